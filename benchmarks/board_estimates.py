@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from pfbench.results.decisions.pair_effects import location_effects
-from pfbench.results.statistics.paired_effects import log_levels, subtract_levels
+from pfbench.stats.effects import log_levels, subtract_levels
+from pfbench.stats.pair_effects import location_effects
 
 STORE = Path(__file__).with_name("board_estimates.json")
 PAGE = Path(__file__).parents[1] / "docs" / "statistics.md"

@@ -21,9 +21,9 @@ import numpy as np
 
 from pfbench.files import write_atomically
 from pfbench.results import DecisionOptions
-from pfbench.results.decisions import words
-from pfbench.results.decisions.family_tests import decide_family, stack_questions
-from pfbench.results.decisions.simulated_studies import StudySetting, assess_pairs
+from pfbench.stats import decision
+from pfbench.stats.planned_pairs import decide_family, stack_questions
+from pfbench.stats.simulated_studies import StudySetting, assess_pairs
 
 HERE = Path(__file__).parent
 STORE = HERE / "decisions.json"
@@ -72,23 +72,23 @@ def count_words(setting: StudySetting, question: str, effect: str, chunk: int) -
         ]
         by_runs_won = bool(error.by_runs_won[s])
         margin = 0.0 if by_runs_won else OPTIONS.log_margin
-        word, size = words.pair_word(*ends[1], margin=margin)
+        word, size = decision.pair_word(*ends[1], margin=margin)
         if not np.isfinite(tests.p_corrected[s, 1]):
-            word, size = words.NOT_TESTED, ""
+            word, size = decision.NOT_TESTED, ""
         track_word = (
-            words.IDENTICAL
+            decision.IDENTICAL
             if track.identical[s]
-            else words.pair_word(*ends[0], margin=OPTIONS.track_margin)[0]
+            else decision.pair_word(*ends[0], margin=OPTIONS.track_margin)[0]
         )
         counts[f"error {word}"] += 1
         counts[f"track {track_word}"] += 1
         counts["runs won"] += by_runs_won
-        is_sized = size == words.MORE and not by_runs_won
-        counts["more than margin"] += is_sized and word == words.BETTER
-        if not by_runs_won and word != words.NOT_TESTED:
-            claim = words.claim_word(*ends[1], margin=OPTIONS.log_margin, states_size=False)
+        is_sized = size == decision.MORE and not by_runs_won
+        counts["more than margin"] += is_sized and word == decision.BETTER
+        if not by_runs_won and word != decision.NOT_TESTED:
+            claim = decision.claim_word(*ends[1], margin=OPTIONS.log_margin, states_size=False)
             counts[f"claim {claim}"] += 1
-        either = {word, track_word} & {words.BETTER, words.WORSE}
+        either = {word, track_word} & {decision.BETTER, decision.WORSE}
         counts["pair decided"] += bool(either)
     return counts
 

@@ -22,14 +22,14 @@ import torch
 from torch import Tensor
 
 from pfbench import job
-from pfbench.config.folders import conf_dir
 from pfbench.core import Episode, PhiloxStream
 from pfbench.filter import Filter, GaussianFilter, ParticleFilter, TaylorLinearisation, run_filter
 from pfbench.job import build_plan
-from pfbench.job.metadata import describe_state
+from pfbench.job.plan import describe_state
 from pfbench.job.raw_estimate import compute_dead_reckoning, compute_raw_estimate
 from pfbench.model import StateSpaceModel
 from pfbench.results import is_diverged, main_component_group
+from pfbench.results.paper_block import conf_dir
 
 HERE = Path(__file__).parent
 STORE = HERE / "divergence.json"

@@ -34,7 +34,7 @@ from pfbench.core import PhiloxStream, Record, map_inputs
 from pfbench.filter import EssResampler, FilterResult, ParticleFilter, Systematic, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.run_batches import choose_run_batch
-from pfbench.kernels import compilation, process_memory
+from pfbench.kernels import dispatch, process_memory
 from pfbench.model import StateSpaceModel
 
 HERE = Path(__file__).parent
@@ -180,7 +180,7 @@ class Pass:
 
     def __call__(self, seed: int) -> FilterResult:
         draws = PhiloxStream(seed, self.runs, self.record.y.dtype)
-        with compilation.use_compiled(self.engine != "eager"), torch.no_grad():
+        with dispatch.use_compiled(self.engine != "eager"), torch.no_grad():
             return run_filter(self.method, self.model, self.record, draws, run_batch=self.block)
 
     @property
@@ -236,7 +236,7 @@ def moved(model: StateSpaceModel, record: Record, particles: int) -> Moved:
             Pass("eager", model, begun, particles, len(few.y))(0)
         counts.append(traffic.bytes)
     draws = PhiloxStream(0, torch.arange(len(few.y), device=few.y.device), few.y.dtype)
-    with compilation.use_compiled(False), Traffic() as traffic:
+    with dispatch.use_compiled(False), Traffic() as traffic:
         draws.normal("counted", particles, model.noise_dim)
     each = len(few.y) * particles
     return Moved((counts[1] - counts[0]) / each, traffic.bytes / each)

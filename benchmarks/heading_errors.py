@@ -36,7 +36,7 @@ from pfbench.filter import (
     run_filter,
 )
 from pfbench.model import StrapdownTotal, StrapdownTuning
-from pfbench.nav.preintegration import PreintegratedImu, preintegrate
+from pfbench.nav.strapdown import PreintegratedImu, preintegrate
 from pfbench.results import order_statistic_interval
 
 HERE = Path(__file__).parent

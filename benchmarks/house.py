@@ -23,13 +23,13 @@ from workload import ins_model
 
 from pfbench import job
 from pfbench.core import PhiloxStream, Record
-from pfbench.core.affine_map import affine_map
+from pfbench.core.linear_algebra import affine_map
 from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.filter import EssResampler, ParticleFilter, Systematic, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.run_batches import choose_run_batch
 from pfbench.job.filter_pass import choose_engine
-from pfbench.kernels import compilation, process_memory
+from pfbench.kernels import dispatch, process_memory
 from pfbench.model import StateSpaceModel, StochasticVolatility, UnivariateGrowth
 from pfbench.model.ins_gnss import LooseStep
 
@@ -121,7 +121,7 @@ def of(method: Any, particles: int, work: Any, dtype: torch.dtype, engine: str) 
     block = choose_run_batch(len(runs), particles, model.chart.size)
 
     def run(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-        with compilation.use_compiled(engine != "eager"), torch.no_grad():
+        with dispatch.use_compiled(engine != "eager"), torch.no_grad():
             estimate = run_filter(
                 method, model, record, PhiloxStream(seed, runs, dtype), run_batch=block
             )

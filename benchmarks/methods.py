@@ -27,7 +27,7 @@ from race import cpu_name
 from pfbench import job
 from pfbench.core import PhiloxStream, Record, map_inputs
 from pfbench.filter import ParticleFilter, run_filter
-from pfbench.kernels import compilation, process_memory
+from pfbench.kernels import dispatch, process_memory
 from pfbench.noise import NominalNoise
 
 HERE = Path(__file__).parent
@@ -155,7 +155,7 @@ def measure(stored: dict[str, Any], options: argparse.Namespace) -> dict[str, An
         for name, method in methods(options.particles).items()
         if name == FIRST or name not in (*slow, *stored["refused"])
     }
-    with compilation.use_compiled(), torch.no_grad():
+    with dispatch.use_compiled(), torch.no_grad():
         refused = refusals(found, model, record)
         found = {name: method for name, method in found.items() if name not in refused}
         rows = rows_of(found, race(found, model, record, options.rounds))

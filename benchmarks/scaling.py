@@ -30,7 +30,7 @@ from pfbench.filter import ParticleFilter, run_filter
 from pfbench.filter.loop import Watch
 from pfbench.filter.run_batches import choose_run_batch
 from pfbench.job import ScoreRecorder
-from pfbench.kernels import compilation, process_memory
+from pfbench.kernels import dispatch, process_memory
 from pfbench.model import LinearGaussian
 from pfbench.noise import NominalNoise
 from pfbench.scenario import ModelSimulation
@@ -193,7 +193,7 @@ def main() -> None:
     chosen = parser.parse_args()
     torch.set_num_threads(1)
     process_memory.keep_freed_memory()
-    with compilation.use_compiled(), torch.no_grad():
+    with dispatch.use_compiled(), torch.no_grad():
         found = against(chosen.rounds, chosen.scale)
         together, steps = batched(chosen.rounds), max(20, round(300 * chosen.scale))
         judged, scored = watched(chosen.rounds, 0, steps), watched(chosen.rounds, 10, steps)

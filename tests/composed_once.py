@@ -20,7 +20,7 @@ from hydra.core.utils import JobRuntime
 from hydra.types import RunMode
 from omegaconf import _utils
 
-from pfbench.config.folders import conf_dir
+from pfbench.results.paper_block import conf_dir
 
 READS_MORE = re.compile(r"\$|hydra")
 

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from pfbench import job
 from pfbench.core.record import Episode, Record, map_inputs
-from pfbench.noise.white import NominalNoise
+from pfbench.noise.base import NominalNoise
 
 CONF = job.conf_dir()
 

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from pfbench.model.strapdown.tuning import StrapdownTuning
+from pfbench.model.strapdown_tuning import StrapdownTuning
 
 DATA = os.environ.get("PFBENCH_DATA")
 recorded = pytest.mark.skipif(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pfbench.filter.gaussian.spherical_radial import (
+from pfbench.filter.gaussian.linearisation_rules import (
     AxisDegree3,
     AxisDegree5,
     RadialDegree3,

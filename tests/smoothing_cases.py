@@ -13,8 +13,8 @@ from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.record import Record
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.simulated import ModelSimulation
 
 SINGULAR = LinearGaussian(
     [[1.0, 0.7], [0.0, 0.9]], [[0.1], [0.5]], [[1.0, 0.0]], [0.8], [1.0, -1.0], [2.0, 1.0]

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from pfbench.results import store
-from pfbench.results.config_key import compute_config_key
+from pfbench.results.store import compute_config_key
 
 STATE: dict[str, Any] = {
     "names": [

@@ -29,16 +29,16 @@ from recorded_data import DATA
 
 from pfbench import job
 from pfbench.cli.compose import read_description
-from pfbench.config.named_sets import expand_filter_names
-from pfbench.config.tuned_knobs import select_knobs
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels
 from pfbench.filter.exactness import has_covariance
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.job.config import expand_filter_names
 from pfbench.job.scoring import ScoreRecorder
+from pfbench.job.tuned_knobs import select_knobs
 from pfbench.model.base import StateSpaceModel
-from pfbench.results.config_key import compute_config_key
+from pfbench.results.store import compute_config_key
 
 FILES = [*sorted(CONF.rglob("*.yaml")), *sorted(job.experiments_dir().glob("*.yaml"))]
 EXPERIMENTS = [file.stem for file in sorted(job.experiments_dir().glob("*.yaml"))]

@@ -19,7 +19,7 @@ from command_line import pfbench
 
 import pfbench as package
 from pfbench.core.lazy_import import lazy_attributes
-from pfbench.report.plots.paper import paper_catalogue
+from pfbench.report.papers import figures
 from pfbench.results import metrics, store
 
 TEXT = (ROOT / "CONTRIBUTING.md").read_text()
@@ -113,7 +113,7 @@ def test_the_figure_appears_in_the_report(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     entry = follow("Add a report figure", folder)["FINAL_ERROR"]
-    monkeypatch.setitem(paper_catalogue.FIGURES, "final-error", entry)
+    monkeypatch.setitem(figures.FIGURES, "final-error", entry)
     small_study(tmp_path)
     printed = pfbench("report", "study=small", "report.paper_figures=[final-error]", home=tmp_path)
     assert printed.code == 0, printed.err

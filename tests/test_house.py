@@ -24,10 +24,10 @@ FLOORS = (
     ("nav",),
     ("model", "noise"),
     ("filter", "scenario"),
+    ("stats",),
     ("results",),
-    ("config",),
     ("report", "job", "learn", "ppl", "testing"),
-    ("claims", "judge", "replay"),
+    ("claims", "judge"),
     ("cli",),
     ("__main__",),
 )
@@ -36,13 +36,12 @@ FLOOR = {folder: height for height, floor in enumerate(FLOORS) for folder in flo
 TOGETHER = {("core", "kernels"), ("kernels", "core")}
 ONLY = {  # (importing folder, imported folder): the modules that it may name
     ("filter", "model"): {"pfbench.model.base"},
-    ("ppl", "report"): {"pfbench.report.plots.plotting"},
 }
 NEVER = {("filter", "noise"), ("scenario", "results"), ("scenario", "filter"), ("nav", "kernels")}
-AT_THE_SAME_FLOOR = {("ppl", "report"), ("learn", "job")}
-FOREIGN = {"hydra": {"cli", "config", "job"}, "omegaconf": {"cli", "config", "job"}}
+AT_THE_SAME_FLOOR = {("learn", "job")}
+FOREIGN = {"hydra": {"cli", "job"}, "omegaconf": {"cli", "job"}}
 NO_ENGINE = ("torch", "pyro", "hydra")  # stored files are enough for these folders
-STORED = {"results", "report", "claims", "judge"}
+STORED = {"stats", "results", "report", "claims", "judge"}
 LONGEST_FUNCTION = 25
 
 
@@ -72,7 +71,7 @@ def allowed(folder: str, name: str) -> bool:
     parts = name.split(".")
     target = parts[1] if len(parts) > 1 else ""
     if target not in FLOOR:  # the package itself: its version and `load`
-        return FLOOR[folder] >= FLOOR["config"]
+        return FLOOR[folder] >= FLOOR["results"]
     pair = (folder, target)
     if target == folder or pair in TOGETHER:
         return True
@@ -146,13 +145,13 @@ BROKEN = {
     "pfbench.core.record": "from pfbench.nav.earth import radii",
     "pfbench.nav.earth": "import pfbench.model.base",
     "pfbench.core.chart": "from pfbench import model",
-    "pfbench.model.textbook": "from pfbench.noise.white import NominalNoise",
+    "pfbench.model.textbook": "from pfbench.noise.base import NominalNoise",
     "pfbench.filter.loop": "from pfbench.model.textbook import UnivariateGrowth",
     "pfbench.filter.gaussian.gaussian_filter": "def f():\n    from pfbench.scenario import base",
     "pfbench.scenario.base": "from pfbench.filter import loop",
     "pfbench.filter.smoothing": "from ..model import linear_gaussian",
     "pfbench.job.plan": "from pfbench.report import page",
-    "pfbench.report.page": "import torch",
+    "pfbench.report.study_report": "import torch",
     "pfbench.results.metrics": "from pfbench.job import plan",
     "pfbench.results.store": "from pyro import distributions",
     "pfbench.model.base": "from hydra.utils import instantiate",

@@ -18,7 +18,7 @@ from markupsafe import escape
 
 from pfbench.claims.page import write_claims
 from pfbench.report import is_equal_drawing
-from pfbench.report.stored_page import read_page_data, rebuild_page
+from pfbench.report.study_report import read_page_data, rebuild_page
 
 
 def load(name: str) -> ModuleType:

@@ -11,16 +11,16 @@ from torch import Tensor
 
 from pfbench.core.record import Episode, Record
 from pfbench.job import conf_dir
-from pfbench.model.sins_gnss_tight import SinsGnssTight, TightStep
+from pfbench.model.tight_coupling import SinsGnssTight, TightStep
 from pfbench.nav import earth
 from pfbench.nav.aiding import AlignmentErrors, ProcessNoiseInflation
-from pfbench.nav.gnss.orbits import WalkerConstellation
-from pfbench.nav.gnss.ranging import RangingReceiver
 from pfbench.nav.imu_errors import ImuErrors
-from pfbench.nav.ramps import CycloidRamp, RampTrajectory
+from pfbench.nav.manoeuvres import CycloidRamp, RampTrajectory
+from pfbench.nav.orbits import WalkerConstellation
+from pfbench.nav.ranging import RangingReceiver
 from pfbench.nav.trajectory import TrajectoryStart
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.simulated_flight import SimulatedFlight
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.flights import SimulatedFlight
 
 IMU = ImuErrors(0.03, 0.0, 0.0, 0.001, 50.0, 0.0, 0.0, 50.0)
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from pfbench.filter import InertiaVelocity
-from pfbench.filter.swarm import chaotic_sequences
+from pfbench.filter.proposed import swarm_motion
 
 MOST = 150  # iterations, as in their figure
 BLUE, ORANGE = "#0072B2", "#D55E00"
@@ -37,7 +37,7 @@ def main() -> None:
     z = torch.tensor([0.3, 0.3 + 1e-6], dtype=torch.float64)
     sequence = [z]
     for _ in range(40):
-        sequence.append(chaotic_sequences.logistic_map(sequence[-1], z))
+        sequence.append(swarm_motion.logistic_map(sequence[-1], z))
     both = torch.stack(sequence)
     orbit.plot(both[:, 0], color=BLUE, marker="o", ms=3, label="from 0.3")
     orbit.plot(both[:, 1], color=ORANGE, ls="--", marker="s", ms=3, label="from 0.3 + 1e-6")
@@ -45,7 +45,7 @@ def main() -> None:
     orbit.legend(fontsize=8, loc="lower left")
 
     generator = torch.Generator().manual_seed(1)
-    values = chaotic_sequences.iterate_logistic(
+    values = swarm_motion.iterate_logistic(
         torch.rand(200_000, dtype=torch.float64, generator=generator)
     )
     histogram.hist(

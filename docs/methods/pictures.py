@@ -23,45 +23,51 @@ from pfbench.filter.belief import (
     normalise_log_weights,
     weighted_mean_cov,
 )
-from pfbench.filter.gaussian.covariance_matching import MatrixNoiseAdaptation
 from pfbench.filter.gaussian.ensemble_kalman import EnsembleKalmanFilter, EnsembleTransformUpdate
-from pfbench.filter.gaussian.gain_adaptation import AdaptiveFactorGain, BoundedRatioGain
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.innovation import GainAdaptation, NoiseAdaptation
-from pfbench.filter.gaussian.linearisation_rules import SigmaPointLinearisation, TaylorLinearisation
-from pfbench.filter.gaussian.noise_adaptation import ConstrainedNoiseAdaptation, FadingMemory
-from pfbench.filter.gaussian.spherical_radial import (
+from pfbench.filter.gaussian.linearisation_rules import (
     AxisDegree3,
     AxisDegree5,
     RadialDegree3,
     RadialDegree5,
+    SigmaPointLinearisation,
     SimplexDegree3,
     SphericalRadialPoints,
+    TaylorLinearisation,
 )
+from pfbench.filter.gaussian.noise_adaptation import (
+    AdaptiveFactorGain,
+    BoundedRatioGain,
+    ConstrainedNoiseAdaptation,
+    FadingMemory,
+    MatrixNoiseAdaptation,
+)
+from pfbench.filter.guided.guides import SharedGuideProposal
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
-from pfbench.filter.guided.shared_guide import SharedGuideProposal
 from pfbench.filter.loop import run_filter
 from pfbench.filter.marginal.rao_blackwellised import RaoBlackwellisedFilter
-from pfbench.filter.moves.flow_kernels import NoiseFlowKernel
-from pfbench.filter.moves.metropolis import MetropolisHastings
-from pfbench.filter.moves.path_history import StateHistory as Past
+from pfbench.filter.moves.metropolis import MetropolisHastings, StateHistory as Past
+from pfbench.filter.moves.path_kernels import NoiseFlowKernel
 from pfbench.filter.particle.gaussian_particle_filter import GaussianResampler
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.point_sets import HaltonPoints
 from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import EssResampler, Resampler
-from pfbench.filter.particle.resampling_schemes import Systematic
-from pfbench.filter.polymerised.partition import AxisAlignedCells, WhitenedCells, divide_cells
-from pfbench.filter.polymerised.placement import ScaledCentrePlacement
-from pfbench.filter.polymerised.resampler import PolymerisedResampler, UnchangedAllocation
-from pfbench.filter.reconstructed.dmc_controller import DmcController
-from pfbench.filter.reconstructed.proposal import ReconstructedProposal
-from pfbench.filter.reconstructed.weight_correction import NoWeightCorrection
-from pfbench.filter.swarm.swarm_coordinates import AllComponents, LikelihoodFitness
-from pfbench.filter.swarm.swarm_limits import SwarmLimits
-from pfbench.filter.swarm.swarm_proposal import SwarmProposal
-from pfbench.filter.swarm.swarm_weighting import PrintedWeighting
+from pfbench.filter.particle.resampling import EssResampler, Resampler, Systematic
+from pfbench.filter.particle.sqmc import HaltonPoints
+from pfbench.filter.proposed.dmc_controller import DmcController
+from pfbench.filter.proposed.polymerised import (
+    AxisAlignedCells,
+    PolymerisedResampler,
+    ScaledCentrePlacement,
+    UnchangedAllocation,
+    WhitenedCells,
+    divide_cells,
+)
+from pfbench.filter.proposed.reconstructed import NoWeightCorrection, ReconstructedProposal
+from pfbench.filter.proposed.swarm import SwarmLimits, SwarmProposal
+from pfbench.filter.proposed.swarm_coordinates import AllComponents, LikelihoodFitness
+from pfbench.filter.proposed.swarm_weighting import PrintedWeighting
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 
 HERE = Path(__file__).parent

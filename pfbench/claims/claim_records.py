@@ -1,28 +1,20 @@
-"""Claims read from claims.yaml, with checks of their keys and names."""
+"""Claims of the papers as records: conditions, metrics, tests and choices, read from claims.yaml with checks."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from pfbench.claims.schema import (
-    CLAIM_GROUPS,
-    CLAIM_METRICS,
-    FORMS,
-    GROUPED,
-    MARKS,
-    PAPERS,
-    REASONS,
-    STATISTICS,
-    Claim,
-    ClaimTest,
-)
+from pfbench.results import metrics
+
+# --------------------------------------------------------------------------------------------------
+# Claims read from claims.yaml, with checks of their keys and names.
 
 FILE = Path(__file__).with_name("claims.yaml")
 SHOWN = ("holds", "fails")
@@ -182,3 +174,241 @@ def _check_option(
     if value not in options:
         listed = ", ".join(map(str, options))
         raise ValueError(f"{claim}: {key} must be one of {listed}, got {key}={value!r}.")
+
+
+# --------------------------------------------------------------------------------------------------
+# Records of the papers' claims: conditions, metrics and tests that decide each of them.
+#
+# The records are in claims.yaml. Values of `all` hold for every test of a claim. Lists within a test
+# represent as many tests, and `method` represents the filter as printed and as repaired. A claim that
+# a test of this repository decides without runs has `shown`, "holds" or "fails", and the name of that
+# test.
+
+FORMS = ("printed", "repaired")
+
+
+PAPERS = {
+    "000": "Yan et al. 2016, modified particle filter for SINS/SAR",
+    "001": "Pu and Qin, QMC polymerisation for airborne passive location",
+    "002": "COFM-AMSSRCPF 2024, SINS/GNSS",
+    "003": "DMC reconstruction for SINS/GPS with a large azimuth error",
+    "004": "Tian et al., chaos particle swarm with escape factor for GPS/INS",
+}
+
+
+NOT_STATED, NOT_RUN = "not specified in the paper", "not run"
+NO_POWER, LOST = "too few runs", "too many lost runs"
+REASONS = (NOT_STATED, NOT_RUN, NO_POWER, LOST)
+MARKS = ("circular", "vacuous")
+
+
+# Fields that each statistic requires besides a.
+STATISTICS = {
+    "less": "b",
+    "greater": "b",
+    "equal": "b",
+    "no_worse": "b",
+    "close": "b",
+    "below": "high",
+    "above": "low",
+    "within": "low high",
+    "near": "printed",
+    "flat": "",
+    "falls": "",
+    "share": "low",
+    "cost": "",
+    "report": "",
+}
+
+
+# Metrics of claims that are not in the table of metrics; those of component errors first.
+_ERROR_METRICS = ("mean_abs", "settled", "growth", "sd")
+
+
+_RUN_METRICS = ("effective", "severely_overconfident")
+_BY_SCOPE = {metric.name: metric.scope for metric in metrics.METRICS}
+SCALED = (*(m for m, s in _BY_SCOPE.items() if s == "components"), *_ERROR_METRICS)
+CLAIM_METRICS = tuple(dict.fromkeys((*_BY_SCOPE, *_ERROR_METRICS, *_RUN_METRICS)))
+GROUPED = (*SCALED, *(m for m, s in _BY_SCOPE.items() if s == "group"))  # metrics of a group
+
+
+CLAIM_GROUPS = (
+    "attitude",
+    "velocity",
+    "position",
+    "gyro_bias",
+    "accelerometer_bias",
+    "gyro_constant",
+    "gyro_markov",
+    "clock [m]",
+    "clock [m/s]",
+    "state [m]",
+    "state [m/s]",
+    "state",
+)
+
+
+@dataclass(frozen=True)
+class ClaimTest:
+    """Test that a claim asks for.
+
+    Attributes:
+        statistic: One of `STATISTICS`, see `claim_tests`.
+        study: Experiment whose results are used.
+        cell: Condition, as scenario/noise/model.
+        metric: One of `CLAIM_METRICS`.
+        a: Label of a filter.
+        b: Label of the filter that a is compared with, or empty.
+        b_cell: Condition of b, if it differs. Runs of the same number are paired.
+        b_study: Experiment of b, if it differs.
+        group: Group of the state, as named in reports.
+        component: Component of the group, or "norm".
+        start: First time included, in seconds.
+        end: Last time included, in seconds.
+        settled: Bound of the metric "settled", in displayed units.
+        printed: Printed ratio of a to b, or the printed number of "near".
+        low: Lower limit claimed, in displayed units. For "cost", of the ratio of two times or of
+            one time in seconds.
+        high: Upper limit claimed, as `low`.
+        margin: Relative margin; in displayed units for "close", of the logarithm for "flat".
+        decides: Whether the verdict depends on the test. If not, the page shows it only.
+    """
+
+    statistic: str
+    study: str
+    cell: str
+    metric: str
+    a: str
+    b: str = ""
+    b_cell: str = ""
+    b_study: str = ""
+    group: str = ""
+    component: str = "norm"
+    start: float = 0.0
+    end: float = np.inf
+    settled: float = np.nan
+    printed: float = np.nan
+    low: float = -np.inf
+    high: float = np.inf
+    margin: float = 0.1
+    decides: bool = True
+
+    @property
+    def measure(self) -> str:
+        """Name of the measured quantity, equal for both sides."""
+        names = {"effective": "effective particles", "seconds_per_step": "time per step"}
+        name = names.get(self.metric, self.metric).replace("_", " ")
+        bound = f" at {self.settled:g}" if self.metric == "settled" else ""
+        target = self.group if self.component == "norm" else self.component
+        has_all_time = self.start == 0 and np.isinf(self.end)
+        span = "" if has_all_time else f", {self.start:g} to {self.end:g} s"
+        span = span.replace(" to inf s", " s to the end")
+        words = (name + bound, target if self.metric in GROUPED else "")
+        return " ".join(word for word in words if word) + span
+
+    @property
+    def sides(self) -> list[tuple[str, str, str]]:
+        """Study, condition and label of a and, if there is one, of b."""
+        b = (self.b_study or self.study, self.b_cell or self.cell, self.b)
+        return [(self.study, self.cell, self.a), *([b] if self.b else [])]
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Claim of a paper.
+
+    Attributes:
+        id: Identifier, as "C000-1".
+        paper: Key of `PAPERS`.
+        claim: Words of the paper, shortened.
+        source: Equation, figure, table or section.
+        printed: Printed numbers as text; empty without numbers.
+        tests: Tests by form, "printed" or "repaired", or "" if the claim is about no method of
+            the paper.
+        reasons: By form, or "", a reason and its explanation why that form cannot be decided.
+        note: Interpretation of the words [ours].
+        mark: "circular" or "vacuous" and its explanation, if the tests cannot support the claim;
+            empty texts otherwise.
+        evidence: By form, or "", "holds" or "fails" and the evidence, if no runs are needed.
+    """
+
+    id: str
+    paper: str
+    claim: str
+    source: str
+    printed: str
+    tests: Mapping[str, tuple[ClaimTest, ...]]
+    reasons: Mapping[str, tuple[str, str]]
+    note: str = ""
+    mark: tuple[str, str] = ("", "")
+    evidence: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+
+    @property
+    def studies(self) -> list[str]:
+        """Studies whose results the tests use."""
+        tests = (test for tests in self.tests.values() for test in tests)
+        return list(dict.fromkeys(side[0] for test in tests for side in test.sides))
+
+
+# --------------------------------------------------------------------------------------------------
+# Choices of this project in the configurations of a claim's studies, where a paper states no value.
+#
+# The configurations mark them with `[ours]` in a comment.
+
+_MARK = "[ours]"
+_GROUPS = ("scenario", "noise", "model")
+
+
+def list_choices(claim: Claim, conf: Path, experiments: Path) -> list[str]:
+    """List the choices of this project in the studies of a claim.
+
+    Args:
+        claim: Claim.
+        conf: Folder of configurations.
+        experiments: Folder of experiments.
+
+    Returns:
+        Choices of the experiments, then of scenarios, regimes, models and filters; none twice.
+    """
+    files: dict[Path, None] = {}
+    tests = [test for tests in claim.tests.values() for test in tests]
+    for study in claim.studies:
+        files[experiments / f"{study}.yaml"] = None
+    for test in tests:
+        for _, cell, label in test.sides:
+            for group, name in zip(_GROUPS, cell.split("/"), strict=True):
+                files |= dict.fromkeys(_inherited_files(conf / group, name))
+            filters = _inherited_files(conf / "filter", label.partition("[")[0])
+            files |= dict.fromkeys(filters)
+    return list(dict.fromkeys(text for path in files for text in _marked_choices(path)))
+
+
+def _inherited_files(folder: Path, name: str) -> Iterator[Path]:
+    """Yield the file of a configuration and those of the same group that it extends."""
+    path = folder / f"{name}.yaml"
+    if not path.is_file():
+        return
+    yield path
+    for parent in _read(path).get("defaults", ()):
+        if isinstance(parent, str) and parent != "_self_":
+            yield from _inherited_files(folder, parent)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Read a configuration without interpolation."""
+    return dict(yaml.safe_load(path.read_text(encoding="utf-8")) or {})
+
+
+def _marked_choices(path: Path) -> Iterator[str]:
+    """Yield the marked choices of a file: keys with values and remarks, and sentences of its head."""
+    if not path.is_file():
+        return
+    for line in path.read_text(encoding="utf-8").splitlines():
+        setting, _, remark = line.partition("#")
+        if _MARK not in remark:
+            continue
+        remark = re.sub(r"\s+", " ", remark.partition(_MARK)[0]).strip(" .;,")
+        if setting.strip():
+            yield f"{setting.strip()} ({remark})" if remark else setting.strip()
+        else:
+            yield f"{path.stem}: {remark}"

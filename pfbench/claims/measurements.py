@@ -1,20 +1,33 @@
-"""Measurements for the claims' tests, read from results: one long table of all runs."""
+"""Measurements for the claims' tests: from results, or from stored files that need no results."""
 
 from __future__ import annotations
 
+import io
+import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
-from pfbench.claims.schema import SCALED, Claim, ClaimTest
-from pfbench.results import metric_values, metrics, status, store
-from pfbench.results.conditions import Condition, JobFile, load_conditions
-from pfbench.results.error_measures import convergence_time, mean_per_run, rmse_per_run
+from pfbench.claims.claim_records import NOT_RUN, SCALED, Claim, ClaimTest
+from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.files.table_file import check_parquet
+from pfbench.results import metrics, metrics as metric_values, status, store
+from pfbench.results.conditions import (
+    ComponentGroup,
+    Condition,
+    JobFile,
+    component_groups,
+    load_conditions,
+)
 from pfbench.results.frame import drop_before, select_steps
-from pfbench.results.state_groups import ComponentGroup, component_groups
+from pfbench.stats.error_measures import convergence_time, mean_per_run, rmse_per_run
+
+# --------------------------------------------------------------------------------------------------
+# Measurements for the claims' tests, read from results: one long table of all runs.
 
 Side = tuple[str, str, str]  # study, condition, label
 MEASURED_COLUMNS = ["study", "cell", "label", "measure", "seed", "run", "lost", "unit", "value"]
@@ -241,3 +254,146 @@ def _unit(result: store.JobResult, test: ClaimTest) -> str:
         return "" if unit == metrics.GROUP_UNIT else unit
     groups = component_groups(result.meta["state"])
     return next((group.unit for group in groups if group.group == test.group), "")
+
+
+# --------------------------------------------------------------------------------------------------
+# Measurements of the claims as files, from which verdicts are decided again where the results are missing.
+
+MEASUREMENTS = "measurements.parquet"
+JOBS = "jobs.json"
+# What the page says of a job: `cost.format_budget` and `list_commits` read these values.
+_JOB_KEYS = (
+    *("key", "label", "runs", "particles", "particles_used"),
+    *("budget", "budget_allocation", "likelihoods_per_step"),
+)
+
+
+class ClaimData(NamedTuple):
+    """Measurements and jobs of all claims.
+
+    Attributes:
+        rows: Table as of `load_claim_measurements`.
+        jobs: Metadata by study, condition and label.
+    """
+
+    rows: pd.DataFrame
+    jobs: dict[Side, Mapping[str, Any]]
+
+
+def load_claim_data(
+    claims: Sequence[Claim], results: str | Path, folder: Path, *, allow_mixed_versions: bool
+) -> ClaimData:
+    """Measure the claims' tests in the results, and read those of studies without results from files.
+
+    Args:
+        claims: Records.
+        results: Folder of all studies.
+        folder: Folder of the page, which may hold the files of `write_claim_data`.
+        allow_mixed_versions: As in `load_claim_measurements`.
+
+    Raises:
+        ValueError: If results do not belong together, or a file is damaged.
+    """
+    measured = ClaimData(
+        load_claim_measurements(claims, results, allow_mixed_versions=allow_mixed_versions),
+        claim_job_metadata(claims, results, mixed=allow_mixed_versions),
+    )
+    stored = _read_claim_data(folder)
+    measured_studies = {side[0] for side in measured.jobs}
+    tests = {(*side, test.measure) for test in list_tests(claims) for side in test.sides}
+    sides = {tuple(test[:3]) for test in tests}
+    keys = pd.MultiIndex.from_frame(stored.rows[MEASURED_COLUMNS[:4]])
+    is_used = keys.isin(tests) & ~stored.rows["study"].isin(measured_studies).to_numpy()
+    jobs = {
+        side: job
+        for side, job in stored.jobs.items()
+        if side in sides and side[0] not in measured_studies
+    }
+    tables = [table for table in (measured.rows, stored.rows[is_used]) if len(table)]
+    rows = pd.concat(tables, ignore_index=True) if tables else measured.rows
+    return ClaimData(rows, {**measured.jobs, **jobs})
+
+
+def write_claim_data(data: ClaimData, folder: RecordedFolder) -> None:
+    """Write measurements and jobs. Equal results give equal bytes.
+
+    Args:
+        data: Measurements and jobs.
+        folder: Folder of the page.
+    """
+    rows = data.rows.sort_values(MEASURED_COLUMNS[:6], ignore_index=True)
+    texts = [name for name in MEASURED_COLUMNS if rows[name].dtype == object]
+    buffer = io.BytesIO()
+    rows.astype(dict.fromkeys(texts, "category")).to_parquet(buffer, index=False)
+    folder.write(MEASUREMENTS, buffer.getvalue())
+    jobs = [[*side, _shorten(data.jobs[side])] for side in sorted(data.jobs)]
+    folder.write(JOBS, json.dumps(jobs, indent=0, sort_keys=True, allow_nan=False) + "\n")
+
+
+def _read_claim_data(folder: Path) -> ClaimData:
+    """Read the files of `write_claim_data`; no rows without them."""
+    table, jobs = folder / MEASUREMENTS, folder / JOBS
+    if not table.is_file():
+        return ClaimData(pd.DataFrame(columns=MEASURED_COLUMNS), {})
+    path = table
+    try:
+        check_parquet(table)
+        rows = pd.read_parquet(table)[MEASURED_COLUMNS]
+        rows = rows.astype({name: object for name in rows.select_dtypes("category")})
+        path = jobs
+        entries = json.loads(jobs.read_text("utf-8"))
+        metadata = {(study, cell, label): meta for study, cell, label, meta in entries}
+    except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
+        raise ValueError(
+            f"{path} must be written by pfbench claims, got {error}. "
+            "Remove it and run: make studies, then pfbench claims."
+        ) from error
+    return ClaimData(rows, metadata)
+
+
+def _shorten(meta: Mapping[str, Any]) -> dict[str, Any]:
+    """Select the values of a job that the page shows."""
+    config = meta.get("config")
+    budget = {"budget": config["budget"]} if config and "budget" in config else {}
+    seconds, versions = meta.get("seconds", {}), meta.get("versions", {})
+    return {
+        **budget,
+        **{name: meta[name] for name in _JOB_KEYS if meta.get(name) is not None},
+        "seconds": {name: seconds[name] for name in ("per_step",) if name in seconds},
+        "versions": {name: versions[name] for name in ("commit", "build") if name in versions},
+    }
+
+
+# --------------------------------------------------------------------------------------------------
+# Protection of stored verdicts: a page without results must not replace one with results.
+
+
+def check_stored_verdicts(path: Path, records: Sequence[dict[str, Any]]) -> None:
+    """Check that no stored verdict is replaced by one with fewer results.
+
+    Args:
+        path: Stored verdicts.json, which need not exist.
+        records: New records, as in the file.
+
+    Raises:
+        ValueError: If results of a stored verdict are missing. The message names the file, the number of
+            claims and the remedy.
+    """
+    if not path.is_file():
+        return
+    stored = {
+        record["id"]: _count_missing(record) for record in json.loads(path.read_text("utf-8"))
+    }
+    lost = [r["id"] for r in records if _count_missing(r) > stored.get(r["id"], float("inf"))]
+    if lost:
+        raise ValueError(
+            f"results_dir must hold the results of the verdicts in {path}, got none for {len(lost)} of "
+            f"{len(records)} claims, which would become '{NOT_RUN}'. Nothing was written. Run their "
+            f"studies first, write the page elsewhere with reports_dir=DIR, or remove {path}."
+        )
+
+
+def _count_missing(record: dict[str, Any]) -> int:
+    """Count the tests of a claim that were not run."""
+    reasons = [test["reason"] for tests in record["findings"].values() for test in tests]
+    return [record["reason"], *reasons].count(NOT_RUN)

@@ -6,9 +6,8 @@ import os
 from collections.abc import Iterator, Sequence
 
 from pfbench.cli.messages import format_error
-from pfbench.config.composition import compose, list_groups
-from pfbench.files.rare_collections import collect_rarely
-from pfbench.files.work_start import start_work
+from pfbench.files.command_start import collect_rarely, start_work
+from pfbench.job.config import compose, list_groups
 
 HELP = """\
 pfbench check

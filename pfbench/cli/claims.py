@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from pfbench.config.composition import compose
-from pfbench.config.folders import conf_dir, experiments_dir
+from pfbench.job.config import compose
+from pfbench.results.paper_block import conf_dir, experiments_dir
 
 HELP = """\
 pfbench claims [key=value ...]

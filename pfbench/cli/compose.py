@@ -1,16 +1,21 @@
-"""Configurations of commands: sweeps, experiments and descriptions of files."""
+"""Configurations of commands, and their check before Hydra acts on them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
+from itertools import islice
 from pathlib import Path
+from typing import Any, NoReturn
 
-from pfbench.cli.messages import suggest_similar
-from pfbench.config.composition import JobConfig, compose
-from pfbench.config.folders import experiments_dir
-from pfbench.config.named_sets import expand_filter_sets
-from pfbench.config.sweep_check import expand_sweep
+from pfbench.cli.messages import format_flag, suggest_similar
+from pfbench.job.config import JobConfig, compose, compose_tree, expand_filter_sets
+from pfbench.job.trust import UntrustedConfigError, check_study
+from pfbench.results.paper_block import conf_dir, experiments_dir
+
+# --------------------------------------------------------------------------------------------------
+# Configurations of commands: sweeps, experiments and descriptions of files.
 
 
 def compose_study(words: Sequence[str]) -> JobConfig:
@@ -100,3 +105,152 @@ def read_description(path: Path) -> str:
     lines = path.read_text().splitlines()
     first = next((line for line in lines if not line.startswith("# @package")), "")
     return first.removeprefix("#").strip() if first.startswith("#") else ""
+
+
+# --------------------------------------------------------------------------------------------------
+# Check of a command before Hydra acts on it: Hydra makes folders and calls plugins before any job.
+
+_MOST_VALUES = 100_000  # of one key of a sweep
+
+
+def check_words(words: Sequence[str]) -> JobConfig | None:
+    """Check the words of `pfbench run`, those of all jobs of a sweep included.
+
+    A job whose configuration is invalid for another reason fails by itself later, and the other jobs
+    of the sweep run.
+
+    Args:
+        words: Overrides and flags of Hydra, without `trust`.
+
+    Returns:
+        Configuration of the first job, None if it is not valid.
+
+    Raises:
+        UntrustedConfigError: If a file sets what only the command line may set, or names what is
+            not trusted.
+        ValueError: If a word is a flag that Hydra does not have.
+    """
+    args = _parse_flags(list(words))
+    if args.config_path or args.config_name or args.config_dir or args.experimental_rerun:
+        raise UntrustedConfigError(
+            "--config-path, --config-name and --experimental-rerun must not be used, since pfbench has its "
+            "own main file. Use --config-dir=FOLDER for more files."
+        )
+    overrides = list(args.overrides)
+    return _check_sweep(overrides) if args.multirun else _check_composition(overrides)
+
+
+def replace_config_dir(words: Sequence[str]) -> list[str]:
+    """Replace the flag `--config-dir` of Hydra by the search path with this folder.
+
+    Args:
+        words: Overrides and flags of Hydra.
+
+    Returns:
+        The words without the flag.
+
+    Raises:
+        ValueError: If the flag is without a folder, or the search path is given twice.
+    """
+    index = next((i for i, w in enumerate(words) if re.match(r"(--config-dir|-cd)(=|$)", w)), None)
+    if index is None:
+        return list(words)
+    _, equals, folder = words[index].partition("=")
+    after = index + 1 if equals else index + 2
+    folder = folder or "".join(words[index + 1 : after])
+    others = [*words[:index], *words[after:]]
+    is_twice = any(re.match(r"[+~]*hydra\.searchpath\b|--config-dir\b|-cd\b", w) for w in others)
+    if not folder or is_twice:
+        raise ValueError(
+            f"--config-dir must be given once, with a folder and without hydra.searchpath, got {folder!r}. "
+            "Write several folders as hydra.searchpath=[file://A,file://B]."
+        )
+    path = f"file://{folder}".replace("'", "\\'")
+    return [*others, f"hydra.searchpath=['{path}']"]
+
+
+def _parse_flags(words: list[str]) -> Any:
+    """Split words into Hydra's flags and overrides."""
+    from hydra._internal.utils import get_args_parser
+
+    def refuse(message: str) -> NoReturn:
+        raise ValueError(f"a flag is not valid: {message}. See pfbench run --help")
+
+    parser: Any = get_args_parser()
+    parser.error = refuse  # argparse would print its usage and end the process
+    args, unknown = parser.parse_known_args(words)
+    if unknown:
+        raise ValueError(format_flag(words, unknown[0], "run"))
+    return args
+
+
+def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
+    """Expand overrides as Hydra's sweeper does. A later override replaces an earlier one.
+
+    Args:
+        overrides: Overrides, some with several values.
+
+    Returns:
+        For each key the alternatives, each as an override.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    alternatives: dict[str, list[str]] = {}
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        key = override.get_key_element()
+        if override.is_sweep_override():
+            texts = list(islice(override.sweep_string_iterator(), _MOST_VALUES + 1))
+            if not 0 < len(texts) <= _MOST_VALUES:
+                raise UntrustedConfigError(
+                    f"{key} must have 1 to {_MOST_VALUES} values, got {'more' if texts else 'none'} of "
+                    f"{override.input_line}. Write them as {key}=A,B."
+                )
+            values = [f"{key}={value}" for value in texts]
+        else:
+            values = [override.input_line or f"{key}={override.get_value_element_as_str()}"]
+        alternatives[key] = values
+    return list(alternatives.values())
+
+
+def _check_composition(words: list[str]) -> JobConfig | None:
+    """Compose a configuration for its checks. Other errors are left to the job."""
+    try:
+        return compose(words)
+    except UntrustedConfigError:
+        raise
+    except Exception:
+        return None
+
+
+def _check_sweep(overrides: list[str]) -> JobConfig | None:
+    """Check the first job of a sweep, and all values that can choose a file that is not pfbench's.
+
+    Returns the configuration of the first job, None if it is not valid.
+    """
+    try:
+        tree = compose_tree([options[0] for options in expand_sweep(overrides)])
+        params = tree.hydra.sweeper.params or {}
+        swept = [f"{name}={value}" for name, value in params.items()]
+        alternatives = expand_sweep([*swept, *overrides])
+    except UntrustedConfigError:
+        raise
+    except Exception:  # Hydra reports an invalid override
+        return None
+    first = [options[0] for options in alternatives]
+    config = _check_composition(first)
+    values: Mapping[str, object] = config.values if config else {}
+    for index, options in enumerate(alternatives):
+        for option in options[1:]:
+            key, _, value = option.lstrip("+").partition("=")
+            if key == "study":
+                check_study(value.strip("'\""))
+            is_plain = key in values and not isinstance(values[key], Mapping)
+            if not is_plain and not _is_own_file(key, value):
+                _check_composition([*first[:index], option, *first[index + 1 :]])
+    return config
+
+
+def _is_own_file(group: str, name: str) -> bool:
+    """Return whether a choice of a group is a file of pfbench."""
+    folder = experiments_dir() if group == "experiment" else conf_dir() / group
+    return (folder / f"{name}.yaml").is_file()

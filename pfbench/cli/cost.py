@@ -9,8 +9,8 @@ from typing import Any
 
 from pfbench.cli.compose import split_words
 from pfbench.cli.report import check_has_results
-from pfbench.config.composition import compose
-from pfbench.config.protected_keys import FOLDER_KEYS
+from pfbench.job.config import compose
+from pfbench.job.file_rules import FOLDER_KEYS
 
 HELP = """\
 pfbench cost study=NAME [rounds=7] [overwrite=true] [key=value ...]
@@ -70,8 +70,8 @@ def _time_study(
     folder: Path, changes: dict[str, Any], numbers: tuple[int, float], overwrite: bool
 ) -> int:
     """Time the conditions of a study that are not yet in its file, and return their number."""
-    from pfbench.replay.recomputation import describe_changed_code
-    from pfbench.replay.step_timing import estimate_time, time_condition
+    from pfbench.job.replay import describe_changed_code
+    from pfbench.job.step_timing import estimate_time, time_condition
     from pfbench.results.conditions import load_conditions
     from pfbench.results.step_times import (
         measurement_key,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pfbench.cli.compose import given_keys, read_description
-from pfbench.config.composition import compose
-from pfbench.config.folders import conf_dir
+from pfbench.job.config import compose
+from pfbench.results.paper_block import conf_dir
 
 HELP = """\
 pfbench datasheet scenario=NAME [noise=NAME] [runs=20] [key=value ...]

@@ -59,9 +59,13 @@ def judge_trajectories(words: Sequence[str]) -> None:
     """
     values = _split(words)
     options, sources, programs = _sort_words(values)
-    from pfbench.judge.judge_notes import describe_notes
-    from pfbench.judge.judge_page import describe_judgement, describe_material, write_judgement
     from pfbench.judge.judgement import judge_programs
+    from pfbench.judge.page import (
+        describe_judgement,
+        describe_material,
+        describe_notes,
+        write_judgement,
+    )
 
     reference, study = programs.pop("reference"), str(values.get("study", "judge"))
     if not re.fullmatch(r"[\w+.-]*\w[\w+.-]*", study) or len(study) > _LONGEST_NAME:

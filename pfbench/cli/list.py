@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 
 from pfbench.cli.compose import given_keys, read_description
 from pfbench.cli.messages import suggest_similar
-from pfbench.config.composition import list_groups
+from pfbench.job.config import list_groups
 
 HELP = """\
 pfbench list [GROUP] [key=value ...]
@@ -53,8 +53,8 @@ def list_options(words: Sequence[str]) -> None:
 
 def _list_fitting(group: str, words: Sequence[str]) -> Collection[str]:
     """List the models or scenarios that fit overrides, which name the other one."""
-    from pfbench.config.composition import compose_tree
-    from pfbench.config.model_fit import list_fitting_models, list_fitting_scenarios
+    from pfbench.job.config import compose_tree
+    from pfbench.job.model_fit import list_fitting_models, list_fitting_scenarios
 
     needed = _OTHER.get(group)
     if needed is None or needed not in given_keys(words):

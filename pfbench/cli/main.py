@@ -9,13 +9,17 @@ from collections.abc import Sequence
 from importlib import import_module
 
 import pfbench
-from pfbench.cli.messages import format_error, notes_of, suggest_similar
+from pfbench.cli.messages import (
+    describe_unknown,
+    format_error,
+    format_flag,
+    keep_trace,
+    notes_of,
+    suggest_similar,
+)
 from pfbench.cli.terminal import SignalStop, lasting_outputs, stop_workers, stopped_by_signals
-from pfbench.cli.unknown_errors import describe_unknown, keep_trace
-from pfbench.config.hydra_messages import format_flag
-from pfbench.config.trust import ENVIRONMENT, split_trust
-from pfbench.files.rare_collections import collect_as_usual
-from pfbench.files.work_start import has_work_started, reset_work
+from pfbench.files.command_start import collect_as_usual, has_work_started, reset_work
+from pfbench.job.trust import ENVIRONMENT, split_trust
 
 # command: function of the module of the same name, summary
 COMMANDS = {
@@ -55,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
     Raises:
         SystemExit: With code 1 if the command failed, 2 if it was refused before its work started
-            (`pfbench.files.work_start`). With 128 and its number if a signal ended it, such as 130.
+            (`pfbench.files.command_start`). With 128 and its number if a signal ended it, such as 130.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     before = os.environ.get(ENVIRONMENT), sys.argv

@@ -1,17 +1,21 @@
-"""Error messages of the command line: key, value and remedy."""
+"""Error messages of the command line: key, value and remedy, also for errors of Hydra."""
 
 from __future__ import annotations
 
 import difflib
+import dis
 import errno
 import re
+import tempfile
+import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
-from pfbench.cli.unknown_errors import describe_unknown, is_named
-from pfbench.config.hydra_messages import format_choice_error, format_value_error
+# --------------------------------------------------------------------------------------------------
+# Error messages of the command line: key, value and remedy.
 
 # extra of the package that installs a launcher
 _EXTRAS = {"ray": "ray", "submitit": "slurm", "joblib": "launch"}
@@ -226,8 +230,8 @@ def _format_unknown_key(name: str, words: Sequence[str]) -> str:
 
 def _composed_keys(words: Sequence[str], excluded: str) -> list[str]:
     """List the dotted keys of the configuration of all other overrides."""
-    from pfbench.config.composition import compose
-    from pfbench.config.sweep_check import expand_sweep
+    from pfbench.cli.compose import expand_sweep
+    from pfbench.job.config import compose
 
     others = [word for word in words if "=" in word and excluded not in word]
     keys: dict[str, None] = {}
@@ -251,3 +255,194 @@ def _dotted_keys(node: Any, path: str = "") -> Iterator[str]:
     if isinstance(node, dict):
         for key, value in node.items():
             yield from _dotted_keys(value, f"{path}.{key}" if path else str(key))
+
+
+# --------------------------------------------------------------------------------------------------
+# Messages for errors of Hydra, which name neither key nor remedy.
+
+# how Hydra's parser begins its errors
+_GRAMMAR = (
+    "mismatched input",
+    "extraneous input",
+    "no viable alternative",
+    "token recognition error",
+)
+
+
+def format_value_error(text: str) -> str:
+    """Format an error of Hydra about a single value.
+
+    Args:
+        text: Message of the error.
+
+    Returns:
+        The key, the value given, and a remedy. Empty for other errors.
+    """
+    if match := re.search(r"Ambiguous value for argument '([^']+)'", text):
+        return f"{match[1]} must be one value, got several. Add -m to run all: pfbench run -m ..."
+    if match := re.search(r"Interpolation key '([^']+)' not found\s+full_key: (\S+)", text):
+        group, _, name = match[1].partition(".")
+        return (
+            f"{match[2]} must be set, since {match[1]} does not exist. "
+            f"Set {match[2]}=... or choose a {group} that defines {name}."
+        )
+    if match := re.search(r"Missing mandatory value: (\S+)", text):
+        return f"{match[1]} must be set. Set {match[1]}=..."
+    if "LexerNoViableAlt" in text or text.startswith(_GRAMMAR):
+        return (
+            "each word must be key=value. Quote a value with spaces or signs; names consist of a-z, A-Z, "
+            "0-9 and underscores."
+        )
+    if match := re.search(r"tried to allocate (\d+) bytes", text):
+        size = int(match[1]) / 2**30
+        return f"memory must hold an array of {size:.3g} GiB. Reduce runs, particles or steps."
+    if match := re.search(r"Error parsing override '([^']*)'", text):
+        return f"'{match[1]}' must be key=value. Quote it if the shell reads brackets or spaces."
+    if match := re.search(r"Error merging override (\S+)=(\S*)", text):
+        key = match[1].lstrip("+~")
+        return f"{key} must have a value of its type, got {match[2]}. See its default: pfbench run --cfg all"
+    if match := re.search(r"An item is already at '([^']+)'", text):
+        return f"{match[1]} exists already. Leave out the plus sign: {match[1]}=VALUE"
+    return ""
+
+
+def format_flag(words: Sequence[str], flag: str, command: str) -> str:
+    """Format an error about a flag that does not exist, such as `--scenario`.
+
+    Args:
+        words: Words of the command.
+        flag: The flag, one of the words.
+        command: Name of the command.
+
+    Returns:
+        The flag, and how the override is written.
+    """
+    key, _, value = flag.lstrip("-").partition("=")
+    following = words[words.index(flag) + 1 :] if flag in words else []
+    if not value and following and not re.match(r"-|.*=", following[0]):
+        value = following[0]
+    return (
+        f"{flag} is not an option. Overrides have no dashes: write {key}={value or 'VALUE'} "
+        f"(pfbench {command} --help)"
+    )
+
+
+def format_choice_error(text: str, words: Sequence[str]) -> str:
+    """Format an error of Hydra about the choice of a file or the search path.
+
+    Args:
+        text: Message of the error.
+        words: Overrides of the command.
+
+    Returns:
+        The key, the value given, and a remedy. Empty for other errors.
+    """
+    path = next((word for word in words if re.match(r"\+?\w+=\.{0,2}/", word)), "")
+    if path and re.search(r"Could not (find|load)", text) and path.partition("=")[2] in text:
+        group = path.lstrip("+").partition("=")[0]
+        return (
+            f"{path} must be a name, got a path. Add its folder with hydra.searchpath=[file://FOLDER], "
+            f"or choose a name: pfbench list {group}"
+        )
+    if "Config group override must be a string or a list" in text:
+        from pfbench.job.config import list_groups
+
+        is_number = re.compile(r"[+~]*(\w+)=(null|true|false|[-+.\d].*)", re.IGNORECASE)
+        numbers = (
+            word for word in words if (m := is_number.fullmatch(word)) and m[1] in list_groups()
+        )
+        if (word := next(numbers, None)) is None:
+            return "each group must have the name of a file. List the groups: pfbench list"
+        group = word.lstrip("+").partition("=")[0]
+        return f"{word} must name a file of the group. Choose one: pfbench list {group}"
+    return ""
+
+
+# --------------------------------------------------------------------------------------------------
+# Errors that pfbench does not name: stage and file by the entry on the stack, and the file of the trace.
+#
+# A sentence is written where an error is expected: pfbench raises it by a `raise` statement. All other errors are of Python or of
+# a library. They are reported with what was being done, their class and text, and a file with the whole trace.
+
+# what a folder of pfbench does; those without an entry serve the others
+_STAGES = {
+    "claims": "writing the page of the claims",
+    "cli": "running the command",
+    "config": "composing the configuration",
+    "filter": "running the filter",
+    "job": "running the job",
+    "judge": "comparing the trajectories",
+    "learn": "training the network",
+    "model": "evaluating the model",
+    "noise": "drawing the errors of the measurements",
+    "replay": "computing the stored run again",
+    "report": "writing the page",
+    "results": "reading the results",
+    "scenario": "drawing the data of the scenario",
+}
+_FILE_NAMES = ("path", "file")  # local variables of functions that read or write
+_RAISE = dis.opmap["RAISE_VARARGS"]
+
+
+def is_named(error: BaseException) -> bool:
+    """Return whether pfbench raised an error itself, so that its text is a sentence for the user.
+
+    Args:
+        error: Error of a command. One without a trace comes from another process, where pfbench raised it.
+    """
+    if any(base.__module__.partition(".")[0] == "pfbench" for base in type(error).__mro__):
+        return True
+    entry = error.__traceback__
+    while entry is not None and entry.tb_next is not None:
+        entry = entry.tb_next
+    if entry is None:
+        return True
+    is_raised = entry.tb_frame.f_code.co_code[entry.tb_lasti] == _RAISE
+    return is_raised and _module(entry.tb_frame)[0] == "pfbench"
+
+
+def describe_unknown(error: BaseException) -> str:
+    """Describe an error that pfbench does not name.
+
+    Args:
+        error: Error of Python or of a library.
+
+    Returns:
+        Stage or file, class and text of the error, and a remedy.
+    """
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    package_frames = [frame for frame in reversed(frames) if _module(frame)[0] == "pfbench"]
+    folders = [_module(frame)[1] for frame in package_frames]
+    stage = next((_STAGES[name] for name in folders if name in _STAGES), "running the command")
+    files = [frame.f_locals.get(name) for frame in package_frames[:3] for name in _FILE_NAMES]
+    path = next((value for value in files if isinstance(value, Path)), None)
+    name = f"{stage} ({path})" if path else stage
+    reason = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
+    subject = str(path) if path else "the words of the command and the files that they name"
+    return f"{name} must succeed, got {reason.rstrip('.')}. Check {subject}."
+
+
+def keep_trace(error: BaseException, words: Sequence[str]) -> Path | None:
+    """Write the trace of an error into a file of its own in the system's temporary folder.
+
+    Args:
+        error: Error.
+        words: Words of the command.
+
+    Returns:
+        The file, or None if none can be written.
+    """
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="pfbench-", suffix=".txt", delete=False, encoding="utf-8", errors="backslashreplace"
+        ) as file:  # fmt: skip
+            file.write(f"{' '.join(['pfbench', *words])}\n\n")
+            file.writelines(traceback.format_exception(error))
+    except OSError:
+        return None
+    return Path(file.name)
+
+
+def _module(frame: FrameType) -> list[str]:
+    """Return the parts of the name of a frame's module, at least two."""
+    return [*str(frame.f_globals.get("__name__", "")).split("."), ""]

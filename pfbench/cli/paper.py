@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 from pfbench.cli.compose import compose_study
 from pfbench.cli.report import check_has_results, find_page_data, make_report_options
-from pfbench.config.composition import JobConfig
+from pfbench.job.config import JobConfig
 
 if TYPE_CHECKING:
     from pfbench.files.recorded_folder import RecordedFolder
-    from pfbench.report.journal.page_format import PageFormat
+    from pfbench.report.journal.figure_style import PageFormat
 
 HELP = """\
 pfbench paper study=NAME journal=ieee|elsevier|springer [key=value ...]
@@ -39,14 +39,14 @@ def write_study_paper(words: Sequence[str]) -> None:
     Raises:
         ValueError: If the format is not valid, the study does not exist or a table does not fit.
     """
-    from pfbench.report.journal.page_format import find_page_format
+    from pfbench.report.journal.figure_style import find_page_format
 
     values = {key: _value(words, key) for key in ("journal", "width")}
     page = find_page_format(values["journal"], values["width"])
     config = compose_study([word for word in words if word.partition("=")[0] not in values])
     from pfbench.files.recorded_folder import RecordedFolder
     from pfbench.report.journal.paper_folder import write_paper
-    from pfbench.report.stored_page import read_page_data
+    from pfbench.report.study_report import read_page_data
 
     study, reports = config.values["study"], Path(config.values["reports_dir"])
     stored = find_page_data(config, words)
@@ -69,7 +69,7 @@ def _write_of_results(config: JobConfig, page: PageFormat, folder: RecordedFolde
     """Write the paper of the results of a study with the values of all views and runs; return remarks."""
     from pfbench.report.board import build_pack, read_study
     from pfbench.report.journal.paper_folder import write_paper
-    from pfbench.report.verdict_files import write_verdict_files
+    from pfbench.report.study_report import write_verdict_files
     from pfbench.results.conditions import load_conditions
 
     study, results = config.values["study"], config.values["results_dir"]

@@ -9,8 +9,8 @@ from typing import Any
 
 from pfbench.cli.compose import split_words
 from pfbench.cli.report import check_has_results
-from pfbench.config.composition import compose
-from pfbench.config.protected_keys import FOLDER_KEYS
+from pfbench.job.config import compose
+from pfbench.job.file_rules import FOLDER_KEYS
 
 HELP = """\
 pfbench replay study=NAME run=NUMBER filter=NAME [scenario=NAME] [noise=NAME] [model=NAME] [key=value ...]
@@ -51,9 +51,9 @@ def replay_run(words: Sequence[str]) -> None:
     )
     study, results = config.values["study"], Path(config.values["results_dir"])
     check_has_results(study, results)
-    from pfbench.replay import recomputation, replay_files
-    from pfbench.replay.agreement import compare_runs, describe_agreement
-    from pfbench.replay.run_selection import find_run
+    from pfbench.job import replay
+    from pfbench.job.replay import compare_runs, describe_agreement
+    from pfbench.job.run_selection import find_run
 
     choices = {key: values[key] for key in _CHOICES if key in values}
     stored = find_run(study, results, _run_number(values["run"]), values["filter"], choices)
@@ -62,18 +62,18 @@ def replay_run(words: Sequence[str]) -> None:
         for key in ("data", *FOLDER_KEYS, *_PLACES)
         if key in values or key not in _PLACES
     }
-    result = recomputation.recompute_run(stored, changes)
-    comparable = recomputation.select_stored_scores(result, stored.result)
+    result = replay.recompute_run(stored, changes)
+    comparable = replay.select_stored_scores(result, stored.result)
     meta = stored.result.meta
     print(f"run {stored.run} of {stored.condition.name} / {stored.job.label}, seed {meta['seed']}")
-    print(f"status: {replay_files.describe_status(comparable)}")
+    print(f"status: {replay.describe_status(comparable)}")
     print(describe_agreement(compare_runs(stored.result, comparable)))
     _print_versions(meta["versions"], result.meta["versions"])
-    if changed := recomputation.describe_changed_code(meta):
+    if changed := replay.describe_changed_code(meta):
         print(changed)
-    for name, old, new, unit in replay_files.tabulate_metrics(stored, comparable):
+    for name, old, new, unit in replay.tabulate_metrics(stored, comparable):
         print(f"  {name:28} {_format(new):>12} {unit:8} stored {_format(old)}")
-    for path in replay_files.write_replay(stored, result, config.values["reports_dir"]):
+    for path in replay.write_replay(stored, result, config.values["reports_dir"]):
         print(f"{path.suffix[1:]}: {path.resolve()}")
 
 

@@ -11,9 +11,9 @@ from typing import Any
 from pfbench.cli.claims import write_claims_page
 from pfbench.cli.compose import compose_study, count_planned_jobs, given_keys
 from pfbench.cli.messages import format_error, suggest_similar
-from pfbench.config.composition import JobConfig, compose
-from pfbench.config.folders import experiments_dir, name_run_command
-from pfbench.files.work_start import start_work
+from pfbench.files.command_start import start_work
+from pfbench.job.config import JobConfig, compose
+from pfbench.results.paper_block import experiments_dir, name_run_command
 
 HELP = """\
 pfbench report study=NAME [key=value ...]
@@ -118,8 +118,7 @@ def make_report_options(config: JobConfig) -> Any:
 
 def _write_page(config: JobConfig) -> Path:
     """Write the report of one study, or make its page of the stored data where the results are missing."""
-    from pfbench.report.page import write_report
-    from pfbench.report.stored_page import rebuild_page
+    from pfbench.report.study_report import rebuild_page, write_report
 
     values = config.values
     if data := find_page_data(config):
@@ -140,7 +139,7 @@ def find_page_data(config: JobConfig, words: Sequence[str] = ()) -> Path | None:
     Raises:
         ValueError: If the words set an option of the report, which stored data cannot follow.
     """
-    from pfbench.report.stored_page import PAGE_DATA
+    from pfbench.report.study_report import PAGE_DATA
 
     study, results = (
         config.values["study"],
@@ -189,7 +188,7 @@ def _write_claims(
 ) -> str:
     """Write the page of the claims if their studies have results or measurements; return a line for the user."""
     from pfbench.claims.claim_records import read_claims
-    from pfbench.claims.stored_measurements import MEASUREMENTS
+    from pfbench.claims.measurements import MEASUREMENTS
 
     values = compose(words).values
     folder = Path(values["reports_dir"]) / "claims"
@@ -208,7 +207,7 @@ def _write_claims(
 
 def _renew_published(study: str, folder: Path, results: Path) -> str:
     """Make the page of a published study of its stored data; return a line for the user."""
-    from pfbench.report.stored_page import PAGE_DATA, rebuild_page
+    from pfbench.report.study_report import PAGE_DATA, rebuild_page
 
     if (folder / PAGE_DATA).is_file():
         return f"{study}: {rebuild_page(folder).resolve()}, of the stored data"

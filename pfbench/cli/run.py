@@ -1,30 +1,39 @@
-"""Command `pfbench run`: one job, or a sweep."""
+"""Command `pfbench run`: one job or a sweep, its progress, and the report of failed jobs."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import logging
 import os
 import re
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
-from pfbench.cli.sweep.application import make_application
-from pfbench.cli.sweep.job_errors import (
-    hide_hydra_line,
-    report_failed_job,
-    summarise_failed_jobs,
-)
-from pfbench.cli.sweep.study_plan import StudyPlan, plan_study
-from pfbench.cli.sweep.sweep_progress import SWEEP_JOBS, SweepProgress, note_outcome
-from pfbench.cli.sweep.until_decided import GrowingSweep, check_has_sweep, wants_until_decided
+from pfbench.cli.application import make_application
+from pfbench.cli.compose import check_words, replace_config_dir
+from pfbench.cli.messages import format_error, notes_of
 from pfbench.cli.terminal import end_with_parent
-from pfbench.config.composition import JobConfig, register_experiments
-from pfbench.config.named_sets import expand_filter_sets
-from pfbench.config.sweep_check import check_words, replace_config_dir
-from pfbench.config.trust import ENVIRONMENT
-from pfbench.files.work_start import start_work
+from pfbench.cli.until_decided import (
+    GrowingSweep,
+    StudyPlan,
+    check_has_sweep,
+    plan_study,
+    wants_until_decided,
+)
+from pfbench.files.command_start import start_work
+from pfbench.files.reader_notes import NOTE, SWEEP_LOG, append_line
+from pfbench.job.config import JobConfig, expand_filter_sets, register_experiments
+from pfbench.job.trust import ENVIRONMENT
+
+# --------------------------------------------------------------------------------------------------
+# Command `pfbench run`: one job, or a sweep.
 
 HELP = """\
 pfbench run [-m] key=value ...
@@ -116,7 +125,7 @@ def print_study_size(plan: StudyPlan | None) -> None:
     Args:
         plan: Plan of the study, None if it is not valid.
     """
-    from pfbench.job.settings import check_settings
+    from pfbench.job.plan import check_settings
 
     if plan is None:
         return
@@ -245,3 +254,194 @@ def run_with_retries(sweep: Callable[[], Any]) -> None:
             print(message, file=sys.stderr)
             if "ray" in sys.modules:
                 sys.modules["ray"].shutdown()  # the next attempt starts new processes of Ray
+
+
+# --------------------------------------------------------------------------------------------------
+# Report of a failed job: once, on its line in a sweep, else as the error of the command.
+
+log = logging.getLogger("pfbench")
+
+_HYDRA_LINE = "Error executing job with overrides"
+_OTHER_TERMINAL = ("slurm", "ray_cluster")  # launchers whose jobs print elsewhere
+
+
+class SweepJobError(Exception):
+    """Error of a job that its own line has reported."""
+
+
+class _WithoutHydraLine:
+    """Stream that leaves out Hydra's list of overrides before an error."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        """Write a text, unless it is Hydra's line."""
+        return len(text) if text.startswith(_HYDRA_LINE) else int(self._stream.write(text))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+@contextlib.contextmanager
+def hide_hydra_line() -> Iterator[None]:
+    """Leave Hydra's line about a failed job out of the error stream: the message follows it."""
+    stream: Any = _WithoutHydraLine(sys.stderr)
+    with contextlib.redirect_stderr(stream):
+        yield
+
+
+def report_failed_job(error: Exception, start: str, name: str, words: Sequence[str]) -> Exception:
+    """Print the line of a failed job of a sweep.
+
+    Args:
+        error: Error of the job.
+        start: Start of the line, such as `[3/40] `.
+        name: Scenario, noise regime and filter.
+        words: Overrides of the job.
+
+    Returns:
+        Error to raise in its place, with the same message.
+    """
+    message = " ".join(format_error(error, words).split())
+    log.error("%sfailed    %s", start, "   ".join([name, message, *notes_of(error)]))
+    return SweepJobError(message)
+
+
+def summarise_failed_jobs(error: Exception, words: Sequence[str]) -> Exception:
+    """Return the error that ends a sweep.
+
+    Args:
+        error: First error of a job, or another error of the sweep.
+        words: Words of the command.
+
+    Returns:
+        A reference to the lines of the jobs, if they were printed in the same terminal. Else the
+        error itself.
+    """
+    if isinstance(error, SweepJobError):
+        start_work()  # a job that cannot start fails in a sweep: the other jobs run
+    launcher = next((w.partition("=")[2] for w in words if w.startswith("hydra/launcher=")), "")
+    if not isinstance(error, SweepJobError) or launcher in _OTHER_TERMINAL:
+        return error
+    return SweepJobError(
+        "all jobs of the sweep must finish, got failed jobs. Their lines above give the reasons. "
+        "Correct them, and repeat the command to run them again."
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Counts of a sweep, printed at its end.
+
+SWEEP_JOBS = "PFBENCH_SWEEP_JOBS"  # environment variable: number of jobs, for the counter
+
+
+@dataclass
+class SweepProgress:
+    """Counts of a sweep, from a file to which its jobs append.
+
+    Any launcher can run the jobs. Jobs that do not get the environment, on a running cluster, are
+    counted by the results that were written meanwhile.
+
+    Attributes:
+        jobs: Number of jobs, or None if unknown.
+        study: Name of the study, or None if it cannot be determined.
+        folder: Folder of the results.
+        start_time: Start of the sweep, seconds since the epoch.
+    """
+
+    jobs: int | None = None
+    study: str | None = None
+    folder: Path = Path()
+    start_time: float = field(default_factory=time.time)
+
+    @classmethod
+    def start(cls, plan: StudyPlan | None) -> SweepProgress:
+        """Count the jobs of a sweep and set the total for the counters of its jobs.
+
+        Args:
+            plan: Plan of the sweep, None if it is not valid.
+        """
+        if plan is None:  # the sweep itself reports the error
+            return cls()
+        values = plan.first.values
+        os.environ[SWEEP_JOBS] = str(plan.jobs)
+        study = str(values["study"]) if plan.has_one_study else None
+        sweep = cls(plan.jobs, study, Path(values["results_dir"]) / str(values["study"]))
+        os.environ[SWEEP_LOG] = str(sweep._log)
+        return sweep
+
+    def finish(self, is_complete: bool = True, is_part: bool = False) -> None:
+        """Print the counts, and the next command if the study has results.
+
+        Args:
+            is_complete: Whether the sweep ended without an error.
+            is_part: Whether more runs may follow, so that the next command is not printed.
+        """
+        os.environ.pop(SWEEP_JOBS, None)
+        os.environ.pop(SWEEP_LOG, None)
+        if is_complete or self._log.is_file():
+            start_work()  # in another process, for most launchers
+        if self.study is None or self.jobs is None:
+            return
+        counts = self._count_outcomes() or self._count_files(is_complete)
+        elapsed = time.time() - self.start_time
+        has_results = any(self.folder.glob("*.npz"))
+        command = (
+            f"  Next: pfbench report study={self.study}" if has_results and not is_part else ""
+        )
+        print(f"sweep: {counts} in {elapsed:.0f} s.{command}")
+
+    @property
+    def _log(self) -> Path:
+        """File of the outcomes, in the folder of the results because remote jobs see it."""
+        name = f".sweep-{os.getpid()}-{self.start_time:.6f}"
+        return self.folder.absolute() / name
+
+    def _count_outcomes(self) -> str:
+        """Count the jobs by outcome, and remove the file. Empty if there is none."""
+        try:
+            lines = self._log.read_text().splitlines()
+            self._log.unlink()
+        except OSError:
+            return ""
+        with contextlib.suppress(OSError):  # no job wrote a file, or others are there
+            self.folder.rmdir()
+        outcomes = defaultdict(set)  # a job that a retry skips has two
+        for line in lines:
+            number, _, status = line.partition(" ")
+            if number != NOTE:
+                outcomes[number].add(status)
+        finished = sum("finished" in of_job for of_job in outcomes.values())
+        failed = sum(of_job == {"failed"} for of_job in outcomes.values())
+        skipped = len(outcomes) - finished - failed
+        rest = (self.jobs or 0) - len(outcomes)
+        text = f"{finished} finished, {skipped} skipped, {failed} failed"
+        return f"{text}, {rest} not run" if rest > 0 else text
+
+    def _count_files(self, is_complete: bool) -> str:
+        """Count the jobs by the files that were written since the start."""
+        finished, failed = self._count("*.npz"), self._count("*.failed.json")
+        others = max(0, (self.jobs or 0) - finished - failed)
+        # an error without a note is of the command, which then stopped before these jobs
+        state = "skipped" if is_complete or failed else "not run"
+        return f"{finished} finished, {others} {state}, {failed} failed"
+
+    def _count(self, pattern: str) -> int:
+        """Count the files that were written since the start."""
+        times = (file.stat().st_mtime for file in self.folder.glob(pattern))
+        return sum(modified >= self.start_time - 0.05 for modified in times)
+
+
+def note_outcome(number: int | None, status: str) -> None:
+    """Append the outcome of a job to the file of its sweep, if it has one.
+
+    Args:
+        number: Number of the job in the sweep, None outside a sweep.
+        status: `finished`, `skipped` or `failed`.
+    """
+    path = os.environ.get(SWEEP_LOG)
+    if path is None or number is None:
+        return
+    with contextlib.suppress(OSError):  # of a full disk: the job reports it
+        append_line(path, f"{number} {status}")

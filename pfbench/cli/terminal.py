@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-from pfbench.files.work_start import has_work_started
+from pfbench.files.command_start import has_work_started
 
 _SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 _WATCH = "watch of the sweep"  # name of a thread

@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from pfbench.config.composition import compose
+from pfbench.job.config import compose
 
 HELP = """\
 pfbench train key=value ...
@@ -63,7 +63,7 @@ def train_network(words: Sequence[str]) -> None:
 def _draw_losses(checkpoint: Path) -> Path:
     """Draw the losses that a checkpoint contains, in its folder."""
     from pfbench.filter.learned.checkpoint import read_checkpoint
-    from pfbench.report.plots.training_figures import write_training_figure
+    from pfbench.report.scenario_figures import write_training_figure
 
     lines = read_checkpoint(checkpoint)["losses"]
     losses = {

@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pfbench.config.composition import JobConfig, compose
-from pfbench.config.named_sets import TUNED_METHODS
-from pfbench.config.tuned_knobs import AUTO, NOMINAL
+from pfbench.job.config import TUNED_METHODS, JobConfig, compose
+from pfbench.job.tuned_knobs import AUTO, NOMINAL
 
 HELP = """\
 pfbench tune scenario=NAME [model=NAME] [filter=NAME,NAME] [key=value ...]
@@ -55,9 +54,7 @@ def tune_filters(words: Sequence[str]) -> None:
         ValueError: If a filter is without a knob, a list is empty, a value is not valid, no filter can be
             tuned, or a study scores the seed of the tuning.
     """
-    from pfbench.job.tuning.candidate_search import SEED_SHIFT
-    from pfbench.job.tuning.knobs import list_candidates
-    from pfbench.job.tuning.scored_seeds import check_seed
+    from pfbench.job.tuning import SEED_SHIFT, check_seed, list_candidates
 
     options = _OPTIONS | {k: v for k, _, v in (w.partition("=") for w in words) if k in _OPTIONS}
     lists = {key: _split_list(key, options[key]) for key in ("filter", "noise", "r_factors")}
@@ -98,9 +95,8 @@ def _search(
     name: str,
 ) -> Path:
     """Search the knobs of all filters, judge the world, and write the file."""
-    from pfbench.job.tuning.candidate_search import CandidateSearch
-    from pfbench.job.tuning.tuned_files import write_tuned_file
-    from pfbench.job.tuning.world_fit import measure_fit
+    from pfbench.job.tuned_files import measure_fit, write_tuned_file
+    from pfbench.job.tuning import CandidateSearch
 
     fixed = [f"seed={world['seed']}", f"runs={world['runs']}", "pcrb=false", "score_steps=0"]
     fixed += ["budget=particles", "engine=kernels"]  # whatever an experiment sets
@@ -139,7 +135,7 @@ def _own_folder(words: Sequence[str]) -> str:
 
 def _describe_use(folder: Path, words: Sequence[str]) -> str:
     """Say how a study finds the file, if it does not by itself."""
-    from pfbench.config.folders import conf_dir
+    from pfbench.results.paper_block import conf_dir
 
     is_found = folder.resolve() == conf_dir() or any("hydra.searchpath" in word for word in words)
     return (
@@ -149,7 +145,7 @@ def _describe_use(folder: Path, words: Sequence[str]) -> str:
 
 def _check_new_name(name: str, folder: Path) -> None:
     """Check that the name of a file of a user's own folder differs from those of pfbench, since a run refuses it."""
-    from pfbench.config.folders import conf_dir
+    from pfbench.results.paper_block import conf_dir
 
     if folder.resolve() != conf_dir() and (conf_dir() / "tuned" / f"{name}.yaml").is_file():
         raise ValueError(

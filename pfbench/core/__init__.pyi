@@ -4,10 +4,10 @@ from pfbench.core.chart import (
     AngleBlock as AngleBlock,
     Chart as Chart,
     EuclideanBlock as EuclideanBlock,
+    LieGroupBlock as LieGroupBlock,
     QuaternionBlock as QuaternionBlock,
 )
 from pfbench.core.distribution_sampling import NumberSource as NumberSource
-from pfbench.core.manifold.group_block import LieGroupBlock as LieGroupBlock
 from pfbench.core.random_stream import PhiloxStream as PhiloxStream, RandomStream as RandomStream
 from pfbench.core.record import (
     Episode as Episode,

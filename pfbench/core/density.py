@@ -17,9 +17,9 @@ from torch.distributions import (
     biject_to,
 )
 
-from pfbench.core.covariance import gaussian_log_density
-from pfbench.kernels import cpp
-from pfbench.kernels.compilation import compilable
+from pfbench.core.linear_algebra import gaussian_log_density
+from pfbench.kernels import dispatch
+from pfbench.kernels.dispatch import compilable
 
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -180,4 +180,4 @@ def _particle_quadratic(y: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
     return -0.5 * (z * z).sum(-1)
 
 
-_quadratic = compilable(_run_quadratic, operator=cpp.log_normal, keep_in_graph=False)
+_quadratic = compilable(_run_quadratic, operator=dispatch.log_normal, keep_in_graph=False)

@@ -1,12 +1,12 @@
 """Public names of `pfbench.files` and the modules that define them."""
 
-from pfbench.files.atomic_write import write_atomically as write_atomically
-from pfbench.files.digest import (
+from pfbench.files.atomic_write import (
     DIGEST as DIGEST,
     has_valid_digest as has_valid_digest,
     hash_content as hash_content,
+    write_atomically as write_atomically,
 )
-from pfbench.files.markdown import (
+from pfbench.files.escapes import (
     markdown_bullets as markdown_bullets,
     markdown_head as markdown_head,
     markdown_paragraph as markdown_paragraph,

@@ -1,14 +1,18 @@
-"""Escapes of text from results, names and configurations, one per format of a report.
-
-Labels, names of states, units and error messages come from files that another person may have
-written. Each writer escapes them with the function of its format.
-"""
+"""Text of results, names and configurations in each format of a report."""
 
 from __future__ import annotations
 
 import re
+import textwrap
 import unicodedata
 from html import escape
+from typing import Any
+
+# --------------------------------------------------------------------------------------------------
+# Escapes of text from results, names and configurations, one per format of a report.
+#
+# Labels, names of states, units and error messages come from files that another person may have
+# written. Each writer escapes them with the function of its format.
 
 
 def _greek(letter: str) -> str:
@@ -100,3 +104,33 @@ def _escape_character(sign: re.Match[str]) -> str:
     if len(parts) == 2 and parts[0].isascii() and parts[1] in _ACCENTS:
         return rf"\{_ACCENTS[parts[1]]}{{{parts[0]}}}"
     return f"(U+{ord(sign[0]):04X})"
+
+
+# --------------------------------------------------------------------------------------------------
+# Lines of Markdown, for studies that write their own page.
+
+WIDTH = 130
+
+
+def markdown_row(*cells: Any) -> str:
+    """Format a row of a table."""
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def markdown_head(*cells: str) -> list[str]:
+    """Format the first two lines of a table."""
+    return [markdown_row(*cells), "|" + " --- |" * len(cells)]
+
+
+def markdown_paragraph(text: str) -> list[str]:
+    """Wrap a text and add an empty line."""
+    return [*textwrap.wrap(text, WIDTH, break_long_words=False, break_on_hyphens=False), ""]
+
+
+def markdown_bullets(*texts: str) -> list[str]:
+    """Format a list with an item per text."""
+    lines = [
+        textwrap.wrap(f"- {text}", WIDTH, subsequent_indent="  ", break_on_hyphens=False)
+        for text in texts
+    ]
+    return [*(line for item in lines for line in item), ""]

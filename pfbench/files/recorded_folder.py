@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import json
 import logging
+import subprocess
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import Any, Self
 
-from pfbench.files.atomic_write import set_aside, write_atomically
-from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
-from pfbench.files.git_files import list_unchanged_in_git
-from pfbench.files.work_start import start_work
+from pfbench.files.atomic_write import (
+    DIGEST,
+    has_valid_digest,
+    hash_content,
+    set_aside,
+    write_atomically,
+)
+from pfbench.files.command_start import start_work
 
 MANIFEST = "manifest.json"
 _SHOWN = 3  # names in a warning at most
@@ -195,3 +200,32 @@ def _list_names(names: Sequence[str]) -> str:
     """Format the first names and the number of the others."""
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     return f"{', '.join(names[:_SHOWN])}{more}"
+
+
+# --------------------------------------------------------------------------------------------------
+# Files whose content git stores, so that a new file of that name loses nothing.
+
+_TIMEOUT = 10  # s
+
+
+def list_unchanged_in_git(folder: Path) -> set[str]:
+    """List the files of a folder whose content is that of the index of git.
+
+    Args:
+        folder: Folder.
+
+    Returns:
+        Names relative to the folder, with `/`. Empty outside a repository and without git.
+    """
+    try:
+        stored, changed = (_list_files(folder, *option) for option in ((), ("--modified",)))
+    except (OSError, subprocess.SubprocessError):
+        return set()
+    return stored - changed
+
+
+def _list_files(folder: Path, *options: str) -> set[str]:
+    """List the files of the index in a folder; with --modified those that differ from it."""
+    command = ["git", "-C", str(folder), "ls-files", "-z", *options]
+    done = subprocess.run(command, capture_output=True, check=True, timeout=_TIMEOUT)
+    return set(filter(None, done.stdout.decode(errors="surrogateescape").split("\0")))

@@ -8,7 +8,7 @@ The definitions need no truth:
   in two cases. The spread is at its floor and the estimate is farther from the raw measurement than
   five of its standard deviations. Or no component has a variance (in float64: above rounding), and
   the initial state was uncertain. Moments that are not finite count as collapsed, too, and so does a
-  spread that the number type does not resolve, see `pfbench.filter.resolution`.
+  spread that the number type does not resolve, see `pfbench.filter.health`.
 - **diverged**: the estimate is farther from the raw measurements than five times their standard
   deviation, in more than half of the checked steps or in the last four.
 - **overconfident**: the normalised innovation squared (NIS) exceeds the 0.999 quantile of its
@@ -29,21 +29,21 @@ truth exists, `pfbench.results.status` decides by the error instead.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
 from scipy.special import chdtri
 from torch import Tensor
 
-from pfbench.core.record import Record
+from pfbench.core.density import has_finite_moments
+from pfbench.core.record import Record, map_inputs
 from pfbench.filter.belief import ParticleBelief, StepInfo
-from pfbench.filter.misfit import compute_misfit, compute_misfits, uncounted_observation
-from pfbench.filter.pareto_tail import RELIABLE_K, fit_pareto_k
-from pfbench.filter.particle.particle_moments import compute_once
-from pfbench.filter.resolution import is_coarse, is_ill_conditioned, starts_certain
+from pfbench.filter.particle.particle_moments import compute_nis, compute_once
 from pfbench.filter.run_batches import join_runs
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.base import ModelWrapper, StateSpaceModel, initial_law
 
 HEALTH = (
     *("ok", "lost", "collapsed", "diverged", "overconfident"),
@@ -305,3 +305,237 @@ def _has_spread(model: StateSpaceModel, mean: Tensor, variance: Tensor) -> Tenso
 def _is_far(misfit: Tensor, observed: Tensor) -> Tensor:
     """Return where an estimate is farther from the raw measurement than the limit."""
     return misfit.double() > _MISFIT**2 * observed
+
+
+# --------------------------------------------------------------------------------------------------
+# Distance of estimates from the raw measurements, for the health of runs.
+
+
+@contextmanager
+def uncounted_observation(model: StateSpaceModel) -> Iterator[None]:
+    """Evaluate `observation` by the method of the class.
+
+    A counter of likelihood evaluations replaces that of the object. Checks are not charged to the
+    filter.
+
+    Args:
+        model: State-space model.
+    """
+    inner = model
+    while isinstance(inner, ModelWrapper):
+        inner = inner.model
+    counted = inner.__dict__.pop("observation", None)
+    try:
+        yield
+    finally:
+        if counted is not None:
+            inner.__dict__["observation"] = counted
+
+
+def compute_misfit(model: StateSpaceModel, record: Record, mean: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute the NIS of estimates under the measurement noise alone.
+
+    Args:
+        model: State-space model of the step.
+        record: Prepared record of the step.
+        mean: Estimates, [R, D].
+
+    Returns:
+        NIS and the number of observed components, [R] each.
+    """
+    with uncounted_observation(model):
+        return compute_nis(model, mean.unsqueeze(1), torch.zeros_like(mean[:, :1]), record)
+
+
+def compute_misfits(
+    model: StateSpaceModel, record: Record, mean: Tensor, steps: list[int]
+) -> tuple[Tensor, Tensor]:
+    """Compute `compute_misfit` in several steps.
+
+    Args:
+        model: State-space model; `at_step` gives the model of a step.
+        record: Prepared record of all steps.
+        mean: Estimates, [R, T, D].
+        steps: Numbers of C steps.
+
+    Returns:
+        NIS and the number of observed components, [C, R] each.
+    """
+    if len(mean) == 1 and all(model.at_step(t) is model for t in steps):
+        # the steps of a single run as runs: ten calls would take a third of a small filter's time
+        u = map_inputs(lambda a: a[0, steps], record.u)
+        misfit, observed = compute_misfit(model, Record(record.y[0, steps], u), mean[0, steps])
+        return misfit.unsqueeze(1), observed.unsqueeze(1)
+    results = [compute_misfit(model.at_step(t), record.at_step(t), mean[:, t]) for t in steps]
+    misfits, observed_counts = zip(*results, strict=True)
+    return torch.stack(misfits), torch.stack(observed_counts)
+
+
+# --------------------------------------------------------------------------------------------------
+# Shape of the largest weights, the Pareto k-hat: how heavy their tail is.
+#
+# The largest weights of a step are fitted by a generalised Pareto distribution. Above k = 0.5 the
+# variance of the weights is infinite, and above 0.7 the estimate is not reliable for any number of
+# particles at hand. A tail that no particle has reached is not seen.
+#
+# References:
+#     Zhang and Stephens 2009, "A new and efficient estimation method for the generalized Pareto
+#         distribution".
+#     Vehtari, Simpson, Gelman, Yao and Gabry 2024, "Pareto smoothed importance sampling".
+
+RELIABLE_K = 0.7  # largest k-hat of a reliable estimate [Vehtari et al.]
+
+_FEWEST = 5  # weights in a tail
+_PRIOR_K, _PRIOR_COUNT = 0.5, 10.0  # k-hat is shrunk as by ten weights of this shape
+_PRIOR_SCALE = 3.0  # of the grid of the profile likelihood
+
+
+def fit_pareto_k(log_w: Tensor) -> Tensor:
+    """Estimate the shape of the tail of weights.
+
+    The tail is the largest min(N / 5, 3 sqrt(N)) weights, less the next one.
+
+    Args:
+        log_w: Log weights, [R, N]. -inf marks an inactive slot.
+
+    Returns:
+        k-hat, float64 [R]. NaN if the tail has fewer than five weights, or a quarter of them are
+        equal; infinite if a few weights are all there is.
+    """
+    n = log_w.shape[1]
+    size = math.ceil(min(0.2 * n, 3.0 * math.sqrt(n)))
+    if size < _FEWEST:
+        return torch.full_like(log_w[:, 0], torch.nan, dtype=torch.float64)
+    largest = log_w.double().topk(size + 1, 1).values.flip(1)  # ascending
+    largest = largest - largest[:, -1:]
+    w = torch.exp(largest)
+    k = _fit_shape(w[:, 1:] - w[:, :1])
+    quartile = largest[:, _quartile(size) + 1]
+    k = torch.where(quartile > largest[:, 0], k, torch.nan)  # NaN if all are inactive, too
+    return torch.where(quartile < math.log(torch.finfo(w.dtype).tiny), torch.inf, k)
+
+
+def _quartile(size: int) -> int:
+    """Return the index of the lower quartile of ascending numbers."""
+    return int(size / 4 + 0.5) - 1
+
+
+def _fit_shape(excess: Tensor) -> Tensor:
+    """Return the shape of a generalised Pareto distribution [R] of ascending numbers [R, M]."""
+    size = excess.shape[1]
+    count = 30 + math.isqrt(size)
+    rank = torch.arange(1, count + 1, dtype=excess.dtype, device=excess.device)
+    quartile = excess[:, _quartile(size), None]
+    grid = 1.0 / excess[:, -1:] + (1.0 - torch.sqrt(count / (rank - 0.5))) / (
+        _PRIOR_SCALE * quartile
+    )
+    k = torch.log(1.0 - grid.unsqueeze(-1) * excess.unsqueeze(1)).mean(-1)
+    profile = size * (torch.log(-grid / k) - k - 1.0)
+    b = (torch.softmax(profile, 1) * grid).sum(1, keepdim=True)
+    shape = torch.log1p(-b * excess).mean(1)
+    return (size * shape + _PRIOR_COUNT * _PRIOR_K) / (size + _PRIOR_COUNT)
+
+
+# --------------------------------------------------------------------------------------------------
+# Resolution of the number type: whether it represents the standard deviations of a problem.
+#
+# A number x of a type has a spacing of eps |x|. The estimate of a filter is off by about the largest of these ratios, in
+# standard deviations (measured for EKF, CKF and UKF on linear models, see `tests/filter/test_resolution.py`):
+#
+# - the spacing of a measurement against its noise,
+# - the spacing of a state against its standard deviation,
+# - eps against the smallest share of variance that a component has, given those before it. It is the
+#   reciprocal of the condition of the correlations.
+#
+# The limit is a tenth of a standard deviation [ours]. A component of zero variance is known exactly and is left out. Double
+# precision always passes. Of particle filters only the measurements are checked: after resampling, constant components such as
+# sensor biases may be equal in all particles, in any number type.
+
+LIMIT = 0.1  # standard deviations
+
+_LARGE = 0.9  # quantile of the measurements that decides, so that outliers do not
+_STEPS = 10
+_PIVOT_SCALE = 4.0  # the error of the narrowest direction is a quarter of eps / pivot
+
+
+def is_coarse(value: Tensor, variance: Tensor) -> Tensor:
+    """Return where the spacing of numbers exceeds the limit.
+
+    Args:
+        value: Numbers in the type of the computation.
+        variance: Their variances.
+
+    Returns:
+        Mask. False where a variance is zero or not finite, and for float64.
+    """
+    if value.dtype == torch.float64:
+        return torch.zeros_like(value, dtype=torch.bool)
+    spacing = torch.finfo(value.dtype).eps * value.abs()
+    return (spacing > LIMIT * variance.sqrt()) & (variance > 0.0)
+
+
+def is_ill_conditioned(covariance: Tensor) -> Tensor:
+    """Return the runs whose correlations the number type does not resolve.
+
+    Args:
+        covariance: Covariances, [R, d, d].
+
+    Returns:
+        Mask, [R]. False where the covariance is not finite, and for float64.
+    """
+    if covariance.dtype == torch.float64:
+        return torch.zeros(len(covariance), dtype=torch.bool, device=covariance.device)
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    sd = torch.sqrt(torch.where(variance > 0.0, variance, 1.0))
+    correlation = covariance / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
+    fixed = torch.diag_embed((variance <= 0.0).to(sd))  # known exactly: a one on the diagonal
+    lower, info = torch.linalg.cholesky_ex(correlation + fixed)
+    pivot = lower.diagonal(dim1=-2, dim2=-1).square().amin(-1)
+    eps = torch.finfo(covariance.dtype).eps
+    is_finite = torch.isfinite(covariance).flatten(1).all(1)
+    return is_finite & ((info > 0) | (eps > _PIVOT_SCALE * LIMIT * pivot))
+
+
+def starts_certain(model: StateSpaceModel, runs: int, spread: Tensor | None) -> Tensor:
+    """Return the runs whose initial state is known exactly.
+
+    Args:
+        model: State-space model.
+        runs: Number of runs R.
+        spread: Cholesky factor of each run's initial covariance, [R, d, d]; None uses the model.
+
+    Returns:
+        Mask, [R]. False where the variance of the initial distribution does not exist.
+    """
+    initial = initial_law(model, runs, spread)
+    if not has_finite_moments(initial):
+        return torch.zeros(runs, dtype=torch.bool, device=model.anchor.device)
+    return (initial.variance == 0.0).all(-1).expand(runs)
+
+
+def check_measurement_resolution(distribution: Any, y: Tensor, model: str) -> None:
+    """Check that a type other than float64 resolves the measurements.
+
+    Args:
+        distribution: Distribution of the measurements of the first step, batch [R, N].
+        y: Prepared measurements, [R, T, Dy], in the type of the computation.
+        model: Name of the model.
+
+    Raises:
+        ValueError: If a tenth of the measurements of a component have a spacing above a tenth of
+            their standard deviation.
+    """
+    if y.dtype == torch.float64 or not has_finite_moments(distribution):
+        return
+    sd = distribution.stddev.flatten(0, 1).nanmedian(0).values
+    some = y[:, :: max(1, y.shape[1] // _STEPS)].flatten(0, 1).abs()
+    size = some.nanquantile(_LARGE, 0)
+    coarse = is_coarse(size, sd.square()).nonzero().flatten().tolist()
+    if coarse:
+        k, name = coarse[0], str(y.dtype).removeprefix("torch.")
+        spacing = torch.finfo(y.dtype).eps * float(size[k])
+        raise ValueError(
+            f"dtype must resolve a tenth of the measurement noise of {model}, got {name} with a "
+            f"spacing of {spacing:.2g} for component {k} of standard deviation {float(sd[k]):.2g}. "
+            "Set dtype=float64."
+        )

@@ -13,9 +13,8 @@ from pfbench.core.density import check_event_dimension
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state
-from pfbench.filter.misfit import uncounted_observation
-from pfbench.filter.model_jacobians import check_noise_gain
-from pfbench.filter.resolution import check_measurement_resolution
+from pfbench.filter.health import check_measurement_resolution, uncounted_observation
+from pfbench.filter.linearisation import check_noise_gain
 from pfbench.model.base import ModelWrapper, StateSpaceModel, initial_law, named_inputs
 
 _STATES = 4  # of each run that the model is tried with

@@ -1,11 +1,15 @@
-"""Coordinates in which a covariance is the unit matrix."""
+"""Coordinates in which a covariance is the unit matrix, and conditioning by square roots in them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+
+# --------------------------------------------------------------------------------------------------
+# Coordinates in which a covariance is the unit matrix.
 
 LOG_2PI = math.log(2.0 * math.pi)
 
@@ -62,3 +66,95 @@ def whitening_basis(covariance: Tensor) -> tuple[Tensor, Tensor]:
     root_values = torch.where(range_mask, values, 0.0).sqrt()
     whitening = (vectors / divisors.unsqueeze(-2)).mT / sd.unsqueeze(-2)
     return whitening, sd.unsqueeze(-1) * vectors * root_values.unsqueeze(-2)
+
+
+# --------------------------------------------------------------------------------------------------
+# Condition normal distributions by square roots of their covariances.
+
+
+def condition_on(
+    a: Tensor, first: Sequence[int], rest: Sequence[int]
+) -> tuple[list[Tensor], Tensor]:
+    """Condition the normal vector e = A xi, xi ~ N(0, I), on some of its components.
+
+    Gram-Schmidt, component by component. A component of s without remaining variance does
+    not remove variance from l. No covariance is formed.
+
+    Args:
+        a: Root A, [..., d, m], with m at least the size of l.
+        first: Components s on which to condition.
+        rest: Components l that remain.
+
+    Returns:
+        Columns L_j [..., d] with e = sum_j L_j z_j + remainder and independent z_j ~ N(0, 1). A
+        lower triangular root of the remainder's covariance for l [..., l, l], of any sign.
+    """
+    size = a.norm(dim=-1)
+    tolerance = 1e3 * torch.finfo(a.dtype).eps
+    columns = []
+    for i in first:
+        row = a[..., i, :]
+        length = row.norm(dim=-1, keepdim=True)
+        nonzero = length > tolerance * size[..., i : i + 1]
+        axis = torch.where(nonzero, row / torch.where(nonzero, length, 1.0), 0.0)
+        column = (a @ axis.unsqueeze(-1)).squeeze(-1)
+        a = a - column.unsqueeze(-1) * axis.unsqueeze(-2)
+        columns.append(column)
+    return columns, torch.linalg.qr(a[..., rest, :].mT, mode="r")[1].mT
+
+
+def split_root(a: Tensor, components: Sequence[int], sd: float) -> tuple[list[Tensor], Tensor]:
+    """Split the normal vector e = A xi, xi ~ N(0, I), into offsets to be drawn and a remainder.
+
+    e = sum_j c_j z_j + A' xi in distribution, with independent z_j ~ N(0, 1). In the remainder, the
+    standard deviation of each of the components is at most `sd`, and unchanged where it was smaller.
+    Each column c_j is a multiple of the regression of e on its component.
+
+    Args:
+        a: Root A, [..., d, m].
+        components: Components whose variance is split.
+        sd: Standard deviation that remains, positive.
+
+    Returns:
+        Columns c_j, [..., d], and the root A' [..., d, m].
+    """
+    columns = []
+    for i in components:
+        row = a[..., i, :]
+        length = row.norm(dim=-1, keepdim=True)
+        axis = row / length.clamp(min=sd)  # of unit length wherever something is drawn
+        share = (sd / length.clamp(min=sd)).square()
+        column = (a @ axis.unsqueeze(-1)).squeeze(-1)
+        columns.append(torch.sqrt(1.0 - share) * column)
+        a = a - (1.0 - share.sqrt()).unsqueeze(-1) * column.unsqueeze(-1) * axis.unsqueeze(-2)
+    return columns, a
+
+
+def kalman_update_root(root: Tensor, h: Tensor, r: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Apply the Kalman update of N(0, root root') by r = H l + v, v ~ N(0, I).
+
+    Measurement components are processed one after the other, on the root [Potter 1963].
+
+    Args:
+        root: Root of the prior covariance, [R, N or 1, l, l].
+        h: Measurement matrix H, [R, N or 1, k, l].
+        r: Innovation, [R, N, k].
+
+    Returns:
+        Mean [R, N, l], root [R, N or 1, l, l], and the log density of r without its term
+        -k/2 log 2 pi [R, N].
+
+    References:
+        Bierman 1977, Factorization Methods for Discrete Sequential Estimation.
+    """
+    shift, log_likelihood = r.new_zeros(*r.shape[:-1], root.shape[-1]), torch.zeros_like(r[..., 0])
+    for j in range(r.shape[-1]):
+        row = h[..., j, :]
+        f = (root * row.unsqueeze(-1)).sum(-2)  # root' h
+        q2 = 1.0 + f.square().sum(-1)
+        cross_cov = (root * f.unsqueeze(-2)).sum(-1)
+        e = r[..., j] - (row * shift).sum(-1)
+        shift = shift + cross_cov * (e / q2).unsqueeze(-1)
+        root = root - (cross_cov / (q2 + q2.sqrt()).unsqueeze(-1)).unsqueeze(-1) * f.unsqueeze(-2)
+        log_likelihood = log_likelihood - 0.5 * (e * e / q2 + torch.log(q2))
+    return shift, root, log_likelihood

@@ -1,29 +1,27 @@
 """Public names of `pfbench.job` and the modules that define them."""
 
-from pfbench.config.composition import (
+from pfbench.job.config import (
     JobConfig as JobConfig,
     compose as compose,
     list_groups as list_groups,
     register_experiments as register_experiments,
     resolve_config as resolve_config,
 )
-from pfbench.config.folders import (
-    conf_dir as conf_dir,
-    experiments_dir as experiments_dir,
-)
-from pfbench.config.instantiation import instantiate as instantiate
 from pfbench.job.datasheet_data import build_datasheet as build_datasheet
-from pfbench.job.metadata import read_versions as read_versions
-from pfbench.job.pcrb_cache import compute_pcrb as compute_pcrb
+from pfbench.job.memory import available_memory as available_memory
+from pfbench.job.model_fit import instantiate as instantiate
+from pfbench.job.pcrb import compute_pcrb as compute_pcrb
 from pfbench.job.plan import (
     IGNORED_IN_KEY as IGNORED_IN_KEY,
     JobPlan as JobPlan,
+    apply_global_settings as apply_global_settings,
     build_plan as build_plan,
     job_key as job_key,
+    read_versions as read_versions,
 )
-from pfbench.job.resumable import ResumableResults as ResumableResults
 from pfbench.job.run_job import (
     JobOutcome as JobOutcome,
+    ResumableResults as ResumableResults,
     compute_job as compute_job,
     run as run,
 )
@@ -31,5 +29,4 @@ from pfbench.job.scoring import (
     ProperScores as ProperScores,
     ScoreRecorder as ScoreRecorder,
 )
-from pfbench.job.settings import apply_global_settings as apply_global_settings
-from pfbench.job.system_memory import available_memory as available_memory
+from pfbench.results.paper_block import conf_dir as conf_dir, experiments_dir as experiments_dir

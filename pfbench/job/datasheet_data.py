@@ -11,21 +11,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pfbench.config.composition import JobConfig
-from pfbench.config.instantiation import instantiate_parts
 from pfbench.core.record import Episode, iterate_steps
+from pfbench.job.config import JobConfig
 from pfbench.job.inputs import find_inputs
-from pfbench.job.metadata import describe_state, make_provenance
-from pfbench.job.pcrb_cache import compute_pcrb
-from pfbench.job.plan import IGNORED_IN_KEY
+from pfbench.job.model_fit import instantiate_parts
+from pfbench.job.pcrb import compute_pcrb
+from pfbench.job.plan import IGNORED_IN_KEY, apply_global_settings, describe_state, make_provenance
 from pfbench.job.raw_estimate import compute_raw_estimate
-from pfbench.job.settings import apply_global_settings
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
-from pfbench.results.conditions import DATASHEETS
-from pfbench.results.config_key import compute_config_key, extend_key
-from pfbench.results.state_groups import main_component_group
-from pfbench.scenario.recording_regime import RecordingRegime
+from pfbench.results.conditions import DATASHEETS, main_component_group
+from pfbench.results.store import compute_config_key, extend_key
+from pfbench.scenario.oracle_noise import RecordingRegime
 
 RUNS = 20  # default: spreads to a sixth, in seconds [ours]
 _CONFIG_KEYS = ("scenario", "model", "noise", "seed", "first_run", "runs", "pcrb")

@@ -20,10 +20,10 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.loop import FilterResult, Watch, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.job.memory import MemoryTrimmer, peak_above, start_peak_measurement
 from pfbench.job.plan import JobPlan
 from pfbench.job.scoring import LikelihoodCounter, ScoreRecorder
-from pfbench.job.system_memory import MemoryTrimmer, peak_above, start_peak_measurement
-from pfbench.kernels import compilation
+from pfbench.kernels import dispatch
 from pfbench.kernels.cpp_library import is_library_loaded
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
@@ -120,7 +120,7 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     step = _compile_step(engine, method, counter, clock)
     baseline = start_peak_measurement(device)
     start_time = clock()
-    with compilation.use_compiled(engine != "eager"):
+    with dispatch.use_compiled(engine != "eager"):
         estimate = _filter_episode(plan, step or method, model, episode, runs, watch, label)
     step_compile_seconds = step.seconds if step else 0.0
     filter_seconds = clock() - start_time - recorder.seconds - step_compile_seconds

@@ -15,13 +15,12 @@ from typing import Any
 
 import hydra
 
-from pfbench.config.composition import CHOICES
-from pfbench.config.paper_block import remove_all_blocks
-from pfbench.config.source_digest import hash_user_code
-from pfbench.config.trust import check_configuration, trusted_packages
-from pfbench.files.digest import hash_file
-from pfbench.results.config_key import Inputs
+from pfbench.files.atomic_write import hash_file
+from pfbench.job.config import CHOICES
+from pfbench.job.trust import check_configuration, hash_user_code, trusted_packages
 from pfbench.results.inputs import list_changed
+from pfbench.results.paper_block import remove_all_blocks
+from pfbench.results.store import Inputs
 
 CODE_OF = "code of "  # start of the names of source files of a user's classes
 _MISSING = "missing"

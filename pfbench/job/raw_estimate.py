@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from pfbench.core.covariance import distribution_covariance
-from pfbench.core.jacobian import jacobian
+from pfbench.core.linear_algebra import distribution_covariance, jacobian
 from pfbench.core.record import Record, iterate_steps
 from pfbench.filter.loop import prepare_record
 from pfbench.model.base import StateSpaceModel, initial_law

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -11,30 +12,34 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from torch import Tensor
 
-from pfbench.config.composition import CHOICES, JobConfig, resolve_config
-from pfbench.config.source_digest import list_user_packages
-from pfbench.config.trust import trusted_packages
-from pfbench.config.tuning_names import describe_foreign
 from pfbench.core.record import Episode
-from pfbench.files.atomic_write import set_aside
-from pfbench.files.work_start import start_work
+from pfbench.files.atomic_write import (
+    DIGEST,
+    has_valid_digest,
+    hash_content,
+    set_aside,
+    write_atomically,
+)
+from pfbench.files.command_start import start_work
 from pfbench.filter.learned.checkpoint import checkpoint_provenance
-from pfbench.job.allocation import EpisodeSource, apply_budget, max_runs_in_memory
+from pfbench.job.budget import EpisodeSource, apply_budget, max_runs_in_memory
+from pfbench.job.config import CHOICES, JobConfig, resolve_config
 from pfbench.job.filter_pass import TimedFilterPass, pass_filter
 from pfbench.job.inputs import check_unchanged, find_inputs
-from pfbench.job.metadata import make_metadata
-from pfbench.job.pcrb_cache import compute_pcrb, lacks_bound
-from pfbench.job.plan import JobPlan, build_plan, job_key
-from pfbench.job.settings import check_settings
+from pfbench.job.pcrb import compute_pcrb, lacks_bound
+from pfbench.job.plan import JobPlan, build_plan, check_settings, job_key, make_metadata
+from pfbench.job.trust import list_user_packages, trusted_packages
 from pfbench.results import store
 from pfbench.results.conditions import DATASHEETS
-from pfbench.results.config_key import Inputs, list_same_configuration
 from pfbench.results.headline import describe_runs, main_rmse
 from pfbench.results.inputs import list_changed
 from pfbench.results.joined_runs import join_arrays, join_metadata
+from pfbench.results.paper_block import describe_foreign
+from pfbench.results.store import Inputs, list_same_configuration
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
+
 
 log = logging.getLogger("pfbench")
 
@@ -281,3 +286,52 @@ def _check_durations(metadata: Sequence[dict[str, Any]], outputs: Sequence[dict[
             "memory must be enough for all runs together, since they have different durations, got "
             f"enough for {size} runs. Split the job (runs={size}, first_run=...)."
         )
+
+
+# --------------------------------------------------------------------------------------------------
+# Results of the parts of a study in one file, from which a study resumes.
+
+
+class ResumableResults:
+    """Finished parts of a study by name, JSON values that are written at once.
+
+    A file of another request, or a damaged one, is replaced.
+
+    Args:
+        path: File of the results. Its folder is created.
+        request: Description of the computation on which the parts depend.
+
+    Attributes:
+        path: File of the results.
+        state: Content of the file: `request` and `done`, the parts by name.
+    """
+
+    def __init__(self, path: Path, request: Mapping[str, Any]) -> None:
+        self.path = path
+        self.state: dict[str, Any] = {"request": json.loads(json.dumps(request)), "done": {}}
+        try:
+            stored = json.loads(path.read_text())
+        except (FileNotFoundError, ValueError):
+            return
+        is_whole = isinstance(stored, dict) and has_valid_digest(stored)
+        if is_whole and stored.get("request") == self.state["request"]:
+            self.state = {key: stored[key] for key in ("request", "done")}
+
+    def __call__(self, name: str, make: Callable[[], Any]) -> Any:
+        """Return one part, computed by `make` unless an earlier call has stored it.
+
+        Args:
+            name: Name of the part, unique in the study.
+            make: Computes the part, a value that JSON can represent.
+
+        Returns:
+            The part.
+        """
+        finished = self.state["done"]
+        if name not in finished:
+            finished[name] = make()
+            # of the values as JSON returns them
+            content = json.loads(json.dumps(self.state))
+            text = json.dumps({**content, DIGEST: hash_content(content)})
+            write_atomically(self.path, lambda file: file.write(text.encode()))
+        return finished[name]

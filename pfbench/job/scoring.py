@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from pfbench.core.covariance import factor, squared_length
+from pfbench.core.linear_algebra import factor, squared_length
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.belief import StepInfo, normalise_log_weights
-from pfbench.kernels import cpp
-from pfbench.kernels.compilation import compilable
+from pfbench.kernels import dispatch
+from pfbench.kernels.dispatch import compilable
 from pfbench.model.base import StateSpaceModel
 
 Groups: TypeAlias = Collection[tuple[int, ...]]
@@ -231,10 +231,13 @@ def _separate_energy(points: Tensor) -> Tensor:
 
 # Without these kernels ten scored steps took half as long as 300 steps of a filter [measured].
 _marginal_scores = compilable(
-    _separate_marginals, operator=cpp.marginal_scores, keep_in_graph=False, use_torch_compiler=False
+    _separate_marginals,
+    operator=dispatch.marginal_scores,
+    keep_in_graph=False,
+    use_torch_compiler=False,
 )
 _energy_score = compilable(
-    _separate_energy, operator=cpp.energy_score, keep_in_graph=False, use_torch_compiler=False
+    _separate_energy, operator=dispatch.energy_score, keep_in_graph=False, use_torch_compiler=False
 )
 
 

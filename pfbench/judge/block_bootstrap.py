@@ -26,8 +26,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pfbench.results.error_measures import Array
-from pfbench.results.statistics.world_effects import EffectEstimate
+from pfbench.stats.effects import EffectEstimate
+from pfbench.stats.error_measures import Array
 
 MIN_BLOCKS = 6  # blocks from which a test is made
 _CORRELATION_TIMES = 8.0  # least mean length of a block

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from pfbench.judge.readers.trajectory_table import ALL_COLUMNS
+from pfbench.judge.trajectory_table import ALL_COLUMNS
 
 FRAMES = ("", "ned", "enu")
 FORMATS = ("", "table", "tum", "kf_gins", "nmea", "result")

@@ -14,15 +14,21 @@ from pfbench.judge.alignment import (
     CommonEpochs,
     column_errors,
     common_columns,
+    fill_holes,
     find_common_epochs,
     position_errors,
 )
-from pfbench.judge.axis_checks import check_axes
-from pfbench.judge.clock_checks import check_clock, check_common_time
-from pfbench.judge.epoch_holes import fill_holes
+from pfbench.judge.checks import (
+    check_axes,
+    check_clock,
+    check_common_time,
+    check_distance,
+    check_units,
+)
+from pfbench.judge.formats import TrajectoryFile, read_trajectories
 from pfbench.judge.judge_options import JudgeOptions, SourceOptions, name_program
-from pfbench.judge.readers.trajectory_files import TrajectoryFile, read_trajectories
-from pfbench.judge.readers.trajectory_table import (
+from pfbench.judge.reference_track import ReferenceTrack
+from pfbench.judge.trajectory_table import (
     ATTITUDE_SD,
     COVARIANCE_COLUMNS,
     LOCAL,
@@ -32,11 +38,9 @@ from pfbench.judge.readers.trajectory_table import (
     TrajectoryTable,
     covariance_matrices,
 )
-from pfbench.judge.reference_checks import check_distance, check_units
-from pfbench.judge.reference_track import ReferenceTrack
 from pfbench.judge.unit_checks import check_consistent_units
-from pfbench.results.error_measures import Array
 from pfbench.results.store import JobResult
+from pfbench.stats.error_measures import Array
 
 _DEG = 180 / np.pi
 _SD = {"position": POSITION_SD, "velocity": VELOCITY_SD, "attitude": ATTITUDE_SD}

@@ -12,14 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from pfbench.judge.readers.local_frame import to_north_east_down
-from pfbench.judge.readers.trajectory_table import (
+from pfbench.judge.trajectory_table import (
     GEODETIC,
     LOCAL,
     VELOCITY_COLUMNS,
     TrajectoryTable,
+    to_north_east_down,
 )
-from pfbench.results.error_measures import Array
+from pfbench.stats.error_measures import Array
 
 _LATEST = 1e11  # s, above GPS and Unix times
 _SINCE_1970 = (1e8, 1e10)  # s, from 1973 to 2286

@@ -1,9 +1,12 @@
-"""Library of the C++ operators: choice of the variant, compilation where none came with the package, loading."""
+"""Library of the C++ operators: choice of the variant, a folder that the user alone can write, loading."""
 
 from __future__ import annotations
 
 import ctypes
 import logging
+import os
+import stat
+import sys
 from functools import cache
 from pathlib import Path
 from subprocess import CalledProcessError
@@ -11,7 +14,9 @@ from subprocess import CalledProcessError
 import torch
 
 from pfbench.kernels.library_build import build_library, find_variants, name_library
-from pfbench.kernels.private_folder import check_private, code_folder
+
+# --------------------------------------------------------------------------------------------------
+# Library of the C++ operators: choice of the variant, compilation where none came with the package, loading.
 
 log = logging.getLogger("pfbench")
 _WITH_PACKAGE = Path(__file__).parent
@@ -56,3 +61,81 @@ def is_library_loaded() -> bool:
         )
         return False
     return True
+
+
+# --------------------------------------------------------------------------------------------------
+# Folder of compiled code. Code is loaded only from a folder that the user alone can write.
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def code_folder() -> Path:
+    """Return the folder of compiled code, `pfbench` in the user's cache folder.
+
+    Raises:
+        OSError: If it cannot be made, or if others can write there.
+    """
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(home) / "pfbench"
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    check_private(folder)
+    return folder
+
+
+def use_private_cache() -> None:
+    """Make torch's compiler keep its code in `code_folder`, unless the user chose another folder.
+
+    Its default is a folder of a predictable name in the system's temporary folder. An import of the
+    compiler writes this default into the environment, so that it looks like the user's choice.
+
+    Raises:
+        OSError: If the folder cannot be made, or if others can write there.
+    """
+    compiler = sys.modules.get("torch._inductor.runtime.cache_dir_utils")
+    default = os.path.abspath(compiler.default_cache_dir()) if compiler else None
+    if os.environ.get("TORCHINDUCTOR_CACHE_DIR") in (None, default):
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(code_folder() / "torch")
+
+
+def check_private(path: Path) -> None:
+    """Check that a folder or a file belongs to the user and that no other can write it.
+
+    Args:
+        path: Path of the folder or file.
+
+    Raises:
+        PermissionError: If it is a link, belongs to another user, or others may write it.
+    """
+    status = path.lstat()
+    is_plain = stat.S_ISDIR(status.st_mode) or stat.S_ISREG(status.st_mode)
+    is_owned = not hasattr(os, "getuid") or status.st_uid == os.getuid()
+    if not is_plain or not is_owned or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise PermissionError(
+            f"{path} must be a folder or file of this user that others cannot write. Compiled code "
+            "is not loaded from it. Remove it, or set XDG_CACHE_HOME to a private folder."
+        )
+
+
+def find_compiled_code(library: Path) -> Path:
+    """Return the file of a library, in the package, in `code_folder` or in a private folder of the user.
+
+    Others cannot reach the files in `code_folder`, whatever the mode of these is.
+
+    Args:
+        library: Path of the library.
+
+    Returns:
+        Absolute path without links.
+
+    Raises:
+        PermissionError: If others can write the library or its folder.
+        FileNotFoundError: If it does not exist.
+    """
+    file = library.resolve(strict=True)
+    if _PACKAGE in file.parents:
+        return file
+    home = code_folder().resolve()
+    is_kept = home in file.parents and not home.stat().st_mode & (stat.S_IXGRP | stat.S_IXOTH)
+    for path in () if is_kept else (file.parent, file):
+        check_private(path)
+    return file

@@ -1,20 +1,85 @@
-"""Kernels of particles.cu: operators of `pfbench.kernels.cpp` on a CUDA device, compiled by torch's NVRTC.
+"""Kernels of particles.cu: operators of `pfbench.kernels.dispatch` on a CUDA device, compiled by torch's NVRTC.
 
 If they do not compile, a warning is logged and torch's own compiler is used.
 """
 
 from __future__ import annotations
 
+import ctypes
 import logging
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
-from pfbench.kernels.cuda_launch import compile_kernel, launch_kernel
 from pfbench.kernels.operator_checks import check_first
+
+# --------------------------------------------------------------------------------------------------
+# Compilation of the kernels of particles.cu by torch's NVRTC, and their launch.
+
+_SOURCES = Path(__file__).parent / "src"
+
+
+def launch_kernel(
+    name: str, grid: tuple[int, int, int], threads: int, *args: Tensor | int, shared: int = 0
+) -> None:
+    """Launch a kernel of particles.cu in the current stream of its first argument's device.
+
+    Args:
+        name: Name of the kernel, with its template arguments.
+        grid: Blocks along each axis. Nothing is launched if one is 0.
+        threads: Threads of a block.
+        args: Arguments of the kernel; integers are 32 bits wide.
+        shared: Bytes of shared memory of a block.
+
+    Raises:
+        RuntimeError: If the driver refuses the launch.
+    """
+    assert isinstance(args[0], Tensor)
+    if 0 in grid:  # the driver rejects empty grids
+        return None
+    device = args[0].device
+    if torch.cuda.current_device() != device.index:
+        with torch.cuda.device(device):
+            return launch_kernel(name, grid, threads, *args, shared=shared)
+    function, driver = compile_kernel(name, device.index)
+    values = [
+        ctypes.c_void_p(a.data_ptr()) if isinstance(a, Tensor) else ctypes.c_int(a) for a in args
+    ]
+    pointers = (ctypes.c_void_p * len(values))(*map(ctypes.addressof, values))
+    stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
+    code = driver.cuLaunchKernel(function, *grid, threads, 1, 1, shared, stream, pointers, None)
+    if code:
+        raise RuntimeError(f"{name} cannot run: the CUDA driver returned error {code}.")
+
+
+@cache
+def compile_kernel(name: str, device: int) -> tuple[Any, Any]:
+    """Compile a kernel.
+
+    Args:
+        name: Name of the kernel, with its template arguments.
+        device: Index of the CUDA device.
+
+    Returns:
+        The kernel, and the driver, which torch would open again at each call.
+    """
+    return torch.cuda._compile_kernel(read_source(), name).func, ctypes.CDLL("libcuda.so.1")
+
+
+def read_source() -> str:
+    """Return the source of the kernels as one text, with the generator that C++ uses, too."""
+    generator = (_SOURCES / "generator.h").read_text().replace("#pragma once\n", "")
+    text = (_SOURCES / "particles.cu").read_text()
+    line = next(line for line in text.splitlines() if line.startswith('#include "generator.h"'))
+    return text.replace(line, generator)
+
+
+# --------------------------------------------------------------------------------------------------
+# Kernels of particles.cu: operators of `pfbench.kernels.dispatch` on a CUDA device, compiled by torch's NVRTC.
 
 log = logging.getLogger("pfbench")
 _REAL = {torch.float32: "float", torch.float64: "double"}
@@ -211,7 +276,7 @@ KERNELS: dict[str, Callable[..., Any]] = {
         _propagate_affine, _gather_propagate, _resample_systematic, _count_unique, _weighted_moments,
     )
 }  # fmt: skip
-"""Operators of `pfbench.kernels.cpp` on a CUDA device. They do not check values: the host would wait."""
+"""Operators of `pfbench.kernels.dispatch` on a CUDA device. They do not check values: the host would wait."""
 
 _ACCEPTS: dict[str, Callable[..., bool]] = {
     "philox_normals": lambda *_: True,

@@ -4,10 +4,13 @@ from pfbench.core.normal import (
     independent_normal as independent_normal,
     normal_batch as normal_batch,
 )
-from pfbench.model.azimuth_errors import (
+from pfbench.model.azimuth import (
+    Discretisation as Discretisation,
     ErrorEquations as ErrorEquations,
     ExactErrorEquations as ExactErrorEquations,
     PrintedErrorEquations as PrintedErrorEquations,
+    SinsGpsAzimuth as SinsGpsAzimuth,
+    TrapezoidDiscretisation as TrapezoidDiscretisation,
 )
 from pfbench.model.base import (
     ModelWrapper as ModelWrapper,
@@ -20,56 +23,49 @@ from pfbench.model.linear_gaussian import (
     linear_walk as linear_walk,
     local_level as local_level,
 )
-from pfbench.model.nonlinear_dynamics import (
-    Lorenz63 as Lorenz63,
-    Pendulum as Pendulum,
-)
 from pfbench.model.passive_location import (
     PassiveLocation as PassiveLocation,
     PlatformInputs as PlatformInputs,
     compute_level_attitude as compute_level_attitude,
 )
-from pfbench.model.pseudorange_errors import (
-    LosNlosRangeError as LosNlosRangeError,
-    NormalExponentialMixture as NormalExponentialMixture,
-    NormalRangeError as NormalRangeError,
-    PseudorangeError as PseudorangeError,
-    UrbanInputs as UrbanInputs,
-)
-from pfbench.model.sins_gnss_tight import SinsGnssTight as SinsGnssTight
-from pfbench.model.sins_gnss_tight_nl import SinsGnssTightNl as SinsGnssTightNl
-from pfbench.model.sins_gps_azimuth import (
-    Discretisation as Discretisation,
-    SinsGpsAzimuth as SinsGpsAzimuth,
-    TrapezoidDiscretisation as TrapezoidDiscretisation,
-)
 from pfbench.model.sins_sar import SinsSar as SinsSar
-from pfbench.model.strapdown.aided import StrapdownAided as StrapdownAided
-from pfbench.model.strapdown.tight import StrapdownTight as StrapdownTight
-from pfbench.model.strapdown.total import StrapdownTotal as StrapdownTotal
-from pfbench.model.strapdown.tuning import (
+from pfbench.model.strapdown import (
+    StrapdownAided as StrapdownAided,
+    StrapdownTight as StrapdownTight,
+    StrapdownTotal as StrapdownTotal,
+)
+from pfbench.model.strapdown_tuning import (
     AidedTuning as AidedTuning,
     RangeErrorModel as RangeErrorModel,
     StrapdownTuning as StrapdownTuning,
     TightTuning as TightTuning,
 )
-from pfbench.model.terrain.random_terrain import (
+from pfbench.model.terrain import (
     RandomTerrain as RandomTerrain,
+    TerrainAided as TerrainAided,
+    TerrainInputs as TerrainInputs,
     TerrainWaves as TerrainWaves,
     compute_elevation as compute_elevation,
     compute_slope as compute_slope,
 )
-from pfbench.model.terrain.terrain_aided import (
-    TerrainAided as TerrainAided,
-    TerrainInputs as TerrainInputs,
-)
 from pfbench.model.textbook import (
     Benes as Benes,
+    Lorenz63 as Lorenz63,
+    Pendulum as Pendulum,
     StochasticVolatility as StochasticVolatility,
     UnivariateGrowth as UnivariateGrowth,
 )
+from pfbench.model.tight_coupling import (
+    SinsGnssTight as SinsGnssTight,
+    SinsGnssTightNl as SinsGnssTightNl,
+)
 from pfbench.model.urban_gnss import (
+    LosNlosRangeError as LosNlosRangeError,
+    NormalExponentialMixture as NormalExponentialMixture,
+    NormalRangeError as NormalRangeError,
+    PseudorangeError as PseudorangeError,
     UrbanGnss as UrbanGnss,
+    UrbanInputs as UrbanInputs,
     UrbanTuning as UrbanTuning,
     range_change as range_change,
 )

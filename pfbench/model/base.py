@@ -16,8 +16,8 @@ from torch.distributions import Distribution, Independent
 from typing_extensions import override
 
 from pfbench.core.chart import Chart, EuclideanBlock
-from pfbench.core.covariance import gaussian_log_density
 from pfbench.core.density import log_density, log_normal_density
+from pfbench.core.linear_algebra import gaussian_log_density
 from pfbench.core.normal import StandardNormal, dense_normal
 from pfbench.core.record import Record
 

@@ -12,7 +12,7 @@ from typing_extensions import override
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock, wrap_angle
 from pfbench.core.normal import independent_normal
 from pfbench.core.record import Record
-from pfbench.model.ins_errors import (
+from pfbench.model.ins_gnss import (
     BIASES,
     NAVIGATION,
     InsErrorModel,
@@ -20,8 +20,13 @@ from pfbench.model.ins_errors import (
     name_ins_components,
 )
 from pfbench.nav import attitude
-from pfbench.nav.aiding import AlignmentErrors, ProcessNoiseInflation
-from pfbench.nav.component_major import (
+from pfbench.nav.aiding import (
+    AlignmentErrors,
+    ProcessNoiseInflation,
+    SarSensor,
+    compute_heading_difference,
+)
+from pfbench.nav.earth import (
     convert_from_metres,
     convert_to_metres,
     earth_quantities,
@@ -30,7 +35,6 @@ from pfbench.nav.component_major import (
     rotation_matrix,
 )
 from pfbench.nav.imu_errors import ImuErrors
-from pfbench.nav.sar import SarSensor, compute_heading_difference
 from pfbench.nav.strapdown import InsIntervals
 
 _SIZES = (4, 3, 3, 3, 3)  # quaternion, velocity, position, gyro bias, accelerometer bias

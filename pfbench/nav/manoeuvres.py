@@ -1,16 +1,9 @@
-"""Trajectories from manoeuvres: a sequence of segments.
-
-A segment changes speed, climb angle and heading by a given amount. Speed changes linearly (or
-smoothly). Angles change by the quintic u^3 (10 - 15 u + 6 u^2), so angular rate and angular
-acceleration are continuous and zero at the joints [ours].
-
-Manoeuvres, which are written in YAML, use degrees where an argument name ends in `_deg`. A
-`ManoeuvreSegment` is in SI units and radians.
-"""
+"""Trajectories from manoeuvres: a sequence of segments, or sums of smooth ramps."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
@@ -27,6 +20,16 @@ from pfbench.nav.trajectory import (
     TrajectoryStart,
     integrate_motion,
 )
+
+# --------------------------------------------------------------------------------------------------
+# Trajectories from manoeuvres: a sequence of segments.
+#
+# A segment changes speed, climb angle and heading by a given amount. Speed changes linearly (or
+# smoothly). Angles change by the quintic u^3 (10 - 15 u + 6 u^2), so angular rate and angular
+# acceleration are continuous and zero at the joints [ours].
+#
+# Manoeuvres, which are written in YAML, use degrees where an argument name ends in `_deg`. A
+# `ManoeuvreSegment` is in SI units and radians.
 
 
 @dataclass(frozen=True)
@@ -218,3 +221,160 @@ def _profile(
             )
         )
     return MotionProfile(*(torch.cat(column) for column in zip(*rows, strict=True)))
+
+
+# --------------------------------------------------------------------------------------------------
+# Trajectories from ramps: sums of smooth changes of speed, angles and climb rate.
+
+
+@dataclass(frozen=True)
+class _Ramp(ABC):
+    """A smooth change between two times.
+
+    Attributes:
+        start_s: Start time, s.
+        end_s: End time, s.
+        change: In the unit of the changing quantity.
+    """
+
+    start_s: float
+    end_s: float
+    change: float
+
+    def __post_init__(self) -> None:
+        if not self.end_s > self.start_s:
+            raise ValueError(
+                f"end_s must be later than start_s = {self.start_s}, got {self.end_s}. "
+                "Change one of them."
+            )
+
+    @abstractmethod
+    def evaluate(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return value and two time derivatives at times t s."""
+
+
+@dataclass(frozen=True)
+class CosineRamp(_Ramp):
+    """A change by half a cosine, 1/2 - 1/2 cos(pi u), between two times.
+
+    The rate is continuous and the second derivative is not.
+    """
+
+    @override
+    def evaluate(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        k = math.pi / (self.end_s - self.start_s)
+        a = k * (t.clamp(self.start_s, self.end_s) - self.start_s)
+        inside = ((t > self.start_s) & (t < self.end_s)).to(t)
+        c = 0.5 * self.change
+        return (
+            c * (1 - torch.cos(a)),
+            c * k * torch.sin(a) * inside,
+            c * k * k * torch.cos(a) * inside,
+        )
+
+
+@dataclass(frozen=True)
+class CycloidRamp(_Ramp):
+    """A change with a raised-cosine rate, u - sin(2 pi u) / 2 pi, between two times.
+
+    Two derivatives are continuous.
+    """
+
+    @override
+    def evaluate(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        length = self.end_s - self.start_s
+        u = (t.clamp(self.start_s, self.end_s) - self.start_s) / length
+        turn = 2 * math.pi * u
+        value = self.change * (u - torch.sin(turn) / (2 * math.pi))
+        rate = self.change / length * (1 - torch.cos(turn))
+        return value, rate, self.change * 2 * math.pi / length**2 * torch.sin(turn)
+
+
+@dataclass(frozen=True)
+class RampTrajectory(TrajectorySource):
+    """A motion with speed, angles and climb rate as sums of ramps.
+
+    Attributes:
+        start: Initial position, speed, heading.
+        duration_s: Duration, s.
+        speed: Changes of speed, m/s. Changes of the horizontal speed with `climb_rate_changes`.
+        climb_deg: Changes of the flight-path angle. Not together with `climb_rate_changes`.
+        heading_deg: Changes of heading, clockwise.
+        climb_rate_changes: Changes of the vertical speed, m/s.
+
+    Raises:
+        ValueError: If `climb_deg` and `climb_rate_changes` are both given. On `generate`, if the
+            speed is negative, the duration is not a whole number of samples, or a CosineRamp begins
+            or ends between two samples.
+    """
+
+    start: TrajectoryStart
+    duration_s: float
+    speed: Sequence[_Ramp] = ()
+    climb_deg: Sequence[_Ramp] = ()
+    heading_deg: Sequence[_Ramp] = ()
+    climb_rate_changes: Sequence[_Ramp] = ()
+
+    def __post_init__(self) -> None:
+        if self.climb_deg and self.climb_rate_changes:
+            raise ValueError(
+                "trajectory.climb_deg and trajectory.climb_rate_changes must not both be set, "
+                "got both. Give one of them."
+            )
+
+    @override
+    def generate(self, rate: float) -> TrajectoryData:
+        n = round(self.duration_s * rate)
+        if n < 1 or abs(n - self.duration_s * rate) > 1e-6:
+            raise ValueError(
+                f"trajectory.duration_s must be a whole number of samples at rate={rate}, "
+                f"got {self.duration_s}. Change it."
+            )
+        for ramp in (*self.speed, *self.climb_deg, *self.heading_deg, *self.climb_rate_changes):
+            if isinstance(ramp, CosineRamp):
+                _check_on_samples(ramp, self.duration_s, rate)
+        steps = torch.arange(n + 1, dtype=torch.float64)
+        nodes = self.compute_motion((steps[:-1, None] + NODES) / rate)
+        return integrate_motion(self.compute_motion(steps / rate), nodes, self.start, rate)
+
+    def compute_motion(self, t: Tensor) -> MotionProfile:
+        """Compute the motion at times t s."""
+        speed, speed1, _ = _total(self.speed, t, self.start.speed)
+        heading, heading1, heading2 = _total(self.heading_deg, t, self.start.heading_deg)
+        angles = (torch.deg2rad(a) for a in (heading, heading1, heading2))
+        if not self.climb_rate_changes:
+            climb, climb1, _ = _total(self.climb_deg, t, 0.0)
+            return MotionProfile(
+                speed, speed1, torch.deg2rad(climb), torch.deg2rad(climb1), *angles
+            )
+        if speed.min() < 0:  # the length of the velocity does not show it
+            raise ValueError(
+                f"horizontal speed must not be negative, got {speed.min():.3f} m/s. "
+                "Brake less, or start faster."
+            )
+        up, up1, _ = _total(self.climb_rate_changes, t, 0.0)
+        along = torch.hypot(speed, up)
+        safe = along.clamp(min=1e-9)
+        along1 = torch.where(along > 0, (speed * speed1 + up * up1) / safe, speed1)
+        climb1 = (speed * up1 - up * speed1) / safe.square()
+        return MotionProfile(along, along1, torch.atan2(up, speed), climb1, *angles)
+
+
+def _check_on_samples(ramp: CosineRamp, duration: float, rate: float) -> None:
+    for name, time in (("start_s", ramp.start_s), ("end_s", ramp.end_s)):
+        samples = time * rate
+        # the second derivative, and with it the roll rate, jumps: quadrature over it is wrong
+        if 0 < time < duration and abs(samples - round(samples)) > 1e-6:
+            raise ValueError(
+                f"{name} of a CosineRamp must be a multiple of {1 / rate:.6g} s at rate={rate}, "
+                f"got {time}. Change it, or use a CycloidRamp."
+            )
+
+
+def _total(ramps: Sequence[_Ramp], t: Tensor, start: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Sum ramps from a start value, with derivatives."""
+    value, rate, second = torch.full_like(t, start), torch.zeros_like(t), torch.zeros_like(t)
+    for ramp in ramps:
+        change, change1, change2 = ramp.evaluate(t)
+        value, rate, second = value + change, rate + change1, second + change2
+    return value, rate, second

@@ -1,23 +1,24 @@
-"""INS mechanisation: attitude, velocity and position from sensor increments.
-
-Two-sample (or one-sample) mechanisation in East, North, Up with coning, rotation and sculling
-corrections [Savage 1998, "Strapdown inertial navigation integration algorithm design", parts 1
-and 2; Yan Gongmin, PSINS].
-
-This is the inner loop of every simulation. The step works component-major, [3, R] and
-[3, 4, R], because eager torch spends its time on the number of operations, not on their size.
-"""
+"""INS mechanisation from sensor increments: coning and sculling, attitude, velocity and position, preintegration."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from pfbench.nav import attitude, earth
-from pfbench.nav.increments import prepare_steps
+
+# --------------------------------------------------------------------------------------------------
+# INS mechanisation: attitude, velocity and position from sensor increments.
+#
+# Two-sample (or one-sample) mechanisation in East, North, Up with coning, rotation and sculling
+# corrections [Savage 1998, "Strapdown inertial navigation integration algorithm design", parts 1
+# and 2; Yan Gongmin, PSINS].
+#
+# This is the inner loop of every simulation. The step works component-major, [3, R] and
+# [3, 4, R], because eager torch spends its time on the number of operations, not on their size.
 
 
 class InsState(NamedTuple):
@@ -248,3 +249,191 @@ def _intervals(nodes: list[_State], forces: list[Tensor], duration: Tensor) -> I
         f,
         duration,
     )
+
+
+# --------------------------------------------------------------------------------------------------
+# Coning and sculling corrections of inertial increments, for many steps at once.
+#
+# Rotation vectors and velocity increments do not depend on the navigation state
+# [Savage 1998, "Strapdown inertial navigation integration algorithm design", parts 1 and 2].
+
+_CHUNK = 256  # steps prepared at once: hides the overhead and fits in the cache
+
+
+def prepare_steps(
+    dtheta: Tensor, dv: Tensor, d: Tensor, per_step: int
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Yield body rotation, velocity increment and spans of each step.
+
+    Args:
+        dtheta: Angle increments, [R or 1, n, 3], rad.
+        dv: Velocity increments, [R or 1, n, 3], m/s.
+        d: Sampling intervals, [R or 1, n], s.
+        per_step: Samples per step, 1 or 2.
+
+    Yields:
+        Body rotation, [3, 3, R], velocity increment in body axes at the start of the step,
+        [3, 1, R], and spans, [3, R]. The spans are half the duration, the duration, and its inverse.
+    """
+    n = dtheta.shape[-2]
+    for begin in range(0, n, _CHUNK * per_step):
+        stop = min(begin + _CHUNK * per_step, n)
+        first = max(begin - 1, 0) if per_step == 1 else begin
+        chunk = (dtheta[..., first:stop, :], dv[..., first:stop, :], d[..., first:stop])
+        turn, push, t = correct_coning_sculling(*chunk, per_step, has_previous=first < begin)
+        inverse = torch.where(t > 0, 1 / t, torch.zeros_like(t))  # a padded step has t = 0
+        spans = torch.stack([t / 2, t, inverse], dim=-1)
+        turns = attitude.dcm_from_rotation_vector(turn).permute(1, 2, 3, 0).contiguous()
+        pushes = push.permute(1, 2, 0).unsqueeze(2).contiguous()
+        yield from zip(
+            turns.unbind(0),
+            pushes.unbind(0),
+            spans.permute(1, 2, 0).contiguous().unbind(0),
+            strict=True,
+        )
+
+
+def correct_coning_sculling(
+    dtheta: Tensor, dv: Tensor, d: Tensor, per_step: int, has_previous: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute rotation vectors, velocity increments and durations of steps.
+
+    Rates are linear in time over two samples of d1 and d2 seconds. The coning and the sculling
+    integral are then cross products of the samples times (d1 + d2)^2 / (6 d1 d2), 2/3 for equal
+    samples. Over the second sample alone the factor is d2^2 / (6 d1 (d1 + d2)), 1/12. A constant
+    force in a body that turns at a constant rate gives f + w x f / 2 + w x (w x f) / 6 + ...
+    Terms of the varying part are correct to second order.
+
+    Args:
+        dtheta: Angle increments, [R or 1, n, 3], rad.
+        dv: Velocity increments, [R or 1, n, 3], m/s.
+        d: Sampling intervals, [R or 1, n], s.
+        per_step: Samples per step, 1 or 2.
+        has_previous: Whether the first sample precedes the first step (one sample per step).
+
+    Returns:
+        Rotation vectors and velocity increments [R, s, 3], and durations [R or 1, s].
+    """
+    if per_step == 2:
+        w1, w2, f1, f2, d1, d2 = *_pair(dtheta, -2), *_pair(dv, -2), *_pair(d, -1)
+        w, f, t, factor = w1 + w2, f1 + f2, d1 + d2, (d1 + d2) ** 2 / (6 * d1 * d2)
+    else:
+        if not has_previous:
+            dtheta, dv = (
+                torch.cat([torch.zeros_like(x[..., :1, :]), x], dim=-2) for x in (dtheta, dv)
+            )
+            d = torch.cat([d[..., :1], d], dim=-1)
+        w1, w2, f1, f2, d1, d2 = *_lag(dtheta, -2), *_lag(dv, -2), *_lag(d, -1)
+        w, f, t, factor = w2, f2, d2, d2**2 / (6 * d1 * (d1 + d2))
+    factor = torch.where((d1 > 0) & (d2 > 0), factor, torch.zeros_like(factor)).unsqueeze(-1)
+    coning = factor * torch.linalg.cross(w1, w2)
+    sculling = factor * (torch.linalg.cross(w1, f2) + torch.linalg.cross(f1, w2))
+    swept = torch.linalg.cross(w, f)
+    return w + coning, f + 0.5 * swept + torch.linalg.cross(w, swept) / 6 + sculling, t
+
+
+def _pair(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    first, second = x.unflatten(dim, (-1, 2)).unbind(dim)
+    return first, second
+
+
+def _lag(x: Tensor, dim: int) -> tuple[Tensor, Tensor]:
+    return x.narrow(dim, 0, x.shape[dim] - 1), x.narrow(dim, 1, x.shape[dim] - 1)
+
+
+# --------------------------------------------------------------------------------------------------
+# Preintegration of IMU samples over filter intervals, with bias corrections.
+#
+# [Forster, Carlone, Dellaert, Scaramuzza 2017, "On-manifold preintegration for real-time
+# visual-inertial odometry"]
+
+
+class PreintegratedImu(NamedTuple):
+    """IMU increments of each interval, in body axes at its start, without gravity.
+
+    Body axes are right, forward, up.
+
+    Attributes:
+        rotation: Rotation from the body at the end to the body at the start, quaternion,
+            [R or 1, T, 4].
+        velocity_increment: Velocity increment, [R or 1, T, 3], m/s.
+        position_increment: Position increment from rest, [R or 1, T, 3], m.
+        jacobian: Derivatives of (rotation vector on the right of `rotation`, velocity and position
+            increment) with respect to (gyro, accelerometer) bias, [R or 1, T, 9, 6].
+        bias: Gyro and accelerometer bias that were subtracted, [R or 1, T, 6], rad/s, m/s^2.
+        gravity: [R or 1, T], m/s^2, downwards.
+        duration: [R or 1, T], s. 0 pads a short run: the interval changes nothing.
+    """
+
+    rotation: Tensor
+    velocity_increment: Tensor
+    position_increment: Tensor
+    jacobian: Tensor
+    bias: Tensor
+    gravity: Tensor
+    duration: Tensor
+
+
+@torch.no_grad()
+def preintegrate(
+    force: Tensor, rate: Tensor, spans: Tensor, bias: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Preintegrate S samples of an interval, each with mean force and angular rate.
+
+    The force of a sample is rotated by the attitude at its middle, which is second order. Samples
+    of zero duration change nothing and can pad intervals with fewer samples.
+
+    Args:
+        force: Measured specific force, body axes, [..., S, 3], m/s^2.
+        rate: Measured angular rate, [..., S, 3], rad/s.
+        spans: Durations, [..., S], s.
+        bias: Gyro and accelerometer bias to subtract, [..., 6].
+
+    Returns:
+        Rotation [..., 4], velocity and position increment [..., 3] and Jacobian [..., 9, 6], see
+        `PreintegratedImu`.
+    """
+    half_turn = (rate - bias[..., None, :3]) * (0.5 * spans.unsqueeze(-1))
+    halves = attitude.dcm_from_rotation_vector(half_turn)
+    slips = 0.5 * spans[..., None, None] * right_jacobian(half_turn)
+    f = force - bias[..., None, 3:]
+    c = torch.eye(3, dtype=f.dtype, device=f.device).expand(*f.shape[:-2], 3, 3)
+    v, p = torch.zeros_like(f[..., 0, :]), torch.zeros_like(f[..., 0, :])
+    by_c, by_v, by_p = (
+        f.new_zeros(*f.shape[:-2], 3, k) for k in (3, 6, 6)
+    )  # by_c: gyro bias alone
+    for k in range(spans.shape[-1]):
+        half, slip, dt = halves[..., k, :, :], slips[..., k, :, :], spans[..., k, None]
+        middle, by_middle = c @ half, half.mT @ by_c - slip
+        a = (middle @ f[..., k, :, None]).squeeze(-1)
+        by_a = torch.cat([-middle @ attitude.skew(f[..., k, :]) @ by_middle, -middle], -1)
+        p, by_p = (
+            p + (v + 0.5 * a * dt) * dt,
+            by_p + (by_v + 0.5 * by_a * dt[..., None]) * dt[..., None],
+        )
+        v, by_v = v + a * dt, by_v + by_a * dt[..., None]
+        c, by_c = middle @ half, half.mT @ by_middle - slip
+    top = torch.cat([by_c, torch.zeros_like(by_c)], -1)
+    return attitude.quaternion_from_dcm(c), v, p, torch.cat([top, by_v, by_p], -2)
+
+
+def right_jacobian(r: Tensor) -> Tensor:
+    """Compute J with exp(r + d) = exp(r) exp(J d) to first order in d, [..., 3, 3].
+
+    Correct to third order in the rotation vector r [..., 3].
+    """
+    k = attitude.skew(r)
+    unit = torch.eye(3, dtype=r.dtype, device=r.device)
+    return unit - 0.5 * k + k @ k / 6.0 - k @ k @ k / 24.0
+
+
+def rotate(q: Tensor, a: Tensor) -> Tensor:
+    """Rotate vectors by unit quaternions.
+
+    Args:
+        q: Unit quaternions, [..., 4].
+        a: Vectors, [..., 3].
+    """
+    axis, a = torch.broadcast_tensors(q[..., 1:], a)
+    twice = 2.0 * torch.linalg.cross(axis, a)
+    return a + q[..., :1] * twice + torch.linalg.cross(axis, twice)

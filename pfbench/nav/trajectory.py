@@ -9,10 +9,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.interpolate import BSpline
+from scipy.sparse.linalg import spsolve
+from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.nav import attitude, earth
 
@@ -238,3 +245,196 @@ def ideal_sensors(
     f = acceleration + coriolis + earth.gravity(lat, h)[..., None] * up
     w = body_rate + (to_body @ (w_ie + w_en)[..., None]).squeeze(-1)
     return w, (to_body @ f[..., None]).squeeze(-1)
+
+
+# --------------------------------------------------------------------------------------------------
+# Smooth motion through a recorded one, and the output of ideal inertial sensors.
+#
+# Recorded positions, velocities and attitudes contradict each other by centimetres and cannot be
+# differentiated. Splines through them are twice differentiable, and their position, velocity,
+# attitude and sensors agree exactly. The splines stay within the errors of the record and serve as
+# the truth of a scenario. Knots are evenly spaced and the fit is least squares [ours].
+
+_POSITION, _ATTITUDE = 5, 3  # degrees of the splines
+_PASSES = 4  # Gauss-Newton steps for attitude, each squares the angular error
+
+
+class RecordedMotion(NamedTuple):
+    """A recorded motion at n instants, float64.
+
+    Attributes:
+        time: Increasing times, [n], s.
+        pos: Latitude, longitude, height, [n, 3], rad, rad, m.
+        vel: East, North, Up, [n, 3], m/s.
+        dcm: Body (right, forward, up) to level, [n, 3, 3].
+    """
+
+    time: Tensor
+    pos: Tensor
+    vel: Tensor
+    dcm: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSpline(TrajectorySource):
+    """A smooth motion close to a recorded one.
+
+    Position is a quintic spline, fitted to recorded positions and velocities. Attitude is scipy's
+    RotationSpline: its rotation vector between knots is cubic, angular rate and acceleration are
+    continuous, and the angular acceleration is zero at both ends. It is fitted to the recorded
+    attitudes by Gauss-Newton steps. Recorded angular rates are not used.
+
+    Attributes:
+        recorded: The motion.
+        knot_interval_s: Time between knots, s. Motion with a shorter period than about twice this
+            value is smoothed out.
+        use_full_log: Time, s. The flight is cut to a multiple of it.
+        position_sd: Position errors of the record, m. Only the ratio to `velocity_sd` matters.
+        velocity_sd: Velocity errors of the record, m/s.
+
+    Raises:
+        ValueError: If a size is not positive, the record has a gap that is too long for
+            `knot_interval_s`, or it is shorter than `use_full_log`. On `generate`, if
+            `use_full_log` is not a multiple of the sampling interval.
+    """
+
+    recorded: RecordedMotion
+    knot_interval_s: float = 0.4
+    use_full_log: float = 1.0
+    position_sd: float = 0.02
+    velocity_sd: float = 0.05
+
+    def __post_init__(self) -> None:
+        for name in ("knot_interval_s", "use_full_log", "position_sd", "velocity_sd"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(
+                    f"trajectory.{name} must be positive, got {getattr(self, name)}. Change it."
+                )
+        time = self.recorded.time
+        step = time.diff()
+        if len(time) < 2 or not bool((step > 0.0).all()):
+            raise ValueError(
+                f"recorded times must increase, got {len(time)} rows. Sort at least 2 rows by time."
+            )
+        i = int(step.argmax())
+        # splines need two instants between knots
+        if float(step[i]) > 0.5 * self.knot_interval_s + 1e-9:
+            raise ValueError(
+                f"trajectory.knot_interval_s must be at least twice the longest gap of the record, "
+                f"{float(step[i]):.3f} s after t = {float(time[i]):.3f}, got {self.knot_interval_s}. "
+                "Increase it, or choose start and end without this gap."
+            )
+        if float(time[-1] - time[0]) < self.use_full_log:
+            raise ValueError(
+                "trajectory.use_full_log must be at most the duration of the record, "
+                f"{float(time[-1] - time[0]):.3f} s, got {self.use_full_log}. Reduce it."
+            )
+
+    @override
+    def generate(self, rate: float) -> TrajectoryData:
+        samples = self.use_full_log * rate
+        if abs(samples - round(samples)) > 1e-6 or round(samples) < 1:
+            raise ValueError(
+                f"trajectory.use_full_log must be a whole number of samples at rate={rate}, "
+                f"got {self.use_full_log} ({samples:g} samples). Change it."
+            )
+        start = float(self.recorded.time[0])
+        n = int((float(self.recorded.time[-1]) - start) / self.use_full_log + 1e-6) * round(samples)
+        steps = torch.arange(n + 1, dtype=torch.float64)
+        ends, nodes = start + steps / rate, start + (steps[:-1, None] + NODES) / rate
+        last = float(self.recorded.time[-1])
+        ends, nodes = (t.clamp(max=last) for t in (ends, nodes))  # rounding
+        position, attitude = self._fit_position(), self._fit_attitude()
+        pos, vel, _ = position.at_step(ends)
+        w, f = _ideal_spline_sensors(position, attitude, nodes)
+        weights = WEIGHTS[:, None] / rate
+        dtheta, dv = (weights * w).sum(1), (weights * f).sum(1)
+        return TrajectoryData(steps / rate, pos, vel, _dcm(attitude, ends), dtheta, dv)
+
+    def _fit_position(self) -> _PositionSpline:
+        pos, vel = self.recorded.pos, self.recorded.vel
+        origin = pos[0]
+        scale = earth.metre_scale(origin)
+        metres, rates = (
+            ((pos - origin) * scale).numpy(),
+            (earth.position_rate(pos, vel) * scale).numpy(),
+        )
+        weight = (self.position_sd / self.velocity_sd) ** 2
+        time = self.recorded.time.numpy()
+        spline = _fit_spline(
+            time, _knots(time, self.knot_interval_s), _POSITION, metres, rates, weight
+        )
+        return _PositionSpline(spline, origin, scale)
+
+    def _fit_attitude(self) -> Any:
+        time, recorded = self.recorded.time.numpy(), Rotation.from_matrix(self.recorded.dcm.numpy())
+        knots = _knots(time, self.knot_interval_s)
+        at_knots = Slerp(time, recorded)(knots)
+        for _ in range(_PASSES):
+            error = (RotationSpline(knots, at_knots)(time).inv() * recorded).as_rotvec()
+            correction = _fit_spline(time, knots, _ATTITUDE, error)(knots)
+            at_knots = at_knots * Rotation.from_rotvec(correction)
+        return RotationSpline(knots, at_knots)
+
+
+class _PositionSpline(NamedTuple):
+    """Position as a spline of metres North, East, Up from an origin."""
+
+    spline: Any
+    origin: Tensor
+    scale: Tensor
+
+    def at_step(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return position, velocity East, North, Up and acceleration, [..., 3] each."""
+        x, x1, x2 = (
+            torch.from_numpy(self.spline(t.numpy(), order)) / self.scale for order in (0, 1, 2)
+        )
+        pos = self.origin + x
+        metres, metres1 = torch.func.jvp(earth.metre_scale, (pos,), (x1,))[:2]
+        vel, acc = metres * x1, metres1 * x1 + metres * x2
+        return pos, vel[..., [1, 0, 2]], acc[..., [1, 0, 2]]
+
+
+def _ideal_spline_sensors(
+    position: _PositionSpline, attitude: Any, t: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Compute angular rate and specific force in body axes [..., 3]."""
+    pos, vel, acceleration = position.at_step(t)
+    body_rate = torch.from_numpy(attitude(t.numpy().ravel(), 1)).reshape(vel.shape)
+    return ideal_sensors(pos, vel, acceleration, body_rate, _dcm(attitude, t).mT)
+
+
+def _dcm(attitude: Any, t: Tensor) -> Tensor:
+    """Evaluate body-to-level matrices [..., 3, 3]."""
+    return torch.from_numpy(attitude(t.numpy().ravel()).as_matrix()).reshape(*t.shape, 3, 3)
+
+
+def _knots(time: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
+    """Place knots at the first time, then every `spacing` seconds, and at the last."""
+    intervals = max(1, int((time[-1] - time[0]) / spacing))
+    # The last interval is up to twice as long. Evenly stretched knots would lie inside samples,
+    # which reduces the order of the quadrature.
+    return np.append(time[0] + spacing * np.arange(intervals), time[-1])
+
+
+def _fit_spline(
+    time: NDArray[np.float64],
+    knots: NDArray[np.float64],
+    degree: int,
+    values: NDArray[np.float64],
+    rates: NDArray[np.float64] | None = None,
+    weight: float = 0.0,
+) -> Any:
+    """Fit the spline that minimises sum |values - s|^2 + weight sum |rates - s'|^2."""
+    t = np.concatenate([np.repeat(knots[0], degree), knots, np.repeat(knots[-1], degree)])
+    a = BSpline.design_matrix(time, t, degree)
+    normal, right = a.T @ a, a.T @ values
+    if rates is not None:
+        # the derivative has coefficients degree (c_{i+1} - c_i) / (t_{i+degree+1} - t_{i+1})
+        ratio = degree / (t[degree + 1 : -1] - t[1 : -degree - 1])
+        difference = sparse.diags_array(
+            [-ratio, ratio], offsets=[0, 1], shape=(len(ratio), len(ratio) + 1)
+        )
+        b = BSpline.design_matrix(time, t[1:-1], degree - 1) @ difference
+        normal, right = normal + weight * (b.T @ b), right + weight * (b.T @ rates)
+    return BSpline(t, spsolve(normal.tocsc(), right), degree)

@@ -1,6 +1,13 @@
 """Public names of `pfbench.noise` and the modules that define them."""
 
-from pfbench.noise.base import NoiseRegime as NoiseRegime
+from pfbench.noise.base import (
+    GlintNoise as GlintNoise,
+    LaplaceNoise as LaplaceNoise,
+    NoiseRegime as NoiseRegime,
+    NominalNoise as NominalNoise,
+    OutlierNoise as OutlierNoise,
+    StudentTNoise as StudentTNoise,
+)
 from pfbench.noise.correlated import (
     GaussMarkovNoise as GaussMarkovNoise,
     NonLineOfSightNoise as NonLineOfSightNoise,
@@ -10,15 +17,8 @@ from pfbench.noise.distributions import (
     make_normal as make_normal,
 )
 from pfbench.noise.error_replay import ErrorReplay as ErrorReplay
-from pfbench.noise.outage import MeasurementOutage as MeasurementOutage
-from pfbench.noise.time_varying import (
+from pfbench.noise.time_windows import (
     BiasStep as BiasStep,
+    MeasurementOutage as MeasurementOutage,
     VarianceSurge as VarianceSurge,
-)
-from pfbench.noise.white import (
-    GlintNoise as GlintNoise,
-    LaplaceNoise as LaplaceNoise,
-    NominalNoise as NominalNoise,
-    OutlierNoise as OutlierNoise,
-    StudentTNoise as StudentTNoise,
 )

@@ -1,7 +1,8 @@
-"""Protocol of noise regimes, and the process noise of a step."""
+"""Protocol of noise regimes, and the regimes without memory: nominal, heavy-tailed and impulsive errors."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -10,7 +11,11 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
+from pfbench.noise import distributions
 from pfbench.noise.distributions import ErrorDistribution
+
+# --------------------------------------------------------------------------------------------------
+# Protocol of noise regimes, and the process noise of a step.
 
 _SAMPLES = 20  # samples of process noise within a step
 
@@ -120,3 +125,201 @@ def make_no_distribution_error(noise: str, reason: str) -> ValueError:
         f"oracle_noise must be false for noise={noise}, got true. Its errors do not have a "
         f"distribution per step, because {reason}. Set oracle_noise=false."
     )
+
+
+# --------------------------------------------------------------------------------------------------
+# Noise regimes without memory: nominal, heavy-tailed and impulsive errors.
+#
+# The nominal part of each regime uses the random numbers of the nominal regime, so filters are compared
+# across regimes on common random numbers.
+
+
+class _UnitProcess(NoiseRegime):
+    """A regime with nominal process noise."""
+
+    @override
+    def process_factors(self, time: Tensor) -> Tensor:
+        return torch.ones_like(time)
+
+
+def _same_at_all_steps(
+    family: distributions.Family, channels: MeasurementChannels, time: Tensor
+) -> ErrorDistribution:
+    """Return the same distribution at all steps."""
+    shape = len(time), len(channels.sd)
+    return ErrorDistribution(family, time.new_zeros(shape), time.new_ones(shape))
+
+
+@dataclass(frozen=True)
+class NominalNoise(_UnitProcess):
+    """White normal errors of nominal size."""
+
+    @override
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        return channels.sd * draws.normal("world.receiver", len(time), len(channels.sd))
+
+    @override
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        return _same_at_all_steps(distributions.make_normal, channels, time)
+
+
+@dataclass(frozen=True)
+class StudentTNoise(_UnitProcess):
+    """Student's t errors with `dof` degrees of freedom and nominal scale.
+
+    The scale, and not the variance, is nominal. Nominal variance would make most errors smaller
+    than the filter assumes. [ours]
+
+    Attributes:
+        dof: Degrees of freedom.
+
+    Raises:
+        ValueError: If `dof` is below 3, where the variance is large or infinite.
+    """
+
+    dof: int = 4
+
+    def __post_init__(self) -> None:
+        if self.dof < 3:
+            raise ValueError(
+                f"noise.dof must be at least 3, got {self.dof}. The variance of smaller values is large or infinite."
+            )
+
+    @override
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        t, k = len(time), len(channels.sd)
+        z = draws.normal("world.receiver", t, k)
+        squares = draws.normal("world.tails", t, k * self.dof).square()
+        chi2 = squares.reshape(-1, t, k, self.dof).sum(-1)
+        return channels.sd * z / torch.sqrt(chi2 / self.dof)
+
+    @override
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        return _same_at_all_steps(distributions.make_student_t(self.dof), channels, time)
+
+
+@dataclass(frozen=True)
+class LaplaceNoise(_UnitProcess):
+    """Laplace errors of nominal variance.
+
+    Only the shape differs from the assumption of a Kalman filter. Larger nominal errors become
+    larger errors (monotone transformation). [ours]
+    """
+
+    @override
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        return channels.sd * distributions.normal_to_laplace(
+            draws.normal("world.receiver", len(time), len(channels.sd))
+        )
+
+    @override
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        return _same_at_all_steps(distributions.make_laplace, channels, time)
+
+
+@dataclass(frozen=True)
+class _ContaminatedNoise(_UnitProcess):
+    """Normal errors, with some probability errors of another distribution.
+
+    Attributes:
+        probability: Probability of a large error per epoch, or per component.
+        sd_factor: Standard deviation of a large error in nominal standard deviations.
+        joint: Whether all components of an epoch have large errors together, or each independently.
+
+    Raises:
+        ValueError: If `probability` is outside [0, 1], or `sd_factor` is below 1.
+    """
+
+    probability: float
+    sd_factor: float
+    joint: bool
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.probability <= 1.0:
+            raise ValueError(
+                f"noise.probability must be between 0 and 1, got {self.probability}. "
+                "Set a probability."
+            )
+        if not self.sd_factor >= 1.0:
+            raise ValueError(
+                f"noise.sd_factor must be at least 1, got {self.sd_factor}. "
+                "Give a factor on the nominal standard deviation."
+            )
+
+    @property
+    def _large_errors(self) -> distributions.Family:
+        return distributions.make_normal
+
+    def _outlier_mask(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        """Draw a mask of large errors, [R, T, 1 or Dy]."""
+        size = 1 if self.joint else len(channels.sd)
+        return draws.uniform("world.outliers", len(time), size) < self.probability
+
+    @override
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        family = distributions.contaminated_normal(
+            self.probability, self.sd_factor, self.joint, self._large_errors
+        )
+        return _same_at_all_steps(family, channels, time)
+
+
+@dataclass(frozen=True)
+class OutlierNoise(_ContaminatedNoise):
+    """Impulsive errors, a contaminated normal [Tukey 1960; Huber 1964].
+
+    The attributes are those of `GlintNoise`. An outlier is a nominal error times `sd_factor`.
+    """
+
+    probability: float = 0.05
+    sd_factor: float = 10.0
+    joint: bool = True
+
+    @override
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        outlier_mask = self._outlier_mask(draws, channels, time)
+        factor = torch.where(outlier_mask, self.sd_factor, 1.0).to(channels.sd)
+        return factor * NominalNoise().draw_errors(draws, channels, time)
+
+
+@dataclass(frozen=True)
+class GlintNoise(_ContaminatedNoise):
+    """Radar glint: normal errors, with some probability Laplace errors.
+
+    [Wu 1993, "Target tracking with glint noise"]. For glint with a wide normal use `OutlierNoise`
+    with joint=false.
+
+    Attributes:
+        probability: Probability of a glint per epoch, or per component.
+        sd_factor: Standard deviation of a glint in nominal standard deviations.
+        joint: Whether all components of an epoch have glint together, or each independently.
+
+    Raises:
+        ValueError: If `probability` is outside [0, 1], or `sd_factor` is below 1.
+    """
+
+    probability: float = 0.1
+    sd_factor: float = 10.0
+    joint: bool = False
+
+    @property
+    @override
+    def _large_errors(self) -> distributions.Family:
+        return distributions.make_laplace
+
+    @override
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        outlier_mask = self._outlier_mask(draws, channels, time)
+        spike = self.sd_factor * LaplaceNoise().draw_errors(draws, channels, time)
+        return torch.where(outlier_mask, spike, NominalNoise().draw_errors(draws, channels, time))

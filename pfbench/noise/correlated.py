@@ -12,9 +12,8 @@ from typing_extensions import override
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
 from pfbench.noise import distributions
-from pfbench.noise.base import LayeredRegime, NoiseRegime, make_no_distribution_error
+from pfbench.noise.base import LayeredRegime, NoiseRegime, NominalNoise, make_no_distribution_error
 from pfbench.noise.distributions import ErrorDistribution
-from pfbench.noise.white import NominalNoise
 
 
 @dataclass(frozen=True)

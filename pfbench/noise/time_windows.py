@@ -1,12 +1,22 @@
-"""Time windows in which a noise regime acts."""
+"""Noise regimes that change with time: surges, bias steps and outages, and the windows in which they act."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from typing_extensions import override
+
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import MeasurementChannels
+from pfbench.noise.base import LayeredRegime, NoiseRegime, NominalNoise
+from pfbench.noise.distributions import ErrorDistribution
+
+# --------------------------------------------------------------------------------------------------
+# Time windows in which a noise regime acts.
 
 Windows = Sequence[Sequence[float | None]]
 """Pairs (from, to) in s, from inclusive, to exclusive, in order. None is the end of the record."""
@@ -78,3 +88,188 @@ def window_edges(window: Sequence[float | None]) -> tuple[float, float]:
     if len(window) != 2 or window[0] is None:
         return math.nan, math.nan
     return window[0], math.inf if window[1] is None else window[1]
+
+
+# --------------------------------------------------------------------------------------------------
+# Noise regimes that change with time: variance surges and bias steps.
+
+
+@dataclass(frozen=True)
+class VarianceSurge(NoiseRegime):
+    """Variances of measurement and process noise multiplied in time windows.
+
+    Errors outside the windows are identical to errors without a surge. Errors inside are scaled by
+    the square root of the factor. Process noise is the noise of simulated sensors (see
+    `NoiseRegime.process_factors`), or the driving noise of a simulated model.
+
+    Attributes:
+        windows_s: Pairs of seconds (from, to), from inclusive, to exclusive, in order. None as `to`
+            is the end of the record.
+        measurement_variance_factors: Factor on R in each window.
+        process_variance_factors: Factor on Q in each window.
+        reference_duration_s: Duration for which the windows are written, to stretch them to the
+            record, s. None uses them unchanged.
+        base_regime: Errors that are scaled.
+
+    Raises:
+        ValueError: If a window is invalid, the numbers of factors and windows differ, or a factor
+            is not positive.
+    """
+
+    windows_s: Windows
+    measurement_variance_factors: Sequence[float]
+    process_variance_factors: Sequence[float]
+    reference_duration_s: float | None = None
+    base_regime: NoiseRegime = field(default_factory=NominalNoise)
+
+    def __post_init__(self) -> None:
+        check_windows(self.windows_s, self.reference_duration_s)
+        for key, factors in (
+            ("measurement_variance_factors", self.measurement_variance_factors),
+            ("process_variance_factors", self.process_variance_factors),
+        ):
+            valid = all(0.0 < f < float("inf") for f in factors)
+            if len(factors) != len(self.windows_s) or not valid:
+                raise ValueError(
+                    f"noise.{key} must be {len(self.windows_s)} positive factors on the variance, "
+                    f"got {list(factors)}. Give one per window."
+                )
+
+    @override
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        return self._factors_at(self.measurement_variance_factors, time).sqrt()[
+            :, None
+        ] * self.base_regime.draw_errors(draws, channels, time)
+
+    @override
+    def process_factors(self, time: Tensor) -> Tensor:
+        return self._factors_at(
+            self.process_variance_factors, time
+        ) * self.base_regime.process_factors(time)
+
+    @override
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        family, shift, scale = self.base_regime.error_distribution(channels, time)
+        root = self._factors_at(self.measurement_variance_factors, time).sqrt()[:, None]
+        return ErrorDistribution(family, root * shift, root * scale)
+
+    def _factors_at(self, factors: Sequence[float], time: Tensor) -> Tensor:
+        """Return the factor at each time, [T]."""
+        return time.new_tensor([*factors, 1.0])[
+            window_index(self.windows_s, time, self.reference_duration_s)
+        ]  # index -1 (outside) selects 1
+
+
+@dataclass(frozen=True)
+class BiasStep(LayeredRegime):
+    """A constant bias of one or all components from some time on.
+
+    Attributes:
+        bias_sd: Bias in nominal standard deviations of each component, with sign.
+        onset_s: Start time, s.
+        component: Index of the measurement component, from 0. None means all components.
+        reference_duration_s: Duration for which `onset_s` is written, to stretch it to the record,
+            s. None uses it unchanged.
+        base_regime: Errors to which the bias is added.
+
+    Raises:
+        ValueError: If the component does not exist, or the time is after the end of the record.
+    """
+
+    bias_sd: float = 5.0
+    onset_s: float = 700.0
+    component: int | None = None
+    reference_duration_s: float | None = None
+    base_regime: NoiseRegime = field(default_factory=NominalNoise)
+
+    def __post_init__(self) -> None:
+        check_windows(((self.onset_s, None),), self.reference_duration_s)
+
+    @override
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        return (
+            self.base_regime.draw_errors(draws, channels, time)
+            + self._bias(channels, time) * channels.sd
+        )
+
+    @override
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        family, shift, scale = self.base_regime.error_distribution(channels, time)
+        return ErrorDistribution(family, shift + self._bias(channels, time), scale)
+
+    def _bias(self, channels: MeasurementChannels, time: Tensor) -> Tensor:
+        """Return the bias in nominal standard deviations, [T, Dy]."""
+        n = len(channels.sd)
+        if self.component is not None and not 0 <= self.component < n:
+            raise ValueError(
+                f"noise.component must be between 0 and {n - 1}, got {self.component}. "
+                f"The scenario measures {n} components."
+            )
+        biased = torch.tensor([self.component in (None, i) for i in range(n)])
+        started = window_index(((self.onset_s, None),), time, self.reference_duration_s) == 0
+        return torch.where(started[:, None] & biased, self.bias_sd, 0.0).to(time)
+
+
+# --------------------------------------------------------------------------------------------------
+# Noise regime of missing measurements.
+#
+# A regime that changes the errors of another regime has it as `base_regime`. For example, an outage of
+# a receiver with heavy tails is MeasurementOutage(windows, base_regime=StudentTNoise(4)).
+
+
+@dataclass(frozen=True)
+class MeasurementOutage(LayeredRegime):
+    """Missing measurements of all or most sources in some time windows.
+
+    Attributes:
+        windows_s: Pairs of seconds (from, to), from inclusive, to exclusive, in order.
+        visible_sources: Number of visible sources. The sources with the lowest numbers stay
+            visible, the same in all runs, so episodes stay paired. [ours]
+        reference_duration_s: Duration for which the windows are written, to stretch them to the
+            record, s. None uses them unchanged.
+        base_regime: Errors of the visible measurements.
+
+    Raises:
+        ValueError: If a window is invalid or begins after the end of the record, or
+            `visible_sources` is not below the number of sources.
+    """
+
+    windows_s: Windows = ((100.0, 130.0),)
+    visible_sources: int = 0
+    reference_duration_s: float | None = None
+    base_regime: NoiseRegime = field(default_factory=NominalNoise)
+
+    def __post_init__(self) -> None:
+        check_windows(self.windows_s, self.reference_duration_s)
+        if self.visible_sources < 0:
+            raise ValueError(
+                f"noise.visible_sources must be 0 or more, got {self.visible_sources}. "
+                "Give the number of visible sources."
+            )
+
+    @override
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        sources: Sequence[int] = sorted(set(channels.source))
+        if self.visible_sources >= len(sources):
+            raise ValueError(
+                f"noise.visible_sources must be less than the {len(sources)} sources of the scenario, "
+                f"got {self.visible_sources}. Otherwise no source is missing."
+            )
+        affected = torch.tensor(
+            [source in sources[self.visible_sources :] for source in channels.source]
+        )
+        missing = (window_index(self.windows_s, time, self.reference_duration_s) >= 0)[
+            :, None
+        ] & affected
+        return torch.where(missing, torch.nan, self.base_regime.draw_errors(draws, channels, time))
+
+    @override
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        # NaN in the record shows the outage, so only visible components need a distribution
+        return self.base_regime.error_distribution(channels, time)

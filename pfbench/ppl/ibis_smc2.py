@@ -13,17 +13,21 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from pfbench.core.derived_stream import relabel
-from pfbench.core.random_stream import PhiloxStream, RandomStream
+from pfbench.core.random_stream import PhiloxStream, RandomStream, relabel
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
 from pfbench.filter.exactness import check_has_evidence
 from pfbench.filter.loop import FilterPass, prepare_record
-from pfbench.filter.particle.resampling_schemes import Systematic
+from pfbench.filter.particle.resampling import Systematic
 from pfbench.model.base import StateSpaceModel
-from pfbench.ppl.arguments import check_counts, check_kinds, check_number
-from pfbench.ppl.parameterised_model import ParameterisedModel, Values
-from pfbench.ppl.posterior_estimate import repeat_runs
+from pfbench.ppl.likelihood import repeat_runs
+from pfbench.ppl.parameterised_model import (
+    ParameterisedModel,
+    Values,
+    check_counts,
+    check_kinds,
+    check_number,
+)
 
 
 class Smc2Result(NamedTuple):

@@ -18,9 +18,14 @@ from torch import Tensor
 from torch.distributions import biject_to
 
 from pfbench.core.record import Record
-from pfbench.ppl.arguments import check_counts, check_kinds, check_number
 from pfbench.ppl.parameter_posterior import ParameterPosterior
-from pfbench.ppl.parameterised_model import ParameterisedModel, Values
+from pfbench.ppl.parameterised_model import (
+    ParameterisedModel,
+    Values,
+    check_counts,
+    check_kinds,
+    check_number,
+)
 
 Program = Callable[[Record], Values]
 

@@ -13,13 +13,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report import scenario_data, writers
-from pfbench.report.plots import scenario_figures
-from pfbench.report.plots.figure_files import FigureSpec
-from pfbench.report.plots.plotting import format_slug
-from pfbench.report.table_formats import format_number
-from pfbench.results import consistency, store
-from pfbench.results.state_groups import component_groups
+from pfbench.report import scenario_figures, writers
+from pfbench.report.writers import format_number
+from pfbench.results import status, store
+from pfbench.results.conditions import component_groups
+from pfbench.results.plotting import FigureSpec, format_slug
 
 _Figure = tuple[str, str, Callable[[store.JobResult], Figure]]  # name, caption, plot
 
@@ -80,7 +78,7 @@ def _truth_figures(sheet: store.JobResult) -> Iterator[_Figure]:
     """Yield the figures of track, range and inertial sensors."""
     data = sheet.data
     if "track" in data:
-        has_others = len(scenario_data.select_tracks(data["track"])) > 1
+        has_others = len(scenario_figures.select_tracks(data["track"])) > 1
         others = " and of the other runs (grey)" if has_others else ""
         text = f"True track of the first run{others}: plan view and height above the start."
         yield "track", text, scenario_figures.plot_scenario_track
@@ -114,7 +112,7 @@ def _measurement_figures(sheet: store.JobResult) -> Iterator[_Figure]:
 
 def _statistics_figures(sheet: store.JobResult) -> Iterator[_Figure]:
     """Yield the figures of the residuals and of the spread of the runs."""
-    if scenario_data.group_residuals(sheet):
+    if scenario_figures.group_residuals(sheet):
         text = (
             "Residuals at the true state, in standard deviations of the model, and the standard "
             "normal density. The outermost bins include all larger values."
@@ -122,7 +120,7 @@ def _statistics_figures(sheet: store.JobResult) -> Iterator[_Figure]:
         yield "residuals", text, scenario_figures.plot_residuals
         text = "Residuals of the first run over time, with lines at two standard deviations."
         yield "residuals_time", text, scenario_figures.plot_residuals_over_time
-    if sheet.meta["runs"] > 1 and scenario_data.compute_spreads(sheet):
+    if sheet.meta["runs"] > 1 and scenario_figures.compute_spreads(sheet):
         text = "Spread of the true states over the runs (standard deviation of the norm)"
         if "pcrb" in sheet.data:
             text += (
@@ -146,17 +144,17 @@ def list_facts(sheet: store.JobResult) -> list[str]:
     observed = f"{100 * data['seen'].mean():.3g}"
     texts.append(f"Measurement of {len(kinds)} components: {counts}. Observed: {observed} %.")
     if "azimuth" in data:
-        visible = scenario_data.visible_satellites(sheet)
-        is_sparse = scenario_data.has_sparse_counts(visible)
+        visible = scenario_figures.visible_satellites(sheet)
+        is_sparse = scenario_figures.has_sparse_counts(visible)
         least = visible[visible > 0].min() if is_sparse else visible.min()
         total = data["elevation"].shape[1]
         texts.append(f"Satellites above the horizon: {least} to {visible.max()} of {total}.")
     residual = data["residual"]
-    is_equal = scenario_data.drop_equal_runs(residual).shape[0] == 1
+    is_equal = scenario_figures.drop_equal_runs(residual).shape[0] == 1
     if is_equal and meta["runs"] > 1 and not np.isnan(residual).all():
         texts.append("All runs have equal residuals, which are counted once.")
     if "raw_estimate" in meta:
-        texts.append(scenario_data.describe_raw_estimate(meta))
+        texts.append(scenario_figures.describe_raw_estimate(meta))
     return [*texts, f"{meta['pcrb'][0].upper()}{meta['pcrb'][1:]}."]
 
 
@@ -203,7 +201,7 @@ def list_missing_figures(sheet: store.JobResult) -> list[str]:
     constant = [
         block.group
         for block in others
-        if not scenario_data.compute_deviation(a, block.places).any()
+        if not scenario_figures.compute_deviation(a, block.places).any()
     ]
     if constant and meta["runs"] > 1:
         reasons.append(f"Spread of {', '.join(constant)}: equal in all runs.")
@@ -213,8 +211,8 @@ def list_missing_figures(sheet: store.JobResult) -> list[str]:
 def whiteness_table(sheet: store.JobResult) -> pd.DataFrame:
     """Tabulate mean, variance and lag-1 autocorrelation of residuals with 95 % intervals."""
     rows = []
-    for kind, z in scenario_data.group_residuals(sheet).items():
-        moments = consistency.compute_whiteness(z)
+    for kind, z in scenario_figures.group_residuals(sheet).items():
+        moments = status.compute_whiteness(z)
         rows.append({
             "measurement": kind,
             "components": z.shape[-1],
@@ -230,7 +228,7 @@ def whiteness_table(sheet: store.JobResult) -> pd.DataFrame:
 def spread_table(sheet: store.JobResult) -> pd.DataFrame:
     """Tabulate the spread of the runs and the PCRB at the first, middle and last step with truth."""
     rows = []
-    for block, time, value, bound in scenario_data.compute_spreads(sheet):
+    for block, time, value, bound in scenario_figures.compute_spreads(sheet):
         row: dict[str, Any] = {"group": block.group, "unit": block.unit}
         for name, t in (("first", 0), ("middle", len(time) // 2), ("last", len(time) - 1)):
             row[f"spread, {name} step"] = float(value[t])

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from pfbench.results.decisions.options import DecisionOptions
-from pfbench.results.study_decisions.main_metrics import check_main_metric
+from pfbench.stats.decision import DecisionOptions
+from pfbench.stats.main_metrics import check_main_metric
 
 _FORMATS = ("svg", "png")
 

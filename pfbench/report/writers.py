@@ -13,14 +13,20 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from pfbench.files.escapes import escape_code_block, escape_markdown
+from pfbench.files.escapes import (
+    escape_code_block,
+    escape_csv,
+    escape_html,
+    escape_latex,
+    escape_markdown,
+)
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report import provenance, table_formats
-from pfbench.report.plots.figure_files import FigureSpec, draw_figure
-from pfbench.report.plots.plotting import format_slug
+from pfbench.report import provenance
+from pfbench.results.plotting import FigureSpec, draw_figure, format_slug
 
 _HERE = Path(__file__).parent
 _MANY = 2000  # entries above which a JSON file is compressed
@@ -116,9 +122,9 @@ def write_table(folder: RecordedFolder, name: str, table: pd.DataFrame, note: st
         table: Table.
         note: Note below the LaTeX table and in the last column of the CSV file.
     """
-    text = table_formats.format_csv(table.assign(note=note) if note else table)
+    text = format_csv(table.assign(note=note) if note else table)
     folder.write(f"tables/{name}.csv", text)
-    folder.write(f"tables/{name}.tex", table_formats.format_latex(table, note))
+    folder.write(f"tables/{name}.tex", format_latex(table, note))
 
 
 def _data_address(suffix: str, content: bytes) -> str:
@@ -162,10 +168,10 @@ def template_environment(home: Path, *, is_html: bool) -> jinja2.Environment:
         finalize=None if is_html else _escape_value,
     )
     environment.filters |= {
-        "table": lambda table: Markup(table_formats.format_html(table)),
-        "pipe": lambda table: Markup(table_formats.format_markdown(table)),
+        "table": lambda table: Markup(format_html(table)),
+        "pipe": lambda table: Markup(format_markdown(table)),
         "code": lambda text: Markup(escape_code_block(text)),
-        "number": table_formats.format_number,
+        "number": format_number,
     }
     environment.filters["name_build"] = provenance.name_build
     return environment
@@ -174,3 +180,112 @@ def template_environment(home: Path, *, is_html: bool) -> jinja2.Environment:
 def _escape_value(value: Any) -> Markup:
     """Escape a value of a Markdown template, unless a template or a table made it."""
     return value if hasattr(value, "__html__") else Markup(escape_markdown(str(value)))
+
+
+# --------------------------------------------------------------------------------------------------
+# Formats of tables: HTML, Markdown, LaTeX, CSV, and numbers with three digits.
+
+
+def format_html(table: pd.DataFrame) -> str:
+    """Format a table as HTML, with classes for the alignment.
+
+    Optional end tags are left out, because they would be most of a page of tables.
+    """
+    numeric = [_is_number(table[name]) for name in table]
+    head = "".join(
+        f"<th{' class=number' if right else ''}>{escape_html(str(name))}"
+        for name, right in zip(table, numeric, strict=True)
+    )
+    kinds = ["<td>" if right else "<td class=t>" for right in numeric]
+    body = "\n".join(
+        "<tr>"
+        + "".join(
+            kind + escape_html(format_number(value))
+            for kind, value in zip(kinds, values, strict=True)
+        )
+        for values in table.itertuples(index=False)
+    )
+    rows = f"<thead><tr>{head}</thead>\n<tbody>\n{body}\n</tbody>"
+    return f'<div class="wide"><table class="plain">\n{rows}\n</table></div>'
+
+
+def format_markdown(table: pd.DataFrame) -> str:
+    """Format a table as Markdown, with columns padded to equal width."""
+    cells = [
+        [str(name) for name in table],
+        *([format_number(v) for v in row] for row in table.itertuples(index=False)),
+    ]
+    cells = [[escape_markdown(text) for text in row] for row in cells]
+    width = [max(3, *(len(row[j]) for row in cells)) for j in range(len(table.columns))]
+    right = [_is_number(table[name]) for name in table]
+    rows = [
+        "| "
+        + " | ".join(
+            t.rjust(w) if r else t.ljust(w) for t, w, r in zip(row, width, right, strict=True)
+        )
+        + " |"
+        for row in cells
+    ]
+    rule = (
+        "|"
+        + "|".join("-" * (w + 1) + (":" if r else "-") for w, r in zip(width, right, strict=True))
+        + "|"
+    )
+    return "\n".join([rows[0], rule, *rows[1:]])
+
+
+def format_latex(table: pd.DataFrame, note: str = "") -> str:
+    """Format a table as a booktabs tabular.
+
+    Args:
+        table: Table.
+        note: Note below the last rule.
+    """
+    layout = "".join("r" if _is_number(table[name]) else "l" for name in table)
+    rows = [
+        [str(name) for name in table],
+        *([format_number(v) for v in row] for row in table.itertuples(index=False)),
+    ]
+    lines = [" & ".join(map(escape_latex, row)) + r" \\" for row in rows]
+    body = ["\\toprule", lines[0], "\\midrule", *lines[1:], "\\bottomrule"]
+    if note:
+        body.append(
+            rf"\multicolumn{{{len(table.columns)}}}{{l}}{{\footnotesize {escape_latex(note)}}} \\"
+        )
+    return "\n".join([rf"\begin{{tabular}}{{{layout}}}", *body, r"\end{tabular}", ""])
+
+
+def format_csv(table: pd.DataFrame) -> str:
+    """Format a table as CSV with all digits. A spreadsheet computes none of its texts."""
+    plain = table.map(lambda value: escape_csv(value) if isinstance(value, str) else value)
+    return plain.to_csv(
+        index=False, lineterminator="\n", header=[escape_csv(str(name)) for name in table]
+    )
+
+
+def format_number(value: Any) -> str:
+    """Format a value with three significant digits; counts and texts are unchanged."""
+    if (
+        value is None
+        or value is pd.NA
+        or (isinstance(value, float | np.floating) and np.isnan(value))
+    ):
+        return "–"
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    if not isinstance(value, float | np.floating):
+        return str(value)
+    if np.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    size = abs(float(value))
+    if size == 0:
+        return "0"  # not -0
+    if not 1e-3 <= size < 1e5:
+        return f"{value:.2e}"
+    digits = 2 - int(np.floor(np.log10(float(f"{size:.2e}"))))
+    return f"{value:.{max(digits, 0)}f}"
+
+
+def _is_number(column: pd.Series) -> bool:
+    """Return whether a column contains numbers."""
+    return bool(pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column))

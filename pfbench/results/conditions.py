@@ -9,18 +9,15 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from pfbench.files.atomic_write import set_aside
 from pfbench.results import store
 from pfbench.results.inputs import describe_older, select_newest_inputs
-from pfbench.results.job_labels import (
-    flatten_settings,
-    list_data_settings,
-    list_differing,
-    make_distinct_label,
-    name_data,
-)
 from pfbench.results.joined_runs import find_consecutive_parts, join_metadata, read_joined
 from pfbench.results.step_times import STEP_TIME, add_step_times
+from pfbench.results.store import DATA_FOLDERS
+from pfbench.stats.study_runs import natural_sort_key
 
 log = logging.getLogger("pfbench")
 
@@ -181,12 +178,6 @@ def unlabelled_settings(jobs: Sequence[JobFile]) -> list[str]:
     return [name for name in differing if not all(f"{name}=" in job.label for job in jobs)]
 
 
-def natural_sort_key(text: str) -> list[tuple[int, int, str]]:
-    """Return a sorting key that puts 400 before 1600."""
-    parts = re.split(r"(\d+)", text)
-    return [(0, int(text), "") if text.isdigit() else (1, 0, text) for text in parts]
-
-
 def _condition_key(meta: Mapping[str, Any]) -> tuple[str, str, str]:
     """Return scenario, noise and model of a job."""
     choices = meta["choices"]
@@ -254,3 +245,173 @@ def _no_results_message(study: str, results: Path) -> str:
         f"Studies with results in {results}: {', '.join(list_stored_studies(results)) or 'none'}."
     )
     return f"{folder} must hold results, got none{failed}. {available} Run its jobs: pfbench run study={study} ..."
+
+
+# --------------------------------------------------------------------------------------------------
+# Labels of jobs: the name of a filter with the settings in which jobs of that filter differ.
+
+_DATA_SETTINGS = ("scenario", "noise")  # settings that decide the data of a filter
+_NOT_DATA = "scenario.paper."  # names and thresholds
+_WORDS = "filter.paper."  # names of a filter, which differ with the world of its tuning
+_LOCATION_SETTINGS = ("scenario.cache_dir", *DATA_FOLDERS)  # settings that do not
+
+
+def parse_label(label: str) -> tuple[str, dict[str, str]]:
+    """Split a label into its name and its settings.
+
+    Args:
+        label: Label such as "sir" or "sir[particles=100]", or the name of a scenario with settings.
+
+    Returns:
+        Name, and values as text by setting.
+    """
+    name, _, text = label.partition("[")
+    pairs = re.split(r",(?=[\w.]+=)", text.removesuffix("]")) if text else []
+    return name, {key: value for key, _, value in (pair.partition("=") for pair in pairs)}
+
+
+def make_distinct_label(meta: Mapping[str, Any], twins: Sequence[Mapping[str, Any]]) -> str:
+    """Extend a label by the settings in which jobs of that label differ.
+
+    Settings of the filter alone are used if they suffice.
+
+    Args:
+        meta: Metadata of a job.
+        twins: Metadata of all jobs of the same label in its condition.
+    """
+    if len(twins) == 1:
+        return str(meta["label"])
+    flat = [flatten_settings(twin["config"]) for twin in twins]
+    names = [name for name in list_differing(flat) if not name.startswith(_WORDS)]
+    of_filter = [name for name in names if name.startswith("filter.")]
+    if len({tuple(repr(config.get(name)) for name in of_filter) for config in flat}) == len(flat):
+        names = of_filter
+    text = _format_settings(meta, names, "filter.")
+    return f"{meta['label']}[{text or meta['key']}]"
+
+
+def list_data_settings(metadata: Sequence[Mapping[str, Any]]) -> list[str]:
+    """List the settings of scenario and noise in which jobs of one filter differ.
+
+    Args:
+        metadata: Metadata of the jobs of a scenario, noise regime and model.
+    """
+    by_label: dict[str, list[dict[str, Any]]] = {}
+    for meta in metadata:
+        config = {name: meta["config"].get(name) for name in _DATA_SETTINGS}
+        by_label.setdefault(str(meta["label"]), []).append(flatten_settings(config))
+    names = {name for twins in by_label.values() for name in list_differing(twins)}
+    return sorted(name for name in names if not name.startswith(_NOT_DATA))
+
+
+def name_data(meta: Mapping[str, Any], settings: Sequence[str]) -> tuple[str, str]:
+    """Return the names of scenario and noise regime of a job, with settings of its data.
+
+    Args:
+        meta: Metadata of the job.
+        settings: Names of `list_data_settings`.
+    """
+    names = []
+    for group in _DATA_SETTINGS:
+        of_group = [name for name in settings if name.partition(".")[0] == group]
+        text = _format_settings(meta, of_group, f"{group}.")
+        name = str(meta["choices"][group])
+        names.append(f"{name}[{text}]" if text else name)
+    return names[0], names[1]
+
+
+def list_differing(configs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """List the settings in which flat configurations differ, without locations.
+
+    Args:
+        configs: Configurations of `flatten_settings`.
+    """
+    names = sorted(set().union(*configs) - set(_LOCATION_SETTINGS))
+    return [name for name in names if len({repr(config.get(name)) for config in configs}) > 1]
+
+
+def flatten_settings(config: Any, path: str = "") -> dict[str, Any]:
+    """Flatten a configuration to dotted names; stages of a filter are numbered.
+
+    Args:
+        config: Node of a configuration.
+        path: Name of the node, empty for the whole.
+    """
+    if isinstance(config, list) and any(isinstance(stage, Mapping) for stage in config):
+        config = dict(enumerate(config))
+    if not isinstance(config, Mapping):
+        return {path: config}
+    return {
+        key: value
+        for name, below in config.items()
+        for key, value in flatten_settings(below, f"{path}.{name}" if path else str(name)).items()
+    }
+
+
+def _format_settings(meta: Mapping[str, Any], names: Sequence[str], prefix: str) -> str:
+    """Format settings of a job; a class is written without its module."""
+    config = flatten_settings(meta["config"]) if names else {}
+    texts = []
+    for name in names:
+        value, key = config.get(name, "-"), name.removeprefix(prefix)
+        if key.endswith("_target_"):
+            key = key.removesuffix("._target_")
+            value = str(value).rpartition(".")[2]
+        texts.append(f"{key}={value}")
+    return ",".join(texts)
+
+
+# --------------------------------------------------------------------------------------------------
+# Groups of state components that have a common unit, and the units shown to readers.
+
+# The only conversion from SI to displayed units: displayed unit and factor.
+_DISPLAY_UNITS = {
+    "rad": ("arcmin", 60 * 180 / np.pi),
+    "rad/s": ("deg/h", 3600 * 180 / np.pi),
+    "m/s^2": ("mg", 1e3 / 9.80665),
+}
+
+
+class ComponentGroup(NamedTuple):
+    """Components of one unit, whose error has a norm.
+
+    Attributes:
+        group: Name. A group of mixed units is divided by unit, as "clock [m]" and "clock [m/s]".
+        state_group: Group of the state that it is or belongs to; NEES refers to it.
+        places: Indices of the components in the state.
+        components: Names of the components.
+        unit: Displayed unit.
+        scale: Factor from SI to the displayed unit.
+    """
+
+    group: str
+    state_group: str
+    places: list[int]
+    components: list[str]
+    unit: str
+    scale: float
+
+
+def component_groups(state: Mapping[str, Any]) -> list[ComponentGroup]:
+    """List the groups of a state, `meta["state"]`, in displayed units."""
+    groups = []
+    for group, index in state["groups"].items():
+        units = [state["units"][i] for i in index]
+        for unit in dict.fromkeys(units):
+            indices = [i for i in index if state["units"][i] == unit]
+            display, scale = _DISPLAY_UNITS.get(unit, (unit, 1.0))
+            name = group if len(set(units)) == 1 else f"{group} [{display or '1'}]"
+            names = [state["names"][i] for i in indices]
+            groups.append(ComponentGroup(name, group, indices, names, display, scale))
+    return groups
+
+
+def select_main_group(groups: Sequence[str]) -> str:
+    """Return the position, or the first group, or an empty name."""
+    return "position" if "position" in groups else groups[0] if groups else ""
+
+
+def main_component_group(state: Mapping[str, Any]) -> ComponentGroup:
+    """Return the group of the headline: position if there is one, else the first of one unit."""
+    groups = {group.group: group for group in component_groups(state)}
+    return groups[select_main_group(list(groups))]

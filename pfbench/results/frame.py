@@ -11,10 +11,15 @@ import numpy as np
 import pandas as pd
 
 from pfbench.results import metrics, status, store
-from pfbench.results.conditions import Condition, JobFile, load_conditions
-from pfbench.results.error_measures import convergence_time
-from pfbench.results.state_groups import component_groups, main_component_group
-from pfbench.results.study_decisions.independent_runs import select_independent_runs
+from pfbench.results.conditions import (
+    Condition,
+    JobFile,
+    component_groups,
+    load_conditions,
+    main_component_group,
+)
+from pfbench.stats.error_measures import convergence_time
+from pfbench.stats.run_dependence import select_independent_runs
 
 log = logging.getLogger("pfbench")
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from pfbench.results import status
-from pfbench.results.error_measures import Array
-from pfbench.results.state_groups import main_component_group
+from pfbench.results.conditions import main_component_group
+from pfbench.stats.error_measures import Array
 
 
 def main_rmse(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> float:

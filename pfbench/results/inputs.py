@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pfbench.results.config_key import PLACE_SETTINGS, Inputs, compute_config_key
+from pfbench.results.store import PLACE_SETTINGS, Inputs, compute_config_key
 
 Item = tuple[Path, dict[str, Any]]  # file and metadata of a job
 _OF_DATA = ("scenario", "noise", "model")  # groups whose inputs all filters of a condition share

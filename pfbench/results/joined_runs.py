@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pfbench.results import store
-from pfbench.results.config_key import PLACE_SETTINGS, compute_config_key
+from pfbench.results.store import PLACE_SETTINGS, compute_config_key
 
 _SHARED = ("time", "pcrb", "range", "score_steps")  # arrays without an axis of runs
 _EQUAL = ("time", "range", "score_steps")  # of all parts

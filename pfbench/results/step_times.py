@@ -14,10 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pfbench.files.atomic_write import write_atomically
-from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
-from pfbench.results.error_measures import Array
-from pfbench.results.statistics.world_effects import EffectEstimate
+from pfbench.files.atomic_write import DIGEST, has_valid_digest, hash_content, write_atomically
+from pfbench.stats.effects import EffectEstimate
+from pfbench.stats.error_measures import Array
 
 STEP_TIMES = "step_times.json"
 STEP_TIME = "step_time"  # of the metadata of a job

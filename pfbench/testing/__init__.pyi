@@ -1,23 +1,23 @@
 """Public names of `pfbench.testing` and the modules that define them."""
 
-from pfbench.testing.averages import (
-    check_convergence as check_convergence,
-    check_evidence as check_evidence,
-    filter_record as filter_record,
-)
 from pfbench.testing.filters import (
     check_bounded_weights as check_bounded_weights,
     check_causality as check_causality,
+    check_convergence as check_convergence,
+    check_evidence as check_evidence,
     check_filter as check_filter,
     check_independence as check_independence,
+    filter_record as filter_record,
 )
-from pfbench.testing.jacobians import check_jacobians as check_jacobians
+from pfbench.testing.models import (
+    check_jacobians as check_jacobians,
+    check_proposal as check_proposal,
+)
 from pfbench.testing.moves import (
     PathPosterior as PathPosterior,
     check_move as check_move,
     simulate_path_posterior as simulate_path_posterior,
 )
-from pfbench.testing.proposals import check_proposal as check_proposal
 from pfbench.testing.reference import (
     FilterMoments as FilterMoments,
     KalmanResult as KalmanResult,

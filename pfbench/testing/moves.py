@@ -14,11 +14,16 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.files.table_file import Array
 from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.moves.metropolis import McmcKernel, MetropolisHastings, Move
-from pfbench.filter.moves.path_history import PathHistory
+from pfbench.filter.moves.metropolis import McmcKernel, MetropolisHastings, Move, PathHistory
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.testing.results import LawCheck, check_p_values
-from pfbench.testing.subjects import check_count, compute_twice, describe_subject, find_kind
+from pfbench.testing.results import (
+    LawCheck,
+    check_count,
+    check_p_values,
+    compute_twice,
+    describe_subject,
+    find_kind,
+)
 
 STEPS = 10  # so 11 states of 2 components
 PATH_SIZE = 2 * (STEPS + 1)

@@ -15,8 +15,7 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.particle.resampling import EssResampler, Resampler, ResamplingScheme
 from pfbench.model.linear_gaussian import local_level
-from pfbench.testing.results import LawCheck, check_p_values
-from pfbench.testing.subjects import check_count, compute_twice, find_kind
+from pfbench.testing.results import LawCheck, check_count, check_p_values, compute_twice, find_kind
 
 _STATEMENT = "a resampler gives each particle its weight on average"
 _KINDS = {

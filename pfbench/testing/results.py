@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
+import torch
+from torch import Tensor
+
+from pfbench.core.parameter_checks import check_whole_number
 from pfbench.files.table_file import Array
+from pfbench.filter.input_check import check_is_filter
+from pfbench.model.base import StateSpaceModel
 
 
 class LawCheck(NamedTuple):
@@ -86,3 +93,163 @@ def check_p_values(
         f"{statement}: p = {smallest:.2g} for {name}{numbers}. The limit is {limit:g}"
     )
     return LawCheck(statement, smallest, limit, details=dict(details))
+
+
+# --------------------------------------------------------------------------------------------------
+# Checks of what a test receives: an object of the right kind, whose results can be repeated.
+
+
+def find_kind(
+    tester: str, stage: object, kinds: Mapping[str, tuple[str, ...]], example: str
+) -> str:
+    """Return the kind of a stage, by the arguments of its call.
+
+    Args:
+        tester: Name of the function that tests the stage.
+        stage: Stage of a user.
+        kinds: Arguments of the call, by kind.
+        example: Python code of a stage, for the message.
+
+    Returns:
+        The first kind whose arguments the call takes.
+
+    Raises:
+        ValueError: If the stage is a class, or if its call takes the arguments of no kind.
+    """
+    if callable(stage) and not isinstance(stage, type):
+        for kind, arguments in kinds.items():
+            if takes_arguments(stage, len(arguments)):
+                return kind
+    expected = " or ".join(
+        f"a {kind}, called with ({', '.join(arguments)})" for kind, arguments in kinds.items()
+    )
+    raise ValueError(f"{tester}: stage must be {expected}, got {describe_subject(stage, example)}")
+
+
+def describe_subject(item: object, example: str) -> str:
+    """Return what a test received, with the remedy.
+
+    Args:
+        item: Object that is not of the right kind.
+        example: Python code of an object that is.
+
+    Returns:
+        End of a message, two sentences.
+    """
+    if isinstance(item, type):
+        return f"the class {item.__name__}. Pass an instance, such as {example}."
+    if _is_filter(item):
+        return f"the filter {type(item).__name__}. Test a whole filter by check_filter."
+    text = repr(item) if isinstance(item, str | int | float | None) else type(item).__name__
+    return f"{text}. Pass an instance, such as {example}."
+
+
+def check_subject(tester: str, method: object, model: object, y: object, dimensions: str) -> None:
+    """Check the types of a filter, its model and the measurements.
+
+    Args:
+        tester: Name of the function that tests the filter.
+        method: Filter.
+        model: State-space model, or None.
+        y: Measurements, or None.
+        dimensions: Axes of the measurements, such as `R, T, Dy`.
+
+    Raises:
+        ValueError: If one of them is of another type, or has another number of axes.
+    """
+    check_is_filter(method)
+    if model is not None:
+        check_is_model(tester, model)
+    axes = len(dimensions.split(","))
+    if y is not None and not (isinstance(y, Tensor) and y.dim() == axes):
+        got = f"shape {list(y.shape)}" if isinstance(y, Tensor) else type(y).__name__
+        raise ValueError(
+            f"{tester}: y must be a tensor [{dimensions}], got {got}. Mark a missing component "
+            "as NaN."
+        )
+
+
+def check_is_model(tester: str, model: object) -> None:
+    """Check that a model is an instance of `StateSpaceModel`.
+
+    Args:
+        tester: Name of the function that uses the model.
+        model: Model.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    if not isinstance(model, StateSpaceModel):
+        got = describe_subject(model, "linear_walk(1.0, 0.5, 1.0)")
+        raise ValueError(f"{tester}: model must be a StateSpaceModel, got {got}")
+
+
+def check_count(tester: str, least: int = 1, **counts: object) -> None:
+    """Check numbers of runs, particles or paths.
+
+    Args:
+        tester: Name of the function.
+        least: Smallest number.
+        **counts: Numbers by the name of the argument.
+
+    Raises:
+        ValueError: If a number is not whole or is too small.
+    """
+    for name, value in counts.items():
+        check_whole_number(f"{tester}: {name}", value, least, "Choose a larger one.")
+
+
+def compute_twice(
+    subject: str, compute: Callable[[], Any], values: Callable[[Any], Mapping[str, Any]]
+) -> Any:
+    """Return a result that is computed twice with the same inputs and the same random stream.
+
+    Args:
+        subject: What computes the result, for the message.
+        compute: Function without arguments.
+        values: Function from a result to its tensors or arrays by name.
+
+    Returns:
+        The first result.
+
+    Raises:
+        AssertionError: If the results differ.
+    """
+    first, second = compute(), compute()
+    later = values(second)
+    for name, value in values(first).items():
+        old, new = (torch.as_tensor(a).nan_to_num() for a in (value, later[name]))
+        is_same = old.shape == new.shape and torch.equal(old, new)
+        assert is_same, (
+            f"a {subject} is repeatable: the {name} must be the same in a second call with the same "
+            "inputs and random stream, got others. This one is not repeatable. Draw all random "
+            "numbers from `draws`, not from torch, NumPy or random, and keep no state between calls"
+        )
+    return first
+
+
+def takes_arguments(stage: Callable[..., object], count: int) -> bool:
+    """Return whether a call takes a number of positional arguments.
+
+    Args:
+        stage: Object that can be called.
+        count: Number of arguments.
+
+    Returns:
+        True for a built-in function, which states no arguments.
+    """
+    try:
+        inspect.signature(stage).bind(*range(count))
+    except ValueError:
+        return True
+    except TypeError:
+        return False
+    return True
+
+
+def _is_filter(item: object) -> bool:
+    try:
+        check_is_filter(item)
+    except ValueError:
+        return False
+    return True

@@ -15,9 +15,9 @@ from scipy import stats
 
 from pfbench import job
 from pfbench.cli.compose import read_sweep
-from pfbench.report.board.decided_parts import StudyFacts
-from pfbench.report.looks import find_looks
+from pfbench.report.board.pack import StudyFacts
 from pfbench.report.options import ReportOptions
+from pfbench.results.looks import find_looks
 
 sys.path.insert(0, str(ROOT / "docs"))  # scripts, not a package
 import recorded_wins

@@ -11,11 +11,9 @@ import pytest
 from scipy import stats
 
 from pfbench import job
-from pfbench.claims import claim_samples, verdicts
-from pfbench.claims.choices import list_choices
-from pfbench.claims.claim_records import read_claims
-from pfbench.claims.schema import Claim, ClaimTest
-from pfbench.results.statistics.intervals import order_statistic_interval
+from pfbench.claims import verdicts, verdicts as claim_samples
+from pfbench.claims.claim_records import Claim, ClaimTest, list_choices, read_claims
+from pfbench.stats.intervals import order_statistic_interval
 
 CONF, STUDIES = job.conf_dir(), job.experiments_dir()
 LESS = ClaimTest("less", "s", "flight/surge/ins_gnss", "rmse", "a", "b", group="position")

@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 from synthetic_results import METHODS, write
 
-from pfbench.claims import figures, page
-from pfbench.claims.schema import Claim, ClaimTest
+from pfbench.claims import page, page as figures
+from pfbench.claims.claim_records import Claim, ClaimTest
 
 CELL = "flight/surge/ins_gnss"
 TEST = ClaimTest("less", "one", CELL, "rmse", "cofm_amssrcpf", "ekf", group="position")

@@ -13,8 +13,8 @@ from command_line import pfbench
 
 from pfbench import job
 from pfbench.cli import messages
-from pfbench.config.composition import compose
-from pfbench.config.trust import split_trust
+from pfbench.job.config import compose
+from pfbench.job.trust import split_trust
 from pfbench.results import store
 
 WALK = ("scenario=linear_walk", "scenario.steps=5", "runs=2", "particles=20")

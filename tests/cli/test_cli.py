@@ -175,8 +175,8 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("noise.probability must be between 0 and 1, got 2",),
     ),
     "no such class": (
-        ("noise._target_=pfbench.noise.white.Louder",),
-        ("noise._target_ must be a public class of pfbench", "got 'pfbench.noise.white.Louder'"),
+        ("noise._target_=pfbench.noise.base.Louder",),
+        ("noise._target_ must be a public class of pfbench", "got 'pfbench.noise.base.Louder'"),
     ),
     "a model without its scenario": (
         ("model=ins_gnss",),

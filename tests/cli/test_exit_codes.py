@@ -14,7 +14,7 @@ from command_line import pfbench
 
 from pfbench import job
 from pfbench.cli import list as list_command
-from pfbench.files.work_start import has_work_started, reset_work, start_work
+from pfbench.files.command_start import has_work_started, reset_work, start_work
 from pfbench.results import store
 
 WALK = ("scenario=linear_walk", "scenario.steps=5", "runs=2")

@@ -20,7 +20,7 @@ from command_line import environment, pfbench, processes_of
 from pfbench.cli import list as list_command
 from pfbench.cli.main import main
 from pfbench.cli.terminal import LastingOutput, SignalStop, stopped_by_signals
-from pfbench.files.work_start import reset_work, start_work
+from pfbench.files.command_start import reset_work, start_work
 
 WALK = ("scenario=linear_walk", "scenario.steps=5", "runs=2")
 

@@ -15,11 +15,10 @@ import torch
 from command_line import Said, pfbench
 
 from pfbench.cli import list as list_command
-from pfbench.cli.messages import format_error
-from pfbench.cli.unknown_errors import describe_unknown, is_named
-from pfbench.config.trust import check_study
-from pfbench.results.conditions import natural_sort_key
-from pfbench.results.job_labels import parse_label
+from pfbench.cli.messages import describe_unknown, format_error, is_named
+from pfbench.job.trust import check_study
+from pfbench.results.conditions import parse_label
+from pfbench.stats.study_runs import natural_sort_key
 
 SENTENCE = re.compile(r"error (\w+): \S.* (must|is not|does not|exists already)\b.*[^\s:]$")
 DEMO = ("study=demo", "report.figure_formats=[svg]")

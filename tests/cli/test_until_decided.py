@@ -13,10 +13,9 @@ from command_line import Said, pfbench
 import pfbench as package
 from pfbench.report.options import ReportOptions
 from pfbench.results import store
-from pfbench.results.decisions.growing_study import decide_at_looks
-from pfbench.results.decisions.tidy_table import tidy_runs
-from pfbench.results.statistics.sequential_looks import LookPlan
-from pfbench.results.until_decided.look_table import LookMetric, read_look_table
+from pfbench.results.look_table import LookMetric, read_look_table
+from pfbench.stats.sequential_looks import LookPlan, decide_at_looks
+from pfbench.stats.study_runs import tidy_runs
 
 STUDY = ("scenario=linear_walk", "scenario.steps=12", "particles=60", "pcrb=false", "score_steps=0")
 SWEEP = ("run", "-m", *STUDY, "filter=ekf,sir,rpf")

@@ -12,8 +12,8 @@ import pytest
 from command_line import environment, pfbench
 
 from pfbench import job
-from pfbench.config.sweep_check import replace_config_dir
-from pfbench.config.trust import UntrustedConfigError
+from pfbench.cli.compose import replace_config_dir
+from pfbench.job.trust import UntrustedConfigError
 
 NOISE = "_target_: pfbench.noise.NominalNoise\n"
 SWEEP = "# @package _global_\nhydra:\n  sweeper:\n    params:\n      "

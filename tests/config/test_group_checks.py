@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pfbench import job
-from pfbench.results.config_key import compute_config_key
+from pfbench.results.store import compute_config_key
 
 NOMINAL = "_target_: pfbench.noise.NominalNoise\n"
 CLASS = "noise must be keys and values with the key _target_"

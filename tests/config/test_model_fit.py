@@ -18,14 +18,13 @@ from recorded_data import DATA
 from torch import Tensor
 
 from pfbench import job
-from pfbench.cli.compose import read_sweep
-from pfbench.config.composition import compose_tree
-from pfbench.config.model_fit import is_fitting, list_fitting_models, list_fitting_scenarios
-from pfbench.config.sweep_check import expand_sweep
+from pfbench.cli.compose import expand_sweep, read_sweep
 from pfbench.core.channels import describe_misfit
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record
 from pfbench.filter import CubaturePoints, GaussianFilter, SigmaPointLinearisation, run_filter
+from pfbench.job.config import compose_tree
+from pfbench.job.model_fit import is_fitting, list_fitting_models, list_fitting_scenarios
 from pfbench.model import LinearGaussian, Pendulum
 from pfbench.noise import NominalNoise
 from pfbench.scenario import ModelSimulation

@@ -21,12 +21,12 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf, _utils
 
 from pfbench import job
+from pfbench.cli import application
 from pfbench.cli.check import _matching_scenario
-from pfbench.cli.sweep import application
-from pfbench.config import shared_loader
-from pfbench.config.composition import list_groups
-from pfbench.files import rare_collections
-from pfbench.files.work_start import reset_work, start_work
+from pfbench.files import command_start
+from pfbench.files.command_start import reset_work, start_work
+from pfbench.job import shared_loader
+from pfbench.job.config import list_groups
 
 GROUPS = list_groups()
 
@@ -210,11 +210,11 @@ def test_garbage_is_collected_as_usual_once_work_starts() -> None:
     usual = gc.get_threshold()
     reset_work()
     reset_work()
-    assert gc.get_threshold()[0] == rare_collections._YOUNG_OBJECTS > usual[0]
+    assert gc.get_threshold()[0] == command_start._YOUNG_OBJECTS > usual[0]
     start_work()
     assert gc.get_threshold() == usual
     start_work()
     assert gc.get_threshold() == usual
     reset_work()
-    rare_collections.collect_as_usual()
+    command_start.collect_as_usual()
     assert gc.get_threshold() == usual

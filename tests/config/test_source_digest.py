@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from pfbench.config.source_digest import hash_user_code
 from pfbench.job import job_key
+from pfbench.job.trust import hash_user_code
 
 FILES = {
     "codelab/__init__.py": "",

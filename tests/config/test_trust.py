@@ -11,11 +11,11 @@ from hostile_cases import COMMANDS, FILES, GROUPS, NODES, text_of, try_file
 from omegaconf import OmegaConf
 
 from pfbench import job
-from pfbench.config import trust
-from pfbench.config.composition import compose_tree
-from pfbench.config.protected_keys import check_composed
-from pfbench.config.sweep_check import check_words
-from pfbench.config.trust import UntrustedConfigError
+from pfbench.cli.compose import check_words
+from pfbench.job import trust
+from pfbench.job.config import compose_tree
+from pfbench.job.file_rules import check_composed
+from pfbench.job.trust import UntrustedConfigError
 
 
 def refuse_to_compose(folder: Path, group: str, text: str) -> None:

@@ -29,8 +29,8 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.particle_moments import compute_nis
 from pfbench.model.base import StateSpaceModel, StaticModel
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.simulated import ModelSimulation
 
 
 def f64(values: Any) -> Tensor:

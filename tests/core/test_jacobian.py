@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from pfbench.core import jacobian as jacobian_module
-from pfbench.core.jacobian import jacobian
+from pfbench.core import linear_algebra as jacobian_module
+from pfbench.core.linear_algebra import jacobian
 
 R, D = 3, 4
 AT = torch.linspace(0.3, 1.7, R * D, dtype=torch.float64).view(R, 1, D)

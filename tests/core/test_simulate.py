@@ -27,16 +27,14 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import draw_noise
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import linear_walk
-from pfbench.model.nonlinear_dynamics import Pendulum
-from pfbench.noise.outage import MeasurementOutage
-from pfbench.noise.time_varying import VarianceSurge
-from pfbench.noise.white import NominalNoise, OutlierNoise
+from pfbench.model.textbook import Pendulum
+from pfbench.noise.base import NominalNoise, OutlierNoise
+from pfbench.noise.time_windows import MeasurementOutage, VarianceSurge
 from pfbench.ppl.model_batch import ModelBatch
 from pfbench.ppl.parameterised_model import ParameterisedModel
-from pfbench.ppl.prior_predictive import simulate
-from pfbench.ppl.pyro_program import latent_program
-from pfbench.scenario.model_simulation import ModelSimulation
-from pfbench.scenario.recording_regime import RecordingRegime
+from pfbench.ppl.pyro_program import latent_program, simulate
+from pfbench.scenario.oracle_noise import RecordingRegime
+from pfbench.scenario.simulated import ModelSimulation
 
 RUNS = 20_000
 

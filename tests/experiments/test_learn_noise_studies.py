@@ -14,7 +14,7 @@ import torch
 from pfbench.experiments import learn_canyon_noise, learn_quad_noise
 from recorded_data import recorded
 
-from pfbench.model.pseudorange_errors import LosNlosRangeError, NormalRangeError
+from pfbench.model.urban_gnss import LosNlosRangeError, NormalRangeError
 from pfbench.ppl.parameter_posterior import ParameterPosterior
 
 LAWS = {

@@ -16,12 +16,12 @@ import torch
 from faults.children import run_child
 from faults.sweeps import CLEAR, result_files, run_sweep
 from faults.tally import FINE, Tally
-from pfbench.files.digest import hash_content
+from pfbench.files.atomic_write import hash_content
 from pfbench.filter.learned.checkpoint import hash_weights, read_checkpoint, write_checkpoint
 from pfbench.job import run_job
-from pfbench.job.resumable import ResumableResults
+from pfbench.job.run_job import ResumableResults
 from pfbench.results import conditions, store
-from pfbench.scenario import episode_cache
+from pfbench.scenario import simulated
 
 SWAPS = 0.1  # of the trials
 MEMORY_GIB = 4.0  # of addresses; a damaged size must not fill the machine
@@ -86,7 +86,7 @@ def make_episodes(folder: Path) -> Subject:
     recipes: dict[Path, int] = {}
 
     def load(number: int) -> dict[str, torch.Tensor]:
-        return episode_cache.load_or_build(folder, f"recipe {number}", partial(build, number))
+        return simulated.load_or_build(folder, f"recipe {number}", partial(build, number))
 
     for number in range(2):
         load(number)

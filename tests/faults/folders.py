@@ -30,9 +30,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from faults.tally import FINE, Tally
 from pfbench import job
-from pfbench.config import shared_loader
-from pfbench.config.composition import compose_tree
-from pfbench.config.sweep_check import check_words, expand_sweep, replace_config_dir
+from pfbench.cli.compose import check_words, expand_sweep, replace_config_dir
+from pfbench.job import shared_loader
+from pfbench.job.config import compose_tree
 
 SECRET = "x7secretx7"
 PLACES = (f"/nowhere/{SECRET}", "results", "reports", "worlds", "untrained")

@@ -32,7 +32,7 @@ from faults import (
     storage,
 )
 from faults.tally import Tally
-from pfbench.job.resumable import ResumableResults
+from pfbench.job.run_job import ResumableResults
 
 STORE = ROOT / "results" / "faults"
 

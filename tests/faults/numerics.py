@@ -30,7 +30,7 @@ from pfbench.filter.health import HEALTH
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.kernels import compilation
+from pfbench.kernels import dispatch
 from pfbench.model.linear_gaussian import LinearGaussian
 
 ENGINES = ("eager", "kernels", "compiled")
@@ -117,7 +117,7 @@ def try_case(name: str, case: Extreme, engine: str) -> list[Any]:
         if not isinstance(method, ParticleFilter) or method.history is not None:
             raise ValueError(f"{name} must be a particle filter without moves. Choose another one.")
         method = CompiledParticleFilter(method)
-    context = compilation.use_compiled(engine != "eager")
+    context = dispatch.use_compiled(engine != "eager")
     try:
         with torch.no_grad(), context:
             model = case.build()

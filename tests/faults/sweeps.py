@@ -15,8 +15,8 @@ from command_line import Said, pfbench
 
 from faults.tally import FINE
 from pfbench import job
-from pfbench.config.composition import JobConfig, compose
-from pfbench.files.digest import hash_content
+from pfbench.files.atomic_write import hash_content
+from pfbench.job.config import JobConfig, compose
 from pfbench.results import store
 
 SWEEP = (

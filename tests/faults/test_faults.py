@@ -39,8 +39,8 @@ from faults import (
 )
 from faults.sweeps import new_home, run_jobs, undisturbed
 from faults.tally import BAD, FINE, Tally
-from pfbench.config import shared_loader
 from pfbench.filter.loop import FilterResult
+from pfbench.job import shared_loader
 from pfbench.results import store
 
 SHORT = 25  # files of each kind
@@ -118,7 +118,7 @@ def test_a_writer_that_is_not_atomic_is_reported(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_missing_digest_check_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pfbench.job.resumable.has_valid_digest", lambda _: True)
+    monkeypatch.setattr("pfbench.job.run_job.has_valid_digest", lambda _: True)
     assert damage.run("resumable parts", 4 * SHORT, 7).counts["false"] > 0
 
 
@@ -141,7 +141,7 @@ def test_a_file_that_a_configuration_makes_is_reported(monkeypatch: pytest.Monke
 
 def plant_no_check(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("check_content", "check_defaults", "check_group", "check_place", "check_composed"):
-        monkeypatch.setattr(f"pfbench.config.shared_loader.{name}", lambda *_, **__: None)
+        monkeypatch.setattr(f"pfbench.job.shared_loader.{name}", lambda *_, **__: None)
     monkeypatch.setattr(folders, "LIMIT_S", 2)  # of a sweep that has no end
 
 
@@ -149,7 +149,7 @@ def plant_follows_links(monkeypatch: pytest.MonkeyPatch) -> None:
     def is_kind(root: Path, name: str, kind: int) -> bool:
         return (root / name).exists() and stat.S_IFMT((root / name).stat().st_mode) == kind
 
-    monkeypatch.setattr("pfbench.config.foreign_folder._is_kind", is_kind)
+    monkeypatch.setattr("pfbench.job.shared_loader._is_kind", is_kind)
     monkeypatch.setattr("os.O_NOFOLLOW", 0)
 
 
@@ -161,7 +161,7 @@ def plant_shadows(monkeypatch: pytest.MonkeyPatch) -> None:
     def find(self: Any, config_path: str) -> Any:
         return next((s for s in self.delegate.sources if s.is_config(config_path)), None)
 
-    monkeypatch.setattr("pfbench.config.shared_loader._SharedRepository._find_source", find)
+    monkeypatch.setattr("pfbench.job.shared_loader._SharedRepository._find_source", find)
 
 
 def plant_python_tags(monkeypatch: pytest.MonkeyPatch) -> None:

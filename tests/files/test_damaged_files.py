@@ -15,12 +15,17 @@ import pytest
 import torch
 from command_line import pfbench
 
-from pfbench.files.atomic_write import set_aside, write_atomically
-from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
+from pfbench.files.atomic_write import (
+    DIGEST,
+    has_valid_digest,
+    hash_content,
+    set_aside,
+    write_atomically,
+)
 from pfbench.filter.learned import checkpoint
-from pfbench.job.resumable import ResumableResults
+from pfbench.job.run_job import ResumableResults
 from pfbench.results import store
-from pfbench.scenario import episode_cache
+from pfbench.scenario import simulated
 
 TRIALS = 300  # of each kind of file
 WALK = ("scenario=linear_walk", "scenario.steps=5", "filter=ekf", "runs=2")
@@ -89,7 +94,7 @@ def test_damaged_episodes_are_built_again(tmp_path: Path, caplog: pytest.LogCapt
     builds = []
 
     def read() -> dict[str, torch.Tensor]:
-        return episode_cache.load_or_build(tmp_path, "recipe", lambda: builds.append(1) or expected)
+        return simulated.load_or_build(tmp_path, "recipe", lambda: builds.append(1) or expected)
 
     read()
     (path,) = tmp_path.glob("*.npz")

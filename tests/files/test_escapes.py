@@ -18,7 +18,7 @@ from pfbench.files.escapes import (
     escape_latex,
     escape_markdown,
 )
-from pfbench.report import table_formats
+from pfbench.report import writers
 
 PLAIN = ("sir", "cofm_amssrcpf", "sir[ess_threshold=0.5]", "3-D position [m]", "a, b: 1.5", "−12 %")
 
@@ -41,7 +41,7 @@ def test_no_text_of_a_csv_file_is_a_formula(text: str) -> None:
     assert escape_csv(text) == escaped
     assert escape_csv(f"a{text}").count("\r") == 0  # a line break in a text would start a row
     table = pd.DataFrame({text: [text, "a"], "number": [-1.5, 2.0]})
-    rows = list(csv.reader(io.StringIO(table_formats.format_csv(table), newline="")))
+    rows = list(csv.reader(io.StringIO(writers.format_csv(table), newline="")))
     assert rows[:2] == [[escaped, "number"], [escaped, "-1.5"]]
 
 
@@ -116,9 +116,9 @@ def test_html_gives_the_text_back_in_content_and_attributes(text: str) -> None:
 @pytest.mark.parametrize(
     ("write", "pattern"),
     [
-        (table_formats.format_html, r"<b>"),
-        (table_formats.format_markdown, r"<b>|(?<!\\)\|x"),
-        (table_formats.format_latex, r"(?<!\\)[_&]x"),
+        (writers.format_html, r"<b>"),
+        (writers.format_markdown, r"<b>|(?<!\\)\|x"),
+        (writers.format_latex, r"(?<!\\)[_&]x"),
     ],
 )
 def test_tables_escape_names_of_columns_and_cells(

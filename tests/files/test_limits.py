@@ -19,9 +19,9 @@ from pyarrow import parquet
 from pfbench.files import limits
 from pfbench.files.table_file import read_table_file
 from pfbench.filter.learned.checkpoint import read_checkpoint
-from pfbench.report.stored_page import PAGE_DATA, read_page_data
+from pfbench.report.study_report import PAGE_DATA, read_page_data
 from pfbench.results.store import read_metadata, read_result
-from pfbench.scenario.episode_cache import _read
+from pfbench.scenario.simulated import _read
 
 
 def write_zip(path: Path) -> None:

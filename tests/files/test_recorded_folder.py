@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 from checkout import ROOT
 
-from pfbench.files.atomic_write import remove_temporary_files
-from pfbench.files.digest import DIGEST, hash_content
+from pfbench.files.atomic_write import DIGEST, hash_content, remove_temporary_files
 from pfbench.files.recorded_folder import MANIFEST, RecordedFolder
 
 OLD = {"page.md": "old page", "figures/a.svg": "a", "figures/b.svg": "b", "tables/t.csv": "1"}
@@ -246,7 +245,7 @@ REMOVALS = {
     "files/recorded_folder.py": 1,
     "results/store.py": 2,  # a damaged result, and the note of a failure of earlier inputs
     "learn/training_job.py": 2,
-    "cli/sweep/sweep_progress.py": 2,  # its own log, and the folder of the study if it is empty
+    "cli/run.py": 2,  # its own log, and the folder of the study if it is empty
 }
 
 

@@ -17,11 +17,11 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import StepInfo
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle import compiled_step
+from pfbench.filter.particle import compiled_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.swarm.swarm_proposal import SwarmProposal
-from pfbench.kernels import compilation
+from pfbench.filter.proposed.swarm import SwarmProposal
+from pfbench.kernels import dispatch
 from pfbench.model.linear_gaussian import LinearGaussian
 
 RUNS, STEPS = 3, 4
@@ -55,7 +55,7 @@ def run(method: Any, compiled: bool, batch: int | None = None) -> FilterResult:
         return {"first": deviations[:, 0, 0], "spread": deviations.square().sum((1, 2))}
 
     draws = PhiloxStream(5, torch.arange(RUNS))
-    with compilation.use_compiled(compiled), torch.no_grad():
+    with dispatch.use_compiled(compiled), torch.no_grad():
         return run_filter(method, tracker(), Record(Y), draws, keep, run_batch=batch)
 
 
@@ -121,9 +121,9 @@ def test_a_recorded_step_computes_what_the_step_as_it_is_computes(
     if name in NAMES and refusal(name, model, record):
         pytest.skip("refuses this model")
     method, draws = small_method_of(name), PhiloxStream(5, torch.arange(len(record.y)))
-    with compilation.use_compiled(), torch.no_grad():
+    with dispatch.use_compiled(), torch.no_grad():
         expected = run_filter(method, model, record, draws)
-        with compilation.capture_graph():
+        with dispatch.capture_graph():
             recorded = run_filter(method, model, record, draws)
     assert_results_agree(recorded, expected)
 
@@ -141,7 +141,7 @@ def test_a_compiled_step_computes_what_the_step_as_it_is_computes(name: str) -> 
     )
     draws = PhiloxStream(5, torch.arange(len(record.y)))
     step = CompiledParticleFilter(method_of(name))
-    with compilation.use_compiled(), torch.no_grad():
+    with dispatch.use_compiled(), torch.no_grad():
         assert_results_agree(
             run_filter(step, model, record, draws), run_filter(step.method, model, record, draws)
         )
@@ -170,10 +170,10 @@ def test_a_compiled_step_with_other_numbers_is_not_used(
 
         return run_step, None
 
-    monkeypatch.setattr(compiled_step, "compile_function", compile_wrongly)
+    monkeypatch.setattr(compiled_filter, "compile_function", compile_wrongly)
     model, step = tracker().to(dtype), CompiledParticleFilter(method_of("sir"))
     draws = PhiloxStream(5, torch.arange(RUNS), dtype)
-    with compilation.use_compiled(), torch.no_grad():
+    with dispatch.use_compiled(), torch.no_grad():
         result = run_filter(step, model, Record(Y.to(dtype)), draws)
         expected = run_filter(step.method, model, Record(Y.to(dtype)), draws)
     assert step.is_active == (fault == "none")

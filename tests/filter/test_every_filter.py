@@ -28,7 +28,7 @@ from pfbench.filter.loop import prepare_record, run_filter
 from pfbench.filter.particle.auxiliary_weights import LookAheadWeights
 from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.swarm.swarm_proposal import SwarmProposal
+from pfbench.filter.proposed.swarm import SwarmProposal
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.testing import (

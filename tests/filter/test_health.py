@@ -18,12 +18,11 @@ from pfbench.filter import (
     Systematic,
     TaylorLinearisation,
 )
-from pfbench.filter.health import HEALTH, HealthMonitor, count_health
+from pfbench.filter.health import HEALTH, HealthMonitor, count_health, fit_pareto_k
 from pfbench.filter.loop import FilterPass, FilterResult, prepare_record, run_filter
-from pfbench.filter.pareto_tail import fit_pareto_k
 from pfbench.model import LinearGaussian, UnivariateGrowth, linear_walk
 from pfbench.noise import NominalNoise
-from pfbench.ppl.prior_predictive import simulate
+from pfbench.ppl.pyro_program import simulate
 from pfbench.results import headline, status
 from pfbench.scenario import ModelSimulation
 

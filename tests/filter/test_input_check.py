@@ -17,11 +17,11 @@ from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import CubaturePoints
 from pfbench.filter.loop import run_filter
-from pfbench.filter.moves.flow_kernels import NoiseFlowStatKernel
 from pfbench.filter.moves.metropolis import MetropolisHastings
+from pfbench.filter.moves.path_kernels import NoiseFlowStatKernel
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.weight_update import BayesWeightUpdate, FlooredWeightUpdate
-from pfbench.kernels import compilation
+from pfbench.kernels import dispatch
 from pfbench.model.base import ModelWrapper
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.noise import NominalNoise
@@ -218,7 +218,7 @@ def test_what_does_not_fit_is_refused_in_every_engine(case: str) -> None:
     model, record, draws, message = WRONG[case]
     for method in (ParticleFilter(20), GaussianFilter(CubaturePoints())):
         for compiled in (False, True):
-            with compilation.use_compiled(compiled), pytest.raises(ValueError, match=message):
+            with dispatch.use_compiled(compiled), pytest.raises(ValueError, match=message):
                 run_filter(method, model, record, draws)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from pfbench.filter.pareto_tail import fit_pareto_k
+from pfbench.filter.health import fit_pareto_k
 
 # ArviZ 0.23.4, `arviz.stats.psislw`, of the weights u^-k, -log u and u with u = (i - 1/2) / n
 ARVIZ = {

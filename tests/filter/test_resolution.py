@@ -16,13 +16,13 @@ from pfbench.filter import (
     SigmaPointLinearisation,
     TaylorLinearisation,
     health,
+    health as module,
     input_check,
-    resolution as module,
 )
 from pfbench.filter.health import HEALTH
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model import LinearGaussian
-from pfbench.ppl.prior_predictive import simulate
+from pfbench.ppl.pyro_program import simulate
 
 RUNS, STEPS = 4, 30
 FILTERS = {

@@ -14,14 +14,13 @@ from command_line import pfbench
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
+from pfbench.filter.particle.resampling import EssResampler, Systematic
 from pfbench.job import budget
 from pfbench.job.scoring import LikelihoodCounter
 from pfbench.model.linear_gaussian import linear_walk
-from pfbench.noise.white import NominalNoise
+from pfbench.noise.base import NominalNoise
 from pfbench.results import store
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.scenario.simulated import ModelSimulation
 
 WALK = (
     "scenario=linear_walk",

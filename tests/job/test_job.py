@@ -18,7 +18,7 @@ from hydra.errors import InstantiationException
 from pfbench import job
 from pfbench.core.record import Episode, Record
 from pfbench.filter.belief import StepInfo
-from pfbench.job.pcrb_cache import _missing_reason
+from pfbench.job.pcrb import _missing_reason
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.linear_gaussian import linear_walk
 

@@ -15,17 +15,16 @@ import torch
 from command_line import environment, pfbench
 
 from pfbench import job
-from pfbench.config import instantiation
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.job import allocation, instantiate, memory, plan, system_memory
-from pfbench.job.system_memory import GIB, MIB, AllocationCounter
+from pfbench.job import budget, instantiate, memory, memory as system_memory, model_fit, plan
+from pfbench.job.memory import GIB, MIB, AllocationCounter
 from pfbench.model.linear_gaussian import linear_walk
-from pfbench.noise.white import NominalNoise
+from pfbench.noise.base import NominalNoise
 from pfbench.results import store
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.scenario.simulated import ModelSimulation
 
 draw = plan.JobPlan.draw_episode
 MODEL = linear_walk(1.0, 0.3, 1.0)
@@ -213,7 +212,7 @@ def test_a_job_is_instantiated_once_and_drawn_once(
     """Under a budget and a memory limit; if the episodes do not fit together, each batch is drawn once, two for the trial."""
     built, drawn = [], []
     monkeypatch.setattr(
-        instantiation,
+        model_fit,
         "instantiate",
         lambda node, trusted=(): built.append(node._target_) or instantiate(node, trusted),
     )
@@ -259,13 +258,13 @@ def test_a_feedback_process_is_drawn_by_batch() -> None:
             f"scenario.trajectory.segments={SEGMENT}",
         ]
     )
-    source = allocation.EpisodeSource(job.build_plan(config))
+    source = budget.EpisodeSource(job.build_plan(config))
     assert source.joint is not None
     assert source.joint.record.feedback is not None
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(memory, "runs_within_limit", lambda *given, **more: 2)
         patch.setattr(memory, "needs_memory_trial", lambda *given: True)
-        assert allocation.max_runs_in_memory(source.plan, source) == 2
+        assert budget.max_runs_in_memory(source.plan, source) == 2
     assert source.joint is None
     assert len(source.batch(2, 2).record.y) == 1
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from pfbench.config import source_digest
-from pfbench.job.metadata import describe_commit
+from pfbench.job import trust
+from pfbench.job.plan import describe_commit
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
 
@@ -76,10 +76,10 @@ def test_two_wheels_of_other_sources_are_other_builds(
         for file, content in files.items():
             (folder / file).parent.mkdir(parents=True, exist_ok=True)
             (folder / file).write_text(content)
-        monkeypatch.setattr(source_digest, "PACKAGE", folder)
-        monkeypatch.setattr(source_digest, "conf_dir", lambda: folder / "conf")
-        monkeypatch.setattr(source_digest, "experiments_dir", lambda: folder / "experiments")
-        return source_digest.hash_package.__wrapped__()
+        monkeypatch.setattr(trust, "PACKAGE", folder)
+        monkeypatch.setattr(trust, "conf_dir", lambda: folder / "conf")
+        monkeypatch.setattr(trust, "experiments_dir", lambda: folder / "experiments")
+        return trust.hash_package.__wrapped__()
 
     first = build(tmp_path / "one", files)
     assert (build(tmp_path / "two", {**files, name: text}) == first) == is_same

@@ -22,25 +22,23 @@ from pfbench.filter.gaussian.linearisation_rules import (
 )
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
+from pfbench.filter.particle.resampling import EssResampler, Systematic
 from pfbench.job.pcrb import compute_posterior_bound
 from pfbench.model.ins_gnss import InsGnss
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.nonlinear_dynamics import Pendulum
 from pfbench.model.passive_location import PassiveLocation, PlatformInputs, compute_level_attitude
-from pfbench.model.strapdown.total import StrapdownTotal
-from pfbench.model.strapdown.tuning import StrapdownTuning
-from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
+from pfbench.model.strapdown import StrapdownTotal
+from pfbench.model.strapdown_tuning import StrapdownTuning
+from pfbench.model.textbook import Benes, Pendulum, StochasticVolatility, UnivariateGrowth
 from pfbench.nav.aiding import AlignmentErrors, GnssReceiver, ProcessNoiseInflation
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, climb, turn
-from pfbench.nav.preintegration import PreintegratedImu, preintegrate
+from pfbench.nav.strapdown import PreintegratedImu, preintegrate
 from pfbench.nav.trajectory import TrajectoryStart
-from pfbench.noise.outage import MeasurementOutage
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.model_simulation import ModelSimulation
-from pfbench.scenario.simulated_flight import SimulatedFlight
+from pfbench.noise.base import NominalNoise
+from pfbench.noise.time_windows import MeasurementOutage
+from pfbench.scenario.flights import SimulatedFlight
+from pfbench.scenario.simulated import ModelSimulation
 
 WALK = linear_walk(0.5, 0.3, 2.0)
 

@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from pfbench.files.markdown import (
+from pfbench.files.escapes import (
     WIDTH,
     markdown_bullets,
     markdown_head,
     markdown_paragraph,
     markdown_row,
 )
-from pfbench.job.resumable import ResumableResults
+from pfbench.job.run_job import ResumableResults
 from pfbench.ppl.parameter_posterior import ParameterPosterior
 
 

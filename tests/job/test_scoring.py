@@ -23,10 +23,10 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.particle_moments import make_step_info, summarise
 from pfbench.job.scoring import LikelihoodCounter, ScoreRecorder, score_normal, score_particles
-from pfbench.kernels import compilation
+from pfbench.kernels import dispatch
 from pfbench.model.linear_gaussian import linear_walk
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.simulated import ModelSimulation
 
 MODEL = linear_walk(1.0, 0.3, 1.0)
 GROUPS = ((0,), (1,), (0, 1))
@@ -43,7 +43,7 @@ def law(runs: int = 3) -> tuple[Tensor, Tensor]:
 @pytest.fixture(params=[False, True], ids=["eager", "fused"])
 def both(request: pytest.FixtureRequest) -> Iterator[None]:
     """By the library, and by loops of the project's own."""
-    with compilation.use_compiled(request.param):
+    with dispatch.use_compiled(request.param):
         yield
 
 
@@ -225,7 +225,7 @@ def test_a_group_of_a_covariance_is_cut_from_the_whole(
     )
     model: Any = SimpleNamespace(chart=chart)
     for laid in (x.contiguous(), x.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
-        with compilation.use_compiled(fused):
+        with dispatch.use_compiled(fused):
             info = summarise(model, ParticleBelief(laid, log_w, torch.zeros(3, dtype=x.dtype)), {})
             found = info.covariance_of(torch.tensor(parts))
         whole = info.covariance()

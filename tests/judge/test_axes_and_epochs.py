@@ -10,12 +10,12 @@ import pandas as pd
 import pytest
 from scipy.signal import lfilter
 
-from pfbench.judge.axis_checks import check_axes
+from pfbench.judge.alignment import is_in_hole
 from pfbench.judge.block_bootstrap import compare_along_run
-from pfbench.judge.epoch_holes import is_in_hole
+from pfbench.judge.checks import check_axes
+from pfbench.judge.formats import read_trajectories
 from pfbench.judge.judge_options import JudgeOptions, SourceOptions
 from pfbench.judge.judgement import judge_programs
-from pfbench.judge.readers.trajectory_files import read_trajectories
 from pfbench.judge.reference_track import read_reference
 from pfbench.results.store import write_result
 

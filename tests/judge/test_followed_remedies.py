@@ -12,10 +12,9 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pfbench.judge.judge_notes import describe_notes
 from pfbench.judge.judge_options import JudgeOptions, SourceOptions
-from pfbench.judge.judge_tables import tabulate_accuracy
 from pfbench.judge.judgement import judge_programs
+from pfbench.judge.page import describe_notes, tabulate_accuracy
 
 Change = Callable[[pd.DataFrame], pd.DataFrame]
 POSITION, VELOCITY = ["pn", "pe", "pd"], ["vn", "ve", "vd"]

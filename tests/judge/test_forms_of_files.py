@@ -13,9 +13,9 @@ import pytest
 from command_line import pfbench
 from scipy.spatial.transform import Rotation
 
+from pfbench.judge.formats import read_trajectories
 from pfbench.judge.judge_options import SourceOptions
-from pfbench.judge.readers.local_frame import to_north_east_down
-from pfbench.judge.readers.trajectory_files import read_trajectories
+from pfbench.judge.trajectory_table import to_north_east_down
 
 TRUTH = cases.drive(30.0)
 POSITION = TRUTH[["pn", "pe", "pd"]].to_numpy()

@@ -11,8 +11,8 @@ import pytest
 from command_line import pfbench
 
 from pfbench.judge.judge_options import JudgeOptions
-from pfbench.judge.judge_tables import tabulate_accuracy
 from pfbench.judge.judgement import judge_programs
+from pfbench.judge.page import tabulate_accuracy
 
 
 def test_rmse_and_nees_of_known_errors(tmp_path: Path) -> None:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from pfbench.judge.formats import list_trajectory_files, read_trajectories
 from pfbench.judge.judge_options import JudgeOptions, SourceOptions
-from pfbench.judge.readers.local_frame import to_north_east_down
-from pfbench.judge.readers.trajectory_files import list_trajectory_files, read_trajectories
 from pfbench.judge.reference_track import read_reference
+from pfbench.judge.trajectory_table import to_north_east_down
 from pfbench.results.store import write_result
 
 POSITION = ["pn", "pe", "pd"]

@@ -8,18 +8,15 @@ import judge_cases as cases
 import numpy as np
 import pytest
 
-from pfbench.judge.block_decisions import METRIC
-from pfbench.judge.judgement import judge_programs
+from pfbench.judge.judgement import METRIC, judge_programs
 from pfbench.report.options import ReportOptions
-from pfbench.results.decisions.growing_study import decide_at_looks
-from pfbench.results.decisions.options import DecisionOptions
-from pfbench.results.decisions.planned_pairs import decide_planned_pairs
-from pfbench.results.decisions.tidy_table import tidy_runs
 from pfbench.results.frame import load_frame
-from pfbench.results.statistics.sequential_looks import LookPlan
 from pfbench.results.store import write_result
-from pfbench.results.until_decided.look_schedule import LookSchedule
-from pfbench.results.until_decided.pair_states import decide_pairs
+from pfbench.stats.decision import DecisionOptions
+from pfbench.stats.pair_states import LookSchedule, decide_pairs
+from pfbench.stats.planned_pairs import decide_planned_pairs
+from pfbench.stats.sequential_looks import LookPlan, decide_at_looks
+from pfbench.stats.study_runs import tidy_runs
 
 RUNS = 30
 NAMES = ["position_E", "position_N", "position_U"]

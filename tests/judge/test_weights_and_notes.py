@@ -12,13 +12,10 @@ from command_line import pfbench
 from scipy.signal import lfilter
 
 from pfbench.judge.block_bootstrap import compare_along_run, count_equal_blocks
-from pfbench.judge.block_decisions import describe_blocks
-from pfbench.judge.epoch_checks import space_evenly
-from pfbench.judge.judge_notes import describe_notes
 from pfbench.judge.judge_options import JudgeOptions, SourceOptions
-from pfbench.judge.judge_tables import tabulate_accuracy
-from pfbench.judge.judgement import Judgement, judge_programs
-from pfbench.judge.reference_track import read_reference
+from pfbench.judge.judgement import Judgement, describe_blocks, judge_programs
+from pfbench.judge.page import describe_notes, tabulate_accuracy
+from pfbench.judge.reference_track import read_reference, space_evenly
 
 POSITION = ["pn", "pe", "pd"]
 

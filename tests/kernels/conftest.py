@@ -4,11 +4,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from pfbench.kernels import compilation
+from pfbench.kernels import dispatch
 
 
 @pytest.fixture(autouse=True)
 def torch_operations() -> Iterator[None]:
     """Run compilable functions in torch operations unless a test asks for operators."""
-    with compilation.use_compiled(False):
+    with dispatch.use_compiled(False):
         yield

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pfbench.kernels import cpp
+from pfbench.kernels import dispatch
 from pfbench.kernels.manifest import Argument, read_operators
 from pfbench.kernels.operator_checks import check_arguments
 
@@ -131,7 +131,7 @@ def is_valid(name: str, arguments: list[Any]) -> bool:
 
 def run(calls: int, seed: int) -> dict[str, int]:
     """Make random calls and count what became of them."""
-    cpp.sum_and_squares(torch.rand(1, 1))  # loads the operators
+    dispatch.sum_and_squares(torch.rand(1, 1))  # loads the operators
     rng = random.Random(seed)
     torch.manual_seed(seed)
     counts = dict.fromkeys(("computed", "refused", "wrong but computed", "valid but refused"), 0)
@@ -142,7 +142,7 @@ def run(calls: int, seed: int) -> dict[str, int]:
             arguments = spoil(name, arguments, rng)
         valid = is_valid(name, arguments)
         try:
-            getattr(cpp, name)(*arguments)  # its check is that in C++
+            getattr(dispatch, name)(*arguments)  # its check is that in C++
             counts["computed" if valid else "wrong but computed"] += 1
         except (RuntimeError, ValueError, TypeError) as error:
             is_too_large = "more than" in str(error)  # the only check outside of the manifest

@@ -13,27 +13,28 @@ import torch
 from command_line import pfbench
 from torch import Tensor
 
-from pfbench.core import affine_map, covariance, density
+from pfbench.core import density, linear_algebra
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter import log_weights
+from pfbench.filter import belief
 from pfbench.filter.belief import ParticleBelief, gather_ancestors
 from pfbench.filter.gaussian import gaussian_filter, kalman_update, linearisation_rules
-from pfbench.filter.gaussian.linearisation_rules import CubaturePoints, UnscentedPoints
-from pfbench.filter.gaussian.spherical_radial import (
+from pfbench.filter.gaussian.linearisation_rules import (
+    CubaturePoints,
     RadialDegree5,
     SimplexDegree3,
     SphericalRadialPoints,
+    UnscentedPoints,
 )
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle import particle_moments, resampling_schemes
+from pfbench.filter.particle import particle_moments, resampling
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job import filter_pass, scoring
-from pfbench.kernels import compilation, cpp, cpp_library
+from pfbench.kernels import cpp_library, dispatch
 from pfbench.model.linear_gaussian import linear_walk
-from pfbench.noise.white import NominalNoise
+from pfbench.noise.base import NominalNoise
 from pfbench.results import store
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.scenario.simulated import ModelSimulation
 
 RUNS, N, D = 3, 200, 5
 DRAWS = PhiloxStream(3, torch.arange(RUNS)).at_step(1)
@@ -45,17 +46,17 @@ compiler = pytest.mark.skipif(
 
 def test_what_is_not_fused_runs_the_eager_form() -> None:
     seen: list[str] = []
-    half = compilation.compilable(lambda: seen.append("fused"), eager=lambda: seen.append("eager"))
+    half = dispatch.compilable(lambda: seen.append("fused"), eager=lambda: seen.append("eager"))
     half()
-    with compilation.use_compiled(False):
+    with dispatch.use_compiled(False):
         half()
     assert seen == ["eager", "eager"]
 
 
 def test_the_switch_is_put_back_after_an_error() -> None:
-    with pytest.raises(RuntimeError), compilation.use_compiled():
+    with pytest.raises(RuntimeError), dispatch.use_compiled():
         raise RuntimeError
-    assert not compilation._fused.get()
+    assert not dispatch._fused.get()
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (0, 2, 1)])
@@ -85,11 +86,11 @@ def results(x: Tensor, z: Tensor) -> list[Any]:
     )
     return [
         particle_moments._flat_moments(1e3 + x, torch.softmax(z, 1)),
-        log_weights.normalise_updated_weights(hidden),
+        belief.normalise_updated_weights(hidden),
         density.log_normal_density(
             0.1 * x[:, :1], x, torch.full((1, 1, D), 0.7, dtype=dtype), seen
         ),
-        resampling_schemes._systematic(a, n, u.double()),
+        resampling._systematic(a, n, u.double()),
     ]
 
 
@@ -100,7 +101,7 @@ def results(x: Tensor, z: Tensor) -> list[Any]:
 def test_fused_functions_agree_with_eager_ones(dtype: torch.dtype) -> None:
     x, z = DRAWS.normal("x", N, D).to(dtype), DRAWS.normal("w", N, 1)[..., 0].to(dtype)
     eager = results(x, z)
-    with compilation.use_compiled():
+    with dispatch.use_compiled():
         fused = results(x, z)
     torch.testing.assert_close(fused, eager)
 
@@ -116,7 +117,7 @@ def test_a_filter_runs_alike_fused_and_eagerly() -> None:
         return run_filter(ParticleFilter(300), model, record, PhiloxStream(1, torch.arange(4)))
 
     eager = run()
-    with compilation.use_compiled(), torch.no_grad():
+    with dispatch.use_compiled(), torch.no_grad():
         fused = run()
     assert torch.allclose(fused.log_evidence, eager.log_evidence, rtol=1e-9, atol=0.0)
     assert torch.allclose(fused.mean, eager.mean, rtol=1e-9, atol=1e-12)
@@ -133,11 +134,10 @@ def test_a_loop_by_hand_copies_evenly(dtype: torch.dtype) -> None:
     a[5] = torch.nan
     n = torch.tensor([[N], [N // 3], [2], [N], [N], [N]], dtype=dtype)
     u = torch.linspace(1.0 - 1e-9, 1e-9, 6, dtype=torch.float64)[:, None]
+    assert torch.equal(dispatch.resample_systematic(a, n, u), resampling._eager_systematic(a, n, u))
     assert torch.equal(
-        cpp.resample_systematic(a, n, u), resampling_schemes._eager_systematic(a, n, u)
-    )
-    assert torch.equal(
-        cpp.resample_systematic(a[:1], n[:1], u[:1]), cpp.resample_systematic(a, n[:1], u)[:1]
+        dispatch.resample_systematic(a[:1], n[:1], u[:1]),
+        dispatch.resample_systematic(a, n[:1], u)[:1],
     )
 
 
@@ -161,7 +161,7 @@ def test_roots_by_hand_exist_where_roots_do(dtype: torch.dtype, d: int) -> None:
     whole[5, 0, -1] = whole[5, -1, 0] = (
         whole[5].diagonal().max() * 1e3
     )  # correlated above 1, unless there is but one component
-    for found, fine in (cpp.cholesky_factor(whole), covariance._factor(whole)):
+    for found, fine in (dispatch.cholesky_factor(whole), linear_algebra._factor(whole)):
         assert fine.tolist() == [k not in (1, 2, *([5] if d > 1 else [])) for k in range(runs)]
         sd = whole[fine].diagonal(dim1=-2, dim2=-1).sqrt().clamp(min=1e-15)
         off = (found[fine] @ found[fine].mT - whole[fine]) / (sd.unsqueeze(-1) * sd.unsqueeze(-2))
@@ -199,7 +199,7 @@ def test_an_update_by_hand_solves_the_least_squares(
     information = torch.eye(d).double() + exact_m.mT @ torch.linalg.solve(noise, exact_m)
     size = information.diagonal(dim1=-2, dim2=-1).sqrt()
     for shift, root, least, scales, ok in (
-        cpp.kalman_update(m, r, omega),
+        dispatch.kalman_update(m, r, omega),
         kalman_update._separate_update(m, r, omega),
     ):
         assert torch.equal(ok, rooted)
@@ -248,7 +248,10 @@ def test_a_fit_by_hand_is_the_weighted_one(dtype: torch.dtype, k: int, scheme: A
     left = off - torch.einsum("rkd,pd->rpk", wanted, xi.double())
     both = torch.einsum("p,rpk,rpl->rkl", w.double(), left, left)
     for lie in (r, r.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
-        for m, omega in (cpp.fit_affine(lie, xi, w), linearisation_rules._separate_fit(lie, xi, w)):
+        for m, omega in (
+            dispatch.fit_affine(lie, xi, w),
+            linearisation_rules._separate_fit(lie, xi, w),
+        ):
             assert torch.equal(torch.isfinite(m.sum((1, 2)) + omega.sum((1, 2))), fine)
             eps = 100.0 * torch.finfo(dtype).eps
             assert torch.allclose(m[fine].double(), wanted[fine], rtol=eps, atol=eps * 10.0)
@@ -262,8 +265,10 @@ def test_a_loop_by_hand_gathers() -> None:
         (DRAWS.uniform("a", 3 * N, 1)[..., 0] * N).long(),
     )
     expected = x.gather(2, ancestors.expand(D, -1, -1))
-    assert torch.equal(cpp.gather_particles(x, ancestors), expected)
-    assert torch.equal(cpp.gather_particles(x.contiguous().float(), ancestors), expected.float())
+    assert torch.equal(dispatch.gather_particles(x, ancestors), expected)
+    assert torch.equal(
+        dispatch.gather_particles(x.contiguous().float(), ancestors), expected.float()
+    )
 
 
 @compiler
@@ -284,16 +289,16 @@ def test_a_loop_by_hand_weighs_and_averages_in_any_memory_order(
     )
     scale[1, 1] = 0.0  # not seen
     torch.testing.assert_close(
-        cpp.log_normal(y, x, scale, constant),
+        dispatch.log_normal(y, x, scale, constant),
         density._run_quadratic(y, x, scale, constant),
         equal_nan=True,
     )
     torch.testing.assert_close(
-        cpp.weighted_moments(x, w), particle_moments._separate_moments(x, w), equal_nan=True
+        dispatch.weighted_moments(x, w), particle_moments._separate_moments(x, w), equal_nan=True
     )
     w[2, 3] = torch.nan
     torch.testing.assert_close(
-        cpp.sum_and_squares(w), log_weights._separate_totals(w), equal_nan=True
+        dispatch.sum_and_squares(w), belief._separate_totals(w), equal_nan=True
     )
 
 
@@ -314,7 +319,7 @@ def test_a_loop_by_hand_spreads_about_the_mean_in_any_memory_order(
         mean = DRAWS.normal("mean", 1, 11)[:, 0].to(dtype)
         for laid in (x.contiguous(), x.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
             found, wanted = (
-                cpp.group_covariance(laid, mean, w, groups),
+                dispatch.group_covariance(laid, mean, w, groups),
                 particle_moments._separate_spread(x, mean, w, groups),
             )
             eps = torch.finfo(dtype).eps
@@ -335,12 +340,12 @@ def test_a_loop_by_hand_measures_by_a_covariance(dtype: torch.dtype, systems: in
     wide[-1, -1, -1] *= -1.0
     given = ((unit[:, None] * unit).double() * wide).to(dtype)
     found, wanted = (
-        cpp.squared_mahalanobis(unit * e, given),
-        covariance._solved_length(e.double(), wide).to(dtype),
+        dispatch.squared_mahalanobis(unit * e, given),
+        linear_algebra._solved_length(e.double(), wide).to(dtype),
     )
     # by the inverse's elements, which two systems of 15 x 17 numbers have up to 1e3 of
     torch.testing.assert_close(found, wanted, rtol=1e5 * torch.finfo(dtype).eps, atol=0.0)
-    grouped = cpp.squared_mahalanobis(
+    grouped = dispatch.squared_mahalanobis(
         e.unsqueeze(1).expand(-1, 2, -1), wide.to(dtype).unsqueeze(1).expand(-1, 2, -1, -1)
     )
     torch.testing.assert_close(
@@ -348,18 +353,18 @@ def test_a_loop_by_hand_measures_by_a_covariance(dtype: torch.dtype, systems: in
     )
     one = torch.linalg.inv(wide[:1]) * e.double().unsqueeze(1) * e.double().unsqueeze(2)
     torch.testing.assert_close(
-        cpp.squared_mahalanobis(e, wide[:1].to(dtype)).double(),
+        dispatch.squared_mahalanobis(e, wide[:1].to(dtype)).double(),
         one.sum((1, 2)),
         rtol=1e6 * torch.finfo(dtype).eps,
         atol=1e-6,
     )
     e[0], given[:, 0], given[:, :, 0] = torch.nan, 0.0, 0.0
-    assert torch.isnan(cpp.squared_mahalanobis(e, wide.to(dtype))).tolist() == [True] + [False] * (
-        systems - 1
-    )
+    assert torch.isnan(dispatch.squared_mahalanobis(e, wide.to(dtype))).tolist() == [True] + [
+        False
+    ] * (systems - 1)
     for lost in (given, torch.zeros_like(given)):
-        assert not torch.isfinite(cpp.squared_mahalanobis(e, lost)).any()
-        assert not torch.isfinite(covariance._solved_length(e, lost)).any()
+        assert not torch.isfinite(dispatch.squared_mahalanobis(e, lost)).any()
+        assert not torch.isfinite(linear_algebra._solved_length(e, lost)).any()
 
 
 @compiler
@@ -389,7 +394,7 @@ def test_a_loop_by_hand_scores_components(dtype: torch.dtype, particles: int) ->
         (w.unsqueeze(-1) * (error.unsqueeze(1) + x).abs()).sum(1),
     )
     for laid in (x.contiguous(), x.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
-        found = cpp.marginal_scores(error, laid, w)
+        found = dispatch.marginal_scores(error, laid, w)
         off = torch.where(
             torch.isinf(crps) & (found[0] == crps), 0.0, (found[0].double() - crps).abs()
         )
@@ -407,7 +412,10 @@ def test_a_loop_by_hand_scores_vectors(dtype: torch.dtype, points: int) -> None:
     x = 3.0 + DRAWS.normal("x", points, 6).to(dtype)
     x[1, 0, 2] = torch.nan
     for parts in ([0], [3, 1, 5], [0, 1, 2, 3, 4, 5]):
-        found, wanted = cpp.energy_score(x[:, :, parts]), scoring._separate_energy(x[:, :, parts])
+        found, wanted = (
+            dispatch.energy_score(x[:, :, parts]),
+            scoring._separate_energy(x[:, :, parts]),
+        )
         torch.testing.assert_close(
             found, wanted, rtol=1e2 * torch.finfo(dtype).eps, atol=0.0, equal_nan=True
         )
@@ -422,8 +430,8 @@ def test_without_a_library_operators_run_in_torch_and_one_line_says_so(
     cpp_library.is_library_loaded.cache_clear()
     monkeypatch.setattr(cpp_library, "load_library", load)
     terms = torch.rand(3, 5)
-    with compilation.use_compiled():
-        sums = [log_weights._totals(terms) for _ in range(2)]
+    with dispatch.use_compiled():
+        sums = [belief._totals(terms) for _ in range(2)]
     cpp_library.is_library_loaded.cache_clear()
     for total, square in sums:
         torch.testing.assert_close(total, terms.sum(1, keepdim=True))
@@ -458,8 +466,8 @@ def test_a_loop_by_hand_moves_by_the_coefficients_that_are_not_zero(
     ):
         parts = ((a, x), (b, noise))
         moved = sum(torch.einsum("rij,rnj->irn", by.expand(RUNS, -1, -1), of) for by, of in parts)
-        torch.testing.assert_close(cpp.propagate_affine(a, x, b, noise), moved)
-        torch.testing.assert_close(affine_map._dense_affine(a, x, b, noise), moved)
+        torch.testing.assert_close(dispatch.propagate_affine(a, x, b, noise), moved)
+        torch.testing.assert_close(linear_algebra._dense_affine(a, x, b, noise), moved)
 
 
 @compiler
@@ -468,14 +476,14 @@ def test_a_gradient_goes_round_the_loops_by_hand() -> None:
         DRAWS.normal("x", N, D).requires_grad_(),
         torch.softmax(DRAWS.normal("w", N, 1)[..., 0], -1),
     )
-    with compilation.use_compiled():
+    with dispatch.use_compiled():
         particle_moments._flat_moments(x, w)[0].sum().backward()
     torch.testing.assert_close(x.grad, w.unsqueeze(-1).expand_as(x))
 
 
 @compiler
 def test_small_numbers_are_still_numbers_after_the_loops_are_loaded() -> None:
-    cpp.philox_normals(torch.tensor(1), 2, torch.tensor(0), torch.arange(2), 2, 2)
+    dispatch.philox_normals(torch.tensor(1), 2, torch.tensor(0), torch.arange(2), 2, 2)
     assert (
         float(torch.tensor(1e-310, dtype=torch.float64) / 2) > 0.0
     )  # -ffast-math, when linked, would make it 0
@@ -549,7 +557,7 @@ def test_compiling_keeps_the_validation_of_distributions() -> None:
     before = torch.distributions.Distribution._validate_args
     model = linear_walk(1.0, 0.3, 1.0)
     record = Record(torch.zeros(2, 3, 1, dtype=torch.float64))
-    with compilation.use_compiled():
+    with dispatch.use_compiled():
         run_filter(ParticleFilter(20), model, record, PhiloxStream(1, torch.arange(2)))
-    compilation._compile_by_torch(lambda a: a + 1.0)(torch.ones(2))
+    dispatch._compile_by_torch(lambda a: a + 1.0)(torch.ones(2))
     assert torch.distributions.Distribution._validate_args == before

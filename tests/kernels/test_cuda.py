@@ -16,11 +16,11 @@ import random_calls
 import torch
 from torch import Tensor
 
-from pfbench.core import affine_map, random_stream
+from pfbench.core import linear_algebra, random_stream
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter import belief
-from pfbench.filter.particle import particle_moments, resampling_schemes
-from pfbench.kernels import cpp, cuda, cuda_launch
+from pfbench.filter.particle import particle_moments, resampling
+from pfbench.kernels import cuda, cuda as cuda_launch, dispatch
 
 COMPILER = next(
     (found for name in ("c++", "g++", "clang++") if (found := shutil.which(name))), None
@@ -167,7 +167,7 @@ def test_resampling(loop: Loop, runs: int, n: int, d: int, dtype: torch.dtype) -
         assert (w.gather(1, found) > 0).all()
         counts = torch.zeros(runs, n).scatter_add(1, found, torch.ones(found.shape))
         assert ((counts - wanted * w).abs() < 1.0 + 1e-6 * wanted).all()
-        wanted_ones = resampling_schemes._eager_systematic(w, number, u)[:, :wanted]
+        wanted_ones = resampling._eager_systematic(w, number, u)[:, :wanted]
         assert torch.equal(found, wanted_ones)
 
 
@@ -179,7 +179,7 @@ def test_resampling_with_numbers_of_their_own(loop: Loop) -> None:
     )
     found, wanted = (
         loop("resample_systematic", w, number, u),
-        resampling_schemes._eager_systematic(w, number, u),
+        resampling._eager_systematic(w, number, u),
     )
     for r, n in enumerate((30, 7, 1)):
         assert torch.equal(found[r, :n], wanted[r, :n])
@@ -224,7 +224,10 @@ def test_moving(
     phi = torch.where(phi.abs() < 0.7, 0.0, phi)
     product = loop("propagate_affine", phi, x, gain, w)
     torch.testing.assert_close(
-        product, affine_map._dense_affine(phi, x, gain, w), rtol=FINE[dtype], atol=10 * FINE[dtype]
+        product,
+        linear_algebra._dense_affine(phi, x, gain, w),
+        rtol=FINE[dtype],
+        atol=10 * FINE[dtype],
     )
     ancestors = (made.uniform("a", n, 1)[..., 0] * n).long()
     key = torch.tensor(4), 99, torch.tensor(3), torch.arange(3)
@@ -233,7 +236,7 @@ def test_moving(
         random_stream.draw_normals if dtype == torch.float32 else random_stream.draw_normals_float64
     )
     noise = draw(*key, width, -(-n // 4))[..., :n].permute(1, 2, 0)
-    wanted = affine_map._dense_affine(
+    wanted = linear_algebra._dense_affine(
         phi, belief._select_components(first, ancestors).permute(1, 2, 0), gain, noise
     )
     torch.testing.assert_close(
@@ -306,4 +309,4 @@ def test_operators_know_the_shape_of_what_they_make() -> None:
             torch.tensor(3),
             torch.arange(3),
         )
-        assert cpp.gather_propagate(*args).shape == (5, 3, 6)
+        assert dispatch.gather_propagate(*args).shape == (5, 3, 6)

@@ -31,18 +31,17 @@ from pfbench.filter.learned.proposal import LearnedProposal
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
-from pfbench.filter.swarm.swarm_proposal import SwarmProposal
-from pfbench.kernels import compilation
-from pfbench.learn.training_config import Training
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.proposed.swarm import SwarmProposal
+from pfbench.kernels import dispatch
+from pfbench.learn.trainer import Training
 from pfbench.learn.training_data import draw_training_data
 from pfbench.learn.training_job import train
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, local_level
-from pfbench.noise.white import NominalNoise
+from pfbench.noise.base import NominalNoise
 from pfbench.results import store
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.scenario.simulated import ModelSimulation
 
 pytestmark = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
@@ -79,7 +78,7 @@ def on(
     draws: type[PhiloxStream] = PhiloxStream,
 ) -> FilterResult:
     model = model.to(device)
-    with torch.no_grad(), compilation.use_compiled(fused):
+    with torch.no_grad(), dispatch.use_compiled(fused):
         return run_filter(
             method,
             model,

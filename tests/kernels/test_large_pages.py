@@ -11,7 +11,7 @@ import pytest
 
 KERNEL = Path("/sys/kernel/mm/transparent_hugepage/enabled")
 PROGRAM = """
-import pfbench.kernels.cpp
+import pfbench.kernels.dispatch
 import torch
 kept = [torch.ones(10**6) for _ in range(20)]
 print(next(line.split()[1] for line in open("/proc/self/smaps_rollup") if "AnonHugePages" in line))

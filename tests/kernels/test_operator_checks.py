@@ -13,19 +13,18 @@ import pytest
 import random_calls
 import torch
 
-from pfbench.core import affine_map, covariance, density, random_stream
-from pfbench.filter import belief, log_weights
+from pfbench.core import density, linear_algebra, random_stream
+from pfbench.filter import belief, belief as log_weights
 from pfbench.filter.gaussian import kalman_update, linearisation_rules
-from pfbench.filter.particle import particle_moments, resampling_schemes
+from pfbench.filter.particle import particle_moments, resampling
 from pfbench.job import scoring
 from pfbench.kernels import (
-    compilation,
-    cpp,
     cpp_library,
+    cpp_library as private_folder,
+    dispatch,
     manifest,
     operator_sources,
-    private_folder,
-    step_table,
+    step_compiler,
 )
 from pfbench.kernels.operator_checks import check_arguments
 from pfbench.kernels.step_compiler import compile_function
@@ -40,7 +39,7 @@ def test_the_cpp_sources_are_those_of_the_manifest() -> None:
     for name, text in operator_sources.make_sources().items():
         assert (manifest.KERNELS_FOLDER / "src" / name).read_text() == text, name
     for name in manifest.read_operators():
-        assert getattr(cpp, name).__name__ == name
+        assert getattr(dispatch, name).__name__ == name
 
 
 @compiler
@@ -53,26 +52,26 @@ def test_random_calls_are_computed_or_refused() -> None:
 
 
 WRONG = {
-    "index above": lambda: cpp.gather_particles(X, torch.full((3, 2), 4)),
-    "index below": lambda: cpp.gather_particles(X, torch.full((3, 2), -1)),
-    "large index": lambda: cpp.gather_particles(X, torch.full((3, 2), 2**62)),
-    "more particles than slots": lambda: cpp.resample_systematic(W, 8 * ONE, 0.5 * ONE),
-    "count below 0": lambda: cpp.resample_systematic(W, -ONE, 0.5 * ONE),
-    "count not a number": lambda: cpp.resample_systematic(W, torch.nan * ONE, 0.5 * ONE),
-    "uniform below 0": lambda: cpp.resample_systematic(W, 4 * ONE, -9.0 * ONE),
-    "uniform above 1": lambda: cpp.resample_systematic(W, 4 * ONE, 1e9 * ONE),
-    "ancestor above": lambda: cpp.count_unique(torch.tensor([[0, 4]]), torch.zeros(1, 2)),
-    "ancestor below": lambda: cpp.count_unique(torch.tensor([[0, -1]]), torch.zeros(1, 2)),
-    "group above": lambda: cpp.group_covariance(
+    "index above": lambda: dispatch.gather_particles(X, torch.full((3, 2), 4)),
+    "index below": lambda: dispatch.gather_particles(X, torch.full((3, 2), -1)),
+    "large index": lambda: dispatch.gather_particles(X, torch.full((3, 2), 2**62)),
+    "more particles than slots": lambda: dispatch.resample_systematic(W, 8 * ONE, 0.5 * ONE),
+    "count below 0": lambda: dispatch.resample_systematic(W, -ONE, 0.5 * ONE),
+    "count not a number": lambda: dispatch.resample_systematic(W, torch.nan * ONE, 0.5 * ONE),
+    "uniform below 0": lambda: dispatch.resample_systematic(W, 4 * ONE, -9.0 * ONE),
+    "uniform above 1": lambda: dispatch.resample_systematic(W, 4 * ONE, 1e9 * ONE),
+    "ancestor above": lambda: dispatch.count_unique(torch.tensor([[0, 4]]), torch.zeros(1, 2)),
+    "ancestor below": lambda: dispatch.count_unique(torch.tensor([[0, -1]]), torch.zeros(1, 2)),
+    "group above": lambda: dispatch.group_covariance(
         torch.rand(1, 3, 2), torch.rand(1, 2), torch.rand(1, 3), torch.tensor([[0, 2]])
     ),
-    "group below": lambda: cpp.group_covariance(
+    "group below": lambda: dispatch.group_covariance(
         torch.rand(1, 3, 2), torch.rand(1, 2), torch.rand(1, 3), torch.tensor([[-1, 0]])
     ),
-    "too many numbers": lambda: cpp.philox_normals(
+    "too many numbers": lambda: dispatch.philox_normals(
         torch.tensor(1), 1, torch.tensor(1), torch.arange(4), 2**29, 2**29
     ),
-    "no particles": lambda: cpp.marginal_scores(
+    "no particles": lambda: dispatch.marginal_scores(
         torch.rand(1, 2), torch.rand(1, 0, 2), torch.rand(1, 0)
     ),
 }
@@ -93,20 +92,20 @@ def eager_function(name: str) -> Callable[..., Any]:
         "philox_normals": random_stream.draw_normals,
         "philox_normals_float64": random_stream.draw_normals_float64,
         "philox_uniforms": random_stream.draw_uniforms,
-        "resample_systematic": resampling_schemes._systematic,
+        "resample_systematic": resampling._systematic,
         "gather_particles": belief._gather_components,
         "log_normal": density._quadratic,
-        "propagate_affine": affine_map._affine,
+        "propagate_affine": linear_algebra._affine,
         "count_unique": particle_moments.count_distinct_ancestors,
         "sum_and_squares": log_weights._totals,
         "sum_log_weights": log_weights._add_terms,
         "normalise_weights": log_weights.normalise_updated_weights,
         "weighted_moments": particle_moments._flat_moments,
-        "cholesky_factor": covariance.factor,
+        "cholesky_factor": linear_algebra.factor,
         "kalman_update": kalman_update._updated,
         "fit_affine": linearisation_rules._fitted,
         "group_covariance": particle_moments._spread,
-        "squared_mahalanobis": covariance.squared_length,
+        "squared_mahalanobis": linear_algebra.squared_length,
         "marginal_scores": scoring._marginal_scores,
         "energy_score": scoring._energy_score,
     }[name]
@@ -137,7 +136,7 @@ def test_an_operator_computes_what_its_torch_function_does(name: str) -> None:
     torch.manual_seed(11)
     for _ in range(12):
         call = valid_numbers(name, rng)
-        expected, result = eager_function(name)(*call), getattr(cpp, name)(*call)
+        expected, result = eager_function(name)(*call), getattr(dispatch, name)(*call)
         is_single = any(isinstance(a, torch.Tensor) and a.dtype == torch.float32 for a in call)
         tolerance = 2e-4 if is_single else 1e-9
         torch.testing.assert_close(
@@ -158,13 +157,13 @@ def test_normalised_weights_at_their_limits(dtype: torch.dtype) -> None:
     rows[8, 0] = torch.inf
     rows[9] -= 2.0 / torch.finfo(dtype).eps
     rows[10] = -3.0
-    expected, result = log_weights._separate_normalise(rows), cpp.normalise_weights(rows)
+    expected, result = log_weights._separate_normalise(rows), dispatch.normalise_weights(rows)
     tolerance = 2e-6 if dtype == torch.float32 else 1e-13
     for a, b in zip(result, expected, strict=True):
         torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance)
     # every weight to its last places, down to the smallest normal number
     x = -torch.linspace(0.0, 80.0 if dtype == torch.float32 else 700.0, 4001, dtype=dtype)
-    w = cpp.normalise_weights(x[None])[2][0].double()
+    w = dispatch.normalise_weights(x[None])[2][0].double()
     reference = torch.exp(x.double())
     ratio = w / (reference / reference.sum())
     assert float((ratio / ratio[0] - 1.0).abs().max()) < 8.0 * torch.finfo(dtype).eps
@@ -179,12 +178,12 @@ def test_the_sum_of_log_weights_has_no_nan(dtype: torch.dtype) -> None:
     terms, log_w, log_ratio = (grid[:, k].repeat(3, 1) for k in range(3))
     total = terms + log_w + log_ratio
     expected = torch.where(torch.isnan(total), -torch.inf, total)
-    assert torch.equal(cpp.sum_log_weights(terms, log_w, log_ratio), expected)
+    assert torch.equal(dispatch.sum_log_weights(terms, log_w, log_ratio), expected)
     assert torch.equal(log_weights._separate_sum(terms, log_w, log_ratio), expected)
     column = torch.tensor([[0.25], [-torch.inf], [torch.nan]], dtype=dtype)
     for a, b in ((column, column), (log_w, column), (column, log_ratio)):
-        full = cpp.sum_log_weights(terms, a.expand_as(terms), b.expand_as(terms))
-        assert torch.equal(cpp.sum_log_weights(terms, a, b), full)
+        full = dispatch.sum_log_weights(terms, a.expand_as(terms), b.expand_as(terms))
+        assert torch.equal(dispatch.sum_log_weights(terms, a, b), full)
         assert torch.equal(log_weights._separate_sum(terms, a, b), full)
 
 
@@ -204,7 +203,7 @@ def test_a_wrong_call_has_one_message_in_eager_mode_and_in_cpp(name: str) -> Non
     rng = random.Random(name)
     valid = random_calls.make_call(name, rng, dict.fromkeys("BDRNMWEKPGS", 3))
     function = eager_function(name)
-    assert refusal(function, valid) == refusal(getattr(cpp, name), valid) == ""
+    assert refusal(function, valid) == refusal(getattr(dispatch, name), valid) == ""
     calls = [valid[:-1]]
     for place, argument in enumerate(random_calls.OPERATORS[name]):
         for value in random_calls.wrong_values(argument, valid[place]):
@@ -214,8 +213,8 @@ def test_a_wrong_call_has_one_message_in_eager_mode_and_in_cpp(name: str) -> Non
         message = refusal(function, call)
         assert message.startswith(f"ValueError: {name}"), message
         assert " must " in message
-        assert refusal(getattr(cpp, name), call) == message
-        with compilation.use_compiled():
+        assert refusal(getattr(dispatch, name), call) == message
+        with dispatch.use_compiled():
             assert refusal(function, call) == message
 
 
@@ -224,7 +223,7 @@ def test_a_step_is_called_by_its_number_only() -> None:
     """No address goes through Python, and a library without a step is not taken."""
     for number in (-1, 0, 4096, 2**62, id(X)):
         with pytest.raises(RuntimeError, match="must be the number of a registered step"):
-            step_table.run_steps(number, [], [], [torch.rand(2, 1)], [])
+            step_compiler.run_steps(number, [], [], [torch.rand(2, 1)], [])
     loaded = str(Path(torch.__file__).parent / "lib/libc10.so").encode()  # may be another user's
     names = [b"", b"no such file", b"libc10.so", loaded, b"\xff" * 5000]
     for name in names:
@@ -232,9 +231,9 @@ def test_a_step_is_called_by_its_number_only() -> None:
             RuntimeError if name != loaded else (RuntimeError, PermissionError),
             match=r"library must be a step of torch's compiler|Compiled code is not loaded",
         ):
-            step_table.register_step(torch.tensor(list(name), dtype=torch.uint8), 1, [])
+            step_compiler.register_step(torch.tensor(list(name), dtype=torch.uint8), 1, [])
     with pytest.raises(RuntimeError, match="must be a path as bytes"):
-        step_table.register_step(torch.zeros(4), 1, [])
+        step_compiler.register_step(torch.zeros(4), 1, [])
 
 
 @compiler
@@ -251,7 +250,7 @@ def test_a_step_is_loaded_only_from_where_others_cannot_write(
     link.symlink_to(library)
 
     def register(path: Path) -> None:
-        step_table.register_step(step_table.encode_path(path), 1, [])
+        step_compiler.register_step(step_compiler.encode_path(path), 1, [])
 
     for folder_mode, library_mode in ((0o777, 0o600), (0o700, 0o666), (0o720, 0o600)):
         folder.chmod(folder_mode)
@@ -265,7 +264,7 @@ def test_a_step_is_loaded_only_from_where_others_cannot_write(
     kept.parent.mkdir()
     kept.write_bytes(b"")
     kept.chmod(0o664)  # of a user whose files a group may write, in a folder that it cannot enter
-    for path in (library, link, kept, Path(step_table.__file__)):
+    for path in (library, link, kept, Path(step_compiler.__file__)):
         with pytest.raises(RuntimeError, match="library must be a step of torch's compiler"):
             register(path)
     monkeypatch.setattr(os, "getuid", lambda: 12345)
@@ -280,7 +279,7 @@ def test_a_compiled_step_takes_the_arguments_that_it_was_compiled_for() -> None:
     assert entry is not None
     number, constants = entry
     good = [torch.rand(1, 3, 2), torch.rand(1, 4).double()]
-    first, second = step_table.run_steps(number, constants, [], good, [])
+    first, second = step_compiler.run_steps(number, constants, [], good, [])
     assert torch.equal(first, good[0][0] + 1.0)
     assert torch.equal(second, good[1][0] * 2.0)
     wrong = {
@@ -292,11 +291,11 @@ def test_a_compiled_step_takes_the_arguments_that_it_was_compiled_for() -> None:
     }
     for words, inputs in wrong.items():
         with pytest.raises(RuntimeError, match=words):
-            step_table.run_steps(number, constants, [], inputs, [])
+            step_compiler.run_steps(number, constants, [], inputs, [])
     with pytest.raises(RuntimeError, match="inputs must have at least one"):
-        step_table.run_steps(number, constants, example, [], [])
+        step_compiler.run_steps(number, constants, example, [], [])
     with pytest.raises(RuntimeError, match="state must have at most 2 tensors"):
-        step_table.run_steps(number, constants, [*example, example[0]], [good[0]], [])
+        step_compiler.run_steps(number, constants, [*example, example[0]], [good[0]], [])
 
 
 def test_the_python_check_names_the_argument() -> None:

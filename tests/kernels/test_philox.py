@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pfbench.core import random_stream
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.kernels import compilation, cpp, philox
+from pfbench.kernels import dispatch, philox
 from pfbench.kernels.generator_version import GENERATOR_VERSION
 from pfbench.kernels.philox import DOUBLE, SINGLE, Counter, Precision, transform_pair
 from pfbench.kernels.step_compiler import compile_function
@@ -24,9 +24,12 @@ compiler = pytest.mark.skipif(
 )
 WORD = st.integers(0, 2**32 - 1)
 DRAWS: dict[str, tuple[Callable[[Counter], Tensor], Callable[..., Tensor]]] = {
-    "normals": (lambda at: philox.compute_normals(at, SINGLE), cpp.philox_normals),
-    "normals_float64": (lambda at: philox.compute_normals(at, DOUBLE), cpp.philox_normals_float64),
-    "uniforms": (philox.compute_uniforms, cpp.philox_uniforms),
+    "normals": (lambda at: philox.compute_normals(at, SINGLE), dispatch.philox_normals),
+    "normals_float64": (
+        lambda at: philox.compute_normals(at, DOUBLE),
+        dispatch.philox_normals_float64,
+    ),
+    "uniforms": (philox.compute_uniforms, dispatch.philox_uniforms),
 }
 
 # Random123 known-answer vectors of philox4x32 with 10 rounds: counter, key -> words
@@ -112,7 +115,7 @@ def test_compiled_code_draws_the_bits_of_torch(dtype: torch.dtype) -> None:
         return [stream.normal("x", n, w), stream.uniform("x", n, w)]
 
     def step_function(number: Tensor) -> list[Tensor]:
-        with compilation.capture_graph():
+        with dispatch.capture_graph():
             return [2.0 * a for a in draw(number, 77, 2)]
 
     for step, n, w in ((1, 1000, 3), (2, 77, 1)):  # the second call is of another shape
@@ -120,7 +123,7 @@ def test_compiled_code_draws_the_bits_of_torch(dtype: torch.dtype) -> None:
         for threads in (1, 2):
             torch.set_num_threads(threads)
             try:
-                with compilation.use_compiled():
+                with dispatch.use_compiled():
                     found = draw(step, n, w)
             finally:
                 torch.set_num_threads(1)

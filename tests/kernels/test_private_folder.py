@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from pfbench.kernels import cpp_library, library_build, private_folder
+from pfbench.kernels import cpp_library, cpp_library as private_folder, library_build
 
 LOAD = """
 from pathlib import Path

@@ -26,8 +26,7 @@ from pfbench.filter.learned.differentiable_resampling import (
 )
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, Resampler
-from pfbench.filter.particle.resampling_schemes import Multinomial, Systematic
+from pfbench.filter.particle.resampling import EssResampler, Multinomial, Resampler, Systematic
 from pfbench.model.base import StateSpaceModel
 from pfbench.testing import check_evidence, filter_record
 

@@ -45,17 +45,14 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.moves.metropolis import MetropolisHastings
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
-from pfbench.learn.trainer import TrainingState
-from pfbench.learn.training_config import Progress, Training
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.learn.trainer import Progress, Training, TrainingState
 from pfbench.learn.training_data import TrainingData, draw_training_data
 from pfbench.learn.training_job import train
 from pfbench.model.linear_gaussian import local_level
-from pfbench.noise.base import NoiseRegime
-from pfbench.noise.white import NominalNoise
+from pfbench.noise.base import NoiseRegime, NominalNoise
 from pfbench.results import store
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.scenario.simulated import ModelSimulation
 
 LEVEL = local_level(1.0, 0.3, 0.0, 1.0)  # what is seen is three times as sure as what is predicted
 SMALL = partial(DiagonalNormalHead, hidden=(8,))

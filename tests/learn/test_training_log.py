@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pfbench.learn.training_log import write_losses
+from pfbench.learn.training_job import write_losses
 
 
 def test_a_table_of_the_user_is_kept_and_an_old_log_is_replaced(tmp_path: Path) -> None:

@@ -34,8 +34,8 @@ from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, climb, cruise, turn
 from pfbench.nav.strapdown import InsIntervals
 from pfbench.nav.trajectory import TrajectoryStart
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.simulated_flight import SimulatedFlight
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.flights import SimulatedFlight
 
 IMU = ImuErrors(0.05, 0.05, 3600.0, 0.01, 100.0, 50.0, 1800.0, 5.0)
 RECEIVER = GnssReceiver((6.87, 7.20, 4.83), (0.21, 0.20, 0.14))

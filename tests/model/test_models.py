@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent
 
 from pfbench.core.chart import wrap_angle
-from pfbench.core.covariance import (
+from pfbench.core.linear_algebra import (
     distribution_covariance,
     gaussian_log_density,
     shared_distribution_covariance,
@@ -25,8 +25,7 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.model.base import StateSpaceModel, StaticModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
-from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
+from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
 
 MODELS: dict[str, Callable[[], StateSpaceModel]] = {
     "growth": UnivariateGrowth,

@@ -22,14 +22,13 @@ from pfbench.filter.gaussian.linearisation_rules import (
     TaylorLinearisation,
 )
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.model.sins_gnss_tight import NAMES, SinsGnssTight
-from pfbench.model.sins_gnss_tight_nl import SinsGnssTightNl
+from pfbench.model.tight_coupling import NAMES, SinsGnssTight, SinsGnssTightNl
 from pfbench.nav import attitude, earth, strapdown
 from pfbench.nav.aiding import AlignmentErrors, FlightSolution, GnssReceiver, ProcessNoiseInflation
-from pfbench.nav.gnss.ranging import RangingInputs
+from pfbench.nav.ranging import RangingInputs
 from pfbench.nav.trajectory import TrajectoryData
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.simulated_flight import SimulatedFlight
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.flights import SimulatedFlight
 
 __all__ = ["flight"]  # a fixture
 

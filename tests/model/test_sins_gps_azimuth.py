@@ -27,18 +27,16 @@ from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job import conf_dir
 from pfbench.job.scoring import ScoreRecorder
-from pfbench.model.azimuth_errors import (
+from pfbench.model.azimuth import (
     ErrorEquations,
+    EulerDiscretisation,
     ExactErrorEquations,
     LinearisedRateEquations,
     PrintedErrorEquations,
-    compute_euler_rate,
-    compute_level_coupling,
-)
-from pfbench.model.sins_gps_azimuth import (
-    EulerDiscretisation,
     SinsGpsAzimuth,
     TrapezoidDiscretisation,
+    compute_euler_rate,
+    compute_level_coupling,
 )
 from pfbench.nav import attitude, earth, error_dynamics
 from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
@@ -46,8 +44,8 @@ from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, climb, turn
 from pfbench.nav.strapdown import InsIntervals
 from pfbench.nav.trajectory import TrajectoryStart
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.simulated_flight import SimulatedFlight
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.flights import SimulatedFlight
 
 ARCMIN = math.radians(1 / 60)
 IMU = ImuErrors(

@@ -29,16 +29,21 @@ from pfbench.job import conf_dir
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.sins_sar import SarStep, SinsSar
 from pfbench.nav import attitude, earth, error_dynamics
-from pfbench.nav.aiding import ARCMIN, AlignmentErrors, ProcessNoiseInflation
-from pfbench.nav.component_major import convert_from_metres, convert_to_metres, earth_quantities
+from pfbench.nav.aiding import (
+    ARCMIN,
+    AlignmentErrors,
+    ProcessNoiseInflation,
+    SarSensor,
+    compute_heading_difference,
+)
+from pfbench.nav.earth import convert_from_metres, convert_to_metres, earth_quantities
 from pfbench.nav.imu_errors import ImuErrors
-from pfbench.nav.ramps import CosineRamp, RampTrajectory
-from pfbench.nav.sar import SarSensor, compute_heading_difference
+from pfbench.nav.manoeuvres import CosineRamp, RampTrajectory
 from pfbench.nav.strapdown import InsIntervals
 from pfbench.nav.trajectory import TrajectoryStart
-from pfbench.noise.outage import MeasurementOutage
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.simulated_flight import SimulatedFlight
+from pfbench.noise.base import NominalNoise
+from pfbench.noise.time_windows import MeasurementOutage
+from pfbench.scenario.flights import SimulatedFlight
 
 IMU = ImuErrors(
     gyro_bias_deg_h=0.1,

@@ -15,9 +15,9 @@ from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
-from pfbench.model.strapdown.aided import StrapdownAided
-from pfbench.model.strapdown.tuning import AidedTuning, StrapdownTuning
-from pfbench.nav.preintegration import PreintegratedImu, preintegrate
+from pfbench.model.strapdown import StrapdownAided
+from pfbench.model.strapdown_tuning import AidedTuning, StrapdownTuning
+from pfbench.nav.strapdown import PreintegratedImu, preintegrate
 
 MOTION = StrapdownTuning(
     gyro_density=2e-3,

@@ -14,11 +14,10 @@ from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
-from pfbench.model.strapdown.tight import StrapdownTight, TightMemsInputs
-from pfbench.model.strapdown.total import StrapdownTotal
-from pfbench.model.strapdown.tuning import RangeErrorModel, StrapdownTuning, TightTuning
-from pfbench.nav.gnss.receiver_clock import ReceiverClock
-from pfbench.nav.preintegration import preintegrate
+from pfbench.model.strapdown import StrapdownTight, StrapdownTotal, TightMemsInputs
+from pfbench.model.strapdown_tuning import RangeErrorModel, StrapdownTuning, TightTuning
+from pfbench.nav.ranging import ReceiverClock
+from pfbench.nav.strapdown import preintegrate
 
 MOTION = StrapdownTuning(
     gyro_density=2e-3,

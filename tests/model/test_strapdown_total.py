@@ -11,16 +11,16 @@ import torch
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from pfbench.core import quaternion
+from pfbench.core import chart
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import CubaturePoints, SigmaPointLinearisation
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.model.strapdown.total import StrapdownTotal
-from pfbench.model.strapdown.tuning import StrapdownTuning
+from pfbench.model.strapdown import StrapdownTotal
+from pfbench.model.strapdown_tuning import StrapdownTuning
 from pfbench.nav import attitude
-from pfbench.nav.preintegration import PreintegratedImu, preintegrate, rotate
+from pfbench.nav.strapdown import PreintegratedImu, preintegrate, rotate
 
 BELIEVED = StrapdownTuning(
     gyro_density=1e-2,
@@ -156,9 +156,7 @@ def test_bias_derivatives_against_finite_differences() -> None:
             sides.append(
                 torch.cat(
                     [
-                        quaternion.rotation_vector_from_quaternion(
-                            quaternion.quaternion_multiply(back, q)
-                        ),
+                        chart.rotation_vector_from_quaternion(chart.quaternion_multiply(back, q)),
                         v,
                         p,
                     ]

@@ -18,12 +18,17 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record
 from pfbench.filter import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.model.terrain.random_terrain import RandomTerrain, compute_elevation, compute_slope
-from pfbench.model.terrain.terrain_aided import TerrainAided, TerrainInputs
+from pfbench.model.terrain import (
+    RandomTerrain,
+    TerrainAided,
+    TerrainInputs,
+    compute_elevation,
+    compute_slope,
+)
 from pfbench.nav.manoeuvres import ManoeuvreTrajectory, cruise, turn
 from pfbench.nav.trajectory import TrajectoryStart
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.terrain_flight import TerrainFlight
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.flights import TerrainFlight
 
 sys.path.insert(0, str(ROOT / "docs"))  # scripts, not a package
 import terrain_limit

@@ -15,14 +15,16 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from pfbench.core.record import Record
-from pfbench.model.pseudorange_errors import (
+from pfbench.model.urban_gnss import (
     LosNlosRangeError,
     NormalExponentialMixture,
     NormalRangeError,
     PseudorangeError,
+    UrbanGnss,
     UrbanInputs,
+    UrbanTuning,
+    range_change,
 )
-from pfbench.model.urban_gnss import UrbanGnss, UrbanTuning, range_change
 from pfbench.testing import check_jacobians
 
 BELIEVED = UrbanTuning(

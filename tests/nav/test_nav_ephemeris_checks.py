@@ -12,9 +12,9 @@ import pytest
 import torch
 from ephemeris_cases import EPHEMERIDES, as_rinex, later_by_two_hours
 
-from pfbench.nav.gnss.broadcast_orbits import BroadcastConstellation
-from pfbench.nav.gnss.ephemeris_checks import POSITION_TOLERANCE, RANGES
-from pfbench.nav.gnss.rinex import read_rinex
+from pfbench.nav.broadcast_orbits import BroadcastConstellation
+from pfbench.nav.ephemeris import read_rinex
+from pfbench.nav.ephemeris_checks import POSITION_TOLERANCE, RANGES
 
 NOON = "2016-06-06T12:00:00"
 TIMES = torch.tensor([0.0, 3000.0, 9000.0], dtype=torch.float64)

@@ -12,8 +12,8 @@ from ephemeris_cases import EPHEMERIDES, later_by_two_hours
 from recorded_data import DATA
 
 from pfbench.nav import earth
-from pfbench.nav.gnss.broadcast_orbits import BroadcastConstellation
-from pfbench.nav.gnss.orbit_dynamics import J2, compute_gravity
+from pfbench.nav.broadcast_orbits import BroadcastConstellation
+from pfbench.nav.ephemeris_checks import J2, compute_gravity
 
 
 def three(first: pd.DataFrame = EPHEMERIDES) -> pd.DataFrame:

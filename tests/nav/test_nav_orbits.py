@@ -16,9 +16,9 @@ from recorded_data import DATA, recorded
 from torch import Tensor
 
 from pfbench.nav import earth
-from pfbench.nav.gnss.broadcast_orbits import BroadcastConstellation
-from pfbench.nav.gnss.ephemeris import GM_GPS
-from pfbench.nav.gnss.orbits import (
+from pfbench.nav.broadcast_orbits import BroadcastConstellation
+from pfbench.nav.ephemeris import GM_GPS, WEEK, read_rinex
+from pfbench.nav.orbits import (
     GPS_OMEGA,
     LIGHT,
     Constellation,
@@ -28,7 +28,6 @@ from pfbench.nav.gnss.orbits import (
     receive_signals,
     sagnac,
 )
-from pfbench.nav.gnss.rinex import WEEK, read_rinex
 
 TIMES = torch.arange(0.0, 7200.0, 240.0, dtype=torch.float64) + 13.0
 NOON = (datetime(2016, 6, 6, 12) - datetime(1980, 1, 6)).total_seconds()

@@ -14,8 +14,13 @@ from torch import Tensor
 from pfbench import job
 from pfbench.job import conf_dir
 from pfbench.nav import attitude, earth
-from pfbench.nav.manoeuvres import cruise, generate_manoeuvres
-from pfbench.nav.ramps import CosineRamp, CycloidRamp, RampTrajectory
+from pfbench.nav.manoeuvres import (
+    CosineRamp,
+    CycloidRamp,
+    RampTrajectory,
+    cruise,
+    generate_manoeuvres,
+)
 from pfbench.nav.strapdown import navigate
 from pfbench.nav.trajectory import TrajectoryData, TrajectoryStart
 

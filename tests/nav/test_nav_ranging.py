@@ -15,15 +15,13 @@ from torch.autograd import forward_ad
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.nav import earth
 from pfbench.nav.aiding import AidingData, AlignmentErrors, FlightSolution
-from pfbench.nav.gnss.orbits import LIGHT, WalkerConstellation
-from pfbench.nav.gnss.ranging import RangingInputs, RangingReceiver
-from pfbench.nav.gnss.receiver_clock import ReceiverClock
-from pfbench.nav.gnss.satellite_geometry import SatelliteGeometry, predict_ranges
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.manoeuvres import ManoeuvreTrajectory, cruise, turn
+from pfbench.nav.orbits import LIGHT, SatelliteGeometry, WalkerConstellation, predict_ranges
+from pfbench.nav.ranging import RangingInputs, RangingReceiver, ReceiverClock
 from pfbench.nav.trajectory import TrajectoryStart
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.simulated_flight import SimulatedFlight
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.flights import SimulatedFlight
 
 DEG, SATELLITES = math.pi / 180, 6
 

@@ -7,11 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from pfbench.core import quaternion
+from pfbench.core import chart
 from pfbench.nav import attitude, earth, strapdown
 from pfbench.nav.manoeuvres import accelerate, climb, cruise, generate_manoeuvres, turn
-from pfbench.nav.motion_spline import MotionSpline, RecordedMotion
-from pfbench.nav.trajectory import TrajectoryData, TrajectoryStart
+from pfbench.nav.trajectory import MotionSpline, RecordedMotion, TrajectoryData, TrajectoryStart
 
 PLAN = [
     cruise(4),
@@ -128,7 +127,7 @@ def test_velocity_is_the_derivative_of_position_and_turns_are_those_of_the_attit
         (slope - rate) * earth.metre_scale(flight.pos[inner])
     ).abs().max() < 1.5 * jerk / 6 / 200.0**2
     step = attitude.quaternion_from_dcm(flight.dcm[:-1].mT @ flight.dcm[1:])
-    turned = quaternion.rotation_vector_from_quaternion(step)
+    turned = chart.rotation_vector_from_quaternion(step)
     level = earth.earth_rate(flight.pos[:-1, 0]) + earth.transport_rate(
         flight.pos[:-1, 0], flight.pos[:-1, 2], flight.vel[:-1]
     )

@@ -9,7 +9,7 @@ from nav_reference import SHORT, T003, T004, errors, true_start
 from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.nav import attitude, earth, increments
+from pfbench.nav import attitude, earth, strapdown
 from pfbench.nav.imu_errors import ImuErrors, add_imu_errors
 from pfbench.nav.manoeuvres import accelerate, cruise, generate_manoeuvres
 from pfbench.nav.strapdown import InsState, navigate
@@ -94,7 +94,7 @@ def test_a_steady_force_in_a_body_that_turns_steadily(per_step):
     )
     samples = torch.ones(1, 2, 3, dtype=torch.float64)
     spans = torch.full((1, 2), span, dtype=torch.float64)
-    turn, push, _ = increments.correct_coning_sculling(
+    turn, push, _ = strapdown.correct_coning_sculling(
         samples * w * span, samples * f * span, spans, per_step, False
     )
     k, angle = attitude.skew(w), w.norm()
@@ -205,7 +205,7 @@ def test_preparing_steps_in_chunks_leaves_no_seam(monkeypatch, per_step):
     flight = generate_manoeuvres(*SHORT, rate=20)
     inputs = (flight.dtheta[None], flight.dv[None], 0.05, 20, per_step)
     whole, _ = navigate(true_start(flight), *inputs)
-    monkeypatch.setattr(increments, "_CHUNK", 7)
+    monkeypatch.setattr(strapdown, "_CHUNK", 7)
     pieces, _ = navigate(true_start(flight), *inputs)
     for a, b in zip(whole, pieces, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-14, atol=1e-14)

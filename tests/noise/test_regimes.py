@@ -14,12 +14,19 @@ from scipy import stats
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import MeasurementChannels
-from pfbench.noise.base import NoiseRegime, check_unit_process, process_variance_factors
+from pfbench.noise.base import (
+    GlintNoise,
+    LaplaceNoise,
+    NoiseRegime,
+    NominalNoise,
+    OutlierNoise,
+    StudentTNoise,
+    check_unit_process,
+    process_variance_factors,
+)
 from pfbench.noise.correlated import GaussMarkovNoise, NonLineOfSightNoise
 from pfbench.noise.error_replay import ErrorReplay
-from pfbench.noise.outage import MeasurementOutage
-from pfbench.noise.time_varying import BiasStep, VarianceSurge
-from pfbench.noise.white import GlintNoise, LaplaceNoise, NominalNoise, OutlierNoise, StudentTNoise
+from pfbench.noise.time_windows import BiasStep, MeasurementOutage, VarianceSurge
 
 SD = torch.tensor([2.0, 0.05, 30.0], dtype=torch.float64)
 TIME = torch.arange(0.0, 300.0, dtype=torch.float64)

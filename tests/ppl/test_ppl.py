@@ -26,26 +26,32 @@ from pfbench.filter.gaussian.linearisation_rules import (
 )
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
+from pfbench.filter.particle.resampling import EssResampler, Systematic
 from pfbench.model.base import ModelWrapper, StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.nonlinear_dynamics import Pendulum
 from pfbench.model.passive_location import PassiveLocation, PlatformInputs, compute_level_attitude
-from pfbench.model.pseudorange_errors import NormalExponentialMixture
-from pfbench.model.textbook import StochasticVolatility, UnivariateGrowth
-from pfbench.ppl.correlated_numbers import CorrelatedStream, SortedResampler
+from pfbench.model.textbook import Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.model.urban_gnss import NormalExponentialMixture
 from pfbench.ppl.ibis_smc2 import smc2
-from pfbench.ppl.marginal_likelihood import FilterLikelihood, GaussianHmmLikelihood
+from pfbench.ppl.likelihood import (
+    CorrelatedStream,
+    FilterLikelihood,
+    GaussianHmmLikelihood,
+    SortedResampler,
+    repeat_runs,
+)
 from pfbench.ppl.model_batch import ModelBatch
 from pfbench.ppl.parameter_posterior import ParameterPosterior, plot_posterior
-from pfbench.ppl.parameter_walk import ParameterWalk
 from pfbench.ppl.parameterised_model import ParameterisedModel
-from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
-from pfbench.ppl.posterior_estimate import repeat_runs
-from pfbench.ppl.prior_predictive import simulate
-from pfbench.ppl.pyro_program import compute_path, latent_program, program
-from pfbench.ppl.switching import SwitchingNoise, emission_distribution
+from pfbench.ppl.particle_mcmc import ParameterWalk, PmmhSettings, pmmh
+from pfbench.ppl.pyro_program import (
+    SwitchingNoise,
+    compute_path,
+    emission_distribution,
+    latent_program,
+    program,
+    simulate,
+)
 
 EKF, CKF, UKF = (
     GaussianFilter(TaylorLinearisation()),

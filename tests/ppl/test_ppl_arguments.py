@@ -12,13 +12,12 @@ from pfbench.core.record import Record
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.linear_gaussian import local_level
 from pfbench.ppl.ibis_smc2 import smc2
-from pfbench.ppl.marginal_likelihood import FilterLikelihood
+from pfbench.ppl.likelihood import FilterLikelihood
 from pfbench.ppl.nuts_svi import nuts, svi
+from pfbench.ppl.parameter_posterior import simulation_based_calibration
 from pfbench.ppl.parameterised_model import ParameterisedModel
 from pfbench.ppl.particle_mcmc import pmmh
-from pfbench.ppl.prior_predictive import simulate
-from pfbench.ppl.pyro_program import program
-from pfbench.ppl.sbc import simulation_based_calibration
+from pfbench.ppl.pyro_program import program, simulate
 
 GOOD: dict[str, Any] = {"draws": 2, "warmup": 1, "chains": 1, "seed": 0}
 WRONG_CALLS: dict[str, tuple[Callable[..., Any], dict[str, Any], str]] = {

@@ -26,13 +26,17 @@ from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.linear_gaussian import local_level
 from pfbench.ppl.ibis_smc2 import smc2
-from pfbench.ppl.marginal_likelihood import FilterLikelihood, GaussianHmmLikelihood
+from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood
 from pfbench.ppl.nuts_svi import normal_guide, nuts, svi
-from pfbench.ppl.parameter_posterior import ParameterPosterior
+from pfbench.ppl.parameter_posterior import (
+    ParameterPosterior,
+    SbcRanks,
+    sbc_histograms,
+    simulation_based_calibration,
+)
 from pfbench.ppl.parameterised_model import ParameterisedModel
 from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
 from pfbench.ppl.pyro_program import latent_program, program
-from pfbench.ppl.sbc import SbcRanks, sbc_histograms, simulation_based_calibration
 
 EKF, YEARS = GaussianFilter(TaylorLinearisation()), 12
 NILE = ParameterisedModel(

@@ -11,10 +11,14 @@ import pytest
 from command_line import Said, pfbench
 
 from pfbench import job
-from pfbench.replay.agreement import compare_runs, describe_agreement
-from pfbench.replay.recomputation import recompute_run, replay_config
-from pfbench.replay.run_selection import StoredRun, find_run
-from pfbench.replay.traces import magnification
+from pfbench.job.replay import (
+    compare_runs,
+    describe_agreement,
+    magnification,
+    recompute_run,
+    replay_config,
+)
+from pfbench.job.run_selection import StoredRun, find_run
 from pfbench.results import store
 
 WALK = ("scenario=linear_walk", "scenario.steps=8", "runs=4", "first_run=10", "score_steps=2")

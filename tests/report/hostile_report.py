@@ -9,7 +9,7 @@ from unittest import mock
 import synthetic_results as synthetic
 from escape_cases import HOSTILE
 
-from pfbench.report import page
+from pfbench.report import study_report
 from pfbench.results import store
 
 SHORT = "=<img src=x onerror=evil()>"  # names that are part of the names of files
@@ -41,5 +41,5 @@ def write_hostile_report(folder: Path) -> Path:
             disguise(synthetic.write(results, method, runs=8, steps=20))
     broken = {"scenario": HOSTILE, "noise": HOSTILE, "filter": HOSTILE, "model": HOSTILE}
     store.write_failure(results / "00000000deadbeef.npz", broken, ValueError(f"{HOSTILE}\n# c"))
-    options = page.ReportOptions(figure_formats=("svg",))
-    return page.write_report("demo", results.parent, folder / "reports", options).parent
+    options = study_report.ReportOptions(figure_formats=("svg",))
+    return study_report.write_report("demo", results.parent, folder / "reports", options).parent

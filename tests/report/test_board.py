@@ -14,6 +14,7 @@ import pytest
 from scipy import stats
 
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.board.entries import StudyNames, metric_entries
 from pfbench.report.board.levels import (
     StudyArrays,
     arrange_runs,
@@ -21,21 +22,24 @@ from pfbench.report.board.levels import (
     compare_track_shares,
     compute_condition_levels,
 )
-from pfbench.report.board.pack_entries import StudyNames, metric_entries
-from pfbench.report.board.planned import decide_planned, planned_entries, round_ratio
-from pfbench.report.board.sentence import describe_view
-from pfbench.report.board.study_views import build_views
+from pfbench.report.board.study_views import (
+    build_views,
+    decide_planned,
+    planned_entries,
+    round_ratio,
+)
 from pfbench.report.board.view import (
     BoardRow,
     Scope,
     ViewOptions,
     build_rows,
     describe_filters,
+    describe_view,
 )
-from pfbench.report.looks import PartName, find_looks
 from pfbench.report.options import ReportOptions
-from pfbench.report.study_page.opening import describe_pairs, name_effects
-from pfbench.report.verdict_files import write_verdict_files
+from pfbench.report.study_page.page_writer import describe_pairs, name_effects
+from pfbench.report.study_report import write_verdict_files
+from pfbench.results.looks import PartName, find_looks
 
 ONE_CONDITION = pd.DataFrame({"family": ["w"], "scenario": ["w"], "regime": ["nominal"]})
 EFFECTS = {"mcmc_rpf": -0.3, "sir": 0.0, "ukf": 0.5}

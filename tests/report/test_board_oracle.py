@@ -8,7 +8,7 @@ import pytest
 import synthetic_results as synthetic
 from board_oracle import find_differences
 
-from pfbench.report.page import write_report
+from pfbench.report.study_report import write_report
 
 METHODS = (*synthetic.METHODS, synthetic.Method("cpf", 1.01, 0.9, 200, 7.0, (1, 2, 3, 4, 5)))
 

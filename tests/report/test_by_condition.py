@@ -7,10 +7,10 @@ import re
 import numpy as np
 import pandas as pd
 
-from pfbench.report.board.decided_parts import StudyFacts, decide_parts
-from pfbench.report.board.pack_entries import ViewKey
-from pfbench.report.looks import PartName, find_looks
+from pfbench.report.board.entries import ViewKey
+from pfbench.report.board.pack import StudyFacts, decide_parts
 from pfbench.report.options import ReportOptions
+from pfbench.results.looks import PartName, find_looks
 
 LEVELS = {  # of each condition, logarithmic; None where all runs diverge
     "ekf": (0.0, 0.0, 0.0, 0.0),

@@ -15,9 +15,9 @@ from command_line import block, pfbench
 from pfbench.core.record import Episode, Record
 from pfbench.job import datasheet_data
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.noise.white import NominalNoise
+from pfbench.noise.base import NominalNoise
 from pfbench.report import datasheet
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.scenario.simulated import ModelSimulation
 
 WALK = ("scenario=linear_walk", "scenario.steps=12")
 PAGE = ROOT / "docs" / "write_a_scenario.md"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from pfbench.report.study_page.equal_time import offer_budgets, select_equal_time
+from pfbench.report.study_page.page_writer import offer_budgets, select_equal_time
 
 TIMES = {
     "sir[particles=100]": (100, 1.0), "sir[particles=400]": (400, 2.0), "sir[particles=1600]": (1600, 7.0),

@@ -10,14 +10,19 @@ import numpy as np
 import pytest
 from config_cases import CONF
 
-from pfbench.config.composition import compose
-from pfbench.config.paper_block import FAMILIES, check_paper_blocks, remove_nested_blocks
-from pfbench.config.paper_files import list_named_parts, plan_installed_pairs, read_paper_block
-from pfbench.config.tuning_names import OWN_WORLD
-from pfbench.report.looks import MethodLook, find_looks, study_looks
-from pfbench.report.plots.plotting import line_styles
-from pfbench.report.setting_names import describe_settings
+from pfbench.job.config import compose
 from pfbench.results.conditions import Condition, JobFile
+from pfbench.results.looks import MethodLook, describe_settings, find_looks, study_looks
+from pfbench.results.paper_block import (
+    FAMILIES,
+    OWN_WORLD,
+    check_paper_blocks,
+    list_named_parts,
+    plan_installed_pairs,
+    read_paper_block,
+    remove_nested_blocks,
+)
+from pfbench.results.plotting import line_styles
 
 METHODS = list_named_parts("filter")
 LOOKS = find_looks(METHODS)

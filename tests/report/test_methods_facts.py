@@ -15,11 +15,9 @@ from command_line import pfbench
 from page_packs import build_pack
 
 from pfbench.report import read_page_data
-from pfbench.report.journal.document import format_methods
-from pfbench.report.journal.methods_text import write_methods
-from pfbench.report.methods_facts import MethodsFacts, collect_methods_facts
-from pfbench.report.page import write_report
-from pfbench.report.stored_page import rebuild_page
+from pfbench.report.journal.paper_folder import format_methods
+from pfbench.report.methods_text import MethodsFacts, collect_methods_facts, write_methods
+from pfbench.report.study_report import rebuild_page, write_report
 from pfbench.results.conditions import Condition, load_conditions
 
 FACTS = [field.name for field in fields(MethodsFacts)]

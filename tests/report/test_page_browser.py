@@ -11,7 +11,7 @@ import pytest
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.study_page import write_page
-from pfbench.report.study_page.opening import format_short
+from pfbench.report.study_page.page_writer import format_short
 
 playwright = pytest.importorskip(
     "playwright.sync_api", reason="playwright is not installed: pip install 'pfbench[browser]'"

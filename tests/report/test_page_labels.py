@@ -12,7 +12,7 @@ import pytest
 from checkout import ROOT
 
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report import stored_page
+from pfbench.report import study_report
 from pfbench.report.study_page import write_page
 
 playwright = pytest.importorskip(
@@ -107,12 +107,12 @@ def test_labels_of_a_published_page_are_whole(
     study: str, tmp_path: Path, chromium: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # the stored decisions are those that are decided again (test_published)
-    monkeypatch.setattr(stored_page, "decide_again", lambda pack, runs: pack)
+    monkeypatch.setattr(study_report, "decide_again", lambda pack, runs: pack)
     folder = tmp_path / study
     folder.mkdir()
     for name in STORED:
         shutil.copy(ROOT / "reports" / study / name, folder)
-    assert list_cut(chromium, stored_page.rebuild_page(folder)) == {width: [] for width in WIDTHS}
+    assert list_cut(chromium, study_report.rebuild_page(folder)) == {width: [] for width in WIDTHS}
 
 
 @pytest.fixture(scope="module")

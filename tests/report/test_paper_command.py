@@ -10,7 +10,7 @@ import pytest
 import synthetic_results as synthetic
 
 from pfbench.cli.paper import write_study_paper
-from pfbench.report.page import write_report
+from pfbench.report.study_report import write_report
 
 
 @pytest.fixture(autouse=True)

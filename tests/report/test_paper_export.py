@@ -16,11 +16,15 @@ from page_packs import build_pack
 from synthetic_results import study
 
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report.journal import paper_folder, references
-from pfbench.report.journal.error_columns import format_error_value
-from pfbench.report.journal.figure_style import FigureSetting
-from pfbench.report.journal.main_table import make_main_tables, make_supplement
-from pfbench.report.journal.page_format import JOURNALS, SUPERSCRIPTS, find_page_format
+from pfbench.report import provenance
+from pfbench.report.journal import paper_folder
+from pfbench.report.journal.figure_style import (
+    JOURNALS,
+    SUPERSCRIPTS,
+    FigureSetting,
+    find_page_format,
+)
+from pfbench.report.journal.main_table import format_error_value, make_main_tables, make_supplement
 from pfbench.report.journal.pair_table import make_planned_table
 from pfbench.report.journal.paper_folder import (
     draw_paper_figure,
@@ -35,9 +39,9 @@ from pfbench.report.journal.table_layout import (
     format_table,
     measure_table,
     text_cell,
+    text_width,
 )
-from pfbench.report.journal.text_width import text_width
-from pfbench.report.methods_facts import collect_methods_facts
+from pfbench.report.methods_text import collect_methods_facts
 from pfbench.results.conditions import Condition, load_conditions
 
 HOSTILE = {0: r"A_b%$#&{}~^\x", 1: "Kürzel α [2]", 2: "$x^2$ <b>|"}
@@ -59,7 +63,7 @@ def write(
 ) -> list[str]:
     page = find_page_format(journal, width)
     pack["methods"] = collect_methods_facts(conditions).to_entries() | {"particles": {}}
-    pack["bibtex"] = references.format_bibliography(pack, conditions)
+    pack["bibtex"] = provenance.format_bibliography(pack, conditions)
     with RecordedFolder(folder) as target:
         return paper_folder.write_paper(pack, page, target)
 
@@ -306,7 +310,7 @@ def test_each_reference_of_a_filter_has_an_entry_and_each_entry_a_filter() -> No
         for path in (ROOT / "conf" / "filter").glob("*.yaml")
     ]
     cited = {block["cite"] for block in blocks if block.get("cite")}
-    bib = (Path(references.__file__).with_name("methods.bib")).read_text()
+    bib = (Path(provenance.__file__).with_name("methods.bib")).read_text()
     assert set(re.findall(r"^@\w+\{(\w+),", bib, re.MULTILINE)) == cited
     assert bib.isascii()
     for entry in re.findall(r"^@.*?^\}", bib, re.MULTILINE | re.DOTALL):

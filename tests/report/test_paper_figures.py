@@ -17,15 +17,12 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from pfbench import job
-from pfbench.report import page
-from pfbench.report.plots.axis_ticks import format_ticks
-from pfbench.report.plots.figure_files import render_palette_png
-from pfbench.report.plots.paper import experiment_plots, flight_figures, paper_figures, time_plots
-from pfbench.report.plots.paper.paper_catalogue import FIGURES
-from pfbench.report.plots.plotting import line_styles
+from pfbench.report import study_report
+from pfbench.report.papers import figures, plots, specs
+from pfbench.report.papers.figures import FIGURES
 from pfbench.results import store
-from pfbench.results.conditions import load_conditions
-from pfbench.results.state_groups import component_groups
+from pfbench.results.conditions import component_groups, load_conditions
+from pfbench.results.plotting import format_ticks, line_styles, render_palette_png
 
 SIR = synthetic.Method("sir", 1.3, 0.8, 200, 4.0, (7,))
 SWARM = synthetic.Method("cpso_escape", 1.0, 1.0, 200, 9.0)
@@ -54,7 +51,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def drawn(results: Path, *wanted: str) -> dict[str, tuple[str, Figure]]:
     found = load_conditions("paper_004", results)
     style = line_styles(sorted({job.label for cell in found for job in cell.jobs}))
-    made = paper_figures.paper_figures("paper_004", found, style, wanted or None, start_time_s=10.0)
+    made = figures.paper_figures("paper_004", found, style, wanted or None, start_time_s=10.0)
     return {drawing.name: (drawing.caption, drawing.make()) for drawing in made}
 
 
@@ -104,7 +101,7 @@ def test_values_of_a_parameter_have_a_line_each(tmp_path: Path) -> None:
         )
     found = load_conditions("paper_002_bound", tmp_path)
     style = line_styles([job.label for cell in found for job in cell.jobs])
-    (drawing,) = paper_figures.paper_figures("paper_002_bound", found, style, ["002-3-bound"])
+    (drawing,) = figures.paper_figures("paper_002_bound", found, style, ["002-3-bound"])
     figure = drawing.make()
     lines = [line(figure, 0, f"ratio bound {value}") for value in ("1.0", "1000000000.0")]
     results = {r.meta["label"]: r for r in store.list_results(tmp_path / "paper_002_bound")}
@@ -164,7 +161,7 @@ def test_nothing_lies_beyond_the_axes(results: Path) -> None:
     wild[..., 6] *= 1 + 1e4 * np.exp(-np.arange(30) / 2)
     block = next(b for b in component_groups(result.meta["state"]) if b.group == "position")
     own = {"cpso_escape": (store.JobResult(result.meta, {**result.data, "error": wild}), block)}
-    panel = time_plots.plot_errors(own, line_styles(["cpso_escape"])).axes[0]
+    panel = plots.plot_errors(own, line_styles(["cpso_escape"])).axes[0]
     assert panel.get_yscale() == "symlog"
     assert panel.get_ylim()[1] >= np.quantile(wild[:, 0, 6], 0.95)
     ticks = list(panel.get_yticks())
@@ -183,7 +180,7 @@ def test_a_bad_filter_does_not_flatten_the_good_ones(results: Path, wild: float)
     bad = loaded(results, "cofm_amssrcpf")
     bad = store.JobResult(bad.meta, {**bad.data, "error": wild * bad.data["error"]})
     own = {label: (result, block) for label, result in (*good.items(), ("cofm_amssrcpf", bad))}
-    figure = time_plots.plot_errors(own, line_styles(list(own)))
+    figure = plots.plot_errors(own, line_styles(list(own)))
     figure.draw_without_rendering()
     for component, axis in enumerate(figure.axes):
         assert axis.get_yscale() == "symlog"
@@ -204,7 +201,7 @@ def test_a_bad_filter_does_not_flatten_the_good_ones(results: Path, wild: float)
 def test_a_bias_stands_beside_itself_before_correction(results: Path) -> None:
     result = loaded(results, "cpso_escape")
     block = next(b for b in component_groups(result.meta["state"]) if b.group == "attitude")
-    figure = time_plots.plot_errors(
+    figure = plots.plot_errors(
         {"cpso_escape": (result, block)}, line_styles(["cpso_escape"]), before=True
     )
     first = np.quantile(block.scale * result.data["error"][:, 0, 0].astype(float), [0.05, 0.95])
@@ -231,7 +228,7 @@ def test_traces_are_drawn_with_what_is_printed_of_them(results: Path) -> None:
 def test_err_is_the_horizontal_error_over_the_range(results: Path) -> None:
     for label in ("sir", "cpso_escape"):
         result = loaded(results, label)
-        each = experiment_plots.mean_relative_error(result)
+        each = plots.mean_relative_error(result)
         assert each.size == (~result.data["lost"]).sum()
         error = result.data["error"][..., [6, 7]]
         valid = error[~result.data["lost"]].astype(float)
@@ -241,7 +238,7 @@ def test_err_is_the_horizontal_error_over_the_range(results: Path) -> None:
         "first": {"sir": np.arange(101.0), "gpf": np.array([5.0])},
         "second": {"sir": np.full(3, 7.0)},
     }
-    axis = experiment_plots.plot_against(values, line_styles(["gpf", "sir"]), "Err").axes[0]
+    axis = plots.plot_against(values, line_styles(["gpf", "sir"]), "Err").axes[0]
     lines = [(np.asarray(one.get_xdata()), np.asarray(one.get_ydata())) for one in axis.lines]
     assert sorted((round(x[0]), y[0]) for x, y in lines if len(y) == 1) == [
         (0, 5.0),
@@ -249,7 +246,7 @@ def test_err_is_the_horizontal_error_over_the_range(results: Path) -> None:
         (1, 7.0),
     ]
     assert [tuple(y) for _, y in lines if len(y) == 2 and y[1] > y[0]] == [(5.0, 95.0)]
-    wide = experiment_plots.plot_against(
+    wide = plots.plot_against(
         {"first": {"sir": np.array([0.1]), "gpf": np.array([90.0])}},
         line_styles(["gpf", "sir"]),
         "",
@@ -305,7 +302,7 @@ def test_largest_errors_stand_beside_the_printed_ones(results: Path) -> None:
 
 def test_the_flight_is_the_true_track_and_its_velocity(results: Path) -> None:
     caption, flight = drawn(results, "000-1")["000-1_flight"]
-    velocity = flight_figures.plot_flight_velocity(loaded(results, "sir"))
+    velocity = specs.plot_flight_velocity(loaded(results, "sir"))
     arrays = loaded(results, "sir").data
     plan, height = flight.axes
     track = arrays["track"][0].astype(float)
@@ -337,8 +334,8 @@ def test_a_figure_that_cannot_be_drawn_is_told(
 
 
 def test_the_page_links_to_each_of_them(results: Path, tmp_path: Path) -> None:
-    options = page.ReportOptions(figure_formats=("png",), paper_figures=("004-iterations",))
-    made = page.write_report("paper_004", results, tmp_path, options)
+    options = study_report.ReportOptions(figure_formats=("png",), paper_figures=("004-iterations",))
+    made = study_report.write_report("paper_004", results, tmp_path, options)
     name = "004-iterations_flight_nominal_ins_gnss_iterations"
     text = made.read_text()
     assert '<figure id="paper_004_iterations_flight_nominal_ins_gnss_iterations"><img' in text

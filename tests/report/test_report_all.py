@@ -9,7 +9,7 @@ import pytest
 from command_line import pfbench
 
 from pfbench.claims import claim_records, page as claims_page
-from pfbench.report import page
+from pfbench.report import study_report
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
     """Options of each report that was asked for; none is drawn."""
     asked: dict[str, Any] = {}
 
-    def write(study: str, results: str, out: str, options: page.ReportOptions) -> Path:
+    def write(study: str, results: str, out: str, options: study_report.ReportOptions) -> Path:
         if study == "broken":
             raise ValueError("the cell holds results that differ")
         asked[study] = options
@@ -27,7 +27,7 @@ def made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str, Any]:
         asked["claims"] = None
         return Path(out) / "claims" / "index.html"
 
-    monkeypatch.setattr(page, "write_report", write)
+    monkeypatch.setattr(study_report, "write_report", write)
     monkeypatch.setattr(claims_page, "write_claims", of_claims)
     monkeypatch.chdir(tmp_path)
     return asked

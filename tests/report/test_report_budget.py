@@ -6,7 +6,7 @@ from omegaconf import OmegaConf
 from pfbench import job
 from pfbench.job.plan import DEFAULTS_NOT_IN_KEY
 from pfbench.results import store
-from pfbench.results.config_key import compute_config_key
+from pfbench.results.store import compute_config_key
 
 CONFIG = OmegaConf.load(job.conf_dir() / "config.yaml")
 

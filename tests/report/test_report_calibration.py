@@ -5,8 +5,8 @@ import pytest
 import synthetic_results as synthetic
 from scipy import stats
 
-from pfbench.results import conditions, consistency, frame, metrics, store
-from pfbench.results.state_groups import component_groups
+from pfbench.results import conditions, frame, metrics, status, store
+from pfbench.results.conditions import component_groups
 
 ARCMIN = 180 * 60 / np.pi
 METHODS = (
@@ -84,7 +84,7 @@ def test_coverage_tells_narrow_from_honest_and_leaves_lost_runs_out(loaded):
     assert share["narrow"] < 70 < share["honest"] < share["wide"]
     narrow = 100 * (2 * stats.norm.cdf(0.4 * 1.6449) - 1)
     assert share["narrow"] == pytest.approx(narrow, abs=6)
-    own = consistency.coverage_per_run(arrays["pit"], arrays["lost"], 0.9)
+    own = status.coverage_per_run(arrays["pit"], arrays["lost"], 0.9)
     assert np.isnan(own).tolist() == arrays["lost"].tolist()
 
 

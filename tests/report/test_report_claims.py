@@ -19,17 +19,17 @@ from synthetic_results import METHODS, STATE, VERSIONS, Method, write
 from pfbench import job
 from pfbench.claims import (
     claim_records,
-    claim_samples,
-    claim_tables,
-    figures as claims_figures,
+    claim_records as schema,
     measurements,
+    page as claim_tables,
+    page as claims_figures,
     page as claims_page,
-    schema,
     verdicts,
+    verdicts as claim_samples,
 )
-from pfbench.claims.schema import Claim, ClaimTest
+from pfbench.claims.claim_records import Claim, ClaimTest
 from pfbench.results import store
-from pfbench.results.statistics import intervals, power, signed_rank
+from pfbench.stats import intervals, rank_tests, study_size
 
 IDS = [
     *(f"C000-{k}" for k in range(1, 10)),
@@ -475,10 +475,10 @@ def test_what_lacks_power_says_the_runs_that_it_takes() -> None:
         rows = frame([LESS, other], **values, n=np.exp(np.linspace(-1, 1.1, 20)))
         found = verdicts.decide_claims([claim(LESS, other)], rows)[0].findings[""][0]
         assert (found.outcome, found.reason, found.family) == ("open", "too few runs", 2)
-        for_it = power.required_runs(-middle / 0.5, 2 * 0.05 / 2) if middle < 0 else np.inf
+        for_it = study_size.required_runs(-middle / 0.5, 2 * 0.05 / 2) if middle < 0 else np.inf
         beyond = middle + np.log(1.1)  # worth the name is a tenth
         against_it = (
-            power.required_runs(beyond / 0.5, 0.05 / 2, efficiency=2 / np.pi)
+            study_size.required_runs(beyond / 0.5, 0.05 / 2, efficiency=2 / np.pi)
             if beyond > 0
             else np.inf
         )
@@ -493,7 +493,7 @@ def test_what_lacks_power_says_the_runs_that_it_takes() -> None:
     )
     share = alone("share", metric="severely_overconfident", low=0.05)
     (found,) = ruled(share, a=np.arange(20) < 2).findings[""]
-    assert found.needed == power.required_runs_proportion(0.1, 0.05, 0.05)
+    assert found.needed == study_size.required_runs_proportion(0.1, 0.05, 0.05)
 
 
 def test_a_share_is_tested_from_one_side() -> None:
@@ -594,8 +594,8 @@ def test_holm_goes_over_all_comparisons_of_a_paper() -> None:
 def test_holm_is_that_of_statsmodels() -> None:
     p = np.random.default_rng(20).random(30) ** 3
     p[3] = p[17]
-    assert signed_rank.holm(p) == pytest.approx(multipletests(p, method="holm")[1])
-    assert signed_rank.holm([]).size == 0
+    assert rank_tests.holm(p) == pytest.approx(multipletests(p, method="holm")[1])
+    assert rank_tests.holm([]).size == 0
 
 
 def test_forms_are_told_apart() -> None:

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 import synthetic_results as synthetic
 
-from pfbench.report import datasheet, scenario_data
-from pfbench.report.plots import scenario_figures
-from pfbench.report.plots.plotting import RC
-from pfbench.results import consistency, store
+from pfbench.report import datasheet, scenario_figures
+from pfbench.results import status, store
+from pfbench.results.plotting import RC
 
 STEPS, RUNS, SLOTS = 30, 6, 4
 META: dict[str, Any] = {
@@ -157,13 +156,13 @@ def test_the_sky_has_north_up_and_east_to_the_right_and_names(whole: store.JobRe
 def test_a_scene_may_spell_its_satellites_and_show_them_at_some_steps_alone(
     whole: store.JobResult,
 ) -> None:
-    assert scenario_data.list_satellites(whole) == ["G01", "G02", "G07", "G30"]
+    assert scenario_figures.list_satellites(whole) == ["G01", "G02", "G07", "G30"]
     codes = [[ord(letter) for letter in name] for name in ("E1 ", "R24", "G05", "C06")]
     spelled = whole.data | {"satellites": np.array(codes, np.float32)}
     for name in ("azimuth", "elevation"):
         spelled[name] = np.where(np.arange(STEPS)[:, None] % 3 == 0, spelled[name], np.nan)
     sheet = store.JobResult(whole.meta, spelled)
-    assert scenario_data.list_satellites(sheet) == ["E1", "R24", "G05", "C06"]
+    assert scenario_figures.list_satellites(sheet) == ["E1", "R24", "G05", "C06"]
     assert any(
         fact == "Satellites above the horizon: 3 to 4 of 4." for fact in datasheet.list_facts(sheet)
     )
@@ -192,7 +191,7 @@ def test_runs_with_the_same_residuals_count_once(whole: store.JobResult) -> None
 def test_white_normal_numbers_lie_in_their_bands_and_others_do_not() -> None:
     rng = np.random.default_rng(2)
     white = rng.standard_normal((20, 200, 3))
-    law = consistency.compute_whiteness(white)
+    law = status.compute_whiteness(white)
     # bands are of 1.96 standard errors: three of them allow 5.9
     assert abs(law.mean) < 3 * law.mean_band
     assert abs(law.variance - 1) < 3 * law.variance_band
@@ -200,21 +199,21 @@ def test_white_normal_numbers_lie_in_their_bands_and_others_do_not() -> None:
     assert law.numbers == 12000
     assert law.variance_band == pytest.approx(1.96 * np.sqrt(2 / 12000))
     assert law.lag_band == pytest.approx(1.96 / np.sqrt(20 * 199 * 3))
-    assert consistency.compute_whiteness(white + 0.2).mean > 5 * law.mean_band
-    assert consistency.compute_whiteness(1.1 * white).variance > 1 + 5 * law.variance_band
+    assert status.compute_whiteness(white + 0.2).mean > 5 * law.mean_band
+    assert status.compute_whiteness(1.1 * white).variance > 1 + 5 * law.variance_band
     slow = white.copy()
     for t in range(1, 200):
         slow[:, t] = 0.5 * slow[:, t - 1] + np.sqrt(0.75) * white[:, t]
-    assert consistency.compute_whiteness(slow).lag == pytest.approx(0.5, abs=0.05)
+    assert status.compute_whiteness(slow).lag == pytest.approx(0.5, abs=0.05)
 
 
 def test_neighbours_are_the_measurements_next_to_each_other() -> None:
     z = np.full((1, 9, 1), np.nan)
     z[0, ::2, 0] = [1.0, -1.0, 1.0, -1.0, 1.0]
-    law = consistency.compute_whiteness(z)
+    law = status.compute_whiteness(z)
     assert law.lag == -1.0
     assert law.lag_band == pytest.approx(1.96 / 2)
     assert law.variance == 1.0
-    empty = consistency.compute_whiteness(z * np.nan)
+    empty = status.compute_whiteness(z * np.nan)
     assert empty.numbers == 0
     assert np.isnan(empty.variance)

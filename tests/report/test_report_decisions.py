@@ -12,12 +12,12 @@ import pandas as pd
 import pytest
 import synthetic_results as synthetic
 
-from pfbench.config.paper_files import plan_installed_pairs
-from pfbench.report import page
+from pfbench.report import study_report
 from pfbench.report.options import ReportOptions
-from pfbench.report.study_files import decide_study
+from pfbench.report.study_report import decide_study
 from pfbench.results import frame, store
-from pfbench.results.decisions.decision import Decision
+from pfbench.results.paper_block import plan_installed_pairs
+from pfbench.stats.decision import Decision
 
 EFFECTS = {"sir": 0.4, "rpf": 0.2, "mcmc_rpf": 0.0}
 PAIRS = [("mcmc_rpf", "sir"), ("mcmc_rpf", "rpf")]
@@ -192,7 +192,7 @@ def test_a_page_without_enough_data_states_why(case: str, tmp_path: Path) -> Non
         if case == "identical":
             first = first or arrays
             store.write_result(path, meta, first)
-    made = page.write_report("demo", tmp_path, tmp_path / "reports")
+    made = study_report.write_report("demo", tmp_path, tmp_path / "reports")
     records = json.loads((made.parent / "decisions.json").read_text())
     words = {r["word"] for r in records}
     assert not words & {"better", "worse"}

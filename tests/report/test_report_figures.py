@@ -13,12 +13,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
-from pfbench.report.plots import (
-    axis_ticks,
-    label_placement,
-    plotting,
-)
-from pfbench.report.plots.figure_files import render_palette_png
+from pfbench.report.journal import ratio_figures
+from pfbench.results import plotting
+from pfbench.results.plotting import render_palette_png
 
 
 def lightness(colour: str) -> float:
@@ -66,7 +63,7 @@ def test_ticks_of_an_axis_have_one_style(ends: tuple[float, float]) -> None:
         figure, (axis,) = plotting.stacked_axes(1, 1.4)
         axis.plot([0, 1], ends)
         axis.set_yscale("log")
-        axis_ticks.set_plain_ticks(axis.yaxis, ends)
+        plotting.set_plain_ticks(axis.yaxis, ends)
         figure.draw_without_rendering()
         said = [text.get_text() for text in axis.get_yticklabels() if text.get_text()]
     assert len(said) > 1
@@ -80,7 +77,7 @@ def test_long_numbers_that_lie_abreast_do_not_touch() -> None:
         figure, (axis,) = plotting.stacked_axes(1, 1.4)
         axis.plot([1500.0, 6e4], [0.0, 1.0])
         axis.set_xscale("log")
-        axis_ticks.set_plain_ticks(axis.xaxis, [1500.0, 6e4])
+        plotting.set_plain_ticks(axis.xaxis, [1500.0, 6e4])
         axis.set_yticks([0, 1], ["dmc_reconstructed_printed", "sir"])
         figure.draw_without_rendering()
     assert min(gaps(axis)) > 6
@@ -97,9 +94,9 @@ def gaps(axis: Axes) -> list[float]:
 
 
 def test_powers_are_those_of_the_values() -> None:
-    assert axis_ticks.format_ticks([1.0, 1e4, 1e8]) == ["10⁰", "10⁴", "10⁸"]
-    assert axis_ticks.format_ticks([-2e6, 0.0, 5e-5]) == ["-2·10⁶", "0", "5·10⁻⁵"]
-    assert axis_ticks.format_ticks([-1000.0, 0.0, 0.5]) == ["-1000", "0", "0.5"]
+    assert plotting.format_ticks([1.0, 1e4, 1e8]) == ["10⁰", "10⁴", "10⁸"]
+    assert plotting.format_ticks([-2e6, 0.0, 5e-5]) == ["-2·10⁶", "0", "5·10⁻⁵"]
+    assert plotting.format_ticks([-1000.0, 0.0, 0.5]) == ["-1000", "0", "0.5"]
 
 
 # the front of accuracy and time
@@ -107,7 +104,7 @@ def test_powers_are_those_of_the_values() -> None:
 
 def test_a_name_of_two_lines_takes_room_for_two():
     one, two = (
-        label_placement._text_size(name) for name in ("sir[particles=100]", "sir\n[particles=100]")
+        ratio_figures._text_size(name) for name in ("sir[particles=100]", "sir\n[particles=100]")
     )
     assert two[1] == 2 * one[1]
     assert two[0] < one[0]

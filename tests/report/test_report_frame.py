@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import synthetic_results as synthetic
 
-from pfbench.replay.run_selection import find_run
-from pfbench.report.looks import study_part_names
-from pfbench.results import conditions, frame, state_groups, store
+from pfbench.job.run_selection import find_run
+from pfbench.results import conditions, conditions as state_groups, frame, store
+from pfbench.results.looks import study_part_names
 
 SMALL = {"runs": 6, "steps": 20}
 

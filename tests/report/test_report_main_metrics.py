@@ -12,11 +12,11 @@ from scipy import stats
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.options import ReportOptions
-from pfbench.report.study_files import write_study_files
+from pfbench.report.study_report import write_study_files
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
 from pfbench.results.frame import load_frame
-from pfbench.results.study_decisions.main_metrics import (
+from pfbench.stats.main_metrics import (
     MAIN_METRICS,
     RULES,
     select_main_metrics,

@@ -7,11 +7,11 @@ import pytest
 import synthetic_results as synthetic
 from scipy import stats
 
-from pfbench.claims import schema
-from pfbench.report.study_files import summarise_metrics
+from pfbench.claims import claim_records
+from pfbench.report.study_report import summarise_metrics
 from pfbench.results import conditions, frame, metrics, status, store
-from pfbench.results.state_groups import component_groups
-from pfbench.results.statistics import signed_rank
+from pfbench.results.conditions import component_groups
+from pfbench.stats import rank_tests
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +69,7 @@ def test_probabilities_of_counts_are_not_compared_with_densities(results):
 def test_the_table_of_metrics_is_complete():
     names = [metric.name for metric in metrics.METRICS]
     assert len(names) == len(set(names))
-    assert set(names) <= set(schema.CLAIM_METRICS)
+    assert set(names) <= set(claim_records.CLAIM_METRICS)
     for metric in metrics.METRICS:
         assert metric.direction in ("lower", "higher", "target"), metric.name
         assert metric.caption.endswith("."), metric.name
@@ -82,18 +82,18 @@ def test_signed_rank_tests_of_many_pairs_are_those_of_scipy(n, alternative):
     d = rng.normal(0.3, 1, (9, n))
     d[3:6] = np.round(d[3:6], 1)  # some ties and zeros
     d[6:] = np.round(d[6:])  # many
-    statistic, p = signed_rank.wilcoxon_signed_rank_rows(d, alternative)
+    statistic, p = rank_tests.wilcoxon_signed_rank_rows(d, alternative)
     # scipy permutes ties of few differences, for seconds: one row without and one with ties
     checked = (0, {"two-sided": 3, "greater": 6, "less": 4}[alternative]) if n == 13 else range(9)
     for k, (row, t, value) in enumerate(zip(d, statistic, p, strict=True)):
         if row.any() and k in checked:
             expected = stats.wilcoxon(row, alternative=alternative, zero_method="zsplit")
             assert (t, value) == pytest.approx((expected.statistic, expected.pvalue), rel=1e-11)
-        assert signed_rank.wilcoxon_signed_rank(row, alternative) == (
+        assert rank_tests.wilcoxon_signed_rank(row, alternative) == (
             t,
             value,
         )  # alone as among others
-    assert signed_rank.wilcoxon_signed_rank(np.zeros(n)).p == 1
+    assert rank_tests.wilcoxon_signed_rank(np.zeros(n)).p == 1
 
 
 def test_a_run_is_diverged_if_its_error_exceeds_the_threshold_in_a_tenth_of_the_steps_or_at_the_end():

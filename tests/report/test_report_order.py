@@ -12,11 +12,11 @@ import pandas as pd
 import pytest
 import synthetic_results as synthetic
 
-from pfbench.report import page
+from pfbench.report import study_report
 from pfbench.results import frame, store
-from pfbench.results.decisions.filter_sets import order_filters
-from pfbench.results.decisions.planned_pairs import decide_planned_pairs
-from pfbench.results.decisions.tidy_table import tidy_runs
+from pfbench.stats.filter_sets import order_filters
+from pfbench.stats.planned_pairs import decide_planned_pairs
+from pfbench.stats.study_runs import tidy_runs
 
 NOISES = ("nominal", "surge", "heavy", "outage", "jam")
 METHODS = synthetic.METHODS[1:]
@@ -95,7 +95,7 @@ def test_order_of_files_and_workers_change_no_verdict(tmp_path: Path) -> None:
     said = []
     for turn in (0, 7):
         folder = study(tmp_path / f"results{turn}" / "demo", turn)
-        made = page.write_report("demo", folder.parent, tmp_path / f"reports{turn}")
+        made = study_report.write_report("demo", folder.parent, tmp_path / f"reports{turn}")
         names = ("decisions.json", "consistency.json", "metrics.csv", "verdicts.csv")
         said.append([(made.parent / name).read_text() for name in names])
         assert ("worker 3" in made.read_text()) is bool(turn)

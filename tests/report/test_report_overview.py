@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pfbench.results.metric_values import MetricInput, mean_trace
-from pfbench.results.metrics import compute_metric
+from pfbench.results.metrics import MetricInput, compute_metric, mean_trace
 from pfbench.results.store import JobResult
 
 NAN = np.nan

@@ -12,12 +12,12 @@ import pandas as pd
 import pytest
 import synthetic_results as synthetic
 
-from pfbench.report import page, table_formats
+from pfbench.report import study_report, writers
 from pfbench.report.board.curves import make_curves
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
 
-QUICK = page.ReportOptions(figure_formats=("svg",))
+QUICK = study_report.ReportOptions(figure_formats=("svg",))
 
 
 def everything(folder):
@@ -37,11 +37,11 @@ def results(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def report(results, tmp_path_factory):
-    return page.write_report(
+    return study_report.write_report(
         "demo",
         results,
         tmp_path_factory.mktemp("reports"),
-        page.ReportOptions(figure_formats=("svg", "png")),
+        study_report.ReportOptions(figure_formats=("svg", "png")),
     ).parent
 
 
@@ -89,14 +89,14 @@ def test_the_page_says_what_ran_what_failed_and_what_was_lost(report):
 
 
 def test_same_results_same_bytes_whatever_the_order_of_files(results, tmp_path, monkeypatch):
-    first = page.write_report("demo", results, tmp_path / "one", QUICK).parent
+    first = study_report.write_report("demo", results, tmp_path / "one", QUICK).parent
     copy = tmp_path / "copy" / "demo"
     copy.mkdir(parents=True)
     for path in sorted((results / "demo").iterdir(), reverse=True):
         shutil.copy(path, copy)
     real = Path.glob
     monkeypatch.setattr(Path, "glob", lambda self, pattern: reversed(sorted(real(self, pattern))))
-    second = page.write_report("demo", copy.parent, tmp_path / "two", QUICK).parent
+    second = study_report.write_report("demo", copy.parent, tmp_path / "two", QUICK).parent
     assert everything(first) == everything(second)
 
 
@@ -107,7 +107,7 @@ def test_a_new_report_removes_the_figures_of_the_old_one_alone(tmp_path, caplog)
     ):
         synthetic.write(tmp_path / "paper_001", method, runs=6, steps=8)
     folder = tmp_path / "reports" / "paper_001"
-    page.write_report(
+    study_report.write_report(
         "paper_001",
         tmp_path,
         tmp_path / "reports",
@@ -119,7 +119,7 @@ def test_a_new_report_removes_the_figures_of_the_old_one_alone(tmp_path, caplog)
     for path in mine:
         path.parent.mkdir(exist_ok=True)
         path.write_text("mine")
-    page.write_report(
+    study_report.write_report(
         "paper_001", tmp_path, tmp_path / "reports", replace(QUICK, paper_figures=("001-3",))
     )
     assert {path.name for path in (folder / "figures").iterdir()} == {
@@ -142,15 +142,15 @@ def test_mixed_versions_are_refused_and_named_when_allowed(tmp_path):
         versions={**synthetic.VERSIONS, "commit": "fff9999"},
     )
     with pytest.raises(ValueError, match=r"versions\.commit"):
-        page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
+        study_report.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     assert not (tmp_path / "reports").exists()
-    mixed = page.ReportOptions(figure_formats=("svg",), allow_mixed_versions=True)
-    path = page.write_report("demo", tmp_path, tmp_path / "reports", mixed)
+    mixed = study_report.ReportOptions(figure_formats=("svg",), allow_mixed_versions=True)
+    path = study_report.write_report("demo", tmp_path, tmp_path / "reports", mixed)
     assert "0123abc, fff9999" in path.read_text()
 
 
 def test_the_page_says_what_its_jobs_took_and_how_many_were_asked_for(results, tmp_path):
-    page.write_report("demo", results, tmp_path, replace(QUICK, planned=6))
+    study_report.write_report("demo", results, tmp_path, replace(QUICK, planned=6))
     text = (tmp_path / "demo" / "index.html").read_text()
     seconds = sum(
         1.0 + 1e-3 * method.milliseconds * 40 for method in synthetic.METHODS
@@ -164,7 +164,7 @@ def test_a_threshold_of_no_group_is_refused_before_anything_is_written(results, 
         ValueError,
         match=r"report\.convergence_threshold must name groups of the results, got height",
     ):
-        page.write_report(
+        study_report.write_report(
             "demo", results, tmp_path, replace(QUICK, convergence_threshold={"height": 1.0})
         )
     assert not list(tmp_path.iterdir())
@@ -178,7 +178,7 @@ def test_a_toy_without_map_particles_or_rival(tmp_path):
     toy = {name: arrays[name] for name in ("time", "log_evidence", "lost")}
     toy |= {name: arrays[name][..., :1] for name in ("error", "sd", "nees")}
     store.write_result(path, {**meta, "state": state}, toy)
-    made = page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
+    made = study_report.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     assert "kalman" in made.read_text()
     assert json.loads((made.parent / "decisions.json").read_text()) == []
 
@@ -188,7 +188,7 @@ def test_a_filter_that_lost_every_run_is_worse_and_has_no_number(tmp_path):
     synthetic.write(folder, synthetic.METHODS[0], runs=12, steps=20)
     doomed = synthetic.Method("doomed", 1.0, lost=tuple(range(12)))
     synthetic.write(folder, doomed, runs=12, steps=20)
-    made = page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
+    made = study_report.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     records = json.loads((made.parent / "decisions.json").read_text())
     track = [r for r in records if r["metric"] == "keeps track" and r["question"] == "a"]
     assert [(r["a"], r["b"], r["word"]) for r in track] == [("doomed", "ekf", "worse")]
@@ -226,7 +226,7 @@ def test_conditions_whose_data_differ_say_so(tmp_path):
             {**meta, "config": {"filter": {"name": "ekf"}, "scenario": {"gps_sd": sd}}},
             arrays,
         )
-    page.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
+    study_report.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     text = (tmp_path / "reports" / "demo" / "report.md").read_text()
     assert (
         "Conditions in brackets differ in gps sd. Their data differ: filters are compared within each of them."
@@ -236,9 +236,9 @@ def test_conditions_whose_data_differ_say_so(tmp_path):
 
 def test_options_are_checked():
     with pytest.raises(ValueError, match="alpha must be between 0 and 1, got 5"):
-        page.ReportOptions(alpha=5)
+        study_report.ReportOptions(alpha=5)
     with pytest.raises(ValueError, match=r"formats must be a subset of svg, png, got .'gif'"):
-        page.ReportOptions(figure_formats=("gif",))
+        study_report.ReportOptions(figure_formats=("gif",))
 
 
 @pytest.mark.parametrize(
@@ -250,11 +250,11 @@ def test_options_are_checked():
     ],
 )  # fmt: skip
 def test_numbers_have_three_digits(value, text):
-    assert table_formats.format_number(value) == text
+    assert writers.format_number(value) == text
 
 
 def test_markdown_columns_line_up():
-    text = table_formats.format_markdown(pd.DataFrame({"a|b": ["x", "yy"], "n": [1.0, 20.0]}))
+    text = writers.format_markdown(pd.DataFrame({"a|b": ["x", "yy"], "n": [1.0, 20.0]}))
     assert text.splitlines() == [
         "| a\\|b |    n |",
         "|------|-----:|",
@@ -264,7 +264,7 @@ def test_markdown_columns_line_up():
 
 
 def test_templates_are_packaged():
-    here = Path(page.__file__).parent
+    here = Path(study_report.__file__).parent
     patterns = tomllib.loads((here.parents[1] / "pyproject.toml").read_text())["tool"][
         "setuptools"
     ]["package-data"]

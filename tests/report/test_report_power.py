@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 from statsmodels.stats.power import TTestPower
 
-from pfbench.results.statistics import power, signed_rank
+from pfbench.stats import rank_tests, study_size
 
 
 def _p(d):
@@ -23,22 +23,24 @@ def _p(d):
 )
 def test_the_runs_of_a_t_test_are_those_of_statsmodels(effect, alpha):
     exact = TTestPower().solve_power(effect, alpha=alpha, power=0.8, alternative="two-sided")
-    assert power.required_runs(effect, alpha, efficiency=1.0) == pytest.approx(
+    assert study_size.required_runs(effect, alpha, efficiency=1.0) == pytest.approx(
         np.ceil(exact), abs=1
     )
     n = int(np.ceil(exact))
     theirs = TTestPower().power(effect, n, alpha)
-    assert power.compute_power(effect, n, alpha, efficiency=1.0) == pytest.approx(theirs, abs=0.01)
+    assert study_size.compute_power(effect, n, alpha, efficiency=1.0) == pytest.approx(
+        theirs, abs=0.01
+    )
 
 
 @pytest.mark.parametrize("effect", [0.35, 0.6])
 def test_the_runs_needed_find_the_effect_as_often_as_said(effect):
-    n = int(power.required_runs(effect, 0.05))
+    n = int(study_size.required_runs(effect, 0.05))
     trials = 4000
     found = np.mean(_p(effect + np.random.default_rng(1).standard_normal((trials, n))) <= 0.05)
     # The asymptotic efficiency is within two per cent of power at these sizes.
     assert found == pytest.approx(0.8, abs=4 * np.sqrt(0.16 / trials) + 0.02)
-    assert power.compute_power(effect, n, 0.05) == pytest.approx(found, abs=0.05)
+    assert study_size.compute_power(effect, n, 0.05) == pytest.approx(found, abs=0.05)
 
 
 @pytest.mark.parametrize(
@@ -51,10 +53,10 @@ def test_the_runs_of_a_share_find_it_as_often_as_said(share, limit, alpha):
             return stats.binom.sf(stats.binom.isf(alpha, n, limit), n, share)
         return stats.binom.cdf(stats.binom.ppf(alpha, n, limit) - 1, n, share)
 
-    n = int(power.required_runs_proportion(share, limit, alpha))
+    n = int(study_size.required_runs_proportion(share, limit, alpha))
     # the exact test is cautious, and its power goes up and down with n
     assert np.mean([exact(k) for k in range(n - 5, n + 6)]) == pytest.approx(0.8, abs=0.06)
-    assert power.required_runs_proportion(limit, limit) == np.inf
+    assert study_size.required_runs_proportion(limit, limit) == np.inf
 
 
 @pytest.mark.parametrize("n", [5, 9, 13, 14, 50, 51, 100])
@@ -63,20 +65,22 @@ def test_the_signed_rank_test_is_scipys(n, digits):
     d = np.round(np.random.default_rng(n).normal(0.3, 1, n), digits)
     for side in ("two-sided", "greater"):
         expected = stats.wilcoxon(d, alternative=side, zero_method="zsplit")
-        assert signed_rank.wilcoxon_signed_rank(d, side) == pytest.approx(
+        assert rank_tests.wilcoxon_signed_rank(d, side) == pytest.approx(
             (expected.statistic, expected.pvalue), rel=1e-11
         )
 
 
 def test_needed_runs_and_power_are_one_relation():
     for effect, alpha in ((1.5, 0.05), (0.2, 0.01)):
-        n = int(power.required_runs(effect, alpha))
+        n = int(study_size.required_runs(effect, alpha))
         assert (
-            power.compute_power(effect, n, alpha) >= 0.8 > power.compute_power(effect, n - 1, alpha)
+            study_size.compute_power(effect, n, alpha)
+            >= 0.8
+            > study_size.compute_power(effect, n - 1, alpha)
         )
-    assert power.required_runs(0.0) == np.inf
-    assert power.required_runs(1e9, 0.05) == power.min_pairs(0.05) == 6
+    assert study_size.required_runs(0.0) == np.inf
+    assert study_size.required_runs(1e9, 0.05) == study_size.min_pairs(0.05) == 6
     assert (
         stats.wilcoxon(np.arange(1.0, 7)).pvalue <= 0.05 < stats.wilcoxon(np.arange(1.0, 6)).pvalue
     )
-    assert power.compute_power(9.0, 5) == 0.0
+    assert study_size.compute_power(9.0, 5) == 0.0

@@ -10,9 +10,9 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.linear_gaussian import linear_walk
-from pfbench.noise.white import NominalNoise
-from pfbench.results.statistics import effect_sizes, signed_rank
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.simulated import ModelSimulation
+from pfbench.stats import effects, rank_tests
 
 # R 4, ?wilcox.test: depression of nine patients at two visits [Hollander, Wolfe 1973, p. 29]
 FIRST = np.array([1.83, 0.50, 1.62, 2.48, 1.68, 1.88, 1.55, 3.06, 1.30])
@@ -21,7 +21,7 @@ SECOND = np.array([0.878, 0.647, 0.598, 2.05, 1.06, 1.29, 1.06, 3.14, 1.29])
 
 def test_wilcoxons_test_is_that_of_r() -> None:
     """wilcox.test(x, y, paired = TRUE, alternative = "greater"): V = 40, p-value = 0.01953, which is exact."""
-    statistic, p = signed_rank.wilcoxon_signed_rank(FIRST - SECOND)
+    statistic, p = rank_tests.wilcoxon_signed_rank(FIRST - SECOND)
     assert statistic in (40.0, 45.0 - 40.0)
     assert p / 2 == pytest.approx(0.01953, abs=5e-6)
 
@@ -46,10 +46,7 @@ def test_a_filter_under_two_names_beats_itself_as_seldom_as_alpha() -> None:
     def share_of_wins(a: np.ndarray, b: np.ndarray) -> float:
         return float(
             np.mean(
-                [
-                    signed_rank.wilcoxon_signed_rank(d)[1] <= alpha
-                    for d in effect_sizes.log_ratio(a, b)
-                ]
+                [rank_tests.wilcoxon_signed_rank(d)[1] <= alpha for d in effects.log_ratio(a, b)]
             )
         )
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from statsmodels.stats.multitest import multipletests
 
-from pfbench.results.statistics import effect_sizes, signed_rank
+from pfbench.stats import effects, rank_tests
 
 
 def test_demsar_example():
@@ -41,7 +41,7 @@ def test_demsar_example():
         0.981,
         0.978,
     ]
-    statistic, _ = signed_rank.wilcoxon_signed_rank(np.round(np.array(plain) - np.array(other), 3))
+    statistic, _ = rank_tests.wilcoxon_signed_rank(np.round(np.array(plain) - np.array(other), 3))
     assert statistic == 12.0
 
 
@@ -49,26 +49,26 @@ def test_demsar_example():
 def test_holm_is_that_of_statsmodels(seed):
     p = np.random.default_rng(seed).random(12) ** 3
     p[3] = p[7]
-    np.testing.assert_allclose(signed_rank.holm(p), multipletests(p, method="holm")[1])
+    np.testing.assert_allclose(rank_tests.holm(p), multipletests(p, method="holm")[1])
 
 
 def test_a_lost_run_outranks_any_other():
     a, b = np.ones(9), np.full(9, 1e6)
     a[0], b[0] = np.inf, 1.0
-    d = effect_sizes.log_ratio(a, b)
+    d = effects.log_ratio(a, b)
     assert d[0] > -4 * d[1:].min() > 0
     # a wins 8 pairs by a factor of a million and loses one run: that pair holds the largest rank, 9 of 45.
-    assert signed_rank.wilcoxon_signed_rank(d).statistic == 9
-    assert effect_sizes.log_ratio(b, a).tolist() == (-d).tolist()
+    assert rank_tests.wilcoxon_signed_rank(d).statistic == 9
+    assert effects.log_ratio(b, a).tolist() == (-d).tolist()
 
 
 def test_two_lost_runs_are_a_tie():
     a, b = np.array([1.0, np.inf, 4.0]), np.array([2.0, np.inf, 8.0])
-    assert effect_sizes.log_ratio(a, b)[1] == 0
+    assert effects.log_ratio(a, b)[1] == 0
 
 
 def test_rounding_decides_nothing():
     a = np.linspace(1, 2, 30)
     # in every run the same way, but less than single precision tells
-    assert signed_rank.wilcoxon_signed_rank(effect_sizes.log_ratio(a, a * (1 + 1e-7))).p == 1.0
-    assert signed_rank.wilcoxon_signed_rank(effect_sizes.log_ratio(a, a * (1 + 1e-5))).p < 1e-5
+    assert rank_tests.wilcoxon_signed_rank(effects.log_ratio(a, a * (1 + 1e-7))).p == 1.0
+    assert rank_tests.wilcoxon_signed_rank(effects.log_ratio(a, a * (1 + 1e-5))).p < 1e-5

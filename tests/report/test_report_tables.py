@@ -9,12 +9,12 @@ import pandas as pd
 import pytest
 
 from pfbench import job
-from pfbench.report import table_formats
+from pfbench.report import writers
 
 
 def written() -> str:
     """Every sign beyond ASCII that the package and its configuration hold, and others that units and names have."""
-    folders = (Path(table_formats.__file__).parents[1], job.conf_dir(), job.experiments_dir())
+    folders = (Path(writers.__file__).parents[1], job.conf_dir(), job.experiments_dir())
     files = [
         path
         for folder in folders
@@ -33,7 +33,7 @@ def test_latex_is_of_letters_that_pdflatex_reads():
     table = pd.DataFrame(
         {signs: [f"before{sign}after" for sign in signs], "value": np.full(len(signs), -np.inf)}
     )
-    found = table_formats.format_latex(table, signs)
+    found = writers.format_latex(table, signs)
     assert found.isascii()
     body = re.sub(r"\\[\\$&%#_{}|~^]", "", found)  # commands of one sign
     assert body.count("$") % 2 == 0
@@ -60,12 +60,12 @@ def test_latex_is_of_letters_that_pdflatex_reads():
     ],
 )  # fmt: skip
 def test_what_a_sign_becomes(text, said):
-    assert table_formats.format_latex(pd.DataFrame({"a": [text]})).splitlines()[4] == said + r" \\"
+    assert writers.format_latex(pd.DataFrame({"a": [text]})).splitlines()[4] == said + r" \\"
 
 
 def test_numbers_that_are_none():
     table = pd.DataFrame({"a": [np.inf, -np.inf, np.nan]})
-    assert table_formats.format_latex(table).splitlines()[4:7] == [
+    assert writers.format_latex(table).splitlines()[4:7] == [
         r"$\infty$ \\",
         r"$-\infty$ \\",
         r"-- \\",

@@ -12,8 +12,8 @@ import pytest
 from page_packs import build_pack
 from scipy import stats
 
-from pfbench.config.named_sets import FILTER_SETS
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.job.config import FILTER_SETS
 from pfbench.report.board.robust_word import (
     CONTROL,
     RobustnessEvidence,
@@ -21,10 +21,10 @@ from pfbench.report.board.robust_word import (
     describe_robustness,
     find_robust_filters,
 )
-from pfbench.report.looks import find_looks
 from pfbench.report.options import ReportOptions
 from pfbench.report.study_page import write_page
-from pfbench.results.statistics.world_effects import EffectEstimate
+from pfbench.results.looks import find_looks
+from pfbench.stats.effects import EffectEstimate
 
 
 def effect(differences: np.ndarray) -> EffectEstimate:

@@ -17,11 +17,10 @@ from command_line import pfbench
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import read_page_data, write_page_data
-from pfbench.report.board.decided_parts import StudyFacts
-from pfbench.report.looks import PartName, find_looks
+from pfbench.report.board.pack import StudyFacts
 from pfbench.report.options import ReportOptions
-from pfbench.report.page import write_report
-from pfbench.report.stored_page import decide_again, rebuild_page
+from pfbench.report.study_report import decide_again, rebuild_page, write_report
+from pfbench.results.looks import PartName, find_looks
 from pfbench.results.step_times import StepTimes
 
 

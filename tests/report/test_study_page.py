@@ -12,9 +12,13 @@ import pytest
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.study_page import write_page
-from pfbench.report.study_page.encoding import encode_pack, encode_views
-from pfbench.report.study_page.number_codes import encode_decimals, encode_levels
-from pfbench.report.study_page.opening import format_short
+from pfbench.report.study_page.encoding import (
+    encode_decimals,
+    encode_levels,
+    encode_pack,
+    encode_views,
+)
+from pfbench.report.study_page.page_writer import format_short
 
 
 def write(pack, path):

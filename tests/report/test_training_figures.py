@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pfbench.report.plots.training_figures import plot_training, write_training_figure
+from pfbench.report.scenario_figures import plot_training, write_training_figure
 
 LOSSES = {
     "epoch": [1.0, 2.0, 3.0, 4.0],

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import synthetic_results as synthetic
 
-from pfbench.files.digest import hash_content
-from pfbench.replay.run_selection import find_run
+from pfbench.files.atomic_write import hash_content
+from pfbench.job.run_selection import find_run
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
 

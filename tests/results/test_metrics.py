@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from pfbench.results import error_measures, status
+from pfbench.results import status
+from pfbench.stats import error_measures
 
 NONE = np.zeros(4, dtype=bool)
 

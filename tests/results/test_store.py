@@ -12,8 +12,8 @@ import pytest
 from checkout import TESTS
 from hypothesis import given, strategies as st
 
-from pfbench.results import config_key, store
-from pfbench.results.config_key import compute_config_key
+from pfbench.results import store, store as config_key
+from pfbench.results.store import compute_config_key
 
 R, T, D = 3, 5, 2
 STATE = {"names": ["x", "v"], "units": ["m", "m/s"], "groups": {"position": [0], "b_velocity": [1]}}
@@ -74,7 +74,7 @@ def test_key_knows_content_not_order(config):
 
 
 def test_key_survives_the_process():
-    code = "from pfbench.results.config_key import compute_config_key; print(compute_config_key({'b': [1, 2.5, None], 'a': {'c': 'ü'}}))"
+    code = "from pfbench.results.store import compute_config_key; print(compute_config_key({'b': [1, 2.5, None], 'a': {'c': 'ü'}}))"
     environment = {**os.environ, "PYTHONHASHSEED": "77"}
     other = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment

@@ -14,33 +14,34 @@ from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, FeedbackRun, MeasurementChannels, Record
 from pfbench.filter.belief import GaussianBelief, ParticleBelief, StepInfo
-from pfbench.filter.feedback import apply_feedback
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import (
     SigmaPointLinearisation,
     TaylorLinearisation,
     UnscentedPoints,
 )
-from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.filter.loop import FilterResult, apply_feedback, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job import conf_dir
 from pfbench.job.scoring import ScoreRecorder
-from pfbench.model.azimuth_errors import ExactErrorEquations, PrintedErrorEquations
+from pfbench.model.azimuth import (
+    ExactErrorEquations,
+    PrintedErrorEquations,
+    SinsGpsAzimuth,
+    TrapezoidDiscretisation,
+)
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.ins_gnss import InsGnss
 from pfbench.model.linear_gaussian import linear_walk
-from pfbench.model.sins_gps_azimuth import SinsGpsAzimuth, TrapezoidDiscretisation
 from pfbench.nav import attitude, earth, strapdown
 from pfbench.nav.aiding import AidingData, AlignmentErrors, FlightSolution, GnssReceiver
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, cruise, turn
 from pfbench.nav.trajectory import TrajectoryStart
-from pfbench.noise.base import NoiseRegime
-from pfbench.noise.outage import MeasurementOutage
-from pfbench.noise.time_varying import VarianceSurge
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.recording_regime import RecordingRegime
-from pfbench.scenario.simulated_flight import SimulatedFlight
+from pfbench.noise.base import NoiseRegime, NominalNoise
+from pfbench.noise.time_windows import MeasurementOutage, VarianceSurge
+from pfbench.scenario.flights import SimulatedFlight
+from pfbench.scenario.oracle_noise import RecordingRegime
 
 IMU = ImuErrors(
     gyro_bias_deg_h=1.0,

@@ -20,7 +20,7 @@ from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.loop import run_filter
 from pfbench.job.scoring import ScoreRecorder
-from pfbench.noise.white import NominalNoise
+from pfbench.noise.base import NominalNoise
 
 RUNS = 100
 FALSE_ALARM = 1e-2

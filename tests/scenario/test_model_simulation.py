@@ -13,12 +13,10 @@ from scipy import stats
 
 import pfbench
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.nonlinear_dynamics import Pendulum
-from pfbench.model.textbook import StochasticVolatility
-from pfbench.noise.outage import MeasurementOutage
-from pfbench.noise.time_varying import VarianceSurge
-from pfbench.noise.white import NominalNoise, OutlierNoise
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.model.textbook import Pendulum, StochasticVolatility
+from pfbench.noise.base import NominalNoise, OutlierNoise
+from pfbench.noise.time_windows import MeasurementOutage, VarianceSurge
+from pfbench.scenario.simulated import ModelSimulation
 
 RUNS, STEPS = 4000, 15
 

@@ -33,17 +33,20 @@ from pfbench.filter.gaussian.linearisation_rules import (
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
-from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
-from pfbench.noise.base import NoiseRegime
+from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.noise.base import (
+    GlintNoise,
+    LaplaceNoise,
+    NoiseRegime,
+    NominalNoise,
+    OutlierNoise,
+    StudentTNoise,
+)
 from pfbench.noise.correlated import GaussMarkovNoise, NonLineOfSightNoise
 from pfbench.noise.error_replay import ErrorReplay
-from pfbench.noise.outage import MeasurementOutage
-from pfbench.noise.time_varying import BiasStep, VarianceSurge
-from pfbench.noise.white import GlintNoise, LaplaceNoise, NominalNoise, OutlierNoise, StudentTNoise
-from pfbench.scenario.model_simulation import ModelSimulation
-from pfbench.scenario.oracle_noise import OracleNoiseModel
-from pfbench.scenario.recording_regime import RecordingRegime
+from pfbench.noise.time_windows import BiasStep, MeasurementOutage, VarianceSurge
+from pfbench.scenario.oracle_noise import OracleNoiseModel, RecordingRegime
+from pfbench.scenario.simulated import ModelSimulation
 
 CONF = job.conf_dir()
 KALMAN = GaussianFilter(TaylorLinearisation())

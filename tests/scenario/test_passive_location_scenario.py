@@ -35,12 +35,14 @@ from pfbench.model.passive_location import (
     predict_bearing,
     relative_motion,
 )
-from pfbench.noise.base import NoiseRegime
-from pfbench.noise.outage import MeasurementOutage
-from pfbench.noise.white import NominalNoise, OutlierNoise, StudentTNoise
-from pfbench.scenario.emitter_prior import FirstMeasurement, first_fix
-from pfbench.scenario.passive_location import PassiveLocationScenario
-from pfbench.scenario.quadrature_prior import QuadratureEmitterPrior
+from pfbench.noise.base import NoiseRegime, NominalNoise, OutlierNoise, StudentTNoise
+from pfbench.noise.time_windows import MeasurementOutage
+from pfbench.scenario.passive_location import (
+    FirstMeasurement,
+    PassiveLocationScenario,
+    QuadratureEmitterPrior,
+    first_fix,
+)
 
 SD = (1.64e-3, 1.64e-3, 1e-4, 1e-4, 1.0)
 SCENE = PassiveLocationScenario(

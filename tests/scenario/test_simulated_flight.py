@@ -23,10 +23,9 @@ from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, climb, cruise, turn
 from pfbench.nav.trajectory import TrajectoryData, TrajectoryStart
-from pfbench.noise.base import NoiseRegime
-from pfbench.noise.outage import MeasurementOutage
-from pfbench.noise.white import NominalNoise, OutlierNoise, StudentTNoise
-from pfbench.scenario.simulated_flight import SimulatedFlight
+from pfbench.noise.base import NoiseRegime, NominalNoise, OutlierNoise, StudentTNoise
+from pfbench.noise.time_windows import MeasurementOutage
+from pfbench.scenario.flights import SimulatedFlight
 
 PATH = ManoeuvreTrajectory(
     segments=(accelerate(5.0, 4.0), climb(8.0, 2.0, 2.0), turn(20.0, 6.0), cruise(4.0)),

@@ -26,9 +26,13 @@ from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.learned.differentiable_resampling import SoftResampler, StopGradientResampler
 from pfbench.filter.loop import FilterResult
-from pfbench.filter.moves.flow_kernels import NoiseFlowKernel, NoiseFlowStatKernel
 from pfbench.filter.moves.metropolis import KernelCycle, MetropolisHastings
-from pfbench.filter.moves.path_block_kernels import LastStateKernel, PathBlockKernel
+from pfbench.filter.moves.path_kernels import (
+    LastStateKernel,
+    NoiseFlowKernel,
+    NoiseFlowStatKernel,
+    PathBlockKernel,
+)
 from pfbench.filter.moves.path_proposals import SmoothedSegment
 from pfbench.filter.particle.auxiliary_weights import (
     LookAheadWeights,
@@ -38,13 +42,12 @@ from pfbench.filter.particle.auxiliary_weights import (
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Multinomial, Residual, Ssp, Systematic
+from pfbench.filter.particle.resampling import EssResampler, Multinomial, Residual, Ssp, Systematic
 from pfbench.filter.particle.sqmc import HilbertSortedResampler, SqmcProposal, SqmcScheme
 from pfbench.filter.particle.weight_update import BayesWeightUpdate
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import linear_walk
-from pfbench.ppl.correlated_numbers import SortedResampler
+from pfbench.ppl.likelihood import SortedResampler
 from pfbench.testing import (
     check_causality,
     check_convergence,

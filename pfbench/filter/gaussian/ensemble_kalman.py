@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.covariance import factor, shared_distribution_covariance
+from pfbench.core.linear_algebra import factor, shared_distribution_covariance
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, StepInfo

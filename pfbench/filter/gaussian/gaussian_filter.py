@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,15 +10,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pfbench.core.covariance import distribution_covariance, factor
+from pfbench.core.chart import Chart
+from pfbench.core.linear_algebra import distribution_covariance, factor
+from pfbench.core.parameter_checks import check_whole_number
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief, StepInfo
-from pfbench.filter.gaussian.adaptation_chain import (
-    adapt_innovation,
-    check_adaptations,
-    states_evidence,
-)
 from pfbench.filter.gaussian.innovation import (
     GainAdaptation,
     Innovation,
@@ -25,21 +23,28 @@ from pfbench.filter.gaussian.innovation import (
     compute_innovation,
     linearise_about_posterior,
 )
-from pfbench.filter.gaussian.kalman_update import GaussianStep, move_root, repair_fit
-from pfbench.filter.gaussian.linearisation_rules import (
-    AffineApproximation,
-    DifferenceSpace,
-    LinearisationRule,
-)
-from pfbench.filter.gaussian.measurement_update import (
+from pfbench.filter.gaussian.kalman_update import (
+    GaussianStep,
     MeasurementUpdate,
     WhitenedPosterior,
     check_measurement_update,
     measurement_posterior,
+    move_root,
+    repair_fit,
 )
-from pfbench.filter.gaussian.point_reach import check_point_reach
-from pfbench.filter.linearisation import check_moments, compute_additive_gain
-from pfbench.filter.model_jacobians import find_propagation_jacobian
+from pfbench.filter.gaussian.linearisation_rules import (
+    AffineApproximation,
+    DifferenceSpace,
+    LinearisationRule,
+    SigmaPointLinearisation,
+    SigmaPoints,
+    UnscentedPoints,
+)
+from pfbench.filter.linearisation import (
+    check_moments,
+    compute_additive_gain,
+    find_propagation_jacobian,
+)
 from pfbench.model.base import StateSpaceModel, initial_law
 
 
@@ -248,3 +253,123 @@ class GaussianFilter:
             posterior = measurement_posterior(update, innovation)
             repaired = repaired | repaired_again
         return posterior, repaired
+
+
+# --------------------------------------------------------------------------------------------------
+# The adaptations of a Gaussian filter, applied in order.
+
+
+def adapt_innovation(
+    noise_adaptations: Sequence[NoiseAdaptation],
+    gain_adaptations: Sequence[GainAdaptation],
+    innovation: Innovation,
+    belief: GaussianBelief,
+) -> tuple[Innovation, dict[str, Tensor], dict[str, Tensor]]:
+    """Apply all adaptations to an innovation.
+
+    Args:
+        noise_adaptations: Noise adaptations in order.
+        gain_adaptations: Gain adaptations in order, applied last.
+        innovation: Innovation of the step.
+        belief: Belief at t-1.
+
+    Returns:
+        The innovation, the values for the next step, and the diagnostics [R] of this step.
+    """
+    memory: dict[str, Tensor] = {}
+    for adaptation in noise_adaptations:
+        innovation, carried = adaptation.noise_adapt(innovation, belief)
+        memory |= carried
+    trace = {
+        name: value if value.dim() == 1 else value.amax(1)
+        for name, value in memory.items()
+        if value.dim() <= 2
+    }
+    if gain_adaptations:
+        widening = torch.ones_like(belief.mean[:, 0])
+        for gain in gain_adaptations:
+            widening = gain(innovation, widening)
+        innovation, trace["widening"] = innovation.inflate(widening), widening
+    return innovation, memory, trace
+
+
+def states_evidence(adaptation: object) -> bool:
+    """Return whether an adaptation states that it does not use the measurement of the step."""
+    return bool(getattr(adaptation, "has_evidence", False))
+
+
+def check_adaptations(
+    noise_adaptations: Sequence[NoiseAdaptation],
+    gain_adaptations: Sequence[GainAdaptation],
+    iterations: int,
+) -> None:
+    """Check that adaptations do not judge one innovation twice.
+
+    Args:
+        noise_adaptations: Noise adaptations of the filter.
+        gain_adaptations: Gain adaptations of the filter.
+        iterations: Number of updates.
+
+    Raises:
+        ValueError: If iterations is not a whole number from 1, or above 1 with an adaptation that uses the innovation, or
+            if two noise adaptations use it.
+    """
+    check_whole_number("filter.iterations", iterations, 1, "Use 1 for a single update.")
+    if iterations > 1 and (noise_adaptations or gain_adaptations):
+        raise ValueError(
+            "filter.iterations must be 1 with noise_adaptations or gain_adaptations, got "
+            f"{iterations}. Set filter.iterations=1."
+        )
+    judges = [type(a).__name__ for a in noise_adaptations if not states_evidence(a)]
+    if len(judges) > 1:
+        raise ValueError(
+            "filter.noise_adaptations must contain at most one that uses the measurement of the "
+            f"step, got {' and '.join(judges)}. Remove all but one: the same innovation would count "
+            "twice."
+        )
+
+
+# --------------------------------------------------------------------------------------------------
+# Check of sigma points whose angles are so large that a rule sees another distribution.
+
+
+def check_point_reach(rule: LinearisationRule, chart: Chart, covariance: Tensor) -> None:
+    """Check the largest angle between the mean and a point of the initial distribution.
+
+    A point beyond half a turn has the shorter angle on the other side. Closer points fail too, because
+    the first measurements move the mean: benchmarks/point_reach.md.
+
+    Args:
+        rule: Linearisation rule. One without points is valid.
+        chart: Chart of the state.
+        covariance: Initial covariance, [R, d, d].
+
+    Raises:
+        ValueError: If the angle of a point exceeds `rule.largest_angle`.
+    """
+    if not isinstance(rule, SigmaPointLinearisation) or rule.largest_angle is None or chart.flat:
+        return
+    limit = rule.largest_angle
+    reach = _largest_angle(rule.points, chart, covariance)
+    if reach > limit:
+        unscented = rule.points if isinstance(rule.points, UnscentedPoints) else UnscentedPoints()
+        spread = unscented.alpha * limit / _largest_angle(unscented, chart, covariance)
+        raise ValueError(
+            f"filter.linearisation.points must lie within {math.degrees(limit):.0f} degrees of the "
+            f"mean in angles and rotations, got {math.degrees(reach):.0f} degrees for the initial "
+            f"distribution. Use filter=ukf filter.linearisation.points.alpha={_round_down(spread)}. "
+            "To compare rules at this uncertainty, add +filter.linearisation.largest_angle=null."
+        )
+
+
+def _largest_angle(points: SigmaPoints, chart: Chart, covariance: Tensor) -> float:
+    """Return the largest angle of a point from the mean over all blocks and runs, rad."""
+    xi = points(chart.dimension)[0].to(covariance)
+    angles = chart.rotation_angles(xi @ factor(covariance)[0].mT)
+    return float(angles.nan_to_num().amax()) if angles.numel() else 0.0
+
+
+def _round_down(value: float) -> float:
+    """Round down to one significant digit."""
+    digit = 10.0 ** math.floor(math.log10(value))
+    return float(f"{math.floor(value / digit) * digit:.1g}")

@@ -8,17 +8,21 @@ multiplied by the Cholesky factor L, so the rest of the filter works on square r
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations, product
 from typing import NamedTuple, Protocol, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.jacobian import jacobian
-from pfbench.kernels import cpp
-from pfbench.kernels.compilation import compilable
+from pfbench.core.linear_algebra import jacobian
+from pfbench.kernels import dispatch
+from pfbench.kernels.dispatch import compilable
 
 ConditionalMoments: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
 """xi [R, P, d] -> mean [R, P, k] and covariance [R or 1, P or 1, k, k] given each point."""
@@ -149,7 +153,7 @@ def _separate_fit(r: Tensor, xi: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     return m, (w[:, None] * residual).mT @ residual
 
 
-_fitted = compilable(_separate_fit, operator=cpp.fit_affine, use_torch_compiler=False)
+_fitted = compilable(_separate_fit, operator=dispatch.fit_affine, use_torch_compiler=False)
 
 
 @dataclass(frozen=True)
@@ -209,3 +213,273 @@ class CubaturePoints:
         offsets = math.sqrt(d) * torch.eye(d, dtype=torch.float64)
         w = torch.full((2 * d,), 0.5 / d, dtype=torch.float64)
         return torch.cat([offsets, -offsets]), w, w
+
+
+# --------------------------------------------------------------------------------------------------
+# Points of Gauss-Hermite quadrature: the tensor product, and the sparse grid of Smolyak.
+#
+# References:
+#     K. Ito, K. Xiong 2000, "Gaussian filters for nonlinear filtering problems".
+#     B. Jia, M. Xin, Y. Cheng 2012, "Sparse-grid quadrature nonlinear filtering".
+
+_MOST_POINTS = 20_000
+_SIZES = (1, 3, 5)  # points of the univariate rules of a sparse grid
+_LEVELS = (2, 3)
+
+
+@dataclass(frozen=True)
+class GaussHermitePoints:
+    """Tensor product of Gauss-Hermite points, m^d points.
+
+    Exact for polynomials of degree 2 m - 1 in each variable. All weights are positive.
+
+    Attributes:
+        order: Points m in each direction.
+
+    Raises:
+        ValueError: If the order is below 2, or on use if there are more than 20 000 points.
+    """
+
+    order: int = 3
+
+    def __post_init__(self) -> None:
+        if type(self.order) is not int or self.order < 2:
+            raise ValueError(
+                f"linearisation.points.order must be a whole number of at least 2, got {self.order}. "
+                "Use 3."
+            )
+
+    def __call__(self, d: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return points [P, d], mean weights [P] and covariance weights [P]."""
+        if self.order**d > _MOST_POINTS:
+            raise ValueError(
+                f"linearisation.points must have at most {_MOST_POINTS} points, got {self.order}^{d} "
+                f"for {d} components. Use filter=sparse_grid."
+            )
+        return _tensor_product(self.order, d)
+
+
+@dataclass(frozen=True)
+class SparseGridPoints:
+    """Sparse grid of Gauss-Hermite points by Smolyak's construction.
+
+    Exact for polynomials of total degree 2 level - 1, with 2 d + 1 points at level 2 and
+    2 d^2 + 4 d + 1 at level 3. Level 2 is the unscented transform with kappa = 3 - d. Some weights
+    are negative, so a covariance may lose its root: see `GaussianFilter.repair_covariance`.
+
+    Attributes:
+        level: 2 or 3.
+
+    Raises:
+        ValueError: If the level is neither.
+    """
+
+    level: int = 3
+
+    def __post_init__(self) -> None:
+        if self.level not in _LEVELS:
+            raise ValueError(f"linearisation.points.level must be 2 or 3, got {self.level}. Use 3.")
+
+    def __call__(self, d: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return points [P, d], mean weights [P] and covariance weights [P]."""
+        return _smolyak(self.level, d)
+
+
+def _univariate(order: int) -> tuple[list[float], list[float]]:
+    """Return points and weights of N(0, 1); the middle of an odd rule is exactly 0."""
+    x, w = np.polynomial.hermite_e.hermegauss(order)
+    x, w = 0.5 * (x - x[::-1]), w / w.sum()
+    return x.tolist(), w.tolist()
+
+
+@lru_cache(maxsize=64)
+def _tensor_product(order: int, d: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Build the tensor product."""
+    x, w = (torch.tensor(a, dtype=torch.float64) for a in _univariate(order))
+    index = torch.cartesian_prod(*[torch.arange(order)] * d).reshape(-1, d)
+    weight = w[index].prod(-1)
+    return x[index], weight, weight
+
+
+@lru_cache(maxsize=64)
+def _smolyak(level: int, d: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Combine tensor products of few axes and add the weights of equal points."""
+    total: defaultdict[tuple[tuple[int, float], ...], float] = defaultdict(float)
+    for s in range(max(0, level - d), level):
+        factor = (-1.0) ** (level - 1 - s) * math.comb(d - 1, level - 1 - s)
+        for axes, sizes in _finer_axes(s, d):
+            rules = [list(zip(*_univariate(size), strict=True)) for size in sizes]
+            for nodes in product(*rules):
+                key = tuple((a, x) for a, (x, _) in zip(axes, nodes, strict=True) if x != 0.0)
+                total[key] += factor * math.prod(weight for _, weight in nodes)
+    points = torch.zeros(len(total), d, dtype=torch.float64)
+    for row, key in zip(points, total, strict=True):
+        for axis, x in key:
+            row[axis] = x
+    weight = torch.tensor(list(total.values()), dtype=torch.float64)
+    return points, weight, weight
+
+
+def _finer_axes(s: int, d: int) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """List the axes with more than one point, and their points, for an excess s of levels over 1."""
+    if s == 0:
+        return [((), ())]
+    one_axis = [((axis,), (_SIZES[s],)) for axis in range(d)]
+    pairs = [(pair, (_SIZES[1],) * 2) for pair in combinations(range(d), 2)] if s == 2 else []
+    return [*one_axis, *pairs]
+
+
+# --------------------------------------------------------------------------------------------------
+# Sigma points of spherical-radial cubature: products of a spherical and a radial rule.
+
+
+class SphericalRule(Protocol):
+    """Mean over the unit sphere.
+
+    Implementations are frozen, so that points can be cached.
+    """
+
+    def __call__(self, d: int) -> tuple[Tensor, Tensor]:
+        """Return unit vectors [P, d] and weights [P] with sum 1."""
+
+
+class RadialRule(Protocol):
+    """Mean over |x|, x ~ N(0, I_d)."""
+
+    def __call__(self, d: int) -> list[tuple[float, float]]:
+        """Return pairs of radius and weight; the weights have sum 1."""
+
+
+@dataclass(frozen=True)
+class SphericalRadialPoints:
+    """Points r u and weights c a from a spherical rule and a radial rule.
+
+    A radius of 0 gives one centre point. The degree is the smaller degree of the two rules
+    [Arasaratnam and Haykin 2009, proposition 3.2]. The higher degree of the other rule holds in
+    one direction only: E|x|^4 for a third-degree sphere and a fifth-degree radius.
+
+    | sphere, radius | filter | points |
+    |---|---|---|
+    | Axis3, Radial3 | CKF | 2 d |
+    | Axis5, Radial5 | HCKF (a negative weight if d >= 5) | 2 d^2 + 1 |
+    | Simplex3, Radial3 | SSRCKF | 2 d + 2 |
+    | Simplex5, Radial5 | SSRHCKF (negative weights if d >= 8) | d^2 + 3 d + 3 |
+    | Simplex3, Radial5 | MSSRCKF | 2 d + 3 |
+    | Simplex5, Radial3 | SSR53 (negative weights if d >= 8) | d^2 + 3 d + 2 |
+    | Axis3, Radial5 | MCKF, the UKF with kappa = 2 | 2 d + 1 |
+
+    With negative weights a covariance may not be positive definite: see `GaussianFilter.repair_covariance`.
+
+    Attributes:
+        spherical_rule: Spherical rule.
+        radial_rule: Radial rule.
+    """
+
+    spherical_rule: SphericalRule
+    radial_rule: RadialRule
+
+    def __call__(self, d: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return points [P, d], and their weights [P] for means and for covariances."""
+        return _product(self, d)
+
+
+@lru_cache(maxsize=64)
+def _product(rule: SphericalRadialPoints, d: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Combine both rules into points and weights."""
+    u, a = rule.spherical_rule(d)
+    shells = rule.radial_rule(d)
+    xi = torch.cat(
+        [r * u if r > 0.0 else torch.zeros(1, d, dtype=torch.float64) for r, _ in shells]
+    )
+    w = torch.cat(
+        [c * a if r > 0.0 else torch.full((1,), c, dtype=torch.float64) for r, c in shells]
+    )
+    return xi, w, w
+
+
+@dataclass(frozen=True)
+class RadialDegree3(RadialRule):
+    """One shell: E|x|^2 = d [Arasaratnam and Haykin 2009]."""
+
+    @override
+    def __call__(self, d: int) -> list[tuple[float, float]]:
+        return [(math.sqrt(d), 1.0)]
+
+
+@dataclass(frozen=True)
+class RadialDegree5(RadialRule):
+    """One shell and the centre: also E|x|^4 = d (d + 2) [Jia, Xin and Cheng 2013]."""
+
+    @override
+    def __call__(self, d: int) -> list[tuple[float, float]]:
+        return [(0.0, 2.0 / (d + 2)), (math.sqrt(d + 2), d / (d + 2))]
+
+
+@dataclass(frozen=True)
+class AxisDegree3(SphericalRule):
+    """Both ends of each axis, 2 d points [Arasaratnam and Haykin 2009]."""
+
+    @override
+    def __call__(self, d: int) -> tuple[Tensor, Tensor]:
+        return _with_opposites(torch.eye(d, dtype=torch.float64), 0.5 / d)
+
+
+@dataclass(frozen=True)
+class AxisDegree5(SphericalRule):
+    """Axes and diagonals of each pair of axes, 2 d^2 points [Jia, Xin and Cheng 2013]."""
+
+    @override
+    def __call__(self, d: int) -> tuple[Tensor, Tensor]:
+        axes = torch.eye(d, dtype=torch.float64)
+        i, j = torch.triu_indices(d, d, 1)
+        diagonals = torch.cat([axes[i] + axes[j], axes[i] - axes[j]]) / math.sqrt(2.0)
+        return _concatenated(
+            _with_opposites(axes, (4 - d) / (2 * d * (d + 2))),
+            _with_opposites(diagonals, 1.0 / (d * (d + 2))),
+        )
+
+
+@dataclass(frozen=True)
+class SimplexDegree3(SphericalRule):
+    """Simplex corners and their opposites, 2 d + 2 points [Wang, Feng and Tseng 2014]."""
+
+    @override
+    def __call__(self, d: int) -> tuple[Tensor, Tensor]:
+        return _with_opposites(_simplex(d), 0.5 / (d + 1))
+
+
+@dataclass(frozen=True)
+class SimplexDegree5(SphericalRule):
+    """Corners and projected edge midpoints of a simplex [Lu and Darmofal 2004]."""
+
+    @override
+    def __call__(self, d: int) -> tuple[Tensor, Tensor]:
+        corners = _simplex(d)
+        corner_points = _with_opposites(corners, d * (7 - d) / (2 * (d + 1) ** 2 * (d + 2)))
+        if d == 1:  # the edge midpoint is the centre
+            return corner_points
+        i, j = torch.triu_indices(d + 1, d + 1, 1)
+        midpoints = math.sqrt(d / (2 * (d - 1))) * (corners[i] + corners[j])
+        return _concatenated(
+            corner_points,
+            _with_opposites(midpoints, 2 * (d - 1) ** 2 / (d * (d + 1) ** 2 * (d + 2))),
+        )
+
+
+def _with_opposites(u: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+    """Return unit vectors and their opposites, all with the same weight."""
+    return torch.cat([u, -u]), torch.full((2 * len(u),), weight, dtype=torch.float64)
+
+
+def _concatenated(*point_sets: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Concatenate pairs of points and weights."""
+    return torch.cat([u for u, _ in point_sets]), torch.cat([a for _, a in point_sets])
+
+
+def _simplex(d: int) -> Tensor:
+    """Return corners a_j of a regular simplex [d + 1, d] with a_j . a_k = -1/d."""
+    i = torch.arange(1, d + 1, dtype=torch.float64)
+    j = torch.arange(1, d + 2, dtype=torch.float64)[:, None]
+    below_diagonal = -torch.sqrt((d + 1) / (d * (d - i + 2) * (d - i + 1)))
+    on_diagonal = torch.sqrt((d + 1) * (d - i + 1) / (d * (d - i + 2)))
+    return torch.where(i < j, below_diagonal, 0.0) + torch.where(i == j, on_diagonal, 0.0)

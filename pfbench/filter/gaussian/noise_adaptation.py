@@ -1,8 +1,4 @@
-"""Noise adaptations of Gaussian filters: fading memory, and constrained R and Q.
-
-The paper [COFM-AMSSRCPF 2024, Measurement and Control] describes its equations in prose only.
-Choices that it leaves open are marked [ours].
-"""
+"""Adaptations of Gaussian filters: fading memory, constrained and matched covariances, bounded gains."""
 
 from __future__ import annotations
 
@@ -15,9 +11,27 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.filter.belief import GaussianBelief
-from pfbench.filter.gaussian.innovation import Innovation, NoiseAdaptation
+from pfbench.filter.gaussian.innovation import (
+    GainAdaptation,
+    Innovation,
+    NoiseAdaptation,
+    PrincipalAxes,
+    axes_by_group,
+    check_weight,
+    compute_group_root,
+    diagonal_axes,
+    measurement_precision,
+    principal_axes,
+    whitened_measurement,
+)
+from pfbench.filter.gaussian.kalman_update import kalman_gain_update
 from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
-from pfbench.filter.gaussian.principal_axes import PrincipalAxes, check_weight, principal_axes
+
+# --------------------------------------------------------------------------------------------------
+# Noise adaptations of Gaussian filters: fading memory, and constrained R and Q.
+#
+# The paper [COFM-AMSSRCPF 2024, Measurement and Control] describes its equations in prose only.
+# Choices that it leaves open are marked [ours].
 
 
 @dataclass(frozen=True)
@@ -197,3 +211,230 @@ def scale_columns(m: Tensor, state_factor: float, noise_factor: Tensor | float) 
     """
     d = m.shape[-2]
     return torch.cat([m[..., :d] * state_factor, m[..., d:] * noise_factor], -1)
+
+
+# --------------------------------------------------------------------------------------------------
+# Noise adaptations by covariance matching: one factor on R, or full matrices.
+
+
+@dataclass(frozen=True)
+class ScalarNoiseAdaptation(NoiseAdaptation):
+    """One factor on R from the mean squared innovation, Q unchanged.
+
+    Scalar form of [Mohamed and Schwarz 1999]: r = running mean of v' W v / k minus tr(W C_zz) / k,
+    W = diag(R)^-1. All excess innovation is attributed to measurement noise.
+
+    Attributes:
+        forgetting_factor: Weight of the newest step.
+        max_r_factor: Largest factor, at least 1.
+
+    Raises:
+        ValueError: If an argument is outside its range.
+    """
+
+    forgetting_factor: float = 0.2
+    max_r_factor: float = 100.0
+
+    def __post_init__(self) -> None:
+        check_weight("ScalarNoiseAdaptation.forgetting_factor", self.forgetting_factor)
+        if not self.max_r_factor >= 1.0:
+            raise ValueError(
+                "ScalarNoiseAdaptation.max_r_factor must be at least 1, "
+                f"got {self.max_r_factor}. Use 1 for no adaptation."
+            )
+
+    @override
+    def predict_scale(
+        self, predicted: AffineApproximation, belief: GaussianBelief
+    ) -> AffineApproximation:
+        return predicted
+
+    @override
+    def noise_adapt(
+        self, innovation: Innovation, belief: GaussianBelief
+    ) -> tuple[Innovation, dict[str, Tensor]]:
+        w = measurement_precision(innovation)
+        k = innovation.observed_mask.sum(-1, dtype=innovation.r.dtype)
+        mean_square = belief.memory.get("surprise", torch.ones_like(k))
+        newest = (w * innovation.r.square()).sum(-1) / k.clamp(min=1.0)
+        mean_square = torch.where(
+            k > 0,
+            (1.0 - self.forgetting_factor) * mean_square + self.forgetting_factor * newest,
+            mean_square,
+        )
+        expected = (w * diagonal_axes(innovation.predicted_covariance)).sum(-1) / k.clamp(min=1.0)
+        r = (mean_square - expected).clamp(1.0, self.max_r_factor)
+        return innovation.with_noise(innovation.noise * r[:, None, None]), {
+            "surprise": mean_square,
+            "trace_r": r,
+        }
+
+
+@dataclass(frozen=True)
+class MatrixNoiseAdaptation(NoiseAdaptation):
+    """Full matrices R and Q from residuals [Akhlaghi, Zhou and Huang 2017].
+
+    For comparison. R <- a R + (1 - a) (e e' + C+_zz), with residual e and covariance C+_zz after
+    the update. The source uses the covariance before the update, but E e e' = R - H P+ H'.
+    Q <- a Q + (1 - a) K v v' K', where each term has rank one. Residuals come from the statistical
+    linearisation [ours]. R and Q start at the model's values, whose weight decays.
+
+    Attributes:
+        forgetting_factor: a in (0, 1]. 1 switches both adaptations off.
+
+    Raises:
+        ValueError: If a is outside (0, 1].
+    """
+
+    forgetting_factor: float = 0.99
+    has_evidence = True  # R and Q of a step follow from the steps before it
+
+    def __post_init__(self) -> None:
+        check_weight("MatrixNoiseAdaptation.forgetting_factor", self.forgetting_factor)
+
+    @override
+    def predict_scale(
+        self, predicted: AffineApproximation, belief: GaussianBelief
+    ) -> AffineApproximation:
+        if "process" not in belief.memory:  # before the first measurement
+            return predicted
+        model_weight = belief.memory["kept"][:, None, None]
+        m, noise = (
+            scale_columns(predicted.m, 1.0, model_weight.sqrt()),
+            predicted.noise * model_weight + belief.memory["process"],
+        )
+        return predicted._replace(
+            m=m, omega=predicted.omega + (noise - predicted.noise), noise=noise
+        )
+
+    @override
+    def noise_adapt(
+        self, innovation: Innovation, belief: GaussianBelief
+    ) -> tuple[Innovation, dict[str, Tensor]]:
+        a, nominal = self.forgetting_factor, innovation.nominal
+        defaults = (
+            torch.ones_like(nominal),
+            torch.zeros_like(nominal),
+            torch.zeros_like(innovation.root),
+        )
+        names = "kept_measurement", "measurement", "process"
+        share, learned, process = (
+            belief.memory.get(name, first) for name, first in zip(names, defaults, strict=True)
+        )
+        pair_mask = innovation.observed_mask.unsqueeze(-1) & innovation.observed_mask.unsqueeze(-2)
+        adapted = innovation.with_noise(share * nominal + learned)
+        shift, root, _ = kalman_gain_update(adapted)
+        e = innovation.r - (innovation.m @ shift.unsqueeze(-1)).squeeze(-1)
+        root_after = innovation.m @ root
+        newest = _outer(e) + root_after @ root_after.mT + (adapted.omega - adapted.noise)
+        model_weight = belief.memory.get("kept", torch.ones_like(e[:, 0])) * a
+        return adapted, {
+            "kept": model_weight,
+            "kept_measurement": torch.where(pair_mask, a * share, share),
+            "measurement": torch.where(pair_mask, a * learned + (1.0 - a) * newest, learned),
+            "process": a * process
+            + (1.0 - a) * _outer((innovation.root @ shift.unsqueeze(-1)).squeeze(-1)),
+        }
+
+
+def _outer(a: Tensor) -> Tensor:
+    """Return outer products a a' of vectors [R, k] as [R, k, k]."""
+    return a.unsqueeze(-1) * a.unsqueeze(-2)
+
+
+# --------------------------------------------------------------------------------------------------
+# Gain adaptations: adaptive factor, and a bound on the ratio of error to noise.
+
+
+@dataclass(frozen=True)
+class AdaptiveFactorGain(GainAdaptation):
+    """Scale the predicted covariance by 1 / alpha if the innovation is large.
+
+    P- / alpha [Yang, He and Xu 2001] with dV = sqrt(v' W v / tr(W (C_zz + R))). The factor is
+    alpha = 1 while dV <= c0, then c0 / dV, and at least `min_factor`. It cannot distinguish a wrong
+    state from a noisy measurement. A noise burst therefore inflates all states, step after step.
+    Combine it with BoundedRatioGain.
+
+    Attributes:
+        threshold: c0. Infinity switches the factor off.
+        min_factor: Smallest alpha.
+        weight_by_noise: W = diag(R)^-1 of the model's noise [ours]. False is W = I as printed in the
+            literature, which adds m^2 to (m/s)^2.
+
+    Raises:
+        ValueError: If an argument is outside its range.
+    """
+
+    threshold: float = 1.5
+    min_factor: float = 0.1
+    weight_by_noise: bool = True
+
+    def __post_init__(self) -> None:
+        check_weight("AdaptiveFactorGain.min_factor", self.min_factor)
+        if not self.threshold > 0.0:
+            raise ValueError(
+                f"AdaptiveFactorGain.threshold must be positive, got {self.threshold}. "
+                "Use .inf for no factor."
+            )
+
+    @override
+    def __call__(self, innovation: Innovation, factor: Tensor) -> Tensor:
+        w = (
+            measurement_precision(innovation)
+            if self.weight_by_noise
+            else innovation.observed_mask.to(innovation.r.dtype)
+        )
+        expected = (w * diagonal_axes(innovation.predicted_covariance + innovation.noise)).sum(-1)
+        normalised_innovation = torch.sqrt(
+            (w * innovation.r.square()).sum(-1) / torch.where(expected > 0.0, expected, 1.0)
+        )
+        return factor / torch.where(
+            normalised_innovation > self.threshold, self.threshold / normalised_innovation, 1.0
+        ).clamp(min=self.min_factor)
+
+
+@dataclass(frozen=True)
+class BoundedRatioGain(GainAdaptation):
+    """Bound the ratio rho of predicted error to noise [ours, after the paper].
+
+    The gain is rho / (1 + rho). rho is the largest eigenvalue of C_zz in units of the current R
+    of a sensor group. A factor f above 1 is reduced until f rho is at most `max_ratio`, but not
+    below 1, so the model's own prediction is never narrowed. If f rho is below `min_ratio`, f grows.
+
+    Attributes:
+        max_ratio: Upper bound. Infinity switches it off.
+        min_ratio: Lower bound. 0 switches it off.
+        groups: Group number of each component, as in ConstrainedNoiseAdaptation.
+
+    Raises:
+        ValueError: If a bound is negative or `min_ratio` exceeds `max_ratio`.
+    """
+
+    max_ratio: float = 1.0
+    min_ratio: float = 0.0
+    groups: Sequence[int] | None = None
+    has_evidence = True
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.min_ratio <= self.max_ratio:
+            raise ValueError(
+                "BoundedRatioGain.min_ratio must be from 0 to max_ratio, "
+                f"got min_ratio={self.min_ratio}, max_ratio={self.max_ratio}. Choose 0 <= min_ratio <= max_ratio."
+            )
+
+    @override
+    def __call__(self, innovation: Innovation, factor: Tensor) -> Tensor:
+        _, joint_mask = axes_by_group(innovation, self.groups)
+        white = whitened_measurement(
+            compute_group_root(innovation.noise, joint_mask),
+            innovation.predicted_covariance,
+            joint_mask,
+        )
+        rho = torch.linalg.eigvalsh(white).amax(-1).clamp(min=0.0)
+        positive_rho = torch.where(rho > 0.0, rho, 1.0)
+        factor = torch.where(
+            factor * rho > self.max_ratio, (self.max_ratio / positive_rho).clamp(min=1.0), factor
+        )
+        return torch.where(
+            (factor * rho < self.min_ratio) & (rho > 0.0), self.min_ratio / positive_rho, factor
+        )

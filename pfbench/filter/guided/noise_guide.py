@@ -11,28 +11,29 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
-from pfbench.core.covariance import distribution_covariance, factor
+from pfbench.core.linear_algebra import distribution_covariance, factor
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
-from pfbench.filter.defensive_mixture import check_fraction, choose_defensive_particles
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import (
     AffineApproximation,
     DifferenceSpace,
     around_first,
 )
-from pfbench.filter.guided.guide_memory import check_covariance_factor, check_normal_guide
+from pfbench.filter.guided.guides import check_covariance_factor, check_normal_guide
 from pfbench.filter.linearisation import mask_covariance, mean_noise, unwrap_independent
-from pfbench.filter.particle.point_sets import IidPoints, PointSet
 from pfbench.filter.particle.proposals import (
     Proposal,
     ProposalSample,
+    check_fraction,
+    choose_defensive_particles,
     draw_standardised_noise,
     log_noise_density,
     log_standard_normal,
     scale_noise,
 )
+from pfbench.filter.particle.sqmc import IidPoints, PointSet
 from pfbench.filter.whitening import log_determinant
 from pfbench.model.base import StateSpaceModel
 

@@ -14,8 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pfbench.files.atomic_write import write_atomically
-from pfbench.files.digest import DIGEST, has_valid_digest, hash_content
+from pfbench.files.atomic_write import DIGEST, has_valid_digest, hash_content, write_atomically
 from pfbench.files.limits import TABLE_BYTES, check_is_file, check_zip
 
 CHECKPOINT_FORMAT = "pfbench checkpoint 2"

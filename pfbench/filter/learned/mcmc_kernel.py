@@ -10,12 +10,12 @@ from torch.distributions import Distribution, Normal
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.learned.network_builder import CheckpointSpec, build_networks
+from pfbench.filter.learned.differentiable_resampling import sample_from
+from pfbench.filter.learned.networks import CheckpointSpec, build_networks
 from pfbench.filter.learned.proposal import NetworkFactory
-from pfbench.filter.learned.reparameterised_sampling import sample_from
 from pfbench.filter.linearisation import unwrap_independent
-from pfbench.filter.moves.flow_kernels import propagate_path
-from pfbench.filter.moves.path_history import StateHistory, concatenate_histories
+from pfbench.filter.moves.metropolis import StateHistory, concatenate_histories
+from pfbench.filter.moves.path_kernels import propagate_path
 from pfbench.filter.particle.proposals import log_standard_normal
 from pfbench.model.base import StateSpaceModel
 

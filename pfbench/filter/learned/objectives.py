@@ -18,8 +18,7 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state, simulate_steps
 from pfbench.filter.belief import StepInfo
-from pfbench.filter.learned.gain import LearnedGain
-from pfbench.filter.learned.gain_filter import LearnedGainFilter
+from pfbench.filter.learned.gain_filter import LearnedGain, LearnedGainFilter
 from pfbench.filter.learned.mcmc_kernel import LearnedRandomWalk
 from pfbench.filter.learned.proposal import LearnedProposal
 from pfbench.filter.moves.metropolis import MetropolisHastings

@@ -16,8 +16,8 @@ from typing_extensions import override
 
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.defensive_mixture import check_fraction
 from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
+from pfbench.filter.particle.proposals import check_fraction
 from pfbench.filter.particle.weight_update import BayesWeightUpdate, WeightUpdate
 from pfbench.model.base import StateSpaceModel
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.filter.belief import ParticleBelief, ess
-from pfbench.kernels.compilation import is_capturing
+from pfbench.kernels.dispatch import is_capturing
 
 
 class ParticleCount(Protocol):

@@ -14,20 +14,20 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.covariance import distribution_covariance
-from pfbench.core.derived_stream import relabel
-from pfbench.core.random_stream import RandomStream
+from pfbench.core.linear_algebra import distribution_covariance
+from pfbench.core.random_stream import RandomStream, relabel
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state
-from pfbench.filter.belief import Filter, ParticleBelief, StepInfo
-from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
-from pfbench.filter.log_weights import (
+from pfbench.filter.belief import (
     ComputedWeights,
+    Filter,
+    ParticleBelief,
+    StepInfo,
     is_equal_for_all,
     normalise_updated_weights,
 )
-from pfbench.filter.moves.metropolis import Move
-from pfbench.filter.moves.path_history import PathHistory, combine_histories
+from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
+from pfbench.filter.moves.metropolis import Move, PathHistory, combine_histories
 from pfbench.filter.particle.auxiliary_weights import AuxiliaryWeights, PosteriorWeights
 from pfbench.filter.particle.particle_count import FixedCount, ParticleCount, count_particles
 from pfbench.filter.particle.particle_moments import (
@@ -37,7 +37,6 @@ from pfbench.filter.particle.particle_moments import (
     make_step_info,
     weighted_mean_variance,
 )
-from pfbench.filter.particle.point_sets import IidPoints, PointSet
 from pfbench.filter.particle.proposals import (
     HELD_STEPS,
     BootstrapProposal,
@@ -45,8 +44,8 @@ from pfbench.filter.particle.proposals import (
     Proposal,
     hold_resampling,
 )
-from pfbench.filter.particle.resampling import EssResampler, Resampler
-from pfbench.filter.particle.resampling_schemes import Systematic
+from pfbench.filter.particle.resampling import EssResampler, Resampler, Systematic
+from pfbench.filter.particle.sqmc import IidPoints, PointSet
 from pfbench.filter.particle.weight_update import (
     BayesWeightUpdate,
     MemoryWeightUpdate,

@@ -8,15 +8,20 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 from torch import Tensor
 
-from pfbench.core.covariance import shared_distribution_covariance, squared_length
 from pfbench.core.density import has_finite_moments
+from pfbench.core.linear_algebra import shared_distribution_covariance, squared_length
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief, StepInfo, normalise_log_weights
+from pfbench.filter.belief import (
+    ParticleBelief,
+    StepInfo,
+    exponentiate,
+    has_long_rows,
+    normalise_log_weights,
+)
 from pfbench.filter.gaussian.linearisation_rules import around_first
 from pfbench.filter.linearisation import mask_covariance
-from pfbench.filter.log_weights import exponentiate, has_long_rows
-from pfbench.kernels import cpp
-from pfbench.kernels.compilation import compilable
+from pfbench.kernels import dispatch
+from pfbench.kernels.dispatch import compilable
 from pfbench.model.base import StateSpaceModel
 
 T = TypeVar("T")
@@ -202,7 +207,7 @@ def _count_distinct(copy_of: Tensor, log_w: Tensor) -> Tensor:
     return (marks.scatter_add_(1, copy_of, (log_w > -torch.inf).to(log_w.dtype)) > 0.0).sum(1)
 
 
-count_distinct_ancestors = compilable(_count_distinct, operator=cpp.count_unique)
+count_distinct_ancestors = compilable(_count_distinct, operator=dispatch.count_unique)
 
 
 def _separate_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
@@ -226,10 +231,10 @@ def _separate_spread(x: Tensor, mean: Tensor, w: Tensor, groups: Tensor) -> Tens
     return (w[:, None, None] * deviations) @ deviations.mT
 
 
-_spread = compilable(_separate_spread, operator=cpp.group_covariance, keep_in_graph=False)
+_spread = compilable(_separate_spread, operator=dispatch.group_covariance, keep_in_graph=False)
 _flat_moments = compilable(
     _fused_moments,
     eager=_separate_moments,
-    operator=cpp.weighted_moments,
+    operator=dispatch.weighted_moments,
     keep_in_graph=has_long_rows,
 )

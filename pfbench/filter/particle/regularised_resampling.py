@@ -1,4 +1,4 @@
-"""Regularised resampling: copies plus a step of a smoothing kernel."""
+"""Resampling that moves the copies: smoothing kernels, and the Thompson-Taylor generator."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.covariance import factor
+from pfbench.core.linear_algebra import factor
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
 from pfbench.filter.particle.resampling import EssResampler, Resampler
+from pfbench.filter.whitening import whiten
 from pfbench.model.base import StateSpaceModel
+
+# --------------------------------------------------------------------------------------------------
+# Regularised resampling: copies plus a step of a smoothing kernel.
 
 
 class SmoothingKernel(Protocol):
@@ -156,3 +160,108 @@ class RegularisedResampler(Resampler):
             x = model.chart.add(copies.x, step)
         x = torch.where(resampled_mask[:, None, None], x, copies.x)
         return copies._replace(x=x), resampled_mask
+
+
+# --------------------------------------------------------------------------------------------------
+# Thompson-Taylor generator: particles combine nearest neighbours at random.
+
+_PAIRS = 20_000_000  # distances that are computed at a time
+
+
+@dataclass(frozen=True)
+class ThompsonTaylorResampler(Resampler):
+    """Random combinations of the neighbours of resampled particles.
+
+    z = xbar + sum_l u_l (x_l - xbar) over the m nearest neighbours x_l of each copy. The neighbours
+    include the copy, xbar is their mean, and u_l is uniform with mean 1/m and variance (m - 1)/m^2
+    [Taylor and Thompson 1986]. The covariance within a neighbourhood is multiplied by (m - 1)/m, so
+    mean and covariance of the sample hardly change for any shape. Distances are Euclidean in
+    whitened coordinates [ours]. Copies of one particle are neighbours of each other, so m copies
+    stay equal, as in the published algorithm.
+
+    Attributes:
+        resampler: Resampler that copies, to equal weights.
+        neighbours: Number of neighbours m.
+        as_printed: Use a single random neighbour, z = xbar + u_k (x_k - xbar), as printed. The sum
+            is missing there, and the covariance within a neighbourhood shrinks to 1/m.
+
+    Raises:
+        ValueError: If there are fewer than two neighbours, or, on use, more than particles.
+
+    References:
+        Pu and Qin, "Application of quasi Monte Carlo polymerization re-sampling particle filter
+        algorithm in airborne passive location", eq. 12.
+    """
+
+    resampler: EssResampler
+    neighbours: int = 20
+    as_printed: bool = False
+    is_exact = False
+
+    def __post_init__(self) -> None:
+        if self.neighbours < 2:
+            raise ValueError(
+                f"resampler.neighbours must be at least 2, got {self.neighbours}. "
+                "Count the particle itself as one."
+            )
+
+    @override
+    def __call__(
+        self,
+        model: StateSpaceModel,
+        belief: ParticleBelief,
+        log_a: Tensor,
+        n: Tensor,
+        draws: RandomStream,
+    ) -> tuple[ParticleBelief, Tensor]:
+        slots, m = belief.x.shape[1], self.neighbours
+        if m > slots:
+            raise ValueError(
+                f"resampler.neighbours must be at most {slots} (the particles), got {m}. "
+                "Choose fewer."
+            )
+        mean, covariance = weighted_mean_cov(model.chart, belief)
+        copies, resampled_mask = self.resampler(model, belief, log_a, n, draws)
+        d = model.chart.subtract(copies.x, mean.unsqueeze(1))
+        near = nearest_neighbours(whiten(d, factor(covariance)[0]), copies.log_w > -torch.inf, m)
+        rows = d.gather(1, near.flatten(1).unsqueeze(-1).expand(-1, -1, d.shape[-1])).unflatten(
+            1, (slots, m)
+        )
+        centre = rows.mean(2)
+        combination = self._combine(rows - centre.unsqueeze(2), draws)
+        x = model.chart.add(mean.unsqueeze(1), centre + combination)
+        x = torch.where(resampled_mask[:, None, None], x, copies.x)
+        return copies._replace(x=x), resampled_mask
+
+    def _combine(self, r: Tensor, draws: RandomStream) -> Tensor:
+        """Combine the deviations r [R, N, m, d] of neighbours from their mean, [R, N, d]."""
+        m = self.neighbours
+        half = math.sqrt(3.0 * (m - 1.0)) / m
+        u = draws.uniform("neighbours", r.shape[1], m).to(r)
+        u = 1.0 / m + half * (2.0 * u - 1.0)
+        if not self.as_printed:
+            return (u.unsqueeze(-2) @ r).squeeze(-2)
+        index = (m * draws.uniform("neighbour", r.shape[1], 1)).long().clamp(max=m - 1)
+        neighbour = r.gather(2, index.unsqueeze(-1).expand(-1, -1, 1, r.shape[-1])).squeeze(2)
+        return u[..., :1] * neighbour
+
+
+def nearest_neighbours(z: Tensor, active_mask: Tensor, m: int) -> Tensor:
+    """Find the m nearest active points of each point, including itself.
+
+    Args:
+        z: Points, [R, N, d].
+        active_mask: Active points, [R, N].
+        m: Number of neighbours.
+
+    Returns:
+        Indices in ascending order, [R, N, m]. Copies of a particle are equally near, and rounding
+        decides between them; in this order that does not matter.
+    """
+    block = max(1, _PAIRS // max(1, z.shape[0] * z.shape[1]))
+    penalty = torch.where(active_mask, 0.0, torch.inf).unsqueeze(1)
+    indices = [
+        (torch.cdist(points, z) + penalty).topk(m, largest=False, sorted=False).indices
+        for points in z.split(block, 1)
+    ]
+    return torch.cat(indices, 1).sort(-1).values

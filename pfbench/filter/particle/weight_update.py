@@ -12,8 +12,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.record import Record
-from pfbench.filter.log_weights import add_log_weights, is_resolved
-from pfbench.kernels.compilation import is_capturing
+from pfbench.filter.belief import add_log_weights, is_resolved
+from pfbench.kernels.dispatch import is_capturing
 from pfbench.model.base import StateSpaceModel
 
 WEIGHT_UPDATE_MEMORY = "weight_update."  # start of the names of its values in the particles' memory

@@ -24,8 +24,7 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import GaussianBelief
-from pfbench.filter.robust.hypotheses import Branches
-from pfbench.filter.robust.hypothesis_filter import OFFSET, HypothesisFilter, branch_memory
+from pfbench.filter.robust.hypotheses import OFFSET, Branches, HypothesisFilter, branch_memory
 from pfbench.model.base import StateSpaceModel
 
 

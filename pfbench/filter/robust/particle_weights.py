@@ -15,11 +15,10 @@ from torch import Tensor
 from torch.distributions import Independent, MultivariateNormal, Normal
 from typing_extensions import override
 
-from pfbench.core.covariance import factor, shared_distribution_covariance
+from pfbench.core.linear_algebra import factor, shared_distribution_covariance
 from pfbench.core.record import Record
 from pfbench.filter.belief import normalise_log_weights
-from pfbench.filter.gaussian.innovation import Innovation
-from pfbench.filter.gaussian.principal_axes import diagonal_axes
+from pfbench.filter.gaussian.innovation import Innovation, diagonal_axes
 from pfbench.filter.linearisation import mask_covariance
 from pfbench.filter.particle.particle_moments import predict_moments
 from pfbench.filter.particle.weight_update import (
@@ -27,8 +26,12 @@ from pfbench.filter.particle.weight_update import (
     MemoryWeightUpdate,
     UpdatedWeights,
 )
-from pfbench.filter.robust.component_groups import DOWNWEIGHTED, GroupDistances
-from pfbench.filter.robust.robust_update import InnovationWeight, ResidualLoss
+from pfbench.filter.robust.robust_update import (
+    DOWNWEIGHTED,
+    GroupDistances,
+    InnovationWeight,
+    ResidualLoss,
+)
 from pfbench.filter.whitening import LOG_2PI
 from pfbench.model.base import StateSpaceModel
 

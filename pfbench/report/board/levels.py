@@ -16,11 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pfbench.report.board.run_table import LOG_SCORE
-from pfbench.results.decisions.pair_effects import estimate_share_difference
-from pfbench.results.error_measures import Array, Flags
-from pfbench.results.statistics.paired_effects import ConditionEffects, log_levels
-from pfbench.results.statistics.world_effects import EffectEstimate
+from pfbench.report.board.entries import LOG_SCORE
+from pfbench.stats.effects import ConditionEffects, EffectEstimate, log_levels
+from pfbench.stats.error_measures import Array, Flags
+from pfbench.stats.pair_effects import estimate_share_difference
 
 _LARGEST_LOG = 700.0  # whose exponential is finite
 _CONDITION = ["family", "scenario", "regime"]

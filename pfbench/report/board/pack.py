@@ -1,27 +1,71 @@
-"""Data of the page and of the paper of a study: one dictionary, all numbers decided here."""
+"""Data of the page and of the paper of a study: one dictionary, all numbers decided here from one reading."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
 
 from pfbench.report import provenance
-from pfbench.report.board.decided_parts import StudyFacts, decide_parts
-from pfbench.report.board.pack_entries import (
+from pfbench.report.board.curves import (
+    CellKey,
+    count_carried_runs,
+    list_calibration,
+    list_runs,
+    make_curves,
+    make_tracks,
+)
+from pfbench.report.board.entries import (
+    METRIC_NAMES,
+    StudyNames,
+    ViewKey,
     budget_entries,
     cell_entries,
     describe_uncommitted,
     describe_versions,
+    filter_entry,
+    job_rows,
+    join_rows,
+    metric_entries,
+    name_regimes,
     regime_entries,
 )
-from pfbench.report.board.run_table import METRIC_NAMES
-from pfbench.report.board.study_data import StudyData, read_study
-from pfbench.report.journal.references import format_bibliography
-from pfbench.report.looks import study_looks, study_part_names
-from pfbench.report.methods_facts import collect_methods_facts
+from pfbench.report.board.robust_word import describe_robustness
+from pfbench.report.board.study_views import (
+    build_views,
+    decide_planned,
+    planned_entries,
+    planned_words,
+)
+from pfbench.report.board.sweeps import list_sweeps
+from pfbench.report.board.view import BEST, EQUAL, MISSING, NOT_KEPT, OPEN
+from pfbench.report.journal.study_pack import ALL
+from pfbench.report.methods_text import collect_methods_facts
 from pfbench.report.options import ReportOptions
-from pfbench.results.conditions import Condition, differing_settings
-from pfbench.results.store import list_failures
+from pfbench.report.provenance import format_bibliography
+from pfbench.results.conditions import Condition, differing_settings, parse_label
+from pfbench.results.frame import drop_before, to_long_rows
+from pfbench.results.looks import (
+    MethodLook,
+    PartName,
+    add_tuning,
+    find_looks,
+    study_looks,
+    study_part_names,
+)
+from pfbench.results.paper_block import REFERENCES, list_named_parts
+from pfbench.results.status import count_statuses
+from pfbench.results.step_times import StepTimes
+from pfbench.results.store import JobResult, list_failures
+from pfbench.stats.decision import WORSE
+from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
+
+# --------------------------------------------------------------------------------------------------
+# Data of the page and of the paper of a study: one dictionary, all numbers decided here.
 
 
 def build_pack(
@@ -91,3 +135,365 @@ def _describe_differing(conditions: Sequence[Condition]) -> str:
         for condition in conditions
         if (settings := differing_settings(condition.jobs))
     )
+
+
+# --------------------------------------------------------------------------------------------------
+# All data of the results of a study that its page needs, from one reading of each file.
+
+
+class StudyData(NamedTuple):
+    """Data of a study.
+
+    Attributes:
+        table: One row per filter, condition and run, see `run_table.build_run_table`.
+        metrics: All metrics in long rows, see `frame.load_frame`; empty unless requested.
+        curves: Quantiles of the error over time by condition.
+        tracks: Single runs by condition.
+        notes: Notes on the filters.
+        times: Times in rounds by label, of each condition; without filters that were not measured.
+        warning: Sentence on runs that are not independent; empty if none is shown.
+    """
+
+    table: pd.DataFrame
+    metrics: pd.DataFrame
+    curves: dict[CellKey, dict[str, Any]]
+    tracks: dict[CellKey, dict[str, Any]]
+    notes: MethodNotes
+    times: dict[CellKey, dict[str, StepTimes]]
+    warning: str = ""
+
+
+def read_study(
+    conditions: Sequence[Condition], options: ReportOptions, *, has_metrics: bool = False
+) -> StudyData:
+    """Read the results of a study, one condition at a time.
+
+    Args:
+        conditions: Conditions of the study.
+        options: Options of the report.
+        has_metrics: Whether to collect all metrics.
+
+    Raises:
+        ValueError: If a job lacks values of the metric that decides.
+    """
+    rows, metrics, notes = [], [], MethodNotes()
+    data = StudyData(pd.DataFrame(), pd.DataFrame(), {}, {}, notes, {})
+    start, converged = options.start_time_s, options.convergence_threshold
+    most = count_carried_runs(max(len(c.jobs) for c in conditions), len(conditions))
+    for condition, regime in zip(conditions, name_regimes(conditions), strict=True):
+        results = {job.label: job.load() for job in condition.jobs}
+        parts = [
+            job_rows((condition, regime, label), drop_before(result, start), options.metric)
+            for label, result in results.items()
+        ]  # fmt: skip
+        rows += parts
+        for job in condition.jobs:
+            notes.add(job.label, results[job.label])
+            if has_metrics:
+                metrics.append(to_long_rows(condition, job, results[job.label], start, converged))
+        key = condition.scenario, regime
+        times = {job.label: StepTimes.from_metadata(job.meta) for job in condition.jobs}
+        data.times[key] = {label: rounds for label, rounds in times.items() if rounds}
+        data.curves[key] = make_curves(results, len(conditions))
+        errors = pd.concat(parts).pivot_table("rmse", "filter", "run", dropna=False)
+        if errors.shape == (len(results), len(parts[0])):  # all filters have the same runs
+            values = errors.loc[list(results)].to_numpy()
+            data.tracks[key] = make_tracks(
+                results, values, [int(run) for run in errors.columns.to_numpy()], most
+            )
+    long_rows = pd.concat(metrics, ignore_index=True) if metrics else data.metrics
+    return _leave_out_copies(
+        data._replace(table=join_rows(rows, options.metric), metrics=long_rows)
+    )
+
+
+def _leave_out_copies(data: StudyData) -> StudyData:
+    """Leave out copies of runs, and state runs that are not independent."""
+    copies, warning = assess_runs(data.table, "rmse", RUN)
+    return data._replace(
+        table=drop_runs(data.table, copies, RUN),
+        metrics=drop_runs(data.metrics, copies, RUN),
+        warning=warning,
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Decided parts of a page: all that follows from the runs of a study, and its other inputs.
+#
+# A published study keeps its runs and these facts, so that its page is decided again without results.
+
+_BASELINES = (*REFERENCES, "ukf", "ckf")  # offered first if they are in the study
+_MOST_BASELINES, _FEW_BASELINES = 3, 2
+_MANY = 300  # filters times conditions, from which a page offers few baselines
+_OPTIONS = ("alpha", "equivalence_margin", "metric", "baseline")  # that decide
+_OUTCOMES = {  # in the order in which methods are ranked
+    BEST: "smallest error in {}",
+    EQUAL: "equal to it in {}",
+    OPEN: "not decided in {}",
+    WORSE: "worse in {}",
+    NOT_KEPT: "track not kept in {}",
+    MISSING: "not run in {}",
+}
+
+
+class StudyFacts(NamedTuple):
+    """Inputs of decisions other than the runs.
+
+    Attributes:
+        looks: Looks by label.
+        worlds: Names of the scenarios by key.
+        regimes: Names of the noise regimes by key.
+        options: Options of the report.
+        times: Times in rounds by label, of each scenario and regime.
+        failures: Jobs that failed.
+        warning: Sentence on runs that are not independent; empty if none is shown.
+        differing: Sentence on conditions whose jobs differ in their data; empty without any.
+    """
+
+    looks: Mapping[str, MethodLook]
+    worlds: Mapping[str, PartName]
+    regimes: Mapping[str, PartName]
+    options: ReportOptions
+    times: Mapping[CellKey, Mapping[str, StepTimes]]
+    failures: Sequence[Any] = ()
+    warning: str = ""
+    differing: str = ""
+
+    def to_entries(self) -> dict[str, Any]:
+        """Return plain values, from which `from_pack` restores the facts."""
+        return {
+            "options": {name: getattr(self.options, name) for name in _OPTIONS},
+            "looks": [asdict(look) for look in self.looks.values()],
+            "regimes": [asdict(name) for name in self.regimes.values()],
+            "times": [
+                [*key, {label: times._replace(seconds=times.seconds.tolist())._asdict()
+                        for label, times in by_label.items()}]
+                for key, by_label in self.times.items() if by_label
+            ],
+            "warning": self.warning,
+            "differing": self.differing,
+        }  # fmt: skip
+
+    @classmethod
+    def from_pack(cls, pack: Mapping[str, Any]) -> StudyFacts:
+        """Restore the facts of a stored page. Installed methods have their present looks, and the stored data of their tuning.
+
+        Args:
+            pack: Data of a page.
+        """
+        facts = pack["facts"]
+        stored = [MethodLook(**{**v, "baselines": tuple(v["baselines"])}) for v in facts["looks"]]
+        labels = [look.key for look in stored]
+        methods = {parse_label(label)[0] for label in labels}
+        is_installed = methods <= set(list_named_parts("filter"))
+        looks = {look.key: look for look in stored}
+        present = find_looks(labels) if is_installed else looks
+        return cls(
+            {
+                key: add_tuning(look, looks[key].tuning, looks[key].tuned_on)
+                for key, look in present.items()
+            },
+            {entry["key"]: PartName(**entry) for entry in pack["worlds"]},
+            {entry["key"]: PartName(**entry) for entry in facts["regimes"]},
+            ReportOptions(**facts["options"]),
+            {
+                (world, regime): {
+                    label: StepTimes(np.array(times["seconds"]), times["group"])
+                    for label, times in by_label.items()
+                }
+                for world, regime, by_label in facts["times"]
+            },
+            pack["failures"],
+            facts["warning"],
+            facts["differing"],
+        )
+
+
+def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
+    """Decide all parts of a page that follow from the runs.
+
+    Args:
+        table: Table of `build_run_table`.
+        facts: Inputs of decisions other than the runs.
+    """
+    looks, worlds, options = facts.looks, facts.worlds, facts.options
+    planned = decide_planned(table, looks, options)
+    conditions = len(table[["scenario", "regime"]].drop_duplicates())
+    most = _MOST_BASELINES if len(looks) * conditions <= _MANY else _FEW_BASELINES
+    names = StudyNames(
+        looks, worlds, facts.regimes, select_baselines(looks, options.baseline)[:most]
+    )
+    views = build_views(table, names, options, planned_words(planned), facts.times)
+    warnings = (
+        _count_failures(len(facts.failures)),
+        facts.warning,
+        _describe_baseline(looks, options.baseline, next(iter(views)).baseline),
+    )
+    for key, view in views.items():
+        proposed = _describe_best_proposed(views, key, looks)
+        view["sentence"] = " ".join(filter(None, (*warnings, view["sentence"], proposed)))
+        view["small_print"] = " ".join(filter(None, (view["small_print"], facts.differing)))
+    first = next(iter(views.values()))["rows"]
+    return {
+        "alpha": options.alpha,
+        "filters": [filter_entry(looks[row["filter"]]) for row in first],
+        "worlds": [asdict(name) for name in worlds.values()],
+        "metrics": metric_entries(table, options.metric),
+        "baselines": list(dict.fromkeys(key.baseline for key in views)),
+        "views": views,
+        "planned": planned_entries(planned, table, looks, worlds, options),
+        "robustness": describe_robustness(table, looks, options),
+        "calibration": list_calibration(table),
+        "runs": list_runs(table),
+        "sweeps": list_sweeps(views, looks, options.metric),
+        "failures": list(facts.failures),
+    }
+
+
+def _count_failures(number: int) -> str:
+    """State how many jobs failed; empty if none did."""
+    jobs = (
+        "1 job has no valid result and is"
+        if number == 1
+        else f"{number} jobs have no valid result and are"
+    )
+    return f"{jobs} missing from all tables." if number else ""
+
+
+def _describe_best_proposed(
+    views: Mapping[ViewKey, Mapping[str, Any]], key: ViewKey, looks: Mapping[str, MethodLook]
+) -> str:
+    """Count the verdicts of the best proposed method over the conditions of a view, each decided alone.
+
+    Empty for a view of one condition, without a proposed method, and where one has an error in all conditions.
+    """
+    proposed = [row["filter"] for row in views[key]["rows"] if looks[row["filter"]].proposed]
+    ranked = {row["filter"] for row in views[key]["rows"] if row["rank"] is not None}
+    conditions = [
+        view
+        for view_key, view in views.items()
+        if (view_key.metric, view_key.baseline) == (key.metric, key.baseline)
+        and ALL not in (view_key.world, view_key.regime)
+        and key.world in (ALL, view_key.world)
+        and key.regime in (ALL, view_key.regime)
+    ]
+    if len(conditions) < 2 or not proposed or ranked & set(proposed):
+        return ""
+    counts = {label: dict.fromkeys(_OUTCOMES, 0) for label in proposed}
+    for view in conditions:
+        for row in view["rows"]:
+            if row["filter"] in counts:
+                counts[row["filter"]][row["verdict"]] += 1
+    best = max(proposed, key=lambda label: tuple(counts[label].values()))
+    parts = [
+        text.format(n)
+        for text, n in zip(_OUTCOMES.values(), counts[best].values(), strict=True)
+        if n
+    ]
+    return (
+        f"Best proposed method in single conditions, each decided alone: [[{looks[best].name}]]. "
+        f"Of {len(conditions)} conditions: {', '.join(parts)}."
+    )
+
+
+def _describe_baseline(looks: Mapping[str, MethodLook], requested: str, baseline: str) -> str:
+    """State that another baseline is shown than the selected one; empty if it is shown."""
+    if requested in ("", baseline):
+        return ""
+    return (
+        f"[[{looks[requested].name}]] has no error to compare in all conditions: "
+        f"[[{looks[baseline].name}]] is the baseline in its place."
+    )
+
+
+def select_baselines(looks: Mapping[str, MethodLook], baseline: str = "") -> list[str]:
+    """Select the baselines that a reader may choose, the one of the opening view first.
+
+    Args:
+        looks: Looks by label.
+        baseline: Label of the first baseline, empty for the default.
+
+    Raises:
+        ValueError: If the study lacks it.
+    """
+    if baseline and baseline not in looks:
+        raise ValueError(
+            f"report.baseline must be a filter of the study, got {baseline}. "
+            f"Choose from {', '.join(looks)}."
+        )
+    stated = [label for look in looks.values() for label in look.baselines]
+    available = [label for label in (baseline, *_BASELINES, *stated) if label in looks]
+    return list(dict.fromkeys(available)) or list(looks)[:1]
+
+
+# --------------------------------------------------------------------------------------------------
+# Notes on each filter: particles, exactness, failures and modelling choices.
+
+_COUNTS = ("runs", "lost", "diverged", "collapsed", "severely_overconfident")
+
+
+class MethodNotes:
+    """Notes on all filters of a study, collected job by job."""
+
+    def __init__(self) -> None:
+        self._counts: dict[str, Counter[str]] = {}
+        self._particles: dict[str, dict[str, None]] = {}
+        self._exact: dict[str, bool] = {}
+        self._bounded: dict[str, set[bool | None]] = {}
+        self._choices: dict[str, dict[str, None]] = {}
+
+    def add(self, label: str, result: JobResult) -> None:
+        """Add a job.
+
+        Args:
+            label: Label of the filter.
+            result: Result of the job.
+        """
+        meta = result.meta
+        status = count_statuses(result.data, meta)._asdict()
+        counts = self._counts.setdefault(label, Counter())
+        counts.update({name: int(status[name] or 0) for name in _COUNTS})
+        counts["limited_runs"] += int(meta["runs"]) if status["diverged"] is not None else 0
+        particles = meta.get("particles")
+        self._particles.setdefault(label, {})[str(particles)] = None
+        self._exact[label] = self._exact.get(label, True) and bool(meta.get("is_exact"))
+        self._bounded.setdefault(label, set()).add(meta.get("has_bounded_weights"))
+        for text in meta.get("modelling_choices", ()):
+            self._choices.setdefault(str(text), {})[label] = None
+
+    def to_entries(self, looks: Mapping[str, MethodLook]) -> dict[str, Any]:
+        """Return the entries of the page.
+
+        Args:
+            looks: Looks by label.
+
+        Returns:
+            `filter_notes`, one per filter, and `choices`, each with the names of its filters.
+        """
+        notes = []
+        for label, counts in self._counts.items():
+            particles = [n for n in self._particles[label] if n != "None"]
+            has_limit = counts["limited_runs"] > 0
+            notes.append({
+                "filter": label, "particles": " or ".join(particles), "is_exact": self._exact[label],
+                "has_bounded_weights": _common(self._bounded[label]),
+                **{name: counts[name] for name in _COUNTS},
+                "diverged": counts["diverged"] if has_limit else None,
+            })  # fmt: skip
+        choices = [
+            {"text": text, "filters": _name_filters(labels, looks)}
+            for text, labels in sorted(self._choices.items())
+        ]
+        return {"filter_notes": notes, "choices": choices}
+
+
+def _common(statements: set[bool | None]) -> bool | None:
+    """Return whether weights are bounded in all jobs, None if a job does not state it."""
+    return None if None in statements else all(statements)
+
+
+def _name_filters(labels: Mapping[str, None], looks: Mapping[str, MethodLook]) -> str:
+    """Return the names of filters, "all filters" if none is missing."""
+    if set(labels) == set(looks):
+        return "all filters"
+    return ", ".join(looks[label].name for label in looks if label in labels)

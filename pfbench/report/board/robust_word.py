@@ -16,7 +16,6 @@ import numpy as np
 import pandas as pd
 from scipy.special import stdtr
 
-from pfbench.config.tuning_names import list_tuned_worlds
 from pfbench.report.board.levels import (
     FilterLevels,
     StudyArrays,
@@ -24,14 +23,13 @@ from pfbench.report.board.levels import (
     average_levels,
     compute_condition_levels,
 )
-from pfbench.report.looks import MethodLook, find_looks
 from pfbench.report.options import ReportOptions
-from pfbench.results.comparison.baselines import REFERENCES
-from pfbench.results.error_measures import Flags
-from pfbench.results.job_labels import parse_label
-from pfbench.results.statistics.paired_effects import MIN_RUNS, ConditionEffects
-from pfbench.results.statistics.signed_rank import holm
-from pfbench.results.statistics.world_effects import EffectEstimate
+from pfbench.results.conditions import parse_label
+from pfbench.results.looks import MethodLook, find_looks
+from pfbench.results.paper_block import REFERENCES, list_tuned_worlds
+from pfbench.stats.effects import MIN_RUNS, ConditionEffects, EffectEstimate
+from pfbench.stats.error_measures import Flags
+from pfbench.stats.rank_tests import holm
 
 CONTROL = REFERENCES[0]  # EKF with tuned constant factors on R and Q
 OUTLIER_REGIME, NOMINAL_REGIME = "outliers", "nominal"

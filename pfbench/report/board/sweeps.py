@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from pfbench.report.board.pack_entries import ViewKey
+from pfbench.report.board.entries import ViewKey
 from pfbench.report.journal.study_pack import ALL
-from pfbench.report.looks import MethodLook
-from pfbench.results.job_labels import parse_label
+from pfbench.results.conditions import parse_label
+from pfbench.results.looks import MethodLook
 
 _MIN_VALUES = 2  # of a setting
 

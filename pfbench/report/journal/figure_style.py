@@ -1,18 +1,21 @@
-"""Marks, scales and sizes of all figures of a paper."""
+"""Marks, scales and sizes of the figures of a paper, and the page formats of journals."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pfbench.report.journal.page_format import POINTS_PER_INCH, PageFormat
-from pfbench.report.plots.axis_ticks import set_plain_ticks
+from pfbench.results.plotting import set_plain_ticks
+
+# --------------------------------------------------------------------------------------------------
+# Marks, scales and sizes of all figures of a paper.
 
 ROW = 0.135  # inches, height of a row with a name
 MARGIN = 0.42  # inches, axis below the rows
@@ -151,3 +154,159 @@ def draw_interval(
     style = {**mark_style(look), "marker": ">" if value > limits[1] else "<"}
     axis.plot([edge], [y], zorder=3, clip_on=False, **{**style, "linestyle": "none"})
     return False
+
+
+# --------------------------------------------------------------------------------------------------
+# Page formats of journals: widths of columns, fonts and document classes.
+
+POINTS_PER_INCH = 72.27  # TeX points
+# signs of powers of ten at axes, which LaTeX does not know
+SUPERSCRIPTS = {
+    ord(sign): rf"\textsuperscript{{{digit}}}"
+    for sign, digit in zip("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789", strict=True)
+}
+_POINTS_PER_MM = POINTS_PER_INCH / 25.4
+_NARROWEST, _WIDEST = 60 * _POINTS_PER_MM, 400 * _POINTS_PER_MM
+
+
+class PageFormat(NamedTuple):
+    """Format of the pages of a journal. Lengths are TeX points: 72.27 per inch.
+
+    Attributes:
+        name: Name of the journal or the width.
+        column: Width of a column.
+        text: Width of both columns.
+        height: Height of the text.
+        serif: Font of figures: Times-like, or without serifs.
+        size: Size of text in figures.
+        tick_size: Size of tick labels in figures.
+        head: Lines of LaTeX from the document class to its packages.
+        bibliography: Style of BibTeX.
+    """
+
+    name: str
+    column: float
+    text: float
+    height: float
+    serif: bool
+    size: float
+    tick_size: float
+    head: str
+    bibliography: str
+
+    @property
+    def has_columns(self) -> bool:
+        """Number of columns: true for two."""
+        return self.text > self.column
+
+    def rc(self) -> Any:
+        """Return the settings of matplotlib."""
+        family = "STIXGeneral" if self.serif else "DejaVu Sans"
+        return {
+            "font.family": [family, "DejaVu Sans"],  # STIX lacks some superscripts
+            "mathtext.fontset": "stix" if self.serif else "dejavusans",
+            "font.size": self.size,
+            "axes.labelsize": self.size,
+            "axes.titlesize": self.size,
+            "axes.titlelocation": "left",
+            "axes.titley": 1.0,
+            "legend.fontsize": self.tick_size,
+            "legend.frameon": False,
+            "xtick.labelsize": self.tick_size,
+            "ytick.labelsize": self.tick_size,
+            "axes.linewidth": 0.5,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "axes.grid": True,
+            "axes.axisbelow": True,
+            "grid.linewidth": 0.4,
+            "grid.color": "0.9",
+            "xtick.major.width": 0.5,
+            "ytick.major.width": 0.5,
+            "xtick.minor.width": 0.4,
+            "ytick.minor.width": 0.4,
+            "lines.linewidth": 0.9,
+            "lines.markersize": 3.5,
+            "pdf.fonttype": 42,  # TrueType: journals refuse Type 3
+            "ps.fonttype": 42,
+            "text.parse_math": False,  # a name may contain $ as a plain character
+            "pgf.texsystem": "pdflatex",
+            "pgf.rcfonts": False,  # the fonts of the document
+            "pgf.preamble": "\n".join(
+                rf"\DeclareUnicodeCharacter{{{sign:04X}}}{{{code}}}"
+                for sign, code in SUPERSCRIPTS.items()
+            ),
+            "figure.constrained_layout.h_pad": 0.02,
+            "figure.constrained_layout.w_pad": 0.02,
+        }
+
+
+def _millimetres(value: float) -> float:
+    """Convert millimetres to TeX points."""
+    return value * _POINTS_PER_MM
+
+
+def _own_geometry(text: float, gap: float, height: float) -> str:
+    """Return the package that sets the widths of an article."""
+    return (
+        rf"\usepackage[textwidth={text:.3f}pt,columnsep={gap:.3f}pt,"
+        rf"textheight={height:g}pt,a4paper]{{geometry}}"
+    )
+
+
+_TIMES = r"\usepackage{mathptmx}"
+_ELSEVIER = (_millimetres(90), _millimetres(190), 690.0)
+_SPRINGER = (_millimetres(84), _millimetres(174), 660.0)
+JOURNALS = {
+    "ieee": PageFormat(
+        "ieee", 252.0, 516.0, 690.0, True, 8.0, 7.0,
+        r"\documentclass[journal]{IEEEtran}" "\n" r"\usepackage{cite}", "IEEEtran",
+    ),
+    "elsevier": PageFormat(
+        "elsevier", *_ELSEVIER, False, 7.0, 6.5,
+        "\\documentclass[final,5p,times,twocolumn]{elsarticle}\n"
+        f"\\geometry{{textwidth={_ELSEVIER[1]:.3f}pt,"
+        f"columnsep={_ELSEVIER[1] - 2 * _ELSEVIER[0]:.3f}pt,textheight=690pt}}\n"
+        "\\biboptions{sort&compress}\n\\journal{}",
+        "elsarticle-num",
+    ),
+    "springer": PageFormat(
+        "springer", *_SPRINGER, False, 8.0, 7.0,
+        "\\documentclass[twocolumn]{article}\n"
+        + _own_geometry(_SPRINGER[1], _SPRINGER[1] - 2 * _SPRINGER[0], 660)
+        + "\n" + _TIMES,
+        "unsrt",
+    ),
+}  # fmt: skip
+
+
+def find_page_format(journal: str = "", width: str = "") -> PageFormat:
+    """Return the format of a journal, or that of one column of a given width.
+
+    Args:
+        journal: Name of a journal.
+        width: Width with its unit, such as "120mm" or "345pt" (TeX points).
+
+    Raises:
+        ValueError: If not exactly one of both is given, or its value is not valid.
+    """
+    if bool(journal) == bool(width):
+        got = f"journal={journal} and width={width}" if journal else "none of them"
+        raise ValueError(
+            f"journal or width must be set, got {got}. Use journal={'|'.join(JOURNALS)} or width=120mm."
+        )
+    if journal:
+        if journal not in JOURNALS:
+            raise ValueError(
+                f"journal must be one of {', '.join(JOURNALS)}, got {journal}. "
+                "Use width=120mm for other pages."
+            )
+        return JOURNALS[journal]
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)(mm|pt)", width)
+    points = float(match[1]) * (_POINTS_PER_MM if match[2] == "mm" else 1.0) if match else 0.0
+    if not _NARROWEST <= points <= _WIDEST:
+        raise ValueError(
+            f"width must be 60mm to 400mm, in mm or pt, got {width}. Use width=120mm or width=345pt."
+        )
+    head = f"\\documentclass{{article}}\n{_own_geometry(points, 10, 640)}\n{_TIMES}"
+    return PageFormat(width, points, points, 640.0, False, 8.0, 7.0, head, "unsrt")

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pfbench.files.escapes import escape_latex
-from pfbench.report.journal.error_columns import format_error_value
+from pfbench.report.journal.main_table import format_error_value
 from pfbench.report.journal.study_pack import (
     Pack,
     Row,
@@ -25,8 +25,8 @@ from pfbench.report.journal.table_layout import (
     LatexTable,
     number_column,
     text_cell,
+    text_width,
 )
-from pfbench.report.journal.text_width import text_width
 
 _INDENT = 6.0  # points, of a baseline below its method
 _EQUAL = 5e-4  # ratios further from 1 are not printed as 1.00

@@ -22,7 +22,7 @@ from pfbench.report.journal.study_pack import (
     is_number,
     name_of,
 )
-from pfbench.report.plots.axis_ticks import use_log_if_wide
+from pfbench.results.plotting import use_log_if_wide
 
 _CURVES = 9  # filters at most
 _PANELS = 6  # worlds at most

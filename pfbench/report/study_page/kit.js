@@ -7,7 +7,7 @@ const esc = (text) => String(text).replace(/[&<>"']/g, (sign) => escapes[sign]);
 const strong = (text) => esc(text).replace(/\[\[(.*?)\]\](?!\])/g, "<b>$1</b>");
 const plain = (text) => String(text).replace(/\[\[|\]\]/g, "");
 
-// Numbers with significant digits, as opening.py writes them.
+// Numbers with significant digits, as page_writer.py writes them.
 function short(value, digits = 3) {
   if (value === null || value === undefined) return "–";
   const rounded = Number(value.toPrecision(digits));

@@ -21,7 +21,7 @@ let places = []; // scenario and regime of the views
 const placeOf = (key) => key.slice(1, 3).join("/");
 const views = new Map(); // views that were shown, by key
 
-// The data are the length of a JSON text, the text and the bytes of all codes, in gzip and base 85 (number_codes.py).
+// The data are the length of a JSON text, the text and the bytes of all codes, in gzip and base 85 (encoding.py).
 async function unpack() {
   const stream = new Blob([fromBase85(find("#data").textContent.trim())]).stream();
   const bytes = new Uint8Array(await new Response(stream.pipeThrough(new DecompressionStream("gzip"))).arrayBuffer());

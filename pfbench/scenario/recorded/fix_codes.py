@@ -11,8 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pfbench.scenario.plausibility.log_table import LogTable
-from pfbench.scenario.recorded.log_tables import parse_numbers
+from pfbench.scenario.recorded.log_tables import LogTable, parse_numbers
 
 # names of the codes of each program, those of fixes that are not used in the second place
 PROGRAMS: dict[str, tuple[dict[int, str], dict[int, str]]] = {

@@ -8,12 +8,18 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import torch
 
-from pfbench.core import quaternion
-from pfbench.nav.preintegration import rotate
-from pfbench.scenario.plausibility.dead_reckoning import integrate_windows
-from pfbench.scenario.plausibility.time_order import find_overlap_remedy
-from pfbench.scenario.recorded.log_tables import Array
-from pfbench.scenario.recorded.navigation_log import ImuLog, ReferenceLog
+from pfbench.core import chart
+from pfbench.nav import earth
+from pfbench.nav.strapdown import rotate
+from pfbench.scenario.recorded.dead_reckoning import integrate_windows
+from pfbench.scenario.recorded.log_tables import (
+    Array,
+    ImuLog,
+    LogTable,
+    ReferenceLog,
+    parse_numbers,
+)
+from pfbench.scenario.recorded.time_order import find_overlap_remedy
 
 STANDARD_GRAVITY = 9.80665
 _AGREEING_TURN = 0.3  # part of the rates of the reference that noise may leave [ours]
@@ -209,9 +215,7 @@ def _mean_rates(imu: ImuLog, reference: ReferenceLog) -> tuple[Array, Array] | N
     if len(time) < 10:
         return None
     inverse = q[:-1] * q.new_tensor([1.0, -1.0, -1.0, -1.0])
-    true = quaternion.rotation_vector_from_quaternion(
-        quaternion.quaternion_multiply(inverse, q[1:])
-    ).numpy()
+    true = chart.rotation_vector_from_quaternion(chart.quaternion_multiply(inverse, q[1:])).numpy()
     summed = np.cumsum(0.5 * np.diff(imu.time)[:, None] * (imu.rate[1:] + imu.rate[:-1]), axis=0)
     angle = np.vstack([np.zeros(3), summed])
     measured = np.diff(
@@ -220,3 +224,143 @@ def _mean_rates(imu: ImuLog, reference: ReferenceLog) -> tuple[Array, Array] | N
     measured, true = (turn / np.diff(time)[:, None] for turn in (measured, true))
     # the mean contains the gyro bias
     return measured - measured.mean(axis=0), true - true.mean(axis=0)
+
+
+# --------------------------------------------------------------------------------------------------
+# Scale of one table against another. A wrong unit changes all rows alike, so that single rows look right.
+
+WINDOW = 1.0  # s; tables are compared over windows of about this length
+MIN_RMS_SPEED = 1.0  # m/s; smallest RMS velocity at which position and velocity have a common scale
+MIN_RMS_TURN = 0.03  # rad; smallest RMS rotation in a window, about its mean, that shows a scale
+FEWEST_WINDOWS = 5  # for a scale
+CORRELATED = 0.95  # least correlation of a slow axis, whose slope noise reduces to 0.9 at most
+SCALES = (0.7, 1.4)  # least and largest scale of one table against another
+
+
+def check_position_scale(table: LogTable, time: Array, expected: Array, displacement: Array) -> None:  # fmt: skip
+    """Check that displacements have the scale of the integrated velocities.
+
+    A slow axis is judged only if both are correlated, since noise of the velocity reduces the slope.
+
+    Args:
+        table: Table of the reference, for messages.
+        time: Times of the rows, s, [n + 1].
+        expected: Integrated velocities, m, [n, 3].
+        displacement: Changes of position, m, [n, 3].
+
+    Raises:
+        ValueError: If an axis has another scale.
+    """
+    window = ((time[1:] - time[0]) / WINDOW - 1e-9).astype(int)
+    starts = np.flatnonzero(np.diff(window, prepend=-1))
+    speeds = np.sqrt(np.square(expected / np.diff(time)[:, None]).mean(0))
+    for axis, name in enumerate(("East", "North", "Up")):
+        x, y = expected[:, axis], displacement[:, axis]
+        if speeds[axis] < MIN_RMS_SPEED:
+            x, y = np.add.reduceat(x, starts), np.add.reduceat(y, starts)
+            if len(x) < FEWEST_WINDOWS or not _is_correlated(x, y):
+                continue
+        slope = float((x * y).sum() / (x * x).sum())
+        if not SCALES[0] < slope < SCALES[1]:
+            raise ValueError(
+                f"{table.name}: the {name} position must change with the velocity, got {slope:.3g} "
+                "times the change. Check units (m, m/s, deg), signs and order of the columns."
+            )
+
+
+def _is_correlated(x: Array, y: Array) -> bool:
+    square = float((x * x).sum()) * float((y * y).sum())
+    return abs(float((x * y).sum())) > CORRELATED * math.sqrt(square)
+
+
+def check_turn_scale(table: LogTable, x: Array, y: Array, window: float) -> None:
+    """Check that rotations of the reference have the scale of those of the IMU.
+
+    Args:
+        table: Table of the reference, for messages.
+        x: Rotations of the IMU in each window, rad, [n, 3].
+        y: Rotations of the reference, rad, [n, 3].
+        window: Typical length of the windows, s.
+
+    Raises:
+        ValueError: If an axis has another scale.
+    """
+    if len(x) < FEWEST_WINDOWS or window < 0.5 * WINDOW:
+        return  # between neighbouring rows, noise has a larger part
+    x, y = x - x.mean(0), y - y.mean(0)  # without the bias of the gyroscope
+    for axis, name in enumerate(("x", "y", "z")):
+        square = float((x[:, axis] ** 2).sum())
+        if np.sqrt(square / len(x)) < MIN_RMS_TURN:
+            continue
+        slope = float((x[:, axis] * y[:, axis]).sum()) / square
+        if not SCALES[0] < slope < SCALES[1]:
+            raise ValueError(
+                f"{table.name}: the attitude must turn with the angular rate about {name}, got "
+                f"{slope:.3g} times the rotation. Check units (rad, rad/s), signs and axes."
+            )
+
+
+# --------------------------------------------------------------------------------------------------
+# Checks of the tables of a road drive: direction of the wheels, and positions that are given twice.
+
+_GEOCENTRIC, _GEODETIC = ("x", "y", "z"), ("lat_deg", "lon_deg", "h_m")
+SAME_POSITION = 1.0  # m; difference of two forms of one position, for rounded degrees
+_BRAKING, _SLOW = 10.0, 1.0  # m/s^2, hard braking on a road; m/s, noise of the wheels about zero
+
+
+def check_geocentric(table: LogTable) -> None:
+    """Check that Earth-fixed and geodetic positions are the same, if a table has both.
+
+    Args:
+        table: Table.
+
+    Raises:
+        ValueError: If a position differs by more than a metre.
+    """
+    if not table.has(_GEOCENTRIC):
+        return
+    geodetic = parse_numbers(table, _GEODETIC) * [np.pi / 180, np.pi / 180, 1.0]
+    expected = earth.ecef(torch.from_numpy(geodetic)).numpy()
+    difference = np.linalg.norm(parse_numbers(table, _GEOCENTRIC) - expected, axis=1)
+    i = int(np.argmax(difference))
+    if difference[i] > SAME_POSITION:
+        raise ValueError(
+            f"{table.name}: x, y, z and lat_deg, lon_deg, h_m must be the same position within "
+            f"{SAME_POSITION:g} m, got {difference[i]:.3g} m in {table.row(i)}. "
+            "Correct the wrong columns, or remove x, y, z."
+        )
+
+
+def check_wheel_direction(table: LogTable, time: Array, speed: Array) -> tuple[str, ...]:
+    """Check that the wheels stop before they reverse.
+
+    The reference velocity of a road vehicle does not show whether it moves backwards.
+
+    Args:
+        table: Table of the odometry, for messages.
+        time: Times, s, [T].
+        speed: Wheel speed, m/s, [T]. Negative when reversing.
+
+    Returns:
+        A note if most of the drive is backwards.
+
+    Raises:
+        ValueError: If the sign changes faster than the vehicle can brake.
+    """
+    change, largest = np.abs(np.diff(speed)), 2.0 * _SLOW + _BRAKING * np.diff(time)
+    wrong = np.flatnonzero((speed[1:] * speed[:-1] < 0.0) & (change > largest))
+    if wrong.size:
+        i = int(wrong[0])
+        raise ValueError(
+            f"{table.name}: column v_fwd must change its sign near zero, got {speed[i + 1]:g} m/s "
+            f"after {speed[i]:g} m/s in {table.row(i + 1)} ({wrong.size} such rows). "
+            "Correct the sign or remove this row."
+        )
+    moving = np.abs(speed) > _SLOW
+    backwards = int((speed < -_SLOW).sum())
+    if 2 * backwards <= int(moving.sum()):
+        return ()
+    return (
+        f"{table.name}: the wheels turn backwards in {backwards} of {int(moving.sum())} moving rows. "
+        "Check the sign of v_fwd",
+    )

@@ -28,16 +28,14 @@ from numpy.typing import NDArray
 from pfbench.files.reader_notes import announce_notes
 from pfbench.nav import attitude, earth
 from pfbench.nav.plausible_limits import PlausibleLimits
-from pfbench.scenario.plausibility.clock_offsets import find_fix_offset, find_imu_offset
-from pfbench.scenario.plausibility.column_checks import check_changes
-from pfbench.scenario.plausibility.log_agreement import (
+from pfbench.scenario.recorded.clock_offsets import find_fix_offset, find_imu_offset
+from pfbench.scenario.recorded.fix_codes import FixCodes, check_fix_codes, select_usable
+from pfbench.scenario.recorded.log_agreement import (
     compare_fixes,
     compare_inertial,
     compare_reference,
     compare_times,
 )
-from pfbench.scenario.plausibility.log_table import LogTable
-from pfbench.scenario.recorded.fix_codes import FixCodes, check_fix_codes, select_usable
 from pfbench.scenario.recorded.log_checks import (
     STANDARD_GRAVITY,
     check_force,
@@ -46,18 +44,18 @@ from pfbench.scenario.recorded.log_checks import (
 )
 from pfbench.scenario.recorded.log_tables import (
     Array,
+    GnssLog,
+    ImuLog,
+    LogFiles,
+    LogTable,
+    NavigationLog,
+    ReferenceLog,
+    check_changes,
     check_increasing,
     check_seconds,
     parse_numbers,
     read_table,
     read_times,
-)
-from pfbench.scenario.recorded.navigation_log import (
-    GnssLog,
-    ImuLog,
-    LogFiles,
-    NavigationLog,
-    ReferenceLog,
     swap_frd_rfu,
 )
 

@@ -10,23 +10,23 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pfbench.files.digest import hash_file
+from pfbench.files.atomic_write import hash_file
 from pfbench.files.reader_notes import announce_notes
 from pfbench.nav import attitude, earth
-from pfbench.nav.motion_spline import MotionSpline, RecordedMotion
-from pfbench.nav.trajectory import TrajectoryData
-from pfbench.scenario.plausibility.column_checks import check_changes
-from pfbench.scenario.plausibility.log_agreement import compare_reference
-from pfbench.scenario.plausibility.log_table import LogTable
+from pfbench.nav.trajectory import MotionSpline, RecordedMotion, TrajectoryData
+from pfbench.scenario.recorded.log_agreement import compare_reference
 from pfbench.scenario.recorded.log_tables import (
+    LogTable,
+    ReferenceLog,
+    check_changes,
     find_dataset,
     find_table,
     list_tables,
     parse_numbers,
     read_table,
     read_times,
+    swap_frd_rfu,
 )
-from pfbench.scenario.recorded.navigation_log import ReferenceLog, swap_frd_rfu
 
 
 @dataclass(frozen=True)

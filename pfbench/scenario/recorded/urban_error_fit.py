@@ -15,14 +15,10 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from pfbench.model.pseudorange_errors import (
-    LosNlosRangeError,
-    NormalExponentialMixture,
-    NormalRangeError,
-)
+from pfbench.model.urban_gnss import LosNlosRangeError, NormalExponentialMixture, NormalRangeError
 from pfbench.nav import earth
 from pfbench.scenario.recorded.log_tables import Array, find_dataset
-from pfbench.scenario.recorded.urban_log import UrbanLog, read_drive, rotate_heading, select_stretch
+from pfbench.scenario.recorded.urban import UrbanLog, read_drive, rotate_heading, select_stretch
 
 
 class RangeResiduals(NamedTuple):

@@ -12,13 +12,16 @@ from hypothesis import given, settings, strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
-from pfbench.core.jacobian import jacobian
-from pfbench.core.manifold.group_block import SIDES, LieGroupBlock
-from pfbench.core.manifold.rotation_series import (
+from pfbench.core.chart import (
+    SIDES,
+    Chart,
+    EuclideanBlock,
+    LieGroupBlock,
+    QuaternionBlock,
     inverse_jacobian_coefficient,
     jacobian_coefficients,
 )
+from pfbench.core.linear_algebra import jacobian
 
 SIZES = (4, 7, 10)
 

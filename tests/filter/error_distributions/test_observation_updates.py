@@ -17,17 +17,16 @@ from torch import Tensor, distributions as dist
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.error_distributions.observation_updates import (
+from pfbench.filter.exactness import has_evidence
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.guided.guides import SharedGuideProposal
+from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
+from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.filter.robust.observation_updates import (
     MixtureObservationUpdate,
     StudentObservationUpdate,
 )
-from pfbench.filter.exactness import has_evidence
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
-from pfbench.filter.guided.shared_guide import SharedGuideProposal
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.robust.innovation_gate import InnovationGate
-from pfbench.filter.robust.student_update import StudentUpdate
+from pfbench.filter.robust.updates import InnovationGate, StudentUpdate
 from pfbench.filter.smoothing.gaussian_smoother import smooth
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.noise import distributions as errors

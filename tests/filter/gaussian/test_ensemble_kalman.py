@@ -28,8 +28,7 @@ from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.proposals import BootstrapProposal
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
-from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
+from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
 
 ANALYSES: dict[str, EnsembleUpdate] = {
     "perturbed": PerturbedObservationUpdate(),

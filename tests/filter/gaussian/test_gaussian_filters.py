@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
 from pfbench.core.chart import Chart, EuclideanBlock, wrap_angle
-from pfbench.core.covariance import factor
+from pfbench.core.linear_algebra import factor
 from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
@@ -29,24 +29,21 @@ from pfbench.filter.gaussian.linearisation_rules import (
     CubaturePoints,
     DifferenceSpace,
     LinearisationRule,
+    RadialDegree3,
     SigmaPointLinearisation,
+    SimplexDegree3,
+    SphericalRadialPoints,
     TaylorLinearisation,
     UnscentedPoints,
 )  # fmt: skip
-from pfbench.filter.gaussian.spherical_radial import (
-    RadialDegree3,
-    SimplexDegree3,
-    SphericalRadialPoints,
-)
 from pfbench.filter.linearisation import compute_additive_gain
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
-from pfbench.model.textbook import Benes, UnivariateGrowth
-from pfbench.noise.white import NominalNoise
+from pfbench.model.textbook import Benes, Lorenz63, Pendulum, UnivariateGrowth
+from pfbench.noise.base import NominalNoise
 from pfbench.ppl.model_batch import ModelBatch
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.scenario.simulated import ModelSimulation
 
 RULES: dict[str, LinearisationRule] = {
     "jacobian": TaylorLinearisation(),

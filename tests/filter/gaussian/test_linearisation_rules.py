@@ -15,22 +15,20 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import (
-    CubaturePoints,
-    SigmaPointLinearisation,
-    UnscentedPoints,
-)
-from pfbench.filter.gaussian.spherical_radial import (
     AxisDegree3,
     AxisDegree5,
+    CubaturePoints,
     RadialDegree5,
+    SigmaPointLinearisation,
     SimplexDegree3,
     SimplexDegree5,
     SphericalRadialPoints,
     SphericalRule,
+    UnscentedPoints,
 )
 from pfbench.filter.loop import run_filter
 from pfbench.model.base import StateSpaceModel
-from pfbench.model.nonlinear_dynamics import Lorenz63
+from pfbench.model.textbook import Lorenz63
 
 COUNTS = {
     "ckf3": lambda n: 2 * n,

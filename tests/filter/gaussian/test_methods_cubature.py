@@ -19,7 +19,7 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.kalman_update import GaussianStep
 from pfbench.filter.gaussian.linearisation_rules import SigmaPointLinearisation, TaylorLinearisation
 from pfbench.model.base import StateSpaceModel
-from pfbench.model.sins_gnss_tight import SinsGnssTight
+from pfbench.model.tight_coupling import SinsGnssTight
 
 __all__ = ["flight"]
 MSSRCKF = GaussianFilter(SigmaPointLinearisation(RULES["mssr"]))

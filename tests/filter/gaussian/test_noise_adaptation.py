@@ -20,25 +20,27 @@ from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief
-from pfbench.filter.gaussian.covariance_matching import MatrixNoiseAdaptation, ScalarNoiseAdaptation
-from pfbench.filter.gaussian.gain_adaptation import AdaptiveFactorGain, BoundedRatioGain
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.innovation import Innovation
+from pfbench.filter.gaussian.innovation import Innovation, principal_axes
 from pfbench.filter.gaussian.linearisation_rules import (
-    LinearisationRule,
-    SigmaPointLinearisation,
-    TaylorLinearisation,
-)
-from pfbench.filter.gaussian.noise_adaptation import ConstrainedNoiseAdaptation, FadingMemory
-from pfbench.filter.gaussian.principal_axes import principal_axes
-from pfbench.filter.gaussian.spherical_radial import (
     AxisDegree3,
     AxisDegree5,
+    LinearisationRule,
     RadialDegree3,
     RadialDegree5,
+    SigmaPointLinearisation,
     SimplexDegree3,
     SimplexDegree5,
     SphericalRadialPoints,
+    TaylorLinearisation,
+)
+from pfbench.filter.gaussian.noise_adaptation import (
+    AdaptiveFactorGain,
+    BoundedRatioGain,
+    ConstrainedNoiseAdaptation,
+    FadingMemory,
+    MatrixNoiseAdaptation,
+    ScalarNoiseAdaptation,
 )
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model.base import StateSpaceModel

@@ -14,16 +14,15 @@ from config_cases import composed
 from filter_cases import method_of
 
 from pfbench import job
-from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, QuaternionBlock
-from pfbench.core.manifold.group_block import LieGroupBlock
+from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, LieGroupBlock, QuaternionBlock
 from pfbench.core.random_stream import PhiloxStream
+from pfbench.filter.gaussian.gaussian_filter import check_point_reach
 from pfbench.filter.gaussian.linearisation_rules import (
     CubaturePoints,
     SigmaPointLinearisation,
+    SparseGridPoints,
     UnscentedPoints,
 )
-from pfbench.filter.gaussian.point_reach import check_point_reach
-from pfbench.filter.gaussian.quadrature_points import SparseGridPoints
 
 CHART = Chart((EuclideanBlock(6), QuaternionBlock(), EuclideanBlock(6)))
 

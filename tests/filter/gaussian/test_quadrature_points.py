@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from pfbench.filter.gaussian.linearisation_rules import UnscentedPoints
-from pfbench.filter.gaussian.quadrature_points import GaussHermitePoints, SparseGridPoints
+from pfbench.filter.gaussian.linearisation_rules import (
+    GaussHermitePoints,
+    SparseGridPoints,
+    UnscentedPoints,
+)
 
 
 def normal_moment(powers: np.ndarray) -> float:

@@ -16,25 +16,26 @@ from torch.distributions import Independent, MultivariateNormal, Normal, Student
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, ess, weighted_mean_cov
-from pfbench.filter.gaussian.gain_adaptation import AdaptiveFactorGain, BoundedRatioGain
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import (
+    AxisDegree3,
     CubaturePoints,
+    RadialDegree3,
+    RadialDegree5,
     SigmaPointLinearisation,
+    SimplexDegree3,
+    SphericalRadialPoints,
     TaylorLinearisation,
     UnscentedPoints,
 )
-from pfbench.filter.gaussian.noise_adaptation import ConstrainedNoiseAdaptation, FadingMemory
-from pfbench.filter.gaussian.spherical_radial import (
-    AxisDegree3,
-    RadialDegree3,
-    RadialDegree5,
-    SimplexDegree3,
-    SphericalRadialPoints,
+from pfbench.filter.gaussian.noise_adaptation import (
+    AdaptiveFactorGain,
+    BoundedRatioGain,
+    ConstrainedNoiseAdaptation,
+    FadingMemory,
 )
+from pfbench.filter.guided.guides import ParticleGuideProposal, SharedGuideProposal
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
-from pfbench.filter.guided.particle_guide import ParticleGuideProposal
-from pfbench.filter.guided.shared_guide import SharedGuideProposal
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.auxiliary_weights import (
     AdditiveTempering,
@@ -46,16 +47,13 @@ from pfbench.filter.particle.auxiliary_weights import (
 )
 from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.point_sets import SobolPoints
 from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
-from pfbench.filter.reconstructed.proposal import ReconstructedProposal
-from pfbench.filter.reconstructed.weight_correction import MarginalRatioCorrection
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.sqmc import SobolPoints
+from pfbench.filter.proposed.reconstructed import MarginalRatioCorrection, ReconstructedProposal
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
-from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
-from pfbench.model.textbook import TimeIndexInputs, UnivariateGrowth
+from pfbench.model.textbook import Lorenz63, Pendulum, TimeIndexInputs, UnivariateGrowth
 from pfbench.testing import check_evidence, filter_record, reference_moments
 
 EKF, UKF, CKF = (

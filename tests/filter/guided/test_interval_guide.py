@@ -20,13 +20,12 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.guided.interval_guide import GuidedIntervalProposal
 from pfbench.filter.loop import run_filter
-from pfbench.filter.moves.flow_kernels import NoiseFlowKernel
 from pfbench.filter.moves.metropolis import MetropolisHastings
+from pfbench.filter.moves.path_kernels import NoiseFlowKernel
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Multinomial, Systematic
+from pfbench.filter.particle.resampling import EssResampler, Multinomial, Systematic
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.testing import (

@@ -36,6 +36,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
 )
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.learned import checkpoint
+from pfbench.filter.learned.differentiable_resampling import sample_from
 from pfbench.filter.learned.features import (
     InnovationFeature,
     InputFeature,
@@ -49,14 +50,11 @@ from pfbench.filter.learned.networks import (
     ZukoFlowHead,
 )
 from pfbench.filter.learned.proposal import PAST, LearnedProposal
-from pfbench.filter.learned.reparameterised_sampling import sample_from
 from pfbench.filter.loop import run_filter
-from pfbench.filter.moves.metropolis import MetropolisHastings
-from pfbench.filter.moves.path_history import StateHistory
+from pfbench.filter.moves.metropolis import MetropolisHastings, StateHistory
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
+from pfbench.filter.particle.resampling import EssResampler, Systematic
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.testing import check_evidence, filter_record, simulate_path_posterior

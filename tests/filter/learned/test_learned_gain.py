@@ -19,23 +19,20 @@ from torch.distributions import Cauchy, Distribution, Independent
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.exactness import check_has_evidence, has_covariance, has_evidence
-from pfbench.filter.feedback import apply_feedback
 from pfbench.filter.health import HEALTH
-from pfbench.filter.learned.gain import GainInputs, LearnedGain
-from pfbench.filter.learned.gain_filter import LearnedGainFilter
+from pfbench.filter.learned.gain_filter import GainInputs, LearnedGain, LearnedGainFilter
 from pfbench.filter.learned.networks import SkipMlp
 from pfbench.filter.learned.objectives import EvidenceLowerBound, StateErrorLoss
 from pfbench.filter.learned.proposal import LearnedProposal
-from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.filter.loop import FilterResult, apply_feedback, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.scoring import ScoreRecorder
-from pfbench.learn.trainer import TrainingState
-from pfbench.learn.training_config import Training
+from pfbench.learn.trainer import Training, TrainingState
 from pfbench.learn.training_data import TrainingData, draw_training_data
 from pfbench.learn.training_job import train
 from pfbench.model.linear_gaussian import LinearGaussian, local_level
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.simulated import ModelSimulation
 
 LEVEL = local_level(0.5, 1.0, 0.0, 1.0)
 HEAD = partial(SkipMlp, hidden=(16,))

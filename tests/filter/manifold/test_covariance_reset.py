@@ -12,8 +12,7 @@ import torch
 from checkout import ROOT
 from torch import Tensor
 
-from pfbench.core.chart import Chart, EuclideanBlock
-from pfbench.core.manifold.group_block import SIDES, LieGroupBlock
+from pfbench.core.chart import SIDES, Chart, EuclideanBlock, LieGroupBlock
 from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record

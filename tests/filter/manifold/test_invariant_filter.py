@@ -25,9 +25,9 @@ from pfbench.filter import (
     run_filter,
 )
 from pfbench.filter.belief import StepInfo
-from pfbench.filter.manifold.chart_model import ChartModel
+from pfbench.filter.gaussian.invariant import ChartModel
 from pfbench.model import StrapdownTotal, linear_walk
-from pfbench.nav.preintegration import PreintegratedImu
+from pfbench.nav.strapdown import PreintegratedImu
 
 sys.path.insert(0, str(ROOT / "benchmarks"))  # scripts, not a package
 import heading_errors

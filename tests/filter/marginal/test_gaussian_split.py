@@ -29,8 +29,8 @@ from pfbench.filter import (
     TaylorLinearisation,
     run_filter,
 )
-from pfbench.filter.particle.point_sets import IidPoints
-from pfbench.filter.square_root_update import split_root
+from pfbench.filter.particle.sqmc import IidPoints
+from pfbench.filter.whitening import split_root
 from pfbench.model import LinearGaussian, StrapdownTotal
 from pfbench.model.base import StateSpaceModel
 from pfbench.testing import check_causality, check_convergence, check_evidence, check_independence

@@ -25,32 +25,35 @@ from pfbench.filter.belief import normalise_log_weights
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.marginal.conditional_linearisation import StatePartition, partition_state
-from pfbench.filter.marginal.rao_blackwellised import MarginalisedProposal, RaoBlackwellisedFilter
+from pfbench.filter.marginal.rao_blackwellised import (
+    MarginalisedProposal,
+    RaoBlackwellisedFilter,
+    StatePartition,
+    partition_state,
+)
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
-from pfbench.filter.square_root_update import condition_on, kalman_update_root
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.whitening import condition_on, kalman_update_root
 from pfbench.job import conf_dir
-from pfbench.model.azimuth_errors import (
+from pfbench.model.azimuth import (
     ErrorEquations,
     ExactErrorEquations as ExactForm,
     LinearisedRateEquations,
     PrintedErrorEquations,
+    SinsGpsAzimuth,
+    TrapezoidDiscretisation,
 )
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.ins_gnss import InsGnss
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
-from pfbench.model.sins_gps_azimuth import SinsGpsAzimuth, TrapezoidDiscretisation
-from pfbench.model.textbook import UnivariateGrowth
+from pfbench.model.textbook import Lorenz63, Pendulum, UnivariateGrowth
 from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, turn
 from pfbench.nav.trajectory import TrajectoryStart
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.simulated_flight import SimulatedFlight
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.flights import SimulatedFlight
 
 PARTS = ("f", "g", "h", "r", "m0", "l0")
 WALK = linear_walk(1.0, 0.5, 1.0)

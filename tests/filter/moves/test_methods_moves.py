@@ -15,14 +15,17 @@ from torch import Tensor
 
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.loop import FilterResult
-from pfbench.filter.moves.flow_kernels import NoiseFlowGibbsKernel, NoiseFlowKernel
 from pfbench.filter.moves.metropolis import McmcKernel, MetropolisHastings
-from pfbench.filter.moves.path_block_kernels import LastStateKernel, PathBlockKernel
+from pfbench.filter.moves.path_kernels import (
+    LastStateKernel,
+    NoiseFlowGibbsKernel,
+    NoiseFlowKernel,
+    PathBlockKernel,
+)
 from pfbench.filter.moves.path_proposals import SmoothedSegment
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
+from pfbench.filter.particle.resampling import EssResampler, Systematic
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.testing import filter_record, run_kalman_filter
 

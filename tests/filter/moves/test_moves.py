@@ -23,24 +23,30 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.linearisation import derivative
 from pfbench.filter.loop import run_filter
-from pfbench.filter.moves.flow_kernels import (
+from pfbench.filter.moves.metropolis import (
+    KernelCycle,
+    McmcKernel,
+    MetropolisHastings,
+    StateHistory,
+)
+from pfbench.filter.moves.path_kernels import (
+    LastStateKernel,
     NoiseFlowGibbsKernel,
     NoiseFlowKernel,
     NoiseFlowStatKernel,
+    PathBlockKernel,
+    PathStatistics,
     RandomWalk,
+    fisher_information,
     propagate_path,
 )
-from pfbench.filter.moves.metropolis import KernelCycle, McmcKernel, MetropolisHastings
-from pfbench.filter.moves.path_block_kernels import LastStateKernel, PathBlockKernel
-from pfbench.filter.moves.path_history import StateHistory
-from pfbench.filter.moves.path_proposals import SmoothedSegment
-from pfbench.filter.moves.path_segments import (
+from pfbench.filter.moves.path_proposals import (
     CopiedSegment,
     PathSegment,
     PriorSegment,
+    SmoothedSegment,
     driving_noise,
 )
-from pfbench.filter.moves.path_statistics import PathStatistics, fisher_information
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
 from pfbench.filter.particle.regularised_resampling import (
@@ -48,13 +54,11 @@ from pfbench.filter.particle.regularised_resampling import (
     GaussianSmoothing,
     RegularisedResampler,
 )
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
+from pfbench.filter.particle.resampling import EssResampler, Systematic
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
-from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
-from pfbench.noise.white import NominalNoise
+from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.noise.base import NominalNoise
 from pfbench.testing import (
     PathPosterior,
     check_evidence,

@@ -13,23 +13,23 @@ from command_line import pfbench
 from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from pfbench.core.affine_map import affine_map
+from pfbench.core.linear_algebra import affine_map
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import StepInfo
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle import compiled_step
+from pfbench.filter.particle import compiled_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import Proposal
 from pfbench.job.scoring import LikelihoodCounter
-from pfbench.kernels import compilation, cpp, step_compiler
+from pfbench.kernels import dispatch, step_compiler
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.model.textbook import UnivariateGrowth
-from pfbench.noise.white import NominalNoise
+from pfbench.noise.base import NominalNoise
 from pfbench.results import store
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.scenario.simulated import ModelSimulation
 
 RUNS, STEPS = 4, 12
 compiler = pytest.mark.skipif(
@@ -47,7 +47,7 @@ def record_of(model: StateSpaceModel) -> Record:
 def run(
     method: Any, model: StateSpaceModel, record: Record, at_once: int | None = None
 ) -> FilterResult:
-    with compilation.use_compiled(), torch.no_grad():
+    with dispatch.use_compiled(), torch.no_grad():
         return run_filter(
             method, model, record, PhiloxStream(1, torch.arange(RUNS)), run_batch=at_once
         )
@@ -175,7 +175,7 @@ def test_blocks_of_runs_share_a_graph_where_they_are_alike(monkeypatch: pytest.M
         recorded.append([tuple(a.shape) for a in tensors])
         return lambda given: step(*given), None
 
-    monkeypatch.setattr(compiled_step, "compile_function", as_it_is)
+    monkeypatch.setattr(compiled_filter, "compile_function", as_it_is)
     model = walk()
     method, record = ParticleFilter(50), record_of(model)
     step = CompiledParticleFilter(method)
@@ -203,7 +203,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
 
         return call, None
 
-    monkeypatch.setattr(compiled_step, "compile_function", as_it_is)
+    monkeypatch.setattr(compiled_filter, "compile_function", as_it_is)
     return asked
 
 
@@ -239,7 +239,7 @@ def test_steps_taken_together_are_the_steps_taken_one_by_one(recorded: list[list
             }
 
     draws = PhiloxStream(1, torch.arange(RUNS))
-    with compilation.use_compiled(), torch.no_grad():
+    with dispatch.use_compiled(), torch.no_grad():
         together, counted = run_filter(step, model, record, draws, watch), tally.count
         apart = run_filter(method, model, record, draws, watch)
     agree(together, apart)
@@ -261,7 +261,7 @@ def test_a_graph_that_held_its_step_s_number_fast_would_be_seen(
         place = next(k for k, a in enumerate(example) if a.dim() == 0)
         return lambda given: step(*given[:place], example[place], *given[place + 1 :]), None
 
-    monkeypatch.setattr(compiled_step, "compile_function", frozen)
+    monkeypatch.setattr(compiled_filter, "compile_function", frozen)
     model, method = walk(), ParticleFilter(50)
     record = record_of(model)
     with pytest.raises(AssertionError):
@@ -287,7 +287,7 @@ def as_graph(model: StateSpaceModel, method: ParticleFilter) -> tuple[Any, list[
         raise RuntimeError("only noted")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiled_step, "compile_function", noted)
+        patch.setattr(compiled_filter, "compile_function", noted)
         run(CompiledParticleFilter(method), model, record_of(model))
     return kept[0], kept[1]
 
@@ -323,12 +323,12 @@ def test_copies_noise_and_move_are_joined_where_nothing_comes_between(
     """As for a CUDA device; here `driven` is what it stands for."""
 
     def driven(phi: Tensor, x: Tensor, ancestors: Tensor, gain: Tensor, *key: Any) -> Tensor:
-        noise = cpp.philox_normals_float64(*key, gain.shape[-1], -(-ancestors.shape[1] // 4))[
+        noise = dispatch.philox_normals_float64(*key, gain.shape[-1], -(-ancestors.shape[1] // 4))[
             ..., : ancestors.shape[1]
         ]
-        return cpp.propagate_affine(
+        return dispatch.propagate_affine(
             phi,
-            cpp.gather_particles(x, ancestors).permute(1, 2, 0),
+            dispatch.gather_particles(x, ancestors).permute(1, 2, 0),
             gain,
             noise.permute(1, 2, 0).to(x.dtype),
         )
@@ -358,7 +358,7 @@ def test_large_steps_go_one_by_one(
     recorded: list[list[int]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What steps keep together stays small: nothing is computed of the next one before this one has been told."""
-    monkeypatch.setattr(compiled_step, "_MAX_NUMBERS", 1)
+    monkeypatch.setattr(compiled_filter, "_MAX_NUMBERS", 1)
     model, method, told = walk(), ParticleFilter(50), []
 
     def watch(t: int, info: StepInfo) -> dict[str, Tensor]:

@@ -24,11 +24,10 @@ from pfbench.filter.particle.gaussian_particle_filter import (
     GaussianResampler,
 )
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.point_sets import HaltonPoints, IidPoints, PointSet, SobolPoints
+from pfbench.filter.particle.sqmc import HaltonPoints, IidPoints, PointSet, SobolPoints
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
-from pfbench.model.textbook import UnivariateGrowth
+from pfbench.model.textbook import Lorenz63, Pendulum, UnivariateGrowth
 
 WALK = linear_walk(1.0, 0.5, 1.0)
 STEPS = 20

@@ -34,9 +34,14 @@ from pfbench.filter.particle.particle_count import (
     ParticleCount,
 )
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, ResamplingScheme
-from pfbench.filter.particle.resampling_schemes import Multinomial, Stratified, Systematic
-from pfbench.kernels import compilation
+from pfbench.filter.particle.resampling import (
+    EssResampler,
+    Multinomial,
+    ResamplingScheme,
+    Stratified,
+    Systematic,
+)
+from pfbench.kernels import dispatch
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.testing import check_evidence, reference_moments
 
@@ -301,7 +306,7 @@ def test_a_stage_that_asks_for_too_many_particles_is_refused(compiled: bool) -> 
     for factor in (2.0, 0.0, -1.0, torch.nan):
         method = ParticleFilter(20, particle_count=TooMany(factor))
         with (
-            compilation.use_compiled(compiled),
+            dispatch.use_compiled(compiled),
             pytest.raises(ValueError, match=r"from 1 to 20 slots"),
         ):
             run_filter(method, linear_walk(1.0, 0.3, 1.0), record, draws)

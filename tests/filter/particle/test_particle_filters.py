@@ -23,8 +23,8 @@ from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, ess, normalise_log_weights
 from pfbench.filter.loop import run_filter
-from pfbench.filter.moves.flow_kernels import NoiseFlowKernel
 from pfbench.filter.moves.metropolis import MetropolisHastings
+from pfbench.filter.moves.path_kernels import NoiseFlowKernel
 from pfbench.filter.particle.auxiliary_weights import LookAheadWeights, PosteriorWeights
 from pfbench.filter.particle.gaussian_particle_filter import (
     GaussianPredictionProposal,
@@ -34,23 +34,23 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.particle_moments import count_distinct_ancestors
 from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import EssResampler, ResamplingScheme
-from pfbench.filter.particle.resampling_schemes import (
+from pfbench.filter.particle.resampling import (
+    EssResampler,
     Killing,
     Multinomial,
+    ResamplingScheme,
     Residual,
     Ssp,
     Stratified,
     Systematic,
 )
 from pfbench.filter.particle.weight_update import BayesWeightUpdate, FlooredWeightUpdate
-from pfbench.kernels import compilation, cpp
+from pfbench.kernels import dispatch
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
-from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.simulated import ModelSimulation
 from pfbench.testing import check_convergence, check_evidence, filter_record, reference_moments
 
 SCHEMES: list[ResamplingScheme] = [
@@ -665,7 +665,7 @@ def test_distinct_particles_are_counted(
     different: list[list[int]] = []
     moves = (MetropolisHastings(NoiseFlowKernel(), mcmc_steps=2),) if moving else ()
     method = ParticleFilter(40, EssResampler(scheme), moves=moves, proposal=Counting(different))
-    with compilation.use_compiled(fused):
+    with dispatch.use_compiled(fused):
         trace = run_filter(method, model, record, PhiloxStream(5, torch.arange(4))).trace
     assert bool(trace["resampled"].any())
     assert trace["unique" if moving else "ancestors"].T.tolist() == different
@@ -679,7 +679,7 @@ def test_of_empty_slots_and_new_particles_no_ancestors_are_counted() -> None:
     copies = torch.tensor([[0, 0, 2, 3], [1, 1, 5, 1], [0, 2, 2, 3], [3, 2, 2, 3], [1, 1, 1, 1]])
     log_w = torch.zeros(5, 4, dtype=torch.float64)
     log_w[0, 2] = log_w[1, 3] = -torch.inf
-    for count in (count_distinct_ancestors, cpp.count_unique):
+    for count in (count_distinct_ancestors, dispatch.count_unique):
         assert count(copies, log_w).tolist() == [2, 2, 3, 2, 1]
     method = ParticleFilter(
         10, resampler=GaussianResampler(), proposal=GaussianPredictionProposal()

@@ -11,7 +11,7 @@ from scipy import stats
 from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.filter.particle.point_sets import (
+from pfbench.filter.particle.sqmc import (
     HaltonPoints,
     IidPoints,
     PointSet,

@@ -15,13 +15,19 @@ from torch import Tensor
 
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock
 from pfbench.core.random_stream import PhiloxStream, RandomStream
-from pfbench.filter.belief import ParticleBelief, ess, weighted_mean_cov
-from pfbench.filter.log_weights import ComputedWeights, exponentiate
+from pfbench.filter.belief import (
+    ComputedWeights,
+    ParticleBelief,
+    ess,
+    exponentiate,
+    weighted_mean_cov,
+)
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import EssResampler, ResamplingScheme
-from pfbench.filter.particle.resampling_schemes import (
+from pfbench.filter.particle.resampling import (
+    EssResampler,
     Killing,
     Multinomial,
+    ResamplingScheme,
     Residual,
     Ssp,
     Stratified,

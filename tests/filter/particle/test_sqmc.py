@@ -17,11 +17,12 @@ from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.auxiliary_weights import LookAheadWeights
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.point_sets import HaltonPoints, PointSet, SobolPoints
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
+from pfbench.filter.particle.resampling import EssResampler, Systematic
 from pfbench.filter.particle.sqmc import (
+    HaltonPoints,
     HilbertSortedResampler,
+    PointSet,
+    SobolPoints,
     SqmcProposal,
     SqmcScheme,
     compute_hilbert_index,

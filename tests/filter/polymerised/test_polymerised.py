@@ -22,31 +22,31 @@ from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.auxiliary_weights import LookAheadWeights
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.point_sets import HaltonPoints, IidPoints, SobolPoints
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
-from pfbench.filter.particle.thompson_taylor import ThompsonTaylorResampler, nearest_neighbours
-from pfbench.filter.polymerised.partition import (
+from pfbench.filter.particle.regularised_resampling import (
+    ThompsonTaylorResampler,
+    nearest_neighbours,
+)
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.sqmc import HaltonPoints, IidPoints, SobolPoints
+from pfbench.filter.proposed.polymerised import (
     AxisAlignedCells,
     CellPartition,
-    WhitenedCells,
-    divide_cells,
-)
-from pfbench.filter.polymerised.placement import PooledCovariancePlacement, ScaledCentrePlacement
-from pfbench.filter.polymerised.resampler import (
     PolymerisedResampler,
+    PooledCovariancePlacement,
     ProportionalAllocation,
+    ScaledCentrePlacement,
     UnchangedAllocation,
+    WhitenedCells,
     aggregate_cells,
+    divide_cells,
 )
 from pfbench.filter.whitening import whiten
 from pfbench.job.pcrb import compute_posterior_bound
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
 from pfbench.model.passive_location import PassiveLocation
-from pfbench.model.textbook import UnivariateGrowth
-from pfbench.noise.white import NominalNoise
+from pfbench.model.textbook import Lorenz63, Pendulum, UnivariateGrowth
+from pfbench.noise.base import NominalNoise
 
 N = 400
 MODEL = PassiveLocation(1.0, 0.1, [1e-3, 1e-3, 1e-4, 1e-4, 1.0])

@@ -20,26 +20,20 @@ from pfbench.filter.belief import ParticleBelief, normalise_log_weights
 from pfbench.filter.linearisation import linearised_innovation, measurement_jacobian
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.proposals import BootstrapProposal, Proposal, ProposalSample
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
-from pfbench.filter.reconstructed.dmc_controller import (
-    DmcController,
-    OneStepResponse,
-    StaticResponse,
-)
-from pfbench.filter.reconstructed.proposal import ReconstructedNoiseProposal, ReconstructedProposal
-from pfbench.filter.reconstructed.weight_correction import (
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.proposed.dmc_controller import DmcController, OneStepResponse, StaticResponse
+from pfbench.filter.proposed.reconstructed import (
     MarginalRatioCorrection,
     NoWeightCorrection,
+    ReconstructedNoiseProposal,
+    ReconstructedProposal,
     TransitionRatioCorrection,
     WeightCorrection,
 )
-from pfbench.model.azimuth_errors import PrintedErrorEquations
+from pfbench.model.azimuth import PrintedErrorEquations, SinsGpsAzimuth, TrapezoidDiscretisation
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
-from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
-from pfbench.model.sins_gps_azimuth import SinsGpsAzimuth, TrapezoidDiscretisation
-from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
+from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
 from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.testing import check_evidence, filter_record, reference_moments

@@ -18,9 +18,12 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.innovation import NoiseAdaptation
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.robust.noise_learning import SageHusaAdaptation, VariationalNoiseAdaptation
-from pfbench.filter.robust.variational_covariances import VariationalCovarianceAdaptation
-from pfbench.filter.robust.windowed_noise import WindowedNoiseAdaptation
+from pfbench.filter.robust.noise_learning import (
+    SageHusaAdaptation,
+    VariationalCovarianceAdaptation,
+    VariationalNoiseAdaptation,
+    WindowedNoiseAdaptation,
+)
 from pfbench.model.linear_gaussian import LinearGaussian
 
 Q, R0 = 0.25, 2.0

@@ -18,17 +18,19 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.exactness import has_evidence
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.moves.flow_kernels import RandomWalk
 from pfbench.filter.moves.metropolis import MetropolisHastings
-from pfbench.filter.moves.path_block_kernels import LastStateKernel
+from pfbench.filter.moves.path_kernels import LastStateKernel, RandomWalk
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.robust.innovation_gate import InnovationGate
-from pfbench.filter.robust.m_estimation import CorrentropyUpdate, HuberUpdate
 from pfbench.filter.robust.particle_weights import RobustWeightUpdate
-from pfbench.filter.robust.scaled_noise import ScaledNoise
-from pfbench.filter.robust.student_update import StudentUpdate
-from pfbench.filter.robust.weight_functions import huber_log_density, student_log_density
-from pfbench.filter.robust.weighted_likelihood import WeightedLikelihoodUpdate
+from pfbench.filter.robust.robust_update import huber_log_density, student_log_density
+from pfbench.filter.robust.updates import (
+    CorrentropyUpdate,
+    HuberUpdate,
+    InnovationGate,
+    ScaledNoise,
+    StudentUpdate,
+    WeightedLikelihoodUpdate,
+)
 from pfbench.model.linear_gaussian import LinearGaussian
 
 Q, DOF = 0.25, 3.0

@@ -25,11 +25,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
     TaylorLinearisation,
 )
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.robust.innovation_gate import InnovationGate
-from pfbench.filter.robust.m_estimation import CorrentropyUpdate, HuberUpdate
-from pfbench.filter.robust.scaled_noise import ScaledNoise
-from pfbench.filter.robust.student_update import StudentUpdate
-from pfbench.filter.robust.weight_functions import (
+from pfbench.filter.robust.robust_update import (
     WeightFunction,
     cauchy_weight,
     compute_efficiency,
@@ -38,9 +34,16 @@ from pfbench.filter.robust.weight_functions import (
     threshold_table,
     welsch_weight,
 )
-from pfbench.filter.robust.weighted_likelihood import WeightedLikelihoodUpdate
+from pfbench.filter.robust.updates import (
+    CorrentropyUpdate,
+    HuberUpdate,
+    InnovationGate,
+    ScaledNoise,
+    StudentUpdate,
+    WeightedLikelihoodUpdate,
+)
 from pfbench.model.linear_gaussian import LinearGaussian
-from pfbench.ppl.marginal_likelihood import FilterLikelihood
+from pfbench.ppl.likelihood import FilterLikelihood
 
 EKF = TaylorLinearisation()
 UPDATES: dict[str, NoiseAdaptation] = {

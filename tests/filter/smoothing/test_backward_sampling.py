@@ -14,24 +14,23 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.moves.flow_kernels import NoiseFlowKernel
 from pfbench.filter.moves.metropolis import MetropolisHastings
+from pfbench.filter.moves.path_kernels import NoiseFlowKernel
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
-from pfbench.filter.smoothing.backward_samplers import (
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.smoothing.backward_sampling import (
     BackwardSampler,
     BackwardStep,
     ExactBackwardSampler,
     MetropolisBackwardSampler,
     RejectionBackwardSampler,
+    sample_trajectories,
 )
-from pfbench.filter.smoothing.backward_sampling import sample_trajectories
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.model.textbook import UnivariateGrowth
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.simulated import ModelSimulation
 
 SAMPLERS: dict[str, BackwardSampler] = {
     "exact": ExactBackwardSampler(),
@@ -185,7 +184,7 @@ def test_paths_do_not_depend_on_how_many_are_weighed_at_a_time(
     record = ModelSimulation(model, 4).draw(NominalNoise(), torch.arange(2), 0).record
     draws = PhiloxStream(1, torch.arange(2))
     whole = sample_trajectories(ParticleFilter(20), model, record, draws, 7)
-    monkeypatch.setattr("pfbench.filter.smoothing.backward_samplers._PAIRS", 50)
+    monkeypatch.setattr("pfbench.filter.smoothing.backward_sampling._PAIRS", 50)
     torch.testing.assert_close(
         sample_trajectories(ParticleFilter(20), model, record, draws, 7), whole
     )

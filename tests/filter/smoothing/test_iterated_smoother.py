@@ -13,13 +13,12 @@ from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import (
     CubaturePoints,
+    GaussHermitePoints,
     SigmaPointLinearisation,
     TaylorLinearisation,
 )
 from pfbench.filter.gaussian.noise_adaptation import FadingMemory
-from pfbench.filter.gaussian.quadrature_points import GaussHermitePoints
-from pfbench.filter.smoothing.gaussian_smoother import smooth
-from pfbench.filter.smoothing.iterated_smoother import smooth_iteratively
+from pfbench.filter.smoothing.gaussian_smoother import smooth, smooth_iteratively
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
 

@@ -14,17 +14,17 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.smoothing.conditional_smc import ConditionalSmcKernel
-from pfbench.filter.smoothing.iterated_smoother import smooth_iteratively
-from pfbench.filter.smoothing.noise_space import NoiseSpace
-from pfbench.filter.smoothing.path_kernels import (
+from pfbench.filter.smoothing.gaussian_smoother import smooth_iteratively
+from pfbench.filter.smoothing.noise_space import (
+    ConditionalSmcKernel,
     CrankNicolsonKernel,
+    NoiseSpace,
     PathKernel,
     fit_path_laplace,
     sample_smoothed_paths,
 )
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.model_simulation import ModelSimulation
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.simulated import ModelSimulation
 
 CHAINS, STEPS = 4000, 7
 RECORD = record_of(SINGULAR, 1, STEPS)

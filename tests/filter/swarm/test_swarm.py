@@ -24,19 +24,9 @@ from pfbench.core.record import Episode, Record, map_inputs
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler
-from pfbench.filter.particle.resampling_schemes import Systematic
-from pfbench.filter.swarm.chaotic_sequences import (
-    ChaoticPerturbation,
-    ChaoticPoints,
-    IntervalStart,
-    PriorStart,
-    arcsine_cdf,
-    iterate_logistic,
-    logistic_map,
-    safe_seeds,
-)
-from pfbench.filter.swarm.swarm_coordinates import (
+from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.proposed.swarm import ChiSquareStopping, SwarmLimits, SwarmProposal
+from pfbench.filter.proposed.swarm_coordinates import (
     AllComponents,
     LikelihoodFitness,
     ObservedComponents,
@@ -44,19 +34,28 @@ from pfbench.filter.swarm.swarm_coordinates import (
     SwarmFrame,
     observed_components,
 )
-from pfbench.filter.swarm.swarm_limits import ChiSquareStopping, SwarmLimits
-from pfbench.filter.swarm.swarm_proposal import SwarmProposal
-from pfbench.filter.swarm.swarm_weighting import (
+from pfbench.filter.proposed.swarm_motion import (
+    ChaoticPerturbation,
+    ChaoticPoints,
+    GaussianVelocity,
+    InertiaVelocity,
+    IntervalStart,
+    PriorStart,
+    SwarmState,
+    arcsine_cdf,
+    iterate_logistic,
+    logistic_map,
+    safe_seeds,
+)
+from pfbench.filter.proposed.swarm_weighting import (
     MixtureWeighting,
     PrintedWeighting,
     UnchangedWeighting,
 )
-from pfbench.filter.swarm.velocity_update import GaussianVelocity, InertiaVelocity, SwarmState
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.nonlinear_dynamics import Lorenz63, Pendulum
-from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
-from pfbench.noise.white import NominalNoise
+from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.noise.base import NominalNoise
 
 ALWAYS = EssResampler(Systematic(), 1.0)
 ESCAPE = InertiaVelocity(escape_coefficient=0.12)
@@ -602,7 +601,7 @@ def test_who_is_kept_is_drawn_afresh() -> None:
 
 
 def test_kernels_in_blocks_are_the_sum_over_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    from pfbench.filter.swarm import swarm_weighting
+    from pfbench.filter.proposed import swarm_weighting
 
     a, m = (
         torch.randn(3, 23, 2, dtype=torch.float64, generator=torch.manual_seed(i)) for i in (1, 2)

@@ -16,26 +16,32 @@ from pfbench import job
 from pfbench.cli.compose import read_sweep
 from pfbench.cli.messages import format_error
 from pfbench.cli.tune import tune_filters
-from pfbench.config.named_sets import FILTER_SETS, TUNED_METHODS, expand_filter_sets
-from pfbench.config.paper_files import list_named_parts
-from pfbench.config.tuned_knobs import AUTO, NOMINAL
-from pfbench.config.tuning_names import list_tuned_worlds
-from pfbench.job.tuning import knobs
-from pfbench.job.tuning.candidate_search import (
+from pfbench.job import tuning
+from pfbench.job.config import FILTER_SETS, TUNED_METHODS, expand_filter_sets
+from pfbench.job.tuned_files import Ratio, compare_errors, decide_fit, find_best, read_candidates
+from pfbench.job.tuned_knobs import AUTO, NOMINAL
+from pfbench.job.tuning import (
+    KNOBS,
     Candidate,
     CandidateSearch,
+    Knob,
+    apply_candidate,
+    check_seed,
     choose_candidate,
+    list_candidates,
     score_runs,
     with_candidate,
 )
-from pfbench.job.tuning.knobs import KNOBS, Knob, apply_candidate, list_candidates
-from pfbench.job.tuning.scored_seeds import check_seed
-from pfbench.job.tuning.tuned_files import read_candidates
-from pfbench.job.tuning.world_fit import Ratio, compare_errors, decide_fit, find_best
-from pfbench.report.looks import find_looks, find_stored_world
-from pfbench.report.tuning_words import count_tuned, describe_foreign_knobs, describe_tuning
 from pfbench.results import store
-from pfbench.results.job_labels import make_distinct_label
+from pfbench.results.conditions import make_distinct_label
+from pfbench.results.looks import (
+    count_tuned,
+    describe_foreign_knobs,
+    describe_tuning,
+    find_looks,
+    find_stored_world,
+)
+from pfbench.results.paper_block import list_named_parts, list_tuned_worlds
 
 TUNED = sorted(
     path.stem
@@ -245,7 +251,7 @@ def test_a_search_finds_that_errors_are_larger_than_the_model_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Outliers of 10 sd in 5 % of the epochs have six times the variance: R x 4 is better than R."""
-    monkeypatch.setattr(knobs, "KNOBS", {"ekf_scaled": Knob("q_factor", (1.0,))})
+    monkeypatch.setattr(tuning, "KNOBS", {"ekf_scaled": Knob("q_factor", (1.0,))})
     monkeypatch.chdir(tmp_path)
     tune_filters([
         "scenario=linear_walk", "scenario.steps=60", "runs=20", "filter=ekf_scaled",

@@ -13,7 +13,7 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from pfbench.results.statistics.signed_rank import holm, wilcoxon_signed_rank_rows
+from pfbench.stats.rank_tests import holm, wilcoxon_signed_rank_rows
 
 FILE = Path(__file__).parents[2] / "all_seven_runs.parquet"
 SEVEN = [

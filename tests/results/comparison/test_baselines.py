@@ -1,6 +1,6 @@
 """Planned pairs of a study, by hand."""
 
-from pfbench.results.comparison.baselines import list_planned_pairs
+from pfbench.results.paper_block import list_planned_pairs
 
 BASELINES = {"new": ("sir", "ukf"), "sir": (), "ukf": ()}
 

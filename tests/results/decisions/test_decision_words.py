@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from decision_cases import make_study
 
-from pfbench.results.decisions import words
-from pfbench.results.decisions.filter_sets import order_filters
-from pfbench.results.decisions.planned_pairs import decide_planned_pairs
-from pfbench.results.decisions.sentences import describe_pair, describe_ranking, describe_total
+from pfbench.stats import decision
+from pfbench.stats.filter_sets import order_filters
+from pfbench.stats.planned_pairs import decide_planned_pairs
+from pfbench.stats.sentences import describe_pair, describe_ranking, describe_total
 
 M = 0.05
 PAIR_TABLE = [
@@ -44,13 +44,13 @@ FORBIDDEN = re.compile(
 
 @pytest.mark.parametrize(("low", "high", "decided", "word", "size"), PAIR_TABLE)
 def test_words_of_pairs(low, high, decided, word, size):
-    assert words.pair_word(low, high, decided, M) == (word, size)
+    assert decision.pair_word(low, high, decided, M) == (word, size)
 
 
 @pytest.mark.parametrize(("low", "high", "decided", "with_size", "direction"), CLAIM_TABLE)
 def test_words_of_claims(low, high, decided, with_size, direction):
-    assert words.claim_word(low, high, decided, M) == with_size
-    assert words.claim_word(low, high, decided, M, states_size=False) == direction
+    assert decision.claim_word(low, high, decided, M) == with_size
+    assert decision.claim_word(low, high, decided, M, states_size=False) == direction
 
 
 def test_words_are_monotone():
@@ -59,12 +59,12 @@ def test_words_are_monotone():
     for width in (0.02, 0.12, 0.4):
         centres = np.linspace(-0.5, 0.5, 101)
         ends = [(c - width / 2, c + width / 2) for c in centres]
-        ranks = [order[words.pair_word(*e, e[0] > 0 or e[1] < 0, M)[0]] for e in ends]
+        ranks = [order[decision.pair_word(*e, e[0] > 0 or e[1] < 0, M)[0]] for e in ends]
         assert ranks == sorted(ranks)
 
 
 def test_words_of_track_and_error():
-    combine = words.combine_words
+    combine = decision.combine_words
     assert combine("better", "inconclusive", False) == "better"
     assert combine("better", "worse", False) == "trade-off"
     assert combine("better", "better", True) == "trade-off"

@@ -12,33 +12,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pfbench.results.decisions.family_tests import (
-    correct_p_values,
-    decide_family,
-    stack_questions,
-)
-from pfbench.results.decisions.growing_study import decide_looks
-from pfbench.results.decisions.pair_effects import (
-    PairEffects,
-    QuestionEffect,
-    location_effects,
-    share_effects,
-)
-from pfbench.results.decisions.simulated_studies import (
-    SimulatedPairs,
-    StudySetting,
-    assess_pairs,
-)
-from pfbench.results.decisions.words import FAILS, HOLDS, claim_word
-from pfbench.results.statistics.paired_effects import trimmed_effects
-from pfbench.results.statistics.sequential_looks import LookPlan
-from pfbench.results.statistics.world_effects import (
+from pfbench.stats.decision import FAILS, HOLDS, claim_word
+from pfbench.stats.effects import (
     EffectEstimate,
     combine_conditions,
     estimate_in_new_world,
     estimate_in_these_worlds,
+    moderated_p_values,
+    trimmed_effects,
 )
-from pfbench.results.statistics.world_spread import moderated_p_values
+from pfbench.stats.pair_effects import PairEffects, QuestionEffect, location_effects, share_effects
+from pfbench.stats.planned_pairs import correct_p_values, decide_family, stack_questions
+from pfbench.stats.sequential_looks import LookPlan, decide_looks
+from pfbench.stats.simulated_studies import SimulatedPairs, StudySetting, assess_pairs
 
 pytestmark = pytest.mark.slow
 MARGIN = math.log(1.05)

@@ -11,26 +11,22 @@ from decision_cases import make_study
 from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
-from pfbench.results.decisions.family_tests import (
+from pfbench.stats.decision import DecisionOptions, MetricRule
+from pfbench.stats.effects import EffectEstimate
+from pfbench.stats.filter_sets import order_filters
+from pfbench.stats.pair_effects import QuestionEffect, location_effects, share_effects
+from pfbench.stats.planned_pairs import (
     correct_p_values,
     decide_family,
-    stack_questions,
-)
-from pfbench.results.decisions.filter_sets import order_filters
-from pfbench.results.decisions.growing_study import decide_at_looks, is_complete
-from pfbench.results.decisions.options import DecisionOptions, MetricRule
-from pfbench.results.decisions.pair_effects import QuestionEffect, location_effects, share_effects
-from pfbench.results.decisions.planned_pairs import (
     decide_planned_pairs,
     decide_secondary_metrics,
     decision_frame,
+    stack_questions,
 )
-from pfbench.results.decisions.sentences import describe_pair
-from pfbench.results.decisions.simulated_studies import StudySetting, assess_pairs
-from pfbench.results.decisions.study_runs import select_pair, to_study_runs
-from pfbench.results.decisions.tidy_table import tidy_runs
-from pfbench.results.statistics.sequential_looks import LookPlan
-from pfbench.results.statistics.world_effects import EffectEstimate
+from pfbench.stats.sentences import describe_pair
+from pfbench.stats.sequential_looks import LookPlan, decide_at_looks, is_complete
+from pfbench.stats.simulated_studies import StudySetting, assess_pairs
+from pfbench.stats.study_runs import select_pair, tidy_runs, to_study_runs
 
 PAIR = [("A", "B")]
 

@@ -5,11 +5,7 @@ import pytest
 from scipy import integrate, stats
 from scipy.special import digamma, polygamma
 
-from pfbench.results.statistics.world_spread import (
-    _inverse_trigamma,
-    fit_world_posterior,
-    moderated_p_values,
-)
+from pfbench.stats.effects import _inverse_trigamma, fit_world_posterior, moderated_p_values
 
 CASES = [
     ([-0.3, -0.1, -0.5], [0.08, 0.05, 0.1], 0.5),

@@ -6,27 +6,27 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pfbench.results.statistics.e_values import (
+from pfbench.stats.effects import EffectEstimate
+from pfbench.stats.rank_tests import (
     combine_e_values,
     confidence_sequence,
     least_count,
     log_e_value,
     sign_log_e_value,
 )
-from pfbench.results.statistics.sequential_looks import (
+from pfbench.stats.sequential_looks import (
     LookPlan,
     boundary_scores,
     repeated_interval,
     repeated_p_value,
 )
-from pfbench.results.statistics.study_size import (
+from pfbench.stats.study_size import (
     TypicalSpread,
     detectable_effects,
     required_runs_per_condition,
     required_worlds,
     t_test_power,
 )
-from pfbench.results.statistics.world_effects import EffectEstimate
 
 EQUAL = (0.2, 0.4, 0.6, 0.8, 1.0)
 

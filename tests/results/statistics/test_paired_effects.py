@@ -7,21 +7,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pfbench.results.statistics.label_flips import flip_p_value, run_contributions
-from pfbench.results.statistics.paired_effects import (
-    is_identical,
-    order_failed_runs,
-    paired_log_ratio,
-    trimmed_effects,
-)
-from pfbench.results.statistics.world_effects import (
+from pfbench.stats.effects import (
     WorldEffects,
     combine_conditions,
     common_variance,
     estimate_in_new_world,
     estimate_in_these_worlds,
+    is_identical,
+    order_failed_runs,
+    paired_log_ratio,
     prediction_interval,
+    trimmed_effects,
 )
+from pfbench.stats.rank_tests import flip_p_value, run_contributions
 
 SAMPLE = np.array([40.0, 1.0, 2.0, 8.0, 4.0, 5.0, -5.0, 7.0, 3.0, 6.0])
 

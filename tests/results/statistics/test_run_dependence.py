@@ -7,7 +7,7 @@ import pandas as pd
 from decision_cases import make_study
 from scipy.signal import lfilter
 
-from pfbench.results.statistics.run_dependence import (
+from pfbench.stats.run_dependence import (
     ALARM_LEVEL,
     describe_copies,
     describe_dependence,

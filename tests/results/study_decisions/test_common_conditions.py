@@ -5,9 +5,9 @@ from __future__ import annotations
 import pandas as pd
 from decision_cases import make_study
 
-from pfbench.results.decisions.filter_sets import order_filters
-from pfbench.results.decisions.planned_pairs import decide_planned_pairs
-from pfbench.results.study_decisions.common_conditions import select_common_runs
+from pfbench.stats.filter_sets import order_filters
+from pfbench.stats.main_metrics import select_common_runs
+from pfbench.stats.planned_pairs import decide_planned_pairs
 
 FILTERS = {"A": 0.0, "B": 0.0, "C": 0.0, "D": 0.0}
 

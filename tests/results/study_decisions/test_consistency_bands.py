@@ -9,14 +9,14 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from pfbench.results.statistics.signed_rank import holm
-from pfbench.results.study_decisions.consistency_bands import (
+from pfbench.stats.consistency_bands import (
     NO_DEVIATION,
     OVERCONFIDENT,
     UNDERCONFIDENT,
     decide_consistency,
     estimate_ratio,
 )
+from pfbench.stats.rank_tests import holm
 
 
 def make_rows(

@@ -9,16 +9,19 @@ import numpy as np
 import pytest
 from decision_cases import make_study
 
-from pfbench.config.paper_files import plan_installed_pairs
-from pfbench.results.decisions.growing_study import decide_at_looks, is_complete
-from pfbench.results.decisions.options import MetricRule
-from pfbench.results.decisions.study_runs import select_pair, to_study_runs
-from pfbench.results.statistics.sequential_looks import LookPlan
-from pfbench.results.statistics.study_size import detectable_effects
-from pfbench.results.statistics.study_size_sentence import describe_study_size
-from pfbench.results.until_decided.look_lines import describe_end, format_look
-from pfbench.results.until_decided.look_schedule import LookRecord, LookSchedule
-from pfbench.results.until_decided.pair_states import average_over_conditions, decide_pairs
+from pfbench.results.paper_block import plan_installed_pairs
+from pfbench.stats.decision import MetricRule
+from pfbench.stats.pair_states import (
+    LookRecord,
+    LookSchedule,
+    average_over_conditions,
+    decide_pairs,
+    describe_end,
+    format_look,
+)
+from pfbench.stats.sequential_looks import LookPlan, decide_at_looks, is_complete
+from pfbench.stats.study_runs import select_pair, to_study_runs
+from pfbench.stats.study_size import describe_study_size, detectable_effects
 
 PAIRS = [("A", "B"), ("A", "C"), ("B", "C")]
 ANY_TIME = LookSchedule("e_values", 160)

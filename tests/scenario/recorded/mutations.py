@@ -26,11 +26,11 @@ from ephemeris_cases import EPHEMERIDES, as_rinex, later_by_two_hours
 from recorded_data import DATA
 from synthetic_log import tables, write
 
-from pfbench.nav.gnss.broadcast_orbits import BroadcastConstellation
+from pfbench.nav.broadcast_orbits import BroadcastConstellation
 from pfbench.scenario.recorded.log_reader import read_log
-from pfbench.scenario.recorded.raw_gnss_walk import RawGnssReceiver, RecordedWalk
+from pfbench.scenario.recorded.raw_gnss import RawGnssReceiver, RecordedWalk
 from pfbench.scenario.recorded.trajectory_file import read_motion
-from pfbench.scenario.recorded.urban_log import read_drive
+from pfbench.scenario.recorded.urban import read_drive
 
 ERROR, CLOSE, NOTED = "error", "within tolerance", "noted"
 SILENT, UNWRAPPED = "silently wrong", "other exception"

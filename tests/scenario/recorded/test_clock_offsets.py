@@ -11,9 +11,9 @@ import pytest
 from recorded_data import DATA, recorded
 from synthetic_log import tables, write
 
-from pfbench.scenario.plausibility.clock_offsets import find_fix_offset, find_imu_offset
+from pfbench.scenario.recorded.clock_offsets import find_fix_offset, find_imu_offset
 from pfbench.scenario.recorded.log_reader import read_log
-from pfbench.scenario.recorded.navigation_log import GnssLog, LogFiles, NavigationLog, ReferenceLog
+from pfbench.scenario.recorded.log_tables import GnssLog, LogFiles, NavigationLog, ReferenceLog
 
 Log = dict[str, pd.DataFrame]
 LATE = re.compile(

@@ -11,9 +11,9 @@ import pytest
 import torch
 from synthetic_log import tables, write
 
-from pfbench.nav.preintegration import preintegrate
-from pfbench.scenario.plausibility.dead_reckoning import integrate_windows
-from pfbench.scenario.recorded.navigation_log import ImuLog
+from pfbench.nav.strapdown import preintegrate
+from pfbench.scenario.recorded.dead_reckoning import integrate_windows
+from pfbench.scenario.recorded.log_tables import ImuLog
 from pfbench.scenario.recorded.time_grid import split_samples
 
 

@@ -12,9 +12,9 @@ import pymap3d
 import pytest
 from synthetic_log import tables, write
 
-from pfbench.scenario.plausibility.drive_checks import check_geocentric, check_wheel_direction
-from pfbench.scenario.plausibility.log_agreement import describe_missing_times
-from pfbench.scenario.plausibility.log_table import LogTable
+from pfbench.scenario.recorded.log_agreement import describe_missing_times
+from pfbench.scenario.recorded.log_checks import check_geocentric, check_wheel_direction
+from pfbench.scenario.recorded.log_tables import LogTable
 from pfbench.scenario.recorded.trajectory_file import read_motion
 
 TIME = np.arange(0.0, 12.0, 0.3)

@@ -14,12 +14,12 @@ from recorded_data import DATA, recorded
 from synthetic_log import tables, write
 
 from pfbench import job
-from pfbench.files.digest import hash_file
+from pfbench.files.atomic_write import hash_file
 from pfbench.job.inputs import check_unchanged, describe_unnamed_files, find_inputs
 from pfbench.job.plan import build_plan
-from pfbench.replay.recomputation import recompute_run
-from pfbench.replay.run_selection import StoredRun
-from pfbench.report.page import write_report
+from pfbench.job.replay import recompute_run
+from pfbench.job.run_selection import StoredRun
+from pfbench.report.study_report import write_report
 from pfbench.results.conditions import load_conditions
 from pfbench.results.store import list_failures, read_result
 

@@ -18,7 +18,7 @@ from synthetic_log import GRAVITY, ORIGIN, drive, tables, write
 
 from pfbench.scenario.recorded.log_checks import STANDARD_GRAVITY
 from pfbench.scenario.recorded.log_reader import read_log
-from pfbench.scenario.recorded.navigation_log import LogFiles, swap_frd_rfu
+from pfbench.scenario.recorded.log_tables import LogFiles, swap_frd_rfu
 
 Log = dict[str, pd.DataFrame]
 TO_ENU = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])

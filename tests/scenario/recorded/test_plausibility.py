@@ -15,10 +15,9 @@ from mutations import CLOSE, ERROR, EVERY_ROW, NOTED, READERS, run_mutations
 from synthetic_log import tables, write
 
 from pfbench.nav.plausible_limits import LIMIT_COLUMNS, QUANTITIES, PlausibleLimits
-from pfbench.scenario.plausibility.log_agreement import AGREEMENTS
-from pfbench.scenario.plausibility.log_table import LogTable
+from pfbench.scenario.recorded.log_agreement import AGREEMENTS
 from pfbench.scenario.recorded.log_reader import read_log
-from pfbench.scenario.recorded.log_tables import parse_satellites
+from pfbench.scenario.recorded.log_tables import LogTable, parse_satellites
 from pfbench.scenario.recorded.trajectory_file import read_motion
 
 PAGE = ROOT / "docs" / "use_your_data.md"

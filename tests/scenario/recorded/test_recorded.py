@@ -25,16 +25,15 @@ from pfbench.filter.gaussian.linearisation_rules import (
 )
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.job import instantiate
-from pfbench.model.strapdown.total import StrapdownTotal
-from pfbench.nav.preintegration import PreintegratedImu
-from pfbench.noise.outage import MeasurementOutage
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.recorded.assembly import FixReceiver
+from pfbench.model.strapdown import StrapdownTotal
+from pfbench.nav.strapdown import PreintegratedImu
+from pfbench.noise.base import NominalNoise
+from pfbench.noise.time_windows import MeasurementOutage
 from pfbench.scenario.recorded.drive import RecordedDrive, RecordedFlights
 from pfbench.scenario.recorded.log_reader import read_log
-from pfbench.scenario.recorded.log_tables import find_dataset
-from pfbench.scenario.recorded.navigation_log import ImuLog, LogFiles, ReferenceLog
+from pfbench.scenario.recorded.log_tables import ImuLog, LogFiles, ReferenceLog, find_dataset
 from pfbench.scenario.recorded.time_grid import (
+    FixReceiver,
     divide_interval,
     interpolate,
     resample_log,

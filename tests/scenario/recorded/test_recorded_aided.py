@@ -15,21 +15,19 @@ from synthetic_log import tables, write
 
 from pfbench import job
 from pfbench.job import conf_dir
-from pfbench.model.strapdown.aided import StrapdownAided
-from pfbench.model.strapdown.tuning import AidedTuning
-from pfbench.noise.outage import MeasurementOutage
-from pfbench.noise.time_varying import VarianceSurge
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.oracle_noise import OracleNoiseModel
-from pfbench.scenario.recorded.aided_flight import (
+from pfbench.model.strapdown import StrapdownAided
+from pfbench.model.strapdown_tuning import AidedTuning
+from pfbench.noise.base import NominalNoise
+from pfbench.noise.time_windows import MeasurementOutage, VarianceSurge
+from pfbench.scenario.oracle_noise import OracleNoiseModel, RecordingRegime
+from pfbench.scenario.recorded.drive import (
     BaroMagSensors,
+    FixHoldout,
     RecordedAidedFlight,
+    RecordedDrive,
     pressure_height,
 )
-from pfbench.scenario.recorded.assembly import FixReceiver
-from pfbench.scenario.recorded.drive import RecordedDrive
-from pfbench.scenario.recorded.fix_holdout import FixHoldout
-from pfbench.scenario.recording_regime import RecordingRegime
+from pfbench.scenario.recorded.time_grid import FixReceiver
 
 FIELD, IRON = [0.17, 0.01, 0.52], [0.4, -0.2, 0.3]  # North, East, Down; forward, right, down
 MOTION = believed([1.0, 1.0, 2.0], [0.1, 0.1, 0.1])

@@ -21,9 +21,9 @@ from pfbench.filter.loop import run_filter
 from pfbench.job import instantiate
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.nav import attitude, earth
-from pfbench.noise.white import NominalNoise
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.flights import SimulatedFlight
 from pfbench.scenario.recorded.trajectory_file import RecordedTrajectory, read_motion
-from pfbench.scenario.simulated_flight import SimulatedFlight
 
 CONF = ROOT / "conf"
 

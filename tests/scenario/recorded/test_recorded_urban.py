@@ -22,27 +22,28 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.model.pseudorange_errors import (
+from pfbench.model.urban_gnss import (
     LosNlosRangeError,
     NormalExponentialMixture,
     NormalRangeError,
+    UrbanGnss,
+    UrbanTuning,
 )
-from pfbench.model.urban_gnss import UrbanGnss, UrbanTuning
-from pfbench.noise.outage import MeasurementOutage
-from pfbench.noise.time_varying import VarianceSurge
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.recorded.urban_drive import PseudorangeReceiver, UrbanDrive
+from pfbench.noise.base import NominalNoise
+from pfbench.noise.time_windows import MeasurementOutage, VarianceSurge
+from pfbench.scenario.recorded.urban import (
+    PseudorangeReceiver,
+    UrbanDrive,
+    interpolate_reference,
+    read_drive,
+    select_epochs,
+    select_stretch,
+)
 from pfbench.scenario.recorded.urban_error_fit import (
     RangeResiduals,
     estimate_mixture,
     estimate_normal,
     range_residuals,
-)
-from pfbench.scenario.recorded.urban_log import (
-    interpolate_reference,
-    read_drive,
-    select_epochs,
-    select_stretch,
 )
 
 CONF = ROOT / "conf"

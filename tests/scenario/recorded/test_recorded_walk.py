@@ -23,15 +23,14 @@ from pfbench.core.record import Episode, MeasurementChannels
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
-from pfbench.model.strapdown.tight import StrapdownTight, TightMemsInputs
-from pfbench.model.strapdown.tuning import RangeErrorModel, TightTuning
+from pfbench.model.strapdown import StrapdownTight, TightMemsInputs
+from pfbench.model.strapdown_tuning import RangeErrorModel, TightTuning
 from pfbench.nav import earth
-from pfbench.nav.gnss.orbits import WalkerConstellation, azimuth_elevation, receive_signals
-from pfbench.nav.gnss.receiver_clock import ReceiverClock
-from pfbench.noise.base import NoiseRegime
-from pfbench.noise.outage import MeasurementOutage
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.recorded.raw_gnss_walk import RawGnssReceiver, RecordedWalk
+from pfbench.nav.orbits import WalkerConstellation, azimuth_elevation, receive_signals
+from pfbench.nav.ranging import ReceiverClock
+from pfbench.noise.base import NoiseRegime, NominalNoise
+from pfbench.noise.time_windows import MeasurementOutage
+from pfbench.scenario.recorded.raw_gnss import RawGnssReceiver, RecordedWalk
 
 CONF = ROOT / "conf"
 BIAS, DRIFT, OTHER = -4.6e5, -60.0, 12.0  # of the clock, and of the other system

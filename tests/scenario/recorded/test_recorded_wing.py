@@ -21,12 +21,11 @@ from pfbench.core.record import Episode, Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.model.strapdown.total import StrapdownTotal
-from pfbench.noise.outage import MeasurementOutage
-from pfbench.noise.white import NominalNoise
-from pfbench.scenario.recorded.assembly import FixReceiver
-from pfbench.scenario.recorded.drive import RecordedDrive
-from pfbench.scenario.recorded.fix_holdout import FixHoldout
+from pfbench.model.strapdown import StrapdownTotal
+from pfbench.noise.base import NominalNoise
+from pfbench.noise.time_windows import MeasurementOutage
+from pfbench.scenario.recorded.drive import FixHoldout, RecordedDrive
+from pfbench.scenario.recorded.time_grid import FixReceiver
 
 CONF = ROOT / "conf"
 MISSED = np.array([0.3, -0.2, 0.1])  # m North, East, down: the errors of the synthetic fixes

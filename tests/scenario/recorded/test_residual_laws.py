@@ -20,8 +20,8 @@ from torch import Tensor
 
 from pfbench import job
 from pfbench.job import datasheet_data
-from pfbench.noise.white import NominalNoise
-from pfbench.results import consistency
+from pfbench.noise.base import NominalNoise
+from pfbench.results import status
 
 SCENES = sorted(file.stem for file in (job.conf_dir() / "scenario").glob("*.yaml"))
 RUNS = torch.arange(20)
@@ -75,7 +75,7 @@ def at_the_truth(scenario: str) -> Tensor:
 
 def out_of_law(z: Tensor) -> list[str]:
     """What is not as it should be of components [R, T, K] taken together, NaN where nothing was measured."""
-    law, wider = consistency.compute_whiteness(z.numpy()), REACH / float(stats.norm.isf(0.025))
+    law, wider = status.compute_whiteness(z.numpy()), REACH / float(stats.norm.isf(0.025))
     off = {
         "mean": (law.mean, law.mean_band),
         "variance": (law.variance - 1, law.variance_band),

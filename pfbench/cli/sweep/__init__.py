@@ -1,1 +1,0 @@
-"""Sweeps: plan, progress, and studies that add runs until they are decided."""

@@ -1,0 +1,407 @@
+"""Sweep that adds runs until every planned pair of filters is decided: `runs=until-decided`."""
+
+from __future__ import annotations
+
+import copy
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pfbench.cli.compose import expand_sweep, given_keys, read_sweep
+from pfbench.job.config import JobConfig, compose
+from pfbench.results.paper_block import PAPER
+
+if TYPE_CHECKING:
+    from pfbench.results.look_table import LookTable
+    from pfbench.stats.pair_states import LookRecord, LookSchedule, PairState
+
+
+UNTIL_DECIDED = "until-decided"  # value of `runs`
+_HOUR = 3600.0
+# of the report: the decisions of a study follow from them, so they must not change between looks
+_DECIDING_SETTINGS = ("metric", "alpha", "equivalence_margin", "start_time_s")
+
+
+def wants_until_decided(plan: StudyPlan) -> bool:
+    """Return whether a study adds runs until it is decided.
+
+    Args:
+        plan: Plan of the study.
+    """
+    return plan.first.values.get("runs") == UNTIL_DECIDED
+
+
+@dataclass(frozen=True)
+class GrowingSweep:
+    """Sweep whose runs grow from look to look.
+
+    Attributes:
+        study: Name of the study.
+        results: Folder of all studies.
+        jobs: Configurations of all jobs, whose `runs` is `until-decided`.
+        schedule: Looks.
+        max_hours: Computing time of all jobs at most, h; None for no limit.
+        repeats_jobs: Whether jobs run again although their results exist.
+        report: Settings of the report, whose metric, level and margin decide.
+    """
+
+    study: str
+    results: Path
+    jobs: tuple[JobConfig, ...]
+    schedule: LookSchedule
+    max_hours: float | None
+    repeats_jobs: bool
+    report: Mapping[str, Any]
+
+    @classmethod
+    def from_plan(cls, plan: StudyPlan) -> GrowingSweep:
+        """Read the settings of a study.
+
+        Args:
+            plan: Plan of the study.
+
+        Raises:
+            ValueError: If a setting is not valid for a study that adds runs.
+        """
+        from pfbench.stats.main_metrics import check_main_metric
+        from pfbench.stats.pair_states import LookSchedule
+
+        values = plan.first.values
+        settings = values["until_decided"]
+        if not isinstance(settings, Mapping):
+            raise ValueError(
+                f"until_decided must have the keys mode, max_runs and max_hours, got {settings}. Leave it out."
+            )
+        hours = settings["max_hours"]
+        if hours is not None and (type(hours) not in (int, float) or not 0 < hours < math.inf):
+            raise ValueError(
+                f"until_decided.max_hours must be positive or null, got {hours}. Use null for no limit."
+            )
+        if not plan.has_one_study:
+            raise ValueError("study must be one name, got several. Run each study by itself.")
+        if values["budget"] != "particles":
+            raise ValueError(
+                "budget must be particles with runs=until-decided, since a budget would set another "
+                f"number of particles at each look, got {values['budget']}. Use budget=particles."
+            )
+        check_main_metric(values["report"]["metric"])
+        schedule, jobs = LookSchedule(settings["mode"], settings["max_runs"]), plan.compose_jobs()
+        if all(config.values["filter"] == jobs[0].values["filter"] for config in jobs):
+            raise ValueError(
+                "filter must be at least two filters with runs=until-decided, got one per condition. "
+                "Add a filter (filter=ekf,sir), or set a number of runs."
+            )
+        return cls(
+            str(values["study"]), Path(values["results_dir"]), tuple(jobs),
+            schedule, hours, values["overwrite"] or values["pcrb"] is True, values["report"],
+        )  # fmt: skip
+
+    def job_keys(self, number: int) -> set[str]:
+        """Return the keys of all jobs until a look.
+
+        Args:
+            number: Number of the look, from 1.
+        """
+        from pfbench.job.inputs import find_inputs
+        from pfbench.job.plan import job_key
+
+        keys = set()
+        for config in self.jobs:
+            values, inputs = (
+                copy.deepcopy(config.values),
+                find_inputs(config.values, config.trusted),
+            )
+            for first, runs in self.schedule.parts(number):
+                numbers = {"first_run": config.values["first_run"] + first, "runs": runs}
+                keys.add(job_key({**values, **numbers}, inputs))
+        return keys
+
+    def has_results(self, number: int) -> bool:
+        """Return whether all jobs until a look have a file.
+
+        Args:
+            number: Number of the look, from 1.
+        """
+        folder = self.results / self.study
+        return all((folder / f"{key}.npz").exists() for key in self.job_keys(number))
+
+    def read(self, number: int) -> LookTable:
+        """Read the results until a look.
+
+        Args:
+            number: Number of the look, from 1.
+        """
+        from pfbench.results.look_table import LookMetric, read_look_table
+        from pfbench.results.paper_block import plan_installed_pairs
+
+        metric = LookMetric(self.report["metric"], self.report["start_time_s"])
+        return read_look_table(
+            self.study, self.results, self.job_keys(number), plan_installed_pairs, metric
+        )
+
+    def run(self, run_part: Callable[[Sequence[str]], None]) -> None:
+        """Run look after look until all pairs are decided or a cap is reached.
+
+        Args:
+            run_part: Runs the sweep with further overrides.
+
+        Raises:
+            ValueError: If the study was started with another plan, or a result is missing.
+        """
+        from pfbench.stats.pair_states import describe_end, format_look
+
+        record = self._open_record()
+        numbers = range(1, len(self.schedule.runs) + 1)
+        if record.state and self.has_results(len(record.looks)) and not self.repeats_jobs:
+            print(*record.looks, sep="\n")
+            print(f"study {self.study} is finished: {record.state}\n{self._next_command()}")
+            return
+        lines: list[str] = []
+        states: list[PairState] = []
+        seconds = 0.0
+        for number in numbers:
+            if number > 1 and (reason := self._exceeds_time(seconds, number)):
+                record.write(lines)
+                print(f"{reason}\n{self._next_command()}")
+                return
+            table = self._compute_look(number, run_part)
+            seconds = table.seconds
+            earlier, states = states, self._decide(table)
+            lines.append(format_look(number, self.schedule, states, earlier, table.warning))
+            print(lines[-1], flush=True)
+            state = describe_end(number, self.schedule, states)
+            record.write(lines, state)
+            if state:
+                print(f"study {self.study} is finished: {state}\n{self._next_command()}")
+                return
+
+    def _open_record(self) -> LookRecord:
+        """Open the record of the study, with the settings that must not change between looks."""
+        from pfbench.stats.pair_states import RECORD, LookRecord
+
+        request = {
+            "until_decided.mode": self.schedule.mode,
+            "until_decided.max_runs": self.schedule.max_runs,
+            **{f"report.{name}": self.report[name] for name in _DECIDING_SETTINGS},
+            "jobs": sorted(self.job_keys(1)),
+        }
+        return LookRecord(self.results / self.study / RECORD, request)
+
+    def _compute_look(self, number: int, run_part: Callable[[Sequence[str]], None]) -> LookTable:
+        """Run the jobs of a look without a result, and read all runs so far."""
+        start = self.jobs[0].values["first_run"]
+        parts = [
+            [f"runs={runs}", f"first_run={start + first}"]
+            for first, runs in self.schedule.parts(number)
+        ]
+        if self.repeats_jobs or not self.has_results(number):
+            run_part(parts[-1])
+        try:
+            table = self.read(number)
+            is_complete = table.parts == len(self.job_keys(number))
+        except ValueError:  # parts without their neighbours; another reason is raised again below
+            is_complete = False
+        if not is_complete:  # damaged files were set aside
+            for words in parts:
+                run_part(words)
+            table = self.read(number)
+        return table
+
+    def _decide(self, table: LookTable) -> list[PairState]:
+        """Decide the planned pairs with the runs so far."""
+        from pfbench.report.options import ReportOptions
+        from pfbench.stats.main_metrics import RULES
+        from pfbench.stats.pair_states import decide_pairs
+
+        runs, required = table.runs["run"].nunique(), self.schedule.runs[0]
+        if runs < required:
+            raise ValueError(
+                f"runs must be at least {required} independent ones, got {runs}. {table.warning} Use a "
+                "scenario whose data differ from run to run, or set a number of runs."
+            )
+        names = ("alpha", "equivalence_margin", "metric")
+        report = ReportOptions(**{name: self.report[name] for name in names})
+        rule, options = RULES[report.metric], report.decision_options
+        return decide_pairs(table.runs, table.pairs, self.schedule, options, rule)
+
+    def _exceeds_time(self, seconds: float, number: int) -> str:
+        """Return why a look must not begin: its expected end exceeds the limit; empty if it may."""
+        before, after = self.schedule.runs[number - 2 : number]
+        expected = seconds * after / before / _HOUR
+        if self.max_hours is None or expected <= self.max_hours:
+            return ""
+        return (
+            f"stopped before look {number}: {after} runs would need {expected:.3g} h of computing "
+            f"time, the limit until_decided.max_hours is {self.max_hours:g} h. Raise it and repeat "
+            "the command to go on."
+        )
+
+    def _next_command(self) -> str:
+        """Format the next command."""
+        return f"Next: pfbench report study={self.study}"
+
+
+def check_has_sweep(flags: Sequence[str]) -> None:
+    """Check that `runs=until-decided` is used for a sweep.
+
+    Args:
+        flags: Flags of the command.
+
+    Raises:
+        ValueError: If the command runs a single job.
+    """
+    if not flags:
+        raise ValueError(
+            f"runs={UNTIL_DECIDED} must be a sweep over at least two filters, got one job. "
+            "Add -m and filter=NAME,NAME."
+        )
+
+
+# --------------------------------------------------------------------------------------------------
+# Jobs, worlds and pairs of a sweep, before it runs.
+
+# keys that are equal in all jobs of a condition, and how several values are run
+_EQUAL_KEYS = {
+    "seed": "Use more runs of one seed (runs=200), or one study for each seed: study=mine_1 seed=1, then study=mine_2 seed=2.",
+    "runs": "Use the largest number, or one study for each number.",
+    "first_run": "Use first runs that continue each other, such as first_run=0,100 with runs=100.",
+}
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """Jobs of a sweep.
+
+    Attributes:
+        alternatives: Alternatives of each key, each as an override.
+        first: Configuration of the first job.
+        experiments: Names of the experiments.
+    """
+
+    alternatives: tuple[tuple[str, ...], ...]
+    first: JobConfig
+    experiments: tuple[str, ...]
+
+    @property
+    def jobs(self) -> int:
+        """Number of jobs."""
+        jobs = 1
+        for options in self.alternatives:
+            jobs *= len(options)
+        return jobs
+
+    @property
+    def has_one_study(self) -> bool:
+        """Return whether all jobs belong to one study."""
+        return "study" not in self._swept_options() and len(self.experiments) < 2
+
+    def check_comparable(self) -> None:
+        """Check that the report of the study can compare the jobs, which needs equal data in each condition.
+
+        Raises:
+            ValueError: If the jobs of a condition differ in their seed or their runs.
+        """
+        report = self.first.values.get("report")
+        if isinstance(report, Mapping) and report.get("allow_mixed_versions"):
+            return
+        for key, remedy in _EQUAL_KEYS.items():
+            values = [option.partition("=")[2] for option in self._swept_options().get(key, ())]
+            if len(set(values)) > 1 and not (key == "first_run" and self._continue_runs(values)):
+                raise ValueError(
+                    f"{key} must be one value in a study, since its report compares filters on equal data, got "
+                    f"{', '.join(values[:5])}. {remedy} To run them all the same, and to report them, add "
+                    "report.allow_mixed_versions=true to both commands."
+                )
+
+    def _continue_runs(self, first_runs: Sequence[str]) -> bool:
+        """Return whether jobs with these first runs continue each other, so that a report joins them."""
+        runs = self.first.values["runs"]
+        numbers = [int(text) for text in first_runs if text.isdecimal()]
+        is_whole = type(runs) is int and len(numbers) == len(first_runs)
+        return is_whole and sorted(numbers) == [
+            min(numbers) + k * runs for k in range(len(numbers))
+        ]
+
+    def list_families(self) -> dict[str, str]:
+        """Return the family of each scenario of the sweep."""
+        families: dict[str, str] = {}
+        for k, options in enumerate(self.alternatives):
+            if len(options) > 1 and given_keys(options[:1]) == {"scenario"}:
+                for option in options:
+                    words = [values[0] for values in self.alternatives]
+                    words[k] = option
+                    families |= dict([_family(compose_words(words))])
+        return families or dict([_family(self.first)])
+
+    def count_pairs(self) -> int:
+        """Count the planned pairs of filters; at least 1, since one filter is compared later."""
+        from pfbench.results.paper_block import plan_installed_pairs
+
+        swept = self._swept_options()
+        names = [option.partition("=")[2] for option in swept.pop("filter", ("filter=one",))]
+        settings = [len(swept[key]) for key in swept if re.match(r"filter\.|particles$", key)]
+        variants = 1
+        for count in settings:
+            variants *= count
+        labels = names if variants == 1 else [f"{n} {k}" for n in names for k in range(variants)]
+        return max(1, len(plan_installed_pairs(labels)))
+
+    def compose_jobs(self) -> list[JobConfig]:
+        """Compose the configurations of all jobs."""
+        return [compose_words(words) for words in product(*self.alternatives)]
+
+    def describe_size(self) -> str:
+        """Describe what the chosen runs and worlds can show; empty if the runs are not one number."""
+        from pfbench.stats.study_size import describe_study_size
+
+        runs = self.first.values["runs"]
+        if type(runs) is not int or runs < 1 or "runs" in self._swept_options():
+            return ""
+        worlds = len(set(self.list_families().values()))
+        return f"plan: {describe_study_size(runs, worlds, self.count_pairs())}"
+
+    def _swept_options(self) -> dict[str, tuple[str, ...]]:
+        """Return the alternatives of each key that has several."""
+        several = [options for options in self.alternatives if len(options) > 1]
+        return {next(iter(given_keys(options[:1]))): options for options in several}
+
+
+def plan_study(overrides: Sequence[str], first: JobConfig | None = None) -> StudyPlan:
+    """Plan a sweep, or a single job.
+
+    Args:
+        overrides: Overrides, some with several values, without flags.
+        first: Configuration of the first job; None composes it.
+
+    Returns:
+        The plan.
+
+    Raises:
+        Exception: If an override or the configuration of the first job is not valid.
+    """
+    names = [word.partition("=")[2] for word in overrides if word.startswith("+experiment=")]
+    params = [word for name in names for word in read_sweep(name)]
+    alternatives = tuple(tuple(options) for options in expand_sweep([*params, *overrides]))
+    first = first or compose_words([options[0] for options in alternatives])
+    return StudyPlan(alternatives, first, tuple(names))
+
+
+def compose_words(words: Sequence[str]) -> JobConfig:
+    """Compose a configuration without the overrides of Hydra itself, except its search path.
+
+    Args:
+        words: Overrides of one value.
+    """
+    return compose([word for word in words if not re.match(r"[+~]*hydra[/.](?!searchpath)", word)])
+
+
+def _family(config: JobConfig) -> tuple[str, str]:
+    """Return the scenario of a job and its family, itself if none is set."""
+    name = config.choices["scenario"]
+    scenario: Any = config.values.get("scenario")
+    paper = scenario.get(PAPER) if isinstance(scenario, dict) else None
+    return name, str((paper or {}).get("family") or name)

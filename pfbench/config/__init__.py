@@ -1,1 +1,0 @@
-"""Configuration of jobs: composition, trust, and keys that files may not set."""

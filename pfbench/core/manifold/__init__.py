@@ -1,1 +1,0 @@
-"""Chart blocks of matrix Lie groups."""

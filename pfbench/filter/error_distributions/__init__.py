@@ -1,1 +1,0 @@
-"""Updates of Gaussian filters for observation distributions that are not normal."""

@@ -1,1 +1,0 @@
-"""Filters in an invariant chart of the state."""

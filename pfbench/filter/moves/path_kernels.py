@@ -1,0 +1,468 @@
+"""MCMC kernels of paths: moves of the start, of the end, and by statistics of the noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from pfbench.core.linear_algebra import distribution_covariance, factor
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief, normalise_log_weights, weighted_mean_cov
+from pfbench.filter.exactness import is_every_part_exact
+from pfbench.filter.linearisation import (
+    derivative,
+    mask_covariance,
+    measurement_jacobian,
+    transition_jacobian,
+    unwrap_independent,
+)
+from pfbench.filter.moves.metropolis import (
+    McmcKernel,
+    PathHistory,
+    StateHistory,
+    concatenate_histories,
+    stack_history,
+)
+from pfbench.filter.moves.path_proposals import (
+    PathSegment,
+    PriorSegment,
+    SegmentProposal,
+    driving_noise,
+    measurement_log_density,
+    transition_log_density,
+)
+from pfbench.filter.particle.regularised_resampling import GaussianSmoothing, SmoothingKernel
+from pfbench.filter.whitening import compute_half_square, whiten
+from pfbench.model.base import StateSpaceModel
+
+# --------------------------------------------------------------------------------------------------
+# Sufficient statistics of paths under fixed noises, for kernels that shift x_t.
+
+
+@dataclass(frozen=True)
+class PathStatistics(PathHistory):
+    """Gradient and curvature of a particle's log path density under fixed noises.
+
+    If the newest state moves by delta, the log density changes by b.delta - delta' Lambda delta / 2
+    to first order, exactly on linear-Gaussian models. `score` b [R, N, d] belongs to each particle,
+    `information` Lambda [R, 1, d, d] to the run. With the Jacobian Phi of a step at the mean,
+
+        Lambda <- Phi^-T Lambda Phi^-1 + J,   b_i <- Phi^-T b_i + d log p(y | x_i) / dx.
+
+    J is the Fisher information of the measurement at the mean. Initially Lambda = P0^-1 and
+    b_i = -P0^-1 xi_i. The derivative at each particle [ours] also uses variance measurements.
+    """
+
+    @override
+    def merge(self, history: PathHistory) -> PathHistory:
+        if isinstance(history, PathStatistics):
+            return self
+        raise ValueError(
+            "filter.moves must not combine NoiseFlowStatKernel or NoiseFlowGibbsKernel with other "
+            "kernels, got both. Remove the other kernels, because these two do not store paths."
+        )
+
+    @override
+    def start(
+        self, model: StateSpaceModel, belief: ParticleBelief, mean: Tensor, covariance: Tensor
+    ) -> ParticleBelief:
+        """Start with the information and score of the initial distribution."""
+        root, ok = factor(covariance)
+        if not bool((ok & (root.diagonal(dim1=-2, dim2=-1) > 0.0).all(-1)).all()):
+            variance = covariance[0].diagonal().tolist()
+            raise ValueError(
+                "filter.moves: the initial covariance must be positive definite for kernels that use "
+                f"statistics of the path, got variances {variance} of the particles. Use "
+                "NoiseFlowKernel, or a larger initial standard deviation or number of particles."
+            )
+        information = torch.cholesky_inverse(root)
+        score = -model.chart.subtract(belief.x, mean.unsqueeze(1)) @ information
+        return belief._replace(window={"score": score, "information": information.unsqueeze(1)})
+
+    @override
+    def append(
+        self,
+        model: StateSpaceModel,
+        before: ParticleBelief,
+        after: ParticleBelief,
+        w: Tensor | None,
+        record: Record,
+    ) -> ParticleBelief:
+        """Propagate information and score, and add those of the measurement."""
+        chart = model.chart
+        start, end = (
+            chart.mean(belief.x, normalise_log_weights(belief.log_w)).unsqueeze(1)
+            for belief in (before, after)
+        )
+        inverse_step = torch.linalg.inv_ex(transition_jacobian(model, start, record.u)[:, 0])[0]
+        information = inverse_step.mT @ before.window["information"][:, 0] @ inverse_step
+        information = information + fisher_information(model, end, record)
+        information = 0.5 * (information + information.mT)
+        score = before.window["score"] @ inverse_step + _likelihood_gradient(model, after.x, record)
+        return after._replace(window={"score": score, "information": information.unsqueeze(1)})
+
+
+def fisher_information(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
+    """Compute the Fisher information of a measurement, by moments if not normal.
+
+    Args:
+        model: State-space model.
+        x: State, [R, 1, D].
+        record: Record of the step.
+
+    Returns:
+        Information matrix, [R, d, d].
+    """
+    observed_mask, h = ~torch.isnan(record.y), measurement_jacobian(model, x, record)[:, 0]
+    distribution: Any = model.observation(x, record.u)
+    covariance = mask_covariance(distribution_covariance(distribution)[:, 0], observed_mask)
+    information = h.mT @ torch.linalg.solve_ex(covariance, h)[0]
+    if isinstance(distribution, torch.distributions.MultivariateNormal):
+        return information
+
+    def log_sd(a: Tensor, xi: Tensor) -> Tensor:
+        shifted: Any = model.observation(model.chart.add(a, xi), record.u)
+        return torch.log(shifted.stddev)
+
+    log_sd_jacobian = torch.where(
+        observed_mask.unsqueeze(-1), derivative(log_sd, x, model.chart.dimension)[:, 0], 0.0
+    )
+    return information + 2.0 * log_sd_jacobian.mT @ log_sd_jacobian
+
+
+def _likelihood_gradient(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
+    """Compute d log p(y | x) / dx along the chart for each particle [R, N, d]."""
+    with torch.enable_grad():
+        xi = x.new_zeros(*x.shape[:2], model.chart.dimension, requires_grad=True)
+        total = model.log_likelihood(record.y, model.chart.add(x.detach(), xi), record.u).sum()
+        if not total.requires_grad:
+            return torch.zeros_like(xi)
+        return torch.autograd.grad(total, xi, materialize_grads=True)[0]
+
+
+# --------------------------------------------------------------------------------------------------
+# MCMC kernels that move the start of a path and keep its noise.
+#
+# t is the newest step of the window. A random-walk step is h A e in the chart. A comes from the
+# particle set and not from the particle, so the step is symmetric and cancels in the ratio.
+
+
+@dataclass(frozen=True)
+class RandomWalk:
+    """Step h A e of a random walk, with A A' the covariance of the moved quantity.
+
+    h is the bandwidth of a smoothing kernel times `scale`. The Gaussian bandwidth is close to the
+    best scale in many dimensions, 2.38 / sqrt(d).
+
+    Attributes:
+        scale: Factor on the bandwidth.
+        smoothing: Smoothing kernel, which also gives the distribution of e.
+
+    Raises:
+        ValueError: If the scale is not positive.
+    """
+
+    scale: float = 1.0
+    smoothing: SmoothingKernel = field(default_factory=GaussianSmoothing)
+    is_exact = True  # symmetric: its density ratio is 1
+
+    def __post_init__(self) -> None:
+        if not self.scale > 0.0:
+            raise ValueError(
+                f"kernel.random_walk.scale must be positive, got {self.scale}. "
+                "Set a factor on the optimal bandwidth."
+            )
+
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, x: Tensor, draws: RandomStream
+    ) -> Tensor:
+        """Draw steps.
+
+        Args:
+            model: State-space model.
+            belief: Weighted particles.
+            x: States that the steps will move, [R, N, D], with the weights of the belief.
+            draws: Random stream.
+
+        Returns:
+            Steps in the chart, [R, N, d].
+        """
+        covariance = weighted_mean_cov(model.chart, belief._replace(x=x))[1]
+        root, ok = factor(covariance)
+        sd = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
+        active_count = torch.isfinite(belief.log_w).sum(1, keepdim=True).to(x.dtype)
+        h = self.scale * self.smoothing.bandwidth(covariance.shape[-1], active_count)
+        e = self.smoothing.draw(draws, "walk", x.shape[1], covariance.shape[-1])
+        return h.unsqueeze(-1) * (e @ torch.where(ok[:, None, None], root, torch.diag_embed(sd)).mT)
+
+
+@dataclass(frozen=True)
+class NoiseFlowKernel(McmcKernel):
+    """Move the start of the window under fixed noises, without a density [ours].
+
+    s = x_t-L and s' = s (+) h A e, with A from the starts at time t. The path follows from s' under
+    the same noises:
+
+    log beta = log p(s') - log p(s) + sum_j log p(y_j | x'_j) - log p(y_j | x_j).
+
+    While t <= L the start is x_0 and its distribution is exact. Later it is the normal
+    distribution with the filter's moments at t - L. The target is then that of a fixed-lag
+    smoother, so `is_exact` is False. The cost is L model steps.
+
+    Attributes:
+        lag: L. The window may be longer for another kernel. The flow then starts where the
+            window does.
+        random_walk: Step of the start. On a curved chart it is taken in the coordinates about the
+            mean of the start [ours]. The distribution is normal there, so no volume element is
+            missing.
+        noise_refresh: c. Replaces the noises by w' = sqrt(1 - c^2) w + c e, which leaves their
+            normal distribution invariant.
+
+    Raises:
+        ValueError: If the lag is below 1 or the refresh outside [0, 1). On use, if noise that is
+            not normal is refreshed.
+    """
+
+    lag: int = 20
+    random_walk: RandomWalk = field(default_factory=RandomWalk)
+    noise_refresh: float = 0.0
+    is_exact = False
+
+    def __post_init__(self) -> None:
+        if self.lag < 1:
+            raise ValueError(
+                f"kernel.lag must be at least 1, got {self.lag}. Set the number of steps."
+            )
+        if not 0.0 <= self.noise_refresh < 1.0:
+            raise ValueError(
+                f"kernel.noise_refresh must be in [0, 1), got {self.noise_refresh}. "
+                "Use 0 for no refresh."
+            )
+
+    @property
+    @override
+    def required_history(self) -> StateHistory:
+        return StateHistory(self.lag, store_noise=True)
+
+    @override
+    def propose(
+        self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
+    ) -> tuple[ParticleBelief, Tensor]:
+        window, chart = belief.window, model.chart
+        start, centre = window["states"][:, :, 0], window["mean"][:, :, 0]
+        step, xi = self.random_walk(model, belief, start, draws), chart.subtract(start, centre)
+        proposed_start = start + step if chart.flat else chart.add(centre, xi + step)
+        noise = self._refresh_noise(model, window["noise"], draws)
+        states, log_like = propagate_path(model, proposed_start, noise, belief.past)
+        root = factor(window["covariance"][:, 0, 0])[0]
+        before, after = (compute_half_square(whiten(a, root)) for a in (xi, xi + step))
+        log_alpha = before - after + (log_like - window["log_like"]).sum(-1)
+        new_window = {"states": states, "log_like": log_like, "noise": noise}
+        return belief._replace(x=states[:, :, -1], window=window | new_window), log_alpha
+
+    def _refresh_noise(self, model: StateSpaceModel, w: Tensor, draws: RandomStream) -> Tensor:
+        """Mix the noises [R, N, K, W] with new ones."""
+        if self.noise_refresh == 0.0 or w.shape[2] == 0:
+            return w
+        noise: Any = model.noise
+        if not isinstance(unwrap_independent(noise), torch.distributions.Normal):
+            raise ValueError(
+                "kernel.noise_refresh must be 0 for noise that is not normal, got "
+                f"{self.noise_refresh} with {type(model).__name__}. Set noise_refresh=0."
+            )
+        n, steps, width = w.shape[1:]
+        e = draws.normal("refresh", n, steps * width).unflatten(2, (steps, width))
+        return (
+            noise.mean
+            + (1.0 - self.noise_refresh**2) ** 0.5 * (w - noise.mean)
+            + self.noise_refresh * noise.stddev * e
+        )
+
+
+def propagate_path(
+    model: StateSpaceModel, start: Tensor, noise: Tensor, past: tuple[Record, ...]
+) -> tuple[Tensor, Tensor]:
+    """Propagate a path from its start with fixed noises.
+
+    Args:
+        model: State-space model.
+        start: First states, [R, N, D].
+        noise: Noises, [R, N, K, W].
+        past: Records of the K + 1 states, or empty.
+
+    Returns:
+        States [R, N, K+1, D] and log p(y_j | x_j) [R, N, K+1].
+    """
+    x, states = start, [start]
+    values = [model.log_likelihood(record.y, x, record.u) for record in past[:1]] or [
+        torch.zeros_like(start[..., 0])
+    ]
+    for j, record in enumerate(past[1:]):
+        x = model.propagate(x, record.u, noise[:, :, j])
+        states.append(x)
+        values.append(model.log_likelihood(record.y, x, record.u))
+    return stack_history(states), stack_history(values)
+
+
+@dataclass(frozen=True)
+class NoiseFlowStatKernel(McmcKernel):
+    """Move the whole path since t = 0 with its newest state, at constant cost [ours].
+
+    By sufficient statistics [after Storvik 2002; Fearnhead 2002]: x' = x (+) delta, delta = h A e,
+    and log beta = b.delta - delta' Lambda delta / 2. After acceptance b <- b - Lambda delta. Exact
+    on linear-Gaussian models, of first order on others. `PathStatistics` defines b and Lambda.
+
+    Attributes:
+        random_walk: delta, by default with half the optimal bandwidth.
+    """
+
+    random_walk: RandomWalk = field(default_factory=lambda: RandomWalk(0.5))
+    is_exact = False
+    required_history = PathStatistics()
+
+    @override
+    def propose(
+        self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
+    ) -> tuple[ParticleBelief, Tensor]:
+        b, delta = belief.window["score"], self.random_walk(model, belief, belief.x, draws)
+        information_shift = delta @ belief.window["information"][:, 0]
+        log_alpha = (delta * (b - 0.5 * information_shift)).sum(-1)
+        window = belief.window | {"score": b - information_shift}
+        return belief._replace(x=model.chart.add(belief.x, delta), window=window), log_alpha
+
+
+@dataclass(frozen=True)
+class NoiseFlowGibbsKernel(McmcKernel):
+    """`NoiseFlowStatKernel` with delta from its conditional distribution.
+
+    The distribution is N(Lambda^-1 b, Lambda^-1). Always accepted if Lambda has a Cholesky factor.
+    """
+
+    is_exact = False
+    required_history = PathStatistics()
+
+    @override
+    def propose(
+        self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
+    ) -> tuple[ParticleBelief, Tensor]:
+        b, information = belief.window["score"], belief.window["information"][:, 0]
+        root, ok = factor(information)
+        white = torch.linalg.solve_triangular(root, b.mT, upper=False).mT
+        e = draws.normal("gibbs", b.shape[1], b.shape[2])
+        delta = torch.linalg.solve_triangular(root.mT, (white + e).mT, upper=True).mT
+        log_alpha = torch.where(ok[:, None] & torch.isfinite(delta).all(-1), 0.0, -torch.inf)
+        window = belief.window | {"score": b - delta @ information}
+        return belief._replace(x=model.chart.add(belief.x, delta), window=window), log_alpha
+
+
+# --------------------------------------------------------------------------------------------------
+# MCMC kernels that draw the end of a path: the child and previous states.
+#
+# t is the newest step of the window, x_t the child and x_t-1 its parent. A symmetric random walk
+# proposes the child.
+
+
+@dataclass(frozen=True)
+class LastStateKernel(McmcKernel):
+    """Move x_t only, with its parent fixed.
+
+    The ratio is beta = p(y_t | x') p(x' | x_t-1) / (p(y_t | x) p(x | x_t-1)). x_0 does not move.
+    See [Gilks and Berzuini 2001; Ristic, Arulampalam, Gordon 2004].
+
+    Attributes:
+        random_walk: Step of x_t.
+    """
+
+    random_walk: RandomWalk = field(default_factory=RandomWalk)
+    required_history = StateHistory(1, store_density=True)
+
+    @property
+    @override
+    def is_exact(self) -> bool:
+        return is_every_part_exact(**{"kernel.walk": self.random_walk})
+
+    @override
+    def propose(
+        self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
+    ) -> tuple[ParticleBelief, Tensor]:
+        return PathBlockKernel(0, PriorSegment(), self.random_walk).propose(model, belief, draws)
+
+
+@dataclass(frozen=True)
+class PathBlockKernel(McmcKernel):
+    """Move the child and locally resample `block_length` states before it.
+
+    [Yan et al. 2016, eqs. 10-13]: beta = prod_{j = t-length..t} p(y_j | x'_j) p(x'_j | x'_j-1)
+    g(block) / (the same product without primes and with g(block')). If g is exactly
+    p(block | fixed state, y), this is the ratio of the child's terms alone. The missing eq. 13 of
+    the paper was probably this ratio [ours].
+
+    Attributes:
+        block_length: Number of re-drawn states. The paper's indices re-draw L of them, its text
+            L - 1. Fewer are available near the start, and x_0 does not move.
+        segment_proposal: g.
+        random_walk: Step of the child.
+
+    Raises:
+        ValueError: If the length is negative. On use, if the transition density does not exist.
+    """
+
+    block_length: int
+    segment_proposal: SegmentProposal
+    random_walk: RandomWalk = field(default_factory=RandomWalk)
+
+    def __post_init__(self) -> None:
+        if self.block_length < 0:
+            raise ValueError(
+                f"kernel.block_length must be at least 0, got {self.block_length}. "
+                "Use 0 to re-draw no state."
+            )
+
+    @property
+    @override
+    def is_exact(self) -> bool:
+        return is_every_part_exact(
+            **{"kernel.redraw": self.segment_proposal, "kernel.walk": self.random_walk}
+        )
+
+    @property
+    @override
+    def required_history(self) -> StateHistory:
+        return StateHistory(self.block_length + 1, store_density=True)
+
+    @override
+    def propose(
+        self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
+    ) -> tuple[ParticleBelief, Tensor]:
+        steps = len(belief.past) - 1
+        if steps < 1:
+            return belief, torch.full_like(belief.log_w, -torch.inf)
+        first = steps - min(self.block_length, steps - 1)
+        window = belief.window
+        old = PathSegment(window["states"][:, :, first - 1 :], belief.past[first:])
+        child = model.chart.add(belief.x, self.random_walk(model, belief, belief.x, draws))
+        block, log_g = self.segment_proposal(model, old, child, draws)
+        new = PathSegment(
+            concatenate_histories([old.states[:, :, :1], block, child.unsqueeze(2)]), old.records
+        )
+        log_like = measurement_log_density(model, new)
+        log_ratios = (
+            log_like
+            + transition_log_density(model, new)
+            - window["log_like"][:, :, first:]
+            - transition_log_density(model, old)
+        )
+        log_alpha = log_ratios[..., -1] if log_g is None else log_ratios.sum(-1) + log_g
+        new_window = {"states": new.states[:, :, 1:], "log_like": log_like}
+        if "noise" in window:
+            new_window["noise"] = driving_noise(model, new)
+        ends = {
+            name: concatenate_histories([window[name][:, :, : -a.shape[2]], a])
+            for name, a in new_window.items()
+        }
+        return belief._replace(x=child, window=window | ends), log_alpha

@@ -1,1 +1,0 @@
-"""Polymerised resampling: partition, allocation and placement."""

@@ -1,0 +1,1 @@
+"""Filters of the papers that this project reproduces."""

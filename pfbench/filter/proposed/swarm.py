@@ -1,0 +1,357 @@
+"""Particle swarm proposal: move particles towards the measurement, then weight.
+
+A swarm stores the best position of each particle and of all, and a velocity. Gaussian
+attraction [Krohling 2004] gives the swarm-optimised particle filter (PSO-PF). Inertia, chaotic
+perturbation and escape from the worst positions are those of [Tian et al., "Improved adaptive
+particle filter for integrated navigation system"].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+
+import torch
+from scipy.special import chdtri
+from torch import Tensor
+from typing_extensions import override
+
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief, normalise_log_weights
+from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
+from pfbench.filter.particle.proposals import Proposal, ProposalSample, draw_noise
+from pfbench.filter.particle.weight_update import deactivate_invalid_particles
+from pfbench.filter.proposed.swarm_coordinates import (
+    Fitness,
+    ObservedComponents,
+    PosteriorFitness,
+    SwarmCoordinates,
+    SwarmFrame,
+)
+from pfbench.filter.proposed.swarm_motion import (
+    ChaoticPerturbation,
+    InertiaVelocity,
+    PriorStart,
+    SwarmStart,
+    SwarmState,
+    VelocityUpdate,
+    iterate_logistic,
+    logistic_map,
+    match_memory_layout,
+    safe_seeds,
+    select_particle,
+    select_swarm_by_run,
+)
+from pfbench.filter.proposed.swarm_weighting import MixtureWeighting, SwarmWeighting
+from pfbench.model.base import StateSpaceModel
+
+# --------------------------------------------------------------------------------------------------
+# Velocity and position limits, and the stopping rule of a particle swarm.
+
+
+@dataclass(frozen=True)
+class SwarmLimits:
+    """Limits of velocity and position, in scales of each coordinate [ours].
+
+    The paper only names v_max. The scales do not come from the moving swarm, since its contraction
+    and expansion would feed back.
+
+    Attributes:
+        scale_by_prior: The scale is the standard deviation of the initial particles, the paper's
+            recorded interval. False takes the predicted particles.
+        max_velocity_sd: v_max over six scales.
+        max_distance_sd: Largest distance from the predicted mean in standard deviations of the
+            predicted particles. None sets no limit.
+
+    Raises:
+        ValueError: If a limit is not positive.
+    """
+
+    scale_by_prior: bool = False
+    max_velocity_sd: float = 0.5
+    max_distance_sd: float | None = 3.0
+
+    def __post_init__(self) -> None:
+        if not self.max_velocity_sd > 0.0 or (
+            self.max_distance_sd is not None and not self.max_distance_sd > 0.0
+        ):
+            raise ValueError(
+                "proposal.limits must be positive, got "
+                f"max_velocity_sd={self.max_velocity_sd}, max_distance_sd={self.max_distance_sd}. "
+                "Use max_distance_sd=null for no limit of position."
+            )
+
+    def clamp_velocity(self, v: Tensor, scale: Tensor) -> Tensor:
+        """Clamp velocities to their limits.
+
+        Args:
+            v: Velocities, [R, N, k].
+            scale: Scale of each coordinate, [R, 1, k].
+
+        Returns:
+            Velocities, [R, N, k].
+        """
+        limit = 6.0 * self.max_velocity_sd * scale
+        return torch.clamp(v, -limit, limit)
+
+    def clamp_position(self, q: Tensor, sd: Tensor) -> Tensor:
+        """Clamp positions to their limits.
+
+        Args:
+            q: Positions, [R, N, k].
+            sd: Standard deviations of the predicted particles, [R, 1, k].
+
+        Returns:
+            Positions, [R, N, k].
+        """
+        if self.max_distance_sd is None:
+            return q
+        limit = self.max_distance_sd * sd
+        return torch.clamp(q, -limit, limit)
+
+
+@dataclass(frozen=True)
+class ChiSquareStopping:
+    """Stop a run when its best particle fits the measurement well enough [ours].
+
+    The distance -2 ln p(y | x) + 2 ln p(y_hat | x) must be at most this chi-square quantile. The
+    degrees of freedom are the observed components: 5.35 for six and the median. The paper does not
+    specify its epsilon.
+
+    Attributes:
+        quantile: Probability in (0, 1).
+
+    Raises:
+        ValueError: If the quantile is outside (0, 1).
+    """
+
+    quantile: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.quantile < 1.0:
+            raise ValueError(
+                f"proposal.stopping.quantile must be in (0, 1), got {self.quantile}. "
+                "Use 0.5 for the median."
+            )
+
+    def __call__(self, model: StateSpaceModel, best: Tensor, record: Record) -> Tensor:
+        """Compute the mask of the runs that stop.
+
+        Args:
+            model: State-space model of the step.
+            best: Best state of each run, [R, 1, D].
+            record: Record of the step.
+
+        Returns:
+            Mask, [R].
+        """
+        y_hat: Tensor = model.observation(best, record.u).mean[:, 0]
+        observed_mask = ~torch.isnan(record.y)
+        nearest = model.log_likelihood(torch.where(observed_mask, y_hat, torch.nan), best, record.u)
+        distance = 2.0 * (nearest - model.log_likelihood(record.y, best, record.u))[:, 0]
+        limits = distance.new_tensor(_quantiles(self.quantile, observed_mask.shape[-1]))
+        return distance <= limits[observed_mask.sum(-1)]
+
+
+@cache
+def _quantiles(p: float, maximum: int) -> list[float]:
+    """Return chi-square quantiles for 0 to `maximum` degrees of freedom."""
+    return [0.0, *(float(chdtri(k, 1.0 - p)) for k in range(1, maximum + 1))]
+
+
+# --------------------------------------------------------------------------------------------------
+# Particle swarm proposal: move particles towards the measurement, then weight.
+
+
+@dataclass(frozen=True)
+class SwarmProposal(Proposal):
+    """Bootstrap prediction followed by particle swarm optimisation [Tian et al.].
+
+    Steps a to f of the paper. A run without measurement does not move. A run that satisfies
+    `stopping` moves no further. Chaotic sequences belong to slots, because resampled copies would
+    otherwise share a sequence [ours].
+
+    Attributes:
+        velocity: Velocity update.
+        perturbation: Chaotic perturbation, or None.
+        fitness: Objective of the swarm.
+        coordinates: Coordinates of the swarm.
+        limits: Limits of velocity and position.
+        stopping: Stopping rule before the last iteration, or None.
+        iterations: Maximum number of iterations.
+        swarm_start: Particles of the first step.
+        weighting: Weights of the final swarm.
+
+    Raises:
+        ValueError: If iterations is below 1, or limits by the initial particles are combined with
+            whitened coordinates.
+    """
+
+    velocity: VelocityUpdate = field(
+        default_factory=lambda: InertiaVelocity(escape_coefficient=0.12)
+    )
+    perturbation: ChaoticPerturbation | None = field(default_factory=ChaoticPerturbation)
+    fitness: Fitness = field(default_factory=PosteriorFitness)
+    coordinates: SwarmCoordinates = field(default_factory=lambda: ObservedComponents(whiten=True))
+    limits: SwarmLimits = field(default_factory=SwarmLimits)
+    stopping: ChiSquareStopping | None = None
+    iterations: int = 5
+    swarm_start: SwarmStart = field(default_factory=PriorStart)
+    weighting: SwarmWeighting = field(default_factory=MixtureWeighting)
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1:
+            raise ValueError(
+                f"proposal.iterations must be at least 1, got {self.iterations}. Set 1 or more."
+            )
+        if self.limits.scale_by_prior and self.coordinates.whiten:
+            raise ValueError(
+                "proposal.limits.scale_by_prior must be false in whitened coordinates, got true. "
+                "Set limits.scale_by_prior or coordinates.whiten to false."
+            )
+
+    @property
+    @override
+    def is_exact(self) -> bool:
+        return is_every_part_exact(
+            **{"proposal.start": self.swarm_start, "proposal.weights": self.weighting}
+        )
+
+    @property
+    @override
+    def has_bounded_weights(self) -> bool:
+        return bool(has_bounded_weights(self.weighting))
+
+    @override
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
+    ) -> ProposalSample:
+        parents, memory = self._start_step(model, belief, draws)
+        w = draw_noise(model, parents.shape[1], draws)
+        x, log_w = deactivate_invalid_particles(
+            model.propagate(parents, record.u, w), belief.log_w, parents
+        )
+        frame = self.coordinates(model, x, normalise_log_weights(log_w), record.u)
+        swarm, iterations = self.optimise(
+            model, frame, torch.isfinite(log_w), memory, record, draws
+        )
+        log_likelihood = model.log_likelihood(record.y, frame.to_states(swarm.q), record.u)
+        q, log_ratio = self.weighting(frame, swarm.q, log_likelihood, log_w, draws)
+        if self.perturbation:
+            chaos = memory["swarm.chaos"].index_copy(-1, frame.components, swarm.chaos.unsqueeze(1))
+            memory = memory | {"swarm.chaos": chaos}
+        log_ratio = torch.where(torch.isfinite(log_w), log_ratio, -torch.inf)
+        x = frame.to_states(q)
+        return ProposalSample(x, log_ratio, memory, trace={"iterations": iterations})
+
+    def optimise(
+        self,
+        model: StateSpaceModel,
+        frame: SwarmFrame,
+        active_mask: Tensor,
+        memory: dict[str, Tensor],
+        record: Record,
+        draws: RandomStream,
+    ) -> tuple[SwarmState, Tensor]:
+        """Run the swarm optimisation.
+
+        Args:
+            model: State-space model.
+            frame: Coordinates of the predicted particles.
+            active_mask: Mask of active slots, [R, N].
+            memory: Initial scale [R, 1, d] and chaotic values [R, 1, N, d], as required.
+            record: Record of the step.
+            draws: Random numbers.
+
+        Returns:
+            Final swarm, and the number of iterations of each run [R].
+        """
+        penalty = self.fitness(frame)
+
+        def fitness(q: Tensor) -> Tensor:
+            value = model.log_likelihood(record.y, frame.to_states(q), record.u) + penalty(q)
+            return torch.where(active_mask & ~torch.isnan(value), value, -torch.inf)
+
+        swarm = initial = self._initialise_swarm(frame, fitness(frame.q), memory)
+        spread = frame.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt().unsqueeze(1)
+        by_prior = self.limits.scale_by_prior
+        scale = memory["swarm.scale"][..., frame.components] if by_prior else spread
+        spare = self._draw_spare_seeds(frame.q, draws)
+        active = observed_runs = ~torch.isnan(record.y).all(1)
+        iterations = torch.zeros_like(active, dtype=torch.long)
+        for i in range(1, self.iterations + 1):
+            if not active.is_cuda and not bool(active.any()):
+                break
+            v = self.velocity(swarm, active_mask, i / self.iterations, draws, f"swarm.velocity.{i}")
+            iterations = iterations + active
+            updated = self._move_swarm(swarm, v, fitness, scale, spread, spare)
+            swarm = select_swarm_by_run(active, updated, swarm) if self.stopping else updated
+            if self.stopping:
+                best = swarm.best_fitness.argmax(1)
+                best_state = select_particle(frame.to_states(swarm.best), best)
+                active = active & ~self.stopping(model, best_state, record)
+        return select_swarm_by_run(observed_runs, swarm, initial), iterations
+
+    def _draw_spare_seeds(self, q: Tensor, draws: RandomStream) -> Tensor | None:
+        """Draw seeds for chaotic sequences that restart, [R, N, k]."""
+        if not self.perturbation:
+            return None
+        return match_memory_layout(safe_seeds(draws.uniform("swarm.spare", *q.shape[1:])), q)
+
+    def _move_swarm(
+        self,
+        swarm: SwarmState,
+        v: Tensor,
+        fitness: Callable[[Tensor], Tensor],
+        scale: Tensor,
+        spread: Tensor,
+        spare: Tensor | None,
+    ) -> SwarmState:
+        """Move to x + v or, if its fitness is higher, x + v + Dx, and update the records."""
+        v = self.limits.clamp_velocity(v, scale)
+        q = self.limits.clamp_position(swarm.q + v, spread)
+        value, chaos = fitness(q), swarm.chaos
+        if self.perturbation and spare is not None:
+            chaos = logistic_map(chaos, spare)
+            step = self.perturbation(chaos, scale)
+            perturbed = self.limits.clamp_position(swarm.q + v + step, spread)
+            perturbed_value = fitness(perturbed)
+            q = torch.where((perturbed_value > value).unsqueeze(-1), perturbed, q)
+            value = torch.maximum(perturbed_value, value)
+        better, worse = value > swarm.best_fitness, value < swarm.worst_fitness
+        best = torch.where(better.unsqueeze(-1), q, swarm.best)
+        worst = torch.where(worse.unsqueeze(-1), q, swarm.worst)
+        best_fitness = torch.maximum(value, swarm.best_fitness)
+        worst_fitness = torch.minimum(value, swarm.worst_fitness)
+        return SwarmState(q, v, value, best, best_fitness, worst, worst_fitness, chaos)
+
+    def _initialise_swarm(
+        self, frame: SwarmFrame, fitness: Tensor, memory: dict[str, Tensor]
+    ) -> SwarmState:
+        """Return the swarm before its first iteration, with stored chaotic values only."""
+        q = frame.q
+        chaos = (
+            match_memory_layout(memory["swarm.chaos"][:, 0, :, frame.components], q)
+            if self.perturbation
+            else q.new_zeros(len(q), 1, 1)
+        )
+        return SwarmState(q, torch.zeros_like(q), fitness, q, fitness, q, fitness, chaos)
+
+    def _start_step(
+        self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Return parents [R, N, D] and memory, which the first step initialises."""
+        if "swarm.scale" in belief.memory:
+            return belief.x, belief.memory
+        chart = model.chart
+        z = iterate_logistic(draws.uniform("swarm.chaos", belief.x.shape[1], chart.dimension))
+        w = normalise_log_weights(belief.log_w)
+        c = chart.subtract(belief.x, chart.mean(belief.x, w).unsqueeze(1))
+        memory = belief.memory | {
+            "swarm.scale": (w.unsqueeze(-1) * c * c).sum(1, keepdim=True).sqrt()
+        }
+        if self.perturbation:
+            memory = memory | {"swarm.chaos": z.unsqueeze(1)}
+        return self.swarm_start(model, belief, z), memory

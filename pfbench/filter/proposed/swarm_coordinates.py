@@ -1,0 +1,185 @@
+"""Coordinates and objectives of a particle swarm."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from pfbench.core.linear_algebra import factor
+from pfbench.filter.linearisation import derivative
+from pfbench.filter.whitening import compute_half_square, fill_missing, whiten
+from pfbench.model.base import StateSpaceModel
+
+
+class SwarmFrame(NamedTuple):
+    """Coordinates of a swarm: chart components about the mean, or linear in them.
+
+    Attributes:
+        q: Predicted particles, [R, N, k].
+        covariance: Covariance of the predicted particles, [R, k, k].
+        components: Indices of the chart components, [k].
+        to_states: Map of coordinates q [R, N, k] to states [R, N, D].
+    """
+
+    q: Tensor
+    covariance: Tensor
+    components: Tensor
+    to_states: Callable[[Tensor], Tensor]
+
+
+class SwarmCoordinates(Protocol):
+    """Coordinates in which a swarm moves."""
+
+    @property
+    def whiten(self) -> bool:
+        """True if the coordinates are whitened."""
+
+    def __call__(self, model: StateSpaceModel, x: Tensor, w: Tensor, u: Any) -> SwarmFrame:
+        """Compute the coordinates of predicted particles.
+
+        Args:
+            model: State-space model of the step.
+            x: Predicted particles, [R, N, D].
+            w: Weights, [R, N].
+            u: Inputs of the step.
+
+        Returns:
+            Coordinates, and their map to states.
+        """
+
+
+@dataclass(frozen=True)
+class AllComponents(SwarmCoordinates):
+    """All components of the chart, as in the paper, including unobserved ones."""
+
+    whiten = False
+
+    @override
+    def __call__(self, model: StateSpaceModel, x: Tensor, w: Tensor, u: Any) -> SwarmFrame:
+        chart = model.chart
+        mean = chart.mean(x, w).unsqueeze(1)
+        c = chart.subtract(x, mean)
+        index = torch.arange(c.shape[-1], device=c.device)
+        return SwarmFrame(c, (w.unsqueeze(-1) * c).mT @ c, index, lambda q: chart.add(mean, q))
+
+
+@dataclass(frozen=True)
+class ObservedComponents(SwarmCoordinates):
+    """Components o that the measurement depends on. The others may follow [ours].
+
+    Attributes:
+        regress_unobserved: The others move by their regression S_uo S_oo^-1 (o' - o) on o, which
+            leaves their residual unchanged. False does not move them.
+        whiten: Use a = L^-1 o, L L' = S_oo, with the same standard deviation in all directions.
+    """
+
+    regress_unobserved: bool = True
+    whiten: bool = False
+
+    @override
+    def __call__(self, model: StateSpaceModel, x: Tensor, w: Tensor, u: Any) -> SwarmFrame:
+        chart = model.chart
+        mean = chart.mean(x, w).unsqueeze(1)
+        c = chart.subtract(x, mean)
+        index = observed_components(model, mean, u)
+        observed = c[..., index]
+        joint = (w.unsqueeze(-1) * observed).mT @ c  # [R, k, d]
+        covariance = joint[..., index]
+        root = bounded_root(covariance)
+        eye = torch.eye(len(index), dtype=c.dtype, device=c.device)
+        # (d c / d a)', [R, k, d]
+        direction = torch.linalg.solve_triangular(root, joint, upper=False)
+        if not self.regress_unobserved:
+            direction = direction.new_zeros(direction.shape)
+        has_spread = (observed.square().sum(1) > 0.0).unsqueeze(-1)
+        direction = direction.index_copy(-1, index, (root * has_spread).mT)
+        if self.whiten:
+            q, covariance = whiten(observed, root), eye.expand_as(covariance)
+        else:
+            q = observed
+            direction = torch.linalg.solve_triangular(root.mT, direction, upper=True).index_copy(
+                -1, index, eye.expand_as(covariance)
+            )
+        return SwarmFrame(
+            q, covariance, index, lambda new_q: chart.add(mean, c + (new_q - q) @ direction)
+        )
+
+
+class Fitness(Protocol):
+    """Fitness of swarm positions, as a term that is added to the log likelihood."""
+
+    def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
+        """Return the fitness term [R, N] as a function of coordinates q [R, N, k]."""
+
+
+@dataclass(frozen=True)
+class LikelihoodFitness(Fitness):
+    """No additional term: ln Y = ln p(y | x), the meaning of eq. 37.
+
+    As printed, eq. 37 is linear in the residual, without a maximum.
+    """
+
+    @override
+    def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
+        return lambda q: q.new_zeros(q.shape[:-1])
+
+
+@dataclass(frozen=True)
+class PosteriorFitness(Fitness):
+    """Log density of the normal distribution fitted to the predicted particles [ours].
+
+    The swarm then seeks a mode of the posterior.
+
+    Attributes:
+        covariance_shrinkage: Shrinkage of the covariance towards its diagonal, for few particles.
+
+    Raises:
+        ValueError: If the shrinkage is outside [0, 1].
+    """
+
+    covariance_shrinkage: float = 0.05
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.covariance_shrinkage <= 1.0:
+            raise ValueError(
+                "proposal.fitness.covariance_shrinkage must be from 0 to 1, got "
+                f"{self.covariance_shrinkage}. Use 0 for no shrinkage."
+            )
+
+    @override
+    def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
+        s = frame.covariance
+        diagonal = torch.diag_embed(s.diagonal(dim1=-2, dim2=-1))
+        root = bounded_root(s + self.covariance_shrinkage * (diagonal - s))
+        return lambda q: -compute_half_square(whiten(q, root))
+
+
+def observed_components(model: StateSpaceModel, mean: Tensor, u: Any) -> Tensor:
+    """Return the components on which mean or variance of the measurement depends.
+
+    Args:
+        model: State-space model.
+        mean: State at which the derivative is taken, [R, 1, D].
+        u: Inputs of the step.
+
+    Returns:
+        Indices of the components, [k].
+    """
+
+    def moments_of_y(at: Tensor, xi: Tensor) -> Tensor:
+        distribution: Any = model.observation(model.chart.add(at, xi), u)
+        return torch.cat([distribution.mean, distribution.variance], -1)
+
+    slope = derivative(moments_of_y, mean, model.chart.dimension).nan_to_num()  # [R, 1, 2 Dy, d]
+    return (slope != 0.0).flatten(0, 2).any(0).nonzero().squeeze(-1)
+
+
+def bounded_root(covariance: Tensor) -> Tensor:
+    """Compute a Cholesky factor [R, k, k]. Runs without one get NaN and are lost."""
+    root, ok = factor(covariance)
+    return torch.where(ok[:, None, None], fill_missing(root), torch.nan)

@@ -1,1 +1,0 @@
-"""Proposals with state reconstruction by Dynamic Matrix Control."""

@@ -1,1 +1,0 @@
-"""Particle swarm proposal and its parts."""

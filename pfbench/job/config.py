@@ -1,0 +1,449 @@
+"""Configuration of a job, composed from conf/ and experiments/ and resolved.
+
+This module imports Hydra only on use and never imports torch, so that the command line starts fast.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pfbench.files import limits
+from pfbench.job.trust import (
+    UntrustedConfigError,
+    check_configuration,
+    check_places,
+    check_study,
+    split_trust,
+)
+from pfbench.job.tuned_knobs import TUNED, check_tuned_seed, mark_foreign, select_knobs
+from pfbench.results.paper_block import (
+    check_paper_blocks,
+    conf_dir,
+    experiments_dir,
+    remove_nested_blocks,
+)
+from pfbench.results.store import list_not_finite
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+
+CHOICES = ("scenario", "noise", "filter", "model")  # groups that name a job
+
+_HYDRA_STATE = threading.RLock()  # Hydra has one state for all threads of a process
+
+
+@dataclass(frozen=True)
+class JobConfig:
+    """Resolved configuration of one job.
+
+    Attributes:
+        values: Nested plain dictionary, lists and numbers.
+        choices: Name of the file chosen in each group, for instance `{"filter": "sir", ...}`.
+        uses_shared_particles: Whether `filter.particles` refers to the key `particles`. Only then
+            may a budget replace the number.
+        trusted: Packages that `_target_` may name besides pfbench.
+
+    Raises:
+        ValueError: If a group is missing or names no class, one of its numbers is not finite, or a
+            value names what is not trusted.
+    """
+
+    values: dict[str, Any]
+    choices: dict[str, str]
+    uses_shared_particles: bool = False
+    trusted: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        missing = [group for group in CHOICES if group not in self.choices]
+        if missing:
+            raise ValueError(
+                f"choices must name {', '.join(CHOICES)}, got {sorted(self.choices)}. Add "
+                f"{', '.join(missing)}, or build the configuration with job.compose([...])."
+            )
+        check_groups(self.values, CHOICES)
+        check_configuration(self.values, self.trusted)
+        check_simulated_model(self.values, self.choices)
+        check_paper_blocks(self.values)
+        check_places(self.values)
+        if "study" in self.values:
+            self.values["study"] = check_study(self.values["study"])
+
+
+def compose(overrides: Sequence[str] = ()) -> JobConfig:
+    """Compose a configuration from the files of conf/ and experiments/.
+
+    Works within and without a Hydra application. Hydra's global state is the same afterwards.
+
+    Args:
+        overrides: Hydra overrides such as `"scenario=flight_300s"` or `"+experiment=quickstart"`,
+            and `"trust=[mylab]"` for packages whose classes the configuration may name.
+
+    Returns:
+        The configuration of one job.
+
+    Raises:
+        ValueError: If a file sets a key that only the command line may set, or a value names what
+            is not trusted.
+    """
+    words, trusted = split_trust(overrides)
+    with _preserved_hydra_state():
+        composed = compose_tree(words, trusted)
+        choices = {str(k): str(v) for k, v in composed.hydra.runtime.choices.items()}
+        _move_hydra_node(composed)
+        return resolve_config(composed, choices, trusted)
+
+
+def compose_tree(words: Sequence[str], trusted: Sequence[str] | None = None) -> DictConfig:
+    """Compose a configuration with Hydra's own settings, checked by the loader.
+
+    Args:
+        words: Hydra overrides.
+        trusted: Packages that the search path may name. Default: those of PFBENCH_TRUST.
+
+    Returns:
+        The configuration, not resolved, with the node `hydra`.
+
+    Raises:
+        UntrustedConfigError: If a file sets what only the command line may set.
+    """
+    from hydra import version
+    from hydra._internal.hydra import Hydra
+    from hydra._internal.utils import create_config_search_path
+    from hydra.types import RunMode
+
+    from pfbench.job.shared_loader import SharedLoader
+
+    register_experiments()
+    with _preserved_hydra_state():
+        version.setbase("1.3")
+        loader = SharedLoader(create_config_search_path(str(conf_dir())), trusted)
+        return Hydra("app", loader).compose_config(
+            "config", list(words), RunMode.RUN, from_shell=False
+        )
+
+
+def resolve_config(
+    config: JobConfig | DictConfig | Mapping[str, Any],
+    choices: Mapping[str, str] | None = None,
+    trusted: Sequence[str] = (),
+) -> JobConfig:
+    """Resolve all interpolations of a configuration.
+
+    Args:
+        config: Configuration of a job. One that is resolved already is returned unchanged.
+        choices: Names of the chosen scenario, noise, filter and model. Default: `config.choices`.
+        trusted: Packages that `_target_` may name besides pfbench and those of PFBENCH_TRUST.
+
+    Returns:
+        The resolved configuration.
+
+    Raises:
+        ValueError: If the choices do not name scenario, noise, filter and model, a group is not
+            valid, a value refers to itself, or one names what is not trusted.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import InterpolationKeyError
+
+    if isinstance(config, JobConfig):
+        return config
+    tree = config if OmegaConf.is_config(config) else OmegaConf.create(dict(config))
+    is_shared = "particles" in tree["filter"] and OmegaConf.is_interpolation(
+        tree["filter"], "particles"
+    )
+    names = {str(group): str(name) for group, name in (choices or {}).items()}
+    _, packages = split_trust([f"trust=[{','.join(trusted)}]"])
+    select_knobs(tree, names, trusted)
+    try:
+        values = remove_nested_blocks(resolve_values(tree))
+    except InterpolationKeyError as error:
+        if not str(error.full_key).startswith("model."):
+            raise
+        from pfbench.job.model_fit import explain_error
+
+        explained = explain_error(error, tree, trusted, names.get("scenario", ""))
+        if explained is error:
+            raise
+        raise explained from error
+    knobs = values.pop(TUNED, {})  # the filter has them
+    check_tuned_seed(values, names.get("scenario"), knobs)
+    mark_foreign(values, names, knobs.get("world", {}), trusted)
+    return JobConfig(values, names, is_shared, packages)
+
+
+def list_groups() -> dict[str, list[Path]]:
+    """List the files of each configuration group and of the group `experiment`."""
+    folders = [path for path in sorted(conf_dir().iterdir()) if any(path.glob("*.yaml"))]
+    groups = {folder.name: sorted(folder.glob("*.yaml")) for folder in folders}
+    return groups | {"experiment": sorted(experiments_dir().glob("*.yaml"))}
+
+
+class _ExperimentNodes(dict[str, Any]):
+    """Experiments in Hydra's store by file name, loaded when Hydra asks for one.
+
+    Loading all of them takes as long as composing. Hydra copies the store for each composition and the
+    chosen node once more.
+    """
+
+    loaded: ClassVar[dict[tuple[Path, int], Any]] = {}  # by path and time of change
+
+    def __getitem__(self, name: str) -> Any:
+        from hydra.core.config_store import ConfigNode
+
+        path: Path = super().__getitem__(name)
+        version = path, path.stat().st_mtime_ns
+        if version not in self.loaded:
+            node = _load_experiment(path)
+            self.loaded[version] = ConfigNode(
+                name=name, node=node, group="experiment", package="_global_",
+                provider="pfbench.experiments",
+            )  # fmt: skip
+        return self.loaded[version]
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> _ExperimentNodes:
+        return self
+
+
+def register_experiments() -> None:
+    """Register experiments/NAME.yaml with Hydra as the group `experiment`; the folder lies outside conf/."""
+    from hydra.core.config_store import ConfigStore
+
+    paths = {path.name: path for path in experiments_dir().glob("*.yaml")}
+    ConfigStore.instance().repo["experiment"] = _ExperimentNodes(paths)
+
+
+def _load_experiment(path: Path) -> Any:
+    """Load an experiment, with the filters of named sets in its sweep."""
+    from omegaconf import OmegaConf
+
+    node = OmegaConf.load(path)
+    params = OmegaConf.select(node, "hydra.sweeper.params")
+    if params is not None and "filter" in params:
+        params["filter"] = expand_filter_names(str(params["filter"]))
+    return node
+
+
+def _move_hydra_node(composed: DictConfig) -> None:
+    """Move the node `hydra` to where an experiment may look up the choices, as Hydra does by a copy."""
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import OmegaConf, flag_override, open_dict
+
+    application: Any = HydraConfig.instance()
+    holder, node = OmegaConf.create(), composed._get_node("hydra")
+    with open_dict(composed):
+        del composed["hydra"]
+    with flag_override(holder, "no_deepcopy_set_nodes", True):
+        holder["hydra"] = node
+    holder.hydra._set_parent(composed)
+    OmegaConf.set_readonly(holder.hydra, True)
+    application.cfg = holder
+
+
+@contextmanager
+def _preserved_hydra_state() -> Iterator[None]:
+    """Clear Hydra's global state for one composition and restore it afterwards, in one thread at a time."""
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.core.hydra_config import HydraConfig
+
+    with _HYDRA_STATE:
+        application, job = GlobalHydra.instance(), HydraConfig.instance()
+        saved = application.hydra, job.cfg
+        application.clear()
+        try:
+            yield
+        finally:
+            GlobalHydra.instance().hydra, HydraConfig.instance().cfg = saved
+
+
+# --------------------------------------------------------------------------------------------------
+# Checks of the groups of a configuration that hold for all classes: a class, finite numbers, no circles.
+
+_resolved: ContextVar[list[int] | None] = ContextVar("resolved", default=None)
+_CIRCLES = ("Recursive interpolation", "Interpolation to parent node")  # messages of OmegaConf
+
+
+def resolve_values(tree: DictConfig | Mapping[str, Any]) -> dict[str, Any]:
+    """Resolve all interpolations of a configuration.
+
+    Args:
+        tree: Configuration.
+
+    Returns:
+        Nested plain dictionary.
+
+    Raises:
+        ValueError: If a value refers to itself.
+        UntrustedConfigError: If values that refer to others become too many or too long.
+    """
+    from omegaconf import OmegaConf
+    from omegaconf.errors import InterpolationResolutionError
+
+    try:
+        with _bounded_resolution():
+            values = OmegaConf.to_container(tree, resolve=True)
+    except InterpolationResolutionError as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, UntrustedConfigError):
+            cause = cause.__cause__ or cause.__context__
+        if cause is not None:
+            raise cause from None
+        text, key = str(error), error.full_key
+        if not key or not text.startswith(_CIRCLES):
+            raise
+        parent: Any = OmegaConf.to_container(error.parent_node, resolve=False)
+        value = parent[error.key]
+        raise ValueError(
+            f"{key} must not refer to itself, got {value}, which leads back to {key}. "
+            f"Set {key} to a value."
+        ) from error
+    assert isinstance(values, dict)
+    return {str(key): value for key, value in values.items()}
+
+
+@contextmanager
+def _bounded_resolution() -> Iterator[None]:
+    """Limit what OmegaConf resolves: it resolves a value again each time that another one refers to it."""
+    _count_resolved_values()
+    token = _resolved.set([0, 0, 0])
+    try:
+        yield
+    finally:
+        _resolved.reset(token)
+
+
+@cache
+def _count_resolved_values() -> None:
+    """Let OmegaConf count the values and characters that it resolves."""
+    from omegaconf.base import Container
+
+    by_omegaconf = Container.resolve_parse_tree
+
+    def resolve(self: Container, *args: Any, **options: Any) -> Any:
+        counts = _resolved.get()
+        if counts is None:
+            return by_omegaconf(self, *args, **options)
+        counts[0] += 1
+        value = by_omegaconf(self, *args, **options)
+        _add_size(getattr(value, "_content", value), counts)
+        return value
+
+    Container.resolve_parse_tree = resolve  # type: ignore[method-assign]
+
+
+def _add_size(value: Any, counts: list[int]) -> None:
+    """Add the size of a value to the counts of references, values and characters."""
+    counts[1] += 1
+    counts[2] += len(value) if isinstance(value, str) else 0
+    most = (limits.RESOLVED_REFERENCES, limits.RESOLVED_VALUES, limits.RESOLVED_TEXT)
+    if any(count > limit for count, limit in zip(counts, most, strict=True)):
+        raise UntrustedConfigError(
+            "values that refer to others must have at most {} references, {} values and {} characters "
+            "in all, got more. Write fewer references.".format(*most)
+        )
+    children = (
+        value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    )
+    for child in children:
+        _add_size(getattr(child, "_content", None) or getattr(child, "_val", None), counts)
+
+
+def check_groups(values: Mapping[str, Any], groups: Sequence[str]) -> None:
+    """Check that each group names a class and has finite numbers only.
+
+    Args:
+        values: Resolved configuration.
+        groups: Groups to check. One that is missing is skipped.
+
+    Raises:
+        ValueError: If a group is not a dictionary with `_target_`, or a number is not finite.
+    """
+    for group in groups:
+        node = values.get(group, {"_target_": None})
+        if not isinstance(node, Mapping) or "_target_" not in node:
+            is_text = isinstance(node, Mapping) and all(
+                value is None for value in node.values()
+            )  # Hydra's reading
+            content = ", ".join(map(str, node)) if is_text else repr(node)
+            raise ValueError(
+                f"{group} must be keys and values with the key _target_, got {content:.80}. Write "
+                f"_target_: CLASS into its file, or choose another one: pfbench list {group}"
+            )
+        for key, value in list_not_finite(node, group):
+            raise ValueError(f"{key} must be finite, got {value}. Set {key} to a number.")
+
+
+def check_simulated_model(values: Mapping[str, Any], choices: Mapping[str, str]) -> None:
+    """Check that a shipped world that is simulated from its model has this model, since it is named by it.
+
+    Args:
+        values: Resolved configuration.
+        choices: Names of the chosen files by group.
+
+    Raises:
+        ValueError: If another model is chosen. The world would be another one under the same name.
+    """
+    scenario, model = choices.get("scenario", ""), choices.get("model", "")
+    if is_simulated_from(values.get("scenario"), scenario) and model != scenario:
+        raise ValueError(
+            f"model must be {scenario} for scenario={scenario}, which is simulated from it, got {model}. "
+            f"Choose scenario={model} if it exists (pfbench list scenario), or write a scenario of your own with "
+            "_target_: pfbench.scenario.ModelSimulation."
+        )
+
+
+def is_simulated_from(scenario: Any, name: str) -> bool:
+    """Return whether a scenario is a shipped one that is simulated from the model of the same name.
+
+    Args:
+        scenario: Node of the scenario.
+        name: Name of its file.
+    """
+    target = scenario.get("_target_") if isinstance(scenario, Mapping) else None
+    is_shipped = (conf_dir() / "scenario" / f"{name}.yaml").is_file()
+    return target == "pfbench.scenario.ModelSimulation" and is_shipped
+
+
+# --------------------------------------------------------------------------------------------------
+# Named sets of filters, which a sweep may name in place of a list.
+
+SUFFIX = "tuned"  # end of the names of the tuned filters
+TUNED_METHODS = ("ekf_scaled", "gate", "huber", "student")
+FILTER_SETS = {"tuned_baselines": tuple(f"{method}_{SUFFIX}" for method in TUNED_METHODS)}
+
+
+def expand_filter_names(names: str) -> str:
+    """Replace named sets in a list of filters.
+
+    Args:
+        names: Names of filters and sets, separated by commas.
+
+    Returns:
+        Names of filters, each once.
+    """
+    members = [FILTER_SETS.get(name.strip(), (name,)) for name in names.split(",")]
+    return ",".join(dict.fromkeys(name for several in members for name in several))
+
+
+def expand_filter_sets(words: Sequence[str]) -> list[str]:
+    """Replace named sets in the overrides of a sweep.
+
+    Args:
+        words: Overrides and flags.
+
+    Returns:
+        The words, `filter=tuned_baselines` as the list of its filters.
+    """
+    return [
+        f"filter={expand_filter_names(word.removeprefix('filter='))}"
+        if re.match(r"filter=[\w,]+$", word) and set(word[7:].split(",")) & set(FILTER_SETS)
+        else word
+        for word in words
+    ]

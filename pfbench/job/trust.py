@@ -1,0 +1,410 @@
+"""Trust: what a configuration may name, and which keys a file may not set.
+
+A scenario or an experiment may come from a stranger. Before anything is built from a configuration,
+all of it is checked: `_target_` may name public classes of pfbench and names of packages that the
+user trusts, and folders and Hydra's own settings come from the command line or from pfbench.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib.util
+import os
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from functools import cache
+from importlib import import_module
+from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
+from typing import Any
+
+import pfbench
+from pfbench.files import limits
+from pfbench.results.paper_block import conf_dir, experiments_dir
+
+ENVIRONMENT = "PFBENCH_TRUST"  # trusted packages, for the processes of a sweep
+FOLDERS = ("nav", "model", "noise", "scenario", "filter", "learn")
+# public functions that build an object; the other ones run filters, read logs or write files
+BUILDERS = {
+    "nav": ("accelerate", "climb", "cruise", "turn"),
+    "model": ("linear_walk", "local_level"),
+}
+# packages that are too large to be trusted as a whole: each can read, write or run files
+BROAD = (
+    "__main__", "cloudpickle", "fsspec", "hydra", "hydra_plugins", "jinja2", "joblib", "matplotlib", "numpy",
+    "omegaconf", "pandas", "pip", "pkg_resources", "pyro", "ray", "scipy", "seaborn", "setuptools", "sympy",
+    "torch", "triton", "yaml",
+)  # fmt: skip
+HARMLESS = ("pyro.distributions", "torch.distributions", "torch.nn")  # parts of them
+HYDRA_KEYS = ("_target_", "_args_", "_partial_", "_convert_", "_recursive_")
+NAME = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)+")
+STUDY = re.compile(r"[A-Za-z0-9_][\w.+-]{0,99}", re.ASCII)
+_local: set[str] = set()  # trusted packages, which may lie in the current folder
+
+
+class UntrustedConfigError(ValueError):
+    """A configuration names what it may not name, or sets what it may not set."""
+
+
+def split_trust(words: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
+    """Take the key `trust` out of overrides.
+
+    Args:
+        words: Overrides, for instance `["scenario=mine", "trust=[mylab]"]`.
+
+    Returns:
+        The other overrides, and the trusted packages with those of the environment variable.
+
+    Raises:
+        UntrustedConfigError: If an entry is not a name, or is too large to be trusted.
+    """
+    is_trust = [word.lstrip("+").startswith("trust=") for word in words]
+    others = [word for word, is_key in zip(words, is_trust, strict=True) if not is_key]
+    texts = [word.partition("=")[2] for word, is_key in zip(words, is_trust, strict=True) if is_key]
+    return others, _parse_packages([*texts, os.environ.get(ENVIRONMENT, "")])
+
+
+class _CurrentFolder:
+    """Finder of trusted packages in the current folder, where nothing else is imported from."""
+
+    @staticmethod
+    def find_spec(name: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        """Find a top-level package that the user trusts."""
+        is_trusted = path is None and name in {full.partition(".")[0] for full in _local}
+        return PathFinder.find_spec(name, [os.getcwd()]) if is_trusted else None
+
+
+def trusted_packages() -> tuple[str, ...]:
+    """Return the packages that the environment variable names."""
+    return _parse_packages([os.environ.get(ENVIRONMENT, "")])
+
+
+def _parse_packages(texts: Sequence[str]) -> tuple[str, ...]:
+    """Parse lists of packages such as `[mylab,other.filters]`."""
+    names = [name.strip(" '\"") for text in texts for name in text.strip(" []").split(",")]
+    packages = tuple(dict.fromkeys(name for name in names if name))
+    for name in packages:
+        if not re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", name):
+            raise UntrustedConfigError(
+                f"trust must be a list of package names, got {name!r}. Use trust=[mylab]."
+            )
+        is_broad = name.split(".")[0] in (*BROAD, "pfbench", *sys.stdlib_module_names)
+        if is_broad and name not in HARMLESS:
+            raise UntrustedConfigError(
+                f"trust must not be a general library, got {name!r}. It can run or delete files. "
+                "Name the package that defines your classes."
+            )
+    _local.update(packages)
+    if packages and _CurrentFolder not in sys.meta_path:
+        sys.meta_path.append(_CurrentFolder)
+    return packages
+
+
+def check_configuration(values: Any, trusted: Sequence[str] = (), path: str = "") -> None:
+    """Check all names that instantiation would import, and that nothing is left to resolve.
+
+    Args:
+        values: Resolved configuration: dictionaries, lists and plain values.
+        trusted: Names of packages that the user trusts.
+        path: Key of `values`, for messages.
+
+    Raises:
+        UntrustedConfigError: If a name is not public or not trusted, or if a text still has an interpolation.
+    """
+    for key, node in _walk(values, path):
+        if isinstance(node, str) and "${" in node:
+            raise UntrustedConfigError(
+                f"{key} must be resolved, got {node!r}. Remove the escaped interpolation."
+            )
+        if isinstance(node, Mapping):
+            _check_node(key, node, trusted)
+
+
+def check_study(name: Any) -> str:
+    """Check the name of a study, which is also the name of its folder.
+
+    Args:
+        name: Value of the key `study`. YAML reads 2024 as a number.
+
+    Returns:
+        The name as a text.
+
+    Raises:
+        UntrustedConfigError: If it is not a plain name.
+    """
+    name = str(name) if isinstance(name, int | float) else name
+    if not isinstance(name, str) or not STUDY.fullmatch(name) or set(name) == {"."}:
+        raise UntrustedConfigError(
+            f"study must be a name of letters, digits, '_', '-', '+' and '.', got {name!r}. "
+            "Use results_dir=... and reports_dir=... for other folders."
+        )
+    return name
+
+
+def check_places(values: Mapping[str, Any]) -> None:
+    """Check the folders of results and reports: Hydra makes them before a job begins.
+
+    Args:
+        values: Resolved configuration.
+
+    Raises:
+        UntrustedConfigError: If one is not a text, or is empty.
+    """
+    for key in ("results_dir", "reports_dir"):
+        if not isinstance(values.get(key, key), str) or values.get(key) == "":
+            raise UntrustedConfigError(
+                f"{key} must be a folder, got {values[key]!r}. Set {key}={key.partition('_')[0]}, or {key}=./5 for a "
+                "name that YAML reads as a number."
+            )
+
+
+def _walk(node: Any, path: str, depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """Yield all nodes of a configuration with their keys."""
+    if depth > limits.CONFIG_DEPTH:
+        raise UntrustedConfigError(
+            f"{path} must have at most {limits.CONFIG_DEPTH} levels, got more. Simplify the configuration."
+        )
+    yield path, node
+    if isinstance(node, Mapping):
+        for key, value in node.items():
+            yield from _walk(value, f"{path}.{key}" if path else str(key), depth + 1)
+    elif isinstance(node, list | tuple):
+        for index, value in enumerate(node):
+            yield from _walk(value, f"{path}[{index}]", depth + 1)
+
+
+def _check_node(key: str, node: Mapping[Any, Any], trusted: Sequence[str]) -> None:
+    """Check one dictionary of a configuration."""
+    special = [name for name in node if isinstance(name, str) and re.fullmatch(r"_.*_", name)]
+    unknown = [name for name in special if name not in HYDRA_KEYS]
+    if unknown:
+        raise UntrustedConfigError(
+            f"{key} must not have the key {unknown[0]}. Keys of instantiation are "
+            f"{', '.join(HYDRA_KEYS)}."
+        )
+    if "_target_" not in node:
+        return
+    target = node["_target_"]
+    requirement = (
+        f"{key}{'.' if key else ''}_target_ must be a public class of pfbench or of a trusted "
+        f"package, got {target!r}. "
+    )
+    if not isinstance(target, str) or not NAME.fullmatch(target):
+        raise UntrustedConfigError(requirement + "Write it as pfbench.FOLDER.Class.")
+    if target.startswith("pfbench."):
+        if "_args_" in node:
+            raise UntrustedConfigError(
+                f"{key} must name the arguments of {target}, got _args_. Write them as keys."
+            )
+        if not _is_public(target):
+            remedy = _suggest_public(target) + "See pfbench.FOLDER.__all__ for the names."
+            raise UntrustedConfigError(requirement + remedy)
+    elif not any(target.startswith(f"{package}.") for package in trusted):
+        package = target.split(".")[0]
+        is_library = package in BROAD or package in sys.stdlib_module_names
+        remedy = (
+            "Remove this node."
+            if is_library
+            else f"If you trust this package, add trust=[{package}] on the command line."
+        )
+        raise UntrustedConfigError(requirement + "Nothing was run. " + remedy)
+    elif not _is_defined_in(target, trusted):
+        raise UntrustedConfigError(requirement + "The package imports this name from elsewhere.")
+
+
+@cache
+def _is_public(target: str) -> bool:
+    """Return whether a name of pfbench is a class or a builder that a folder exports.
+
+    Classes are recognised by their capital, since the check must not import torch.
+    """
+    parts = target.split(".")
+    if len(parts) != 3 or parts[1] not in FOLDERS:
+        return False
+    folder, name = parts[1:]
+    door = import_module(f"pfbench.{folder}")
+    return name in door.__all__ and (name[0].isupper() or name in BUILDERS.get(folder, ()))
+
+
+def _suggest_public(target: str) -> str:
+    """Return a sentence with the public names that are similar to a name, or an empty text."""
+    names = [
+        f"pfbench.{folder}.{name}"
+        for folder in FOLDERS
+        for name in import_module(f"pfbench.{folder}").__all__
+    ]
+    similar = [name for name in get_close_matches(target, names, 1, 0.8) if _is_public(name)]
+    return f"Similar: {', '.join(similar)}. " if similar else ""
+
+
+def _is_defined_in(target: str, trusted: Sequence[str]) -> bool:
+    """Return whether a name is defined by a trusted package, not imported there from another one."""
+    parts = target.split(".")
+    value: Any = None
+    if importlib.util.find_spec(parts[0]) is None:
+        raise UntrustedConfigError(
+            f"{target} must be importable, but the package {parts[0]} is not installed. Install it, or "
+            "set PYTHONPATH to the folder that contains it."
+        )
+    for count in range(len(parts) - 1, 0, -1):
+        name = ".".join(parts[:count])
+        if not any(name == package or name.startswith(f"{package}.") for package in trusted):
+            return False
+        try:
+            value = import_module(name)
+        except ModuleNotFoundError as error:
+            if error.name is None or not (name == error.name or name.startswith(f"{error.name}.")):
+                raise
+            continue
+        for attribute in parts[count:]:
+            value = getattr(value, attribute)
+        break
+    module = str(getattr(value, "__module__", ""))
+    return any(module == package or module.startswith(f"{package}.") for package in trusted)
+
+
+# --------------------------------------------------------------------------------------------------
+# Digests of the source code of a user's classes, for the key of a job, and of that of pfbench.
+#
+# The code of pfbench is not part of a key: a report refuses results of several builds.
+
+PACKAGE = Path(pfbench.__file__).resolve().parent
+_COMPILED = (".pyc", ".so", ".pyd")
+_LIBRARIES = ("site-packages", "dist-packages")
+
+
+def hash_user_code(values: Any) -> dict[str, str]:
+    """Compute digests of the source files that the classes of a configuration consist of.
+
+    The files are those of the modules that `_target_` names, and of all modules that these import,
+    directly or through others. Installed libraries and pfbench are left out.
+
+    Args:
+        values: Resolved configuration.
+
+    Returns:
+        Hexadecimal digits by the name of the module. Empty if the configuration names no class of a user.
+    """
+    files: dict[str, bytes] = {}
+    for target in sorted(set(_user_targets(values))):
+        _collect(_module_of(target), files)
+    return {name: hashlib.sha256(source).hexdigest()[:16] for name, source in sorted(files.items())}
+
+
+@cache
+def hash_package() -> str:
+    """Compute a digest of the sources of the installed pfbench.
+
+    It depends on the names and contents of the files only, not on times or compiled files. Configuration
+    files do not count: what a job takes from them is part of its key.
+
+    Returns:
+        Hexadecimal digits.
+    """
+    sha256 = hashlib.sha256()
+    configurations = {str(conf_dir()), str(experiments_dir())}  # inside of the package in a wheel
+    for folder, below, files in os.walk(PACKAGE):  # an order of its own for each file system
+        below[:] = sorted(
+            name
+            for name in below
+            if name != "__pycache__" and f"{folder}/{name}" not in configurations
+        )
+        for file in sorted(files):
+            if not file.endswith(_COMPILED):
+                with open(f"{folder}/{file}", "rb", buffering=0) as source:
+                    content = source.read()
+                name = f"{folder.removeprefix(str(PACKAGE))}/{file}"
+                sha256.update(f"{name} {len(content)};".encode() + content)
+    return sha256.hexdigest()[:12]
+
+
+def list_user_packages(values: Any, trusted: Sequence[str]) -> list[str]:
+    """List the trusted packages that define a class of a configuration.
+
+    Args:
+        values: Resolved configuration.
+        trusted: Packages that the user trusts.
+    """
+    targets = list(_user_targets(values))
+    return [name for name in trusted if any(t.startswith(f"{name}.") for t in targets)]
+
+
+def _user_targets(node: Any) -> Iterator[str]:
+    """Yield the names of classes that are defined by neither pfbench nor a general library."""
+    if isinstance(node, Mapping):
+        target = node.get("_target_")
+        if isinstance(target, str) and target.split(".")[0] not in ("pfbench", *BROAD):
+            yield target
+        for value in node.values():
+            yield from _user_targets(value)
+    elif isinstance(node, list | tuple):
+        for value in node:
+            yield from _user_targets(value)
+
+
+def _find_file(module: str) -> Path | None:
+    """Return the file of a module, or None if the module or its file does not exist."""
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, AttributeError, ValueError):  # a parent is missing, or is not a package
+        return None
+    origin = None if spec is None or not spec.has_location else spec.origin
+    return None if origin is None else Path(origin)
+
+
+def _module_of(target: str) -> str:
+    """Return the module of a class: the longest part of its name that is a module."""
+    parts = target.split(".")[:-1]
+    while len(parts) > 1 and _find_file(".".join(parts)) is None:
+        parts.pop()
+    return ".".join(parts)
+
+
+def _collect(module: str, files: dict[str, bytes]) -> None:
+    """Add the source of a module and of the modules of its package that it needs."""
+    file = _find_file(module)
+    if module in files or file is None:
+        return
+    files[module] = source = file.read_bytes()
+    parent = module.rpartition(".")[0]
+    if parent:
+        _collect(parent, files)  # Python runs the packages first
+    if file.suffix == ".py":
+        package = module if file.name == "__init__.py" else parent
+        for name in _imports(ast.parse(source), package):
+            if _is_beside(name.split(".")[0], module.split(".")[0]):
+                _collect(name, files)
+
+
+def _is_beside(name: str, module: str) -> bool:
+    """Return whether a top-level module is a user's own one or a helper in the same folder."""
+    if name == module:
+        return True
+    if name in sys.stdlib_module_names or name in ("pfbench", *BROAD):
+        return False
+    home = _find_home(module)
+    return home is not None and home == _find_home(name)
+
+
+def _find_home(name: str) -> Path | None:
+    """Return the folder of a top-level module, or None for an installed library."""
+    file = _find_file(name)
+    if file is None:
+        return None
+    home = (file.parent if file.name == "__init__.py" else file).parent
+    return None if home.name in _LIBRARIES else home
+
+
+def _imports(tree: ast.AST, package: str) -> Iterator[str]:
+    """Yield the names that a module imports. `from a import b` gives a and a.b, which may be a module."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".")
+            base = parts[: len(parts) - node.level + 1] if node.level else []
+            stem = ".".join([*base, *([node.module] if node.module else [])])
+            yield from (stem, *(f"{stem}.{alias.name}" for alias in node.names))

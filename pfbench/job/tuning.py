@@ -1,0 +1,621 @@
+"""Tuning of the knobs of filters: candidates, joint regimes, seeds that no study scores, and the file."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import yaml
+from torch import Tensor
+from typing_extensions import override
+
+from pfbench.core.record import Episode, Record
+from pfbench.files.command_start import start_work
+from pfbench.filter.belief import GaussianBelief
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.innovation import Innovation, NoiseAdaptation
+from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
+from pfbench.filter.robust.robust_update import RobustUpdate
+from pfbench.filter.robust.updates import ScaledNoise, scale_process_noise
+from pfbench.job.config import JobConfig, compose
+from pfbench.job.filter_pass import TimedFilterPass, pass_filter
+from pfbench.job.plan import JobPlan, build_plan, describe_state
+from pfbench.model.base import StateSpaceModel
+from pfbench.results.conditions import main_component_group
+from pfbench.results.paper_block import experiments_dir
+from pfbench.results.status import is_diverged
+from pfbench.results.store import DamagedResultError, read_metadata
+from pfbench.stats.error_measures import Array, Flags, mean_per_run, rmse_per_run
+
+# --------------------------------------------------------------------------------------------------
+# Search of the knobs of a filter: all candidates, several noise regimes, seeds that no study scores.
+
+SEED_SHIFT = 1000  # seed of a tuning minus seed of the study
+_RUNS_AT_ONCE = 400  # of all candidates and regimes in one pass, which bounds its memory
+TIE = 0.01  # relative difference of two scores that calibration decides
+OBJECTIVE = (
+    "mean over regimes of log(median RMSE / median RMSE of the EKF), smallest; within 1 % the candidate whose "
+    "NEES divided by its dimension is closest to 1"
+)
+
+
+class RegimeScore(NamedTuple):
+    """Score of a filter in a noise regime.
+
+    Attributes:
+        error: Median over runs of the RMSE of the main group; a lost run counts as infinite.
+        nees_ratio: Median over runs of the mean NEES of the main group, divided by its dimension.
+    """
+
+    error: float
+    nees_ratio: float
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A candidate with its scores.
+
+    Attributes:
+        values: Values by knob.
+        log_ratio: Mean over regimes of log(error / error of the EKF in the regime).
+        nees_ratio: Geometric mean over regimes of NEES divided by the dimension.
+        errors: Error by regime.
+    """
+
+    values: dict[str, float]
+    log_ratio: float
+    nees_ratio: float
+    errors: dict[str, float]
+
+
+@dataclass(frozen=True)
+class TuningResult:
+    """Result of the search for one filter.
+
+    Attributes:
+        method: Name of the filter.
+        choice: Candidate of the choice.
+        untuned: The filter as its file states it, without a factor on R.
+        candidates: All candidates.
+        seconds: Computing time of all candidates.
+    """
+
+    method: str
+    choice: Candidate
+    untuned: Candidate
+    candidates: tuple[Candidate, ...]
+    seconds: float
+
+
+def choose_candidate(candidates: Sequence[Candidate]) -> Candidate:
+    """Choose the candidate of the smallest error; within 1 % the best calibrated one.
+
+    Args:
+        candidates: Candidates with their scores.
+
+    Raises:
+        ValueError: If no candidate keeps half of its runs.
+    """
+    least = min(c.log_ratio for c in candidates)
+    if not math.isfinite(least):
+        raise ValueError(
+            "the candidates must keep half of their runs, got none that does. Tune on another "
+            "scenario or model."
+        )
+    near = [c for c in candidates if c.log_ratio <= least + math.log1p(TIE)]
+    return min(near, key=lambda c: abs(math.log(c.nees_ratio)))
+
+
+class CandidateSearch:
+    """Search on one world.
+
+    Args:
+        words: Overrides that name scenario, model, runs and seed of the tuning.
+        regimes: Noise regimes of equal weight.
+        progress: Function that is called with the name of each filter and candidate.
+        start_time_s: Time before which errors do not count [s].
+    """
+
+    def __init__(
+        self,
+        words: Sequence[str],
+        regimes: Sequence[str],
+        progress: Callable[[str], object] = lambda text: None,
+        start_time_s: float = 0.0,
+    ) -> None:
+        self.words, self.regimes, self.progress = tuple(words), tuple(regimes), progress
+        self.start_time_s, self.seconds = start_time_s, 0.0
+        self.batches = draw_batches({r: self.compose("ekf", r) for r in self.regimes})
+        _check_start(self.batches[0].episode.time, start_time_s)
+        start_work()
+        (self.reference,) = self._score([self.compose("ekf", self.regimes[0])])
+
+    def tune(self, method: str, grid: Sequence[dict[str, float]]) -> TuningResult:
+        """Search the knobs of a filter.
+
+        Args:
+            method: Name of the filter.
+            grid: Values of all candidates by knob.
+
+        Returns:
+            The result.
+        """
+        candidates, self.seconds = [], 0.0
+        config = self.compose(method, self.regimes[0])
+        at_once = max(1, _RUNS_AT_ONCE // max(len(batch.runs) for batch in self.batches))
+        for first in range(0, len(grid), at_once):
+            some = grid[first : first + at_once]
+            self.progress(f"{method}, candidates {first + 1} to {first + len(some)} of {len(grid)}")
+            scores = self._score([with_candidate(config, values) for values in some])
+            candidates += [self._rate(*pair) for pair in zip(some, scores, strict=True)]
+        choice, seconds = choose_candidate(candidates), self.seconds
+        untuned = self._rate({}, *self._score([config]))
+        return TuningResult(method, choice, untuned, tuple(candidates), seconds)
+
+    def _rate(self, values: dict[str, float], scores: Mapping[str, RegimeScore]) -> Candidate:
+        """Rate a candidate by its scores in all regimes."""
+        logs = [math.log(s.error / self.reference[r].error) for r, s in scores.items()]
+        ratios = [math.log(s.nees_ratio) for s in scores.values()]
+        return Candidate(
+            values,
+            float(np.mean(logs)),
+            math.exp(float(np.mean(ratios))),
+            {regime: s.error for regime, s in scores.items()},
+        )
+
+    def score_method(self, method: str) -> Candidate:
+        """Run a filter without knobs in all regimes.
+
+        Args:
+            method: Name of the filter.
+        """
+        return self._rate({}, *self._score([self.compose(method, self.regimes[0])]))
+
+    def pass_alone(self, config: JobConfig, threshold: float = math.inf) -> Array:
+        """Run a filter in one regime and return the RMSE of each run [R], infinite for a lost or diverged run.
+
+        Args:
+            config: Configuration of the filter with its runs.
+            threshold: Divergence threshold.
+        """
+        (batch,) = draw_batches({config.choices["noise"]: config})
+        result = batch.pass_filter(config)
+        data = result.arrays(batch.episode, None)
+        error, lost = select_errors(data, result.model, slice(None), self.start_time_s)
+        return rmse_per_run(error, lost | is_diverged(error, lost, threshold))
+
+    def compose(self, method: str, regime: str, words: Sequence[str] = ()) -> JobConfig:
+        """Compose the configuration of a filter.
+
+        Args:
+            method: Name of the filter.
+            regime: Noise regime.
+            words: Overrides that replace those of the search.
+        """
+        return compose([*self.words, f"filter={method}", f"noise={regime}", *words])
+
+    def _score(self, configs: Sequence[JobConfig]) -> list[dict[str, RegimeScore]]:
+        """Run filters in all regimes and compute the scores of each by regime."""
+        scores: list[dict[str, RegimeScore]] = [{} for _ in configs]
+        for batch in self.batches:
+            is_alone = len(configs) == 1
+            result = batch.pass_filter(configs[0]) if is_alone else batch.pass_candidates(configs)
+            self.seconds += sum(result.seconds.get(name, 0.0) for name in ("scores", "filter"))
+            data = result.arrays(batch.episode, None)
+            for k, by_regime in enumerate(scores):
+                for regime, runs in batch.list_runs():
+                    start = k * len(batch.runs)
+                    places = slice(start + runs.start, start + runs.stop)
+                    by_regime[regime] = score_runs(data, result.model, places, self.start_time_s)
+        return scores
+
+
+def _check_start(time: Tensor, start_time_s: float) -> None:
+    """Check that a step remains after the start time."""
+    if not bool((time >= start_time_s).any()):
+        raise ValueError(
+            f"report.start_time_s must be at most {float(time[-1]):g} s, the end of the episode, "
+            f"got {start_time_s:g} s. Use a smaller value."
+        )
+
+
+def with_candidate(config: JobConfig, values: Mapping[str, float]) -> JobConfig:
+    """Return a configuration with the knobs of a candidate.
+
+    Args:
+        config: Configuration of a filter.
+        values: Values by knob, empty for the filter as its file states it.
+    """
+    if not values:
+        return config
+    changed = copy.deepcopy(config.values)
+    node = changed["filter"]
+    node["noise_adaptations"] = apply_candidate(node["noise_adaptations"], values)
+    return JobConfig(changed, config.choices, config.uses_shared_particles, config.trusted)
+
+
+def score_runs(
+    data: Mapping[str, np.ndarray], model: StateSpaceModel, runs: slice, start_time_s: float = 0.0
+) -> RegimeScore:
+    """Compute the score of some runs.
+
+    Args:
+        data: Arrays of a job, see `store.JobResult`.
+        model: Model of the filter.
+        runs: Places of the runs.
+        start_time_s: Time before which errors do not count [s].
+    """
+    state = describe_state(model)
+    group, steps = main_component_group(state), data["time"] >= start_time_s
+    error, lost = select_errors(data, model, runs, start_time_s)
+    number = list(state["groups"]).index(group.state_group)
+    nees = mean_per_run(data["nees"][runs][:, steps, number].astype(float), lost)
+    size = len(state["groups"][group.state_group])
+    return RegimeScore(
+        float(np.median(rmse_per_run(error, lost))), float(np.nanmedian(nees)) / size
+    )
+
+
+def select_errors(
+    data: Mapping[str, np.ndarray], model: StateSpaceModel, runs: slice, start_time_s: float
+) -> tuple[Array, Flags]:
+    """Select the errors of the main group in displayed units [R, T, K], and the lost runs [R].
+
+    Args:
+        data: Arrays of a job, see `store.JobResult`.
+        model: Model of the filter.
+        runs: Places of the runs.
+        start_time_s: Time before which errors do not count [s].
+    """
+    group, steps = main_component_group(describe_state(model)), data["time"] >= start_time_s
+    error = data["error"][runs][:, steps][..., group.places].astype(float) * group.scale
+    return error, np.asarray(data["lost"][runs], dtype=bool)
+
+
+# --------------------------------------------------------------------------------------------------
+# Episodes of several noise regimes as one batch: a filter passes over all of them in one call.
+
+
+class RegimeBatch(NamedTuple):
+    """Runs of several noise regimes behind one another.
+
+    Attributes:
+        regimes: Noise regimes.
+        plan: Plan of the first regime. Its filter does not depend on the regime.
+        episode: Episode of all runs.
+        runs: Numbers of the runs, [K R] for K regimes.
+    """
+
+    regimes: tuple[str, ...]
+    plan: JobPlan
+    episode: Episode
+    runs: Tensor
+
+    def pass_filter(self, config: JobConfig) -> TimedFilterPass:
+        """Run a filter over all runs.
+
+        Args:
+            config: Configuration of the job with the filter.
+        """
+        plan = replace(self.plan, config=config, method=build_plan(config).method)
+        return pass_filter(plan, self.episode, self.runs, "candidate")
+
+    def pass_candidates(self, configs: Sequence[JobConfig]) -> TimedFilterPass:
+        """Run several candidates of a filter over all runs in one pass, one candidate behind another.
+
+        Args:
+            configs: Configurations that differ in the knobs of the filter.
+        """
+        methods = [build_plan(config).method for config in configs]
+        plan = replace(
+            self.plan, config=configs[0], method=join_candidates(methods, len(self.runs))
+        )
+        return pass_filter(plan, *self.repeat(len(configs)), "candidates")
+
+    def repeat(self, times: int) -> tuple[Episode, Tensor]:
+        """Return the episode and the numbers of the runs several times behind one another.
+
+        Args:
+            times: Number of times.
+        """
+        return join_episodes([self.episode] * times), self.runs.repeat(times)
+
+    def list_runs(self) -> Iterator[tuple[str, slice]]:
+        """Yield each regime with the places of its runs."""
+        size = len(self.runs) // len(self.regimes)
+        for k, regime in enumerate(self.regimes):
+            yield regime, slice(k * size, (k + 1) * size)
+
+
+def draw_batches(configs: Mapping[str, JobConfig]) -> list[RegimeBatch]:
+    """Draw the episodes of several noise regimes and join them where one filter pass can have all.
+
+    Runs are independent of each other, so that their numbers do not change. Regimes are not joined if
+    the model of the filter or the process behind the data depends on the regime.
+
+    Args:
+        configs: Configurations of jobs that differ in the noise regime, by regime.
+
+    Returns:
+        Batches in the order of the regimes.
+    """
+    plans = {regime: build_plan(config) for regime, config in configs.items()}
+    episodes = {regime: plan.draw_episode(plan.runs) for regime, plan in plans.items()}
+    is_own = any(
+        plan.values["oracle_noise"] or episodes[regime].record.feedback is not None
+        for regime, plan in plans.items()
+    )
+    groups = [(regime,) for regime in plans] if is_own else [tuple(plans)]
+    return [
+        RegimeBatch(
+            group,
+            plans[group[0]],
+            join_episodes([episodes[regime] for regime in group]),
+            torch.cat([plans[regime].runs for regime in group]),
+        )
+        for group in groups
+    ]
+
+
+def join_episodes(episodes: Sequence[Episode]) -> Episode:
+    """Join episodes of equal times along the axis of runs. Tracks and data sheets are left out.
+
+    Args:
+        episodes: Episodes, each of R runs.
+    """
+    first, records = episodes[0], [episode.record for episode in episodes]
+    starts, spreads = ([getattr(r, name) for r in records] for name in ("start", "spread"))
+    record = Record(
+        torch.cat([r.y for r in records]),
+        _join_inputs([r.u for r in records], [len(r.y) for r in records]),
+        None if starts[0] is None else torch.cat(starts),
+        None if spreads[0] is None else torch.cat(spreads),
+        first.record.feedback,
+    )
+    truth = {name: torch.cat([e.truth[name] for e in episodes]) for name in first.truth}
+    notes = tuple(dict.fromkeys(chain.from_iterable(episode.notes for episode in episodes)))
+    return Episode(record, first.time, truth, None, notes)
+
+
+def _join_inputs(inputs: Sequence[Any], sizes: Sequence[int]) -> Any:
+    """Join inputs in nested NamedTuples. Inputs that all runs of an episode share are repeated."""
+    first = inputs[0]
+    if isinstance(first, tuple):
+        joined = (_join_inputs(values, sizes) for values in zip(*inputs, strict=True))
+        return type(first)(*joined) if first else first
+    return torch.cat([a.expand(n, *a.shape[1:]) for a, n in zip(inputs, sizes, strict=True)])
+
+
+# --------------------------------------------------------------------------------------------------
+# Candidates of one filter side by side: each has its own runs of one batch, which one pass filters.
+
+_CHANGED = ("r", "observed_mask", "m", "omega", "noise")  # fields that an adaptation of R replaces
+
+
+@dataclass(frozen=True, eq=False)
+class JointAdaptation(NoiseAdaptation):
+    """The noise adaptations of several candidates, each for its own runs.
+
+    A linearisation costs the same for all of them, so that 16 candidates take the time of a few.
+
+    Attributes:
+        r_factor: Factor on R of each run, [R].
+        q_factor: Factor on Q of each run, [R].
+        updates: Distinct robust updates, each with the places of its runs.
+    """
+
+    r_factor: Tensor
+    q_factor: Tensor
+    updates: tuple[tuple[NoiseAdaptation, Tensor], ...]
+
+    @override
+    def predict_scale(
+        self, predicted: AffineApproximation, belief: GaussianBelief
+    ) -> AffineApproximation:
+        scaled = scale_process_noise(predicted, self.q_factor.to(predicted.noise))
+        if all(isinstance(update, RobustUpdate) for update, _ in self.updates):
+            return scaled  # which they do not change
+        parts = [
+            update.predict_scale(_select(scaled, places), _select(belief, places))
+            for update, places in self.updates
+        ]
+        return AffineApproximation(*(self._join(fields) for fields in zip(*parts, strict=True)))
+
+    @override
+    def noise_adapt(
+        self, innovation: Innovation, belief: GaussianBelief
+    ) -> tuple[Innovation, dict[str, Tensor]]:
+        scaled = innovation.with_noise(
+            innovation.noise * self.r_factor.to(innovation.noise)[:, None, None]
+        )
+        if not self.updates:
+            return scaled, {}
+        innovations, memories = zip(
+            *(
+                update.noise_adapt(_select(scaled, places), _select(belief, places))
+                for update, places in self.updates
+            ),
+            strict=True,
+        )
+        r, observed_mask, m, omega, noise = (
+            self._join([getattr(several, name) for several in innovations]) for name in _CHANGED
+        )
+        memory = {name: self._join([several[name] for several in memories]) for name in memories[0]}
+        adapted = scaled._replace(r=r, observed_mask=observed_mask, m=m, omega=omega, noise=noise)
+        return adapted, memory
+
+    def _join(self, parts: Sequence[Tensor]) -> Tensor:
+        """Join the values of the runs of all updates in the order of the runs."""
+        return torch.cat(list(parts))[torch.cat([places for _, places in self.updates]).argsort()]
+
+
+def join_candidates(filters: Sequence[GaussianFilter], runs: int) -> GaussianFilter:
+    """Return the filter in which each candidate has its own runs.
+
+    Args:
+        filters: Filters that differ in their noise adaptations: a factor on R and Q, then at most one update.
+        runs: Number of runs of each.
+    """
+    chains = [list(method.noise_adaptations) for method in filters]
+    factors = [[getattr(chain[0], name) for chain in chains] for name in ("r_factor", "q_factor")]
+    assert all(isinstance(chain[0], ScaledNoise) for chain in chains)
+    r_factor, q_factor = (
+        torch.tensor(values, dtype=torch.float64).repeat_interleave(runs) for values in factors
+    )
+    places: dict[NoiseAdaptation, list[Tensor]] = {}
+    for k, stages in enumerate(chains):
+        for update in stages[1:]:
+            places.setdefault(update, []).append(torch.arange(k * runs, (k + 1) * runs))
+    updates = tuple((update, torch.cat(several)) for update, several in places.items())
+    return replace(filters[0], noise_adaptations=(JointAdaptation(r_factor, q_factor, updates),))
+
+
+def _select(parts: Any, places: Tensor) -> Any:
+    """Return an innovation or a belief of some runs; values that all runs share stay."""
+    runs = len(parts[0])
+
+    def select(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {name: select(entry) for name, entry in value.items()}
+        if isinstance(value, tuple):
+            return tuple(map(select, value))
+        return value[places] if value.dim() and len(value) == runs else value
+
+    return type(parts)(*map(select, parts))
+
+
+# --------------------------------------------------------------------------------------------------
+# Knobs of the filters that are tuned alike: the factor on R, and one knob of the method.
+
+R_FACTORS = (1.0, 2.0, 4.0, 8.0)
+_SCALED = "pfbench.filter.ScaledNoise"
+
+
+@dataclass(frozen=True)
+class Knob:
+    """Knob of a method.
+
+    Attributes:
+        name: Key of the robust update, or `q_factor` of the scaled noise.
+        values: Values to try.
+    """
+
+    name: str
+    values: tuple[float, ...]
+
+
+# Each method has the same number of values, so that each has the same number of candidates.
+KNOBS: Mapping[str, Knob] = {
+    "ekf_scaled": Knob("q_factor", (0.25, 0.5, 1.0, 2.0)),
+    "gate": Knob("probability", (0.99, 0.999, 0.9999, 1.0)),
+    "huber": Knob("threshold", (1.0, 1.345, 2.0, 3.0)),
+    "student": Knob("dof", (3.0, 4.0, 6.0, 10.0)),
+    "correntropy": Knob("threshold", (1.5, 2.0, 3.0, 5.0)),
+    "wolf": Knob("threshold", (2.0, 3.0, 4.0, 6.0)),
+    "sage_husa": Knob("forgetting_factor", (0.95, 0.98, 0.99, 0.998)),
+    "vb_r": Knob("forgetting_factor", (0.95, 0.98, 0.99, 0.998)),
+}
+
+
+def list_candidates(method: str, r_factors: Sequence[float] = R_FACTORS) -> list[dict[str, float]]:
+    """List the candidates of a method.
+
+    Args:
+        method: Name of the filter.
+        r_factors: Factors on R.
+
+    Returns:
+        Values by knob, `r_factor` first.
+
+    Raises:
+        ValueError: If the filter does not have a knob.
+    """
+    if method not in KNOBS:
+        raise ValueError(
+            f"filter must be of {', '.join(KNOBS)}, got {method}. Only these have knobs that are "
+            "tuned alike."
+        )
+    knob = KNOBS[method]
+    return [{"r_factor": r, knob.name: v} for r, v in product(r_factors, knob.values)]
+
+
+def apply_candidate(adaptations: list[dict[str, Any]], values: Mapping[str, float]) -> list[Any]:
+    """Set the knobs in the noise adaptations of a filter.
+
+    Args:
+        adaptations: Nodes of the adaptations, the robust update last.
+        values: Values by knob.
+
+    Returns:
+        The nodes, with the scaled noise first.
+    """
+    scaled = {"_target_": _SCALED, "r_factor": values["r_factor"], "q_factor": 1.0}
+    if "q_factor" in values:
+        return [scaled | {"q_factor": values["q_factor"]}]
+    (name,) = (key for key in values if key != "r_factor")
+    return [scaled, {**adaptations[-1], name: values[name]}]
+
+
+# --------------------------------------------------------------------------------------------------
+# Check that no study scores the seed of a tuning: installed experiments, and stored results.
+
+_TUNING = "tuning_"  # start of the names of folders with results of a tuning
+_SCENARIO = "override /scenario"  # of the defaults of an experiment
+_DEFAULT_SEED = 1
+
+
+def check_seed(world: JobConfig, seed: int) -> None:
+    """Check that no study scores a seed in the scenario of a tuning.
+
+    Runs of another window of a recording have other data, so that settings of the scenario are compared
+    where they are stored.
+
+    Args:
+        world: Configuration of the tuning.
+        seed: Seed of the tuning.
+
+    Raises:
+        ValueError: If an experiment or a stored result has the scenario with this seed.
+    """
+    if seed < 0:
+        raise ValueError(f"seed must be at least -1000, got {seed - 1000}. Set seed to that of the study.")  # fmt: skip
+    scenario = world.choices["scenario"]
+    scored = (*_list_experiments(scenario, seed), *_list_results(world, seed))
+    for study in scored:
+        raise ValueError(
+            f"seed + 1000 must be a seed that no study scores in {scenario}, got {seed}, which {study} scores. "
+            "Set another seed."
+        )
+
+
+def _list_experiments(scenario: str, seed: int) -> Iterator[str]:
+    """Yield the experiments with a scenario and a seed."""
+    for path in sorted(experiments_dir().glob("*.yaml")):
+        tree = yaml.safe_load(path.read_text(encoding="utf-8"))
+        sweep = tree.get("hydra", {}).get("sweeper", {}).get("params", {})
+        choices = [entry for entry in tree.get("defaults", ()) if isinstance(entry, Mapping)]
+        single = ",".join(entry[_SCENARIO] for entry in choices if _SCENARIO in entry)
+        scenarios = str(sweep.get("scenario", single)).split(",")
+        seeds = str(sweep.get("seed", tree.get("seed", _DEFAULT_SEED))).split(",")
+        if scenario in scenarios and str(seed) in seeds:
+            yield path.stem
+
+
+def _list_results(world: JobConfig, seed: int) -> Iterator[str]:
+    """Yield the studies with a stored result of a scenario with its settings and a seed."""
+    for path in sorted(Path(world.values["results_dir"]).glob("*/*.npz")):
+        if path.parent.name.startswith(_TUNING):
+            continue
+        try:
+            config = read_metadata(path)["config"]
+        except (DamagedResultError, KeyError):
+            continue
+        if config.get("seed") == seed and config.get("scenario") == world.values["scenario"]:
+            yield path.parent.name

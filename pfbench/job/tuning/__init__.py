@@ -1,1 +1,0 @@
-"""Tuning of the baselines of a study of robustness, on seeds that no study scores."""

@@ -1,1 +1,0 @@
-"""Total-state models of inertial sensors with aiding."""

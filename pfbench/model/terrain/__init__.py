@@ -1,1 +1,0 @@
-"""Navigation by the height of the terrain below a vehicle."""

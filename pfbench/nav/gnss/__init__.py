@@ -1,1 +1,0 @@
-"""Satellite navigation: orbits, ephemerides, ranges and the receiver clock."""

@@ -1,0 +1,371 @@
+"""Marginal likelihoods and posterior densities of parameters by a filter, with correlated random numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, TypeAlias
+
+import torch
+from pyro.distributions import GaussianHMM, MultivariateNormal
+from torch import Tensor
+from typing_extensions import override
+
+from pfbench.core.linear_algebra import distribution_covariance
+from pfbench.core.random_stream import BatchRandomStream, PhiloxStream, RandomStream, relabel
+from pfbench.core.record import Record, map_inputs
+from pfbench.filter.belief import Filter, ParticleBelief, gather_ancestors
+from pfbench.filter.exactness import check_has_evidence, is_every_part_exact
+from pfbench.filter.loop import run_filter
+from pfbench.filter.particle.resampling import Resampler
+from pfbench.model.base import StateSpaceModel, initial_law
+from pfbench.ppl.model_batch import ModelBatch
+from pfbench.ppl.parameterised_model import ParameterisedModel, Values
+
+# --------------------------------------------------------------------------------------------------
+# Marginal likelihoods of models: by a filter, or by Pyro's GaussianHMM.
+
+
+class MarginalLikelihood(Protocol):
+    """A function that computes log p(y_1:T) of each run of a record under a model.
+
+    It is differentiable where the model is.
+    """
+
+    def __call__(self, model: StateSpaceModel, record: Record) -> Tensor:
+        """Compute the log evidence.
+
+        Args:
+            model: State-space model.
+            record: Measurements and inputs of R runs.
+
+        Returns:
+            Log evidence, [R].
+        """
+
+
+@dataclass(frozen=True)
+class FilterLikelihood(MarginalLikelihood):
+    """Marginal likelihood computed by a filter, exact if the filter is.
+
+    Through a Gaussian filter it is differentiable. A particle filter gives an unbiased estimate
+    with fixed random numbers. Its gradient is not that of the likelihood: use it in `pmmh`, which
+    needs no gradient.
+
+    Attributes:
+        method: The filter.
+        seed: Seed of its random numbers, the same at every call.
+
+    Raises:
+        ValueError: If the evidence of the filter is not a density, as with a robust update.
+    """
+
+    method: Filter
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_has_evidence(self.method, "FilterLikelihood")
+
+    @override
+    def __call__(self, model: StateSpaceModel, record: Record) -> Tensor:
+        stream = PhiloxStream(self.seed, torch.arange(len(record.y)))
+        return run_filter(self.method, model, record, stream).log_evidence
+
+
+@dataclass(frozen=True)
+class GaussianHmmLikelihood(MarginalLikelihood):
+    """Marginal likelihood of a linear-Gaussian model by Pyro's GaussianHMM.
+
+    A call raises ValueError for models that are not linear, have singular noise, observe their
+    initial state or need inputs, and for records with missing measurements.
+    """
+
+    @override
+    def __call__(self, model: StateSpaceModel, record: Record) -> Tensor:
+        return gaussian_hmm(model, record).log_prob(record.y.to(model.anchor))
+
+
+def gaussian_hmm(model: StateSpaceModel, record: Record) -> GaussianHMM:
+    """Build Pyro's GaussianHMM of a linear-Gaussian model over measurements [T, Dy].
+
+    Args:
+        model: Model, or models of `ModelBatch`.
+        record: Measurements; its shape is used.
+
+    Returns:
+        Distribution with batch [R].
+
+    Raises:
+        ValueError: If the model or the record is not supported, see `GaussianHmmLikelihood`.
+    """
+    kind = type(model.model if isinstance(model, ModelBatch) else model).__name__
+    gain = model.noise_gain(()) if model.linear else None
+    singular = model.noise_dim < model.chart.dimension
+    has_inputs = bool(record.u) or record.start is not None
+    if gain is None or singular or model.observes_initial or has_inputs:
+        raise ValueError(
+            "GaussianHmmLikelihood needs a linear model with full noise, without inputs, with a "
+            f"step before the first measurement, got {kind}. Use "
+            "FilterLikelihood(GaussianFilter(TaylorLinearisation())), which is exact on every "
+            "linear model."
+        )
+    if bool(torch.isnan(record.y).any()):
+        raise ValueError(
+            "GaussianHmmLikelihood needs complete measurements, got missing components (NaN). "
+            "Use FilterLikelihood."
+        )
+    runs, d = len(record.y), model.chart.dimension
+    eye = torch.eye(d, dtype=gain.dtype, device=gain.device).expand(runs, -1, -1)
+    initial: Any = initial_law(model, runs)
+    start = MultivariateNormal(initial.mean, distribution_covariance(initial))
+    zero = torch.zeros_like(eye)
+    phi = model.propagate(eye, (), zero)  # transposed: row i is the image of unit state i
+    observation: Any = model.observation(torch.cat([eye, zero[:, :1]], 1), ())
+    y_hat, offset = observation.mean[:, :-1], observation.mean[:, -1]
+    q = (gain @ gain.mT).expand(runs, d, d)
+    transition_noise = MultivariateNormal(zero[:, 0].unsqueeze(1), q.unsqueeze(1))
+    r = distribution_covariance(observation)[:, -1].unsqueeze(1)
+    observation_noise = MultivariateNormal(offset.unsqueeze(1), r)
+    h = (y_hat - offset.unsqueeze(1)).unsqueeze(1)
+    steps = record.y.shape[1]
+    return GaussianHMM(
+        start, phi.unsqueeze(1), transition_noise, h, observation_noise, duration=steps
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Estimates of the posterior density of parameters by a filter.
+
+_START_ATTEMPTS = 20
+
+
+class PosteriorEstimator:
+    """Estimator of log p(z) + log p(y | z) for chains z [C, Q, P].
+
+    Q is the number of runs R if they have separate parameters, otherwise 1.
+
+    Args:
+        unknown: Model and prior.
+        method: Any filter.
+        record: Measurements and inputs of R runs.
+        chains: Number of chains C of each posterior.
+        seed: Seed of all random numbers.
+        separate_parameters: Whether each run has its own parameters.
+        rho: Correlation of the filter's random numbers between iterations.
+    """
+
+    def __init__(
+        self,
+        unknown: ParameterisedModel,
+        method: Filter,
+        record: Record,
+        chains: int,
+        seed: int,
+        separate_parameters: bool,
+        rho: float,
+    ) -> None:
+        check_has_evidence(method, "pmmh")
+        self.unknown, self.method = unknown, method
+        self.seed, self.separate_parameters, self.rho = seed, separate_parameters, rho
+        runs = len(record.y)
+        self.shape = (chains, runs if separate_parameters else 1)
+        self.runs_per_model = 1 if separate_parameters else runs
+        self.record = repeat_runs(record, chains)
+        self._stored: StoredNumbers = {}
+
+    def __call__(self, z: Tensor, iteration: int) -> tuple[Tensor, CorrelatedStream | None]:
+        """Estimate the log density, and return the random numbers if they are correlated.
+
+        Args:
+            z: Unconstrained parameters, [C, Q, P].
+            iteration: Number of the iteration, for the random stream.
+
+        Returns:
+            Log density [C, Q], and the correlated stream or None.
+        """
+        values, log_prior = self.unknown.constrained(z.flatten(0, 1))
+        is_valid = self.unknown.in_support(values) & torch.isfinite(log_prior)
+        if not bool(is_valid.all()):  # any valid value serves: the proposal is rejected anyway
+            medians = self._prior_medians()
+            values = {name: torch.where(is_valid, a, medians[name]) for name, a in values.items()}
+        runs = torch.arange(is_valid.numel() * self.runs_per_model)
+        source = relabel(PhiloxStream(self.seed, runs), f"pmmh_{iteration}.")
+        correlated = CorrelatedStream(source, self.rho, self._stored) if self.rho else None
+        stream: Any = correlated or source
+        model = self.unknown.models_per_run(values, self.runs_per_model)
+        log_z = run_filter(self.method, model, self.record, stream).log_evidence
+        log_z = log_z.view(-1, self.runs_per_model).sum(1)
+        total = torch.where(is_valid & torch.isfinite(log_z), log_prior + log_z, -torch.inf)
+        return total.view(self.shape), correlated
+
+    def store_numbers(self, numbers: CorrelatedStream | None, is_accepted: Tensor) -> None:
+        """Store the correlated random numbers of accepted chains.
+
+        Args:
+            numbers: Result of a call.
+            is_accepted: Mask of the chains, [C, Q].
+        """
+        if numbers is not None:
+            numbers.accept(is_accepted.flatten().repeat_interleave(self.runs_per_model))
+
+    def draw_start(self, start: ParameterisedModel) -> tuple[Tensor, Tensor]:
+        """Draw the starts of the chains, repeated while the filter is lost.
+
+        Args:
+            start: Model with the distributions of the starts.
+
+        Returns:
+            Unconstrained parameters [C, Q, P], and their log densities, [C, Q].
+
+        Raises:
+            ValueError: If the filter is lost for all starts of a chain.
+        """
+        log_p = torch.full(self.shape, -torch.inf, dtype=torch.float64)
+        z = self._sample(start, 0)
+        for attempt in range(_START_ATTEMPTS):
+            is_lost = ~torch.isfinite(log_p)
+            z = torch.where(is_lost.unsqueeze(-1), self._sample(start, attempt), z)
+            new_log_p, numbers = self(z, -attempt - 1)
+            self.store_numbers(numbers, is_lost)
+            log_p = torch.where(is_lost, new_log_p, log_p)
+            if bool(torch.isfinite(log_p).all()):
+                return z, log_p
+        lost = int((~torch.isfinite(log_p)).sum())
+        raise ValueError(
+            f"pmmh needs a start at which the filter is not lost, got {lost} chains lost at "
+            f"{_START_ATTEMPTS} draws. Narrow the prior, or use more particles."
+        )
+
+    def start_covariance(self, start: ParameterisedModel) -> Tensor:
+        """Return the covariance of the starts, [Q, P, P]."""
+        z = self.unknown.unconstrained(start.sample(1000, self.seed))
+        p = z.shape[-1]
+        return torch.cov(z.T).view(1, p, p).repeat(self.shape[1], 1, 1)
+
+    def _sample(self, start: ParameterisedModel, attempt: int) -> Tensor:
+        values = start.sample(self.shape[0] * self.shape[1], self.seed + 7919 * (attempt + 1))
+        return self.unknown.unconstrained(values).view(*self.shape, -1)
+
+    def _prior_medians(self) -> Values:
+        return {name: a.median() for name, a in self.unknown.sample(101, self.seed).items()}
+
+
+def repeat_runs(record: Record, copies: int) -> Record:
+    """Repeat all runs of a record.
+
+    Args:
+        record: Record of R runs.
+        copies: Number of repetitions.
+
+    Returns:
+        Record of R `copies` runs, all runs in turn.
+    """
+
+    def repeat(a: Tensor) -> Tensor:
+        return a.repeat(copies, *[1] * (a.dim() - 1))
+
+    start, spread = (None if a is None else repeat(a) for a in (record.start, record.spread))
+    u = map_inputs(lambda a: a if len(a) == 1 else repeat(a), record.u)
+    return Record(repeat(record.y), u, start, spread, record.feedback)
+
+
+# --------------------------------------------------------------------------------------------------
+# Random numbers that are correlated between iterations.
+
+StoredNumbers: TypeAlias = dict[tuple[int, str, int, int], Tensor]
+"""Numbers [R, n, w] by (step, purpose, n, w)."""
+
+
+@dataclass(frozen=True, eq=False)
+class CorrelatedStream(BatchRandomStream):
+    """A random stream correlated with the one of the last accepted iteration.
+
+    A proposed normal number is rho u + sqrt(1 - rho^2) e, which leaves N(0, I) invariant. The two
+    estimates of the likelihood are then correlated, and their ratio is less noisy [Deligiannidis,
+    Doucet and Pitt 2018]. A uniform number is Phi of a normal one.
+
+    Attributes:
+        independent_stream: Random stream e of this iteration.
+        correlation: Correlation rho, 0 for the plain algorithm.
+        stored: Numbers u of the last accepted iteration of each chain.
+        proposed: Numbers of this iteration, filled as they are drawn.
+        step: Time step.
+    """
+
+    independent_stream: RandomStream
+    correlation: float
+    stored: StoredNumbers
+    proposed: StoredNumbers = field(default_factory=dict)
+    step: int = 0
+
+    @property
+    @override
+    def dtype(self) -> torch.dtype:
+        return self.independent_stream.dtype
+
+    @override
+    def at_step(self, step: int) -> CorrelatedStream:
+        return replace(self, independent_stream=self.independent_stream.at_step(step), step=step)
+
+    @override
+    def select_runs(self, runs: slice) -> RandomStream:
+        raise ValueError(
+            "pmmh.rho must be 0 for a filter that splits the runs, got a correlated stream, whose "
+            "numbers belong to all of them. Set rho=0."
+        )
+
+    @override
+    def normal(self, purpose: str, n: int, w: int) -> Tensor:
+        key, e = (self.step, purpose, n, w), self.independent_stream.normal(purpose, n, w)
+        u = self.stored.get(key)
+        self.proposed[key] = (
+            e if u is None else self.correlation * u + (1.0 - self.correlation**2) ** 0.5 * e
+        )
+        return self.proposed[key]
+
+    @override
+    def uniform(self, purpose: str, n: int, w: int) -> Tensor:
+        z = self.normal("uniform." + purpose, n, w).double()
+        return torch.special.ndtr(z).clamp(1e-12, 1.0 - 1e-12)
+
+    def accept(self, is_accepted: Tensor) -> None:
+        """Store the proposed numbers of accepted runs, bool [R]."""
+        mask = is_accepted[:, None, None]
+        for key, new in self.proposed.items():
+            old = self.stored.get(key)
+            self.stored[key] = new if old is None else torch.where(mask, new, old)
+
+
+@dataclass(frozen=True)
+class SortedResampler(Resampler):
+    """A resampler that sorts the particles by one component first.
+
+    With correlated random numbers neighbours then stay neighbours. Without sorting the first
+    resampling removes the correlation. The distribution of the filter does not change.
+
+    Attributes:
+        resampler: Resampler of the filter.
+        component: Component of the state.
+    """
+
+    resampler: Resampler
+    component: int = 0
+
+    @property
+    @override
+    def is_exact(self) -> bool:
+        return is_every_part_exact(**{"resampler.resampler": self.resampler})
+
+    @override
+    def __call__(
+        self,
+        model: StateSpaceModel,
+        belief: ParticleBelief,
+        log_a: Tensor,
+        n: Tensor,
+        draws: RandomStream,
+    ) -> tuple[ParticleBelief, Tensor]:
+        active_mask = torch.isfinite(belief.log_w)
+        order = torch.where(active_mask, belief.x[..., self.component], torch.inf).argsort(1)
+        sorted_belief = gather_ancestors(belief, order)
+        log_a = sorted_belief.log_w if log_a is belief.log_w else log_a.gather(1, order)
+        return self.resampler(model, sorted_belief, log_a, n, draws)

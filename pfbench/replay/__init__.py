@@ -1,1 +1,0 @@
-"""Replay: one run of a stored job, computed again with all its traces."""

@@ -1,0 +1,308 @@
+"""Entries of the data of a page, and the table of runs behind its board."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from pfbench.report import provenance
+from pfbench.results import metrics, status, store
+from pfbench.results.conditions import ComponentGroup, Condition, main_component_group
+from pfbench.results.frame import drop_before
+from pfbench.results.looks import MethodLook, PartName
+from pfbench.results.metrics import MetricInput
+from pfbench.results.step_times import STEP_TIME
+from pfbench.results.store import SAME_LIKELIHOODS, SAME_N
+
+# --------------------------------------------------------------------------------------------------
+# Entries of the data of a page: filters, parts, metrics and planned pairs.
+
+_BUDGET_NAMES = {"particles": "Equal N", "time": "Equal time", "likelihoods": "Equal likelihoods"}
+
+
+class ViewKey(NamedTuple):
+    """Key of a view.
+
+    Attributes:
+        metric: Column of the error.
+        world: Key of the scenario, or "all".
+        regime: Key of the regime, or "all".
+        baseline: Label of the baseline.
+    """
+
+    metric: str
+    world: str
+    regime: str
+    baseline: str
+
+
+class StudyNames(NamedTuple):
+    """Names of the parts of a study.
+
+    Attributes:
+        looks: Looks by label.
+        worlds: Names of the scenarios by key.
+        regimes: Names of the noise regimes by key.
+        baselines: Labels of the baselines.
+    """
+
+    looks: Mapping[str, MethodLook]
+    worlds: Mapping[str, PartName]
+    regimes: Mapping[str, PartName]
+    baselines: Sequence[str]
+
+
+def list_metrics(table: pd.DataFrame, main: str = "rmse") -> list[str]:
+    """List the metrics of a board: that which decides first, then all that have values.
+
+    Args:
+        table: Table of `build_run_table`.
+        main: Metric that decides the study.
+    """
+    names = [name for name in METRIC_NAMES if name in table]
+    names.sort(key=lambda name: name != main)
+    return [name for name in names if name in (main, "rmse") or table[name].notna().any()]
+
+
+def format_interval_level(alpha: float) -> str:
+    """Format the level of an interval in percent.
+
+    Args:
+        alpha: Probability outside the interval.
+    """
+    return f"{100 * (1 - alpha):g} %"
+
+
+def round_values(values: Any) -> Any:
+    """Round numbers to four digits; a number that is not finite becomes None."""
+    if isinstance(values, dict):
+        return {key: round_values(value) for key, value in values.items()}
+    if isinstance(values, list):
+        return [round_values(value) for value in values]
+    if isinstance(values, float):
+        return float(f"{values:.4g}") if math.isfinite(values) else None
+    return None if values == "" else values
+
+
+def describe_versions(conditions: Sequence[Condition]) -> dict[str, str]:
+    """Return builds, date and version of the results. The build of uncommitted code is not its commit."""
+    metadata = [job.meta for c in conditions for job in c.jobs]
+    versions = metadata[0].get("versions", {})
+    return {
+        "commit": ", ".join(provenance.list_builds(metadata)),
+        "date": max(str(meta.get("created", ""))[:10] for meta in metadata),
+        "version": str(versions.get("pfbench", "")),
+    }
+
+
+def describe_uncommitted(conditions: Sequence[Condition]) -> str:
+    """State how many jobs were computed by code that no commit has; empty if none was."""
+    metadata = [job.meta for c in conditions for job in c.jobs]
+    number = sum(provenance.is_uncommitted(meta) for meta in metadata)
+    return f"{number} of {len(metadata)} jobs are of uncommitted code." if number else ""
+
+
+def filter_entry(look: MethodLook) -> dict[str, Any]:
+    """Return the entry of a filter."""
+    return {
+        "key": look.key, "name": look.name, "long": look.long_name, "family": look.family,
+        "proposed": look.proposed, "colour": look.colour, "dark": look.dark_colour,
+        "marker": look.marker, "cite": look.cite,
+    }  # fmt: skip
+
+
+def regime_entries(table: pd.DataFrame, regimes: Mapping[str, PartName]) -> list[dict[str, Any]]:
+    """List the entries of the noise regimes.
+
+    Args:
+        table: Table of `build_run_table`.
+        regimes: Names by key.
+    """
+    entries = []
+    for key in table["regime"].unique():
+        noise, _, model = key.partition(" + ")
+        name = f"{regimes[noise].name} + {model}" if model else regimes[noise].name
+        entries.append({"key": key, "name": name, "words": regimes[noise].words})
+    return entries
+
+
+def cell_entries(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """List the entries of the cells.
+
+    Args:
+        table: Table of `build_run_table`.
+    """
+    is_ambiguous = table.groupby("scenario")["model"].nunique().max() > 1
+    cells = []
+    for (world, regime), rows in table.groupby(["scenario", "regime"], sort=False):
+        particles = rows["particles"].max()
+        cells.append({
+            "world": world, "regime": regime, "noise": str(regime).partition(" + ")[0],
+            "model": rows["model"].iloc[0] if is_ambiguous else "",
+            "runs": int(rows.groupby("filter").size().max()), "seed": int(rows["seed"].iloc[0]),
+            "particles": None if math.isnan(particles) else int(particles),
+        })  # fmt: skip
+    return cells
+
+
+def budget_entries(conditions: Sequence[Condition]) -> list[dict[str, Any]]:
+    """List the entries of the budgets, each with the reason why the study lacks it.
+
+    Args:
+        conditions: Conditions of the study.
+    """
+    jobs = [job.meta for condition in conditions for job in condition.jobs]
+    kinds = {str(meta["config"].get("budget", SAME_N)) for meta in jobs}
+    return [
+        {"key": key, "name": name,
+         "reason_missing": None if key in kinds else f"The study has no jobs with budget={key}."}
+        for key, name in _BUDGET_NAMES.items() if key in kinds or key != SAME_LIKELIHOODS
+    ]  # fmt: skip
+
+
+def metric_entries(table: pd.DataFrame, main: str) -> list[dict[str, Any]]:
+    """List the entries of the metrics.
+
+    Args:
+        table: Table of `build_run_table`.
+        main: Metric that decides the study.
+    """
+    units, groups = table["unit"].unique(), table["group"].unique()
+    unit, group = units[0] if len(units) == 1 else "", groups[0] if len(groups) == 1 else "main"
+    return [
+        {"key": key, "name": METRIC_NAMES[key], "unit": "" if key == LOG_SCORE else unit, "direction": "lower",
+         "caption": f"{METRIC_NAMES[key]} of the {'filter' if key == LOG_SCORE else f'group {group}'}."}
+        for key in list_metrics(table, main)
+    ]  # fmt: skip
+
+
+# --------------------------------------------------------------------------------------------------
+# Table of a study with one row per filter, condition and run: all numbers behind its board.
+
+# metrics of the main group that a board can show, each with the component of its value
+SHOWN_METRICS: Mapping[str, str] = {"rmse": "norm", "max_error": "norm", "crps": "mean"}
+# metrics that can decide a study, but are shown only if they do
+LOG_SCORE = "log_score"  # of a filter, not of a group: a logarithm without unit
+_MAIN_ONLY: Mapping[str, str] = {"energy": "norm", LOG_SCORE: ""}
+METRIC_NAMES = {
+    "rmse": "RMS error", "max_error": "largest error", "crps": "CRPS", "energy": "energy score",
+    LOG_SCORE: "inverse predictive density per step",
+}  # fmt: skip
+
+
+def build_run_table(
+    conditions: Sequence[Condition], start_time_s: float = 0.0, metric: str = "rmse"
+) -> pd.DataFrame:
+    """Build the table of a study.
+
+    Args:
+        conditions: Conditions of the study.
+        start_time_s: Time before which steps are ignored, s.
+        metric: Metric that decides the study, one of `main_metrics.MAIN_METRICS`.
+
+    Returns:
+        Columns filter, scenario, family, regime, model, particles, seed, run, lost, keeps_track,
+        unit, group, the metrics of `SHOWN_METRICS`, coverage_50, coverage_90, nees_ratio and ms.
+        A run without a value has NaN.
+
+    Raises:
+        ValueError: If a job lacks values of the metric that decides.
+    """
+    parts = [
+        job_rows((condition, regime, job.label), drop_before(job.load(), start_time_s), metric)
+        for condition, regime in zip(conditions, name_regimes(conditions), strict=True)
+        for job in condition.jobs
+    ]
+    return join_rows(parts, metric)
+
+
+def join_rows(parts: Sequence[pd.DataFrame], metric: str) -> pd.DataFrame:
+    """Join the rows of all jobs.
+
+    Args:
+        parts: Rows of `job_rows`.
+        metric: Metric that decides the study.
+
+    Raises:
+        ValueError: If a job lacks values of that metric.
+    """
+    for rows in parts:
+        if (rows[metric].isna() & rows["keeps_track"]).all() and rows["keeps_track"].any():
+            where = " / ".join(rows[["scenario", "regime", "filter"]].iloc[0])
+            raise ValueError(
+                f"report.metric must be a metric of all results, got {metric} without values of {where}. "
+                "Choose report.metric=rmse, or run with score_steps above 0."
+            )
+    return pd.concat(parts, ignore_index=True)
+
+
+def name_regimes(conditions: Sequence[Condition]) -> list[str]:
+    """Name the regime of each condition: the noise, with the model if a scenario has several.
+
+    Args:
+        conditions: Conditions of the study.
+    """
+    models = Counter((c.scenario, c.noise) for c in conditions)
+    return [
+        c.noise if models[c.scenario, c.noise] == 1 else f"{c.noise} + {c.model}"
+        for c in conditions
+    ]
+
+
+def job_rows(
+    origin: tuple[Condition, str, str], result: store.JobResult, metric: str = "rmse"
+) -> pd.DataFrame:
+    """Build the rows of one job.
+
+    Args:
+        origin: Condition, name of its regime, and label of the filter.
+        result: Result of the job.
+        metric: Metric that decides the study.
+    """
+    condition, regime, label = origin
+    meta, lost = result.meta, np.asarray(result.data["lost"], dtype=bool)
+    group = main_component_group(meta["state"])
+    particles = meta.get("particles")
+    components = {**SHOWN_METRICS, **{k: v for k, v in _MAIN_ONLY.items() if k == metric}}
+    columns = {
+        "filter": label,
+        "scenario": condition.scenario,
+        "family": status.scenario_family(meta, condition.scenario),
+        "regime": regime,
+        "model": condition.model,
+        "particles": np.nan if particles is None else float(particles),
+        "seed": int(meta["seed"]),
+        "run": np.arange(lost.size) + int(meta.get("first_run", 0)),
+        "lost": lost,
+        "keeps_track": status.keeps_track(result.data, meta),
+        "unit": group.unit,
+        "group": group.group,
+        **dict(_metric_columns(result, group, lost, components)),
+        "ms": 1e3 * float(meta.get(STEP_TIME, {}).get("median", meta["seconds"]["per_step"])),
+    }
+    return pd.DataFrame(columns)
+
+
+def _metric_columns(
+    result: store.JobResult,
+    group: ComponentGroup,
+    lost: np.ndarray,
+    components: Mapping[str, str],
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the values of the main group by metric."""
+    data = MetricInput(result, group, group.state_group)
+    missing = np.full(lost.size, np.nan)
+    for name, component in components.items():
+        values = metrics.compute_metric(name, data).get(component, missing)
+        yield name, np.where(lost, np.nan, np.asarray(values, dtype=np.float64))
+    for name in ("coverage_50", "coverage_90"):
+        values = metrics.compute_metric(name, data).get("mean", missing)
+        yield name, np.where(lost, np.nan, np.asarray(values, dtype=np.float64))
+    dof = len(result.meta["state"]["groups"][group.state_group])
+    nees = metrics.compute_metric("nees", data).get("norm", missing)
+    yield "nees_ratio", np.where(lost, np.nan, np.asarray(nees, dtype=np.float64) / dof)

@@ -1,0 +1,322 @@
+"""Methods paragraph of a study: the facts, computed once, and the text written from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from pfbench.report.journal.study_pack import Pack
+from pfbench.report.provenance import distinct_values, list_builds, name_build
+from pfbench.results import store
+from pfbench.results.conditions import Condition
+from pfbench.results.looks import count_tuned, describe_tuning, study_looks, study_part_names
+from pfbench.results.status import divergence_threshold, scenario_family
+from pfbench.results.step_times import STEP_TIME
+
+# --------------------------------------------------------------------------------------------------
+# Facts of a study from which its methods paragraph is written: numbers, words and lists, computed once.
+#
+# They are stored with the data of the page. Pairs and names of filters are not among them, since a stored page decides
+# and names them again.
+
+_VERSIONS = ("pfbench", "commit", "python", "torch", "numpy")
+_PLACES = ("dtype", "device", "threads")
+
+
+@dataclass(frozen=True)
+class MethodsFacts:
+    """Facts of a methods paragraph.
+
+    Attributes:
+        filters: Number of filters.
+        scenarios: Names of the scenarios.
+        worlds: Number of worlds; scenarios of one trajectory are one world.
+        regimes: Names of the noise regimes.
+        runs: Numbers of runs of a job, ascending.
+        steps: Numbers of steps of a run, ascending.
+        seeds: Seeds, ascending.
+        particles: Numbers of particles of each particle filter, by label.
+        budgets: Budgets of the jobs, such as `store.SAME_N`.
+        metric: Name of the metric that decides.
+        alpha: Level of the families of tests.
+        margin: Relative margin of equivalence.
+        rounds: Fewest rounds in which the times of a job were measured; 0 if a job has none.
+        software: Versions, commit, number type, device and threads; an empty list is unknown.
+        is_recorded: Whether a scenario reads recorded data.
+        has_threshold: Whether a scenario states a divergence threshold.
+        is_complete: Whether each filter was run in each condition.
+        tuned: Numbers of filters with tuned parameters, by the data on which they were tuned.
+    """
+
+    filters: int
+    scenarios: Sequence[str]
+    worlds: int
+    regimes: Sequence[str]
+    runs: Sequence[int]
+    steps: Sequence[int]
+    seeds: Sequence[int]
+    particles: Mapping[str, Sequence[int]]
+    budgets: Sequence[str]
+    metric: str
+    alpha: float
+    margin: float
+    rounds: int
+    software: Mapping[str, Sequence[str]]
+    is_recorded: bool
+    has_threshold: bool
+    is_complete: bool
+    tuned: Mapping[str, int]
+
+    def to_entries(self) -> dict[str, Any]:
+        """Return plain values, from which `from_entries` restores the facts."""
+        return asdict(self)
+
+    @classmethod
+    def from_entries(cls, entries: object, source: str = "methods") -> MethodsFacts:
+        """Restore the facts of a page.
+
+        Args:
+            entries: Values of `to_entries`.
+            source: Where they are stored, for the message of an error.
+
+        Raises:
+            ValueError: If a fact is missing.
+        """
+        stored = entries if isinstance(entries, Mapping) else {}
+        names = [field.name for field in fields(cls)]
+        if missing := [name for name in names if name not in stored]:
+            raise ValueError(
+                f"{source} must have all facts of the methods paragraph, got none for "
+                f"{', '.join(missing)}. Run the study and write its report again."
+            )
+        return cls(**{name: stored[name] for name in names})
+
+
+def collect_methods_facts(
+    conditions: Sequence[Condition],
+    *,
+    alpha: float = 0.05,
+    margin: float = 0.05,
+    metric: str = "RMS error",
+) -> MethodsFacts:
+    """Collect the facts of a methods paragraph from the results of a study.
+
+    Args:
+        conditions: Conditions of the study.
+        alpha: Level of the families of tests.
+        margin: Relative margin of equivalence.
+        metric: Name of the metric that decides.
+    """
+    jobs = [job.meta for condition in conditions for job in condition.jobs]
+    labels = [{job.label for job in condition.jobs} for condition in conditions]
+    scenarios, regimes = (
+        [name.name for name in study_part_names(conditions, group).values()]
+        for group in ("scenario", "noise")
+    )
+    return MethodsFacts(
+        filters=len(set.union(*labels)),
+        scenarios=scenarios,
+        worlds=len({scenario_family(c.jobs[0].meta, c.scenario) for c in conditions}),
+        regimes=regimes,
+        runs=_list_numbers(job["runs"] for job in jobs),
+        steps=_list_numbers(job["steps"] for job in jobs),
+        seeds=_list_numbers(job["seed"] for job in jobs),
+        particles=_list_particles(conditions),
+        budgets=sorted({str(job["config"].get("budget", store.SAME_N)) for job in jobs}),
+        metric=metric,
+        alpha=alpha,
+        margin=margin,
+        rounds=min(len(job.get(STEP_TIME, {}).get("rounds", ())) for job in jobs),
+        software=_list_software(jobs),
+        is_recorded=any(_is_recorded(job) for job in jobs),
+        has_threshold=any(divergence_threshold(job) is not None for job in jobs),
+        is_complete=all(names == set.union(*labels) for names in labels),
+        tuned=count_tuned(study_looks(conditions)),
+    )
+
+
+def _list_numbers(values: Iterable[Any]) -> list[int]:
+    """List the distinct numbers."""
+    return sorted(set(map(int, values)))
+
+
+def _list_particles(conditions: Sequence[Condition]) -> dict[str, list[int]]:
+    """List the numbers of particles of each particle filter by label."""
+    numbers: dict[str, set[int]] = {}
+    for job in (job for condition in conditions for job in condition.jobs):
+        if job.meta.get("particles"):
+            numbers.setdefault(job.label, set()).add(int(job.meta["particles"]))
+    return {label: sorted(counts) for label, counts in sorted(numbers.items())}
+
+
+def _list_software(jobs: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
+    """List versions, commit, number type, device and threads of the jobs."""
+    versions = [job.get("versions", {}) for job in jobs]
+    software = {name: [node[name] for node in versions if node.get(name)] for name in _VERSIONS}
+    software["commit"] = list_builds(jobs)
+    software |= {name: [job[name] for job in jobs if name in job] for name in _PLACES}
+    return {name: distinct_values(map(str, values)) for name, values in software.items()}
+
+
+def _is_recorded(meta: Mapping[str, Any]) -> bool:
+    """Return whether the scenario of a job reads recorded data."""
+    node = meta["config"].get("scenario")
+    return isinstance(node, Mapping) and "root" in node
+
+
+# --------------------------------------------------------------------------------------------------
+# Methods paragraph of a study, written from its facts: what was done, and what was not done.
+
+_FEW_RUNS, _FEW_WORLDS = 10, 6
+
+
+def write_methods(pack: Pack) -> list[str]:
+    """Write the methods paragraph of a study from the data of its page.
+
+    Args:
+        pack: Data of the page: the facts `methods`, the names of the filters and the decided pairs.
+
+    Returns:
+        Two paragraphs of plain text: what was done, and what was not done.
+
+    Raises:
+        ValueError: If a fact is missing.
+    """
+    facts = MethodsFacts.from_entries(pack["methods"])
+    names = {str(look["key"]): str(look["name"]) for look in pack["filters"]}
+    won = sum(bool(pair.get("won")) for pair in pack["planned"])
+    done = [
+        *_describe_design(facts),
+        *_describe_particles(facts, names),
+        *_describe_decisions(facts, len(pack["planned"]), won),
+        *_describe_times(facts),
+        *_describe_software(facts),
+    ]
+    return [" ".join(done), " ".join(["Not done:", *_list_limits(facts)])]
+
+
+def _list_limits(facts: MethodsFacts) -> list[str]:
+    """List what a study did not do, as sentences."""
+    limits = []
+    if len(facts.seeds) == 1:
+        limits.append(
+            f"one seed ({facts.seeds[0]}) was used, so that no result was repeated with another."
+        )
+    if not facts.is_recorded:
+        limits.append("All worlds are simulated, and no recorded data were used.")
+    if facts.worlds < _FEW_WORLDS:
+        text = "One world says" if facts.worlds == 1 else f"{facts.worlds} worlds say"
+        limits.append(f"{text} little about another world.")
+    if min(facts.runs) < _FEW_RUNS:
+        limits.append(
+            f"{min(facts.runs)} runs per condition are fewer than the {_FEW_RUNS} that tests require."
+        )
+    if set(facts.budgets) == {store.SAME_N}:
+        limits.append(_describe_equal_particles(list(facts.particles.values())))
+    if not facts.has_threshold:
+        limits.append("No divergence threshold is stated, so only numerical failures count.")
+    if not facts.is_complete:
+        limits.append("Not every filter was run in every condition.")
+    tuning = describe_tuning(facts.tuned, facts.filters)
+    limits.append(
+        f"{tuning} Parameters of the {'other ' if tuning else ''}filters were not tuned for this comparison unless the paper says so.".lstrip()
+    )
+    if not facts.rounds:
+        limits.append("Times were measured once on a machine that may have been shared.")
+    return limits
+
+
+def _describe_design(facts: MethodsFacts) -> list[str]:
+    """Describe filters, worlds, runs, seed and pairing."""
+    worlds = _count(facts.worlds, "world")
+    if len(facts.scenarios) > facts.worlds:
+        worlds = f"{_count(len(facts.scenarios), 'scenario')} of {worlds}"
+    return [
+        f"This study compares {_count(facts.filters, 'filter')} with pfbench in {worlds} ({'; '.join(facts.scenarios)}) under {_count(len(facts.regimes), 'noise regime')} ({'; '.join(facts.regimes)}), with "
+        f"{_join(facts.runs, 'and')} Monte Carlo runs of {_join(facts.steps, 'and')} steps per condition.",
+        "All filters of a condition receive the same truths, measurements and random numbers "
+        f"(seed {', '.join(map(str, facts.seeds))}), so that comparisons are paired by run.",
+    ]
+
+
+def _describe_particles(facts: MethodsFacts, names: Mapping[str, str]) -> list[str]:
+    """Describe the numbers of particles, with the names of filters that differ, and the budget."""
+    if not facts.particles:
+        return []
+    filters: dict[tuple[int, ...], list[str]] = {}
+    for label, numbers in facts.particles.items():
+        filters.setdefault(tuple(numbers), []).append(names[label])
+    usual = max(filters, key=lambda numbers: len(filters[numbers]))
+    listed = {
+        numbers: f"{_join(numbers, 'or')} ({', '.join(sorted(filters[numbers]))})"
+        for numbers in sorted(filters)
+    }
+    if len(filters) > 1 and 2 * len(filters[usual]) <= len(facts.particles):
+        text = f"Particle filters used {_join(list(listed.values()), 'and')} particles"
+    else:
+        others = "; ".join(text for numbers, text in listed.items() if numbers != usual)
+        exceptions = f", with these exceptions: {others}" if others else ""
+        text = f"Particle filters used {_join(usual, 'or')} particles{exceptions}"
+    budgets = [budget for budget in facts.budgets if budget != store.SAME_N]
+    return [f"{text}, chosen for equal cost ({', '.join(budgets)})." if budgets else f"{text}."]
+
+
+def _describe_equal_particles(numbers: Sequence[Sequence[int]]) -> str:
+    """State that filters were not given equal time, and whether their numbers of particles are equal."""
+    text = "The filters were not given equal time"
+    if len(numbers) < 2:
+        return f"{text}."
+    kind = "equal" if len(set(map(tuple, numbers))) == 1 else "different"
+    return f"{text}: particle filters have {kind} numbers of particles."
+
+
+def _describe_decisions(facts: MethodsFacts, pairs: int, won: int) -> list[str]:
+    """Describe metric, intervals, tests and lost runs."""
+    level = f"{100 * (1 - facts.alpha):g} %"
+    tests = (
+        f"{_count(pairs, 'planned pair')} {'is' if pairs == 1 else 'are'} decided from {_describe_units(pairs, won)}, paired by run, "
+        "with runs as units and Holm's correction over all pairs, separately for track and error; "
+        if pairs
+        else "No pair was planned; "
+    )
+    return [
+        f"The metric is the {facts.metric} over the time of a run; a run that is lost or diverges counts as the largest.",
+        f"Values are 20 % trimmed means over runs on the logarithmic scale, averaged over conditions; ratios to a baseline are paired by run, with {level} intervals.",
+        f"{tests}intervals are simultaneous ({level}), and filters within {100 * facts.margin:g} % are called equivalent.",
+    ]
+
+
+def _describe_units(pairs: int, won: int) -> str:
+    """Describe the differences that decide the planned pairs, some of them by the shares of runs won."""
+    means, shares = "these trimmed means", "the shares of runs won, since tracks are not kept"
+    if won in (0, pairs):
+        return f"the differences of {shares if won else means}"
+    return f"the differences of {means}, or for {won} of them of {shares}"
+
+
+def _describe_times(facts: MethodsFacts) -> list[str]:
+    """Describe how times per step were measured in rounds; empty if they were not."""
+    text = f"Times per step are medians of {facts.rounds} or more rounds in which the filters took turns."
+    return [text] if facts.rounds else []
+
+
+def _describe_software(facts: MethodsFacts) -> list[str]:
+    """Describe versions, commit, number type and device."""
+    value = {name: ", ".join(values) or "unknown" for name, values in facts.software.items()}
+    threads = f"{value['threads']} thread{'' if value['threads'] == '1' else 's'}"
+    return [
+        f"Software: pfbench {value['pfbench']} ({name_build(value['commit'])}), Python {value['python']}, torch "
+        f"{value['torch']}, numpy {value['numpy']}; {value['dtype']} on {value['device']} ({threads}).",
+    ]
+
+
+def _count(number: int, noun: str) -> str:
+    """Format a count with its noun."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _join(values: Sequence[object], word: str) -> str:
+    """List values with a word before the last one."""
+    texts = list(map(str, values))
+    return f" {word} ".join(filter(None, [", ".join(texts[:-1]), texts[-1]]))

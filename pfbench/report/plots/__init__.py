@@ -1,1 +1,0 @@
-"""Plots of results and the figures that reports are made of."""

@@ -1,1 +1,0 @@
-"""Figures of the papers, drawn from results of this package."""

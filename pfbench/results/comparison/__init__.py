@@ -1,1 +1,0 @@
-"""Exploratory comparisons of filters within a condition, and their input across conditions."""

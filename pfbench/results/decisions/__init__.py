@@ -1,1 +1,0 @@
-"""Decisions of a study: estimates, tests of families, words, records and sentences."""

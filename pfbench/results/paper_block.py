@@ -1,0 +1,365 @@
+"""The node `paper` of configuration files, the folders in which they lie, and the pairs that it plans."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Collection, Mapping, Sequence
+from functools import cache
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+import pfbench
+from pfbench.results.conditions import parse_label
+from pfbench.stats.study_runs import natural_sort_key
+
+# --------------------------------------------------------------------------------------------------
+# The node `paper` of a configuration file: names and limits for reports, not for the computation.
+#
+# A scenario, a noise regime or a filter may have this node. It is not passed to the class of the part
+# and does not enter the key of a job. It belongs to its own file: a part that another part contains
+# does not have it.
+
+PARTS = ("scenario", "noise", "filter")
+PAPER = "paper"
+
+FAMILIES = ("kalman", "particle", "gaussian", "guided", "swarm", "learned")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">", "p", "h")  # of matplotlib
+_COLOUR = re.compile(r"#[0-9a-f]{6}")
+
+# keys of the node by part, each with its requirement
+_TEXTS = ("name", "long_name", "words", "unit", "cite", "family", "tuning")
+_KEYS = {
+    "scenario": ("name", "words", "unit", "family", "divergence_threshold"),
+    "noise": ("name", "words", "family"),
+    "filter": (
+        "name", "long_name", "family", "proposed", "colour", "marker", "cite", "baselines",
+        "tuning",
+    ),
+}  # fmt: skip
+
+
+def check_paper_blocks(values: Mapping[str, Any]) -> None:
+    """Check the nodes `paper` of a configuration.
+
+    Args:
+        values: Resolved configuration.
+
+    Raises:
+        ValueError: If a key is unknown or a value does not fit.
+    """
+    for group in PARTS:
+        node = values.get(group)
+        block = node.get(PAPER) if isinstance(node, Mapping) else None
+        if block is None:
+            continue
+        if not isinstance(block, Mapping):
+            raise ValueError(f"{group}.paper must be a dictionary, got {block!r}. Remove it.")
+        for key, value in block.items():
+            _check_key(group, key, value)
+
+
+def remove_nested_blocks(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Remove the nodes `paper` of parts that other parts contain, such as a guide filter.
+
+    Args:
+        values: Resolved configuration.
+
+    Returns:
+        Configuration with the nodes of scenario, noise and filter themselves only.
+    """
+    return {
+        key: {k: v if k == PAPER else remove_all_blocks(v) for k, v in node.items()}
+        if key in PARTS and isinstance(node, Mapping)
+        else node
+        for key, node in values.items()
+    }
+
+
+def remove_all_blocks(node: Any) -> Any:
+    """Remove all nodes `paper` from a part, those of parts inside it included.
+
+    Args:
+        node: Part of a resolved configuration.
+
+    Returns:
+        The part without these nodes.
+    """
+    if isinstance(node, list):
+        return [remove_all_blocks(item) for item in node]
+    if not isinstance(node, Mapping):
+        return node
+    return {key: remove_all_blocks(value) for key, value in node.items() if key != PAPER}
+
+
+def _check_key(group: str, key: str, value: Any) -> None:
+    """Check one value of a node."""
+    if key not in _KEYS[group]:
+        names = ", ".join(_KEYS[group])
+        raise ValueError(
+            f"{group}.paper must have keys of {names}, got {key!r}. Remove or rename it."
+        )
+    requirement = _requirement(group, key, value)
+    if requirement:
+        raise ValueError(f"{group}.paper.{key} must be {requirement}, got {value!r}. Change it.")
+
+
+def _requirement(group: str, key: str, value: Any) -> str:
+    """Return the requirement that a value does not meet, empty if it does."""
+    if value is None:
+        return ""
+    if key == "divergence_threshold" and not _is_positive(value):
+        return "finite and positive, or null for a scenario without this limit"
+    if key in _TEXTS and not isinstance(value, str):
+        return "a text"
+    if key in ("name", "family") and not value.strip():
+        return "a name"
+    if group == "filter" and key == "family" and value not in FAMILIES:
+        return f"one of {', '.join(FAMILIES)}"
+    if key == "proposed" and not isinstance(value, bool):
+        return "true or false"
+    if key == "marker" and value not in MARKERS:
+        return f"one of {' '.join(MARKERS)}"
+    if key == "colour" and not _is_colour_pair(value):
+        return "two colours such as '#0b4f8a', for white and for dark ground"
+    if key == "baselines" and not _is_list_of_names(value):
+        return "a list of filters"
+    return ""
+
+
+def _is_colour_pair(value: Any) -> bool:
+    """Return whether a value is a list of two colours."""
+    return _is_list_of_names(value) and len(value) == 2 and all(map(_COLOUR.fullmatch, value))
+
+
+def _is_list_of_names(value: Any) -> bool:
+    """Return whether a value is a list of texts."""
+    return isinstance(value, list | tuple) and all(isinstance(item, str) for item in value)
+
+
+def _is_positive(value: Any) -> bool:
+    """Return whether a value is a finite positive number."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_number and math.isfinite(value) and value > 0.0
+
+
+# --------------------------------------------------------------------------------------------------
+# Words for the world in which a filter was tuned: in its name, and in the data that a result stores.
+
+OWN_WORLD = "the world of each job"  # data of a tuned filter before a job chooses them
+_DATA = re.compile(r"(?:^|\), )(\w+) \(model (\w+)[,)]")  # as `describe_world` writes it
+_MARK = re.compile(r" \(tuned(?: on ([^()]*))?\)")
+
+
+def add_world(name: str, world: str) -> str:
+    """Return the name of a tuned filter with the world of its tuning.
+
+    Args:
+        name: Name such as "Gated EKF (tuned)".
+        world: Words for the world.
+    """
+    settings = _MARK.search(name)
+    tail = name[settings.end() :] if settings else ""
+    head = name[: settings.start()] if settings else name
+    return f"{head} (tuned on {world}){tail}"
+
+
+def read_world(name: str) -> str:
+    """Return the words for the world in the name of a filter, empty for one without.
+
+    Args:
+        name: Name, as `add_world` makes it.
+    """
+    stated = _MARK.search(name)
+    return (stated[1] or "") if stated else ""
+
+
+def list_tuned_worlds(data: str) -> dict[str, str]:
+    """List the worlds that the data of a tuning state: models by scenario.
+
+    Args:
+        data: Data of a tuning, as a result stores them; several are separated by commas.
+    """
+    return dict(_DATA.findall(data))
+
+
+def find_foreign_world(data: str, scenario: str, model: str = "") -> str:
+    """Return the words for the world of a tuning, empty if it is that of the job or not stated.
+
+    Args:
+        data: Data of the tuning, as a result stores them.
+        scenario: Scenario of the job.
+        model: Model of the job, empty if it is not known.
+    """
+    stated = list_tuned_worlds(data)
+    if not stated or (scenario in stated and model in ("", stated[scenario])):
+        return ""
+    name = scenario if scenario in stated else min(stated)
+    return name_world({"scenario": name, "model": stated[name]}, {"scenario": scenario})
+
+
+def name_world(world: Mapping[str, Any], choices: Mapping[str, str]) -> str:
+    """Name the world of a tuning; its model only where the scenario is the same.
+
+    Args:
+        world: World of the tuning, as its file states it.
+        choices: Names of the chosen files of the job by group.
+    """
+    scenario, model = world.get("scenario", ""), world.get("model", "another model")
+    return f"{scenario} with {model}" if scenario == choices.get("scenario") else f"{scenario}"
+
+
+def describe_foreign(values: Mapping[str, Any]) -> str:
+    """Return " (tuned on WORLD)" for a filter with the knobs of another world; empty for another filter.
+
+    Args:
+        values: Resolved configuration of a job.
+    """
+    words = _MARK.search((values["filter"].get(PAPER) or {}).get("name", ""))
+    return f" (tuned on {words[1]})" if words and words[1] else ""
+
+
+# --------------------------------------------------------------------------------------------------
+# Nodes `paper` as the installed configuration files state them, without composition.
+
+_TUNED_DATA = "${tuned.data}"  # of a filter whose knobs are those of the group `tuned`
+_NAME = re.compile(r"\w+")
+_NODE = re.compile(rf"^{PAPER}:.*\n(?:[ \t]+.*\n?|[ \t]*\n)*", re.MULTILINE)
+
+
+@cache
+def read_paper_block(group: str, name: str) -> Mapping[str, Any]:
+    """Read the node `paper` of an installed file; a variant does not inherit that of its parent.
+
+    Args:
+        group: Group of the configuration: scenario, noise or filter.
+        name: Name of the file without suffix.
+
+    Returns:
+        The node, empty without a file or without a node.
+    """
+    path = conf_dir() / group / f"{name}.yaml"
+    if not _NAME.fullmatch(name) or not path.is_file():
+        return {}
+    node = _NODE.search(path.read_text(encoding="utf-8"))
+    block = (yaml.safe_load(node.group())[PAPER] or {}) if node else {}
+    is_open = block.get("tuning") == _TUNED_DATA
+    return {**block, "tuning": OWN_WORLD} if is_open else block
+
+
+def list_named_parts(group: str) -> list[str]:
+    """List the names of the installed files of a group."""
+    return [path.stem for path in sorted(Path(conf_dir() / group).glob("*.yaml"))]
+
+
+def plan_installed_pairs(labels: Collection[str]) -> list[tuple[str, str]]:
+    """List the planned pairs of filters by the baselines that installed files state.
+
+    Args:
+        labels: Labels of filters.
+    """
+    methods = {parse_label(label)[0] for label in labels}
+    blocks = {method: read_paper_block("filter", method) for method in methods}
+    tuned = sorted(method for method, block in blocks.items() if block.get("tuning"))
+    return list_planned_pairs(
+        labels, {method: block.get("baselines", ()) for method, block in blocks.items()}, tuned
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Folders of the configuration files, of the installed package or of the checkout.
+
+
+def conf_dir() -> Path:
+    """Return the folder of configurations, of the installed package or of the checkout."""
+    return _find_folder("conf", "config.yaml")
+
+
+def experiments_dir() -> Path:
+    """Return the folder of experiments, of the installed package or of the checkout."""
+    return _find_folder("experiments", "quickstart.yaml")
+
+
+def name_run_command(study: str) -> str:
+    """Return the command that runs the jobs of a study: its experiment, or words to complete.
+
+    Args:
+        study: Name of the study.
+    """
+    if (experiments_dir() / f"{study}.yaml").is_file():
+        return f"pfbench run -m +experiment={study}"
+    return f"pfbench run study={study} scenario=NAME noise=NAME filter=NAME"
+
+
+def _find_folder(name: str, marker: str) -> Path:
+    """Return the folder inside or next to the package that contains the marker file."""
+    package = Path(pfbench.__file__).resolve().parent
+    for folder in (package / name, package.parent / name):
+        if (folder / marker).exists():
+            return folder
+    raise FileNotFoundError(
+        f"{name}/{marker} must be inside or next to {package}, got neither. Reinstall pfbench."
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Planned pairs of a study: proposed methods against the baselines of their papers and tuned ones.
+
+_FEW = 5  # filters up to which all pairs are planned if no proposed method is compared
+# filters that measure the others, the first that a study has: the tuned control, EKF, SIR
+REFERENCES = ("ekf_scaled_tuned", "ekf", "sir")
+
+
+def list_planned_pairs(
+    labels: Collection[str], baselines: Mapping[str, Sequence[str]], tuned: Collection[str] = ()
+) -> list[tuple[str, str]]:
+    """List the planned pairs of a study.
+
+    Where a study varies a setting, the filters of a pair have the same value of it. A filter without
+    the setting is compared with each value.
+
+    Args:
+        labels: Filters of the study, with their settings.
+        baselines: Baselines of the paper of each proposed method, by label without settings.
+        tuned: Tuned baselines, labels without settings.
+
+    Returns:
+        Proposed methods with each baseline of their paper, and with each tuned baseline. Without such
+        a pair: all pairs of at most five filters, or each filter with the first of `REFERENCES` that
+        the study has.
+    """
+    labels = sorted(set(labels), key=natural_sort_key)
+    methods = {label: parse_label(label)[0] for label in labels}
+    against = {m: (*baselines[m], *tuned) for m in methods.values() if baselines.get(m)}
+    pairs = [
+        (label, baseline)
+        for label in labels
+        for method in dict.fromkeys(against.get(methods[label], ()))
+        for baseline in _same_settings(label, method, labels)
+    ]
+    if pairs:
+        return pairs
+    if len(labels) <= _FEW:
+        return list(combinations(labels, 2))
+    reference = next((name for name in REFERENCES if name in methods.values()), "")
+    return [
+        (label, baseline)
+        for label in labels
+        if methods[label] != reference
+        for baseline in _same_settings(label, reference, labels)
+    ]
+
+
+def _same_settings(label: str, method: str, labels: Sequence[str]) -> list[str]:
+    """List the labels of a method that do not differ in a setting that a label has too."""
+    settings = parse_label(label)[1]
+    candidates = {candidate: parse_label(candidate) for candidate in labels}
+    return [
+        candidate
+        for candidate, (name, values) in candidates.items()
+        if name == method
+        and all(settings.get(key, value) == value for key, value in values.items())
+    ]

@@ -1,1 +1,0 @@
-"""Statistics of paired samples: tests, effect sizes, intervals and sample sizes."""

@@ -1,1 +1,0 @@
-"""Studies that add runs until every planned pair is decided."""

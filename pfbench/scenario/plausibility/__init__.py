@@ -1,1 +1,0 @@
-"""Agreement between the tables of recorded logs."""

@@ -1,0 +1,469 @@
+"""Raw pseudoranges and Doppler of a log, relative to nominal ranges and a nominal clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Episode, MeasurementChannels, Record
+from pfbench.files.reader_notes import announce_notes
+from pfbench.model.strapdown import StrapdownTight, TightMemsInputs
+from pfbench.model.strapdown_tuning import TightTuning
+from pfbench.nav import earth
+from pfbench.nav.plausible_limits import PlausibleLimits
+from pfbench.nav.strapdown import PreintegratedImu
+from pfbench.noise.base import NoiseRegime, NominalNoise, check_unit_process
+from pfbench.scenario.base import Scenario, check_added_sd, check_duration
+from pfbench.scenario.recorded.fix_codes import FixCodes, check_fix_codes
+from pfbench.scenario.recorded.log_agreement import (
+    check_orbits,
+    compare_directions,
+    compare_ranges,
+    compare_rates,
+    describe_missing_times,
+)
+from pfbench.scenario.recorded.log_reader import read_log
+from pfbench.scenario.recorded.log_tables import (
+    Array,
+    LogFiles,
+    LogTable,
+    find_dataset,
+    list_tables,
+    parse_numbers,
+    parse_satellites,
+    read_table,
+)
+from pfbench.scenario.recorded.time_grid import (
+    FixReceiver,
+    ResampledLog,
+    assemble,
+    encode_names,
+    interpolate,
+    resample_log,
+)
+
+_SAME_EPOCH = 0.02  # s; the receiver clock is accurate to some milliseconds
+_MEASURED = (
+    "t",
+    "svid",
+    "pr",
+    "prr",
+    "sd_pr",
+    "sd_prr",
+    "sclk",
+    "sclkd",
+    "tropo",
+    "iono",
+    "az",
+    "el",
+)
+SKY = "pseudorange"  # table of the raw measurements
+_COLUMNS = (*_MEASURED, "sx", "sy", "sz", "svx", "svy", "svz")
+
+
+class RawGnssLog(NamedTuple):
+    """Raw measurements of S satellites at K times, relative to the origin of the log.
+
+    Missing values are NaN. Vectors are in East, North, Up at the time of reception.
+
+    Attributes:
+        names: Names of the satellites, such as G10 or E07.
+        range: Pseudorange, corrected for satellite clock, troposphere and ionosphere, m, [K, S].
+        rate: Range rate, corrected for the drift of the satellite clock, m/s, [K, S].
+        range_sd: Standard deviation of the range reported by the receiver, m, [K, S].
+        rate_sd: Standard deviation of the range rate reported by the receiver, m/s, [K, S].
+        satellite_position: Positions of the satellites, m, [K, S, 3].
+        velocity: Velocities of the satellites, m/s, [K, S, 3].
+        azimuth: Azimuth, rad, [K, S].
+        elevation: Elevation, rad, [K, S].
+        notes: Messages of the reader.
+    """
+
+    names: tuple[str, ...]
+    range: Array
+    rate: Array
+    range_sd: Array
+    rate_sd: Array
+    satellite_position: Array
+    velocity: Array
+    azimuth: Array
+    elevation: Array
+    notes: tuple[str, ...] = ()
+
+
+def read_sky(
+    folder: Path, time: Array, mask_deg: float, origin: Sequence[float] | None = None
+) -> RawGnssLog:
+    """Read raw measurements at given times.
+
+    Each epoch is assigned to the nearest time within a tolerance.
+
+    Args:
+        folder: Folder of the log.
+        time: Times, s, [K].
+        mask_deg: Smallest elevation, degrees.
+        origin: lat_deg, lon_deg, h_m of the local frame. None if the file contains it.
+
+    Returns:
+        The measurements.
+
+    Raises:
+        ValueError: If a column or the origin is missing, an epoch contains a satellite twice, or
+            the times do not match any epoch.
+    """
+    table = read_table(folder, SKY, {})
+    value = dict(zip(_COLUMNS, parse_numbers(table, _COLUMNS).T, strict=True))
+    after = np.searchsorted(time, value["t"]).clip(1, len(time) - 1)
+    row = np.where(value["t"] - time[after - 1] < time[after] - value["t"], after - 1, after)
+    selected_mask = (np.abs(time[row] - value["t"]) <= _SAME_EPOCH) & (value["el"] >= mask_deg)
+    if not selected_mask.any():
+        raise ValueError(
+            f"{table.name} does not contain a row above {mask_deg} degrees within {_SAME_EPOCH} s of the "
+            "end of a step. Use the same clock for t in all tables."
+        )
+    row_names = np.array(parse_satellites(table, value["svid"]))
+    names, slot = np.unique(row_names[selected_mask], return_inverse=True)
+    index = (row[selected_mask], slot)
+    if len(set(zip(*index, strict=True))) < len(slot):
+        raise ValueError(
+            f"{table.name} must have one row for each satellite and epoch, got two. Remove one."
+        )
+
+    def fill(column: Array) -> Array:
+        out = np.full((len(time), len(names), *column.shape[1:]), np.nan)
+        out[index] = column[selected_mask]
+        return out
+
+    centre, axes = _local(table, origin)
+    position, velocity = (
+        np.stack([value[prefix + axis] for axis in "xyz"], -1) for prefix in ("s", "sv")
+    )
+    corrected = (
+        value["pr"] + value["sclk"] - value["tropo"] - value["iono"],
+        value["prr"] + value["sclkd"],
+    )
+    reported = value["sd_pr"], value["sd_prr"], (position - centre) @ axes.T, velocity @ axes.T
+    angles = np.radians(value["az"]), np.radians(value["el"])
+    columns = [fill(column) for column in (*corrected, *reported, *angles)]
+    notes = (*table.notes, *describe_missing_times(table.name, np.unique(value["t"]), time))
+    return RawGnssLog._make([tuple(names.tolist()), *columns, notes])
+
+
+def _local(table: LogTable, origin: Sequence[float] | None) -> tuple[Array, Array]:
+    """Return Earth-fixed origin, m, [3], and axes East, North, Up, [3, 3]."""
+    keys = [f"origin_{name}" for name in ("lat_deg", "lon_deg", "h_m")]
+    if origin is None and not all(key in table.stated for key in keys):
+        raise ValueError(
+            f"{table.name} does not contain the origin pn = pe = pd = 0. "
+            "Set scenario.origin=[lat_deg, lon_deg, h_m]."
+        )
+    lat, lon, h = [float(table.stated[key]) for key in keys] if origin is None else origin
+    pos = torch.tensor([math.radians(lat), math.radians(lon), h], dtype=torch.float64)
+    return earth.ecef(pos).numpy(), earth.local_axes(pos).numpy()
+
+
+def subtract_nominal_ranges(
+    gnss_log: RawGnssLog, time: Array, velocity: Array
+) -> tuple[Array, tuple[str, ...]]:
+    """Subtract nominal ranges and rates, and the nominal clock.
+
+    Nominal ranges and rates are those of a receiver at rest at the start.
+
+    Args:
+        gnss_log: Raw measurements relative to the start.
+        time: Times, s, [K].
+        velocity: Velocity of the receiver at the first time, East, North, Up, m/s, [3].
+
+    Returns:
+        Reduced ranges, m, and rates, m/s, [K, 2 S], and a note for the report.
+
+    Raises:
+        ValueError: If the first time does not have a GPS satellite.
+    """
+    reach = np.linalg.norm(gnss_log.satellite_position, axis=-1)
+    line = gnss_log.satellite_position / reach[..., None]
+    ranges, rates = gnss_log.range - reach, gnss_log.rate - (line * gnss_log.velocity).sum(-1)
+    gps = np.array([name.startswith("G") for name in gnss_log.names])
+    if np.isnan(ranges[0, gps]).all():
+        raise ValueError(
+            f"scenario.start_s must have a GPS satellite, got none at t = {time[0]:.3f}. "
+            "Select another start."
+        )
+    drift = _mean(rates[0] + line[0] @ velocity, gnss_log.rate_sd[0])
+    level = _mean(ranges[0, gps], gnss_log.range_sd[0, gps])
+    other_level = (
+        _mean(ranges[0, ~gps], gnss_log.range_sd[0, ~gps])
+        if np.isfinite(ranges[0, ~gps]).any()
+        else level
+    )
+    ranges = ranges - np.where(gps, level, other_level) - drift * (time - time[0])[:, None]
+    note = (
+        f"clock: {level:.0f} m and {drift:.2f} m/s subtracted, "
+        f"for other systems {other_level - level:+.1f} m more"
+    )
+    return np.concatenate([ranges, rates - drift], -1), (note,)
+
+
+def _mean(values: Array, sd: Array) -> float:
+    """Compute the mean of the finite values, weighted by reported variances."""
+    finite_mask = np.isfinite(values)
+    return float(np.average(values[finite_mask], weights=sd[finite_mask] ** -2))
+
+
+def make_step_inputs(u: PreintegratedImu, gnss_log: RawGnssLog) -> TightMemsInputs:
+    """Build the inputs of the steps.
+
+    Args:
+        u: Preintegrated IMU samples.
+        gnss_log: Raw measurements relative to the start, at the start and the step ends.
+
+    Returns:
+        Inputs of the tightly coupled model.
+    """
+    # finite values replace missing inputs, since a NaN would propagate to gradients
+    observed_mask = np.isfinite(gnss_log.range)[1:]
+    reach = np.linalg.norm(gnss_log.satellite_position, axis=-1)
+    line = np.where(
+        observed_mask[..., None],
+        (gnss_log.satellite_position / reach[..., None])[1:],
+        [0.0, 0.0, 1.0],
+    )
+    other_system = np.broadcast_to(
+        [float(not name.startswith("G")) for name in gnss_log.names], observed_mask.shape
+    )
+    filled = [
+        np.where(observed_mask, a[1:], fill)
+        for a, fill in ((gnss_log.range_sd, 1.0), (gnss_log.rate_sd, 1.0))
+    ]
+    velocity = np.where(observed_mask[..., None], gnss_log.velocity[1:], 0.0)
+    leaves = (line, np.where(observed_mask, reach[1:], 2e7), velocity, other_system, *filled)
+    return TightMemsInputs(
+        *u, *(torch.from_numpy(np.ascontiguousarray(leaf))[None] for leaf in leaves)
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Recorded walk with IMU, raw pseudoranges and Doppler, scored against a reference.
+#
+# The recorded measurements are corrected for satellite clocks, troposphere and ionosphere. Runs
+# differ in initial errors and in the errors that a noise regime adds to each satellite.
+
+
+@dataclass(frozen=True)
+class RawGnssReceiver:
+    """Conversion of recorded pseudoranges and range rates to measurements.
+
+    Attributes:
+        fix_interval_s: Time between used epochs, s.
+        range_sd: Standard deviation of added range errors, m. With 0 a noise regime can only remove
+            satellites.
+        rate_sd: Standard deviation of added range-rate errors, m/s.
+        mask_deg: Smallest elevation, degrees.
+
+    Raises:
+        ValueError: If the interval is not positive, a standard deviation is negative, or the mask is
+            outside [-90, 90].
+    """
+
+    fix_interval_s: float = 1.0
+    range_sd: float = 0.0
+    rate_sd: float = 0.0
+    mask_deg: float = 10.0
+
+    def __post_init__(self) -> None:
+        check_duration("scenario.receiver.fix_interval_s", self.fix_interval_s)
+        check_added_sd("scenario.receiver.range_sd", self.range_sd)
+        check_added_sd("scenario.receiver.rate_sd", self.rate_sd)
+        if not -90.0 <= self.mask_deg <= 90.0:
+            raise ValueError(
+                "scenario.receiver.mask_deg must be between -90 and 90, "
+                f"got {self.mask_deg}. Set an elevation in degrees."
+            )
+
+    def channels(self, satellites: int) -> MeasurementChannels:
+        """Return the channels of all ranges, then of all range rates."""
+        sd = torch.tensor(
+            [self.range_sd] * satellites + [self.rate_sd] * satellites, dtype=torch.float64
+        )
+        kind = ("range",) * satellites + ("rate",) * satellites
+        return MeasurementChannels(sd, kind, tuple(range(satellites)) * 2)
+
+
+@dataclass(frozen=True)
+class RecordedWalk(Scenario):
+    """One recorded log with raw measurements. Runs differ in initial and added errors.
+
+    The nominal receiver clock has the bias and drift of the first recorded epoch at the reference.
+    It is subtracted from the measurements. The initial clock errors are drawn about it.
+
+    Attributes:
+        root: Folder of all data sets (configuration key data.root).
+        folder: Folder of the log in `root`. In addition to IMU and reference it contains a table
+            `pseudorange`, with one row per epoch and satellite. The columns are t, sys (G or E),
+            svid, pr, prr, sd_pr, sd_prr, sx..sz, svx..svz, sclk, sclkd, tropo, iono in SI units,
+            and az, el in degrees.
+        tuning: Parameters that the filter assumes. The initial errors of the runs have the assumed
+            distribution.
+        receiver: Selection of measurements, and standard deviations of added errors.
+        filter_step_s: Longest filter interval, s.
+        start_s: Start, s of the log. None for the start of the log.
+        end_s: End, s of the log. None for the end of the log.
+        files: Names of the tables. Steps end at the times of `gnss`.
+        origin: lat_deg, lon_deg, h_m of the local frame. None if the files contain it.
+        limits: Limits of the platform for the checks of the log. None for the default limits.
+        fix_codes: Meaning of the column `fix` of the fixes, see `read_log`.
+
+    Raises:
+        ValueError: If the step or the threshold is not positive. `draw` raises it for a missing root
+            or folder, an invalid log, a start without GPS satellites, or a regime that changes the
+            process noise.
+    """
+
+    root: str | None
+    folder: str
+    tuning: TightTuning
+    receiver: RawGnssReceiver = field(default_factory=RawGnssReceiver)
+    filter_step_s: float = 0.25
+    start_s: float | None = None
+    end_s: float | None = None
+    files: LogFiles = field(default_factory=lambda: LogFiles(gnss="reference"))
+    origin: Sequence[float] | None = None
+    limits: PlausibleLimits | None = None
+    fix_codes: FixCodes = None
+    channel_names, input_type = StrapdownTight.channel_names, StrapdownTight.input_type
+
+    def __post_init__(self) -> None:
+        check_duration("scenario.filter_step_s", self.filter_step_s)
+        check_fix_codes(self.fix_codes)
+
+    @override
+    def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
+        leg, gnss_log = self._read()
+        draws, fix_mask = PhiloxStream(seed, runs), torch.from_numpy(leg.fix_steps)
+        motion = assemble(
+            [leg],
+            leg.time,
+            torch.zeros_like(runs),
+            self.tuning.motion,
+            FixReceiver(),
+            NominalNoise(),
+            draws,
+        )
+        time = np.concatenate([[leg.start_s], leg.time])
+        measurements, notes = subtract_nominal_ranges(gnss_log, time, leg.start[4:7])
+        y = torch.where(fix_mask[:, None], torch.from_numpy(measurements[1:]), torch.nan).repeat(
+            len(runs), 1, 1
+        )
+        check_unit_process(noise, motion.time)
+        # errors are drawn per epoch, so that they do not depend on the filter step
+        y[:, fix_mask] += noise.draw_errors(
+            draws.at_step(0), self.receiver.channels(len(gnss_log.names)), motion.time[fix_mask]
+        )
+        record = Record(
+            y,
+            make_step_inputs(motion.record.u, gnss_log),
+            self._draw_start(motion.record.start, draws),
+        )
+        azimuth, elevation = (
+            torch.from_numpy(a[1:]) for a in (gnss_log.azimuth, gnss_log.elevation)
+        )
+        datasheet = {
+            "azimuth": azimuth,
+            "elevation": elevation,
+            "satellites": encode_names(gnss_log.names),
+        }
+        return Episode(
+            record,
+            motion.time,
+            motion.truth,
+            motion.track,
+            (*motion.notes, *notes),
+            motion.datasheet | datasheet,
+        )
+
+    def input_files(self) -> list[Path]:
+        """List the files that `draw` reads."""
+        return list_tables(self.root, self.folder, (*astuple(self.files), SKY))
+
+    def _draw_start(self, motion: Tensor | None, draws: PhiloxStream) -> Tensor:
+        """Draw starts [R, 19], about which the true state has the assumed distribution."""
+        # the true clock is the nominal one
+        clock = self.tuning.clock_sd * draws.at_step(0).normal("world.clock", 1, 3)[:, 0]
+        return torch.cat([clock.new_zeros(len(clock), 0) if motion is None else motion, -clock], -1)
+
+    def _read(self) -> tuple[ResampledLog, RawGnssLog]:
+        """Read the log on filter steps and the raw measurements relative to the start."""
+        folder = find_dataset(self.root, self.folder)
+        log = read_log(
+            folder,
+            self.files,
+            origin=self.origin,
+            limits=self.limits,
+            fix_codes=self.fix_codes,
+        )
+        leg = resample_log(
+            log,
+            self.receiver.fix_interval_s,
+            self.filter_step_s,
+            start=self.start_s,
+            end=self.end_s,
+        )
+        gnss_log = read_sky(
+            folder, np.concatenate([[leg.start_s], leg.time]), self.receiver.mask_deg, self.origin
+        )
+        time = np.concatenate([[leg.start_s], leg.time])
+        motion = interpolate(log.reference, time)
+        notes = check_sky(gnss_log, time, motion, self.limits or PlausibleLimits())
+        leg = leg._replace(notes=(*leg.notes, *notes))
+        announce_notes(folder, leg.notes)
+        start = motion[0, 7:]
+        return leg, gnss_log._replace(satellite_position=gnss_log.satellite_position - start)
+
+
+# --------------------------------------------------------------------------------------------------
+# Checks of raw measurements of a log against its reference.
+
+
+def check_sky(
+    gnss_log: RawGnssLog, time: Array, motion: Array, limits: PlausibleLimits
+) -> tuple[str, ...]:
+    """Check satellites, ranges and range rates against the reference.
+
+    Args:
+        gnss_log: Raw measurements relative to the origin of the log.
+        time: Times, s, [K].
+        motion: Attitude, velocity and position of the reference, [K, 10].
+        limits: Limits of the platform.
+
+    Returns:
+        Notes.
+
+    Raises:
+        ValueError: If a satellite jumps, or a range or range rate is impossible.
+    """
+    name, names = "pseudorange", gnss_log.names
+    # a sphere about the Earth's centre, which lies below the origin of the log
+    position = gnss_log.satellite_position + np.array([0.0, 0.0, earth.A])
+    check_orbits(name, names, time, position, gnss_log.velocity)
+    sight = gnss_log.satellite_position - motion[:, None, 7:]
+    reach = np.linalg.norm(sight, axis=-1)
+    rate = (sight / reach[..., None] * (gnss_log.velocity - motion[:, None, 4:7])).sum(-1)
+    azimuth = np.arctan2(sight[..., 0], sight[..., 1])
+    elevation = np.arcsin(sight[..., 2] / reach)
+    return (
+        *gnss_log.notes,
+        *compare_directions(
+            name, names, time, gnss_log.azimuth - azimuth, gnss_log.elevation - elevation
+        ),
+        *compare_ranges(name, names, time, gnss_log.range - reach, limits),
+        *compare_rates(name, names, time, gnss_log.rate - rate),
+    )

@@ -1,0 +1,182 @@
+"""Episodes simulated from a model: for textbook models and training.
+
+A filter that uses the same model is without model error. Its results are better than in an
+application ("inverse crime").
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.distributions import Distribution
+from typing_extensions import override
+
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Episode, MeasurementChannels, Record
+from pfbench.core.simulate import (
+    draw_initial_state,
+    draw_measurements,
+    is_independent_normal,
+    simulate_steps,
+)
+from pfbench.files.atomic_write import (
+    DIGEST,
+    has_valid_digest,
+    hash_content,
+    set_aside,
+    write_atomically,
+)
+from pfbench.files.limits import check_zip
+from pfbench.kernels.generator_version import GENERATOR_VERSION
+from pfbench.model.base import StateSpaceModel, named_inputs
+from pfbench.noise.base import NoiseRegime, NominalNoise, process_variance_factors
+from pfbench.scenario.base import Scenario
+from pfbench.scenario.oracle_noise import regime_name
+
+
+@dataclass(frozen=True)
+class ModelSimulation(Scenario):
+    """A scenario that simulates `steps` steps of `model`.
+
+    Initial state, driving noise and measurements have the model's own distributions. A noise
+    regime scales normal measurement errors. Its factor on the process noise multiplies the variance
+    of the noise that drives a step, averaged over the interval that ends with the step.
+
+    Attributes:
+        model: State-space model that draws states and measurements.
+        steps: Measurements per run.
+        interval_s: Time between measurements, s, for the time axis of the report.
+
+    Raises:
+        ValueError: If steps is below 1, or the interval or the threshold is not positive. `draw` raises it if a
+            regime changes measurement errors that are not independent normal.
+    """
+
+    model: StateSpaceModel
+    steps: int
+    interval_s: float = 1.0
+    input_type = tuple  # no inputs
+
+    @property
+    def channel_names(self) -> tuple[str, ...]:
+        """Measured channels: those of the model."""
+        return self.model.channel_names
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.steps, int) or self.steps < 1:
+            raise ValueError(
+                f"scenario.steps must be a whole number of at least 1, got {self.steps}. "
+                "Change scenario.steps."
+            )
+        if not self.interval_s > 0.0:
+            raise ValueError(
+                f"scenario.interval_s must be positive, got {self.interval_s}. Give it in seconds."
+            )
+
+    @override
+    def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
+        model, stream = self.model, PhiloxStream(seed, runs)
+        time = self.interval_s * torch.arange(1, self.steps + 1, dtype=torch.float64)
+        blank = torch.full((len(runs), self.steps, 1), torch.nan, dtype=torch.float64)
+        x = draw_initial_state(model, model.initial(len(runs)), stream, "world.state")
+        with named_inputs(model):
+            inputs = model.prepare(Record(blank))
+            scale = process_variance_factors(noise, time).sqrt()
+            steps = list(simulate_steps(model, inputs, stream, x, "world.state", scale))
+        y = _measurements(self.model, [step.distribution for step in steps], noise, stream, time)
+        states = torch.cat([step.x for step in steps], 1)
+        truth = {name: states[..., list(indices)] for name, indices in model.groups.items()}
+        return Episode(Record(y), time, truth)
+
+
+def _measurements(
+    model: StateSpaceModel,
+    distributions: list[Distribution],
+    noise: NoiseRegime,
+    stream: PhiloxStream,
+    time: Tensor,
+) -> Tensor:
+    """Draw measurements under a noise regime [R, T, Dy]."""
+    unit = torch.ones(distributions[0].event_shape, dtype=torch.float64)
+    channels = MeasurementChannels.of_one_kind(unit)
+    errors = noise.draw_errors(stream, channels, time)
+    if all(is_independent_normal(distribution) for distribution in distributions):
+        return draw_measurements(distributions, stream, "world.receiver", errors)
+    missing_mask = torch.isnan(errors)
+    nominal = NominalNoise().draw_errors(stream, channels, time)
+    if not torch.equal(torch.where(missing_mask, nominal, errors), nominal):
+        raise ValueError(
+            f"noise must be nominal for {type(model).__name__}, whose measurement errors are not "
+            f"independent normal, got {regime_name(noise)}. Choose noise=nominal."
+        )
+    y = draw_measurements(distributions, stream, "world.receiver")
+    return torch.where(missing_mask, torch.nan, y)
+
+
+# --------------------------------------------------------------------------------------------------
+# Cache of episodes on disk: simulated once and shared by all filters of a study.
+
+Arrays = dict[str, Tensor]
+log = logging.getLogger("pfbench")
+
+_KEY = "episode_key"  # name of the key in a file, which shows that a file has another one's name
+
+
+def load_or_build(folder: str | Path | None, recipe: object, build: Callable[[], Arrays]) -> Arrays:
+    """Load tensors from the cache, or build and store them.
+
+    Args:
+        folder: Folder of the cache. None disables it.
+        recipe: All that decides the tensors. Its `repr` is the key, so it must consist of frozen
+            dataclasses and plain values.
+        build: Builds the tensors.
+
+    Returns:
+        The tensors by name.
+    """
+    if folder is None:
+        return build()
+    head = f"episodes 2 generator {GENERATOR_VERSION}"
+    key = hashlib.sha256(f"{head} {recipe!r}".encode()).hexdigest()[:16]
+    path = Path(folder) / f"{key}.npz"
+    if path.exists():
+        try:
+            return _read(path)
+        except Exception as error:  # numpy and zipfile raise many kinds for damaged files
+            log.warning(
+                "warning  episode cache: %s is damaged (%s). Renamed to %s, built again",
+                path, error, set_aside(path).name,
+            )  # fmt: skip
+    tensors = build()
+    data: dict[str, Any] = {name: tensor.numpy() for name, tensor in tensors.items()}
+    data[_KEY] = np.array(key)
+    data[DIGEST] = np.array(hash_content(data))
+    write_atomically(path, lambda file: np.savez(file, **data))
+    return tensors
+
+
+def _read(path: Path) -> Arrays:
+    """Read a file of the cache.
+
+    Raises:
+        ValueError: If its digest is not that of its content, or its key is that of other episodes.
+            Other errors are those of numpy.
+    """
+    # opened here, since numpy leaves a damaged file open
+    check_zip(path)
+    with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
+        data = {name: file[name] for name in file.files}
+    if not has_valid_digest(data):
+        raise ValueError("its digest must be that of its content")
+    if str(data.get(_KEY)) != path.stem:
+        raise ValueError(f"its key must be {path.stem}, got {data.get(_KEY)}")
+    items = (item for item in data.items() if item[0] not in (DIGEST, _KEY))
+    return {name: torch.from_numpy(value) for name, value in items}

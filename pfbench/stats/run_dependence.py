@@ -1,0 +1,193 @@
+"""Runs that are not independent: copies of a run, and errors that correlate from run to run.
+
+References:
+    R. Bartels (1982), The rank version of von Neumann's ratio test for randomness.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.special import ndtr
+from scipy.stats import rankdata
+
+from pfbench.stats.error_measures import Array
+from pfbench.stats.main_metrics import ConditionName, select_main_metrics
+
+ALARM_LEVEL = 0.001  # of the test of all filters together: a study has many readers [ours]
+_FEWEST = 10  # runs of a test
+
+
+class RunAssessment(NamedTuple):
+    """Runs of a study that are not independent.
+
+    Attributes:
+        copies: The earlier run by each copy.
+        sentence: What is left out, and whether neighbouring runs are alike; empty for independent runs.
+    """
+
+    copies: dict[Any, Any]
+    sentence: str
+
+
+def assess_runs(table: pd.DataFrame, value: str, run: list[str]) -> RunAssessment:
+    """Find copies of runs, and test the other runs for errors that are alike in neighbouring runs.
+
+    Args:
+        table: One row per filter, scenario, regime and run.
+        value: Column of the error, a number with many digits.
+        run: Columns that name a run, in the order of the runs.
+    """
+    copies = find_copied_runs(table, value, run)
+    dependence = describe_dependence(drop_runs(table, copies, run), value, run)
+    return RunAssessment(copies, " ".join(filter(None, (describe_copies(copies), dependence))))
+
+
+def find_copied_runs(table: pd.DataFrame, value: str, run: list[str]) -> dict[Any, Any]:
+    """Find runs whose errors are equal, digit by digit, to those of an earlier run.
+
+    A condition in which all runs of a filter have one error is left out: its data are not random.
+
+    Args:
+        table: One row per filter, scenario, regime and run.
+        value: Column of the error, a number with many digits.
+        run: Columns that name a run.
+
+    Returns:
+        The earlier run by each copy. A run is a copy if the errors of one filter agree in all conditions.
+    """
+    wide = table.pivot_table(value, ["filter", "scenario", "regime"], run, dropna=False)
+    copies: dict[Any, Any] = {}
+    for _, rows in wide.groupby(level="filter", sort=False):
+        values = rows.to_numpy()
+        largest, least = (
+            extreme(np.where(np.isfinite(values), values, fill), 1)
+            for extreme, fill in ((np.max, -np.inf), (np.min, np.inf))
+        )
+        varying = largest > least
+        first: dict[bytes, Any] = {}
+        for k, name in enumerate(rows.columns):
+            column = np.ascontiguousarray(values[varying, k])
+            if column.size and np.isfinite(column).all():
+                original = first.setdefault(column.tobytes(), name)
+                if original != name:
+                    copies.setdefault(name, original)
+    return copies
+
+
+def drop_runs(table: pd.DataFrame, runs: dict[Any, Any], run: list[str]) -> pd.DataFrame:
+    """Remove the rows of some runs.
+
+    Args:
+        table: Table with the columns of a run.
+        runs: Runs, as the keys of `find_copied_runs`.
+        run: Columns that name a run.
+    """
+    if not runs:
+        return table
+    index = pd.MultiIndex.from_frame(table[run]) if len(run) > 1 else pd.Index(table[run[0]])
+    return table[~index.isin(list(runs))]
+
+
+def describe_copies(copies: dict[Any, Any]) -> str:
+    """Describe copies in one sentence, empty without any.
+
+    Args:
+        copies: Result of `find_copied_runs`.
+    """
+    if not copies:
+        return ""
+    copy, original = next(iter(copies.items()))
+    names = [" ".join(map(str, n)) if isinstance(n, tuple) else str(n) for n in (copy, original)]
+    count = f"{len(copies)} runs have" if len(copies) > 1 else "1 run has"
+    return (
+        f"{count} the errors of another run (run {names[0]} is equal to run {names[1]}) and "
+        f"{'are' if len(copies) > 1 else 'is'} left out: copies are not independent."
+    )
+
+
+def lag_p_values(values: Array) -> Array:
+    """Test for errors that are alike in neighbouring runs, one-sided, by ranks.
+
+    Args:
+        values: Series in the order of the runs, [..., n].
+
+    Returns:
+        p-values, [...]; 1 for fewer than 10 runs.
+    """
+    n = values.shape[-1]
+    if n < _FEWEST:
+        return np.ones(values.shape[:-1])
+    ranks = rankdata(values, axis=-1)
+    centred = ranks - ranks.mean(axis=-1, keepdims=True)
+    total = (centred**2).sum(axis=-1)
+    with np.errstate(invalid="ignore"):
+        ratio = (np.diff(ranks, axis=-1) ** 2).sum(axis=-1) / total
+    variance = 4 * (n - 2) * (5 * n**2 - 2 * n - 9) / (5 * n * (n + 1) * (n - 1) ** 2)
+    return np.asarray(np.where(total > 0, ndtr((ratio - 2) / np.sqrt(variance)), 1.0))
+
+
+def describe_dependence(table: pd.DataFrame, value: str, run: list[str]) -> str:
+    """Describe errors that correlate from run to run, empty if none is shown.
+
+    Args:
+        table: One row per filter, scenario, regime and run.
+        value: Column of the error.
+        run: Columns that name a run, in the order of the runs.
+    """
+    # Ranks within a condition, since a run that some conditions lack has another mean error than the others.
+    ranks = table.groupby(["filter", "scenario", "regime"], sort=False)[value].rank(pct=True)
+    wide = table.assign(rank=ranks - 0.5).pivot_table("rank", "filter", run, dropna=False)
+    p = {
+        str(label): float(lag_p_values(series[np.isfinite(series)]))
+        for label, series in zip(wide.index, wide.to_numpy(), strict=True)
+    }
+    alarms = [label for label, chance in p.items() if chance * len(p) < ALARM_LEVEL]
+    if not alarms:
+        return ""
+    least = min(p[label] for label in alarms) * len(p)
+    return (
+        f"Errors of neighbouring runs are alike for {len(alarms)} of {len(p)} filters (p = {least:.1g}): the runs "
+        "are not independent, and all intervals are too short."
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Rows of the independent runs of a study: copies of runs are left out of a table of all metrics.
+
+RUN = ["seed", "run"]  # columns that name a run
+
+
+class IndependentRows(NamedTuple):
+    """Rows of all metrics without copies of runs.
+
+    Attributes:
+        rows: Rows of the runs that are not copies.
+        sentence: What is left out, and whether neighbouring runs are alike; empty for independent runs.
+    """
+
+    rows: pd.DataFrame
+    sentence: str
+
+
+def select_independent_runs(
+    rows: pd.DataFrame, mains: Mapping[ConditionName, str]
+) -> IndependentRows:
+    """Leave out copies of runs, as a report does.
+
+    Args:
+        rows: Rows of `to_long_rows`, of all conditions.
+        mains: Main group by scenario, noise and model. Its error shows the copies.
+
+    Returns:
+        The rows of the other runs, with a sentence on what is left out.
+    """
+    main = select_main_metrics(rows, mains, "main")
+    errors = main[main["metric"] == "rmse"]
+    regime = errors["noise"].astype(str) + " / " + errors["model"].astype(str)
+    table = errors.assign(filter=errors["label"], regime=regime)
+    copies, sentence = assess_runs(table, "value", RUN)
+    return IndependentRows(drop_runs(rows, copies, RUN).reset_index(drop=True), sentence)

@@ -1,0 +1,336 @@
+"""Runs and worlds that a study requires, and differences that a planned study can show.
+
+References:
+    J. L. Hodges and E. L. Lehmann (1956), The efficiency of some nonparametric competitors of the t-test.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import nctdtr, ndtr, ndtri, stdtrit
+
+from pfbench.stats.effects import MIN_RUNS, TRIM_SHARE
+
+# --------------------------------------------------------------------------------------------------
+# Sample sizes: power of the paired signed-rank test, runs required, smallest detectable effect.
+#
+# Effects are differences of log losses of two filters on the same runs, in standard deviations of the
+# difference. For normal differences the signed-rank test of n pairs equals the t test of 3 n / pi
+# pairs, and for any distribution at least of 0.864 n [Hodges, Lehmann 1956]. The t test is counted by
+# the closed form of Guenther 1981.
+
+EFFICIENCY = 3 / math.pi
+POWER = 0.8
+
+
+def min_pairs(alpha: float) -> int:
+    """Return the pairs below which the two-sided signed-rank test cannot reach p <= alpha.
+
+    If all signs are equal, p = 2^(1 - n).
+    """
+    return math.ceil(1 + math.log2(1 / alpha) - 1e-9)
+
+
+def compute_power(
+    effect: float, pairs: int, alpha: float = 0.05, efficiency: float = EFFICIENCY
+) -> float:
+    """Compute the probability that the two-sided paired signed-rank test shows an effect.
+
+    Args:
+        effect: Mean difference in standard deviations of the difference.
+        pairs: Runs that both filters have.
+        alpha: Level. Before Holm's correction, the level of the family divided by its size.
+        efficiency: Efficiency of the test relative to the t test.
+
+    Returns:
+        Power, 0 to 1.
+    """
+    z = float(-ndtri(alpha / 2))
+    if pairs < min_pairs(alpha):
+        return 0.0
+    return float(ndtr(abs(effect) * math.sqrt(max(efficiency * pairs - z**2 / 2, 0.0)) - z))
+
+
+def required_runs(
+    effect: float, alpha: float = 0.05, power: float = POWER, efficiency: float = EFFICIENCY
+) -> float:
+    """Compute the runs required to show an effect; infinite for no effect.
+
+    Args:
+        effect: Mean difference in standard deviations of the difference.
+        alpha: Level.
+        power: Power required.
+        efficiency: Efficiency of the test relative to the t test.
+
+    Returns:
+        Number of runs.
+    """
+    if effect == 0:
+        return math.inf
+    z = float(-ndtri(alpha / 2))
+    of_t_test = ((z + ndtri(power)) / effect) ** 2 + z**2 / 2
+    return float(max(math.ceil(of_t_test / efficiency), min_pairs(alpha)))
+
+
+def required_runs_proportion(
+    proportion: float, limit: float, alpha: float = 0.05, power: float = POWER
+) -> float:
+    """Compute the runs required to show on which side of a limit a probability lies.
+
+    Normal approximation with a continuity correction [Fleiss, Levin, Paik 2003].
+
+    Args:
+        proportion: Probability.
+        limit: Limit of the probability.
+        alpha: One-sided level.
+        power: Power required.
+
+    Returns:
+        Number of runs, infinite if the probability equals the limit.
+    """
+    if proportion == limit:
+        return math.inf
+    at_limit, at_value = (math.sqrt(p * (1 - p)) for p in (limit, proportion))
+    spread = -ndtri(alpha) * at_limit + ndtri(power) * at_value
+    distance = abs(proportion - limit)
+    smooth = (spread / distance) ** 2
+    return float(math.ceil(smooth / 4 * (1 + math.sqrt(1 + 2 / (smooth * distance))) ** 2))
+
+
+# --------------------------------------------------------------------------------------------------
+# Runs and worlds that a study requires, and differences that a planned study can show.
+
+_HALVINGS = 60
+_MOST = 100_000
+
+
+@dataclass(frozen=True)
+class TypicalSpread:
+    """Typical standard deviations of paired differences, measured on stored studies.
+
+    Attributes:
+        run_sd: SD over runs of the log ratio of a world: standard error times root of the runs.
+        world_sd: SD over worlds of the log ratio.
+        world_correlation: Correlation of two worlds over runs.
+        track_run_sd: SD over runs of the difference of the shares that keep track.
+        track_world_sd: SD over worlds of the same difference.
+    """
+
+    run_sd: float = 0.4
+    world_sd: float = 0.25
+    world_correlation: float = 0.15
+    track_run_sd: float = 0.3
+    track_world_sd: float = 0.05
+
+
+class DetectableEffects(NamedTuple):
+    """Least effects that a study shows with a given power; infinite if it cannot show any.
+
+    Attributes:
+        error_same_worlds: Log ratio of errors in the worlds of the study.
+        error_new: Log ratio of errors in a new world.
+        track_same_worlds: Difference of shares that keep track in the worlds of the study.
+        track_new: Difference of shares in a new world.
+    """
+
+    error_same_worlds: float
+    error_new: float
+    track_same_worlds: float
+    track_new: float
+
+
+def t_test_power(score: float, df: float, alpha: float) -> float:
+    """Compute the power of the two-sided t test.
+
+    Args:
+        score: Effect divided by the standard error.
+        df: Degrees of freedom.
+        alpha: Level.
+
+    Returns:
+        Power, 0 to 1.
+    """
+    if df <= 0:
+        return 0.0
+    limit = float(-stdtrit(df, alpha / 2))
+    tails = 1 - nctdtr(df, abs(score), limit) + nctdtr(df, abs(score), -limit)
+    return float(tails) if np.isfinite(tails) else float(ndtr(abs(score) - limit))
+
+
+def detectable_score(df: float, alpha: float, power: float = POWER) -> float:
+    """Compute the effect in standard errors that the two-sided t test shows with a given power.
+
+    Args:
+        df: Degrees of freedom.
+        alpha: Level.
+        power: Power required.
+
+    Returns:
+        Score, infinite without degrees of freedom.
+    """
+    if df <= 0:
+        return math.inf
+    limit = float(-stdtrit(df, alpha / 2))
+    low, high = 0.0, 6 * limit + 20
+    for _ in range(_HALVINGS):  # scipy.optimize takes a tenth of a second to import
+        middle = (low + high) / 2
+        low, high = (middle, high) if t_test_power(middle, df, alpha) < power else (low, middle)
+    return high
+
+
+def required_worlds(
+    effect: float, comparisons: int = 1, alpha: float = 0.05, power: float = POWER
+) -> float:
+    """Compute the worlds required to show an effect in a new world.
+
+    Args:
+        effect: Mean effect in standard deviations over worlds.
+        comparisons: Size of the family. Each comparison is tested at alpha / comparisons.
+        alpha: Error of the family.
+        power: Power required.
+
+    Returns:
+        Number of worlds, infinite for no effect.
+    """
+    level = alpha / comparisons
+    return _least(lambda w: t_test_power(effect * math.sqrt(w), w - 1, level) >= power, 2, effect)
+
+
+def required_runs_per_condition(
+    effect: float, comparisons: int = 1, alpha: float = 0.05, power: float = POWER
+) -> float:
+    """Compute the runs required to show an effect in the worlds of a study.
+
+    Args:
+        effect: Effect in standard deviations over runs of the mean over worlds.
+        comparisons: Size of the family.
+        alpha: Error of the family.
+        power: Power required.
+
+    Returns:
+        Number of runs per condition, at least 10, infinite for no effect.
+    """
+    level = alpha / comparisons
+    return _least(
+        lambda n: t_test_power(effect * math.sqrt(n), middle_runs(n) - 1, level) >= power,
+        MIN_RUNS,
+        effect,
+    )
+
+
+def middle_runs(runs: int) -> int:
+    """Return the number of runs that remain after trimming."""
+    return runs - 2 * math.floor(TRIM_SHARE * runs + 1e-9)
+
+
+def detectable_effects(
+    runs: int,
+    worlds: int,
+    pairs: int,
+    spread: TypicalSpread | None = None,
+    alpha: float = 0.05,
+    power: float = POWER,
+) -> DetectableEffects:
+    """Compute the least effects that a planned study shows, before it runs.
+
+    Args:
+        runs: Runs per condition.
+        worlds: Number of worlds.
+        pairs: Number of planned pairs. Track and error of each pair are one family.
+        spread: Typical standard deviations, None for those of stored studies.
+        alpha: Error of the family.
+        power: Power required of each comparison.
+
+    Returns:
+        Effects of the questions (a) and (b).
+
+    Raises:
+        ValueError: if a number is not positive.
+    """
+    if min(runs, worlds, pairs) < 1:
+        raise ValueError(
+            f"runs, worlds and pairs must be positive, got {runs}, {worlds} and {pairs}. Use 1 or more."
+        )
+    spread = spread or TypicalSpread()
+    level, rho = alpha / (2 * pairs), spread.world_correlation
+    same_worlds = detectable_score(middle_runs(runs) - 1 if runs >= MIN_RUNS else 0, level, power)
+    new = detectable_score(worlds - 1, level, power)
+    effects = []
+    for run_sd, world_sd in (
+        (spread.run_sd, spread.world_sd),
+        (spread.track_run_sd, spread.track_world_sd),
+    ):
+        over_runs = run_sd * math.sqrt((1 + (worlds - 1) * rho) / (worlds * runs))
+        effects += [
+            same_worlds * over_runs,
+            new * math.hypot(over_runs, world_sd / math.sqrt(worlds)),
+        ]
+    return DetectableEffects(*effects)
+
+
+def _least(is_enough: Callable[[int], bool], start: int, effect: float) -> float:
+    """Return the least number from a start that is enough, by doubling and bisection."""
+    if not effect or not math.isfinite(effect):
+        return math.inf if not effect else float(start)
+    high = start
+    while not is_enough(high):
+        if high > _MOST:
+            return math.inf
+        high *= 2
+    low = max(start, high // 2)
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if is_enough(middle) else (middle + 1, high)
+    return float(low)
+
+
+# --------------------------------------------------------------------------------------------------
+# Sentence about what a study can show, printed before it runs.
+
+_LARGEST_RATIO = 1000.0
+
+
+def describe_study_size(runs: int, worlds: int, pairs: int) -> str:
+    """Describe the least differences that a study shows, before it runs.
+
+    Args:
+        runs: Runs per condition.
+        worlds: Number of worlds, families of scenarios.
+        pairs: Number of planned pairs of filters.
+
+    Returns:
+        One or two sentences on errors, for the worlds of the study and for a new one.
+
+    Raises:
+        ValueError: if a number is not positive.
+    """
+    effects = detectable_effects(runs, worlds, pairs)
+    size = f"{_count(runs, 'run')} and {_count(worlds, 'world')}"
+    if runs < MIN_RUNS:
+        return f"{_count(runs, 'run')} can show nothing: tests require at least {MIN_RUNS} runs."
+    scope = "this world" if worlds == 1 else f"these {worlds} worlds"
+    sentence = f"{size} can show {_ratio(effects.error_same_worlds)} in {scope}"
+    if worlds == 1:
+        new = "and nothing about a new world, which requires at least 2 worlds"
+    else:
+        new = f"and {_ratio(effects.error_new)} in a new world"
+    basis = f"{_count(pairs, 'pair')} of filters, power {POWER:g}, typical spread"
+    return f"{sentence}, {new} ({basis})."
+
+
+def _ratio(effect: float) -> str:
+    """Format a log ratio of errors as a requirement."""
+    ratio = math.exp(min(effect, 700.0))
+    if ratio > _LARGEST_RATIO:
+        return "no error ratio below 1000"
+    return f"error ratios of at least {ratio:.3g}"
+
+
+def _count(number: int, noun: str) -> str:
+    """Format a count with its noun."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"

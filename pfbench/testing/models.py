@@ -1,0 +1,180 @@
+"""Tests of models and proposals: derivatives equal finite differences, weighted averages equal those of the model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief
+from pfbench.filter.linearisation import find_observation_jacobian, find_propagation_jacobian
+from pfbench.filter.particle.proposals import Proposal
+from pfbench.model.base import StateSpaceModel
+from pfbench.model.linear_gaussian import linear_walk
+from pfbench.testing.results import (
+    LawCheck,
+    check_count,
+    check_is_model,
+    check_means,
+    compute_twice,
+    find_kind,
+)
+
+# --------------------------------------------------------------------------------------------------
+# Test of the derivatives that a model states: they equal finite differences.
+
+
+def check_jacobians(
+    model: StateSpaceModel, x: Tensor, u: Any, step: float = 1e-4, limit: float = 1e-5
+) -> dict[str, float]:
+    """Compare stated Jacobians and the noise gain with central differences.
+
+    The methods are `propagation_jacobian`, `observation_jacobian` and `noise_gain`. The differences
+    of the noise gain are taken about the mean of the noise, one standard deviation wide.
+
+    Args:
+        model: State-space model in double precision.
+        x: States at which the derivatives are taken, [R, N, D].
+        u: Inputs of a step.
+        step: Half width of the difference in each component of the chart.
+        limit: Largest error, relative to the largest entry of the Jacobian.
+
+    Returns:
+        Relative error of each derivative that the model states, by name.
+
+    Raises:
+        AssertionError: If the model states none, or an error exceeds the limit.
+        ValueError: If the model is not a `StateSpaceModel`, or the states have another shape.
+    """
+    check_is_model("check_jacobians", model)
+    if x.dim() != 3 or x.shape[-1] != model.chart.size:
+        raise ValueError(
+            f"check_jacobians: x must have shape [R, N, {model.chart.size}], got {list(x.shape)}."
+        )
+    mean = model.noise.mean.expand(*x.shape[:2], -1)
+    maps: dict[str, tuple[Any, Callable[[Tensor], Tensor], Any]] = {
+        "propagation_jacobian": (
+            find_propagation_jacobian(model, x, u),
+            lambda at: model.propagate(at, u, mean),
+            model.chart.subtract,
+        ),
+        "observation_jacobian": (
+            find_observation_jacobian(model, x, u),
+            lambda at: model.observation(at, u).mean,
+            model.residual,
+        ),
+    }
+    pairs = {
+        name: (value, _difference_quotients(model, x, f, subtract, step))
+        for name, (value, f, subtract) in maps.items()
+        if value is not None
+    }
+    gain = model.noise_gain(u)
+    if gain is not None:
+        for side in (1.0, -1.0):  # both: the central difference of a square is 0
+            pairs[f"noise_gain ({side:+g} sd)"] = gain[:, None], _noise_quotients(model, x, u, side)
+    errors: dict[str, float] = {}
+    for label, (value, expected) in pairs.items():
+        name, scale = label.split(" ")[0], expected.abs().max().clamp(min=1e-300)
+        error = float((value - expected).abs().max() / scale)
+        assert error <= limit, (
+            f"{type(model).__name__}.{name} must be the derivative, got a relative error of "
+            f"{error:.2g}."
+        )
+        errors[name] = max(error, errors.get(name, 0.0))
+    assert errors, f"{type(model).__name__} must state a Jacobian, got none."
+    return errors
+
+
+def _noise_quotients(model: StateSpaceModel, x: Tensor, u: Any, side: float) -> Tensor:
+    """Return difference quotients of the step in the noise, [R, N, d, W]."""
+    noise = model.noise
+    mean, steps = noise.mean.expand(*x.shape[:2], -1), side * noise.stddev
+    quiet_x = model.propagate(x, u, mean)
+    columns = [
+        model.chart.subtract(model.propagate(x, u, mean + e), quiet_x) / steps[i]
+        for i, e in enumerate(torch.diag(steps))
+    ]
+    return torch.stack(columns, -1)
+
+
+def _difference_quotients(
+    model: StateSpaceModel,
+    x: Tensor,
+    f: Callable[[Tensor], Tensor],
+    subtract: Callable[[Tensor, Tensor], Tensor],
+    step: float,
+) -> Tensor:
+    """Return central difference quotients of f along the chart, [R, N, k, d]."""
+    increments = step * torch.eye(model.chart.dimension, dtype=x.dtype)
+    columns = [
+        subtract(f(model.chart.add(x, e)), f(model.chart.add(x, -e))) / (2.0 * step)
+        for e in (row.expand(*x.shape[:2], -1) for row in increments)
+    ]
+    return torch.stack(columns, -1)
+
+
+# --------------------------------------------------------------------------------------------------
+# Test of proposals: their weighted averages equal averages over the model.
+
+_STATEMENT = "a proposal returns log p(w) - log q(w)"
+
+
+def check_proposal(
+    proposal: Proposal, particles: int = 20, runs: int = 4000, seed: int = 1, limit: float = 4.5
+) -> LawCheck:
+    """Check E_q[exp(log_ratio) f(x)] = E_p[f(x)] for f = 1, x and x^2.
+
+    The model is a walk with constant velocity, whose predicted moments are known. Its measurement
+    is weak, so that a proposal that uses it stays close to the model and the ratio has a variance.
+
+    Args:
+        proposal: Proposal to test.
+        particles: Number of particles in a run.
+        runs: Number of independent repetitions.
+        seed: Seed of the random stream.
+        limit: Largest number of standard errors.
+
+    Returns:
+        The average with the most standard errors.
+
+    Raises:
+        AssertionError: If the statement does not hold, or if the proposal is not repeatable.
+        ValueError: If the proposal is not an instance that is called with these arguments.
+    """
+    kinds = {"proposal": ("model", "belief", "record", "draws")}
+    find_kind("check_proposal", proposal, kinds, "BootstrapProposal()")
+    check_count("check_proposal", particles=particles)
+    check_count("check_proposal", 2, runs=runs)
+    model = linear_walk(1.0, 0.5, 2.0)
+    streams = PhiloxStream(seed, torch.arange(runs))
+    flat = torch.full((runs, particles), -math.log(particles), dtype=torch.float64)
+    belief = ParticleBelief(
+        streams.normal("state", particles, 2), flat, torch.zeros(runs, dtype=torch.float64)
+    )
+    record = Record(torch.full((runs, 1), 0.7, dtype=torch.float64))
+    proposed = compute_twice(
+        "proposal",
+        lambda: proposal(model, belief, record, streams.at_step(1)),
+        lambda sample: {"states": sample.x, "ratio": sample.log_ratio},
+    )
+    ratio = torch.exp(proposed.log_ratio).unsqueeze(-1)
+    parent = belief.x @ model.f.mT
+    variance = (model.g @ model.g.mT).diagonal()
+    z = (proposed.x - parent) / variance.sqrt()  # standard normal under the model
+    averages = {
+        "exp(log_ratio) - 1": ratio - 1.0,
+        "exp(log_ratio) z": ratio * z,
+        "exp(log_ratio) z^2 - 1": ratio * z * z - 1.0,
+    }
+    deviations = {
+        f"{name}, component {i}": value.mean(1)[:, i].numpy()
+        for name, value in averages.items()
+        for i in range(value.shape[-1])
+    }
+    return check_means(_STATEMENT, deviations, limit)
