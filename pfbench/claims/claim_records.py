@@ -362,13 +362,7 @@ _GROUPS = ("scenario", "noise", "model")
 def list_choices(claim: Claim, conf: Path, experiments: Path) -> list[str]:
     """List the choices of this project in the studies of a claim.
 
-    Args:
-        claim: Claim.
-        conf: Folder of configurations.
-        experiments: Folder of experiments.
-
-    Returns:
-        Choices of the experiments, then of scenarios, regimes, models and filters; none twice.
+    Returns choices of the experiments, then of scenarios, regimes, models and filters; none twice.
     """
     files: dict[Path, None] = {}
     tests = [test for tests in claim.tests.values() for test in tests]

@@ -38,16 +38,8 @@ def load_claim_measurements(
 ) -> pd.DataFrame:
     """Measure all tests of the claims in all available runs.
 
-    Args:
-        claims: Records.
-        results: Folder of all studies. Jobs without results are left out.
-        allow_mixed_versions: Accept several versions, and several seeds, runs or lengths within a condition.
-
-    Returns:
-        Columns study, cell, label, measure, seed, run, lost, unit, value; infinite or NaN if lost.
-
-    Raises:
-        ValueError: if results do not belong together, or lack a group or component.
+    Returns columns study, cell, label, measure, seed, run, lost, unit, value; infinite or NaN if
+    lost.
     """
     tests_by_side: dict[Side, dict[str, ClaimTest]] = {}
     for test in list_tests(claims):
@@ -67,16 +59,7 @@ def load_claim_measurements(
 def claim_job_metadata(
     claims: Sequence[Claim], results: str | Path = "results", *, mixed: bool = False
 ) -> dict[Side, Mapping[str, Any]]:
-    """Read the metadata of the jobs that the claims' tests use.
-
-    Args:
-        claims: Records.
-        results: Folder of all studies.
-        mixed: As in `load_claim_measurements`.
-
-    Returns:
-        Metadata by study, condition and label.
-    """
+    """Read the metadata of the jobs that the claims' tests use."""
     sides = {side for test in list_tests(claims) for side in test.sides}
     return {side: job.meta for side, job in _find_jobs(sides, results, mixed)}
 
@@ -84,15 +67,7 @@ def claim_job_metadata(
 def measure_claim_test(result: store.JobResult, test: ClaimTest) -> np.ndarray:
     """Measure the metric of a test.
 
-    Args:
-        result: Job.
-        test: Test.
-
-    Returns:
-        Value of each run, [R].
-
-    Raises:
-        ValueError: if the job lacks the group, component or time of the test.
+    Returns value of each run, [R].
     """
     result = _drop_after(drop_before(result, test.start), test.end)
     lost, groups = result.data["lost"], result.meta["state"]["groups"]
@@ -117,11 +92,7 @@ def measure_claim_test(result: store.JobResult, test: ClaimTest) -> np.ndarray:
 
 
 def list_tests(claims: Sequence[Claim]) -> Iterator[ClaimTest]:
-    """Yield the tests of all claims.
-
-    Args:
-        claims: Records.
-    """
+    """Yield the tests of all claims."""
     return (test for claim in claims for tests in claim.tests.values() for test in tests)
 
 
@@ -144,11 +115,7 @@ def _find_jobs(
 
 
 def _has_label(job: JobFile, condition: Condition, label: str) -> bool:
-    """Check that a job is of the filter and settings of a label, and the only one.
-
-    Raises:
-        ValueError: if another job of the condition matches too.
-    """
+    """Check that a job is of the filter and settings of a label, and the only one."""
 
     def matches(candidate: JobFile) -> bool:
         name, _, settings = label.rstrip("]").partition("[")
@@ -283,17 +250,7 @@ class ClaimData(NamedTuple):
 def load_claim_data(
     claims: Sequence[Claim], results: str | Path, folder: Path, *, allow_mixed_versions: bool
 ) -> ClaimData:
-    """Measure the claims' tests in the results, and read those of studies without results from files.
-
-    Args:
-        claims: Records.
-        results: Folder of all studies.
-        folder: Folder of the page, which may hold the files of `write_claim_data`.
-        allow_mixed_versions: As in `load_claim_measurements`.
-
-    Raises:
-        ValueError: If results do not belong together, or a file is damaged.
-    """
+    """Measure the claims' tests in the results, and read those of studies without results from files."""
     measured = ClaimData(
         load_claim_measurements(claims, results, allow_mixed_versions=allow_mixed_versions),
         claim_job_metadata(claims, results, mixed=allow_mixed_versions),
@@ -315,12 +272,7 @@ def load_claim_data(
 
 
 def write_claim_data(data: ClaimData, folder: RecordedFolder) -> None:
-    """Write measurements and jobs. Equal results give equal bytes.
-
-    Args:
-        data: Measurements and jobs.
-        folder: Folder of the page.
-    """
+    """Write measurements and jobs. Equal results give equal bytes."""
     rows = data.rows.sort_values(MEASURED_COLUMNS[:6], ignore_index=True)
     texts = [name for name in MEASURED_COLUMNS if rows[name].dtype == object]
     buffer = io.BytesIO()
@@ -369,16 +321,7 @@ def _shorten(meta: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_stored_verdicts(path: Path, records: Sequence[dict[str, Any]]) -> None:
-    """Check that no stored verdict is replaced by one with fewer results.
-
-    Args:
-        path: Stored verdicts.json, which need not exist.
-        records: New records, as in the file.
-
-    Raises:
-        ValueError: If results of a stored verdict are missing. The message names the file, the number of
-            claims and the remedy.
-    """
+    """Check that no stored verdict is replaced by one with fewer results."""
     if not path.is_file():
         return
     stored = {

@@ -58,20 +58,7 @@ def write_claims(
 
     Measurements of studies without results are read from the folder. Equal results give equal bytes.
 
-    Args:
-        results: Folder of all studies. Claims without results and without stored measurements are not run.
-        out: Folder of all reports, which the page links to.
-        alpha: Level after correction.
-        conf: Folder of configurations, as in `read_claims`.
-        experiments: Folder of experiments, as in `read_claims`.
-        allow_mixed_versions: Accept several versions, and several seeds, runs or lengths within a condition.
-        formats: File formats of the figures.
-
-    Returns:
-        Path of index.html.
-
-    Raises:
-        ValueError: if a record is wrong, results do not belong together, or those of stored verdicts are missing.
+    Returns path of index.html.
     """
     claims = read_claims(conf, experiments)
     stored = Path(out) / CLAIMS_STUDY
@@ -105,12 +92,7 @@ def write_claims(
 
 
 def report_anchors(studies: Iterable[str], out: str | Path) -> dict[str, set[str]]:
-    """Read the anchors of the paper figures on the pages of studies that have a page.
-
-    Args:
-        studies: Names of the studies.
-        out: Folder of all reports.
-    """
+    """Read the anchors of the paper figures on the pages of studies that have a page."""
     pages = {study: Path(out) / study / "index.html" for study in sorted(studies)}
     pattern = r'<figure id="([^"]+)"'
     return {
@@ -128,14 +110,7 @@ def rows_by_paper(
 ) -> list[dict[str, Any]]:
     """Collect the title of each paper and the rows of its claims for the templates.
 
-    Args:
-        verdicts: Verdicts from `decide_claims`.
-        reports: Anchors of each study that has a page; None for no links.
-        jobs: Metadata from `claim_job_metadata`; None to omit it.
-        choices: Choices of this project by claim, from `list_choices`; None to omit them.
-
-    Returns:
-        One entry per paper.
+    Returns one entry per paper.
     """
     rows = [
         (
@@ -277,12 +252,7 @@ def list_commits(jobs_metadata: Iterable[Mapping[str, Any]]) -> list[str]:
 
 
 def describe_jobs(claim: Claim, jobs: Jobs) -> list[str]:
-    """Describe runs and budget of a claim's jobs, and their commit if the page has several.
-
-    Args:
-        claim: Claim.
-        jobs: Metadata of all jobs, from `claim_job_metadata`.
-    """
+    """Describe runs and budget of a claim's jobs, and their commit if the page has several."""
     sides = [side for tests in claim.tests.values() for test in tests for side in test.sides]
     used = {side: jobs[side] for side in sides if side in jobs}
     has_several = len(list_commits(jobs.values())) > 1
@@ -362,16 +332,7 @@ _COLOURS = {HOLDS: "#0072B2", FAILS: "#D55E00"}  # open results are grey
 
 
 def figure_anchor(claim: Claim, test: ClaimTest, anchors: Collection[str]) -> str:
-    """Find the anchor of the figure of the paper that shows a test.
-
-    Args:
-        claim: Claim, whose source names the figures of its paper.
-        test: Test of the claim.
-        anchors: Anchors of the figures on the page of the study.
-
-    Returns:
-        The anchor, empty without one.
-    """
+    """Find the anchor of the figure of the paper that shows a test."""
     condition = format_slug(test.cell.replace("/", "_"))
     for name, figure in FIGURES.items():
         if name.startswith(claim.paper) and figure_numbers(claim.source) & figure_numbers(
@@ -422,12 +383,7 @@ def claim_figures(verdicts: Sequence[ClaimVerdict]) -> list[FigureSpec]:
 def plot_claims(rows: Sequence[tuple[str, ClaimTestResult]], relative: bool) -> Figure:
     """Plot measured and printed values, one row per test.
 
-    Args:
-        rows: Identifier of the claim and result of the test.
-        relative: Plot the measured value divided by the printed one.
-
-    Returns:
-        The figure.
+    Returns the figure.
     """
     figure = Figure(figsize=(COLUMN, 0.7 + 0.17 * len(rows)), layout="constrained")
     axis = figure.subplots()

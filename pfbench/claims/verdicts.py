@@ -86,13 +86,7 @@ def run_claim_test(
 ) -> ClaimTestResult:
     """Decide a test before Holm's correction.
 
-    Args:
-        test: Test.
-        series: Rows of `load_claim_measurements` by study, cell, label and measure.
-        alpha: Probability outside the interval.
-
-    Returns:
-        The decision; "open" if it needs Holm's correction.
+    Returns the decision; "open" if it needs Holm's correction.
     """
     tables = [series.get((*side, test.measure)) for side in test.sides]
     rows = [table.set_index(["seed", "run"]).sort_index() for table in tables if table is not None]
@@ -247,13 +241,7 @@ def decide_claims(
 ) -> list[ClaimVerdict]:
     """Decide all claims, in their order.
 
-    Args:
-        claims: Records from `read_claims`.
-        frame: Rows of `load_claim_measurements`, in any order.
-        alpha: Level of the tests after correction, and probability outside the intervals.
-
-    Returns:
-        One verdict per claim.
+    Returns one verdict per claim.
     """
     columns = ["study", "cell", "label", "measure"]
     groups = frame.groupby(columns, sort=False)
@@ -437,13 +425,7 @@ class ClaimSample:
 def sample_claim_test(test: ClaimTest, a: Array, b: Array | None) -> ClaimSample:
     """Compute the values of one test and the region claimed for their median.
 
-    Args:
-        test: Test.
-        a: One number per run of the first filter, [n], infinite where lost.
-        b: Numbers of the second filter in the same runs, if the test has one.
-
-    Returns:
-        Values and region.
+    Shapes: a [n].
     """
     name = test.statistic
     if name in ("flat", "falls"):
@@ -477,12 +459,6 @@ def exclusion_p_value(s: ClaimSample) -> float:
     """Compute the p-value that the median excludes every sufficient effect.
 
     It is at most alpha exactly if the order-statistic interval of level 1 - alpha lies outside.
-
-    Args:
-        s: Values and region.
-
-    Returns:
-        Two-sided p-value of the nearer border; 1 without one.
     """
     # a sufficient effect lies beyond its border, so the border itself is excluded
     allows_equality = s.worth > 0

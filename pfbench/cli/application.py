@@ -14,15 +14,7 @@ _MULTIRUN_FLAGS = ("-m", "--multirun")
 
 
 def make_application(task: Callable[[Any], Any]) -> Callable[[], None]:
-    """Make the application that runs a task for each job.
-
-    Args:
-        task: Function of a composed configuration.
-
-    Returns:
-        What `hydra.main` makes of the task, with the same effects. Words without flags of Hydra read each file once, and
-        are not composed for the mode alone.
-    """
+    """Make the application that runs a task for each job."""
     import hydra
 
     full = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(task)

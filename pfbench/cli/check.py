@@ -17,14 +17,7 @@ The exit code is 1 if a configuration does not compose."""
 
 
 def check_installation(words: Sequence[str]) -> None:
-    """Print the state of the installation as a table of item, value and status.
-
-    Args:
-        words: None.
-
-    Raises:
-        ValueError: If there are words, or a configuration does not compose.
-    """
+    """Print the state of the installation as a table of item, value and status."""
     if words:
         raise ValueError(f"check must be without words, got {' '.join(words)}. Use: pfbench check")
     import torch

@@ -20,22 +20,14 @@ that have neither are listed as not run. They never replace stored verdicts.
 
 
 def report_claims(words: Sequence[str]) -> None:
-    """Write the page of the claims.
-
-    Args:
-        words: Overrides.
-    """
+    """Write the page of the claims."""
     print(f"claims: {write_claims_page(words).resolve()}")
 
 
 def write_claims_page(words: Sequence[str]) -> Path:
     """Write the page of the claims.
 
-    Args:
-        words: Overrides.
-
-    Returns:
-        The page.
+    Returns the page.
     """
     from pfbench.claims.page import write_claims
 

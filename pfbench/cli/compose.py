@@ -21,11 +21,7 @@ from pfbench.results.paper_block import conf_dir, experiments_dir
 def compose_study(words: Sequence[str]) -> JobConfig:
     """Compose the configuration of a study, with its experiment if it exists.
 
-    Args:
-        words: Overrides, `study=NAME` among them.
-
-    Returns:
-        The configuration.
+    Returns the configuration.
     """
     config = compose(words)
     study = config.values["study"]
@@ -45,17 +41,7 @@ def split_words(
 ) -> dict[str, str]:
     """Split words into values by key and check the keys.
 
-    Args:
-        words: Words `key=value`.
-        keys: Keys that the command has.
-        required: Keys that must be set.
-        usage: Command with its required words, such as `pfbench cost study=NAME`.
-
-    Returns:
-        Values by key.
-
-    Raises:
-        ValueError: If a word is not `key=value`, a key is unknown or repeated, or one is missing.
+    Returns values by key.
     """
     values: dict[str, str] = {}
     advice = f"See {' '.join(usage.split()[:2])} --help."
@@ -79,11 +65,7 @@ def split_words(
 def count_planned_jobs(study: str) -> int | None:
     """Count the jobs of the sweep of an experiment.
 
-    Args:
-        study: Name of the experiment.
-
-    Returns:
-        The number, or None if the experiment does not exist or does not define a sweep.
+    Returns the number, or None if the experiment does not exist or does not define a sweep.
     """
     overrides = read_sweep(study)
     return math.prod(map(len, expand_sweep(overrides))) if overrides else None
@@ -119,16 +101,7 @@ def check_words(words: Sequence[str]) -> JobConfig | None:
     A job whose configuration is invalid for another reason fails by itself later, and the other jobs
     of the sweep run.
 
-    Args:
-        words: Overrides and flags of Hydra, without `trust`.
-
-    Returns:
-        Configuration of the first job, None if it is not valid.
-
-    Raises:
-        UntrustedConfigError: If a file sets what only the command line may set, or names what is
-            not trusted.
-        ValueError: If a word is a flag that Hydra does not have.
+    Returns configuration of the first job, None if it is not valid.
     """
     args = _parse_flags(list(words))
     if args.config_path or args.config_name or args.config_dir or args.experimental_rerun:
@@ -143,14 +116,7 @@ def check_words(words: Sequence[str]) -> JobConfig | None:
 def replace_config_dir(words: Sequence[str]) -> list[str]:
     """Replace the flag `--config-dir` of Hydra by the search path with this folder.
 
-    Args:
-        words: Overrides and flags of Hydra.
-
-    Returns:
-        The words without the flag.
-
-    Raises:
-        ValueError: If the flag is without a folder, or the search path is given twice.
+    Returns the words without the flag.
     """
     index = next((i for i, w in enumerate(words) if re.match(r"(--config-dir|-cd)(=|$)", w)), None)
     if index is None:
@@ -187,11 +153,7 @@ def _parse_flags(words: list[str]) -> Any:
 def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
     """Expand overrides as Hydra's sweeper does. A later override replaces an earlier one.
 
-    Args:
-        overrides: Overrides, some with several values.
-
-    Returns:
-        For each key the alternatives, each as an override.
+    Returns for each key the alternatives, each as an override.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
 

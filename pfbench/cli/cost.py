@@ -37,14 +37,7 @@ _KEYS = ("study", "rounds", "seconds", "overwrite", "results_dir", "episode_cach
 
 
 def measure_cost(words: Sequence[str]) -> None:
-    """Measure the time per step of all filters of a study.
-
-    Args:
-        words: Words `key=value`.
-
-    Raises:
-        ValueError: If a word is not valid, or results of the study are missing.
-    """
+    """Measure the time per step of all filters of a study."""
     values = split_words(words, _KEYS, ("study",), "pfbench cost study=NAME")
     rounds, seconds = _read_numbers(values)
     composed = [f"{key}={values[key]}" for key in _KEYS if key in values and key not in ("rounds", "seconds")]  # fmt: skip

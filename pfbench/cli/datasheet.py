@@ -19,14 +19,7 @@ Write the datasheet of a scenario: trajectory, sensors, measurements and truth o
 
 
 def report_scenario(words: Sequence[str]) -> None:
-    """Write the datasheet of a scenario.
-
-    Args:
-        words: Overrides.
-
-    Raises:
-        ValueError: If the scenario is not given, or a value is invalid.
-    """
+    """Write the datasheet of a scenario."""
     keys = given_keys(words)
     if "scenario" not in keys:
         raise ValueError(

@@ -49,14 +49,7 @@ _PAIR = re.compile(
 
 
 def judge_trajectories(words: Sequence[str]) -> None:
-    """Compare programs and write the report.
-
-    Args:
-        words: Overrides.
-
-    Raises:
-        ValueError: If a word or a file is not valid. Nothing is written.
-    """
+    """Compare programs and write the report."""
     values = _split(words)
     options, sources, programs = _sort_words(values)
     from pfbench.judge.judgement import judge_programs

@@ -22,14 +22,7 @@ _OTHER = {"model": "scenario", "scenario": "model"}
 
 
 def list_options(words: Sequence[str]) -> None:
-    """Print the configuration groups, or the files of one group.
-
-    Args:
-        words: Name of a group, or nothing. For a model or a scenario, overrides with the other one.
-
-    Raises:
-        ValueError: If the group does not exist, or the overrides do not name the other one.
-    """
+    """Print the configuration groups, or the files of one group."""
     groups = list_groups()
     if not words:
         for group, files in groups.items():

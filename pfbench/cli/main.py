@@ -52,15 +52,7 @@ First study: pfbench run -m +experiment=quickstart, then pfbench report study=qu
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run the command line.
-
-    Args:
-        argv: Words after `pfbench`. Default: those of the process.
-
-    Raises:
-        SystemExit: With code 1 if the command failed, 2 if it was refused before its work started
-            (`pfbench.files.command_start`). With 128 and its number if a signal ended it, such as 130.
-    """
+    """Run the command line."""
     words = list(sys.argv[1:] if argv is None else argv)
     before = os.environ.get(ENVIRONMENT), sys.argv
     with lasting_outputs() as output, stopped_by_signals():

@@ -40,12 +40,7 @@ _ALL_KEYS = " List all: pfbench run --cfg job"
 def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
     """Format an error for a user.
 
-    Args:
-        error: Error of a command, of Hydra or of a class that a configuration names.
-        words: Overrides of the command.
-
-    Returns:
-        The key, the value given, and a remedy.
+    Returns the key, the value given, and a remedy.
     """
     if type(error).__name__ == "InstantiationException" and error.__cause__ is not None:
         return _format_refusal(f"{error}", error.__cause__, words)
@@ -102,15 +97,7 @@ def notes_of(error: BaseException) -> list[str]:
 
 
 def suggest_similar(name: str, options: Sequence[str]) -> str:
-    """Return a sentence with the options that are similar to a misspelt name.
-
-    Args:
-        name: Name or dotted key that does not exist.
-        options: Existing names or dotted keys. Dotted keys are compared by their last part, too.
-
-    Returns:
-        ` Similar: a, b.`, or an empty text.
-    """
+    """Return a sentence with the options that are similar to a misspelt name."""
 
     def similarity(a: str, b: str) -> float:
         return difflib.SequenceMatcher(None, a, b).ratio()
@@ -128,14 +115,7 @@ def suggest_similar(name: str, options: Sequence[str]) -> str:
 
 
 def find_renamed(word: str) -> tuple[str, str] | None:
-    """Find the new name of a renamed key or choice.
-
-    Args:
-        word: Override `key=value`, or a dotted key.
-
-    Returns:
-        The old and the new name, or None.
-    """
+    """Find the new name of a renamed key or choice."""
     key, _, value = word.lstrip("+~").partition("=")
     table = _renamed_keys()
     if new := table["choices"].get(key, {}).get(value):
@@ -272,11 +252,7 @@ _GRAMMAR = (
 def format_value_error(text: str) -> str:
     """Format an error of Hydra about a single value.
 
-    Args:
-        text: Message of the error.
-
-    Returns:
-        The key, the value given, and a remedy. Empty for other errors.
+    Returns the key, the value given, and a remedy. Empty for other errors.
     """
     if match := re.search(r"Ambiguous value for argument '([^']+)'", text):
         return f"{match[1]} must be one value, got several. Add -m to run all: pfbench run -m ..."
@@ -309,13 +285,7 @@ def format_value_error(text: str) -> str:
 def format_flag(words: Sequence[str], flag: str, command: str) -> str:
     """Format an error about a flag that does not exist, such as `--scenario`.
 
-    Args:
-        words: Words of the command.
-        flag: The flag, one of the words.
-        command: Name of the command.
-
-    Returns:
-        The flag, and how the override is written.
+    Returns the flag, and how the override is written.
     """
     key, _, value = flag.lstrip("-").partition("=")
     following = words[words.index(flag) + 1 :] if flag in words else []
@@ -330,12 +300,7 @@ def format_flag(words: Sequence[str], flag: str, command: str) -> str:
 def format_choice_error(text: str, words: Sequence[str]) -> str:
     """Format an error of Hydra about the choice of a file or the search path.
 
-    Args:
-        text: Message of the error.
-        words: Overrides of the command.
-
-    Returns:
-        The key, the value given, and a remedy. Empty for other errors.
+    Returns the key, the value given, and a remedy. Empty for other errors.
     """
     path = next((word for word in words if re.match(r"\+?\w+=\.{0,2}/", word)), "")
     if path and re.search(r"Could not (find|load)", text) and path.partition("=")[2] in text:
@@ -385,11 +350,7 @@ _RAISE = dis.opmap["RAISE_VARARGS"]
 
 
 def is_named(error: BaseException) -> bool:
-    """Return whether pfbench raised an error itself, so that its text is a sentence for the user.
-
-    Args:
-        error: Error of a command. One without a trace comes from another process, where pfbench raised it.
-    """
+    """Return whether pfbench raised an error itself, so that its text is a sentence for the user."""
     if any(base.__module__.partition(".")[0] == "pfbench" for base in type(error).__mro__):
         return True
     entry = error.__traceback__
@@ -404,11 +365,7 @@ def is_named(error: BaseException) -> bool:
 def describe_unknown(error: BaseException) -> str:
     """Describe an error that pfbench does not name.
 
-    Args:
-        error: Error of Python or of a library.
-
-    Returns:
-        Stage or file, class and text of the error, and a remedy.
+    Returns Stage or file, class and text of the error, and a remedy.
     """
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
     package_frames = [frame for frame in reversed(frames) if _module(frame)[0] == "pfbench"]
@@ -425,12 +382,7 @@ def describe_unknown(error: BaseException) -> str:
 def keep_trace(error: BaseException, words: Sequence[str]) -> Path | None:
     """Write the trace of an error into a file of its own in the system's temporary folder.
 
-    Args:
-        error: Error.
-        words: Words of the command.
-
-    Returns:
-        The file, or None if none can be written.
+    Returns the file, or None if none can be written.
     """
     try:
         with tempfile.NamedTemporaryFile(

@@ -31,14 +31,7 @@ runs.parquet).
 
 
 def write_study_paper(words: Sequence[str]) -> None:
-    """Write the paper export of a study.
-
-    Args:
-        words: Words `key=value`.
-
-    Raises:
-        ValueError: If the format is not valid, the study does not exist or a table does not fit.
-    """
+    """Write the paper export of a study."""
     from pfbench.report.journal.figure_style import find_page_format
 
     values = {key: _value(words, key) for key in ("journal", "width")}

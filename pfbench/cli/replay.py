@@ -35,14 +35,7 @@ _PLACES = ("device", "threads")
 
 
 def replay_run(words: Sequence[str]) -> None:
-    """Compute one stored run again, compare it and write its traces.
-
-    Args:
-        words: Words `key=value`.
-
-    Raises:
-        ValueError: If a word is not valid, or no job or several jobs match.
-    """
+    """Compute one stored run again, compare it and write its traces."""
     keys = (*_REQUIRED, *_CHOICES, *_FOLDERS, *_PLACES)
     usage = "study=NAME run=NUMBER filter=NAME"
     values = split_words(words, keys, _REQUIRED, f"pfbench replay {usage}")

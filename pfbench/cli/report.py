@@ -33,14 +33,7 @@ _PAGES = ("report.md", "index.html")
 
 
 def report_study(words: Sequence[str]) -> None:
-    """Write the report of a study, or those of all studies.
-
-    Args:
-        words: `all` or overrides.
-
-    Raises:
-        ValueError: If the study is a datasheet or the claims, or its results do not exist.
-    """
+    """Write the report of a study, or those of all studies."""
     if list(words[:1]) == ["all"]:
         _report_all(list(words[1:]))
         return
@@ -65,16 +58,7 @@ def report_study(words: Sequence[str]) -> None:
 
 
 def check_has_results(study: str, results: Path) -> None:
-    """Check that a study has files of results.
-
-    Args:
-        study: Name of the study.
-        results: Folder of all studies.
-
-    Raises:
-        ValueError: If it has none. The message names failed jobs, similar studies, and the command that
-            makes the results.
-    """
+    """Check that a study has files of results."""
     from pfbench.results.conditions import list_stored_studies
     from pfbench.results.store import list_failures
 
@@ -97,11 +81,7 @@ def check_has_results(study: str, results: Path) -> None:
 def make_report_options(config: JobConfig) -> Any:
     """Build the options of a report from the group `report`.
 
-    Args:
-        config: Composed configuration.
-
-    Returns:
-        The options.
+    Returns the options.
     """
     from pfbench.report.options import ReportOptions
 
@@ -130,15 +110,7 @@ def _write_page(config: JobConfig) -> Path:
 
 
 def find_page_data(config: JobConfig, words: Sequence[str] = ()) -> Path | None:
-    """Return the stored data of the page of a study without results, if there are any.
-
-    Args:
-        config: Composed configuration.
-        words: Words of the command.
-
-    Raises:
-        ValueError: If the words set an option of the report, which stored data cannot follow.
-    """
+    """Return the stored data of the page of a study without results, if there are any."""
     from pfbench.report.study_report import PAGE_DATA
 
     study, results = (

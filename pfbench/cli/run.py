@@ -62,11 +62,7 @@ _PRINTING_FLAGS = {"--cfg", "-c", "--info", "-i", "--hydra-help", "--version", "
 
 
 def run_jobs(words: Sequence[str]) -> None:
-    """Run one job, or a sweep.
-
-    Args:
-        words: Overrides and flags of Hydra.
-    """
+    """Run one job, or a sweep."""
     register_experiments()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -106,12 +102,7 @@ def _run_alone(overrides: Sequence[str], plan: StudyPlan | None) -> None:
 
 
 def plan_or_none(overrides: Sequence[str], first: JobConfig | None = None) -> StudyPlan | None:
-    """Plan a study; None if its configuration is not valid, which Hydra reports.
-
-    Args:
-        overrides: Overrides and flags of Hydra.
-        first: Configuration of the first job, None if it is not known.
-    """
+    """Plan a study; None if its configuration is not valid, which Hydra reports."""
     words = [word for word in overrides if not word.startswith("-")]
     try:
         return plan_study(words, first if len(words) == len(overrides) else None)
@@ -120,11 +111,7 @@ def plan_or_none(overrides: Sequence[str], first: JobConfig | None = None) -> St
 
 
 def print_study_size(plan: StudyPlan | None) -> None:
-    """Print what the chosen runs and worlds can show; nothing if the settings of the job are not valid.
-
-    Args:
-        plan: Plan of the study, None if it is not valid.
-    """
+    """Print what the chosen runs and worlds can show; nothing if the settings of the job are not valid."""
     from pfbench.job.plan import check_settings
 
     if plan is None:
@@ -145,14 +132,7 @@ def run_sweep(
     *,
     is_part: bool = False,
 ) -> None:
-    """Run all jobs of a sweep and print their counts.
-
-    Args:
-        application: Application of Hydra, which reads its words from `sys.argv`.
-        words: Flags and overrides.
-        plan: Plan of the sweep, None if it is not valid.
-        is_part: Whether more runs may follow, so that the next command is not printed.
-    """
+    """Run all jobs of a sweep and print their counts."""
     sys.argv = ["pfbench run", *words]
     sweep = SweepProgress.start(plan)
     try:
@@ -172,11 +152,7 @@ def delay_keys_of_swept_groups(words: Sequence[str]) -> list[str]:
     Hydra applies other keys first to a configuration without the swept choices, where they may not
     exist: `scenario=linear_walk,growth scenario.steps=15`.
 
-    Args:
-        words: Overrides and flags of a sweep.
-
-    Returns:
-        The words in the same order.
+    Returns the words in the same order.
     """
     pairs = [word.partition("=") for word in words]
     groups = {key for key, _, value in pairs if "," in value and "." not in key}
@@ -191,12 +167,7 @@ def delay_keys_of_swept_groups(words: Sequence[str]) -> list[str]:
 def run_task(cfg: Any, announce: Callable[[], None] | None = None) -> float:
     """Run one job of a Hydra application.
 
-    Args:
-        cfg: Composed configuration.
-        announce: Function that is called when the data of the job are valid, before it is computed.
-
-    Returns:
-        The root mean square error of the main group, for sweepers that optimise.
+    Returns the root mean square error of the main group, for sweepers that optimise.
     """
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf
@@ -224,14 +195,7 @@ def run_task(cfg: Any, announce: Callable[[], None] | None = None) -> float:
 
 
 def run_with_retries(sweep: Callable[[], Any]) -> None:
-    """Run a sweep, and repeat it if joblib or Ray lost one of its processes.
-
-    Args:
-        sweep: Runs all jobs.
-
-    Raises:
-        RuntimeError: If a process was lost in all attempts.
-    """
+    """Run a sweep, and repeat it if joblib or Ray lost one of its processes."""
     for remaining in reversed(range(_RETRIES + 1)):
         try:
             sweep()
@@ -294,14 +258,7 @@ def hide_hydra_line() -> Iterator[None]:
 def report_failed_job(error: Exception, start: str, name: str, words: Sequence[str]) -> Exception:
     """Print the line of a failed job of a sweep.
 
-    Args:
-        error: Error of the job.
-        start: Start of the line, such as `[3/40] `.
-        name: Scenario, noise regime and filter.
-        words: Overrides of the job.
-
-    Returns:
-        Error to raise in its place, with the same message.
+    Returns error to raise in its place, with the same message.
     """
     message = " ".join(format_error(error, words).split())
     log.error("%sfailed    %s", start, "   ".join([name, message, *notes_of(error)]))
@@ -309,16 +266,7 @@ def report_failed_job(error: Exception, start: str, name: str, words: Sequence[s
 
 
 def summarise_failed_jobs(error: Exception, words: Sequence[str]) -> Exception:
-    """Return the error that ends a sweep.
-
-    Args:
-        error: First error of a job, or another error of the sweep.
-        words: Words of the command.
-
-    Returns:
-        A reference to the lines of the jobs, if they were printed in the same terminal. Else the
-        error itself.
-    """
+    """Return the error that ends a sweep."""
     if isinstance(error, SweepJobError):
         start_work()  # a job that cannot start fails in a sweep: the other jobs run
     launcher = next((w.partition("=")[2] for w in words if w.startswith("hydra/launcher=")), "")
@@ -357,11 +305,7 @@ class SweepProgress:
 
     @classmethod
     def start(cls, plan: StudyPlan | None) -> SweepProgress:
-        """Count the jobs of a sweep and set the total for the counters of its jobs.
-
-        Args:
-            plan: Plan of the sweep, None if it is not valid.
-        """
+        """Count the jobs of a sweep and set the total for the counters of its jobs."""
         if plan is None:  # the sweep itself reports the error
             return cls()
         values = plan.first.values
@@ -372,12 +316,7 @@ class SweepProgress:
         return sweep
 
     def finish(self, is_complete: bool = True, is_part: bool = False) -> None:
-        """Print the counts, and the next command if the study has results.
-
-        Args:
-            is_complete: Whether the sweep ended without an error.
-            is_part: Whether more runs may follow, so that the next command is not printed.
-        """
+        """Print the counts, and the next command if the study has results."""
         os.environ.pop(SWEEP_JOBS, None)
         os.environ.pop(SWEEP_LOG, None)
         if is_complete or self._log.is_file():
@@ -434,12 +373,7 @@ class SweepProgress:
 
 
 def note_outcome(number: int | None, status: str) -> None:
-    """Append the outcome of a job to the file of its sweep, if it has one.
-
-    Args:
-        number: Number of the job in the sweep, None outside a sweep.
-        status: `finished`, `skipped` or `failed`.
-    """
+    """Append the outcome of a job to the file of its sweep, if it has one."""
     path = os.environ.get(SWEEP_LOG)
     if path is None or number is None:
         return

@@ -83,11 +83,7 @@ class LastingOutput:
 
 @contextlib.contextmanager
 def lasting_outputs() -> Iterator[LastingOutput]:
-    """Replace the outputs of the process by lasting ones, and restore them and the handlers of the log.
-
-    Yields:
-        The standard output.
-    """
+    """Replace the outputs of the process by lasting ones, and restore them and the handlers of the log."""
     streams, root = (sys.stdout, sys.stderr), logging.getLogger()
     handlers, level = list(root.handlers), root.level
     opened = [_opened(stream) for stream in streams]

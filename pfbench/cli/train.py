@@ -21,14 +21,7 @@ _NOT_OF_A_JOB = ("train.", "train=", "overwrite=", "checkpoint=")
 
 
 def train_network(words: Sequence[str]) -> None:
-    """Train the network of a filter and print the command that uses it.
-
-    Args:
-        words: Overrides.
-
-    Raises:
-        ValueError: If a sweep or oracle noise is requested, or a value is invalid.
-    """
+    """Train the network of a filter and print the command that uses it."""
     from pfbench import job
     from pfbench.job.inputs import find_inputs
     from pfbench.learn.training_job import fit

@@ -45,15 +45,7 @@ _OWN = ("seed", "runs", "study", "results_dir", "report.start_time_s")  # not se
 
 
 def tune_filters(words: Sequence[str]) -> None:
-    """Tune filters, and write their knobs with the best filter of the world.
-
-    Args:
-        words: Words `key=value`.
-
-    Raises:
-        ValueError: If a filter is without a knob, a list is empty, a value is not valid, no filter can be
-            tuned, or a study scores the seed of the tuning.
-    """
+    """Tune filters, and write their knobs with the best filter of the world."""
     from pfbench.job.tuning import SEED_SHIFT, check_seed, list_candidates
 
     options = _OPTIONS | {k: v for k, _, v in (w.partition("=") for w in words) if k in _OPTIONS}

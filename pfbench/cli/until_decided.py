@@ -27,11 +27,7 @@ _DECIDING_SETTINGS = ("metric", "alpha", "equivalence_margin", "start_time_s")
 
 
 def wants_until_decided(plan: StudyPlan) -> bool:
-    """Return whether a study adds runs until it is decided.
-
-    Args:
-        plan: Plan of the study.
-    """
+    """Return whether a study adds runs until it is decided."""
     return plan.first.values.get("runs") == UNTIL_DECIDED
 
 
@@ -59,14 +55,7 @@ class GrowingSweep:
 
     @classmethod
     def from_plan(cls, plan: StudyPlan) -> GrowingSweep:
-        """Read the settings of a study.
-
-        Args:
-            plan: Plan of the study.
-
-        Raises:
-            ValueError: If a setting is not valid for a study that adds runs.
-        """
+        """Read the settings of a study."""
         from pfbench.stats.main_metrics import check_main_metric
         from pfbench.stats.pair_states import LookSchedule
 
@@ -101,11 +90,7 @@ class GrowingSweep:
         )  # fmt: skip
 
     def job_keys(self, number: int) -> set[str]:
-        """Return the keys of all jobs until a look.
-
-        Args:
-            number: Number of the look, from 1.
-        """
+        """Return the keys of all jobs until a look."""
         from pfbench.job.inputs import find_inputs
         from pfbench.job.plan import job_key
 
@@ -121,20 +106,12 @@ class GrowingSweep:
         return keys
 
     def has_results(self, number: int) -> bool:
-        """Return whether all jobs until a look have a file.
-
-        Args:
-            number: Number of the look, from 1.
-        """
+        """Return whether all jobs until a look have a file."""
         folder = self.results / self.study
         return all((folder / f"{key}.npz").exists() for key in self.job_keys(number))
 
     def read(self, number: int) -> LookTable:
-        """Read the results until a look.
-
-        Args:
-            number: Number of the look, from 1.
-        """
+        """Read the results until a look."""
         from pfbench.results.look_table import LookMetric, read_look_table
         from pfbench.results.paper_block import plan_installed_pairs
 
@@ -144,14 +121,7 @@ class GrowingSweep:
         )
 
     def run(self, run_part: Callable[[Sequence[str]], None]) -> None:
-        """Run look after look until all pairs are decided or a cap is reached.
-
-        Args:
-            run_part: Runs the sweep with further overrides.
-
-        Raises:
-            ValueError: If the study was started with another plan, or a result is missing.
-        """
+        """Run look after look until all pairs are decided or a cap is reached."""
         from pfbench.stats.pair_states import describe_end, format_look
 
         record = self._open_record()
@@ -246,14 +216,7 @@ class GrowingSweep:
 
 
 def check_has_sweep(flags: Sequence[str]) -> None:
-    """Check that `runs=until-decided` is used for a sweep.
-
-    Args:
-        flags: Flags of the command.
-
-    Raises:
-        ValueError: If the command runs a single job.
-    """
+    """Check that `runs=until-decided` is used for a sweep."""
     if not flags:
         raise ValueError(
             f"runs={UNTIL_DECIDED} must be a sweep over at least two filters, got one job. "
@@ -300,11 +263,7 @@ class StudyPlan:
         return "study" not in self._swept_options() and len(self.experiments) < 2
 
     def check_comparable(self) -> None:
-        """Check that the report of the study can compare the jobs, which needs equal data in each condition.
-
-        Raises:
-            ValueError: If the jobs of a condition differ in their seed or their runs.
-        """
+        """Check that the report of the study can compare the jobs, which needs equal data in each condition."""
         report = self.first.values.get("report")
         if isinstance(report, Mapping) and report.get("allow_mixed_versions"):
             return
@@ -373,15 +332,7 @@ class StudyPlan:
 def plan_study(overrides: Sequence[str], first: JobConfig | None = None) -> StudyPlan:
     """Plan a sweep, or a single job.
 
-    Args:
-        overrides: Overrides, some with several values, without flags.
-        first: Configuration of the first job; None composes it.
-
-    Returns:
-        The plan.
-
-    Raises:
-        Exception: If an override or the configuration of the first job is not valid.
+    Returns the plan.
     """
     names = [word.partition("=")[2] for word in overrides if word.startswith("+experiment=")]
     params = [word for name in names for word in read_sweep(name)]
@@ -391,11 +342,7 @@ def plan_study(overrides: Sequence[str], first: JobConfig | None = None) -> Stud
 
 
 def compose_words(words: Sequence[str]) -> JobConfig:
-    """Compose a configuration without the overrides of Hydra itself, except its search path.
-
-    Args:
-        words: Overrides of one value.
-    """
+    """Compose a configuration without the overrides of Hydra itself, except its search path."""
     return compose([word for word in words if not re.match(r"[+~]*hydra[/.](?!searchpath)", word)])
 
 

@@ -19,13 +19,7 @@ EACH_SATELLITE = (
 def name_channels(quantity: str, frame: Sequence[str], unit: str) -> tuple[str, ...]:
     """Name the channels of a vector.
 
-    Args:
-        quantity: Measured quantity.
-        frame: Axes.
-        unit: SI unit.
-
-    Returns:
-        A name per axis.
+    Returns a name per axis.
     """
     return tuple(f"{quantity} {axis} [{unit}]" for axis in frame)
 
@@ -33,12 +27,7 @@ def name_channels(quantity: str, frame: Sequence[str], unit: str) -> tuple[str, 
 def describe_misfit(model: Any, source: Any) -> str:
     """Describe the first difference between what a model reads and what a source provides.
 
-    Args:
-        model: State-space model.
-        source: Scenario or sensor.
-
-    Returns:
-        A clause, or an empty text if both fit or one of them does not state what it needs.
+    Returns a clause, or an empty text if both fit or one of them does not state what it needs.
     """
     reads, measures = (getattr(a, "channel_names", ()) for a in (model, source))
     names = type(model).__name__, type(source).__name__

@@ -30,19 +30,8 @@ def log_density(distribution: Distribution, y: Tensor, observed_mask: Tensor, na
     Missing components are integrated out. This is possible for independent components, normal
     distributions and mixtures of both.
 
-    Args:
-        distribution: Batch [R, N], event [Dy].
-        y: Measurements, [R, 1 or N, Dy]; values of missing components are ignored.
-        observed_mask: Observed components, bool [R, 1, Dy].
-        name: Name of the method that returned the distribution, for messages.
-
-    Returns:
-        Log density, [R, N]; 0 where no component is observed.
-
-    Raises:
-        TypeError: If the distribution has not one event dimension.
-        ValueError: If a component is missing that cannot be integrated out, or one is outside a
-            support that depends on the state.
+    Returns log density, [R, N]; 0 where no component is observed. Shapes: distribution [R, N], y
+    [R, 1 or N, Dy], observed_mask [R, 1, Dy].
     """
     kind = type(distribution).__name__
     check_event_dimension(distribution, name, y.shape[-1])
@@ -87,16 +76,7 @@ def _log_prob(distribution: Any, y: Tensor, name: str) -> Tensor:
 
 
 def check_event_dimension(distribution: Distribution, name: str, width: int | None = None) -> None:
-    """Check that the components of a vector are the event of its distribution.
-
-    Args:
-        distribution: Distribution of a vector.
-        name: Name of the method that returned the distribution, for messages.
-        width: Number of components; None if it is not known.
-
-    Raises:
-        TypeError: If the distribution has not one event dimension.
-    """
+    """Check that the components of a vector are the event of its distribution."""
     if len(distribution.event_shape) != 1:
         size = "" if width is None else f" of {width} components"
         raise TypeError(
@@ -151,14 +131,8 @@ def log_normal_density(y: Tensor, mean: Tensor, sd: Tensor, observed_mask: Tenso
     It replaces torch's `log_prob`, which passes over the particles eight times and took half of a
     step of a bootstrap filter.
 
-    Args:
-        y: Measurements, [R, 1, Dy].
-        mean: Means, [R, N, Dy].
-        sd: Standard deviations, [R or 1, 1, Dy] or [R, N, Dy].
-        observed_mask: Observed components, bool [R, 1, Dy].
-
-    Returns:
-        Log density, [R, N].
+    Returns log density, [R, N]. Shapes: y [R, 1, Dy], mean [R, N, Dy], sd [R or 1, 1, Dy],
+    observed_mask [R, 1, Dy].
     """
     scale = observed_mask / sd
     constant = ((torch.log(sd) + _HALF_LOG_2PI) * observed_mask).sum(-1)

@@ -34,18 +34,7 @@ _LARGEST_LOG = 700.0  # exp(700) is finite in float64
 
 
 def quantile(distribution: Any, u: Tensor) -> Tensor:
-    """Compute quantiles of a univariate distribution.
-
-    Args:
-        distribution: Distribution with `icdf`, `cdf` or, if it is discrete, `log_prob`.
-        u: Cumulative probabilities, broadcast against the batch of the distribution.
-
-    Returns:
-        Quantiles.
-
-    Raises:
-        ValueError: If the distribution offers none of these methods, or its values are too large.
-    """
+    """Compute quantiles of a univariate distribution."""
     try:
         values = (
             _invert_pmf(distribution, u)
@@ -98,12 +87,7 @@ def _invert_pmf(distribution: Any, u: Tensor) -> Tensor | None:
 def invert_cdf(distribution: Any, u: Tensor) -> Tensor:
     """Invert a continuous cdf by bisection on the unconstrained real line.
 
-    Args:
-        distribution: Univariate distribution with `cdf`.
-        u: Cumulative probabilities, broadcast against the batch of the distribution.
-
-    Returns:
-        Quantiles.
+    Returns quantiles.
     """
     to_support = biject_to(distribution.support)
     sign = float(getattr(to_support, "sign", 1))
@@ -203,17 +187,7 @@ def draw_values(distribution: Any, stream: RandomStream, purpose: str, n: int) -
     their method `draw_from`, the construction of mixtures, Student's t and transformed
     distributions, a search in discrete supports, `icdf`, and numerical inversion of `cdf`.
 
-    Args:
-        distribution: Batch [], [R] or [R, n], event [k].
-        stream: Random stream of one time step, with R runs.
-        purpose: Name of the draw.
-        n: Number of values per run.
-
-    Returns:
-        Values, [R, n, k].
-
-    Raises:
-        ValueError: If the distribution offers none of these methods.
+    Returns values, [R, n, k]. Shapes: distribution [R].
     """
     base = distribution.base_dist if isinstance(distribution, Independent) else distribution
     per_run, width = len(distribution.batch_shape) == 1, distribution.event_shape[0]

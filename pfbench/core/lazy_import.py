@@ -17,13 +17,6 @@ def lazy_attributes(
     A package would otherwise import every module, torch included, for a single name. The names and
     their modules are the import statements of `__init__.pyi` in the folder of the package,
     from which type checkers and editors know them too.
-
-    Args:
-        package: Name of the package, `__name__`.
-        file: File of the package, `__file__`.
-
-    Returns:
-        `__getattr__`, `__dir__` and `__all__` (PEP 562).
     """
     stub = ast.parse(Path(file).with_name("__init__.pyi").read_text(encoding="utf-8"))
     homes = {

@@ -84,13 +84,8 @@ def gaussian_log_density(r: Tensor, covariance: Tensor, observed_mask: Tensor) -
     A missing component gets unit variance, zero correlation and zero residual, and its constant is
     left out.
 
-    Args:
-        r: Residual, [..., D]. Zero where missing.
-        covariance: Covariance, [..., D, D].
-        observed_mask: Mask of observed components, [..., D].
-
-    Returns:
-        Log density, [...]. NaN where the covariance is not positive definite.
+    Returns log density, [...]. NaN where the covariance is not positive definite. Shapes: r
+    [..., D], covariance [..., D, D], observed_mask [..., D].
     """
     both = observed_mask.unsqueeze(-1) & observed_mask.unsqueeze(-2)
     eye = torch.eye(r.shape[-1], dtype=r.dtype, device=r.device)
@@ -120,14 +115,7 @@ def jacobian(f: Map, value: Tensor, d: int, subtract: Subtract = torch.subtract)
     does not select can spoil a derivative (0 times infinity). The derivative is then computed
     forward.
 
-    Args:
-        f: The map.
-        value: Its value at zero, [R, 1, D].
-        d: Dimension of its argument.
-        subtract: Difference of two values; it wraps angles.
-
-    Returns:
-        Derivative, [R, k, d].
+    Returns derivative, [R, k, d]. Shapes: value [R, 1, D].
     """
     derivative = None
     if not (value.requires_grad or value.is_cuda or is_capturing()):
@@ -170,14 +158,8 @@ def affine_map(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
 
     The compiled version skips zero coefficients, which most are in error models of an INS.
 
-    Args:
-        phi: Transition matrix, [R or 1, D, D].
-        x: States, [R, N, D].
-        gain: Noise gain, [R or 1, D, W].
-        w: Noise, [R, N, W].
-
-    Returns:
-        States, [R, N, D].
+    Returns states, [R, N, D]. Shapes: phi [R or 1, D, D], x [R, N, D], gain [R or 1, D, W], w
+    [R, N, W].
     """
     return _affine(phi, x, gain, w).permute(1, 2, 0)
 

@@ -48,12 +48,7 @@ def dense_normal(mean: Tensor, factor: Tensor) -> MultivariateNormal:
 
     As `MultivariateNormal(mean, scale_tril=factor)`, whose constructor imports SymPy for the shape.
 
-    Args:
-        mean: Means, [..., d].
-        factor: Lower triangular roots of the covariance, [..., d, d].
-
-    Returns:
-        Distribution with event [d].
+    Returns distribution with event [d]. Shapes: mean [..., d], factor [..., d, d].
     """
     batch = torch.broadcast_tensors(mean[..., 0], factor[..., 0, 0])[0].shape
     normal = MultivariateNormal.__new__(MultivariateNormal)

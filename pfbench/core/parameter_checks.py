@@ -26,18 +26,7 @@ def _holds_tensors(values: Any) -> bool:
 
 
 def check_positive(name: str, values: Any) -> Tensor:
-    """Return a float64 tensor of strictly positive numbers.
-
-    Args:
-        name: Configuration key, for the message.
-        values: Numbers.
-
-    Returns:
-        The numbers.
-
-    Raises:
-        ValueError: If a number is not positive or not finite.
-    """
+    """Return a float64 tensor of strictly positive numbers."""
     tensor = as_float64(values)
     if not bool(((tensor > 0) & torch.isfinite(tensor)).all()):
         raise ValueError(
@@ -48,15 +37,7 @@ def check_positive(name: str, values: Any) -> Tensor:
 
 
 def check_tuning(tuning: Any, kind: type) -> None:
-    """Check that a model has the tuning of its own kind, not that of another recorded scenario.
-
-    Args:
-        tuning: Value of the key `model.tuning`.
-        kind: Class that the model needs.
-
-    Raises:
-        ValueError: If it is another class.
-    """
+    """Check that a model has the tuning of its own kind, not that of another recorded scenario."""
     if not isinstance(tuning, kind):
         raise ValueError(
             f"model.tuning must be a {kind.__name__}, got {type(tuning).__name__}. Choose another model: "
@@ -65,17 +46,7 @@ def check_tuning(tuning: Any, kind: type) -> None:
 
 
 def check_whole_number(name: str, value: Any, least: int, remedy: str) -> None:
-    """Check a whole number.
-
-    Args:
-        name: Configuration key, for the message.
-        value: Number.
-        least: Least value.
-        remedy: Sentence of the message that says what to do.
-
-    Raises:
-        ValueError: If the value is not a whole number, or is too small.
-    """
+    """Check a whole number."""
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise ValueError(
             f"{name} must be a whole number of at least {least}, got {value}. {remedy}"
@@ -85,15 +56,7 @@ def check_whole_number(name: str, value: Any, least: int, remedy: str) -> None:
 def check_three_positive(name: str, values: Sequence[float]) -> Tensor:
     """Check and return three positive numbers, [3].
 
-    Args:
-        name: Configuration key.
-        values: Numbers.
-
-    Returns:
-        The numbers, [3].
-
-    Raises:
-        ValueError: If there are not three positive numbers.
+    Returns the numbers, [3].
     """
     if len(values) != 3:
         raise ValueError(
@@ -105,11 +68,7 @@ def check_three_positive(name: str, values: Sequence[float]) -> Tensor:
 def check_run_numbers(runs: Tensor) -> None:
     """Check the range of run numbers on the CPU. On another device the host would wait for them.
 
-    Args:
-        runs: Run numbers, int64, [R].
-
-    Raises:
-        ValueError: If a number is not from 0 to 2**32 - 1.
+    Shapes: runs [R].
     """
     if runs.device.type != "cpu" or isinstance(runs, FakeTensor):
         return

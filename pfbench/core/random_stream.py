@@ -224,15 +224,7 @@ class DerivedStream(RandomStream):
 
 
 def relabel(draws: RandomStream, name: str) -> RandomStream:
-    """Return a stream with a prefix to its labels, so that parts of a step do not share numbers.
-
-    Args:
-        draws: The other stream.
-        name: Prefix of the labels.
-
-    Returns:
-        The derived stream.
-    """
+    """Return a stream with a prefix to its labels, so that parts of a step do not share numbers."""
     return DerivedStream(
         draws,
         lambda d, p, n, w: d.uniform(name + p, n, w),
@@ -241,15 +233,7 @@ def relabel(draws: RandomStream, name: str) -> RandomStream:
 
 
 def select_runs(draws: RandomStream, rows: Tensor) -> RandomStream:
-    """Return the stream of some runs; where possible, the numbers of other runs are not drawn.
-
-    Args:
-        draws: Stream of all runs.
-        rows: Indices or mask of the runs.
-
-    Returns:
-        The stream of these runs.
-    """
+    """Return the stream of some runs; where possible, the numbers of other runs are not drawn."""
     if isinstance(draws, DerivedStream):
         return replace(draws, draws=select_runs(draws.draws, rows))
     if isinstance(draws, PhiloxStream):

@@ -18,9 +18,8 @@ class FeedbackRun(Protocol):
     def correct(self, mean: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         """Correct the process by the estimate [R, D] of the latest step.
 
-        Returns:
-            The estimate as it would read without any correction, [R, D], and a function that maps
-            states [R, N, D] to their values after this correction.
+        Returns the estimate as it would read without any correction, [R, D], and a function that
+        maps states [R, N, D] to their values after this correction.
         """
 
 
@@ -30,15 +29,7 @@ class FeedbackProcess(Protocol):
     def begin(self, record: Record, groups: dict[str, tuple[int, ...]]) -> FeedbackRun:
         """Start a pass.
 
-        Args:
-            record: Measurements and inputs without any correction.
-            groups: Component groups of the model.
-
-        Returns:
-            The pass before its first step.
-
-        Raises:
-            ValueError: If the groups do not give the states to correct.
+        Returns the pass before its first step.
         """
 
 
@@ -105,13 +96,7 @@ def iterate_steps(
     All loops over a record use this function: filters, training, online inference, bounds and
     simulation.
 
-    Args:
-        model: State-space model.
-        record: Measurements [R, T, Dy] and inputs, prepared by the model.
-        steps: Steps of the record, counted from 0. None iterates over all.
-
-    Yields:
-        Step number t, the model of step t, and the record of step t.
+    Shapes: record [R, T, Dy].
     """
     for t in range(record.y.shape[1]):
         if steps is None or t in steps:

@@ -39,24 +39,13 @@ class SimulatedModel(Protocol):
     def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
         """Propagate states by one step.
 
-        Args:
-            x: States, [R, N, D].
-            u: Inputs of the step.
-            w: Driving noise, [R, N, W].
-
-        Returns:
-            States, [R, N, D].
+        Returns states, [R, N, D]. Shapes: x [R, N, D], w [R, N, W].
         """
 
     def observation(self, x: Tensor, u: Any) -> Distribution:
         """Return the distribution of the measurement.
 
-        Args:
-            x: States, [R, N, D].
-            u: Inputs of the step.
-
-        Returns:
-            Distribution with batch [R, N], event [Dy].
+        Returns distribution with batch [R, N], event [Dy]. Shapes: x [R, N, D].
         """
 
     def at_step(self, t: int) -> Any:
@@ -86,18 +75,7 @@ def draw_noise_values(
 ) -> Tensor:
     """Draw driving noise whose deviation from its mean is multiplied by a factor.
 
-    Args:
-        distribution: Noise distribution of a model, event [W].
-        stream: Random stream of one time step.
-        purpose: Name of the draw.
-        n: Number of values per run.
-        scale: Factor on the deviation, []; None is 1.
-
-    Returns:
-        Noise, [R, n, W].
-
-    Raises:
-        ValueError: If a distribution without a finite mean is to be scaled.
+    Returns noise, [R, n, W]. Shapes: distribution [W].
     """
     base = distribution.base_dist if isinstance(distribution, Independent) else distribution
     if isinstance(base, Normal):
@@ -125,19 +103,7 @@ def draw_initial_state(
 ) -> Tensor:
     """Draw initial states.
 
-    Args:
-        model: State-space model.
-        distribution: Initial distribution in the chart, batch [R], event [d].
-        stream: Random stream at step 0.
-        purpose: Name of the draw.
-        n: Number of states per run.
-        start: States about which the distribution is placed, [R, D]; None is the model's origin.
-
-    Returns:
-        States, [R, n, D].
-
-    Raises:
-        TypeError: If the distribution has not one event dimension.
+    Returns states, [R, n, D]. Shapes: distribution [R], start [R, D].
     """
     check_event_dimension(distribution, f"{type(model).__name__}.initial", model.origin.shape[-1])
     origin = model.origin.expand(1, -1) if start is None else start
@@ -155,19 +121,7 @@ def simulate_steps(
 ) -> Iterator[SimulatedStep]:
     """Simulate a model step by step.
 
-    Args:
-        model: State-space model.
-        record: Inputs, prepared by the model; its measurements give the number of steps only.
-        stream: Random stream; step t draws its noise at stream step t + 1.
-        x: Initial states, [R, 1, D].
-        purpose: Name of the noise draws.
-        scale: Factor on the noise of each step, [T]; None is 1.
-
-    Yields:
-        The steps in order.
-
-    Raises:
-        TypeError: If the distribution of noise or measurement has not one event dimension.
+    Shapes: x [R, 1, D], scale [T].
     """
     name = type(model).__name__
     check_event_dimension(model.noise, f"{name}.noise")
@@ -191,15 +145,7 @@ def draw_measurements(
     Independent normal measurements of all steps come from one array at stream step 0, the array
     of the noise regimes. Others are drawn at stream step t + 1.
 
-    Args:
-        distributions: Distribution of each step, batch [R, 1], event [Dy].
-        stream: Random stream.
-        purpose: Name of the draws.
-        errors: Errors of independent normal measurements in standard deviations, [R, T, Dy], or
-            None to draw them as standard normal numbers.
-
-    Returns:
-        Measurements, [R, T, Dy].
+    Returns measurements, [R, T, Dy]. Shapes: distributions [R, 1], errors [R, T, Dy].
     """
     if all(is_independent_normal(distribution) for distribution in distributions):
         mean, sd = (

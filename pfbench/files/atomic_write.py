@@ -45,11 +45,7 @@ def write_atomically(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
 
 
 def remove_temporary_files(path: Path) -> None:
-    """Remove the temporary files that interrupted writes of a file left.
-
-    Args:
-        path: File. Only names that `write_atomically` gives for it are removed.
-    """
+    """Remove the temporary files that interrupted writes of a file left."""
     pattern = re.compile(re.escape(path.name.split(".")[0]) + r"\.[0-9a-f]{8}\.tmp")
     for file in path.parent.iterdir():
         if pattern.fullmatch(file.name) and file.is_file() and not file.is_symlink():
@@ -59,12 +55,7 @@ def remove_temporary_files(path: Path) -> None:
 def set_aside(path: Path, reason: str = "damaged") -> Path:
     """Rename a file, so that it is not read again and another file can have its name.
 
-    Args:
-        path: File.
-        reason: New suffix.
-
-    Returns:
-        The new path, `NAME.damaged`, with a number if that exists.
+    Returns the new path, `NAME.damaged`, with a number if that exists.
     """
     target = path.with_name(f"{path.name}.{reason}")
     number = 1
@@ -101,17 +92,7 @@ def hash_content(content: Any) -> str:
 
 
 def hash_file(path: Path) -> str:
-    """Compute the SHA-256 of the bytes of a file, once in a process while the file is unchanged.
-
-    Args:
-        path: File.
-
-    Returns:
-        16 hexadecimal digits.
-
-    Raises:
-        OSError: If the file cannot be read.
-    """
+    """Compute the SHA-256 of the bytes of a file, once in a process while the file is unchanged."""
     state = path.stat()
     return _hash_bytes(path, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
 

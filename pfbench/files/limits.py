@@ -36,16 +36,7 @@ class LimitError(ValueError):
 
 
 def check_is_file(path: Path, most: int) -> None:
-    """Check that a path is a file and no pipe or device, which may never end, and its size.
-
-    Args:
-        path: File, or a link to one.
-        most: Largest size in bytes.
-
-    Raises:
-        OSError: If the file does not exist.
-        LimitError: If it is another kind of file, or too large.
-    """
+    """Check that a path is a file and no pipe or device, which may never end, and its size."""
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
         raise LimitError(
@@ -58,15 +49,7 @@ def check_is_file(path: Path, most: int) -> None:
 
 
 def check_columns(path: Path, count: int) -> None:
-    """Check the number of columns of a table.
-
-    Args:
-        path: File.
-        count: Number of its columns.
-
-    Raises:
-        LimitError: If there are too many.
-    """
+    """Check the number of columns of a table."""
     if count > TABLE_COLUMNS:
         raise LimitError(
             f"{path.name} must have at most {TABLE_COLUMNS} columns, got {count}. "
@@ -75,15 +58,7 @@ def check_columns(path: Path, count: int) -> None:
 
 
 def check_inflated(path: Path, size: int) -> None:
-    """Check the size that a compressed file states, before it is read.
-
-    Args:
-        path: File.
-        size: Its size without compression in bytes.
-
-    Raises:
-        LimitError: If it is much larger than the file.
-    """
+    """Check the size that a compressed file states, before it is read."""
     most = _most_inflated(path)
     if size > most:
         raise LimitError(
@@ -93,14 +68,7 @@ def check_inflated(path: Path, size: int) -> None:
 
 
 def check_zip(path: Path) -> None:
-    """Check the sizes in a zip file such as a result or a checkpoint, before it is read.
-
-    Args:
-        path: File. One that is not a zip file is left to its reader.
-
-    Raises:
-        LimitError: If its content is much larger than the file.
-    """
+    """Check the sizes in a zip file such as a result or a checkpoint, before it is read."""
     try:
         with zipfile.ZipFile(path) as file:
             size = sum(member.file_size for member in file.infolist())
@@ -110,19 +78,7 @@ def check_zip(path: Path) -> None:
 
 
 def read_gzip(path: Path) -> bytes:
-    """Read a gzip file, which does not state its size, up to the limit.
-
-    Args:
-        path: File.
-
-    Returns:
-        The content.
-
-    Raises:
-        OSError: If the file does not exist.
-        LimitError: If the content is much larger than the file.
-        ValueError: If the file is damaged.
-    """
+    """Read a gzip file, which does not state its size, up to the limit."""
     check_is_file(path, TABLE_BYTES)
     most = _most_inflated(path)
     try:

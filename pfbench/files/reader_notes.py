@@ -23,10 +23,6 @@ def announce_notes(source: str | Path, notes: Sequence[str]) -> None:
     """Log notes on what was read, dropped or assumed.
 
     A note is logged once by a process, and once by all processes of a sweep.
-
-    Args:
-        source: Folder or file of the data.
-        notes: Notes.
     """
     sweep = os.environ.get(SWEEP_LOG, "")
     if len(notes) > _MOST:
@@ -42,15 +38,7 @@ def announce_notes(source: str | Path, notes: Sequence[str]) -> None:
 
 
 def append_line(path: str | Path, line: str) -> None:
-    """Append a line to the file of a sweep, whole among those of other processes.
-
-    Args:
-        path: File. Its folder is made if it is missing.
-        line: Text without a line end.
-
-    Raises:
-        OSError: If the file cannot be written.
-    """
+    """Append a line to the file of a sweep, whole among those of other processes."""
     os.makedirs(os.path.dirname(path), exist_ok=True)
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     try:

@@ -211,11 +211,7 @@ _TIMEOUT = 10  # s
 def list_unchanged_in_git(folder: Path) -> set[str]:
     """List the files of a folder whose content is that of the index of git.
 
-    Args:
-        folder: Folder.
-
-    Returns:
-        Names relative to the folder, with `/`. Empty outside a repository and without git.
+    Returns names relative to the folder, with `/`. Empty outside a repository and without git.
     """
     try:
         stored, changed = (_list_files(folder, *option) for option in ((), ("--modified",)))

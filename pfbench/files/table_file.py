@@ -37,18 +37,7 @@ class TableFile(NamedTuple):
 
 
 def read_table_file(file: Path) -> TableFile:
-    """Read a CSV or Parquet file.
-
-    Args:
-        file: File. The suffix .parquet selects Parquet.
-
-    Returns:
-        The table. Columns of a CSV file can contain text.
-
-    Raises:
-        ValueError: If the file is damaged, larger than the limits of `pfbench.files.limits`, or
-            pyarrow is not installed. The message names the file and, for CSV, the line.
-    """
+    """Read a CSV or Parquet file."""
     limits.check_is_file(file, limits.TABLE_BYTES)
     return _read_parquet(file) if file.suffix == ".parquet" else _read_csv(file)
 
@@ -156,11 +145,7 @@ def _convert(file: Path, options: str, result: str) -> str:
 
 
 def is_number_text(text: str) -> bool:
-    """Return whether a field of a text file is a number.
-
-    Args:
-        text: Field.
-    """
+    """Return whether a field of a text file is a number."""
     try:
         float(text)
     except ValueError:
@@ -206,12 +191,7 @@ def _whole_lines(file: Path) -> tuple[list[str], tuple[str, ...]]:
 
 
 def describe_cut(file: Path, line: int) -> str:
-    """Describe a last line without a line end, which a reader drops.
-
-    Args:
-        file: File.
-        line: Number of the line.
-    """
+    """Describe a last line without a line end, which a reader drops."""
     return (
         f"{file.name}: line {line} has no line end, so the file may be truncated. "
         "This line was dropped"
@@ -261,15 +241,7 @@ def _read_parquet(file: Path) -> TableFile:
 
 
 def check_parquet(file: Path) -> None:
-    """Check the size of a Parquet file by its own counts, before it is read.
-
-    Args:
-        file: File.
-
-    Raises:
-        limits.LimitError: If it is a pipe or a folder, or has too many columns or much more content than bytes.
-        OSError, pyarrow.ArrowException: If it cannot be read.
-    """
+    """Check the size of a Parquet file by its own counts, before it is read."""
     from pyarrow import parquet
 
     limits.check_is_file(file, limits.TABLE_BYTES)

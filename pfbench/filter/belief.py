@@ -168,13 +168,7 @@ def select_by_run(
 ) -> ParticleBelief:
     """Return `new` for resampled runs and `old` for others; the evidence is of `new`.
 
-    Args:
-        resampled_mask: Resampled runs, [R].
-        new: Particles of resampled runs.
-        old: Particles of other runs.
-
-    Returns:
-        Weighted particles.
+    Shapes: resampled_mask [R].
     """
 
     def choose(a: Tensor, b: Tensor) -> Tensor:
@@ -208,12 +202,7 @@ def ess(log_w: Tensor) -> Tensor:
 def weighted_mean_cov(chart: Chart, belief: ParticleBelief) -> tuple[Tensor, Tensor]:
     """Return the weighted mean and covariance of particles.
 
-    Args:
-        chart: Chart of the state.
-        belief: Weighted particles.
-
-    Returns:
-        Mean [R, D] and covariance in the chart about it, [R, d, d].
+    Returns mean [R, D] and covariance in the chart about it, [R, d, d].
     """
     w = normalise_log_weights(belief.log_w)
     mean = chart.mean(belief.x, w)
@@ -271,12 +260,7 @@ class ComputedWeights(NamedTuple):
 def exponentiate(log_w: Tensor, computed: ComputedWeights | None) -> Tensor:
     """Return e to the power of log weights.
 
-    Args:
-        log_w: Log weights, [R, N].
-        computed: Weights at hand. They are used if they are of this tensor of log weights.
-
-    Returns:
-        Weights, [R, N].
+    Returns weights, [R, N]. Shapes: log_w [R, N].
     """
     return computed.w if computed is not None and computed.log_w is log_w else torch.exp(log_w)
 
@@ -303,13 +287,8 @@ def _narrow(a: Tensor) -> Tensor:
 def add_log_weights(log_likelihood: Tensor, log_w: Tensor, log_ratio: Tensor) -> Tensor:
     """Add the terms of log weights.
 
-    Args:
-        log_likelihood: Log likelihoods, [R, N].
-        log_w: Log weights before, [R, N].
-        log_ratio: Log density ratios of the proposal, [R, N].
-
-    Returns:
-        Sum [R, N], -inf in place of NaN.
+    Returns sum [R, N], -inf in place of NaN. Shapes: log_likelihood [R, N], log_w [R, N], log_ratio
+    [R, N].
     """
     return _add_terms(log_likelihood, _narrow(log_w), _narrow(log_ratio))
 
@@ -325,12 +304,8 @@ def _separate_normalise(log_w: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
     A run without a finite weight gets equal weights, as one whose log weights are not resolved.
 
-    Args:
-        log_w: Log weights, [R, N].
-
-    Returns:
-        Normalised log weights [R, N], their logsumexp before [R] (-inf if none is finite), weights
-        [R, N] and effective sample size [R].
+    Returns normalised log weights [R, N], their logsumexp before [R] (-inf if none is finite),
+    weights [R, N] and effective sample size [R]. Shapes: log_w [R, N].
     """
     # one exponential per particle, because exponentials dominate the cost of a small step
     maximum = log_w.detach().amax(1, keepdim=True)

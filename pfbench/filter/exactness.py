@@ -82,12 +82,6 @@ def has_bounded_weights(method: object) -> bool | None:
     Weights without a bound may have an infinite variance. Estimates then converge, but too slowly
     for any number of particles at hand, and a run does not see what it misses. A stage that is
     silent counts as unbounded, and so does one that overrides behaviour of the class that states it.
-
-    Args:
-        method: Filter or stage. It may define `has_bounded_weights: bool`.
-
-    Returns:
-        None for a filter that weighs no particles.
     """
     value = getattr(method, "has_bounded_weights", None)
     if value is None:
@@ -99,36 +93,18 @@ def has_evidence(method: object) -> bool:
     """Return whether the log evidence of a filter is a log density of the measurements.
 
     It is not if a weight or a noise covariance of a step depends on the measurement of that step.
-
-    Args:
-        method: Filter. It or its stages may define `has_evidence: bool`; nothing means True.
-
-    Returns:
-        True if no part states the opposite.
     """
     stages = (getattr(method, name, None) for name in ("proposal", "weight_update"))
     return all(getattr(stage, "has_evidence", True) for stage in (method, *stages))
 
 
 def has_covariance(method: object) -> bool:
-    """Return whether a filter states the covariance of its estimate.
-
-    Args:
-        method: Filter. It may define `has_covariance: bool`; nothing means True.
-    """
+    """Return whether a filter states the covariance of its estimate."""
     return bool(getattr(method, "has_covariance", True))
 
 
 def check_has_evidence(method: object, user: str) -> None:
-    """Check that a filter may serve a parameter inference.
-
-    Args:
-        method: Filter.
-        user: Function or class that uses the evidence, for the message.
-
-    Raises:
-        ValueError: If its evidence is not a density of the measurements.
-    """
+    """Check that a filter may serve a parameter inference."""
     if not has_evidence(method):
         raise ValueError(
             f"{user} must have a filter whose evidence is a density of the measurements, got "

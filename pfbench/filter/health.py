@@ -83,10 +83,6 @@ class HealthCheck(NamedTuple):
 class HealthMonitor:
     """Observer of a filter pass that classifies the runs.
 
-    Args:
-        record: Prepared record, which decides the checked steps.
-        fits_tails: Whether the weights of particles are unbounded, so that their tails are fitted.
-
     Attributes:
         steps: Checked steps, at most ten of those with a measurement.
     """
@@ -121,15 +117,7 @@ class HealthMonitor:
         info: StepInfo,
         beliefs: Sequence[Any] = (),
     ) -> None:
-        """Check a step, if it is one of `steps`.
-
-        Args:
-            t: Step number from 0.
-            model: State-space model; `at_step` gives the model of the step.
-            record: Prepared record of all steps.
-            info: Estimate of the step.
-            beliefs: Beliefs after the step of all batches of runs.
-        """
+        """Check a step, if it is one of `steps`."""
         if t in self.steps:
             if beliefs and isinstance(beliefs[0], ParticleBelief):
                 self._check_particles(model.at_step(t), record.at_step(t), beliefs)
@@ -158,11 +146,7 @@ class HealthMonitor:
     def check_evidence(self, log_evidence: Tensor) -> Tensor:
         """Mark the runs that a measurement is far from in some step.
 
-        Args:
-            log_evidence: Log evidence up to each step, [R, T].
-
-        Returns:
-            Steps in which a run is not lost, [R, T].
+        Returns steps in which a run is not lost, [R, T]. Shapes: log_evidence [R, T].
         """
         gain = torch.diff(log_evidence, prepend=torch.zeros_like(log_evidence[:, :1]))
         self._implausible = ((gain < _IMPLAUSIBLE) & torch.isfinite(gain)).any(1)
@@ -192,12 +176,7 @@ class HealthMonitor:
         The floor is checked in all steps at once. The measurement is evaluated only where it decides.
         Without an impossible measurement it is a collapse unless the initial state was certain.
 
-        Args:
-            model: State-space model; `at_step` gives the model of a step.
-            record: Prepared record of all steps.
-            mean: Estimates, [R, T, D].
-            variance: Variances, [R, T, d].
-            ess: Effective sample sizes, [R, T]; None for a Gaussian filter.
+        Shapes: mean [R, T, D], variance [R, T, d], ess [R, T].
         """
         if self._nis:
             self._checks = self._check(model, record, mean, variance, ess)
@@ -213,11 +192,7 @@ class HealthMonitor:
     def classify(self, lost: Tensor) -> Tensor:
         """Return the health of each run.
 
-        Args:
-            lost: Lost runs, [R].
-
-        Returns:
-            Index in `HEALTH`, int8 [R].
+        Returns index in `HEALTH`, int8 [R]. Shapes: lost [R].
         """
         health = torch.zeros(lost.shape, dtype=torch.int8, device=lost.device)
         if self._checks is not None:
@@ -276,11 +251,7 @@ def with_cached_nis(info: StepInfo) -> StepInfo:
 def count_health(health: Tensor) -> dict[str, int]:
     """Count the runs of each health.
 
-    Args:
-        health: Index in `HEALTH`, [R].
-
-    Returns:
-        Number of runs by name, zeros included.
+    Returns number of runs by name, zeros included. Shapes: health [R].
     """
     counts = torch.bincount(health.long(), minlength=len(HEALTH)).tolist()
     return dict(zip(HEALTH, counts, strict=True))
@@ -317,9 +288,6 @@ def uncounted_observation(model: StateSpaceModel) -> Iterator[None]:
 
     A counter of likelihood evaluations replaces that of the object. Checks are not charged to the
     filter.
-
-    Args:
-        model: State-space model.
     """
     inner = model
     while isinstance(inner, ModelWrapper):
@@ -335,13 +303,7 @@ def uncounted_observation(model: StateSpaceModel) -> Iterator[None]:
 def compute_misfit(model: StateSpaceModel, record: Record, mean: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the NIS of estimates under the measurement noise alone.
 
-    Args:
-        model: State-space model of the step.
-        record: Prepared record of the step.
-        mean: Estimates, [R, D].
-
-    Returns:
-        NIS and the number of observed components, [R] each.
+    Returns NIS and the number of observed components, [R] each. Shapes: mean [R, D].
     """
     with uncounted_observation(model):
         return compute_nis(model, mean.unsqueeze(1), torch.zeros_like(mean[:, :1]), record)
@@ -352,14 +314,7 @@ def compute_misfits(
 ) -> tuple[Tensor, Tensor]:
     """Compute `compute_misfit` in several steps.
 
-    Args:
-        model: State-space model; `at_step` gives the model of a step.
-        record: Prepared record of all steps.
-        mean: Estimates, [R, T, D].
-        steps: Numbers of C steps.
-
-    Returns:
-        NIS and the number of observed components, [C, R] each.
+    Returns NIS and the number of observed components, [C, R] each. Shapes: mean [R, T, D].
     """
     if len(mean) == 1 and all(model.at_step(t) is model for t in steps):
         # the steps of a single run as runs: ten calls would take a third of a small filter's time
@@ -395,12 +350,8 @@ def fit_pareto_k(log_w: Tensor) -> Tensor:
 
     The tail is the largest min(N / 5, 3 sqrt(N)) weights, less the next one.
 
-    Args:
-        log_w: Log weights, [R, N]. -inf marks an inactive slot.
-
-    Returns:
-        k-hat, float64 [R]. NaN if the tail has fewer than five weights, or a quarter of them are
-        equal; infinite if a few weights are all there is.
+    Returns k-hat, float64 [R]. NaN if the tail has fewer than five weights, or a quarter of them
+    are equal; infinite if a few weights are all there is. Shapes: log_w [R, N].
     """
     n = log_w.shape[1]
     size = math.ceil(min(0.2 * n, 3.0 * math.sqrt(n)))
@@ -459,15 +410,7 @@ _PIVOT_SCALE = 4.0  # the error of the narrowest direction is a quarter of eps /
 
 
 def is_coarse(value: Tensor, variance: Tensor) -> Tensor:
-    """Return where the spacing of numbers exceeds the limit.
-
-    Args:
-        value: Numbers in the type of the computation.
-        variance: Their variances.
-
-    Returns:
-        Mask. False where a variance is zero or not finite, and for float64.
-    """
+    """Return where the spacing of numbers exceeds the limit."""
     if value.dtype == torch.float64:
         return torch.zeros_like(value, dtype=torch.bool)
     spacing = torch.finfo(value.dtype).eps * value.abs()
@@ -477,11 +420,8 @@ def is_coarse(value: Tensor, variance: Tensor) -> Tensor:
 def is_ill_conditioned(covariance: Tensor) -> Tensor:
     """Return the runs whose correlations the number type does not resolve.
 
-    Args:
-        covariance: Covariances, [R, d, d].
-
-    Returns:
-        Mask, [R]. False where the covariance is not finite, and for float64.
+    Returns mask, [R]. False where the covariance is not finite, and for float64. Shapes: covariance
+    [R, d, d].
     """
     if covariance.dtype == torch.float64:
         return torch.zeros(len(covariance), dtype=torch.bool, device=covariance.device)
@@ -499,13 +439,8 @@ def is_ill_conditioned(covariance: Tensor) -> Tensor:
 def starts_certain(model: StateSpaceModel, runs: int, spread: Tensor | None) -> Tensor:
     """Return the runs whose initial state is known exactly.
 
-    Args:
-        model: State-space model.
-        runs: Number of runs R.
-        spread: Cholesky factor of each run's initial covariance, [R, d, d]; None uses the model.
-
-    Returns:
-        Mask, [R]. False where the variance of the initial distribution does not exist.
+    Returns mask, [R]. False where the variance of the initial distribution does not exist. Shapes:
+    spread [R, d, d].
     """
     initial = initial_law(model, runs, spread)
     if not has_finite_moments(initial):
@@ -516,14 +451,7 @@ def starts_certain(model: StateSpaceModel, runs: int, spread: Tensor | None) -> 
 def check_measurement_resolution(distribution: Any, y: Tensor, model: str) -> None:
     """Check that a type other than float64 resolves the measurements.
 
-    Args:
-        distribution: Distribution of the measurements of the first step, batch [R, N].
-        y: Prepared measurements, [R, T, Dy], in the type of the computation.
-        model: Name of the model.
-
-    Raises:
-        ValueError: If a tenth of the measurements of a component have a spacing above a tenth of
-            their standard deviation.
+    Shapes: distribution [R, N], y [R, T, Dy].
     """
     if y.dtype == torch.float64 or not has_finite_moments(distribution):
         return

@@ -21,14 +21,7 @@ _STATES = 4  # of each run that the model is tried with
 
 
 def check_is_filter(method: object) -> None:
-    """Check that an object is an instance with the calls of a filter.
-
-    Args:
-        method: Filter.
-
-    Raises:
-        ValueError: If it is a class, or lacks `init` or `step`.
-    """
+    """Check that an object is an instance with the calls of a filter."""
     calls = (getattr(method, name, None) for name in ("init", "step"))
     if isinstance(method, type) or not all(map(callable, calls)):
         kind = f"the class {method.__name__}" if isinstance(method, type) else type(method).__name__
@@ -41,14 +34,7 @@ def check_is_filter(method: object) -> None:
 def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) -> None:
     """Check the shapes and types of a record.
 
-    Args:
-        model: State-space model.
-        record: Measurements [R, T, Dy] and inputs.
-        draws: Random stream of R runs.
-
-    Raises:
-        ValueError: If a shape or a type is wrong, if the record is empty, or if a measurement is
-            infinite.
+    Shapes: record [R, T, Dy].
     """
     for name, item, kind in (("model", model, StateSpaceModel), ("record", record, Record)):
         if not isinstance(item, kind):
@@ -92,18 +78,7 @@ def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) ->
 
 
 def check_model(model: StateSpaceModel, record: Record) -> None:
-    """Check what a model computes at the first step, for a few states of its initial distribution.
-
-    Args:
-        model: State-space model.
-        record: Prepared record, see `prepare_record`.
-
-    Raises:
-        ValueError: If states have another shape, if none is finite, if `propagate` contradicts
-            `noise_gain`, or if the model observes another number of components than `record.y` has. If the number type does not
-            resolve the measurements. If a measurement is outside the support of its distribution.
-        TypeError: If a distribution has not one event dimension.
-    """
+    """Check what a model computes at the first step, for a few states of its initial distribution."""
     first, step_model = record.at_step(0), model.at_step(0)
     runs, width = first.y.shape
     name = type(model).__name__

@@ -30,14 +30,7 @@ def derivative(
 
     All directions are evaluated in one forward pass, as additional particles.
 
-    Args:
-        f: Map of states [R, P, D] and increments xi [R, P, d] to values [R, P, k].
-        at: States, [R, N, D].
-        d: Dimension of the increments.
-        subtract: Difference of two values; it wraps angles.
-
-    Returns:
-        Derivative, [R, N, k, d].
+    Returns derivative, [R, N, k, d]. Shapes: f [R, P, D], at [R, N, D].
     """
     runs, n = at.shape[:2]
     parts = []
@@ -65,14 +58,8 @@ def compute_additive_gain(model: StateSpaceModel, x: Tensor, root: Tensor, u: An
     rule. Noise is also treated as not additive in single precision, which cannot verify the gain,
     and while a step is recorded for compilation.
 
-    Args:
-        model: State-space model.
-        x: Mean state, [R, D].
-        root: Square root of the covariance, [R, d, d].
-        u: Inputs of the step.
-
-    Returns:
-        Gain, [R or 1, d, W]; None if the noise is not additive.
+    Returns gain, [R or 1, d, W]; None if the noise is not additive. Shapes: x [R, D], root
+    [R, d, d].
     """
     if model.has_noise_gain or is_capturing() or x.dtype != torch.float64:
         return model.noise_gain(u)
@@ -100,14 +87,6 @@ def check_moments(model: StateSpaceModel, name: str, distribution: Any) -> None:
     """Check that a Gaussian filter can approximate a distribution of a model.
 
     Normal distributions cost a type check only.
-
-    Args:
-        model: State-space model, for the message.
-        name: Method or property that returned the distribution.
-        distribution: The distribution.
-
-    Raises:
-        ValueError: If mean or variance are not finite.
     """
     if not has_finite_moments(distribution):
         kind = type(unwrap_independent(distribution)).__name__
@@ -125,12 +104,7 @@ def check_moments(model: StateSpaceModel, name: str, distribution: Any) -> None:
 def mean_noise(model: StateSpaceModel, x: Tensor) -> Tensor:
     """Return the mean noise of each state.
 
-    Args:
-        model: State-space model with noise of dimension W.
-        x: States, [R, N, ...].
-
-    Returns:
-        Mean noise, [R, N, W].
+    Returns mean noise, [R, N, W]. Shapes: x [R, N, ...].
     """
     return model.noise.mean.expand(*x.shape[:2], -1)
 
@@ -138,13 +112,7 @@ def mean_noise(model: StateSpaceModel, x: Tensor) -> Tensor:
 def transition_jacobian(model: StateSpaceModel, x: Tensor, u: Any) -> Tensor:
     """Compute the Jacobian of the noise-free step.
 
-    Args:
-        model: State-space model.
-        x: States, [R, N, D].
-        u: Inputs of the step.
-
-    Returns:
-        Jacobian, [R, N, d, d].
+    Returns Jacobian, [R, N, d, d]. Shapes: x [R, N, D].
     """
     stated = find_propagation_jacobian(model, x, u)
     if stated is not None:
@@ -160,13 +128,7 @@ def transition_jacobian(model: StateSpaceModel, x: Tensor, u: Any) -> Tensor:
 def measurement_jacobian(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
     """Compute the Jacobian of the measurement mean.
 
-    Args:
-        model: State-space model.
-        x: States, [R, N, D].
-        record: Measurement and inputs of the step.
-
-    Returns:
-        Jacobian, [R, N, k, d]; rows of missing components are 0.
+    Returns Jacobian, [R, N, k, d]; rows of missing components are 0. Shapes: x [R, N, D].
     """
 
     def observe_increment(a: Tensor, xi: Tensor) -> Tensor:
@@ -181,13 +143,7 @@ def measurement_jacobian(model: StateSpaceModel, x: Tensor, record: Record) -> T
 def linearised_innovation(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
     """Compute y - y_hat of states.
 
-    Args:
-        model: State-space model.
-        x: States, [R, N, D].
-        record: Measurement and inputs of the step.
-
-    Returns:
-        Innovation, [R, N, k]; 0 for missing components.
+    Returns Innovation, [R, N, k]; 0 for missing components. Shapes: x [R, N, D].
     """
     y = record.y.unsqueeze(1)
     r = model.residual(y.nan_to_num(), linearised_mean(model.observation(x, record.u)))
@@ -213,12 +169,7 @@ def is_normal(distribution: Distribution) -> bool:
 def mask_covariance(covariance: Tensor, observed_mask: Tensor) -> Tensor:
     """Replace rows and columns of missing components by those of the unit matrix.
 
-    Args:
-        covariance: Covariance, [..., k, k].
-        observed_mask: Observed components, bool [..., k].
-
-    Returns:
-        Covariance, [..., k, k].
+    Returns covariance, [..., k, k]. Shapes: covariance [..., k, k], observed_mask [..., k].
     """
     both = observed_mask.unsqueeze(-1) & observed_mask.unsqueeze(-2)
     eye = torch.eye(observed_mask.shape[-1], dtype=covariance.dtype, device=covariance.device)
@@ -228,12 +179,7 @@ def mask_covariance(covariance: Tensor, observed_mask: Tensor) -> Tensor:
 def batch_product(m: Tensor, e: Tensor) -> Tensor:
     """Multiply each vector by its matrix.
 
-    Args:
-        m: Matrices, [R, 1 or N, k, l].
-        e: Vectors, [R, 1 or N, l].
-
-    Returns:
-        Products, [R, N, k].
+    Returns products, [R, N, k]. Shapes: m [R, 1 or N, k, l], e [R, 1 or N, l].
     """
     return e @ m[:, 0].mT if m.shape[1] == 1 else (m @ e.unsqueeze(-1)).squeeze(-1)
 
@@ -253,13 +199,7 @@ _ROUNDING = 1e3  # machine epsilons that `propagate` may be off
 def find_propagation_jacobian(model: StateSpaceModel, x: Tensor, u: Any) -> Tensor | None:
     """Return the Jacobian of the noise-free step that a model states.
 
-    Args:
-        model: State-space model.
-        x: States, [R, N, D].
-        u: Inputs of the step.
-
-    Returns:
-        Jacobian, [R, N, d, d]; None if the model states none.
+    Returns Jacobian, [R, N, d, d]; None if the model states none. Shapes: x [R, N, D].
     """
     return _find(model, "propagation_jacobian", "propagate", x, u)
 
@@ -267,13 +207,7 @@ def find_propagation_jacobian(model: StateSpaceModel, x: Tensor, u: Any) -> Tens
 def find_observation_jacobian(model: StateSpaceModel, x: Tensor, u: Any) -> Tensor | None:
     """Return the Jacobian of the mean measurement that a model states.
 
-    Args:
-        model: State-space model.
-        x: States, [R, N, D].
-        u: Inputs of the step.
-
-    Returns:
-        Jacobian, [R, N, k, d]; None if the model states none.
+    Returns Jacobian, [R, N, k, d]; None if the model states none. Shapes: x [R, N, D].
     """
     return _find(model, "observation_jacobian", "observation", x, u)
 
@@ -292,15 +226,7 @@ def _find(model: StateSpaceModel, name: str, of: str, x: Tensor, u: Any) -> Tens
 def is_noise_gain(model: StateSpaceModel, x: Tensor, u: Any, w: Tensor, gain: Tensor) -> bool:
     """Return whether noise enters as x (+) L w in the chart, to rounding.
 
-    Args:
-        model: State-space model.
-        x: States at which it is verified, [R, N, D].
-        u: Inputs of the step.
-        w: Deviations of the noise from its mean, [R, N, W].
-        gain: Gain L, [R or 1, d, W].
-
-    Returns:
-        False if a finite state contradicts it.
+    Shapes: x [R, N, D], w [R, N, W], gain [R or 1, d, W].
     """
     chart, centre = model.chart, torch.nan_to_num(model.noise.mean)
     quiet_x = model.propagate(x, u, centre + torch.zeros_like(w))
@@ -315,12 +241,7 @@ def is_noise_gain(model: StateSpaceModel, x: Tensor, u: Any, w: Tensor, gain: Te
 def probe_noise(model: StateSpaceModel, x: Tensor) -> Tensor:
     """Return deviations of the noise from its mean, of up to three standard deviations.
 
-    Args:
-        model: State-space model.
-        x: States, [R, N, D].
-
-    Returns:
-        Fixed irregular numbers, [R, N, W].
+    Returns fixed irregular numbers, [R, N, W]. Shapes: x [R, N, D].
     """
     noise: Any = model.noise
     shape = (x.shape[1], model.noise_dim)
@@ -333,13 +254,7 @@ def probe_noise(model: StateSpaceModel, x: Tensor) -> Tensor:
 def check_noise_gain(model: StateSpaceModel, x: Tensor, u: Any) -> None:
     """Check the noise gain that a model states at some states.
 
-    Args:
-        model: State-space model.
-        x: States, [R, N, D].
-        u: Inputs of the step.
-
-    Raises:
-        ValueError: If the shape is wrong, or if `propagate` contradicts the gain.
+    Shapes: x [R, N, D].
     """
     gain, name = model.noise_gain(u), f"{type(model).__name__}.noise_gain"
     if gain is None:

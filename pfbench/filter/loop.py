@@ -112,12 +112,7 @@ class FilterPass:
     Iterating takes the steps. Between two steps the caller may replace `belief`, and `model` by one
     with other parameters.
 
-    Args:
-        method: The filter.
-        model: State-space model.
-        record: Measurements [R, T, Dy] and inputs, prepared by the model (`prepare_record`).
-        draws: Random stream. Step 0 is the initial distribution, step t + 1 the record's step t.
-        feedback: Process that the estimates correct, or None.
+    Shapes: record [R, T, Dy].
 
     Attributes:
         belief: Belief after the latest step.
@@ -155,9 +150,6 @@ class FilterPass:
         """Take the steps, several in one call where the filter can do so.
 
         The caller must not change belief or model.
-
-        Yields:
-            Estimate and diagnostics of each step.
         """
         if self.feedback is not None or not isinstance(self.method, MultiStepFilter):
             for step in self:
@@ -185,12 +177,7 @@ def _start(method: Filter, model: StateSpaceModel, record: Record, draws: Random
 def prepare_record(model: StateSpaceModel, record: Record) -> Record:
     """Compute a record's inputs for a model, on its device and in its precision.
 
-    Args:
-        model: State-space model.
-        record: Measurements [R, T, Dy] and inputs.
-
-    Returns:
-        The prepared record. Initial states and factors are those of `record`.
+    Shapes: record [R, T, Dy].
     """
     start, spread = (
         None if a is None else a.to(model.anchor) for a in (record.start, record.spread)
@@ -277,18 +264,7 @@ def apply_feedback(
     The correction applies to particles or to the mean of a Gaussian belief. Its derivative
     transforms the covariance, because a correction of the attitude rotates the axes [ours].
 
-    Args:
-        model: State-space model.
-        feedback: Process that the estimate corrects.
-        belief: Belief after the step.
-        info: Estimate of the step.
-
-    Returns:
-        Belief about the correct_increment process, and the info with the uncorrected estimate.
-
-    Raises:
-        ValueError: If particles or a learned gain carry a past, which refers to the uncorrected
-            process, or if the filter has several hypotheses.
+    Returns belief about the correct_increment process, and the info with the uncorrected estimate.
     """
     valid = torch.isfinite(belief.log_evidence).unsqueeze(-1)
     uncorrected, correct = feedback.correct(torch.where(valid, info.mean, 0.0))

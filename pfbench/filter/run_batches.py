@@ -24,13 +24,7 @@ def choose_run_batch(runs: int, particles: int, dimension: int) -> int:
     4.1, 3.1, 3.0, 3.2 s, in float32 2.2, 2.3, 2.3, 2.5 s. 15-state INS, 500 particles, float64: 100 and
     50 runs took 2.0 and 2.4 s.]
 
-    Args:
-        runs: Number of runs.
-        particles: Number of particles of a run.
-        dimension: Number of components of a particle.
-
-    Returns:
-        Runs per batch.
+    Returns runs per batch.
     """
     return -(-runs // max(1, round(runs * particles * dimension / _BATCH_NUMBERS)))
 
@@ -40,13 +34,7 @@ def split_runs(
 ) -> list[tuple[Record, RandomStream]]:
     """Split a record and its random stream into batches of runs.
 
-    Args:
-        record: Record of R runs.
-        draws: Random stream of these runs.
-        run_batch: Runs of a batch. None takes all.
-
-    Returns:
-        Record and random stream of each batch.
+    Returns Record and random stream of each batch.
     """
     runs = len(record.y)
     if run_batch is None or run_batch >= runs:

@@ -25,12 +25,7 @@ def fill_missing(root: Tensor) -> Tensor:
 def whiten(p: Tensor, root: Tensor) -> Tensor:
     """Compute root^-1 p.
 
-    Args:
-        p: Vectors, [R, N, k].
-        root: Lower triangular root, [R, k, k].
-
-    Returns:
-        Whitened vectors, [R, N, k].
+    Returns whitened vectors, [R, N, k]. Shapes: p [R, N, k], root [R, k, k].
     """
     return torch.linalg.solve_triangular(fill_missing(root), p.mT, upper=False).mT
 
@@ -51,11 +46,8 @@ def compute_half_square(a: Tensor) -> Tensor:
 def whitening_basis(covariance: Tensor) -> tuple[Tensor, Tensor]:
     """Compute whitening and colouring matrices of a covariance S that may be singular.
 
-    Args:
-        covariance: Covariance S, [R, k, k].
-
-    Returns:
-        W and C [R, k, k] with W S W' = 1 and C W = 1 on the range of S. Both are 0 off this range.
+    Returns w and C [R, k, k] with W S W' = 1 and C W = 1 on the range of S. Both are 0 off this
+    range. Shapes: covariance [R, k, k].
     """
     variance = covariance.diagonal(dim1=-2, dim2=-1)
     sd = torch.where(variance > 0.0, variance, 1.0).sqrt()
@@ -80,14 +72,9 @@ def condition_on(
     Gram-Schmidt, component by component. A component of s without remaining variance does
     not remove variance from l. No covariance is formed.
 
-    Args:
-        a: Root A, [..., d, m], with m at least the size of l.
-        first: Components s on which to condition.
-        rest: Components l that remain.
-
-    Returns:
-        Columns L_j [..., d] with e = sum_j L_j z_j + remainder and independent z_j ~ N(0, 1). A
-        lower triangular root of the remainder's covariance for l [..., l, l], of any sign.
+    Returns columns L_j [..., d] with e = sum_j L_j z_j + remainder and independent z_j ~ N(0, 1). A
+    lower triangular root of the remainder's covariance for l [..., l, l], of any sign. Shapes: a
+    [..., d, m].
     """
     size = a.norm(dim=-1)
     tolerance = 1e3 * torch.finfo(a.dtype).eps
@@ -110,13 +97,7 @@ def split_root(a: Tensor, components: Sequence[int], sd: float) -> tuple[list[Te
     standard deviation of each of the components is at most `sd`, and unchanged where it was smaller.
     Each column c_j is a multiple of the regression of e on its component.
 
-    Args:
-        a: Root A, [..., d, m].
-        components: Components whose variance is split.
-        sd: Standard deviation that remains, positive.
-
-    Returns:
-        Columns c_j, [..., d], and the root A' [..., d, m].
+    Returns columns c_j, [..., d], and the root A' [..., d, m]. Shapes: a [..., d, m].
     """
     columns = []
     for i in components:
@@ -135,14 +116,8 @@ def kalman_update_root(root: Tensor, h: Tensor, r: Tensor) -> tuple[Tensor, Tens
 
     Measurement components are processed one after the other, on the root [Potter 1963].
 
-    Args:
-        root: Root of the prior covariance, [R, N or 1, l, l].
-        h: Measurement matrix H, [R, N or 1, k, l].
-        r: Innovation, [R, N, k].
-
-    Returns:
-        Mean [R, N, l], root [R, N or 1, l, l], and the log density of r without its term
-        -k/2 log 2 pi [R, N].
+    Returns mean [R, N, l], root [R, N or 1, l, l], and the log density of r without its term -k/2
+    log 2 pi [R, N]. Shapes: root [R, N or 1, l, l], h [R, N or 1, k, l], r [R, N, k].
 
     References:
         Bierman 1977, Factorization Methods for Discrete Sequential Estimation.

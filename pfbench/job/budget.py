@@ -109,14 +109,7 @@ def allocate_budget(
 ) -> BudgetAllocation:
     """Determine the number of particles at the cost of SIR.
 
-    Args:
-        kind: Unit of cost, one of `store.BUDGETS` except the first.
-        method: Filter, a dataclass with the field `particles`.
-        sir_particles: Particles of SIR that define the cost.
-        trial: Trial on the job's episode.
-
-    Returns:
-        The allocation.
+    Returns the allocation.
     """
     measure = trial.seconds if kind == SAME_TIME else trial.likelihoods
     sir = ParticleFilter(sir_particles)
@@ -136,13 +129,7 @@ def solve_particle_count(
 ) -> tuple[int, float]:
     """Solve for the number of particles at a given cost, by secants in logarithms.
 
-    Args:
-        cost: Measured cost of a number of particles. It grows with the number, up to scatter.
-        price: Target cost.
-        first: Number of the first trial.
-
-    Returns:
-        The tried number whose cost is nearest to the target, and its cost.
+    Returns the tried number whose cost is nearest to the target, and its cost.
     """
     costs = {first: cost(first)}
 
@@ -209,12 +196,7 @@ class EpisodeSource:
         return self._draw(self.plan.runs[:2]) if self.joint is None else self.joint
 
     def batch(self, first: int, size: int) -> Episode:
-        """Return the episode of a batch.
-
-        Args:
-            first: Index of the first run in the job.
-            size: Number of runs.
-        """
+        """Return the episode of a batch."""
         if self.joint is None:
             return self._draw(self.plan.runs[first : first + size])
         return slice_runs(self.joint, slice(first, first + size))
@@ -230,12 +212,7 @@ class EpisodeSource:
 def slice_runs(episode: Episode, runs: slice) -> Episode:
     """Select some runs of an episode.
 
-    Args:
-        episode: Episode of all runs. A feedback process stays that of all of them.
-        runs: Selection.
-
-    Returns:
-        An episode with views of the tensors.
+    Returns an episode with views of the tensors.
     """
     truth = {name: values[runs] for name, values in episode.truth.items()}
     track = None if episode.track is None else episode.track[runs]
@@ -248,15 +225,7 @@ def apply_budget(plan: JobPlan, episodes: EpisodeSource) -> tuple[JobPlan, Budge
     A filter without particles, and one with its own number (filter.particles=...), are unchanged.
     A trial of time uses all runs where their episode is in memory, else two.
 
-    Args:
-        plan: Plan of the job.
-        episodes: Its episodes.
-
-    Returns:
-        The plan with the new filter, and the allocation, None if the filter is unchanged.
-
-    Raises:
-        ValueError: If the whole step is compiled, whose cost is unknown before.
+    Returns the plan with the new filter, and the allocation, None if the filter is unchanged.
     """
     values = plan.values
     if values["budget"] == store.SAME_N or not plan.config.uses_shared_particles:
@@ -295,15 +264,7 @@ def apply_budget(plan: JobPlan, episodes: EpisodeSource) -> tuple[JobPlan, Budge
 def max_runs_in_memory(plan: JobPlan, episodes: EpisodeSource) -> int:
     """Determine the runs that fit into memory at a time, and draw all if they fit.
 
-    Args:
-        plan: Plan of the job, with the number of particles of the budget.
-        episodes: Its episodes.
-
-    Returns:
-        Runs per batch, at most all.
-
-    Raises:
-        ValueError: If a single run does not fit.
+    Returns runs per batch, at most all.
     """
     runs, limit = len(plan.runs), episodes.limit
     if limit is None or not memory.needs_memory_trial(plan.method, plan.model, runs, limit):

@@ -105,15 +105,7 @@ def compose(overrides: Sequence[str] = ()) -> JobConfig:
 def compose_tree(words: Sequence[str], trusted: Sequence[str] | None = None) -> DictConfig:
     """Compose a configuration with Hydra's own settings, checked by the loader.
 
-    Args:
-        words: Hydra overrides.
-        trusted: Packages that the search path may name. Default: those of PFBENCH_TRUST.
-
-    Returns:
-        The configuration, not resolved, with the node `hydra`.
-
-    Raises:
-        UntrustedConfigError: If a file sets what only the command line may set.
+    Returns the configuration, not resolved, with the node `hydra`.
     """
     from hydra import version
     from hydra._internal.hydra import Hydra
@@ -273,15 +265,7 @@ _CIRCLES = ("Recursive interpolation", "Interpolation to parent node")  # messag
 def resolve_values(tree: DictConfig | Mapping[str, Any]) -> dict[str, Any]:
     """Resolve all interpolations of a configuration.
 
-    Args:
-        tree: Configuration.
-
-    Returns:
-        Nested plain dictionary.
-
-    Raises:
-        ValueError: If a value refers to itself.
-        UntrustedConfigError: If values that refer to others become too many or too long.
+    Returns nested plain dictionary.
     """
     from omegaconf import OmegaConf
     from omegaconf.errors import InterpolationResolutionError
@@ -356,15 +340,7 @@ def _add_size(value: Any, counts: list[int]) -> None:
 
 
 def check_groups(values: Mapping[str, Any], groups: Sequence[str]) -> None:
-    """Check that each group names a class and has finite numbers only.
-
-    Args:
-        values: Resolved configuration.
-        groups: Groups to check. One that is missing is skipped.
-
-    Raises:
-        ValueError: If a group is not a dictionary with `_target_`, or a number is not finite.
-    """
+    """Check that each group names a class and has finite numbers only."""
     for group in groups:
         node = values.get(group, {"_target_": None})
         if not isinstance(node, Mapping) or "_target_" not in node:
@@ -381,15 +357,7 @@ def check_groups(values: Mapping[str, Any], groups: Sequence[str]) -> None:
 
 
 def check_simulated_model(values: Mapping[str, Any], choices: Mapping[str, str]) -> None:
-    """Check that a shipped world that is simulated from its model has this model, since it is named by it.
-
-    Args:
-        values: Resolved configuration.
-        choices: Names of the chosen files by group.
-
-    Raises:
-        ValueError: If another model is chosen. The world would be another one under the same name.
-    """
+    """Check that a shipped world that is simulated from its model has this model, since it is named by it."""
     scenario, model = choices.get("scenario", ""), choices.get("model", "")
     if is_simulated_from(values.get("scenario"), scenario) and model != scenario:
         raise ValueError(
@@ -400,12 +368,7 @@ def check_simulated_model(values: Mapping[str, Any], choices: Mapping[str, str])
 
 
 def is_simulated_from(scenario: Any, name: str) -> bool:
-    """Return whether a scenario is a shipped one that is simulated from the model of the same name.
-
-    Args:
-        scenario: Node of the scenario.
-        name: Name of its file.
-    """
+    """Return whether a scenario is a shipped one that is simulated from the model of the same name."""
     target = scenario.get("_target_") if isinstance(scenario, Mapping) else None
     is_shipped = (conf_dir() / "scenario" / f"{name}.yaml").is_file()
     return target == "pfbench.scenario.ModelSimulation" and is_shipped
@@ -422,11 +385,7 @@ FILTER_SETS = {"tuned_baselines": tuple(f"{method}_{SUFFIX}" for method in TUNED
 def expand_filter_names(names: str) -> str:
     """Replace named sets in a list of filters.
 
-    Args:
-        names: Names of filters and sets, separated by commas.
-
-    Returns:
-        Names of filters, each once.
+    Returns names of filters, each once.
     """
     members = [FILTER_SETS.get(name.strip(), (name,)) for name in names.split(",")]
     return ",".join(dict.fromkeys(name for several in members for name in several))
@@ -435,11 +394,7 @@ def expand_filter_names(names: str) -> str:
 def expand_filter_sets(words: Sequence[str]) -> list[str]:
     """Replace named sets in the overrides of a sweep.
 
-    Args:
-        words: Overrides and flags.
-
-    Returns:
-        The words, `filter=tuned_baselines` as the list of its filters.
+    Returns the words, `filter=tuned_baselines` as the list of its filters.
     """
     return [
         f"filter={expand_filter_names(word.removeprefix('filter='))}"

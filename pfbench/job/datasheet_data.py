@@ -74,15 +74,6 @@ def compute_datasheet(
     - `residual` [R, T, Dy], see `compute_residuals`.
     - `track` [R, T, 3] in m, `force` [T, 3] in m/s^2 and `rate` [T, 3] in rad/s, if they exist.
     - `azimuth` and `elevation` [T, S] in rad, `range` [T] in m, and `pcrb` [T, d], if they exist.
-
-    Args:
-        values: Resolved configuration.
-
-    Returns:
-        Metadata and arrays, see `store.Result`.
-
-    Raises:
-        ValueError: If a value of the configuration is invalid.
     """
     apply_global_settings(values)
     model, scenario, noise = instantiate_parts(values, ("model", "scenario", "noise"))
@@ -118,12 +109,7 @@ def compute_datasheet(
 def compute_deviations(model: StateSpaceModel, truth: Tensor) -> Tensor:
     """Compute true states minus their mean over the runs with known truth.
 
-    Args:
-        model: Model of the state.
-        truth: True states, [R, T, D].
-
-    Returns:
-        Deviations, [R, T, d]. NaN where the truth is unknown.
+    Returns deviations, [R, T, d]. NaN where the truth is unknown. Shapes: truth [R, T, D].
     """
     has_truth = ~torch.isnan(truth)
     # the first run with truth: its state is near the others, so that differences are small
@@ -135,14 +121,8 @@ def compute_deviations(model: StateSpaceModel, truth: Tensor) -> Tensor:
 def compute_residuals(model: StateSpaceModel, truth: Tensor, episode: Episode) -> Tensor:
     """Compute standardised measurement residuals at the true state.
 
-    Args:
-        model: Model with the measurement distribution.
-        truth: True states, [R, T, D].
-        episode: Episode with the measurements.
-
-    Returns:
-        Measurement minus expectation in standard deviations, [R, T, Dy]. NaN where the expectation
-        depends on a state with unknown truth.
+    Returns measurement minus expectation in standard deviations, [R, T, Dy]. NaN where the
+    expectation depends on a state with unknown truth. Shapes: truth [R, T, D].
     """
     record = model.prepare(episode.record)
     origin = model.origin.expand(len(truth), -1)

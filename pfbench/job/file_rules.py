@@ -37,17 +37,7 @@ _PLAIN_KEY = re.compile(r"[\w.\[\]@-]+")
 
 
 def check_content(file: Path, values: Mapping[str, Any], *, is_own: bool) -> None:
-    """Check the content of a file, in the package that Hydra gives it.
-
-    Args:
-        file: File, for messages.
-        values: Unresolved content from the root of a configuration on.
-        is_own: Whether the folder of the file is the user's own, so that it may name data.
-
-    Raises:
-        UntrustedConfigError: If the file sets what only the command line may set, or a value
-            names the environment, the user's folders or a path.
-    """
+    """Check the content of a file, in the package that Hydra gives it."""
     for path, value in _walk(values):
         key = path[-1]
         if path[0] == "hydra":
@@ -66,16 +56,7 @@ def check_content(file: Path, values: Mapping[str, Any], *, is_own: bool) -> Non
 
 
 def check_defaults(file: Path, defaults: Sequence[Any]) -> None:
-    """Check the defaults list of a file as Hydra parses it.
-
-    Args:
-        file: File, for messages.
-        defaults: Entries of Hydra.
-
-    Raises:
-        UntrustedConfigError: If an entry is computed, leaves its group, or chooses or places
-            something in hydra other than a launcher of pfbench.
-    """
+    """Check the defaults list of a file as Hydra parses it."""
     for entry in defaults:
         group, value = getattr(entry, "group", None), getattr(entry, "value", None)
         names = [group, getattr(entry, "path", None), entry.package]
@@ -98,15 +79,7 @@ def check_defaults(file: Path, defaults: Sequence[Any]) -> None:
 
 
 def check_place(config_path: str, package: str | None) -> None:
-    """Check that no file is placed in the node `hydra` but those of Hydra's own groups.
-
-    Args:
-        config_path: File as Hydra names it.
-        package: Package that Hydra gives it.
-
-    Raises:
-        UntrustedConfigError: If it is placed there.
-    """
+    """Check that no file is placed in the node `hydra` but those of Hydra's own groups."""
     in_hydra = (package or "").partition(".")[0].partition("[")[0] == "hydra"
     if in_hydra and not config_path.lstrip("/").startswith("hydra/"):
         raise UntrustedConfigError(
@@ -116,16 +89,7 @@ def check_place(config_path: str, package: str | None) -> None:
 
 
 def check_group(file: Path, config_path: str, *, is_own: bool) -> None:
-    """Check that a file of a search path is none of Hydra's settings.
-
-    Args:
-        file: File, for messages.
-        config_path: File as Hydra names it.
-        is_own: Whether the folder is the user's own, so that it may hold launchers.
-
-    Raises:
-        UntrustedConfigError: If the file is one of them.
-    """
+    """Check that a file of a search path is none of Hydra's settings."""
     is_launcher = is_own and config_path.startswith("hydra/launcher/")
     if config_path.lstrip("./").startswith("hydra") and not is_launcher:
         raise UntrustedConfigError(
@@ -328,18 +292,7 @@ _OF_A_NAME = ("name", "override_dirname", "config_name", "num", "id")
 def check_composed(
     tree: Any, words: Sequence[str], compose_reference: Callable[[list[str]], Any] | None
 ) -> None:
-    """Check a composed configuration.
-
-    Args:
-        tree: Composed configuration with its node `hydra`, not resolved.
-        words: Overrides of its composition.
-        compose_reference: Composes overrides without files of a search path. None if the words name
-            no search path, so that all files are those of pfbench.
-
-    Raises:
-        UntrustedConfigError: If the study or a choice has an invalid name, or a file set what only
-            the command line may set.
-    """
+    """Check a composed configuration."""
     check_study(tree._get_node("study")._value() if "study" in tree else None)  # not resolved
     for group, name in tree.hydra.runtime.choices.items():
         if isinstance(name, str) and (name.startswith("/") or ".." in name.split("/")):

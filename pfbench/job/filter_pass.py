@@ -61,12 +61,7 @@ class TimedFilterPass(NamedTuple):
 
         They are NaN from the step at which a run is lost.
 
-        Args:
-            episode: Episode of the runs.
-            pcrb: Standard deviations of the PCRB, [T, d], or None.
-
-        Returns:
-            Arrays by name, see `store.Result`.
+        Returns arrays by name, see `store.Result`. Shapes: pcrb [T, d].
         """
         estimate, trace = self.estimate, dict(self.estimate.trace)
         is_lost = torch.isnan(estimate.mean).any(-1, keepdim=True)
@@ -92,14 +87,7 @@ class TimedFilterPass(NamedTuple):
 def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> TimedFilterPass:
     """Run the filter of a plan over an episode and measure errors, time and memory.
 
-    Args:
-        plan: Plan of the job.
-        episode: Episode of the runs.
-        runs: Numbers of the runs, [R].
-        label: Title of the progress bar.
-
-    Returns:
-        The results.
+    Returns the results. Shapes: runs [R].
     """
     values, method, clock = plan.values, plan.method, plan.choose_timer()
     device, engine = values["device"], values["engine"]
@@ -178,15 +166,7 @@ def choose_engine(
     On the CPU it takes the operators always, and compiles the step where that is predicted to save more
     time than it takes. On a CUDA device it takes kernels for large jobs.
 
-    Args:
-        engine: Engine of the settings.
-        method: Filter.
-        model: Model of the filter.
-        runs: Number of runs.
-        steps: Number of steps.
-
-    Returns:
-        The engine: `eager` if the operators cannot be loaded.
+    Returns the engine: `eager` if the operators cannot be loaded.
     """
     if engine == "eager":
         return "eager"

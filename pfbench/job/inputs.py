@@ -27,19 +27,7 @@ _MISSING = "missing"
 
 
 def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Inputs:
-    """Find all that a job reads besides its configuration and pfbench.
-
-    Args:
-        values: Resolved configuration of the job, or the groups of it that are built.
-        trusted: Packages that it may name besides pfbench and those of PFBENCH_TRUST.
-
-    Returns:
-        Digests by name, for each of `scenario`, `noise`, `filter` and `model` that has inputs. A file
-        is named by its folder and its name, as in "my_log/imu.csv", wherever the folder is.
-
-    Raises:
-        ValueError: If an object names a folder or a device as a file.
-    """
+    """Find all that a job reads besides its configuration and pfbench."""
     trusted = (*trusted, *trusted_packages())
     digests = {}
     for group in CHOICES:
@@ -52,13 +40,7 @@ def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Input
 
 
 def check_unchanged(before: Inputs, values: Mapping[str, Any], trusted: Sequence[str] = ()) -> None:
-    """Raise ValueError if a file was written while a job read it.
-
-    Args:
-        before: Inputs before the job.
-        values: Resolved configuration of the job.
-        trusted: Packages that it may name.
-    """
+    """Raise ValueError if a file was written while a job read it."""
     changed = list_changed(before, find_inputs(values, trusted))
     files = [name for name in changed if not name.startswith(CODE_OF)]  # loaded before
     if files:
@@ -69,12 +51,7 @@ def check_unchanged(before: Inputs, values: Mapping[str, Any], trusted: Sequence
 
 
 def describe_unnamed_files(scenario: Any, trusted: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return a note if nothing in a user's scenario says which files it reads.
-
-    Args:
-        scenario: Node of the configuration.
-        trusted: Packages that it may name.
-    """
+    """Return a note if nothing in a user's scenario says which files it reads."""
     target = str(scenario.get("_target_", ""))
     trusted = (*trusted, *trusted_packages())
     if target.startswith("pfbench.") or any(True for _ in _list_readers(scenario, trusted)):

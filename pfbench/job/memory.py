@@ -35,15 +35,7 @@ _CHECK_STEPS = 10  # steps between two queries of the resident memory
 
 
 def memory_limit(requested: float | None, device: str) -> float | None:
-    """Return the bytes that a job may use.
-
-    Args:
-        requested: Limit in GiB. None means a share of the free memory.
-        device: Device of the job.
-
-    Returns:
-        The limit, or None if the system does not report free memory.
-    """
+    """Return the bytes that a job may use."""
     if requested is not None:
         return requested * GIB
     free = torch.cuda.mem_get_info(device)[0] if device != "cpu" else available_memory()
@@ -69,15 +61,7 @@ def start_peak_measurement(device: str) -> int | None:
 
 
 def peak_above(baseline: int | None, device: str) -> int | None:
-    """Return the peak of used memory above a baseline.
-
-    Args:
-        baseline: Result of `start_peak_measurement`.
-        device: Device of the job.
-
-    Returns:
-        Bytes, or None if the system does not report them.
-    """
+    """Return the peak of used memory above a baseline."""
     if device != "cpu":
         return int(torch.cuda.max_memory_allocated(device))
     return None if baseline is None else max(0, process_memory.peak_memory() - baseline)
@@ -213,16 +197,7 @@ class MemoryEstimate:
     run_batch: Callable[[int], int]
 
     def peak(self, runs: int, total: int | None = None, is_whole: bool = False) -> float:
-        """Compute the peak while `runs` of `total` runs are at work.
-
-        Args:
-            runs: Runs at work.
-            total: All runs of the job. Default: `runs`.
-            is_whole: Whether the episodes of the waiting runs are in memory, too.
-
-        Returns:
-            The peak in bytes.
-        """
+        """Compute the peak while `runs` of `total` runs are at work."""
         waiting = (total or runs) - runs
         idle = waiting * (self.result + (self.episode if is_whole else 0.0))
         return self.base + runs * self.run + self.run_batch(runs) * self.stepped + idle
@@ -233,17 +208,7 @@ def runs_within_limit(
 ) -> int:
     """Determine the runs that fit at a time, in batches of about equal size.
 
-    Args:
-        estimate: Bytes of the job.
-        runs: Runs of the job.
-        limit: Bytes that the job may use.
-        is_whole: Whether the episodes of all runs are in memory.
-
-    Returns:
-        Runs per batch, at most all.
-
-    Raises:
-        ValueError: If a single run does not fit.
+    Returns runs per batch, at most all.
     """
     if estimate.peak(1, runs, is_whole) > limit:
         if estimate.peak(1) > limit:
@@ -266,23 +231,12 @@ def runs_within_limit(
 
 
 def fits_undrawn(runs: int, limit: float | None) -> bool:
-    """Return whether the undrawn episodes of all runs of any scenario fit.
-
-    Args:
-        runs: Runs of the job.
-        limit: Bytes that the job may use. None if unknown.
-    """
+    """Return whether the undrawn episodes of all runs of any scenario fit."""
     return limit is None or _BASE + runs * _MAX_EPISODE <= limit
 
 
 def fits_drawn(estimate: MemoryEstimate, runs: int, limit: float) -> bool:
-    """Return whether the episodes of all runs fit while they are drawn together.
-
-    Args:
-        estimate: Bytes of the job.
-        runs: Runs of the job.
-        limit: Bytes that the job may use.
-    """
+    """Return whether the episodes of all runs fit while they are drawn together."""
     return _BASE + runs * _SIMULATION_FACTOR * estimate.episode <= limit
 
 
@@ -290,12 +244,6 @@ def needs_memory_trial(method: Any, model: StateSpaceModel, runs: int, limit: fl
     """Return whether a job may exceed the limit.
 
     Most jobs are small enough to skip the trial.
-
-    Args:
-        method: Filter.
-        model: Model of the filter.
-        runs: Runs of the job.
-        limit: Bytes that the job may use.
     """
     d = model.chart.dimension
     return runs * (_MAX_EPISODE + 40.0 * _particles(method) * d * (d + 10)) > limit
@@ -310,15 +258,7 @@ def estimate_memory(
 ) -> MemoryEstimate:
     """Estimate the bytes of a job by a trial.
 
-    Args:
-        method: Filter.
-        model: Model of the filter, on the device and in the precision of the job.
-        episode: Episode of two runs of the job, or of its only run.
-        run_batch: Maps a number of runs to the number that is stepped together.
-        watch: Maps (runs, steps) to the `watch` of `run_filter` over these runs and steps.
-
-    Returns:
-        The estimate.
+    Returns the estimate.
     """
     record = model.prepare(episode.record)
     runs, steps = record.y.shape[:2]
@@ -361,12 +301,7 @@ def estimate_memory(
 def first_steps(record: Record, steps: int) -> Record:
     """Copy the first steps of a record.
 
-    Args:
-        record: Measurements and inputs.
-        steps: Number of steps.
-
-    Returns:
-        The copy, without a feedback process.
+    Returns the copy, without a feedback process.
     """
     start, spread = (None if a is None else a.clone() for a in (record.start, record.spread))
     u = map_inputs(lambda a: a[:, :steps].clone(), record.u)

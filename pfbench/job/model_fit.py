@@ -18,17 +18,7 @@ _PARTS = ("model", "scenario")
 
 
 def check_fit(model: Any, scenario: Any, tree: Mapping[str, Any], trusted: Sequence[str]) -> None:
-    """Check that a model reads what a scenario provides.
-
-    Args:
-        model: State-space model.
-        scenario: Source of episodes.
-        tree: Configuration of both.
-        trusted: Packages that the configuration may name besides pfbench.
-
-    Raises:
-        ValueError: If a channel or the inputs differ. It names the shipped models that fit.
-    """
+    """Check that a model reads what a scenario provides."""
     from pfbench.core.channels import describe_misfit
 
     if difference := describe_misfit(model, scenario):
@@ -40,15 +30,8 @@ def explain_error(
 ) -> Exception:
     """Explain an error of a shipped model that has another scenario than it is made for.
 
-    Args:
-        error: Error while the model was resolved or built.
-        tree: Configuration of model and scenario.
-        trusted: Packages that the configuration may name besides pfbench.
-        scenario: Name of the file of the scenario, if it is known.
-
-    Returns:
-        A refusal with the shipped models that fit. The error itself if there is none, or if the class of
-        the model fits this scenario, so that one of its values is wrong.
+    Returns a refusal with the shipped models that fit. The error itself if there is none, or if the
+    class of the model fits this scenario, so that one of its values is wrong.
     """
     target, fitting = (
         str(tree["model"].get("_target_")),
@@ -68,13 +51,7 @@ def list_fitting_models(
 ) -> dict[str, str]:
     """List the shipped models that fit the scenario of a configuration.
 
-    Args:
-        tree: Configuration, resolved or not. Its model is not used.
-        trusted: Packages that the scenario may name besides pfbench.
-        scenario: Name of the file of the scenario, if it is known.
-
-    Returns:
-        Class of each model by the name of its file.
+    Returns class of each model by the name of its file.
     """
     names = [path.stem for path in list_groups()["model"]]
     # one composition for all: each costs as much as a hundred files
@@ -89,11 +66,7 @@ def list_fitting_models(
 def list_fitting_scenarios(words: Sequence[str]) -> list[str]:
     """List the shipped scenarios that fit a model.
 
-    Args:
-        words: Overrides with the model.
-
-    Returns:
-        Names of their files.
+    Returns names of their files.
     """
     fitting = []
     for name in (path.stem for path in list_groups()["scenario"]):
@@ -105,12 +78,7 @@ def list_fitting_scenarios(words: Sequence[str]) -> list[str]:
 
 
 def is_fitting(tree: Mapping[str, Any], trusted: Sequence[str] = ()) -> bool:
-    """Return whether model and scenario of a configuration can be built and fit.
-
-    Args:
-        tree: Configuration, resolved or not.
-        trusted: Packages that it may name besides pfbench.
-    """
+    """Return whether model and scenario of a configuration can be built and fit."""
     from omegaconf import OmegaConf
 
     from pfbench.core.channels import describe_misfit
@@ -194,16 +162,7 @@ def instantiate_parts(
 ) -> tuple[Any, ...]:
     """Build several parts of a configuration, and check that model and scenario fit.
 
-    Args:
-        values: Resolved configuration. Errors name the full key of a part in it.
-        names: Top-level keys of the parts, in the order of their construction.
-        trusted: Packages that the parts may name besides pfbench.
-
-    Returns:
-        The objects.
-
-    Raises:
-        ValueError: If a value is invalid, or the model does not fit the scenario.
+    Returns the objects.
     """
     from omegaconf import OmegaConf
 

@@ -53,29 +53,8 @@ def compute_posterior_bound(
     covariance contributes information too. For a linear model each run has its own recursion, and
     the bound is the mean of the Kalman covariances.
 
-    Args:
-        model: State-space model with the distributions of the scenario. If the scenario has other
-            distributions, use the oracle noise model if it exists.
-        truth: True states, [R, T, D], or [R, T + 1, D] with the initial states first. Without them
-            a nonlinear map is first differentiated at the centre of the initial distribution. A
-            linear model does not use the truth.
-        record: Inputs and measurements. Of the measurements only the pattern of missing components
-            is used.
-        initial: Covariance of the initial distribution in the chart, [d, d] or [R, d, d]. None for
-            the covariance that filters use (the record's spread, else the model's initial
-            distribution).
-        run_by_run: Use a recursion for each run and average the covariances. Required if the
-            Jacobians differ between runs in directions that the noise does not reach. Exact for a
-            model that is linear in the state with inputs that differ between runs. Otherwise the
-            bound of a known trajectory (Taylor 1979), which may lie slightly above the PCRB.
-
-    Returns:
-        Lower bound of the error covariance at each step, [T, d, d].
-
-    Raises:
-        ValueError: If a distribution is not normal or the process noise not additive. If the truth
-            is unknown or has another shape. If the initial covariance is not positive definite, or
-            the Jacobians do not have a common bound.
+    Returns lower bound of the error covariance at each step, [T, d, d]. Shapes: truth [R, T, D],
+    initial [d, d].
     """
     converted = record.to(model.anchor)
     runs = len(record.y)
@@ -336,13 +315,7 @@ def _recipe(
 
 
 def lacks_bound(values: Mapping[str, Any], meta: Mapping[str, Any], names: Container[str]) -> bool:
-    """Return whether a finished job lacks a bound that is requested now and was not when it ran.
-
-    Args:
-        values: Resolved configuration of the job.
-        meta: Metadata of its result.
-        names: Names of the arrays of its result.
-    """
+    """Return whether a finished job lacks a bound that is requested now and was not when it ran."""
     strictness = {False: 0, "auto": 1, True: 2}
     before = strictness.get(meta["config"].get("pcrb"), 0)
     return "pcrb" not in names and strictness.get(values["pcrb"], 0) > before

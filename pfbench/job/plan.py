@@ -177,14 +177,7 @@ def job_key(values: Mapping[str, Any], inputs: Inputs | None = None) -> str:
 
 
 def check_settings(values: Mapping[str, Any]) -> None:
-    """Check the settings of a job that do not belong to one of its objects.
-
-    Args:
-        values: Configuration.
-
-    Raises:
-        ValueError: If a value is invalid. The message names key, requirement and value.
-    """
+    """Check the settings of a job that do not belong to one of its objects."""
     valid = {
         **{
             key: type(values[key]) is int and least <= values[key] <= _MOST.get(key, math.inf)
@@ -280,14 +273,7 @@ def make_metadata(
 ) -> dict[str, Any]:
     """Collect the metadata of a job.
 
-    Args:
-        plan: Plan of the job.
-        model: Model that the filter received.
-        steps: Number of time steps.
-        notes: Modelling choices of the scenario.
-
-    Returns:
-        Values that JSON can represent.
+    Returns values that JSON can represent.
     """
     values, method = plan.values, plan.method
     device = values["device"]
@@ -359,13 +345,6 @@ def describe_commit(checkout: Path) -> str:
     """Return the commit of a checkout, with "-dirty" if a tracked file that decides results is changed.
 
     Pages, reports and tests do not count.
-
-    Args:
-        checkout: Top folder.
-
-    Returns:
-        Abbreviated commit, empty outside a checkout. The repository of a project in whose folder pfbench
-        is installed does not count.
     """
     present = [name for name in _DECIDING if (checkout / name).exists()]
     commands = (

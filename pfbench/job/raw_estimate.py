@@ -94,14 +94,7 @@ def compute_raw_estimate(
 ) -> RawEstimate:
     """Compute the error of the raw estimate of a group of components.
 
-    Args:
-        model: State-space model in double precision.
-        truth: True states, [R, T, D]. NaN where they are unknown.
-        record: Measurements and inputs.
-        group: Components of a difference.
-
-    Returns:
-        The error.
+    Shapes: truth [R, T, D].
     """
     prepared = prepare_record(model, record)
     initial: Any = initial_law(model, len(truth), prepared.spread)
@@ -201,13 +194,7 @@ def _observe(model: StateSpaceModel, step: Record, x: Tensor) -> tuple[Tensor, T
 def compute_dead_reckoning(model: StateSpaceModel, truth: Tensor, record: Record) -> Tensor:
     """Compute the error of the initial state, propagated without noise and measurements.
 
-    Args:
-        model: State-space model in double precision.
-        truth: True states, [R, T, D]. NaN where they are unknown.
-        record: Inputs and initial states.
-
-    Returns:
-        Errors, [R, T, d].
+    Returns errors, [R, T, d]. Shapes: truth [R, T, D].
     """
     prepared, errors = prepare_record(model, record), []
     start = model.origin.expand(len(truth), -1) if prepared.start is None else prepared.start

@@ -45,18 +45,7 @@ _ENGINES = ("kernels", "compiled")  # engines that a job may have used; the othe
 
 
 def replay_config(stored: StoredRun, changes: Mapping[str, Any]) -> JobConfig:
-    """Return the configuration that computes one run of a stored job.
-
-    Args:
-        stored: Run.
-        changes: See `stored_config`.
-
-    Returns:
-        The configuration.
-
-    Raises:
-        ValueError: If the result was not computed by a job, or names what is not trusted.
-    """
+    """Return the configuration that computes one run of a stored job."""
     meta = stored.result.meta
     one_run = {"first_run": stored.run, "runs": 1, "score_steps": int(meta["steps"])}
     return stored_config(meta, stored.job.path, {**one_run, **changes})
@@ -67,18 +56,6 @@ def stored_config(meta: Mapping[str, Any], path: Path, changes: Mapping[str, Any
 
     All settings that affect the numbers are those of the job. A number of particles that a budget chose is
     set as such, so that nothing is measured again.
-
-    Args:
-        meta: Metadata of the job.
-        path: File of the job, for errors.
-        changes: Values of top-level keys that replace the stored ones: folders, the folder of the data,
-            threads, device.
-
-    Returns:
-        The configuration.
-
-    Raises:
-        ValueError: If the result was not computed by a job, or the packages of its classes are not trusted.
     """
     parts = ("scenario", "noise", "filter", "model")
     values = copy.deepcopy(meta["config"])
@@ -113,11 +90,7 @@ def stored_config(meta: Mapping[str, Any], path: Path, changes: Mapping[str, Any
 
 
 def describe_changed_code(meta: Mapping[str, Any]) -> str:
-    """Describe a change of a user's classes since a stored job; empty without one.
-
-    Args:
-        meta: Metadata of the job, whose packages are trusted.
-    """
+    """Describe a change of a user's classes since a stored job; empty without one."""
     if not meta.get("trusted"):
         return ""
     changed = _list_changed_inputs(meta, find_inputs(meta["config"], trusted_packages()))
@@ -150,15 +123,7 @@ def _replace_cache_folders(node: Any, folder: str | None) -> None:
 
 
 def recompute_run(stored: StoredRun, changes: Mapping[str, Any]) -> store.JobResult:
-    """Compute one stored run again.
-
-    Args:
-        stored: Run.
-        changes: See `replay_config`.
-
-    Returns:
-        Result with one run, and scores at all steps.
-    """
+    """Compute one stored run again."""
     config = replay_config(stored, changes)
     _check_inputs(stored.result.meta, find_inputs(config.values, config.trusted))
     choices = {group: config.choices[group] for group in CHOICES}
@@ -185,12 +150,7 @@ def _check_inputs(meta: Mapping[str, Any], present: Inputs) -> None:
 def select_stored_scores(result: store.JobResult, stored: store.JobResult) -> store.JobResult:
     """Select the scores of a replay at the steps at which the stored run was scored.
 
-    Args:
-        result: Result with scores at all steps.
-        stored: Stored result.
-
-    Returns:
-        The replay with the arrays of scores that the stored run has.
+    Returns the replay with the arrays of scores that the stored run has.
     """
     steps = stored.data.get("score_steps")
     names = ("crps", "pit", "energy_score", "nis", "nis_dof")
@@ -235,12 +195,7 @@ class ArrayAgreement(NamedTuple):
 def compare_runs(stored: store.JobResult, replayed: store.JobResult) -> list[ArrayAgreement]:
     """Compare the arrays of two results of one run.
 
-    Args:
-        stored: Stored result with one run.
-        replayed: Computed result with one run, scored at the same steps.
-
-    Returns:
-        Agreement of each array that both have, those that differ most first.
+    Returns Agreement of each array that both have, those that differ most first.
     """
     rows = []
     for name in stored.data:
@@ -254,11 +209,7 @@ def compare_runs(stored: store.JobResult, replayed: store.JobResult) -> list[Arr
 
 
 def describe_agreement(rows: list[ArrayAgreement]) -> str:
-    """Describe the agreement of all arrays in one or two sentences.
-
-    Args:
-        rows: Result of `compare_runs`.
-    """
+    """Describe the agreement of all arrays in one or two sentences."""
     worst = rows[0]
     if math.isinf(worst.digits):
         return f"All {len(rows)} stored arrays are equal in every digit."
@@ -330,12 +281,8 @@ _COLOUR, _GREY = "#0072B2", "0.45"
 def tabulate_traces(result: store.JobResult) -> pd.DataFrame:
     """Build the table of all traces of a run, a row per step.
 
-    Args:
-        result: Result with one run, scored at all steps.
-
-    Returns:
-        Time [s], error and sd of each component in its SI unit, and NEES of each group. The traces of
-        the filter such as ess, the NIS and the true track [m] follow.
+    Returns time [s], error and sd of each component in its SI unit, and NEES of each group. The
+    traces of the filter such as ess, the NIS and the true track [m] follow.
     """
     data, state = result.data, result.meta["state"]
     columns: dict[str, Any] = {"time [s]": data["time"]}
@@ -359,11 +306,7 @@ def tabulate_traces(result: store.JobResult) -> pd.DataFrame:
 
 
 def plot_traces(result: store.JobResult) -> Figure:
-    """Plot a run: error of the main group with its bounds, NIS, effective sample size, and the track.
-
-    Args:
-        result: Result with one run, scored at all steps.
-    """
+    """Plot a run: error of the main group with its bounds, NIS, effective sample size, and the track."""
     data = result.data
     has_ess = "ess" in data and data["ess"].shape == (1, data["time"].size)
     panels = ["error", *(["NIS"] if "nis" in data else []), *(["ESS"] if has_ess else [])]
@@ -433,12 +376,7 @@ def _plot_track(axis: Axes, result: store.JobResult) -> None:
 def magnification(track: np.ndarray, error: np.ndarray) -> int:
     """Return the power of ten that magnifies errors enough to be visible.
 
-    Args:
-        track: True track, [T, 2].
-        error: Errors in the same unit, [T, 2].
-
-    Returns:
-        1, 10, 100, ...: the largest with which the median error is below a twentieth of the track.
+    Shapes: track [T, 2], error [T, 2].
     """
     extent = float(np.ptp(track, axis=0).max())
     size = float(np.nanmedian(_norm(error))) if np.isfinite(error).any() else 0.0
@@ -461,13 +399,7 @@ _FIGURE = "traces"
 def write_replay(stored: StoredRun, result: store.JobResult, reports: str | Path) -> list[Path]:
     """Write the files of a replay to `<reports>/<study>/replay/<condition>_<filter>_run_<number>/`.
 
-    Args:
-        stored: Run.
-        result: The run computed again, scored at all steps.
-        reports: Folder of all reports.
-
-    Returns:
-        traces.csv, traces.parquet if pyarrow is installed, and traces.svg.
+    Returns traces.csv, traces.parquet if pyarrow is installed, and traces.svg.
     """
     condition, job = stored.condition, stored.job
     names = (condition.scenario, condition.noise, condition.model, job.label)
@@ -491,12 +423,7 @@ def tabulate_metrics(
 ) -> list[tuple[str, float, float, str]]:
     """List the metrics of a run, as stored and as computed again.
 
-    Args:
-        stored: Run.
-        replayed: The run computed again, with scores at the stored steps.
-
-    Returns:
-        Name, stored value, new value and unit: errors of each group, and metrics of the filter.
+    Returns name, stored value, new value and unit: errors of each group, and metrics of the filter.
     """
     old, new = (
         to_long_rows(stored.condition, stored.job, result, 0.0, {})
@@ -513,11 +440,7 @@ def tabulate_metrics(
 
 
 def describe_status(result: store.JobResult) -> str:
-    """Describe the status of a run, such as "track kept, overconfident".
-
-    Args:
-        result: Result with one run.
-    """
+    """Describe the status of a run, such as "track kept, overconfident"."""
     count = count_statuses(result.data, result.meta)
     words = {
         "lost": count.lost,

@@ -119,11 +119,7 @@ def run(
 
 
 def list_used_packages(config: JobConfig) -> list[str]:
-    """List the packages of a user that define classes of a job; empty if all are of pfbench.
-
-    Args:
-        config: Configuration of the job.
-    """
+    """List the packages of a user that define classes of a job; empty if all are of pfbench."""
     values = {name: config.values.get(name) for name in CHOICES}
     packages = list_user_packages(values, (*config.trusted, *trusted_packages()))
     return list(dict.fromkeys(packages))

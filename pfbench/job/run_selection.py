@@ -40,22 +40,7 @@ class StoredRun(NamedTuple):
 def find_run(
     study: str, results: str | Path, run: int, label: str, choices: Mapping[str, str]
 ) -> StoredRun:
-    """Find one run of a study.
-
-    Args:
-        study: Name of the folder in `results`.
-        results: Folder of all studies.
-        run: Number of the run.
-        label: Filter, or its label in the report, such as `sir[particles=100]`.
-        choices: Scenario, noise and model, as far as they are given.
-
-    Returns:
-        The run.
-
-    Raises:
-        FileNotFoundError: If results of the study are missing.
-        ValueError: If no job or several jobs match, or the job does not have the run.
-    """
+    """Find one run of a study."""
     plain = {group: parse_label(value)[0] for group, value in choices.items()}
     keys = _matching_keys(Path(results) / study, plain)
     conditions = load_conditions(study, results, allow_mixed_versions=True, keys=keys)
@@ -85,11 +70,7 @@ def find_run(
 def _select_data(
     conditions: Sequence[Condition], choices: Mapping[str, str]
 ) -> Sequence[Condition]:
-    """Select the conditions of settings of scenario and noise such as "flight[gps_sd=2.0]".
-
-    Raises:
-        ValueError: If no condition has the settings.
-    """
+    """Select the conditions of settings of scenario and noise such as "flight[gps_sd=2.0]"."""
     for group, value in choices.items():
         names = {str(getattr(condition, group)) for condition in conditions}
         if "[" in value and value not in names:

@@ -46,9 +46,6 @@ class ProperScores(NamedTuple):
 class LikelihoodCounter:
     """Counter of evaluations of a model's measurement distribution, per state and run.
 
-    Args:
-        model: Model whose method `observation` is wrapped from here on.
-
     Attributes:
         count: Evaluations so far.
     """
@@ -175,14 +172,7 @@ def score_particles(
 ) -> ProperScores:
     """Compute the scores of weighted particles.
 
-    Args:
-        error: Estimate minus truth, [R, d].
-        deviation: Particles minus estimate, [R, N, d].
-        log_w: Log weights, [R, N].
-        groups: Components of each energy score.
-
-    Returns:
-        The scores.
+    Shapes: error [R, d], deviation [R, N, d], log_w [R, N].
     """
     w = normalise_log_weights(log_w)
     crps, below = _marginal_scores(error, deviation, w)
@@ -197,14 +187,7 @@ def score_particles(
 def score_normal(error: Tensor, covariance: Tensor, z: Tensor, groups: Groups) -> ProperScores:
     """Compute the scores of normal distributions.
 
-    Args:
-        error: Mean minus truth, [R, d].
-        covariance: Covariance, [R, d, d].
-        z: Standard normal numbers, [R or 1, n, d], that represent it in the energy scores.
-        groups: Components of each energy score.
-
-    Returns:
-        The scores.
+    Shapes: error [R, d], covariance [R, d, d], z [R or 1, n, d].
     """
     sd = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
     spread = torch.where(sd > 0, sd, 1.0)

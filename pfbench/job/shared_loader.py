@@ -95,18 +95,7 @@ class SharedLoader(ConfigLoaderImpl):
     ) -> DictConfig:
         """Compose a configuration and check it.
 
-        Args:
-            config_name: Main file.
-            overrides: Words.
-            run_mode: Mode of Hydra.
-            from_shell: Whether messages are for a shell.
-            validate_sweep_overrides: Whether a sweep in the words is an error.
-
-        Returns:
-            The configuration, not resolved.
-
-        Raises:
-            UntrustedConfigError: If a file sets what only the command line may set.
+        Returns the configuration, not resolved.
         """
         try:
             tree = super().load_configuration(
@@ -374,12 +363,7 @@ class ForeignFolder(FileConfigSource):
         return _is_kind(Path(self.path), self._normalize_file_name(config_path), stat.S_IFREG)
 
     def load_config(self, config_path: str) -> ConfigResult:
-        """Read a file as Hydra does, after its measures.
-
-        Raises:
-            UntrustedConfigError: If the file is larger or deeper than a configuration may be, or is
-                not keys and values in UTF-8.
-        """
+        """Read a file as Hydra does, after its measures."""
         file = self.file_of(config_path)
         text = _read(file)
         _check_measures(file, text)
@@ -408,17 +392,7 @@ class _NamedText(io.StringIO):
 
 
 def open_folder(provider: str, path: str, trusted: Sequence[str]) -> ForeignFolder:
-    """Return the source of an entry of `hydra.searchpath`.
-
-    Args:
-        provider: Name that Hydra gives the entry.
-        path: `file://FOLDER`, `own://FOLDER`, or `pkg://PACKAGE.FOLDER` of a trusted package.
-        trusted: Trusted packages.
-
-    Raises:
-        ValueError: If the folder does not exist, or the entry is of another kind.
-        UntrustedConfigError: If the package is not trusted, since to find it runs its code.
-    """
+    """Return the source of an entry of `hydra.searchpath`."""
     scheme, _, name = path.rpartition("://")
     if scheme == "pkg":
         folder, scheme = _find_package(name, trusted), "own"

@@ -52,8 +52,7 @@ class TimingTask:
     def measure(self) -> tuple[float, float]:
         """Run the filter over the record.
 
-        Returns:
-            Processor time and elapsed time per step of all runs of the job, s.
+        Returns processor time and elapsed time per step of all runs of the job, s.
         """
         values, (runs, steps) = self.plan.values, self.record.y.shape[:2]
         numbers = self.plan.runs[:runs].to(values["device"])
@@ -69,13 +68,7 @@ class TimingTask:
 
 
 def estimate_time(condition: Condition, rounds: int, seconds: float) -> float:
-    """Estimate how long the rounds of a condition last at the speed of its jobs, s.
-
-    Args:
-        condition: Condition with its stored jobs.
-        rounds: Number of rounds; one more is not counted.
-        seconds: Mean time of one filter in one round, s, see `time_condition`.
-    """
+    """Estimate how long the rounds of a condition last at the speed of its jobs, s."""
     per_step = sum(float(job.meta["seconds"]["per_step"]) for job in condition.jobs)
     return (rounds + 1) * _count_steps(condition.jobs, seconds) * per_step
 
@@ -88,14 +81,7 @@ def time_condition(
     Each filter runs once before, so that nothing is compiled or loaded in a round. The first filter of
     a round is another one each time.
 
-    Args:
-        condition: Condition with its stored jobs.
-        changes: See `recomputation.stored_config`.
-        rounds: Number of rounds.
-        seconds: Mean time of one filter in one round, s. The steps are chosen by it, at least 20.
-
-    Returns:
-        Measurement for `step_times.write_step_times`.
+    Returns measurement for `step_times.write_step_times`.
     """
     steps = _count_steps(condition.jobs, seconds)
     tasks = _build_tasks(condition.jobs, changes, steps)

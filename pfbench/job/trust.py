@@ -52,14 +52,7 @@ class UntrustedConfigError(ValueError):
 def split_trust(words: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
     """Take the key `trust` out of overrides.
 
-    Args:
-        words: Overrides, for instance `["scenario=mine", "trust=[mylab]"]`.
-
-    Returns:
-        The other overrides, and the trusted packages with those of the environment variable.
-
-    Raises:
-        UntrustedConfigError: If an entry is not a name, or is too large to be trusted.
+    Returns the other overrides, and the trusted packages with those of the environment variable.
     """
     is_trust = [word.lstrip("+").startswith("trust=") for word in words]
     others = [word for word, is_key in zip(words, is_trust, strict=True) if not is_key]
@@ -104,16 +97,7 @@ def _parse_packages(texts: Sequence[str]) -> tuple[str, ...]:
 
 
 def check_configuration(values: Any, trusted: Sequence[str] = (), path: str = "") -> None:
-    """Check all names that instantiation would import, and that nothing is left to resolve.
-
-    Args:
-        values: Resolved configuration: dictionaries, lists and plain values.
-        trusted: Names of packages that the user trusts.
-        path: Key of `values`, for messages.
-
-    Raises:
-        UntrustedConfigError: If a name is not public or not trusted, or if a text still has an interpolation.
-    """
+    """Check all names that instantiation would import, and that nothing is left to resolve."""
     for key, node in _walk(values, path):
         if isinstance(node, str) and "${" in node:
             raise UntrustedConfigError(
@@ -126,14 +110,7 @@ def check_configuration(values: Any, trusted: Sequence[str] = (), path: str = ""
 def check_study(name: Any) -> str:
     """Check the name of a study, which is also the name of its folder.
 
-    Args:
-        name: Value of the key `study`. YAML reads 2024 as a number.
-
-    Returns:
-        The name as a text.
-
-    Raises:
-        UntrustedConfigError: If it is not a plain name.
+    Returns the name as a text.
     """
     name = str(name) if isinstance(name, int | float) else name
     if not isinstance(name, str) or not STUDY.fullmatch(name) or set(name) == {"."}:
@@ -145,14 +122,7 @@ def check_study(name: Any) -> str:
 
 
 def check_places(values: Mapping[str, Any]) -> None:
-    """Check the folders of results and reports: Hydra makes them before a job begins.
-
-    Args:
-        values: Resolved configuration.
-
-    Raises:
-        UntrustedConfigError: If one is not a text, or is empty.
-    """
+    """Check the folders of results and reports: Hydra makes them before a job begins."""
     for key in ("results_dir", "reports_dir"):
         if not isinstance(values.get(key, key), str) or values.get(key) == "":
             raise UntrustedConfigError(
@@ -281,12 +251,6 @@ def hash_user_code(values: Any) -> dict[str, str]:
 
     The files are those of the modules that `_target_` names, and of all modules that these import,
     directly or through others. Installed libraries and pfbench are left out.
-
-    Args:
-        values: Resolved configuration.
-
-    Returns:
-        Hexadecimal digits by the name of the module. Empty if the configuration names no class of a user.
     """
     files: dict[str, bytes] = {}
     for target in sorted(set(_user_targets(values))):
@@ -300,9 +264,6 @@ def hash_package() -> str:
 
     It depends on the names and contents of the files only, not on times or compiled files. Configuration
     files do not count: what a job takes from them is part of its key.
-
-    Returns:
-        Hexadecimal digits.
     """
     sha256 = hashlib.sha256()
     configurations = {str(conf_dir()), str(experiments_dir())}  # inside of the package in a wheel
@@ -322,12 +283,7 @@ def hash_package() -> str:
 
 
 def list_user_packages(values: Any, trusted: Sequence[str]) -> list[str]:
-    """List the trusted packages that define a class of a configuration.
-
-    Args:
-        values: Resolved configuration.
-        trusted: Packages that the user trusts.
-    """
+    """List the trusted packages that define a class of a configuration."""
     targets = list(_user_targets(values))
     return [name for name in trusted if any(t.startswith(f"{name}.") for t in targets)]
 

@@ -34,16 +34,7 @@ def write_tuned_file(
 ) -> Path:
     """Write the knobs of tuned filters with the record of their search.
 
-    Args:
-        results: Results of the search by filter.
-        folder: Folder of configuration files.
-        name: Name of the file, which `tuned=NAME` chooses.
-        world: Scenario, model, settings, seed, runs, start time and regimes of the search.
-        fit: Best conventional filter, and whether Kalman filters fit the world.
-        unsupported: Reason by filter without knobs in the world.
-
-    Returns:
-        The file, `FOLDER/tuned/NAME.yaml`.
+    Returns the file, `FOLDER/tuned/NAME.yaml`.
     """
     lines = [
         f"# Knobs of tuned filters, chosen by `pfbench tune` in the world {world['scenario']}.",
@@ -102,14 +93,7 @@ def _list_rows(result: TuningResult) -> Iterator[list[str]]:
 
 
 def read_candidates(node: Mapping[str, Any]) -> tuple[list[Candidate], Candidate]:
-    """Read the candidates of a filter from the file of a tuning.
-
-    Args:
-        node: Entry of the filter.
-
-    Returns:
-        All candidates, and the filter without tuned knobs.
-    """
+    """Read the candidates of a filter from the file of a tuning."""
     head, *rows = (line.split() for line in node["candidates"].splitlines())
     places = {name: k for k, name in enumerate(head)}
     knobs, regimes = head[: places["log_ratio"]], head[places["nees_ratio"] + 1 :]
@@ -126,11 +110,7 @@ def read_candidates(node: Mapping[str, Any]) -> tuple[list[Candidate], Candidate
 
 
 def describe_world(world: Mapping[str, Any]) -> str:
-    """Describe the data of a search for reports.
-
-    Args:
-        world: Scenario, model, settings, seed, runs, start time and regimes of the search.
-    """
+    """Describe the data of a search for reports."""
     settings = [re.sub(r"^scenario\.", "", word) for word in world.get("settings", ())]
     parts = [f"model {world['model']}", *settings, f"seed {world['seed']}"]
     if world.get("start_time_s"):
@@ -202,22 +182,14 @@ class WorldFit:
 
 
 def decide_fit(ratios: Mapping[str, Ratio]) -> bool:
-    """Return whether Kalman filters fit a world: no interval lies below 0.95.
-
-    Args:
-        ratios: Ratios by particle filter.
-    """
+    """Return whether Kalman filters fit a world: no interval lies below 0.95."""
     return not any(ratio.high < FIT_LIMIT for ratio in ratios.values())
 
 
 def compare_errors(errors: Array, reference: Array, cap: float, filters: int = 1) -> Ratio:
     """Compare the errors of paired runs by the mean of their log ratios.
 
-    Args:
-        errors: Error of each run, [R]; infinite for a lost run.
-        reference: Errors of the reference in the same runs, [R].
-        cap: Largest error that counts.
-        filters: Number of filters that share the level of 5 %.
+    Shapes: errors [R], reference [R].
     """
     difference = np.log(np.fmin(errors, cap)) - np.log(np.fmin(reference, cap))
     mean, runs = float(difference.mean()), len(difference)
@@ -229,15 +201,7 @@ def compare_errors(errors: Array, reference: Array, cap: float, filters: int = 1
 def find_best(
     errors: Mapping[str, Mapping[str, float]], cap: float
 ) -> tuple[str, dict[str, float]]:
-    """Find the filter with the smallest objective.
-
-    Args:
-        errors: Error by filter and regime, infinite if most runs are lost. The filter `ekf` is the reference.
-        cap: Largest error that counts.
-
-    Returns:
-        The name, and the objective by filter.
-    """
+    """Find the filter with the smallest objective."""
 
     def objective(values: Mapping[str, float]) -> float:
         return float(
@@ -251,14 +215,7 @@ def find_best(
 def measure_fit(
     search: CandidateSearch, results: list[TuningResult], runs: int, particles: int
 ) -> WorldFit:
-    """Find the best conventional filter, and compare SIR and RPF with it in the first noise regime.
-
-    Args:
-        search: Search on the world.
-        results: Results for all tuned filters.
-        runs: Number of runs of the comparison, at most those of the search.
-        particles: Number of particles.
-    """
+    """Find the best conventional filter, and compare SIR and RPF with it in the first noise regime."""
     regime = search.regimes[0]
     first = [f"runs={runs}", f"particles={particles}"]
     tuned = {f"{result.method}_{SUFFIX}": result.choice for result in results}

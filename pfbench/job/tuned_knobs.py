@@ -21,16 +21,7 @@ _REFERENCE = re.compile(r"\$\{\.*tuned\.(\w+)")
 
 
 def select_knobs(tree: Any, choices: Mapping[str, str], trusted: Sequence[str]) -> None:
-    """Replace the node `tuned` by the knobs of one world.
-
-    Args:
-        tree: Configuration of a job, not resolved. A filter without knobs leaves the node empty.
-        choices: Names of the chosen files by group.
-        trusted: Packages that the command line trusts.
-
-    Raises:
-        ValueError: If the filter needs knobs that no file of the world states.
-    """
+    """Replace the node `tuned` by the knobs of one world."""
     from omegaconf import OmegaConf, flag_override
 
     if TUNED not in tree:
@@ -116,14 +107,7 @@ def mark_foreign(
     world: Mapping[str, Any],
     trusted: Sequence[str] = (),
 ) -> None:
-    """Say in the name of a tuned filter on which other world it was tuned.
-
-    Args:
-        values: Resolved configuration of the job, whose filter is renamed.
-        choices: Names of the chosen files by group.
-        world: World of the tuning, as its file states it.
-        trusted: Packages that the command line trusts.
-    """
+    """Say in the name of a tuned filter on which other world it was tuned."""
     block = values["filter"].get(PAPER) or {}
     if not world or not block.get("tuning"):  # a filter may state its own factors and their data
         return
@@ -163,16 +147,7 @@ def _list_settings(node: Mapping[str, Any]) -> dict[str, Any]:
 def check_tuned_seed(
     values: Mapping[str, Any], scenario: str | None, tuned: Mapping[str, Any]
 ) -> None:
-    """Check that a job with a tuned filter does not score the seed of the tuning in the same scenario.
-
-    Args:
-        values: Configuration of the job.
-        scenario: Name of its scenario.
-        tuned: Content of the file of the tuning.
-
-    Raises:
-        ValueError: If it does.
-    """
+    """Check that a job with a tuned filter does not score the seed of the tuning in the same scenario."""
     world = tuned.get("world", {})
     is_tuned = bool((values["filter"].get(PAPER) or {}).get("tuning"))
     if is_tuned and (world.get("scenario"), world.get("seed")) == (scenario, values.get("seed")):

@@ -95,14 +95,7 @@ class TuningResult:
 
 
 def choose_candidate(candidates: Sequence[Candidate]) -> Candidate:
-    """Choose the candidate of the smallest error; within 1 % the best calibrated one.
-
-    Args:
-        candidates: Candidates with their scores.
-
-    Raises:
-        ValueError: If no candidate keeps half of its runs.
-    """
+    """Choose the candidate of the smallest error; within 1 % the best calibrated one."""
     least = min(c.log_ratio for c in candidates)
     if not math.isfinite(least):
         raise ValueError(
@@ -116,11 +109,7 @@ def choose_candidate(candidates: Sequence[Candidate]) -> Candidate:
 class CandidateSearch:
     """Search on one world.
 
-    Args:
-        words: Overrides that name scenario, model, runs and seed of the tuning.
-        regimes: Noise regimes of equal weight.
-        progress: Function that is called with the name of each filter and candidate.
-        start_time_s: Time before which errors do not count [s].
+    Shapes: start_time_s [s].
     """
 
     def __init__(
@@ -140,12 +129,7 @@ class CandidateSearch:
     def tune(self, method: str, grid: Sequence[dict[str, float]]) -> TuningResult:
         """Search the knobs of a filter.
 
-        Args:
-            method: Name of the filter.
-            grid: Values of all candidates by knob.
-
-        Returns:
-            The result.
+        Returns the result.
         """
         candidates, self.seconds = [], 0.0
         config = self.compose(method, self.regimes[0])
@@ -171,20 +155,11 @@ class CandidateSearch:
         )
 
     def score_method(self, method: str) -> Candidate:
-        """Run a filter without knobs in all regimes.
-
-        Args:
-            method: Name of the filter.
-        """
+        """Run a filter without knobs in all regimes."""
         return self._rate({}, *self._score([self.compose(method, self.regimes[0])]))
 
     def pass_alone(self, config: JobConfig, threshold: float = math.inf) -> Array:
-        """Run a filter in one regime and return the RMSE of each run [R], infinite for a lost or diverged run.
-
-        Args:
-            config: Configuration of the filter with its runs.
-            threshold: Divergence threshold.
-        """
+        """Run a filter in one regime and return the RMSE of each run [R], infinite for a lost or diverged run."""
         (batch,) = draw_batches({config.choices["noise"]: config})
         result = batch.pass_filter(config)
         data = result.arrays(batch.episode, None)
@@ -192,13 +167,7 @@ class CandidateSearch:
         return rmse_per_run(error, lost | is_diverged(error, lost, threshold))
 
     def compose(self, method: str, regime: str, words: Sequence[str] = ()) -> JobConfig:
-        """Compose the configuration of a filter.
-
-        Args:
-            method: Name of the filter.
-            regime: Noise regime.
-            words: Overrides that replace those of the search.
-        """
+        """Compose the configuration of a filter."""
         return compose([*self.words, f"filter={method}", f"noise={regime}", *words])
 
     def _score(self, configs: Sequence[JobConfig]) -> list[dict[str, RegimeScore]]:
@@ -227,12 +196,7 @@ def _check_start(time: Tensor, start_time_s: float) -> None:
 
 
 def with_candidate(config: JobConfig, values: Mapping[str, float]) -> JobConfig:
-    """Return a configuration with the knobs of a candidate.
-
-    Args:
-        config: Configuration of a filter.
-        values: Values by knob, empty for the filter as its file states it.
-    """
+    """Return a configuration with the knobs of a candidate."""
     if not values:
         return config
     changed = copy.deepcopy(config.values)
@@ -246,11 +210,7 @@ def score_runs(
 ) -> RegimeScore:
     """Compute the score of some runs.
 
-    Args:
-        data: Arrays of a job, see `store.JobResult`.
-        model: Model of the filter.
-        runs: Places of the runs.
-        start_time_s: Time before which errors do not count [s].
+    Shapes: start_time_s [s].
     """
     state = describe_state(model)
     group, steps = main_component_group(state), data["time"] >= start_time_s
@@ -268,11 +228,7 @@ def select_errors(
 ) -> tuple[Array, Flags]:
     """Select the errors of the main group in displayed units [R, T, K], and the lost runs [R].
 
-    Args:
-        data: Arrays of a job, see `store.JobResult`.
-        model: Model of the filter.
-        runs: Places of the runs.
-        start_time_s: Time before which errors do not count [s].
+    Shapes: start_time_s [s].
     """
     group, steps = main_component_group(describe_state(model)), data["time"] >= start_time_s
     error = data["error"][runs][:, steps][..., group.places].astype(float) * group.scale
@@ -299,20 +255,12 @@ class RegimeBatch(NamedTuple):
     runs: Tensor
 
     def pass_filter(self, config: JobConfig) -> TimedFilterPass:
-        """Run a filter over all runs.
-
-        Args:
-            config: Configuration of the job with the filter.
-        """
+        """Run a filter over all runs."""
         plan = replace(self.plan, config=config, method=build_plan(config).method)
         return pass_filter(plan, self.episode, self.runs, "candidate")
 
     def pass_candidates(self, configs: Sequence[JobConfig]) -> TimedFilterPass:
-        """Run several candidates of a filter over all runs in one pass, one candidate behind another.
-
-        Args:
-            configs: Configurations that differ in the knobs of the filter.
-        """
+        """Run several candidates of a filter over all runs in one pass, one candidate behind another."""
         methods = [build_plan(config).method for config in configs]
         plan = replace(
             self.plan, config=configs[0], method=join_candidates(methods, len(self.runs))
@@ -320,11 +268,7 @@ class RegimeBatch(NamedTuple):
         return pass_filter(plan, *self.repeat(len(configs)), "candidates")
 
     def repeat(self, times: int) -> tuple[Episode, Tensor]:
-        """Return the episode and the numbers of the runs several times behind one another.
-
-        Args:
-            times: Number of times.
-        """
+        """Return the episode and the numbers of the runs several times behind one another."""
         return join_episodes([self.episode] * times), self.runs.repeat(times)
 
     def list_runs(self) -> Iterator[tuple[str, slice]]:
@@ -339,12 +283,6 @@ def draw_batches(configs: Mapping[str, JobConfig]) -> list[RegimeBatch]:
 
     Runs are independent of each other, so that their numbers do not change. Regimes are not joined if
     the model of the filter or the process behind the data depends on the regime.
-
-    Args:
-        configs: Configurations of jobs that differ in the noise regime, by regime.
-
-    Returns:
-        Batches in the order of the regimes.
     """
     plans = {regime: build_plan(config) for regime, config in configs.items()}
     episodes = {regime: plan.draw_episode(plan.runs) for regime, plan in plans.items()}
@@ -365,11 +303,7 @@ def draw_batches(configs: Mapping[str, JobConfig]) -> list[RegimeBatch]:
 
 
 def join_episodes(episodes: Sequence[Episode]) -> Episode:
-    """Join episodes of equal times along the axis of runs. Tracks and data sheets are left out.
-
-    Args:
-        episodes: Episodes, each of R runs.
-    """
+    """Join episodes of equal times along the axis of runs. Tracks and data sheets are left out."""
     first, records = episodes[0], [episode.record for episode in episodes]
     starts, spreads = ([getattr(r, name) for r in records] for name in ("start", "spread"))
     record = Record(
@@ -457,12 +391,7 @@ class JointAdaptation(NoiseAdaptation):
 
 
 def join_candidates(filters: Sequence[GaussianFilter], runs: int) -> GaussianFilter:
-    """Return the filter in which each candidate has its own runs.
-
-    Args:
-        filters: Filters that differ in their noise adaptations: a factor on R and Q, then at most one update.
-        runs: Number of runs of each.
-    """
+    """Return the filter in which each candidate has its own runs."""
     chains = [list(method.noise_adaptations) for method in filters]
     factors = [[getattr(chain[0], name) for chain in chains] for name in ("r_factor", "q_factor")]
     assert all(isinstance(chain[0], ScaledNoise) for chain in chains)
@@ -527,15 +456,7 @@ KNOBS: Mapping[str, Knob] = {
 def list_candidates(method: str, r_factors: Sequence[float] = R_FACTORS) -> list[dict[str, float]]:
     """List the candidates of a method.
 
-    Args:
-        method: Name of the filter.
-        r_factors: Factors on R.
-
-    Returns:
-        Values by knob, `r_factor` first.
-
-    Raises:
-        ValueError: If the filter does not have a knob.
+    Returns values by knob, `r_factor` first.
     """
     if method not in KNOBS:
         raise ValueError(
@@ -549,12 +470,7 @@ def list_candidates(method: str, r_factors: Sequence[float] = R_FACTORS) -> list
 def apply_candidate(adaptations: list[dict[str, Any]], values: Mapping[str, float]) -> list[Any]:
     """Set the knobs in the noise adaptations of a filter.
 
-    Args:
-        adaptations: Nodes of the adaptations, the robust update last.
-        values: Values by knob.
-
-    Returns:
-        The nodes, with the scaled noise first.
+    Returns the nodes, with the scaled noise first.
     """
     scaled = {"_target_": _SCALED, "r_factor": values["r_factor"], "q_factor": 1.0}
     if "q_factor" in values:
@@ -576,13 +492,6 @@ def check_seed(world: JobConfig, seed: int) -> None:
 
     Runs of another window of a recording have other data, so that settings of the scenario are compared
     where they are stored.
-
-    Args:
-        world: Configuration of the tuning.
-        seed: Seed of the tuning.
-
-    Raises:
-        ValueError: If an experiment or a stored result has the scenario with this seed.
     """
     if seed < 0:
         raise ValueError(f"seed must be at least -1000, got {seed - 1000}. Set seed to that of the study.")  # fmt: skip

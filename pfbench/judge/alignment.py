@@ -60,18 +60,6 @@ def find_common_epochs(
     The trajectories are never interpolated. A trajectory that covers less than `coverage` of the
     time that any of them covers is lost, and does not limit the epochs of the others. A hole is longer
     than 1.5 steps. It keeps its epochs, so that a program gains nothing by leaving out bad ones.
-
-    Args:
-        tables: Trajectories of all programs and runs of a sequence.
-        reference: Reference of the sequence.
-        options: Options.
-
-    Returns:
-        The epochs.
-
-    Raises:
-        ValueError: If fewer than 10 epochs are common, or if holes exist and many other epochs are not
-            common, so that the holes would have a larger weight than their time.
     """
     check_scored_time(reference, options)
     masks = [_scored(table.time, reference, options) for table in tables]
@@ -183,14 +171,7 @@ def position_errors(
 ) -> Array:
     """Compute position errors North, East, Down at rows of a trajectory.
 
-    Args:
-        table: Trajectory.
-        reference: Reference.
-        rows: Rows, [T].
-        align: "none", "offset" (the mean error is removed) or "yaw" (and a turn about the vertical).
-
-    Returns:
-        Estimate minus reference, [T, 3], m.
+    Returns estimate minus reference, [T, 3], m. Shapes: rows [T].
     """
     estimate = reference.locate(table)[rows]
     truth = reference.interpolate_position(table.time[rows])
@@ -210,14 +191,7 @@ def column_errors(
 ) -> Array:
     """Compute errors of velocities or angles at rows of a trajectory.
 
-    Args:
-        table: Trajectory.
-        reference: Reference.
-        rows: Rows, [T].
-        names: Columns of one group.
-
-    Returns:
-        Estimate minus reference, [T, C], m/s or rad.
+    Returns estimate minus reference, [T, C], m/s or rad. Shapes: rows [T].
     """
     truth = reference.interpolate_columns(names, table.time[rows])
     difference = table.select(names)[rows] - truth
@@ -227,15 +201,7 @@ def column_errors(
 def common_columns(
     tables: Sequence[TrajectoryTable], reference: ReferenceTrack
 ) -> dict[str, tuple[str, ...]]:
-    """Return the columns of velocity and attitude that the reference and all tables have.
-
-    Args:
-        tables: Trajectories.
-        reference: Reference.
-
-    Returns:
-        Columns by group, without empty groups.
-    """
+    """Return the columns of velocity and attitude that the reference and all tables have."""
     everywhere = [set(table.values) for table in (*tables, reference.table)]
     shared = set.intersection(*everywhere)
     groups = {"velocity": VELOCITY_COLUMNS, "attitude": ATTITUDE_COLUMNS}
@@ -258,12 +224,7 @@ def is_in_hole(time: Array, grid: Array) -> np.ndarray:
     A gap of more than 1.5 steps between two rows is a hole. Half of it, 0.75 steps, counts before the
     first row and after the last one, where the next row may still be due.
 
-    Args:
-        time: Times of the trajectory, [K], s.
-        grid: Epochs, [T], s.
-
-    Returns:
-        Mask, [T].
+    Returns mask, [T]. Shapes: time [K], grid [T].
     """
     if len(time) < 2:
         return np.zeros(len(grid), dtype=bool)
@@ -278,10 +239,7 @@ def is_in_hole(time: Array, grid: Array) -> np.ndarray:
 def fill_holes(results: Mapping[str, JobResult], holes: Mapping[str, np.ndarray]) -> None:
     """Set the errors in holes to the largest error of any program, in place.
 
-    Args:
-        results: Results by program, see `SequenceResults`. The CRPS in a hole is that of an estimate
-            without spread, and NEES and PIT are NaN.
-        holes: Holes of the runs by program, [R, T].
+    Shapes: holes [R, T].
     """
     groups = {name for result in results.values() for name in result.meta["state"]["groups"]}
     for group in groups:

@@ -61,13 +61,8 @@ class BlockEstimate(NamedTuple):
 def compare_along_run(square_a: Array, square_b: Array, length: float = 0.0) -> BlockEstimate:
     """Compare the mean squared errors of two programs along one run.
 
-    Args:
-        square_a: Squared errors of the first program at common epochs, [T].
-        square_b: Squared errors of the second program, [T].
-        length: Mean length of a block, epochs; 0 for the rule.
-
-    Returns:
-        Estimate, negative if the first program has the smaller error.
+    Returns estimate, negative if the first program has the smaller error. Shapes: square_a [T],
+    square_b [T].
     """
     mean_a, mean_b = float(square_a.mean()), float(square_b.mean())
     if mean_a == mean_b == 0.0 or np.array_equal(square_a, square_b):
@@ -96,12 +91,7 @@ def compare_along_run(square_a: Array, square_b: Array, length: float = 0.0) -> 
 def bootstrap_variance(values: Array, length: float) -> float:
     """Compute the variance of the mean over all resamples of the stationary bootstrap.
 
-    Args:
-        values: Series, [T].
-        length: Mean length of a block, epochs.
-
-    Returns:
-        Variance of the mean.
+    Shapes: values [T].
     """
     n = values.size
     spectrum = np.abs(np.fft.rfft(values - values.mean())) ** 2
@@ -114,11 +104,8 @@ def bootstrap_variance(values: Array, length: float) -> float:
 def choose_block_length(values: Array) -> float:
     """Choose the mean length of a block, epochs.
 
-    Args:
-        values: Series, [T].
-
-    Returns:
-        The larger of the length of Politis and White and of 8 correlation times.
+    Returns the larger of the length of Politis and White and of 8 correlation times. Shapes: values
+    [T].
     """
     return _length_by_rules(values, _correlation_time(values))
 
@@ -126,9 +113,7 @@ def choose_block_length(values: Array) -> float:
 def count_equal_blocks(values: Array, length: float) -> float:
     """Return the number of equal normal blocks whose sums have the kurtosis of the blocks of a series.
 
-    Args:
-        values: Series with mean 0, [T].
-        length: Length of a block, epochs; blocks from the start and from half a block are averaged.
+    Shapes: values [T].
     """
     width, counts = max(round(length), 1), []
     for first in (0, width // 2):

@@ -87,16 +87,7 @@ class _Motion:
 def check_common_time(
     table: TrajectoryTable, reference: ReferenceTrack, applied: float = 0.0
 ) -> None:
-    """Check that a trajectory and the reference share time.
-
-    Args:
-        table: Trajectory.
-        reference: Reference.
-        applied: Shift that its clock already has, s.
-
-    Raises:
-        ValueError: If they do not overlap. The message proposes a unit or a shift.
-    """
+    """Check that a trajectory and the reference share time."""
     (first, last), clock = (table.time[0], table.time[-1]), reference.table.time
     factor = _find_unit(table, reference)
     if last > clock[0] and first < clock[-1] and not factor:
@@ -144,17 +135,7 @@ def check_clock(table: TrajectoryTable, reference: ReferenceTrack, applied: floa
     the median difference. Positions that are far from the reference widen the search from 25 s to all
     offsets that leave half of the trajectory within the reference.
 
-    Args:
-        table: Trajectory.
-        reference: Reference.
-        applied: Shift that its clock already has, s.
-
-    Returns:
-        Time to add to the clock of the trajectory, s; NaN if the motion does not show it.
-
-    Raises:
-        ValueError: If the offset exceeds 0.5 s and leaves less than 20 % of the
-            differences, or if other axes explain more of them.
+    Returns time to add to the clock of the trajectory, s; NaN if the motion does not show it.
     """
     clock = reference.table.time
     rows = np.flatnonzero((table.time >= clock[0]) & (table.time <= clock[-1]))
@@ -214,13 +195,6 @@ def check_axes(table: TrajectoryTable, reference: ReferenceTrack) -> None:
     A column has the opposite sign if its slope on that of the reference is -1 and explains half of its
     variance. It has another name if another column explains 90 % with slope 1 or -1, and its own one
     leaves 5 times the variance.
-
-    Args:
-        table: Trajectory, with the clock of the reference.
-        reference: Reference.
-
-    Raises:
-        ValueError: If a column has the opposite sign or the values of another one.
     """
     rows = reference.is_bridged(table.time)
     if rows.sum() < 20:
@@ -300,15 +274,7 @@ _SMALL = 1e-3  # m, error of interpolation that is of no account
 
 
 def check_distance(table: TrajectoryTable, reference: ReferenceTrack) -> None:
-    """Check that a trajectory comes near the reference at any epoch, even if it diverges later.
-
-    Args:
-        table: Trajectory.
-        reference: Reference.
-
-    Raises:
-        ValueError: If the smallest distance exceeds 1 km and the extent of the reference.
-    """
+    """Check that a trajectory comes near the reference at any epoch, even if it diverges later."""
     rows = (table.time >= reference.table.time[0]) & (table.time <= reference.table.time[-1])
     difference = reference.locate(table)[rows] - reference.interpolate_position(table.time[rows])
     least = float(np.linalg.norm(difference, axis=1).min())
@@ -325,13 +291,7 @@ def check_interpolation(
 ) -> None:
     """Check that steps of the reference are short enough to tell errors from interpolation.
 
-    Args:
-        reference: Reference.
-        time: Scored epochs, [T], s.
-        errors: Position RMSE by program, m; NaN for a lost one.
-
-    Raises:
-        ValueError: If interpolation causes half of the smallest RMSE.
+    Shapes: time [T].
     """
     size = float(np.sqrt(np.mean(reference.interpolation_error(time) ** 2)))
     name, least = min(errors.items(), key=lambda item: item[1] if item[1] >= 0 else np.inf)
@@ -352,15 +312,7 @@ def check_interpolation(
 def check_units(table: TrajectoryTable, reference: ReferenceTrack) -> TrajectoryTable:
     """Compare each column with that of the reference, and refuse a ratio of two units.
 
-    Args:
-        table: Trajectory.
-        reference: Reference.
-
-    Returns:
-        The trajectory, with a note if yaw may be in degrees.
-
-    Raises:
-        ValueError: If a column is a constant times that of the reference, as feet for metres.
+    Returns the trajectory, with a note if yaw may be in degrees.
     """
     rows = reference.is_bridged(table.time)
     if rows.sum() < 10:
@@ -442,13 +394,8 @@ def _ratio(mine: Array, theirs: Array, unit: str, column: str) -> float:
 def regress_column(mine: Array, theirs: Array, is_angle: bool = False) -> tuple[float, float]:
     """Regress a column on one of the reference.
 
-    Args:
-        mine: Column of the program, [T].
-        theirs: Column of the reference at the same times, [T].
-        is_angle: Compare the increments without the largest, which pass half a turn.
-
-    Returns:
-        Slope, and share of the variance that it explains; 1 and 0 for a constant column.
+    Returns slope, and share of the variance that it explains; 1 and 0 for a constant column.
+    Shapes: mine [T], theirs [T].
     """
     if is_angle:
         mine, theirs = np.diff(mine), np.diff(theirs)

@@ -38,18 +38,7 @@ _AXES = ("position_E", "position_N", "position_U")
 
 
 def read_result_trajectories(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
-    """Read the runs of a job whose scenario states the track of the truth.
-
-    Args:
-        file: Result `<key>.npz`.
-        options: Options.
-
-    Returns:
-        One table per run. A lost run has the epochs before its loss.
-
-    Raises:
-        ValueError: If the file is damaged, or states no track or no position in East, North, Up.
-    """
+    """Read the runs of a job whose scenario states the track of the truth."""
     try:
         result = read_result(file)
     except DamagedResultError:
@@ -117,14 +106,7 @@ class TrajectoryFile(NamedTuple):
 def list_trajectory_files(pattern: str) -> list[TrajectoryFile]:
     """List the files of a pattern such as out/{sequence}_{run}.csv.
 
-    Args:
-        pattern: Path, optionally with {sequence} and {run}, each within one folder or file name.
-
-    Returns:
-        Files in order of sequence and run.
-
-    Raises:
-        ValueError: If no file exists.
+    Returns files in order of sequence and run.
     """
     path = Path(pattern)
     if "{" not in pattern:
@@ -158,19 +140,7 @@ def list_trajectory_files(pattern: str) -> list[TrajectoryFile]:
 def read_trajectories(
     path: Path, options: SourceOptions, sd: Path | None = None
 ) -> list[TrajectoryTable]:
-    """Read and check a file; columns are multiplied by their factors, then the clock is shifted.
-
-    Args:
-        path: File: table, TUM, NMEA, text of KF-GINS, or result of pfbench.
-        options: Options of the program.
-        sd: KF-GINS file of standard deviations, or None.
-
-    Returns:
-        One table per run of the file.
-
-    Raises:
-        ValueError: If the format is unknown or a check fails.
-    """
+    """Read and check a file; columns are multiplied by their factors, then the clock is shifted."""
     kind = options.format or find_format(path, bool(options.columns))
     if sd is not None and kind != "kf_gins":
         raise ValueError(
@@ -227,18 +197,7 @@ _HEAD = 1 << 16  # bytes
 
 
 def find_format(file: Path, has_names: bool) -> str:
-    """Find the format of a file.
-
-    Args:
-        file: File.
-        has_names: Whether names of columns are stated, which belong to a table.
-
-    Returns:
-        One of `FORMATS` of the options.
-
-    Raises:
-        ValueError: If the content is that of no format that is read, or of several.
-    """
+    """Find the format of a file."""
     with file.open("rb") as content:
         head = content.read(_HEAD)
     if head[:4] == _PARQUET and file.suffix != ".parquet":

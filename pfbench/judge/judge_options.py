@@ -75,9 +75,6 @@ class JudgeOptions:
         baseline: Program that all others are compared with; empty for all pairs.
         alpha: Error of a family of tests.
         margin: Relative difference of errors within which programs are equivalent.
-
-    Raises:
-        ValueError: If a value is out of range.
     """
 
     start: float = -math.inf
@@ -114,11 +111,7 @@ class JudgeOptions:
 
 @contextmanager
 def name_program(program: str) -> Iterator[None]:
-    """Write the name of the program in the messages of readers, which call it NAME.
-
-    Args:
-        program: Name of the program, or "reference".
-    """
+    """Write the name of the program in the messages of readers, which call it NAME."""
     try:
         yield
     except ValueError as error:

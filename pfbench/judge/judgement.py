@@ -116,15 +116,7 @@ def judge_programs(
 
 
 def plan_pairs(programs: Sequence[str], baseline: str = "") -> tuple[tuple[str, str], ...]:
-    """Return all pairs of programs, or those with the baseline.
-
-    Args:
-        programs: Names.
-        baseline: Name of the baseline; empty for all pairs.
-
-    Raises:
-        ValueError: If the baseline is not a program.
-    """
+    """Return all pairs of programs, or those with the baseline."""
     if not baseline:
         return tuple(combinations(programs, 2))
     if baseline not in programs:
@@ -135,14 +127,7 @@ def plan_pairs(programs: Sequence[str], baseline: str = "") -> tuple[tuple[str, 
 
 
 def tabulate_runs(sequences: Sequence[SequenceResults]) -> pd.DataFrame:
-    """Return one row per program, sequence and run, in the form of `decide_planned_pairs`.
-
-    Args:
-        sequences: Results of all sequences.
-
-    Returns:
-        Columns filter, scenario, family, regime, run, value (position RMSE, m) and keeps_track.
-    """
+    """Return one row per program, sequence and run, in the form of `decide_planned_pairs`."""
     rows = []
     for sequence in sequences:
         for program, result in sequence.results.items():
@@ -269,13 +254,8 @@ def decide_along_runs(
 ) -> list[BlockDecision]:
     """Decide each pair in each sequence by blocks of time; all tests form one family.
 
-    Args:
-        sequences: Results of all sequences.
-        pairs: Pairs of programs.
-        options: Options.
-
-    Returns:
-        One decision per sequence and pair; programs that are absent from a sequence are left out.
+    Returns one decision per sequence and pair; programs that are absent from a sequence are left
+    out.
     """
     members = [
         _compare(sequence, a, b, options)

@@ -41,17 +41,6 @@ def read_nmea_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryT
     Positions are those of GGA, or of GNS without GGA. The height is that above the ellipsoid: altitude plus
     geoid separation, where the receiver states it. NMEA states no vertical velocity. Other sentences and
     other lines are skipped and counted in a note. A receiver can leave out checksums, in all sentences.
-
-    Args:
-        file: File.
-        options: Options.
-
-    Returns:
-        One table. Velocity and standard deviations are left out with a note unless all epochs have
-        them.
-
-    Raises:
-        ValueError: If a checksum or a field is wrong, or no sentence has a position.
     """
     counts: Counter[str] = Counter()
     sentences = _read_sentences(file, counts)

@@ -50,15 +50,7 @@ def write_judgement(
 ) -> Path:
     """Write `<out>/<name>/`. Equal files give equal bytes.
 
-    Args:
-        judgement: Judgement.
-        out: Folder of all reports.
-        name: Name of the report, a folder.
-        options: Options of the comparison.
-        formats: File formats of the figures.
-
-    Returns:
-        Path of index.html.
+    Returns path of index.html.
     """
     tables = {
         "accuracy": tabulate_accuracy(judgement.sequences),
@@ -87,15 +79,7 @@ def write_judgement(
 
 
 def decisions_as_json(judgement: Judgement, options: JudgeOptions) -> dict[str, Any]:
-    """Return all decisions in JSON types.
-
-    Args:
-        judgement: Judgement.
-        options: Options of the comparison.
-
-    Returns:
-        Keys options, decisions, along_runs and ranking.
-    """
+    """Return all decisions in JSON types."""
     return {
         "options": writers.to_json_types(asdict(options)),
         "decisions": [decision.to_dict() for decision in judgement.decisions],
@@ -187,12 +171,7 @@ _AXES = ("North", "East", "Down")
 
 
 def describe_notes(judgement: Judgement, options: JudgeOptions) -> Iterator[str]:
-    """Yield notes on alignment, files, lost and missing runs, clocks, epochs, the reference and offsets.
-
-    Args:
-        judgement: Judgement.
-        options: Options of the comparison.
-    """
+    """Yield notes on alignment, files, lost and missing runs, clocks, epochs, the reference and offsets."""
     if options.align in _ALIGNED:
         yield _ALIGNED[options.align]
     programs = list(dict.fromkeys(run.program for s in judgement.sequences for run in s.runs))
@@ -429,12 +408,7 @@ def files_table(sequences: Sequence[SequenceResults]) -> pd.DataFrame:
 
 
 def error_figures(sequences: Sequence[SequenceResults], largest: int = 8) -> list[FigureSpec]:
-    """Return one figure of position errors over time per sequence.
-
-    Args:
-        sequences: Results of all sequences.
-        largest: Number of sequences with a figure.
-    """
+    """Return one figure of position errors over time per sequence."""
     return [
         FigureSpec(
             f"error_{k}",

@@ -57,14 +57,7 @@ class ReferenceTrack:
     def locate(self, table: TrajectoryTable) -> Array:
         """Return the positions of a table in the local frame of the reference.
 
-        Args:
-            table: Trajectory of a program.
-
-        Returns:
-            North, East, Down, [T, 3], m.
-
-        Raises:
-            ValueError: If one file has local and the other geodetic positions, and the origin is unknown.
+        Returns north, East, Down, [T, 3], m.
         """
         if table.has(LOCAL) and self.is_local:
             return table.select(LOCAL)
@@ -79,11 +72,8 @@ class ReferenceTrack:
     def place(self, table: TrajectoryTable) -> TrajectoryTable:
         """Move a result of pfbench, whose positions start at 0, to its truth in the reference.
 
-        Args:
-            table: Trajectory of a program.
-
-        Returns:
-            The table with a note; unchanged without a truth, or if its truth is not the reference.
+        Returns the table with a note; unchanged without a truth, or if its truth is not the
+        reference.
         """
         inside = self.is_bridged(table.time)
         if table.truth is None or not self.is_local or not inside.any():
@@ -102,8 +92,7 @@ class ReferenceTrack:
     def interpolate_position(self, time: Array) -> Array:
         """Interpolate positions, [K, 3]: cubic with the velocities of the file, else linear.
 
-        Args:
-            time: Times, [K], s.
+        Shapes: time [K].
         """
         clock, position = self.table.time, self.position
         linear = np.stack([np.interp(time, clock, p) for p in position.T], axis=-1)
@@ -124,8 +113,7 @@ class ReferenceTrack:
         with velocities with its fourth power. It is 0 at the rows, and in the long gaps that a user
         bridges. It is infinite between less than 10 rows, which cannot show a motion.
 
-        Args:
-            time: Times, [K], s.
+        Shapes: time [K].
         """
         clock, has_velocity = self.table.time, VELOCITY_COLUMNS[-1] in self.table.values
         k = np.clip(np.searchsorted(clock, time, side="right") - 1, 0, len(clock) - 2)
@@ -148,9 +136,7 @@ class ReferenceTrack:
     def interpolate_columns(self, names: tuple[str, ...], time: Array) -> Array:
         """Interpolate velocities or angles linearly, [K, C]; angles along the shorter way.
 
-        Args:
-            names: Columns.
-            time: Times, [K], s.
+        Shapes: time [K].
         """
         columns = [self.table.values[name] for name in names]
         columns = [
@@ -170,19 +156,7 @@ class ReferenceTrack:
 
 
 def read_reference(path: Path, options: JudgeOptions, source: SourceOptions) -> ReferenceTrack:
-    """Read the reference of a sequence and check its gaps in the scored time.
-
-    Args:
-        path: File.
-        options: Options of the comparison.
-        source: Options of the file.
-
-    Returns:
-        The reference.
-
-    Raises:
-        ValueError: If the file is not valid, has several runs, or has a hole.
-    """
+    """Read the reference of a sequence and check its gaps in the scored time."""
     with name_program("reference"):
         tables = [check_consistent_units(table) for table in read_trajectories(path, source)]
     if len(tables) != 1:
@@ -229,15 +203,7 @@ _REACH_STEPS, _WINDOW = (
 
 
 def check_scored_time(reference: ReferenceTrack, options: JudgeOptions) -> None:
-    """Check that the scored time is within the reference, and blocks are short enough for it.
-
-    Args:
-        reference: Reference.
-        options: Options.
-
-    Raises:
-        ValueError: If not.
-    """
+    """Check that the scored time is within the reference, and blocks are short enough for it."""
     first, last = (float(t) for t in reference.table.time[[0, -1]])
     span = f"{first:.10g} to {last:.10g} s"
     for name, value, is_valid in (
@@ -259,17 +225,7 @@ def check_scored_time(reference: ReferenceTrack, options: JudgeOptions) -> None:
 def check_shared(
     counts: tuple[int, int], share: float, texts: tuple[str, str, str], tolerance: float
 ) -> None:
-    """Check that enough epochs are shared, for scores and for the weight of holes.
-
-    Args:
-        counts: Scored epochs at which all trajectories have a row, and scored epochs in holes.
-        share: Share of the epochs outside of holes that are shared.
-        texts: Name of the reference, number of epochs of each trajectory, and option that helps.
-        tolerance: Largest difference of common epochs, s.
-
-    Raises:
-        ValueError: If fewer than 10 epochs are shared, or holes exist and fewer than 90 % are shared.
-    """
+    """Check that enough epochs are shared, for scores and for the weight of holes."""
     (shared, in_holes), (file, sizes, remedy) = counts, texts
     if shared < LEAST_EPOCHS:
         raise ValueError(
@@ -290,11 +246,7 @@ def space_evenly(time: Array) -> tuple[np.ndarray, Array]:
     that a slow stretch repeats its epochs and a fast one leaves some out. A program that writes its good
     epochs several times gains nothing. An instant beyond 0.75 steps of the neighbourhood takes none.
 
-    Args:
-        time: Epochs, [K], s.
-
-    Returns:
-        Index of the epoch of each instant, [T], and the instants, [T], s.
+    Returns index of the epoch of each instant, [T], and the instants, [T], s. Shapes: time [K].
     """
     steps = np.diff(time)
     if len(steps) < 2:
@@ -315,16 +267,7 @@ def space_evenly(time: Array) -> tuple[np.ndarray, Array]:
 
 
 def check_coverage(names: list[str], coverage: tuple[float, ...], least: float) -> None:
-    """Check that one trajectory at least is not lost.
-
-    Args:
-        names: Names of the files.
-        coverage: Share of the time that each one covers.
-        least: Least share.
-
-    Raises:
-        ValueError: If all of them are lost.
-    """
+    """Check that one trajectory at least is not lost."""
     if max(coverage, default=0.0) < least:
         shares = ", ".join(f"{100 * c:.3g} % ({n})" for n, c in zip(names, coverage, strict=True))
         raise ValueError(

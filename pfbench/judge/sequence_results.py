@@ -100,21 +100,7 @@ def read_runs(
     source: SourceOptions,
     align: str = "none",
 ) -> list[JudgedRun]:
-    """Read all runs of a program in one sequence and check them against the reference.
-
-    Args:
-        program: Name of the program.
-        files: Files of the sequence.
-        reference: Reference.
-        source: Options of the program.
-        align: Motion that is removed; a turn hides the offset of the clock.
-
-    Returns:
-        The runs.
-
-    Raises:
-        ValueError: If a file is not valid, or does not belong to the reference.
-    """
+    """Read all runs of a program in one sequence and check them against the reference."""
     runs = []
     for file in files:
         names = {"sequence": file.sequence, "run": file.run}
@@ -146,20 +132,7 @@ def _check_run(
 def score_sequence(
     name: str, reference: ReferenceTrack, runs: Sequence[JudgedRun], options: JudgeOptions
 ) -> SequenceResults:
-    """Compute the errors of all runs at the common epochs.
-
-    Args:
-        name: Name of the sequence.
-        reference: Reference.
-        runs: Runs of all programs.
-        options: Options.
-
-    Returns:
-        Results by program.
-
-    Raises:
-        ValueError: If the runs share too few epochs.
-    """
+    """Compute the errors of all runs at the common epochs."""
     epochs = find_common_epochs([run.table for run in runs], reference, options)
     results, names = {}, {}
     for program in dict.fromkeys(run.program for run in runs):

@@ -48,17 +48,6 @@ def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
     With frame=enu, the world is East, North, Up and the body forward, left, up [REP 103]. With
     frame=ned they are North, East, Down and forward, right, down. A line of names can state another
     order of the quaternion and further columns, and an index can precede the time.
-
-    Args:
-        file: File.
-        options: Options with the frame.
-
-    Returns:
-        One table.
-
-    Raises:
-        ValueError: If the frame is not stated, a line has other columns, or a quaternion is not of
-            unit length.
     """
     if not options.frame:
         raise ValueError(
@@ -88,15 +77,7 @@ def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
 
 
 def find_pose_columns(names: Sequence[str], rows: Sequence[Sequence[str]]) -> list[int]:
-    """Find the columns of time, position and quaternion (x, y, z, w).
-
-    Args:
-        names: Names of the columns, empty if the file has none.
-        rows: Fields of the first lines.
-
-    Returns:
-        Index of each column of a TUM file; empty if they are not of this kind.
-    """
+    """Find the columns of time, position and quaternion (x, y, z, w)."""
     axes = {m[1]: k for k, name in enumerate(names) if (m := _QUATERNION.fullmatch(name.lower()))}
     first = min(axes.values(), default=0)
     if len(axes) == 4 and max(axes.values()) == first + 3 and first > 3:
@@ -116,17 +97,6 @@ def read_kf_gins_trajectory(
     """Read a navigation result or truth of KF-GINS: week, second, position, velocity, attitude.
 
     The units are deg, deg, m, m/s North, East, Down, and deg for roll, pitch and yaw.
-
-    Args:
-        file: File with 11 columns.
-        options: Options.
-        sd: File of standard deviations with 22 columns (m, m/s, deg), or None.
-
-    Returns:
-        One table; the time is the second of the first week.
-
-    Raises:
-        ValueError: If a line has other columns, or the times of both files differ.
     """
     numbers, lines, notes = _read_numbers(file, _KF_GINS_COLUMNS)
     values = (
@@ -155,15 +125,7 @@ def read_kf_gins_trajectory(
 
 
 def read_head(file: Path, rows: int = 20) -> tuple[list[str], list[list[str]]]:
-    """Read names of columns and the first rows of a text; a line of names can be a comment.
-
-    Args:
-        file: File.
-        rows: Largest number of rows.
-
-    Returns:
-        Names without units, empty if there are none, and fields of the first rows.
-    """
+    """Read names of columns and the first rows of a text; a line of names can be a comment."""
     heads: list[list[str]] = []
     fields: list[list[str]] = []
     with file.open(encoding="utf-8-sig", errors="replace") as lines:
@@ -179,11 +141,7 @@ def read_head(file: Path, rows: int = 20) -> tuple[list[str], list[list[str]]]:
 
 
 def to_numbers(rows: Sequence[Sequence[str]]) -> Array:
-    """Convert the rows of the most common width to numbers [T, K], without damaged ones.
-
-    Args:
-        rows: Fields of lines.
-    """
+    """Convert the rows of the most common width to numbers [T, K], without damaged ones."""
     widths = [len(row) for row in rows]
     width = max(widths, key=widths.count, default=0)
     valid = [row for row in rows if len(row) == width and all(map(is_number_text, row))]
@@ -191,11 +149,7 @@ def to_numbers(rows: Sequence[Sequence[str]]) -> Array:
 
 
 def split_line(line: str) -> list[str]:
-    """Split a line at commas or semicolons, else at blanks and tabs.
-
-    Args:
-        line: Line of a text.
-    """
+    """Split a line at commas or semicolons, else at blanks and tabs."""
     separator = next((s for s in ",;" if s in line), None)
     fields = [field.strip() for field in line.strip().split(separator)]
     return fields[:-1] if separator and not fields[-1] else fields
@@ -275,18 +229,7 @@ _FACTORS: dict[str, dict[str, float]] = {  # of units in names of columns, by qu
 
 
 def read_csv_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
-    """Read a table whose columns have the names of `ALL_COLUMNS`.
-
-    Args:
-        file: File with suffix .csv or .parquet.
-        options: Options with names of columns, as wanted:in_file, and the value of `path`.
-
-    Returns:
-        One table.
-
-    Raises:
-        ValueError: If the file is damaged, or the time or the position has another name.
-    """
+    """Read a table whose columns have the names of `ALL_COLUMNS`."""
     content = read_table_file(file)
     rows = content.rows.rename(columns=str)
     lines = np.arange(len(rows)) + (1 if file.suffix == ".parquet" else 2)

@@ -111,14 +111,7 @@ class TrajectoryTable:
 def check_trajectory(table: TrajectoryTable) -> TrajectoryTable:
     """Check groups, numbers, order of time and plausible ranges.
 
-    Args:
-        table: Table of a reader.
-
-    Returns:
-        The table.
-
-    Raises:
-        ValueError: If a check fails. The message contains file, line, column, value and remedy.
+    Returns the table.
     """
     if len(table.time) < 2:
         raise ValueError(
@@ -279,12 +272,7 @@ ECCENTRICITY_2 = (2 - 1 / 298.257223563) / 298.257223563
 def to_north_east_down(geodetic: Array, origin: Array) -> Array:
     """Convert geodetic positions to the tangent frame of an origin.
 
-    Args:
-        geodetic: Latitude, longitude and height, [T, 3], deg, deg, m.
-        origin: Latitude, longitude and height of the origin, [3].
-
-    Returns:
-        North, East, Down, [T, 3], m.
+    Returns north, East, Down, [T, 3], m. Shapes: geodetic [T, 3].
     """
     lat, lon = np.radians(origin[:2])
     sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)

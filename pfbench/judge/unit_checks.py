@@ -49,14 +49,7 @@ _EQUATOR = 0.02  # deg, where simulations start
 def check_consistent_units(table: TrajectoryTable) -> TrajectoryTable:
     """Check that time, positions, velocities and yaw of a trajectory have units that fit together.
 
-    Args:
-        table: Trajectory.
-
-    Returns:
-        The trajectory, with notes on what looks like another unit and cannot be decided.
-
-    Raises:
-        ValueError: If other units explain the columns. The remedy of the message was tried.
+    Returns the trajectory, with notes on what looks like another unit and cannot be decided.
     """
     _check_largest_time(table)
     position = _horizontal(table)
@@ -78,12 +71,7 @@ def find_angle_factor(mine: Array, theirs: Array) -> tuple[float, bool]:
     angle. It is certain for a constant angle beyond a turn too, as 63 for 1.1 rad. A constant angle within a
     turn is a doubt, since it can be wrong in rad.
 
-    Args:
-        mine: Angle, [T], rad if the unit is right.
-        theirs: Angle that it should have, [T], rad.
-
-    Returns:
-        The factor, and whether it is certain.
+    Shapes: mine [T], theirs [T].
     """
     scatter, zero = _scatter(mine - theirs)
     nothing, _ = _scatter(theirs)

@@ -30,12 +30,7 @@ def choose_variant() -> str:
 
 @cache
 def load_library() -> None:
-    """Load the operators, which registers them, after compiling them if no library came with the package.
-
-    Raises:
-        OSError: If no C++ compiler is installed, or others can write the compiled code.
-        CalledProcessError: If the compiler rejects the source.
-    """
+    """Load the operators, which registers them, after compiling them if no library came with the package."""
     variant = choose_variant()
     built = _WITH_PACKAGE / name_library(variant)
     if not built.exists():
@@ -70,11 +65,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def code_folder() -> Path:
-    """Return the folder of compiled code, `pfbench` in the user's cache folder.
-
-    Raises:
-        OSError: If it cannot be made, or if others can write there.
-    """
+    """Return the folder of compiled code, `pfbench` in the user's cache folder."""
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(home) / "pfbench"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -87,9 +78,6 @@ def use_private_cache() -> None:
 
     Its default is a folder of a predictable name in the system's temporary folder. An import of the
     compiler writes this default into the environment, so that it looks like the user's choice.
-
-    Raises:
-        OSError: If the folder cannot be made, or if others can write there.
     """
     compiler = sys.modules.get("torch._inductor.runtime.cache_dir_utils")
     default = os.path.abspath(compiler.default_cache_dir()) if compiler else None
@@ -98,14 +86,7 @@ def use_private_cache() -> None:
 
 
 def check_private(path: Path) -> None:
-    """Check that a folder or a file belongs to the user and that no other can write it.
-
-    Args:
-        path: Path of the folder or file.
-
-    Raises:
-        PermissionError: If it is a link, belongs to another user, or others may write it.
-    """
+    """Check that a folder or a file belongs to the user and that no other can write it."""
     status = path.lstat()
     is_plain = stat.S_ISDIR(status.st_mode) or stat.S_ISREG(status.st_mode)
     is_owned = not hasattr(os, "getuid") or status.st_uid == os.getuid()
@@ -120,16 +101,6 @@ def find_compiled_code(library: Path) -> Path:
     """Return the file of a library, in the package, in `code_folder` or in a private folder of the user.
 
     Others cannot reach the files in `code_folder`, whatever the mode of these is.
-
-    Args:
-        library: Path of the library.
-
-    Returns:
-        Absolute path without links.
-
-    Raises:
-        PermissionError: If others can write the library or its folder.
-        FileNotFoundError: If it does not exist.
     """
     file = library.resolve(strict=True)
     if _PACKAGE in file.parents:

@@ -26,18 +26,7 @@ _SOURCES = Path(__file__).parent / "src"
 def launch_kernel(
     name: str, grid: tuple[int, int, int], threads: int, *args: Tensor | int, shared: int = 0
 ) -> None:
-    """Launch a kernel of particles.cu in the current stream of its first argument's device.
-
-    Args:
-        name: Name of the kernel, with its template arguments.
-        grid: Blocks along each axis. Nothing is launched if one is 0.
-        threads: Threads of a block.
-        args: Arguments of the kernel; integers are 32 bits wide.
-        shared: Bytes of shared memory of a block.
-
-    Raises:
-        RuntimeError: If the driver refuses the launch.
-    """
+    """Launch a kernel of particles.cu in the current stream of its first argument's device."""
     assert isinstance(args[0], Tensor)
     if 0 in grid:  # the driver rejects empty grids
         return None
@@ -60,12 +49,7 @@ def launch_kernel(
 def compile_kernel(name: str, device: int) -> tuple[Any, Any]:
     """Compile a kernel.
 
-    Args:
-        name: Name of the kernel, with its template arguments.
-        device: Index of the CUDA device.
-
-    Returns:
-        The kernel, and the driver, which torch would open again at each call.
+    Returns the kernel, and the driver, which torch would open again at each call.
     """
     return torch.cuda._compile_kernel(read_source(), name).func, ctypes.CDLL("libcuda.so.1")
 
@@ -111,15 +95,7 @@ def _compiles() -> bool:
 
 
 def find_kernel(name: str, args: tuple[Any, ...]) -> Callable[..., Any] | None:
-    """Return the operator of this name on a CUDA device, or None if it does not take the arguments.
-
-    Args:
-        name: Name of the operator.
-        args: Its arguments.
-
-    Returns:
-        The operator, or None.
-    """
+    """Return the operator of this name on a CUDA device, or None if it does not take the arguments."""
     accepts = _ACCEPTS.get(name)
     if accepts is None or not _compiles() or not accepts(*args):
         return None

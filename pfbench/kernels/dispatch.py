@@ -92,22 +92,7 @@ def compilable(
     keep_in_graph: bool | Callable[..., bool] = True,
     use_torch_compiler: bool = True,
 ) -> F:
-    """Make a function of tensors compilable.
-
-    Args:
-        function: Function to compile.
-        eager: Function for eager mode, if separate operations have a faster method.
-        operator: Hand-written kernel. It replaces the function on the CPU, where it runs in one
-            thread, and on a CUDA device if a kernel of its name exists. It is not used with
-            gradients.
-        keep_in_graph: Whether (or for which tensors) a compiled step on the CPU uses the kernel as
-            one operator. False if torch's compiler does it as well.
-        use_torch_compiler: Whether torch's compiler is used on a CUDA device without a kernel.
-            Linear algebra does not gain from it, and the generator takes minutes to compile.
-
-    Returns:
-        The compilable function.
-    """
+    """Make a function of tensors compilable."""
     run_eagerly = eager or function
     in_graph = operator if operator is not None and keep_in_graph else None
     fits_graph = keep_in_graph if callable(keep_in_graph) else lambda *_: True
@@ -201,15 +186,7 @@ def _define(operator: Operator) -> None:
 
 
 def make_empty_results(name: str, *arguments: Any) -> Any:
-    """Make results of an operator with the right types and shapes, contiguous, without values.
-
-    Args:
-        name: Name of the operator.
-        arguments: Its valid arguments, in order, with its batch as one axis.
-
-    Returns:
-        A tensor, or a tuple of several.
-    """
+    """Make results of an operator with the right types and shapes, contiguous, without values."""
     operator, sizes = read_operators()[name], cast(dict[str, Any], {"1": 1})
     template, real = next(a for a in arguments if isinstance(a, Tensor)), None
     for argument, value in zip(operator.arguments, arguments, strict=True):

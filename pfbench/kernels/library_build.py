@@ -49,11 +49,7 @@ def find_variants() -> dict[str, tuple[str, ...]]:
 
 @cache
 def name_library(variant: str) -> str:
-    """Return the file name of a library. It contains a hash of the sources and flags.
-
-    Args:
-        variant: Name of the variant.
-    """
+    """Return the file name of a library. It contains a hash of the sources and flags."""
     files = sorted(file for file in FOLDER.iterdir() if file.suffix in (".cpp", ".h"))
     text = b"".join(file.name.encode() + file.read_bytes() for file in files)
     flags = repr((FLAGS, find_variants()[variant], sys.platform, platform.machine()))
@@ -61,17 +57,7 @@ def name_library(variant: str) -> str:
 
 
 def build_library(variant: str, target: Path, flags: tuple[str, ...] = ()) -> None:
-    """Compile a variant.
-
-    Args:
-        variant: Name of the variant.
-        target: Path of the library. Its folder must exist.
-        flags: More flags of the compiler.
-
-    Raises:
-        OSError: If no C++ compiler is installed.
-        CalledProcessError: If the compiler rejects the source.
-    """
+    """Compile a variant."""
     compiler = next(filter(None, map(shutil.which, ("c++", "g++", "clang++"))), None)
     if compiler is None:
         raise OSError("a C++ compiler must be on the PATH (c++, g++ or clang++), got none")

@@ -110,11 +110,7 @@ class Operator(NamedTuple):
 
 @cache
 def read_operators() -> dict[str, Operator]:
-    """Read all operators from operators.toml.
-
-    Raises:
-        ValueError: If an argument or a result is not written as the head of the file says.
-    """
+    """Read all operators from operators.toml."""
     content = tomllib.loads((KERNELS_FOLDER / "operators.toml").read_text())
     return {
         name: Operator(

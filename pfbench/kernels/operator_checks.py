@@ -28,11 +28,7 @@ _KINDS = {
 def check_first(kernel: _F) -> _F:
     """Check the arguments before a kernel runs.
 
-    Args:
-        kernel: Function with the name of its operator after an underscore.
-
-    Returns:
-        The function with the checks. It raises ValueError for a wrong argument.
+    Returns the function with the checks. It raises ValueError for a wrong argument.
     """
     name = kernel.__name__.removeprefix("_")
 
@@ -45,18 +41,7 @@ def check_first(kernel: _F) -> _F:
 
 
 def check_arguments(name: str, arguments: Sequence[Any], with_values: bool = True) -> None:
-    """Check the arguments of an operator.
-
-    Args:
-        name: Name of the operator.
-        arguments: Its arguments, in order.
-        with_values: Check the ranges of values, too. Those of tensors on another device than the
-            CPU are never checked, because the host would wait for them.
-
-    Raises:
-        ValueError: If the number, a type, a device, a shape or a value is wrong. The message names
-            the argument.
-    """
+    """Check the arguments of an operator."""
     expected = read_operators()[name].arguments
     if len(arguments) != len(expected):
         raise ValueError(f"{name} must have {len(expected)} arguments, got {len(arguments)}.")

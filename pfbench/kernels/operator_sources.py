@@ -24,11 +24,7 @@ namespace {"""
 
 
 def make_sources() -> dict[str, str]:
-    """Make the generated files of the C++ operators.
-
-    Returns:
-        Text by name of the file in `src`.
-    """
+    """Make the generated files of the C++ operators."""
     operators = [operator for operator in read_operators().values() if operator.is_on_cpu]
     names = ",\n    ".join(
         f'pfbench::entry<&{operator.name}>("{operator.name}")' for operator in operators

@@ -104,14 +104,6 @@ def philox(counter: Words, key: tuple[Tensor | int, Tensor | int], rounds: int =
     The results agree with the published known-answer vectors. A product of two 32-bit words wraps
     around in int64. The sign bits of the arithmetic shift and the high half of the other product
     are masked after the exclusive or.
-
-    Args:
-        counter: Four 32-bit words in int64 tensors.
-        key: Two 32-bit words.
-        rounds: Number of rounds.
-
-    Returns:
-        Four 32-bit random words in int64 tensors.
     """
     c0, c1, c2, c3 = counter
     index = torch.arange(rounds, device=counter[0].device)
@@ -126,15 +118,7 @@ def philox(counter: Words, key: tuple[Tensor | int, Tensor | int], rounds: int =
 
 
 def compute_normals(counter: Counter, precision: Precision) -> Tensor:
-    """Compute standard normal numbers, [w, R, 4 q], in blocks of components that fit the cache.
-
-    Args:
-        counter: Address of the numbers.
-        precision: SINGLE or DOUBLE.
-
-    Returns:
-        The numbers.
-    """
+    """Compute standard normal numbers, [w, R, 4 q], in blocks of components that fit the cache."""
     seed, purpose, step, runs, components, quarters = counter
     size = max(1, _BLOCK // max(1, len(runs) * quarters))
     blocks = torch.arange(components, device=runs.device).split(size)
@@ -144,14 +128,7 @@ def compute_normals(counter: Counter, precision: Precision) -> Tensor:
 
 
 def compute_uniforms(counter: Counter) -> Tensor:
-    """Compute uniform numbers on (0, 1), odd multiples of 2^-53, float64 [w, R, 4 q].
-
-    Args:
-        counter: Address of the numbers.
-
-    Returns:
-        The numbers.
-    """
+    """Compute uniform numbers on (0, 1), odd multiples of 2^-53, float64 [w, R, 4 q]."""
     seed, purpose, step, runs, components, quarters = counter
     block = torch.arange(components, device=runs.device)
     high, low = (
@@ -165,15 +142,7 @@ def draw_words(
 ) -> Words:
     """Draw four random words for each component, run and quarter of the particles.
 
-    Args:
-        key: Seed and hash of the purpose.
-        step: Time step, [].
-        runs: Run numbers, [R].
-        component: Numbers of the components, [w].
-        quarters: Number of counters q.
-
-    Returns:
-        Words, int64, [w, R, q] each.
+    Shapes: runs [R], component [w].
     """
     particle = torch.arange(quarters, device=runs.device)
     step, seed = step.to(runs.device), key[0].to(runs.device)
@@ -209,13 +178,7 @@ def _normals(
 def transform_pair(u: Tensor, v: Tensor, precision: Precision) -> tuple[Tensor, Tensor]:
     """Transform uniform numbers to standard normal ones by Box and Muller.
 
-    Args:
-        u: Numbers in (0, 1].
-        v: Angles in half turns, in [-1, 1].
-        precision: Precision of both.
-
-    Returns:
-        Two independent normal numbers for each pair.
+    Returns two independent normal numbers for each pair.
     """
     bits = u.view(precision.integer)
     k = (precision.root_half + (1 << precision.fraction) - 1 - bits) >> precision.fraction

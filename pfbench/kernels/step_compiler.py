@@ -69,12 +69,7 @@ def compile_function(
 ) -> tuple[TensorFunction, NativeEntry | None]:
     """Compile a function of tensors for the shapes of an example.
 
-    Args:
-        function: Pure function of tensors, without Python branches on their values.
-        example: Arguments. The compiled function takes the same shapes, types and device.
-
-    Returns:
-        The compiled function, and its C++ entry if torch generated one.
+    Returns the compiled function, and its C++ entry if torch generated one.
     """
     use_private_cache()  # before the imports, which choose a folder
     from torch._functorch.config import patch as patch_functorch
@@ -243,15 +238,8 @@ def run_steps(
 ) -> list[Tensor]:
     """Run a compiled step T times.
 
-    Args:
-        step: Number of the compiled step from `register_step`.
-        constants: First arguments of each step.
-        state: Next arguments of the first step. Later steps take the first outputs of the last one.
-        inputs: Inputs of all steps, [T, ...]. Each step takes one row.
-        shared: Last arguments of each step.
-
-    Returns:
-        The outputs of each step, in order, as views [R, N, ...] of [..., R, N].
+    Returns the outputs of each step, in order, as views [R, N, ...] of [..., R, N]. Shapes: inputs
+    [T, ...].
     """
     load_library()
     results: list[Tensor] = torch.ops.pfbench.run_steps.default(
@@ -265,17 +253,7 @@ def register_step(library: Tensor, outputs: int, arguments: list[Tensor]) -> int
 
     The address of the step stays in C++: Python holds a number of a table.
 
-    Args:
-        library: Path of the library that torch's compiler wrote for the step, as bytes, uint8 [n].
-        outputs: Number of tensors that a step returns.
-        arguments: Arguments of one step with the types, shapes and strides that it was compiled for.
-
-    Returns:
-        Number of the step.
-
-    Raises:
-        PermissionError: If others can write the library, see `find_compiled_code`.
-        RuntimeError: If the library is not a step of torch's compiler.
+    Returns number of the step. Shapes: library [n].
     """
     load_library()
     name = os.fsdecode(bytes(library.tolist())) if _is_path(library) else ""
@@ -292,11 +270,7 @@ def register_step(library: Tensor, outputs: int, arguments: list[Tensor]) -> int
 
 
 def encode_path(path: str | Path) -> Tensor:
-    """Return a path as bytes, uint8 [n], as an operator takes it.
-
-    Args:
-        path: Path of a file.
-    """
+    """Return a path as bytes, uint8 [n], as an operator takes it."""
     return torch.tensor(list(os.fsencode(path)), dtype=torch.uint8)
 
 

@@ -54,12 +54,6 @@ _RESUMED_SETTINGS = (
 class TrainingState:
     """The networks of a filter and their optimiser.
 
-    Args:
-        training: Settings.
-        method: The filter.
-        model: State-space model.
-        data: Training data. The first run gives the sizes of the networks.
-
     Attributes:
         method: The filter, with resampler and number of particles of the training if it has particles.
         parts: Trained parts by name.
@@ -88,13 +82,7 @@ class TrainingState:
     ) -> dict[str, float]:
         """Train one epoch, then compute the validation loss.
 
-        Args:
-            progress: Progress of the training. It is updated.
-            data: Training data.
-            validation: Validation data.
-
-        Returns:
-            Values of the log line of the epoch, by name.
+        Returns values of the log line of the epoch, by name.
         """
         start_time = time.perf_counter()
         batches = self._batches(len(data.record.y), progress.epoch)
@@ -135,12 +123,7 @@ class TrainingState:
         return float(loss), float(ess)
 
     def save(self, path: Path, progress: Progress) -> None:
-        """Write all that resuming the training needs.
-
-        Args:
-            path: The file.
-            progress: Progress of the training.
-        """
+        """Write all that resuming the training needs."""
         content = {
             "networks": self._network_weights(),
             "optimiser": self._optimiser.state_dict(),
@@ -152,14 +135,7 @@ class TrainingState:
     def restore(self, path: Path) -> Progress:
         """Resume a stopped training, or start a new one.
 
-        Args:
-            path: File that `save` wrote. It need not exist.
-
-        Returns:
-            Progress of the stopped or new training.
-
-        Raises:
-            ValueError: If the stopped training had other settings.
+        Returns Progress of the stopped or new training.
         """
         if not path.exists():
             return Progress()
@@ -271,17 +247,7 @@ def iterate_segments(
 ) -> Iterator[tuple[Tensor, Tensor]]:
     """Iterate over segments of steps of training data, without gradients between them.
 
-    Args:
-        objective: Loss function.
-        segment: Steps of a segment. None for all.
-        method: The filter.
-        model: State-space model.
-        data: Training data of R runs.
-        draws: Random stream of the filter.
-        scale: Standard deviations of the initial distribution, [R or 1, d].
-
-    Yields:
-        Losses and ESS / N of a segment's S steps, [S, R] each. ESS / N is NaN without particles.
+    Shapes: scale [R or 1, d].
     """
     steps = data.record.y.shape[1]
     recording = torch.is_grad_enabled() and objective.needs_filter_gradient
@@ -435,15 +401,7 @@ class Progress:
 
 
 def set_up_filter(training: Training, method: TrainableFilter) -> TrainableFilter:
-    """Return a filter with the resampler and the number of particles of a training.
-
-    Args:
-        training: Settings.
-        method: The filter. One without particles is returned unchanged.
-
-    Raises:
-        ValueError: If the objective needs particles and the filter has none.
-    """
+    """Return a filter with the resampler and the number of particles of a training."""
     if isinstance(method, ParticleFilter):
         return replace(method, particles=training.particles, resampler=training.resampler)
     if training.objective.needs_particles:

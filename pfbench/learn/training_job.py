@@ -96,19 +96,7 @@ def fit(
 ) -> Path:
     """Train the networks of a configuration, unless their checkpoint exists.
 
-    Args:
-        cfg: Resolved configuration.
-        choices: Name chosen in each configuration group.
-        regimes: Noise regimes of the mixture, by name.
-        build: Function that instantiates a node of the configuration.
-        metadata: Further content of the checkpoint, such as `inputs`, see `pfbench.job.inputs`.
-        tell: Function that prints the log line of an epoch.
-
-    Returns:
-        Path of the checkpoint.
-
-    Raises:
-        ValueError: If a value is out of range, or as `train`.
+    Returns path of the checkpoint.
     """
     model, training, method = (build(cfg[group]) for group in ("model", "train", "filter"))
     model = model.to(cfg["device"], getattr(torch, cfg["dtype"]))
@@ -192,10 +180,6 @@ def write_losses(path: Path, lines: list[dict[str, float]]) -> None:
     """Write the log lines of all epochs to a CSV file.
 
     Another kind of file under this name is renamed to `NAME.kept`.
-
-    Args:
-        path: The file.
-        lines: Log line of each epoch, all with the same names.
     """
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, list(lines[0]))
@@ -208,14 +192,7 @@ def write_losses(path: Path, lines: list[dict[str, float]]) -> None:
 
 
 def open_tensorboard(path: Path) -> Callable[[dict[str, float]], None]:
-    """Return a function that writes log lines for TensorBoard.
-
-    Args:
-        path: Path of the checkpoint. The log folder has its name without the suffix.
-
-    Returns:
-        The function. It does nothing if TensorBoard is not installed.
-    """
+    """Return a function that writes log lines for TensorBoard."""
     if importlib.util.find_spec("tensorboard") is None:
         return lambda line: None
     from torch.utils.tensorboard import SummaryWriter

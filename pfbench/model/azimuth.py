@@ -367,13 +367,7 @@ def compute_level_coupling(alpha: Tensor, w: Tensor, f: Tensor) -> Tensor:
     The tilts are x and y. The cosine and sine of the azimuth error are c and s. Then
     M = [[c, -s, y c + x s], [s, c, y s - x c], [-y, x, 1]].
 
-    Args:
-        alpha: Attitude errors, [R, 3, N].
-        w: Rate of the level frame, [R or 1, 3].
-        f: Specific force, [R or 1, 3].
-
-    Returns:
-        G, [R, 6, N].
+    Returns g, [R, 6, N]. Shapes: alpha [R, 3, N], w [R or 1, 3], f [R or 1, 3].
     """
     x, y, z = alpha.unbind(1)
     (w_e, w_n, w_u), (f_e, f_n, f_u) = w.unsqueeze(-1).unbind(1), f.unsqueeze(-1).unbind(1)
@@ -395,9 +389,7 @@ def compute_level_coupling(alpha: Tensor, w: Tensor, f: Tensor) -> Tensor:
 def compute_euler_rate(alpha: Tensor, w: Tensor) -> Tensor:
     """Compute the rates of the Euler errors of M rotating at w: alpha' = Cw^-1 w.
 
-    Args:
-        alpha: Euler errors, [..., 3].
-        w: Angular rate, [..., 3].
+    Shapes: alpha [..., 3], w [..., 3].
     """
     (sx, sy, _), (cx, cy, _) = torch.sin(alpha).unbind(-1), torch.cos(alpha).unbind(-1)
     level = cy * w[..., 2] - sy * w[..., 0]

@@ -24,11 +24,7 @@ from pfbench.core.record import Record
 
 @contextmanager
 def named_inputs(model: StateSpaceModel) -> Iterator[None]:
-    """Name the input that a model reads from u and that u does not have.
-
-    Raises:
-        ValueError: If the model reads a field that its inputs do not have.
-    """
+    """Name the input that a model reads from u and that u does not have."""
     try:
         yield
     except AttributeError as error:
@@ -358,12 +354,7 @@ class StaticModel(ModelWrapper):
 def check_truth_sizes(truth: Mapping[str, Tensor], sizes: Mapping[str, int]) -> None:
     """Check that true values have the components of their groups: one number would fill a vector.
 
-    Args:
-        truth: True values by group, [R, T, k].
-        sizes: Number of components k of each group of the model.
-
-    Raises:
-        ValueError: If a group has another number of components.
+    Shapes: truth [R, T, k].
     """
     for name in sizes.keys() & truth.keys():
         if truth[name].shape[-1] != sizes[name]:
@@ -391,13 +382,7 @@ def _mean_of(distribution: Any, name: str) -> Tensor:
 def initial_law(model: StateSpaceModel, runs: int, spread: Tensor | None = None) -> Distribution:
     """Return the distribution of x_0 in the chart.
 
-    Args:
-        model: State-space model.
-        runs: Number of runs R.
-        spread: Cholesky factor of each run's initial covariance, [R, d, d]; None uses the model.
-
-    Returns:
-        Distribution with batch [R], event [d].
+    Returns distribution with batch [R], event [d]. Shapes: spread [R, d, d].
     """
     if spread is None:
         return model.initial(runs)

@@ -52,11 +52,7 @@ class StateComponents(NamedTuple):
 def name_components(axes: Mapping[str, tuple[Sequence[str], str]]) -> StateComponents:
     """Name the components of groups with three axes.
 
-    Args:
-        axes: Names of the axes and SI unit by group.
-
-    Returns:
-        The components, in the order of the groups.
+    Returns the components, in the order of the groups.
     """
     return StateComponents(
         tuple(f"{group}_{axis}" for group, (names, _) in axes.items() for axis in names),
@@ -82,14 +78,7 @@ class InsErrorModel(StateSpaceModel):
     p0: Tensor
 
     def check_receiver(self, receiver: Any) -> None:
-        """Check that a sensor measures what the model reads.
-
-        Args:
-            receiver: Sensor whose noise the model assumes.
-
-        Raises:
-            ValueError: If it measures other channels.
-        """
+        """Check that a sensor measures what the model reads."""
         if difference := describe_misfit(self, receiver):
             raise ValueError(
                 f"model.receiver must measure what the model reads, but {difference}. Choose another model: "
@@ -115,13 +104,7 @@ class InsErrorModel(StateSpaceModel):
 def additive_transition(model: StateSpaceModel, x: Tensor, u: Any) -> Distribution:
     """Return the transition distribution for additive noise of full rank with a triangular gain.
 
-    Args:
-        model: Model with `noise_gain`.
-        x: States, [R, N, D].
-        u: Inputs of the step.
-
-    Returns:
-        Distribution with batch [R, N], event [D].
+    Returns distribution with batch [R, N], event [D]. Shapes: x [R, N, D].
     """
     mean = model.propagate(x, u, x.new_zeros(*x.shape[:2], model.noise_dim))
     root = model.noise_gain(u)
@@ -132,16 +115,7 @@ def additive_transition(model: StateSpaceModel, x: Tensor, u: Any) -> Distributi
 def inflate_noise(gain: Tensor, inflation: ProcessNoiseInflation, gyro: int) -> Tensor:
     """Return the triangular root of the process noise plus additional noise.
 
-    Args:
-        gain: Noise gain, [..., D, W].
-        inflation: Additional process noise.
-        gyro: Number of gyro blocks in the state.
-
-    Returns:
-        Root, [..., D, D].
-
-    Raises:
-        ValueError: If the sum is not positive definite.
+    Returns root, [..., D, D]. Shapes: gain [..., D, W].
     """
     sd = [inflation.motion, *[inflation.gyro] * gyro, inflation.accelerometer]
     root, ok = factor(gain @ gain.mT + torch.diag(torch.cat(sd).to(gain).square()))

@@ -154,12 +154,7 @@ def relative_motion(x: Tensor, u: PlatformInputs) -> tuple[Tensor, Tensor]:
 
     [Pu and Qin, eq. 1]
 
-    Args:
-        x: States, [R, N, 4].
-        u: Navigation of the aircraft.
-
-    Returns:
-        Position and velocity, [R, N, 3] each.
+    Returns position and velocity, [R, N, 3] each. Shapes: x [R, N, 4].
     """
     up = x.new_zeros(*x.shape[:-1], 1)
     position = torch.cat([x[..., :2], up], -1) - u.position.unsqueeze(-2)
@@ -173,11 +168,7 @@ def predict_bearing(p: Tensor, v: Tensor, carrier: Tensor, a: Tensor | None = No
     The rates are derived independently, because the print is damaged
     [Pu and Qin, eqs 4-7, eq. 10, and eq. 9 with an acceleration].
 
-    Args:
-        p: Position of the emitter relative to the aircraft, in body axes, [..., 3].
-        v: Relative velocity in body axes, [..., 3].
-        carrier: Frequency, [...], Hz.
-        a: Relative acceleration in body axes, [..., 3]. None omits it.
+    Shapes: p [..., 3], v [..., 3], carrier [...], a [..., 3].
     """
     x, y, z = p.unbind(-1)
     vx, vy, vz = v.unbind(-1)

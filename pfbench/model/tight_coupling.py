@@ -40,30 +40,14 @@ def predict_measurement(
 ) -> Tensor:
     """Predict INS minus receiver, ranges and then rates, [R, N, 2 S].
 
-    Args:
-        position: Position errors North, East, Up, [R, N, 3], m.
-        velocity: Velocity errors East, North, Up, [R, N, 3], m/s.
-        clock: Clock bias and drift, [R, N, 2], m and m/s.
-        sight: Ranging geometry of one step.
-
-    Returns:
-        The prediction.
+    Returns the prediction. Shapes: position [R, N, 3], velocity [R, N, 3], clock [R, N, 2].
     """
     ranges, rates = sight.range_differences(position, velocity)
     return torch.cat([ranges - clock[..., :1], rates - clock[..., 1:]], -1)
 
 
 def compute_initial_sd(imu: ImuErrors, clock: ReceiverClock, initial: AlignmentErrors) -> Tensor:
-    """Return the standard deviations of the initial errors, [17].
-
-    Args:
-        imu: Sensor errors.
-        clock: Receiver clock.
-        initial: Initial navigation errors.
-
-    Raises:
-        ValueError: If a bias is 0, or a sensor has a Markov part.
-    """
+    """Return the standard deviations of the initial errors, [17]."""
     if imu.gyro_markov > 0.0 or imu.accelerometer_markov > 0.0:
         raise ValueError(
             f"model.imu must not have Markov parts, got {imu.gyro_markov_deg_h} deg/h and "
@@ -82,15 +66,7 @@ def compute_initial_sd(imu: ImuErrors, clock: ReceiverClock, initial: AlignmentE
 def check_satellites(record: Record, components: int) -> RangingInputs:
     """Check that the measurements are of the satellites of a tightly coupled model.
 
-    Args:
-        record: Measurements, and inputs of the type that the model reads.
-        components: Number of measurement components of the model.
-
-    Returns:
-        Inputs.
-
-    Raises:
-        ValueError: If the measurements do not fit the receiver of the model.
+    Returns inputs.
     """
     if record.y.shape[-1] != components:
         raise ValueError(
@@ -450,9 +426,7 @@ class _Level(NamedTuple):
     def rate(self, dv: Tensor, dp: Tensor) -> Tensor:
         """Compute the rate of the true level frame in inertial space.
 
-        Args:
-            dv: Velocity errors, [R, N, 3].
-            dp: Position errors, [R, N, 3].
+        Shapes: dv [R, N, 3], dp [R, N, 3].
         """
         pos = self.pos - dp
         return earth.earth_rate(pos[..., 0]) + earth.transport_rate(
@@ -462,9 +436,7 @@ class _Level(NamedTuple):
     def drift(self, dv: Tensor, dp: Tensor) -> Tensor:
         """Compute the rate of dp.
 
-        Args:
-            dv: Velocity errors, [R, N, 3].
-            dp: Position errors, [R, N, 3].
+        Shapes: dv [R, N, 3], dp [R, N, 3].
         """
         return earth.position_rate(self.pos, self.vel) - earth.position_rate(
             self.pos - dp, self.vel - dv
@@ -473,9 +445,7 @@ class _Level(NamedTuple):
     def free_acceleration(self, dv: Tensor, dp: Tensor) -> Tensor:
         """Compute Coriolis acceleration plus gravity, INS minus truth.
 
-        Args:
-            dv: Velocity errors, [R, N, 3].
-            dp: Position errors, [R, N, 3].
+        Shapes: dv [R, N, 3], dp [R, N, 3].
         """
         true = _free(self.pos - dp, self.vel - dv, self.rate(dv, dp))
         return _free(self.pos, self.vel, self.w_in) - true

@@ -310,12 +310,7 @@ class SarSensor(AidingSensor):
 def compute_heading_difference(a: Tensor, b: Tensor) -> Tensor:
     """Compute heading of a minus heading of b, clockwise from North, in [-pi, pi].
 
-    Args:
-        a: Forward axis of a body in East, North, Up (second column of its matrix), [..., 3].
-        b: Forward axis of the other body, [..., 3].
-
-    Returns:
-        Difference, [...], rad.
+    Returns difference, [...], rad. Shapes: a [..., 3], b [..., 3].
     """
     a_east, a_north, _ = a.unbind(-1)
     b_east, b_north, _ = b.unbind(-1)

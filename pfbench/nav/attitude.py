@@ -16,8 +16,7 @@ from torch import Tensor
 def skew(a: Tensor) -> Tensor:
     """Build cross-product matrices [..., 3, 3].
 
-    Args:
-        a: Vectors, [..., 3]. skew(a) b equals a x b.
+    Shapes: a [..., 3].
     """
     x, y, z = a.unbind(-1)
     zero = torch.zeros_like(x)
@@ -91,12 +90,7 @@ def quaternion_from_dcm(c: Tensor) -> Tensor:
 def error_dcm(c_true: Tensor, c_ins: Tensor) -> Tensor:
     """Compute M = C_true C_ins^T, which rotates INS level axes to the true ones.
 
-    Args:
-        c_true: True attitude, [..., 3, 3].
-        c_ins: Attitude of the INS, [..., 3, 3].
-
-    Returns:
-        M, [..., 3, 3].
+    Returns m, [..., 3, 3]. Shapes: c_true [..., 3, 3], c_ins [..., 3, 3].
     """
     return c_true @ c_ins.transpose(-1, -2)
 
@@ -106,12 +100,7 @@ def attitude_error(c_true: Tensor, c_ins: Tensor) -> Tensor:
 
     For small angles M ~ I + skew(alpha). It differs from the difference of pitch, roll and yaw.
 
-    Args:
-        c_true: True attitude, [..., 3, 3].
-        c_ins: Attitude of the INS, [..., 3, 3].
-
-    Returns:
-        alpha (East, North, Up), [..., 3], rad.
+    Returns alpha (East, North, Up), [..., 3], rad. Shapes: c_true [..., 3, 3], c_ins [..., 3, 3].
     """
     return euler_from_dcm(error_dcm(c_true, c_ins))
 
@@ -121,11 +110,7 @@ def residual_error(alpha_true: Tensor, alpha_hat: Tensor) -> Tensor:
 
     Also re-centres particles after such a correction.
 
-    Args:
-        alpha_true: Attitude error before the correction, [..., 3], rad.
-        alpha_hat: Estimated attitude error, [..., 3], rad.
-
-    Returns:
-        Remaining attitude error, [..., 3], rad.
+    Returns remaining attitude error, [..., 3], rad. Shapes: alpha_true [..., 3], alpha_hat
+    [..., 3].
     """
     return euler_from_dcm(dcm_from_euler(alpha_true) @ dcm_from_euler(alpha_hat).transpose(-1, -2))

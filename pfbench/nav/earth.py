@@ -27,11 +27,7 @@ M_RATIO = OMEGA**2 * A**3 * (1 - F_E) / GM  # m of the height formula
 def radii(lat: Tensor) -> tuple[Tensor, Tensor]:
     """Compute the radii of curvature along the meridian and across it.
 
-    Args:
-        lat: Latitude, [...], rad.
-
-    Returns:
-        (R_M, R_N), [...] each, m.
+    Returns (R_M, R_N), [...] each, m. Shapes: lat [...].
     """
     w = 1 - E2 * torch.sin(lat) ** 2
     r_n = A / torch.sqrt(w)
@@ -44,12 +40,7 @@ def gravity(lat: Tensor, h: Tensor) -> Tensor:
     The vector is (0, 0, -g) in East, North, Up. Somigliana's formula on the ellipsoid, second
     order in height [WGS-84, NIMA TR8350.2, eqs 4-1 and 4-3].
 
-    Args:
-        lat: Latitude, [...], rad.
-        h: Height, [...], m.
-
-    Returns:
-        Gravity, [...], m/s^2.
+    Returns gravity, [...], m/s^2. Shapes: lat [...], h [...].
     """
     s2 = torch.sin(lat) ** 2
     ellipsoid = G_EQUATOR * (1 + G_SOMIGLIANA * s2) / torch.sqrt(1 - E2 * s2)
@@ -61,12 +52,7 @@ def inverse_radii_and_gravity(s2: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Te
 
     The terms are shared, and the number of operations is small, for the inner loop of an INS.
 
-    Args:
-        s2: Squared sine of the latitude, [...].
-        h: Height, [...], m.
-
-    Returns:
-        1 / (R_M + h), 1 / (R_N + h), gravity, [...] each.
+    Returns 1 / (R_M + h), 1 / (R_N + h), gravity, [...] each. Shapes: s2 [...], h [...].
     """
     w = torch.rsub(s2, 1.0, alpha=E2)
     root = torch.rsqrt(w)
@@ -89,13 +75,7 @@ def earth_rate(lat: Tensor) -> Tensor:
 def transport_rate(lat: Tensor, h: Tensor, v: Tensor) -> Tensor:
     """Compute the rate of the level frame relative to the Earth due to vehicle motion.
 
-    Args:
-        lat: Latitude, [...], rad.
-        h: Height, [...], m.
-        v: East, North, Up velocity, [..., 3], m/s.
-
-    Returns:
-        Rate in East, North, Up, [..., 3], rad/s.
+    Returns rate in East, North, Up, [..., 3], rad/s. Shapes: lat [...], h [...], v [..., 3].
     """
     r_m, r_n = radii(lat)
     east = v[..., 0] / (r_n + h)
@@ -105,12 +85,7 @@ def transport_rate(lat: Tensor, h: Tensor, v: Tensor) -> Tensor:
 def position_rate(pos: Tensor, v: Tensor) -> Tensor:
     """Compute the time derivative of a position.
 
-    Args:
-        pos: Position, [..., 3], rad, rad, m.
-        v: East, North, Up velocity, [..., 3], m/s.
-
-    Returns:
-        Derivative, [..., 3], rad/s, rad/s, m/s.
+    Returns derivative, [..., 3], rad/s, rad/s, m/s. Shapes: pos [..., 3], v [..., 3].
     """
     return torch.stack([v[..., 1], v[..., 0], v[..., 2]], dim=-1) / metre_scale(pos)
 
@@ -140,12 +115,7 @@ def geodetic(xyz: Tensor, passes: int = 6) -> Tensor:
     Iterates on the reduced latitude [Bowring 1976]. Six passes reach double precision from 10 km
     below the ground to 1000 km above it.
 
-    Args:
-        xyz: Points, [..., 3], m.
-        passes: Number of iterations.
-
-    Returns:
-        Positions, [..., 3], rad, rad, m.
+    Returns positions, [..., 3], rad, rad, m. Shapes: xyz [..., 3].
     """
     x, y, z = xyz.unbind(-1)
     across = torch.hypot(x, y)
@@ -166,8 +136,7 @@ def geodetic(xyz: Tensor, passes: int = 6) -> Tensor:
 def local_axes(origin: Tensor) -> Tensor:
     """Compute rotations [..., 3, 3] from Earth-fixed axes to East, North, Up.
 
-    Args:
-        origin: Latitude, longitude, height, [..., 3], rad, rad, m.
+    Shapes: origin [..., 3].
     """
     sl, cl = torch.sin(origin[..., 0]), torch.cos(origin[..., 0])
     so, co = torch.sin(origin[..., 1]), torch.cos(origin[..., 1])
@@ -181,12 +150,7 @@ def local_enu(pos: Tensor, origin: Tensor) -> Tensor:
     The conversion is exact, through Earth-fixed axes. A level flight therefore sinks below the
     tangent plane, by 8 m at 10 km.
 
-    Args:
-        pos: Positions, [..., 3], rad, rad, m.
-        origin: Origin, [..., 3], broadcast against `pos`.
-
-    Returns:
-        Offsets, [..., 3], m.
+    Returns offsets, [..., 3], m. Shapes: pos [..., 3], origin [..., 3].
     """
     return (local_axes(origin) @ (ecef(pos) - ecef(origin)).unsqueeze(-1)).squeeze(-1)
 
@@ -194,12 +158,7 @@ def local_enu(pos: Tensor, origin: Tensor) -> Tensor:
 def from_local_enu(enu: Tensor, origin: Tensor) -> Tensor:
     """Convert East, North, Up offsets to positions (inverse of `local_enu`).
 
-    Args:
-        enu: Offsets, [..., 3], m.
-        origin: Origin, [..., 3], rad, rad, m.
-
-    Returns:
-        Positions, [..., 3], rad, rad, m.
+    Returns positions, [..., 3], rad, rad, m. Shapes: enu [..., 3], origin [..., 3].
     """
     return geodetic(
         ecef(origin) + (local_axes(origin).transpose(-1, -2) @ enu.unsqueeze(-1)).squeeze(-1)
@@ -215,13 +174,9 @@ def from_local_enu(enu: Tensor, origin: Tensor) -> Tensor:
 def earth_quantities(pos: Tensor, vel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Compute quantities that depend on position and velocity only.
 
-    Args:
-        pos: Position, [..., 3, N], rad, rad, m.
-        vel: Velocity (E, N, U), [..., 3, N], m/s.
-
-    Returns:
-        Rate of the level frame in inertial space, rad/s, gravity with Coriolis acceleration, m/s^2,
-        and rate of the position, (rad/s, rad/s, m/s), [..., 3, N] each.
+    Returns rate of the level frame in inertial space, rad/s, gravity with Coriolis acceleration,
+    m/s^2, and rate of the position, (rad/s, rad/s, m/s), [..., 3, N] each. Shapes: pos [..., 3, N],
+    vel [..., 3, N].
     """
     (lat, _, h), (v_e, v_n, v_u) = pos.unbind(-2), vel.unbind(-2)
     r_m, r_n = radii(lat)
@@ -241,9 +196,7 @@ def earth_quantities(pos: Tensor, vel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 def convert_to_metres(dp: Tensor, pos: Tensor) -> Tensor:
     """Convert INS position errors (rad, rad, m) to metres at the true position.
 
-    Args:
-        dp: Position errors, [..., 3, N].
-        pos: INS position, [..., 3, N].
+    Shapes: dp [..., 3, N], pos [..., 3, N].
     """
     return dp * _metre_scale(pos - dp)
 
@@ -253,9 +206,7 @@ def convert_from_metres(metres: Tensor, pos: Tensor) -> Tensor:
 
     Each pass has the error factor 0.01 error / Earth radius: 200 km are correct to a millimetre.
 
-    Args:
-        metres: Position errors, [..., 3, N].
-        pos: INS position, [..., 3, N].
+    Shapes: metres [..., 3, N], pos [..., 3, N].
     """
     dp = metres * metres.new_tensor([[0.0], [0.0], [1.0]])  # the height error needs no iteration
     for _ in range(3):
@@ -272,9 +223,7 @@ def _metre_scale(pos: Tensor) -> Tensor:
 def rotate_vectors(m: Tensor, a: Tensor) -> Tensor:
     """Multiply matrices by vectors.
 
-    Args:
-        m: Matrices, [..., 3, 3, N].
-        a: Vectors, [..., 3, N].
+    Shapes: m [..., 3, 3, N], a [..., 3, N].
     """
     return (m * a.unsqueeze(-3)).sum(-2)
 
@@ -287,9 +236,7 @@ def rotation_matrix(q: Tensor) -> Tensor:
 def rotate_quaternion(q: Tensor, r: Tensor) -> Tensor:
     """Compute q exp(r) by the series of tan(|r| / 2), correct to 1e-10 at 0.1 rad.
 
-    Args:
-        q: Unit quaternions, [..., 4, N].
-        r: Rotation vectors, [..., 3, N].
+    Shapes: q [..., 4, N], r [..., 3, N].
     """
     s = _square(r)
     small = torch.cat([torch.ones_like(s), r * (0.5 + s * (1.0 / 24.0 + s / 240.0))], -2)

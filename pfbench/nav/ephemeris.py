@@ -24,18 +24,7 @@ GM_GPS = 3.986005e14  # [IS-GPS-200, table 20-IV], Galileo uses earth.GM [OS SIS
 
 
 def read_ephemeris(root: str | None, path: str) -> RinexFile:
-    """Read the ephemerides of a RINEX navigation file or a Parquet table, a row each.
-
-    Args:
-        root: Folder of all data sets (configuration key data.root).
-        path: File in `root`. A Parquet table has the RINEX names as columns.
-
-    Returns:
-        Table of ephemerides, and notes on what was not read.
-
-    Raises:
-        ValueError: If `root` is None, or the file is missing or faulty.
-    """
+    """Read the ephemerides of a RINEX navigation file or a Parquet table, a row each."""
     remedy = (
         f"Set the environment variable PFBENCH_DATA, or data.root=..., to the folder of {path}."
     )
@@ -53,15 +42,7 @@ def read_ephemeris(root: str | None, path: str) -> RinexFile:
 def check_numbers(table: pd.DataFrame, name: str) -> pd.DataFrame:
     """Convert the parameters to numbers.
 
-    Args:
-        table: Ephemerides with RINEX names.
-        name: Name of the file, for the message.
-
-    Returns:
-        Table with numeric columns. `week`, `health` and `ttx` may be NaN.
-
-    Raises:
-        ValueError: If a parameter is blank, text, or infinite. The message names column and row.
+    Returns table with numeric columns. `week`, `health` and `ttx` may be NaN.
     """
     table = table.copy()
     for column in ("prn", *CLOCK, *ORBIT, "tgd", "week", "health", "ttx"):
@@ -90,15 +71,7 @@ def parse_epochs(table: pd.DataFrame, epoch: float) -> pd.DataFrame:
     Rows are ordered by satellite, `toe` and time of transmission. The week of `toe` is modulo 1024,
     as satellites send it. Without a week, the one nearest to the epoch is used.
 
-    Args:
-        table: Ephemerides with RINEX names.
-        epoch: GPS time, seconds since 1980-01-06.
-
-    Returns:
-        Selected ephemerides.
-
-    Raises:
-        ValueError: If a column is missing.
+    Returns selected ephemerides.
     """
     table = table.copy()
     missing = [name for name in ("prn", *CLOCK, *ORBIT) if name not in table]
@@ -127,12 +100,7 @@ def parse_epochs(table: pd.DataFrame, epoch: float) -> pd.DataFrame:
 def describe_unhealthy(table: pd.DataFrame, path: str) -> tuple[str, ...]:
     """Describe the ephemerides that are not used because their satellite is marked unhealthy.
 
-    Args:
-        table: Ephemerides with RINEX names.
-        path: Name of the file.
-
-    Returns:
-        One note, or none.
+    Returns one note, or none.
     """
     if "health" not in table:
         return ()
@@ -159,12 +127,7 @@ def mean_motion(eph: Mapping[str, Tensor]) -> Tensor:
 def broadcast_elements(eph: Mapping[str, Tensor]) -> OrbitalElements:
     """Evaluate the user algorithm and its derivatives.
 
-    Args:
-        eph: Parameters by RINEX name, [...] each, with `tk`, the time from `toe` in s, `sow`, the
-            `toe` in seconds of the week, and `gm`.
-
-    Returns:
-        The elements, [...] each.
+    Returns the elements, [...] each. Shapes: eph [...].
     """
     e, tk, n = eph["e"], eph["tk"], mean_motion(eph)
     anomaly, near = eccentric_anomaly(eph["M0"] + n * tk, e)
@@ -240,9 +203,6 @@ def read_rinex(file: Path) -> RinexFile:
     """Read GPS and Galileo (I/NAV) ephemerides from a RINEX 2 or 3 navigation file.
 
     A record that cannot be read is dropped, and a note names its line.
-
-    Raises:
-        ValueError: If the file is of another kind, or most of its records cannot be read.
     """
     lines = _lines(file)
     version = lines[0][:9].strip() if lines and "RINEX VERSION" in lines[0] else ""

@@ -73,16 +73,7 @@ class EphemerisSelection(NamedTuple):
 def check_ephemerides(table: pd.DataFrame, name: str) -> EphemerisSelection:
     """Select ephemerides with plausible parameters that agree with their neighbours.
 
-    Args:
-        table: Ephemerides of healthy satellites with `name`, `sow` and `gm`, and `toe` and `toc`
-            from a common epoch.
-        name: Name of the file, for messages.
-
-    Returns:
-        The selection.
-
-    Raises:
-        ValueError: If more than a fifth of the records is out of range.
+    Returns the selection.
     """
     reasons = [_reason(row) for row in table.to_dict("records")]
     share = sum(map(bool, reasons)) / max(len(reasons), 1)
@@ -146,8 +137,7 @@ def _compare(
 ) -> tuple[list[int], list[str], bool]:
     """Compare the ephemerides of a satellite with up to two neighbours on each side.
 
-    Returns:
-        Rows to ignore, notes, and whether all rows have a neighbour.
+    Returns rows to ignore, notes, and whether all rows have a neighbour.
     """
     toe = table["toe"].to_numpy()[rows]
     pairs = [
@@ -236,12 +226,7 @@ _LONGEST_CLOCK = 14400.0  # s between compared ephemerides
 def describe_clock_scale(table: pd.DataFrame, name: str) -> tuple[str, ...]:
     """Describe clock offsets that do not change as their drifts state.
 
-    Args:
-        table: Ephemerides with RINEX names, `name` and `toc`, ordered by satellite and time.
-        name: Name of the file.
-
-    Returns:
-        One note, or none.
+    Returns one note, or none.
     """
     first, second = table.iloc[:-1], table.iloc[1:]
     span = second["toc"].to_numpy() - first["toc"].to_numpy()
@@ -280,11 +265,7 @@ _STEP = 30.0  # s of the second difference; its error is below 1e-6 m/s^2
 def compute_gravity(position: Tensor) -> Tensor:
     """Compute the gravitation of the oblate Earth.
 
-    Args:
-        position: Position from the centre in axes that do not rotate, z to the North, m, [..., 3].
-
-    Returns:
-        Gravitation, m/s^2, [..., 3].
+    Returns gravitation, m/s^2, [..., 3]. Shapes: position [..., 3].
     """
     radius = position.norm(dim=-1, keepdim=True)
     polar = 5.0 * (position[..., 2:] / radius) ** 2
@@ -294,14 +275,7 @@ def compute_gravity(position: Tensor) -> Tensor:
 
 
 def compute_unexplained_acceleration(table: pd.DataFrame) -> Tensor:
-    """Compute the acceleration of broadcast orbits that gravity does not explain.
-
-    Args:
-        table: Ephemerides with RINEX names, `sow` and `gm`, n rows.
-
-    Returns:
-        Largest difference within an hour of the time of ephemeris, m/s^2, [n].
-    """
+    """Compute the acceleration of broadcast orbits that gravity does not explain."""
     columns = dict.fromkeys([*CLOCK, *ORBIT, "sow", "gm"])
     eph = {c: torch.from_numpy(table[c].to_numpy(float, copy=True))[:, None, None] for c in columns}
     age = torch.tensor(_AGES, dtype=torch.float64)[:, None]
@@ -319,12 +293,7 @@ def compute_unexplained_acceleration(table: pd.DataFrame) -> Tensor:
 def describe_unexplained(table: pd.DataFrame, name: str) -> tuple[str, ...]:
     """Describe ephemerides whose orbit contradicts gravity.
 
-    Args:
-        table: Ephemerides with RINEX names, `name`, `sow` and `gm`.
-        name: Name of the file.
-
-    Returns:
-        One note, or none.
+    Returns one note, or none.
     """
     acceleration = compute_unexplained_acceleration(table).numpy()
     count = int((~(acceleration <= ACCELERATION_TOLERANCE)).sum())

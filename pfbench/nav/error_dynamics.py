@@ -55,14 +55,7 @@ def error_rate(
 ) -> Tensor:
     """Compute the exact time derivative of the errors, position in (rad, rad, m).
 
-    Args:
-        x: Errors, [..., 9].
-        nominal: INS output.
-        gyro: Gyro errors in body axes, [..., 3], rad/s. None means no errors.
-        accelerometer: Accelerometer errors in body axes, [..., 3], m/s^2. None means no errors.
-
-    Returns:
-        Derivative, [..., 9].
+    Returns derivative, [..., 9]. Shapes: x [..., 9], gyro [..., 3], accelerometer [..., 3].
     """
     alpha, dv, dp = x.split(3, dim=-1)
     dcm, v, pos, f = nominal
@@ -97,16 +90,8 @@ def propagate_error(
     Classical Runge-Kutta with the nominal quantities of mid-interval. The method is second order in
     the length of the interval, because the nominal is constant within it.
 
-    Args:
-        x: Errors at the start, [..., 9], position North, East, Up in m.
-        interval: Interval that broadcasts with x, for example
-            `map_inputs(lambda a: a[:, t, None], intervals)` for x [R, N, 9].
-        gyro: Gyro errors during the interval, body axes, [..., 3], rad/s.
-        accelerometer: Accelerometer errors, body axes, [..., 3], m/s^2.
-        passes: Runge-Kutta steps within the interval.
-
-    Returns:
-        Errors at the end, [..., 9].
+    Returns errors at the end, [..., 9]. Shapes: x [..., 9], interval [R, N, 9], gyro [..., 3],
+    accelerometer [..., 3].
     """
     nominal, step = mid_interval(interval), (interval.duration / passes).unsqueeze(-1)
 
@@ -128,12 +113,7 @@ def coupling_matrix(pos: Tensor, vel: Tensor) -> Tensor:
     Position is in (rad, rad, m). Blocks F12, F13, F22, F23, F32, F33 are set. The attitude columns
     F11 and F21 are 0, for models that treat attitude nonlinearly. `small_angle_matrix` fills them.
 
-    Args:
-        pos: Position, [..., 3], rad, rad, m.
-        vel: East, North, Up velocity, [..., 3], m/s.
-
-    Returns:
-        F, [..., 9, 9].
+    Returns f, [..., 9, 9]. Shapes: pos [..., 3], vel [..., 3].
     """
     lat, h = pos[..., 0], pos[..., 2]
     radius_m, radius_n = earth.radii(lat)
@@ -168,13 +148,7 @@ def small_angle_matrix(pos: Tensor, vel: Tensor, f: Tensor) -> Tensor:
     `coupling_matrix` with F11 = -skew(w_in) and F21 = skew(f). Position is in (rad, rad, m).
     Sensor errors in body axes enter with -C into attitude (gyros) and +C into velocity.
 
-    Args:
-        pos: Position, [..., 3], rad, rad, m.
-        vel: East, North, Up velocity, [..., 3], m/s.
-        f: Specific force in the INS level frame, [..., 3], m/s^2.
-
-    Returns:
-        F, [..., 9, 9].
+    Returns f, [..., 9, 9]. Shapes: pos [..., 3], vel [..., 3], f [..., 3].
     """
     matrix = coupling_matrix(pos, vel)
     w_in = earth.earth_rate(pos[..., 0]) + earth.transport_rate(pos[..., 0], pos[..., 2], vel)
@@ -188,13 +162,8 @@ def convert_transition_to_metres(transition: Tensor, pos_start: Tensor, pos_end:
     S_k Phi S_(k-1)^-1, with each scale at its end of the interval. Only rows and columns 6 to 8
     change, so the matrix may be larger than 9 x 9 (sensor states after the position).
 
-    Args:
-        transition: Transition matrix, [..., D, D], D >= 9.
-        pos_start: Nominal position at the start, [..., 3].
-        pos_end: Nominal position at the end, [..., 3].
-
-    Returns:
-        Matrix for position errors North, East, Up in m, [..., D, D].
+    Returns matrix for position errors North, East, Up in m, [..., D, D]. Shapes: transition
+    [..., D, D], pos_start [..., 3], pos_end [..., 3].
     """
     size = transition.shape[-1]
     before = _scale_position(torch.ones_like(transition[..., 0, :]), earth.metre_scale(pos_start))

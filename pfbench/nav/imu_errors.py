@@ -140,17 +140,7 @@ def add_imu_errors(
 ) -> ImuMeasurements:
     """Add sensor errors to ideal increments.
 
-    Args:
-        dtheta: Angle increments, [n, 3] or [R, n, 3], rad.
-        dv: Velocity increments, [n, 3] or [R, n, 3], m/s.
-        dt: Sampling interval, s.
-        errors: Error sizes.
-        draws: Random stream, labels "world.imu.*". It decides the runs R.
-        process: Factor on the variance of white noise and Gauss-Markov driving noise in each
-            sample, [n]. None is 1.
-
-    Returns:
-        Increments with errors, and the errors.
+    Returns increments with errors, and the errors. Shapes: dtheta [n, 3], dv [n, 3], process [n].
     """
     n = dtheta.shape[-2]
     scale = 1.0 if process is None else process.sqrt()[:, None]
@@ -200,17 +190,7 @@ def simulate_gauss_markov(
     x_k = e^(-dt/time) x_(k-1) + sigma sqrt(1 - e^(-2 dt/time)) N(0, 1), and x_0 has the
     stationary distribution.
 
-    Args:
-        label: Label of the random stream.
-        n: Number of samples.
-        sigma: Stationary standard deviation.
-        time: Correlation time, s.
-        dt: Sampling interval, s.
-        draws: Random stream.
-        scale: Factor on the driving noise, [n, 1].
-
-    Returns:
-        Processes, [R, n, 3].
+    Returns processes, [R, n, 3]. Shapes: scale [n, 1].
     """
     if sigma == 0:
         return torch.zeros_like(draws.normal(label, 1, 3)).expand(-1, n, 3)

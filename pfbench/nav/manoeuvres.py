@@ -43,9 +43,6 @@ class ManoeuvreSegment:
         heading: Change of heading (clockwise from North), rad.
         smooth: Whether the speed changes by the quintic too, without a step in acceleration.
             Otherwise it is linear in time.
-
-    Raises:
-        ValueError: If the duration is not positive.
     """
 
     duration_s: float
@@ -128,17 +125,7 @@ def generate_manoeuvres(
 ) -> TrajectoryData:
     """Fly segments in sequence.
 
-    Args:
-        segments: Manoeuvres (tuples of segments) and single segments, in order.
-        start: Initial position, speed and heading. The climb angle starts at 0.
-        rate: Samples per second.
-
-    Returns:
-        Truth and ideal increments, float64.
-
-    Raises:
-        ValueError: If `segments` is empty, a segment does not last a whole number of samples, or
-            the speed becomes negative.
+    Returns truth and ideal increments, float64.
     """
     plan = [
         s for item in segments for s in ([item] if isinstance(item, ManoeuvreSegment) else item)

@@ -147,13 +147,7 @@ def eccentric_anomaly(mean: Tensor, e: Tensor, passes: int = 8) -> tuple[Tensor,
 
     Exact to rounding for e below 0.5.
 
-    Args:
-        mean: Mean anomaly M, [...], rad.
-        e: Eccentricity, [...].
-        passes: Number of iterations.
-
-    Returns:
-        E and 1 - e cos E, [...] each.
+    Returns e and 1 - e cos E, [...] each. Shapes: mean [...], e [...].
     """
     anomaly = mean + e * torch.sin(mean)
     for _ in range(passes):
@@ -164,12 +158,7 @@ def eccentric_anomaly(mean: Tensor, e: Tensor, passes: int = 8) -> tuple[Tensor,
 def sagnac(satellite: Tensor, flight_time: Tensor) -> Tensor:
     """Rotate vectors from Earth-fixed axes of transmission to axes of reception.
 
-    Args:
-        satellite: Positions or velocities, [..., 3].
-        flight_time: Time of flight, [...], s.
-
-    Returns:
-        Rotated vectors, [..., 3].
+    Returns rotated vectors, [..., 3]. Shapes: satellite [..., 3], flight_time [...].
     """
     angle = GPS_OMEGA * flight_time
     s, c = torch.sin(angle), torch.cos(angle)
@@ -207,14 +196,7 @@ def receive_signals(
     The constellation is evaluated once, at a typical time of flight before reception. The
     satellites fall freely over the remaining 0.02 s. [ours]
 
-    Args:
-        constellation: Satellites.
-        time: Times of reception, [T], s.
-        receiver: Earth-fixed positions, [..., T, 3], m.
-        passes: Number of iterations for the time of flight.
-
-    Returns:
-        Signals.
+    Shapes: time [T], receiver [..., T, 3].
     """
     position, velocity = constellation.at(time - _TYPICAL_FLIGHT)
     acceleration = _fall(position, velocity)
@@ -237,12 +219,8 @@ def _fall(position: Tensor, velocity: Tensor) -> Tensor:
 def azimuth_elevation(receiver: Tensor, satellite: Tensor) -> tuple[Tensor, Tensor]:
     """Compute azimuth and elevation of satellites.
 
-    Args:
-        receiver: Latitude, longitude, height, [..., 3], rad, rad, m.
-        satellite: Earth-fixed positions, [..., S, 3], m.
-
-    Returns:
-        Azimuth, clockwise from North in [0, 2 pi), and elevation, [..., S] each, rad.
+    Returns azimuth, clockwise from North in [0, 2 pi), and elevation, [..., S] each, rad. Shapes:
+    receiver [..., 3], satellite [..., S, 3].
     """
     sight = satellite - earth.ecef(receiver).unsqueeze(-2)
     east, north, up = (sight @ earth.local_axes(receiver).mT).unbind(-1)
@@ -286,13 +264,8 @@ class SatelliteGeometry(NamedTuple):
         is e, the distance is r, and D is truth minus INS in position. Then the ranges differ by
         r s / (1 + sqrt(1 + s)) with s = (2 e.D + |D|^2 / r) / r.
 
-        Args:
-            dp: Position errors North, East, Up, [R, N, 3], m, INS minus truth, in metres at
-                the true position.
-            dv: Velocity errors East, North, Up, [R, N, 3], m/s.
-
-        Returns:
-            Differences of range and rate, [R, N, S] each, m and m/s.
+        Returns differences of range and rate, [R, N, S] each, m and m/s. Shapes: dp [R, N, 3], dv
+        [R, N, 3].
         """
         shift, shift1 = self._displacement(dp, dv)
         r, e, w = self.distance.unsqueeze(-1), self.line, self.closing
@@ -365,14 +338,7 @@ def predict_ranges(
 ) -> SatelliteGeometry:
     """Compute the ranging geometry at the INS. All arguments are float64.
 
-    Args:
-        pos: Positions, [..., 3], rad, rad, m.
-        vel: Velocities East, North, Up, [..., 3], m/s.
-        satellite: Earth-fixed positions of satellites, [..., S, 3], m.
-        satellite_vel: Earth-fixed velocities of satellites, [..., S, 3], m/s.
-
-    Returns:
-        Geometry.
+    Shapes: pos [..., 3], vel [..., 3], satellite [..., S, 3], satellite_vel [..., S, 3].
     """
     position, velocity = convert_to_earth_fixed(pos, vel)
     line = position.unsqueeze(-2) - satellite
@@ -395,11 +361,6 @@ def predict_ranges(
 def convert_to_earth_fixed(pos: Tensor, vel: Tensor) -> tuple[Tensor, Tensor]:
     """Convert position and velocity to Earth-fixed axes.
 
-    Args:
-        pos: Positions, [..., 3], rad, rad, m.
-        vel: Velocities East, North, Up, [..., 3], m/s.
-
-    Returns:
-        Position and velocity, [..., 3] each, m and m/s.
+    Returns position and velocity, [..., 3] each, m and m/s. Shapes: pos [..., 3], vel [..., 3].
     """
     return earth.ecef(pos), (earth.local_axes(pos).mT @ vel.unsqueeze(-1)).squeeze(-1)

@@ -71,16 +71,8 @@ def align(
 ) -> InsState:
     """Start an INS from the truth plus errors (INS minus truth), broadcast to R runs.
 
-    Args:
-        dcm: True attitude, [..., 3, 3].
-        vel: True velocity, [..., 3].
-        pos: True position, [..., 3].
-        alpha: Attitude error East, North, Up, [R, 3], rad: C_ins = C(alpha)^T C_true.
-        dvel: Velocity error East, North, Up, [R, 3], m/s.
-        dpos: Position error North, East, Up, [R, 3], m, in the order of (dL, dlam, dh).
-
-    Returns:
-        State of the INS.
+    Returns state of the INS. Shapes: dcm [..., 3, 3], vel [..., 3], pos [..., 3], alpha [R, 3],
+    dvel [R, 3], dpos [R, 3].
     """
     c = attitude.dcm_from_euler(alpha).transpose(-1, -2) @ dcm
     v, p = torch.broadcast_tensors(vel + dvel, pos + dpos / earth.metre_scale(pos))
@@ -99,21 +91,8 @@ def navigate(
 ) -> tuple[InsState, InsIntervals]:
     """Run the mechanisation over all samples.
 
-    Args:
-        ins: State at the start.
-        dtheta: Angle increments, body axes, [R, n, 3] (or [1, n, 3]), rad.
-        dv: Velocity increments, body axes, [R, n, 3] (or [1, n, 3]), m/s.
-        dt: Sampling interval in s: a number, or one per sample, [n] or [R, n]. Samples may be
-            unequal. Samples of zero duration and zero increment change nothing, so they can pad.
-        samples_per_interval: IMU samples in a filter interval, a divisor of n.
-        samples_per_step: 2, or 1, which uses the previous sample for coning and sculling.
-        tick: Called after each interval (for a progress bar).
-
-    Returns:
-        The state at the end, and the T = n / samples_per_interval intervals.
-
-    Raises:
-        ValueError: If the numbers of samples do not divide.
+    Returns the state at the end, and the T = n / samples_per_interval intervals. Shapes: dtheta
+    [R, n, 3], dv [R, n, 3], dt [n].
     """
     n, per_interval = dtheta.shape[-2], samples_per_interval
     _check_samples(n, dv.shape[-2], per_interval, samples_per_step)
@@ -265,15 +244,7 @@ def prepare_steps(
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     """Yield body rotation, velocity increment and spans of each step.
 
-    Args:
-        dtheta: Angle increments, [R or 1, n, 3], rad.
-        dv: Velocity increments, [R or 1, n, 3], m/s.
-        d: Sampling intervals, [R or 1, n], s.
-        per_step: Samples per step, 1 or 2.
-
-    Yields:
-        Body rotation, [3, 3, R], velocity increment in body axes at the start of the step,
-        [3, 1, R], and spans, [3, R]. The spans are half the duration, the duration, and its inverse.
+    Shapes: dtheta [R or 1, n, 3], dv [R or 1, n, 3], d [R or 1, n].
     """
     n = dtheta.shape[-2]
     for begin in range(0, n, _CHUNK * per_step):
@@ -304,15 +275,8 @@ def correct_coning_sculling(
     force in a body that turns at a constant rate gives f + w x f / 2 + w x (w x f) / 6 + ...
     Terms of the varying part are correct to second order.
 
-    Args:
-        dtheta: Angle increments, [R or 1, n, 3], rad.
-        dv: Velocity increments, [R or 1, n, 3], m/s.
-        d: Sampling intervals, [R or 1, n], s.
-        per_step: Samples per step, 1 or 2.
-        has_previous: Whether the first sample precedes the first step (one sample per step).
-
-    Returns:
-        Rotation vectors and velocity increments [R, s, 3], and durations [R or 1, s].
+    Returns rotation vectors and velocity increments [R, s, 3], and durations [R or 1, s]. Shapes:
+    dtheta [R or 1, n, 3], dv [R or 1, n, 3], d [R or 1, n].
     """
     if per_step == 2:
         w1, w2, f1, f2, d1, d2 = *_pair(dtheta, -2), *_pair(dv, -2), *_pair(d, -1)
@@ -383,15 +347,9 @@ def preintegrate(
     The force of a sample is rotated by the attitude at its middle, which is second order. Samples
     of zero duration change nothing and can pad intervals with fewer samples.
 
-    Args:
-        force: Measured specific force, body axes, [..., S, 3], m/s^2.
-        rate: Measured angular rate, [..., S, 3], rad/s.
-        spans: Durations, [..., S], s.
-        bias: Gyro and accelerometer bias to subtract, [..., 6].
-
-    Returns:
-        Rotation [..., 4], velocity and position increment [..., 3] and Jacobian [..., 9, 6], see
-        `PreintegratedImu`.
+    Returns rotation [..., 4], velocity and position increment [..., 3] and Jacobian [..., 9, 6],
+    see `PreintegratedImu`. Shapes: force [..., S, 3], rate [..., S, 3], spans [..., S], bias
+    [..., 6].
     """
     half_turn = (rate - bias[..., None, :3]) * (0.5 * spans.unsqueeze(-1))
     halves = attitude.dcm_from_rotation_vector(half_turn)
@@ -430,9 +388,7 @@ def right_jacobian(r: Tensor) -> Tensor:
 def rotate(q: Tensor, a: Tensor) -> Tensor:
     """Rotate vectors by unit quaternions.
 
-    Args:
-        q: Unit quaternions, [..., 4].
-        a: Vectors, [..., 3].
+    Shapes: q [..., 4], a [..., 3].
     """
     axis, a = torch.broadcast_tensors(q[..., 1:], a)
     twice = 2.0 * torch.linalg.cross(axis, a)

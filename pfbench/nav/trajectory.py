@@ -110,17 +110,7 @@ def integrate_motion(
 ) -> TrajectoryData:
     """Integrate a motion to a flight.
 
-    Args:
-        samples: Motion at the n + 1 samples.
-        nodes: Motion at n x 3 nodes, `NODES` of the interval from each sample to the next.
-        start: Initial position.
-        rate: Samples per second.
-
-    Returns:
-        Truth and ideal increments, float64.
-
-    Raises:
-        ValueError: If the speed is negative.
+    Returns truth and ideal increments, float64.
     """
     if samples.speed.min() < 0:
         raise ValueError(
@@ -228,15 +218,8 @@ def ideal_sensors(
 ) -> tuple[Tensor, Tensor]:
     """Compute the output of ideal gyros and accelerometers.
 
-    Args:
-        pos: Latitude, longitude, height, [..., 3], rad, rad, m.
-        vel: Velocity East, North, Up, [..., 3], m/s.
-        acceleration: Time derivative of the velocity components, [..., 3], m/s^2.
-        body_rate: Rate of the body relative to the level frame, body axes, [..., 3], rad/s.
-        to_body: Level to body, [..., 3, 3].
-
-    Returns:
-        Angular rate, rad/s, and specific force, m/s^2, in body axes, [..., 3] each.
+    Returns angular rate, rad/s, and specific force, m/s^2, in body axes, [..., 3] each. Shapes: pos
+    [..., 3], vel [..., 3], acceleration [..., 3], body_rate [..., 3], to_body [..., 3, 3].
     """
     lat, h = pos[..., 0], pos[..., 2]
     w_ie, w_en = earth.earth_rate(lat), earth.transport_rate(lat, h, vel)
@@ -291,11 +274,6 @@ class MotionSpline(TrajectorySource):
         use_full_log: Time, s. The flight is cut to a multiple of it.
         position_sd: Position errors of the record, m. Only the ratio to `velocity_sd` matters.
         velocity_sd: Velocity errors of the record, m/s.
-
-    Raises:
-        ValueError: If a size is not positive, the record has a gap that is too long for
-            `knot_interval_s`, or it is shorter than `use_full_log`. On `generate`, if
-            `use_full_log` is not a multiple of the sampling interval.
     """
 
     recorded: RecordedMotion

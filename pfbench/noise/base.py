@@ -78,12 +78,7 @@ def process_variance_factors(noise: NoiseRegime, time: Tensor) -> Tensor:
     A factor is the mean over the interval that ends at the time of the step. The first interval is
     as long as the second.
 
-    Args:
-        noise: Noise regime.
-        time: Times at the ends of the steps, [T], s.
-
-    Returns:
-        Factors, [T].
+    Returns factors, [T]. Shapes: time [T].
     """
     spans = torch.diff(time, prepend=2 * time[:1] - time[1:2]) if len(time) > 1 else time
     inside = 1.0 - (torch.arange(_SAMPLES, dtype=time.dtype) + 0.5) / _SAMPLES
@@ -97,12 +92,7 @@ def process_variance_factors(noise: NoiseRegime, time: Tensor) -> Tensor:
 def check_unit_process(noise: NoiseRegime, time: Tensor) -> None:
     """Check that a regime does not change process noise, for recorded motion.
 
-    Args:
-        noise: Noise regime.
-        time: Times, [T], s.
-
-    Raises:
-        ValueError: If the regime changes the process noise.
+    Shapes: time [T].
     """
     if bool((noise.process_factors(time) != 1.0).any()):
         raise ValueError(
@@ -112,15 +102,7 @@ def check_unit_process(noise: NoiseRegime, time: Tensor) -> None:
 
 
 def make_no_distribution_error(noise: str, reason: str) -> ValueError:
-    """Make the error of a regime without a distribution per step.
-
-    Args:
-        noise: Name of the regime.
-        reason: Explanation.
-
-    Returns:
-        The error.
-    """
+    """Make the error of a regime without a distribution per step."""
     return ValueError(
         f"oracle_noise must be false for noise={noise}, got true. Its errors do not have a "
         f"distribution per step, because {reason}. Set oracle_noise=false."
@@ -231,9 +213,6 @@ class _ContaminatedNoise(_UnitProcess):
         probability: Probability of a large error per epoch, or per component.
         sd_factor: Standard deviation of a large error in nominal standard deviations.
         joint: Whether all components of an epoch have large errors together, or each independently.
-
-    Raises:
-        ValueError: If `probability` is outside [0, 1], or `sd_factor` is below 1.
     """
 
     probability: float

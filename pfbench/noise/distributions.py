@@ -34,10 +34,6 @@ class MixtureDistribution(Distribution):
 
     Torch's mixture requires components of one family. A mixture of univariate distributions is
     univariate. A mixture of Independent ones draws all components of a vector from the same part.
-
-    Args:
-        weights: Weight of each component, broadcast against their batch. 0 omits a component.
-        components: Univariate or Independent distributions of equal shapes.
     """
 
     arg_constraints = {}  # noqa: RUF012
@@ -87,11 +83,6 @@ class ExponentiallyModifiedGaussian(Distribution):
 
     With s the standard deviation of the normal and m the mean `lag` of the exponential,
     log p(y) = s^2/(2 m^2) - (y - loc)/m - log m + log Phi((y - loc)/s - s/m) [Grushka 1972].
-
-    Args:
-        loc: Mean of the normal.
-        scale: Standard deviation of the normal.
-        lag: Mean of the exponential.
     """
 
     arg_constraints = {}  # noqa: RUF012
@@ -144,22 +135,13 @@ def make_student_t(dof: int) -> Family:
 def make_laplace(loc: Tensor, scale: Tensor) -> Distribution:
     """Build independent Laplace distributions.
 
-    Args:
-        loc: Centre, [..., Dy].
-        scale: Standard deviation, [..., Dy].
+    Shapes: loc [..., Dy], scale [..., Dy].
     """
     return Independent(_laplace(loc, scale), 1, validate_args=False)
 
 
 def contaminated_normal(probability: float, sd_factor: float, joint: bool, heavy: Family) -> Family:
-    """Return the family of a contaminated normal distribution.
-
-    Args:
-        probability: Probability of the heavy family.
-        sd_factor: Scale of the heavy family in normal scales.
-        joint: Whether all components are contaminated together, or each independently.
-        heavy: Heavy family.
-    """
+    """Return the family of a contaminated normal distribution."""
 
     def family(loc: Tensor, scale: Tensor) -> Distribution:
         parts = [make_normal(loc, scale), heavy(loc, sd_factor * scale)]
@@ -173,12 +155,7 @@ def contaminated_normal(probability: float, sd_factor: float, joint: bool, heavy
 
 
 def normal_plus_exponential(probability: Tensor, mean: float) -> Family:
-    """Return the family of a normal plus an exponential with some probability.
-
-    Args:
-        probability: Probability of the exponential in each component, [Dy].
-        mean: Mean of the exponential in scales of the normal.
-    """
+    """Return the family of a normal plus an exponential with some probability."""
 
     def family(loc: Tensor, scale: Tensor) -> Distribution:
         p = probability.to(loc)

@@ -23,15 +23,7 @@ Windows = Sequence[Sequence[float | None]]
 
 
 def check_windows(windows: Windows, span: float | None) -> None:
-    """Check windows and their reference duration.
-
-    Args:
-        windows: See Windows.
-        span: Duration of the record for which the windows are written, s, or None.
-
-    Raises:
-        ValueError: If a window ends before it starts, windows overlap, or `span` is not positive.
-    """
+    """Check windows and their reference duration."""
     last = -math.inf
     for window in windows:
         start, stop = window_edges(window)
@@ -56,17 +48,7 @@ def check_windows(windows: Windows, span: float | None) -> None:
 def window_index(windows: Windows, time: Tensor, span: float | None = None) -> Tensor:
     """Find the window of each time: int64 [T], -1 outside all windows.
 
-    Args:
-        windows: See Windows.
-        time: Times up to the end of the record, [T], s.
-        span: Duration for which the windows are written, s. They are stretched to the record. None
-            uses them unchanged.
-
-    Returns:
-        Index of the window, [T].
-
-    Raises:
-        ValueError: If a window begins after the end of the record.
+    Returns index of the window, [T]. Shapes: time [T].
     """
     end = float(time[-1])
     stretch = end / span if span else 1.0

@@ -87,15 +87,7 @@ class GaussianHmmLikelihood(MarginalLikelihood):
 def gaussian_hmm(model: StateSpaceModel, record: Record) -> GaussianHMM:
     """Build Pyro's GaussianHMM of a linear-Gaussian model over measurements [T, Dy].
 
-    Args:
-        model: Model, or models of `ModelBatch`.
-        record: Measurements; its shape is used.
-
-    Returns:
-        Distribution with batch [R].
-
-    Raises:
-        ValueError: If the model or the record is not supported, see `GaussianHmmLikelihood`.
+    Returns distribution with batch [R].
     """
     kind = type(model.model if isinstance(model, ModelBatch) else model).__name__
     gain = model.noise_gain(()) if model.linear else None
@@ -142,15 +134,6 @@ class PosteriorEstimator:
     """Estimator of log p(z) + log p(y | z) for chains z [C, Q, P].
 
     Q is the number of runs R if they have separate parameters, otherwise 1.
-
-    Args:
-        unknown: Model and prior.
-        method: Any filter.
-        record: Measurements and inputs of R runs.
-        chains: Number of chains C of each posterior.
-        seed: Seed of all random numbers.
-        separate_parameters: Whether each run has its own parameters.
-        rho: Correlation of the filter's random numbers between iterations.
     """
 
     def __init__(
@@ -175,12 +158,7 @@ class PosteriorEstimator:
     def __call__(self, z: Tensor, iteration: int) -> tuple[Tensor, CorrelatedStream | None]:
         """Estimate the log density, and return the random numbers if they are correlated.
 
-        Args:
-            z: Unconstrained parameters, [C, Q, P].
-            iteration: Number of the iteration, for the random stream.
-
-        Returns:
-            Log density [C, Q], and the correlated stream or None.
+        Returns log density [C, Q], and the correlated stream or None. Shapes: z [C, Q, P].
         """
         values, log_prior = self.unknown.constrained(z.flatten(0, 1))
         is_valid = self.unknown.in_support(values) & torch.isfinite(log_prior)
@@ -200,9 +178,7 @@ class PosteriorEstimator:
     def store_numbers(self, numbers: CorrelatedStream | None, is_accepted: Tensor) -> None:
         """Store the correlated random numbers of accepted chains.
 
-        Args:
-            numbers: Result of a call.
-            is_accepted: Mask of the chains, [C, Q].
+        Shapes: is_accepted [C, Q].
         """
         if numbers is not None:
             numbers.accept(is_accepted.flatten().repeat_interleave(self.runs_per_model))
@@ -210,14 +186,7 @@ class PosteriorEstimator:
     def draw_start(self, start: ParameterisedModel) -> tuple[Tensor, Tensor]:
         """Draw the starts of the chains, repeated while the filter is lost.
 
-        Args:
-            start: Model with the distributions of the starts.
-
-        Returns:
-            Unconstrained parameters [C, Q, P], and their log densities, [C, Q].
-
-        Raises:
-            ValueError: If the filter is lost for all starts of a chain.
+        Returns unconstrained parameters [C, Q, P], and their log densities, [C, Q].
         """
         log_p = torch.full(self.shape, -torch.inf, dtype=torch.float64)
         z = self._sample(start, 0)

@@ -23,14 +23,6 @@ class ModelBatch(ModelWrapper):
 
     Each method is mapped over the runs with the buffers in which the models differ. It works for
     every model that stores its parameters in buffers. Gradients reach the buffers.
-
-    Args:
-        models: Models of one class that differ in their buffers only.
-        runs_per_model: Number of consecutive runs that share a model.
-
-    Raises:
-        ValueError: If models differ in something other than a buffer, in their origin, or in their
-            noise distribution.
     """
 
     def __init__(self, models: Sequence[StateSpaceModel], runs_per_model: int = 1) -> None:
@@ -190,12 +182,7 @@ def _differing(models: Sequence[StateSpaceModel]) -> dict[str, Tensor]:
 def list_non_buffers(a: StateSpaceModel, b: StateSpaceModel) -> list[str]:
     """List attributes that differ between two models and are not buffers.
 
-    Args:
-        a: Model.
-        b: Model of the same class.
-
-    Returns:
-        Dotted names, attributes of submodules included.
+    Returns dotted names, attributes of submodules included.
     """
     changed = []
     for (path, module), (_, second) in zip(a.named_modules(), b.named_modules(), strict=True):

@@ -166,15 +166,7 @@ def _as_event(distribution: Prior) -> Distribution:
 
 
 def check_counts(algorithm: str, counts: Mapping[str, tuple[Any, int]]) -> None:
-    """Check whole numbers.
-
-    Args:
-        algorithm: Name of the algorithm, for the message.
-        counts: Value and least value by argument.
-
-    Raises:
-        ValueError: If a value is not a whole number, or is too small.
-    """
+    """Check whole numbers."""
     for name, (value, least) in counts.items():
         if isinstance(value, bool) or not isinstance(value, int) or value < least:
             raise ValueError(
@@ -184,15 +176,7 @@ def check_counts(algorithm: str, counts: Mapping[str, tuple[Any, int]]) -> None:
 
 
 def check_kinds(algorithm: str, values: Mapping[str, tuple[Any, Any]]) -> None:
-    """Check the classes of arguments.
-
-    Args:
-        algorithm: Name of the algorithm, for the message.
-        values: Value and class by argument.
-
-    Raises:
-        ValueError: If a value is of another class.
-    """
+    """Check the classes of arguments."""
     for name, (value, kind) in values.items():
         is_class = isinstance(value, type) and kind is not Callable
         if is_class or not isinstance(value, kind):
@@ -206,19 +190,7 @@ def check_kinds(algorithm: str, values: Mapping[str, tuple[Any, Any]]) -> None:
 def check_number(
     algorithm: str, name: str, value: Any, low: float, high: float, bounds: str
 ) -> None:
-    """Check a real number.
-
-    Args:
-        algorithm: Name of the algorithm, for the message.
-        name: Argument.
-        value: Its value.
-        low: Least value.
-        high: Largest value.
-        bounds: Brackets of the interval, such as `[)` without the largest value.
-
-    Raises:
-        ValueError: If the value is not a number of the interval.
-    """
+    """Check a real number."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     is_inside = is_number and math.isfinite(value) and low <= value <= high
     if is_inside and (value > low or bounds[0] == "[") and (value < high or bounds[1] == "]"):

@@ -189,12 +189,8 @@ class ParameterWalk(NamedTuple):
     def step(self, z: Tensor, stream: RandomStream) -> tuple[Tensor, Tensor]:
         """Propose a step of the random walk.
 
-        Args:
-            z: Unconstrained parameters of the chains, [C, Q, P].
-            stream: Random stream of the chains.
-
-        Returns:
-            Proposals [C, Q, P], and log q(z | new) - log q(new | z), [C, Q].
+        Returns proposals [C, Q, P], and log q(z | new) - log q(new | z), [C, Q]. Shapes: z
+        [C, Q, P].
         """
         e = stream.normal("pmmh.walk", 1, z.shape[-1]).view_as(z)
         root = torch.exp(self.log_size)[:, None, None] * self._root()
@@ -203,12 +199,7 @@ class ParameterWalk(NamedTuple):
     def leap(self, z: Tensor, stream: RandomStream) -> tuple[Tensor, Tensor]:
         """Propose from a t distribution with the learned moments, independently of z.
 
-        Args:
-            z: Unconstrained parameters of the chains, [C, Q, P].
-            stream: Random stream of the chains.
-
-        Returns:
-            Proposals [C, Q, P], and log q(z) - log q(new), [C, Q].
+        Returns proposals [C, Q, P], and log q(z) - log q(new), [C, Q]. Shapes: z [C, Q, P].
         """
         e, root = stream.normal("pmmh.leap", 1, z.shape[-1]).view_as(z), self._root()
         chi2 = stream.normal("pmmh.tail", 1, _DEGREES_OF_FREEDOM).square().mean(-1)
@@ -221,13 +212,7 @@ class ParameterWalk(NamedTuple):
     def adapt(self, z: Tensor, acceptance: Tensor | None, rate: float) -> ParameterWalk:
         """Update the moments by stochastic approximation.
 
-        Args:
-            z: Unconstrained parameters of the chains, [C, Q, P].
-            acceptance: Mean probability of acceptance of the step, [Q]. None after a leap.
-            rate: Weight of the update.
-
-        Returns:
-            The updated walk.
+        Returns the updated walk. Shapes: z [C, Q, P], acceptance [Q].
         """
         d = z - self.mean
         spread = (d.unsqueeze(-1) * d.unsqueeze(-2)).mean(0)

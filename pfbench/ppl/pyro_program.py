@@ -108,14 +108,7 @@ def compute_path(
 ) -> tuple[Tensor, Tensor]:
     """Compute states and log likelihoods from initial state and noise.
 
-    Args:
-        model: State-space model.
-        record: Measurements and inputs.
-        shift: Initial states in the chart about the start, [R, d].
-        w: Driving noise, [R, T, W].
-
-    Returns:
-        States, [R, T, D], and log p(y_t | x_t), [R, T].
+    Returns states, [R, T, D], and log p(y_t | x_t), [R, T]. Shapes: shift [R, d], w [R, T, W].
     """
     record = record.to(model.anchor)
     inputs = model.prepare(record).to(model.anchor)
@@ -298,12 +291,7 @@ class SwitchingNoise:
 def emission_distribution(record: Record, values: Values) -> Tensor:
     """Compute log densities of the errors under each regime.
 
-    Args:
-        record: Errors, y [R, T, Dy].
-        values: Parameters, [].
-
-    Returns:
-        Log densities, [R, T, 2]; 0 where all components are missing.
+    Returns log densities, [R, T, 2]; 0 where all components are missing. Shapes: record [R, T, Dy].
     """
     observed_mask = ~torch.isnan(record.y)
     ratios = torch.stack([torch.ones_like(values["ratio"]), values["ratio"]])

@@ -19,14 +19,7 @@ _CLOSE = 1.25  # ratio of times per step below which budgets count as equal: tim
 
 
 def format_budget(metadata: Sequence[Mapping[str, Any]]) -> str:
-    """Format the budget of compared jobs and its measured values as a table note.
-
-    Args:
-        metadata: Metadata of the jobs.
-
-    Raises:
-        ValueError: If the budget of a job is not in `store.BUDGETS`.
-    """
+    """Format the budget of compared jobs and its measured values as a table note."""
     kinds = list(dict.fromkeys(_budget_kind(meta) for meta in metadata))
     if len(kinds) > 1:
         return f"Budget: differs between jobs ({', '.join(kinds)})."

@@ -29,17 +29,7 @@ def write_datasheet(
 
     The target folder is `<out>/datasheets/<scenario>_<noise>/`.
 
-    Args:
-        file: File written by `pfbench datasheet`.
-        out: Folder of all reports.
-        formats: Formats of the figures, svg or png.
-
-    Returns:
-        Path of index.html.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        ValueError: If the file contains a job instead of a datasheet.
+    Returns path of index.html.
     """
     sheet = store.read_result(file)
     if "residual" not in sheet.data:

@@ -74,15 +74,7 @@ class MethodsFacts:
 
     @classmethod
     def from_entries(cls, entries: object, source: str = "methods") -> MethodsFacts:
-        """Restore the facts of a page.
-
-        Args:
-            entries: Values of `to_entries`.
-            source: Where they are stored, for the message of an error.
-
-        Raises:
-            ValueError: If a fact is missing.
-        """
+        """Restore the facts of a page."""
         stored = entries if isinstance(entries, Mapping) else {}
         names = [field.name for field in fields(cls)]
         if missing := [name for name in names if name not in stored]:
@@ -100,14 +92,7 @@ def collect_methods_facts(
     margin: float = 0.05,
     metric: str = "RMS error",
 ) -> MethodsFacts:
-    """Collect the facts of a methods paragraph from the results of a study.
-
-    Args:
-        conditions: Conditions of the study.
-        alpha: Level of the families of tests.
-        margin: Relative margin of equivalence.
-        metric: Name of the metric that decides.
-    """
+    """Collect the facts of a methods paragraph from the results of a study."""
     jobs = [job.meta for condition in conditions for job in condition.jobs]
     labels = [{job.label for job in condition.jobs} for condition in conditions]
     scenarios, regimes = (
@@ -174,14 +159,7 @@ _FEW_RUNS, _FEW_WORLDS = 10, 6
 def write_methods(pack: Pack) -> list[str]:
     """Write the methods paragraph of a study from the data of its page.
 
-    Args:
-        pack: Data of the page: the facts `methods`, the names of the filters and the decided pairs.
-
-    Returns:
-        Two paragraphs of plain text: what was done, and what was not done.
-
-    Raises:
-        ValueError: If a fact is missing.
+    Returns two paragraphs of plain text: what was done, and what was not done.
     """
     facts = MethodsFacts.from_entries(pack["methods"])
     names = {str(look["key"]): str(look["name"]) for look in pack["filters"]}

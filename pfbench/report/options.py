@@ -55,9 +55,6 @@ class ReportOptions:
         title: Title of the page; empty for the name of the study.
         baseline: Label of the filter that measures the others in the opening view; empty for the first of
             `baselines.REFERENCES` that has an error. Planned pairs do not depend on it.
-
-    Raises:
-        ValueError: If a value is out of range.
     """
 
     alpha: float = 0.05

@@ -49,11 +49,7 @@ def is_uncommitted(meta: Mapping[str, Any]) -> bool:
 
 
 def list_builds(metadata: Iterable[Mapping[str, Any]]) -> list[str]:
-    """List the builds of jobs, for people: commits, or digests of the sources without git.
-
-    Args:
-        metadata: Metadata of the jobs.
-    """
+    """List the builds of jobs, for people: commits, or digests of the sources without git."""
     builds = (
         _value_at(meta, "versions.commit") or _value_at(meta, "versions.build") for meta in metadata
     )
@@ -82,12 +78,7 @@ def list_shared_settings(conditions: Sequence[Condition]) -> list[tuple[str, str
 
 
 def compute_cost(conditions: Sequence[Condition], planned: int | None) -> list[tuple[str, str]]:
-    """Count the jobs and sum their time by phase.
-
-    Args:
-        conditions: Conditions of the study.
-        planned: Number of jobs of the experiment, if known.
-    """
+    """Count the jobs and sum their time by phase."""
     parts: Counter[str] = Counter()
     jobs = [job for cell in conditions for job in cell.jobs]
     for job in jobs:
@@ -173,51 +164,30 @@ SELF = "pfbench"
 
 
 def list_cited_keys(pack: Pack) -> list[str]:
-    """List the keys of the references of all filters, in their order.
-
-    Args:
-        pack: Data of the report.
-    """
+    """List the keys of the references of all filters, in their order."""
     keys = dict.fromkeys(str(look.get("cite") or "") for look in pack["filters"])
     return [key for key in keys if key in _entries()]
 
 
 def find_entries(keys: Iterable[str]) -> str:
-    """Return the BibTeX entries of keys; keys without an entry are left out.
-
-    Args:
-        keys: Keys of references.
-    """
+    """Return the BibTeX entries of keys; keys without an entry are left out."""
     entries = _entries()
     return "\n".join(entries[key] for key in dict.fromkeys(keys) if key in entries)
 
 
 def format_bibliography(pack: Pack, conditions: Sequence[Condition]) -> str:
-    """Format the BibTeX file of a study: pfbench itself, then the references of its filters.
-
-    Args:
-        pack: Data of the report.
-        conditions: Conditions of the study.
-    """
+    """Format the BibTeX file of a study: pfbench itself, then the references of its filters."""
     return f"{format_bibtex(conditions)}\n{find_entries(list_cited_keys(pack))}"
 
 
 def renew_bibliography(pack: Pack) -> str:
-    """Format the BibTeX file of stored data: its entry of pfbench, then the present references of the filters.
-
-    Args:
-        pack: Data of the report, with its BibTeX entries.
-    """
+    """Format the BibTeX file of stored data: its entry of pfbench, then the present references of the filters."""
     entry, end, _ = str(pack["bibtex"]).partition("\n}\n")
     return f"{entry}{end}\n{find_entries(list_cited_keys(pack))}"
 
 
 def cite(keys: Sequence[str]) -> str:
-    """Return the citation of keys, empty without one.
-
-    Args:
-        keys: Keys of references.
-    """
+    """Return the citation of keys, empty without one."""
     known_keys = [key for key in keys if key == SELF or key in _entries()]
     return rf"~\cite{{{','.join(known_keys)}}}" if known_keys else ""
 

@@ -278,12 +278,7 @@ def compute_spreads(
 def compute_deviation(data: dict[str, np.ndarray], indices: list[int]) -> np.ndarray:
     """Compute the standard deviation over runs of the norm of components.
 
-    Args:
-        data: Arrays of the datasheet.
-        indices: Indices of the components.
-
-    Returns:
-        Standard deviation, [T]. NaN where fewer than two runs have a truth.
+    Returns standard deviation, [T]. NaN where fewer than two runs have a truth.
     """
     square = (data["error"][..., indices].astype(np.float64) ** 2).sum(-1)
     count = (~np.isnan(square)).sum(0)
@@ -318,11 +313,7 @@ def select_tracks(track: np.ndarray) -> np.ndarray:
 def describe_raw_estimate(meta: Mapping[str, Any]) -> str:
     """Describe the error of the simplest estimate from raw measurements, and the threshold.
 
-    Args:
-        meta: Metadata of a datasheet.
-
-    Returns:
-        Sentences with the error, five times the error, and the divergence threshold in use.
+    Returns sentences with the error, five times the error, and the divergence threshold in use.
     """
     raw, group = meta["raw_estimate"], main_component_group(meta["state"])
     method = {0: "dead reckoning", 1: "least squares of one step"}.get(
@@ -349,12 +340,7 @@ Losses = Mapping[str, Sequence[float]]
 def write_training_figure(path: Path, losses: Losses) -> Path:
     """Write the figure of a training as SVG. Equal losses give equal bytes.
 
-    Args:
-        path: File, replaced if it exists.
-        losses: Values of each epoch by name: epoch, loss, validation, ess.
-
-    Returns:
-        The path.
+    Returns the path.
     """
     spec = FigureSpec(path.stem, "", lambda: plot_training(losses))
     content = draw_figure(spec, ("svg",))["svg"]
@@ -363,11 +349,7 @@ def write_training_figure(path: Path, losses: Losses) -> Path:
 
 
 def plot_training(losses: Losses) -> Figure:
-    """Plot the losses and the effective sample size over the epochs, without the latter if it is NaN.
-
-    Args:
-        losses: Values as in `write_training_figure`.
-    """
+    """Plot the losses and the effective sample size over the epochs, without the latter if it is NaN."""
     has_particles = np.isfinite(losses["ess"]).any()
     figure, (top, *others) = stacked_axes(2 if has_particles else 1, 1.5)
     epoch, validation = np.asarray(losses["epoch"]), np.asarray(losses["validation"])

@@ -72,18 +72,7 @@ def write_report(
     results give equal bytes. Files that an earlier report wrote are removed if this one does not write
     them and they are unchanged (manifest.json). Other files stay.
 
-    Args:
-        study: Name of the folder in `results`.
-        results: Folder of all studies.
-        out: Folder of all reports.
-        options: Options of the report.
-
-    Returns:
-        Path of index.html.
-
-    Raises:
-        FileNotFoundError: If results of the study are missing.
-        ValueError: If results cannot be compared, or a selected group or figure does not exist.
+    Returns path of index.html.
     """
     options = options or ReportOptions()
     conditions = load_conditions(study, results, allow_mixed_versions=options.allow_mixed_versions)
@@ -114,12 +103,7 @@ def write_report(
 def list_job_settings(conditions: Sequence[Condition], planned: int | None) -> list[list[str]]:
     """Describe budget, PCRB, cost and training of the jobs.
 
-    Args:
-        conditions: Conditions of the study.
-        planned: Number of jobs of the experiment, if known.
-
-    Returns:
-        Names and values, for the settings of the page.
+    Returns names and values, for the settings of the page.
     """
     budget = cost.format_budget([job.meta for condition in conditions for job in condition.jobs])
     rows = [("budget", budget.removeprefix("Budget: "))]
@@ -156,14 +140,7 @@ def write_study_files(
 ) -> list[dict[str, Any]]:
     """Write decisions.json, consistency.json, metrics.csv, and the times of `pfbench cost` if there are any.
 
-    Args:
-        table: Rows of `load_frame`.
-        conditions: Conditions of the study.
-        options: Options of the report.
-        folder: Folder of the report.
-
-    Returns:
-        Entries of the downloads of the page.
+    Returns entries of the downloads of the page.
     """
     mains = list_main_groups(conditions)
     names = set(mains.values())
@@ -190,11 +167,7 @@ def write_study_files(
 def list_figure_files(folder: Path) -> list[dict[str, Any]]:
     """List the files of figures of a report as downloads: the leaderboard, and figures of the papers.
 
-    Args:
-        folder: Folder of the report.
-
-    Returns:
-        Entries of the downloads of the page.
+    Returns entries of the downloads of the page.
     """
     files = [folder / HEADLINE, *sorted((folder / "figures").glob("paper_*.*"))]
     names = {HEADLINE: "Error relative to the baseline"}
@@ -216,14 +189,7 @@ def decide_study(
     options: ReportOptions,
     others: Mapping[str, pd.DataFrame] | None = None,
 ) -> list[Decision]:
-    """Decide planned pairs, the metrics of the second family, and the other pairs.
-
-    Args:
-        rows: Rows of `select_main_metrics`.
-        group: Name of the main group in these rows.
-        options: Options of the report.
-        others: Tables of `tidy_other_groups`, None for none.
-    """
+    """Decide planned pairs, the metrics of the second family, and the other pairs."""
     settings = options.decision_options
     rule, tidy = main_rule(options.metric, group), tidy_main(rows, options.metric, group)
     labels = sorted(tidy["filter"].unique(), key=natural_sort_key)
@@ -246,12 +212,8 @@ def decide_study(
 def summarise_metrics(table: pd.DataFrame) -> pd.DataFrame:
     """Summarise each metric and component of each filter over valid runs.
 
-    Args:
-        table: Rows of `load_frame`.
-
-    Returns:
-        A row per condition, filter, group, component and metric, with mean, root mean square and
-        quantiles over the valid runs. NaN without a value.
+    Returns a row per condition, filter, group, component and metric, with mean, root mean square
+    and quantiles over the valid runs. NaN without a value.
     """
     keys = list(_KEYS)
     valid = table["value"].where(~table["lost"] & np.isfinite(table["value"]))
@@ -285,13 +247,7 @@ def write_verdict_files(
 ) -> list[dict[str, Any]]:
     """Write verdicts.csv, runs.parquet and pfbench.bib.
 
-    Args:
-        pack: Data of the page, of `build_pack`.
-        table: Table of `build_run_table`.
-        folder: Folder of the report.
-
-    Returns:
-        Entries of the downloads of the page.
+    Returns entries of the downloads of the page.
     """
     buffer = io.BytesIO()
     table.to_parquet(buffer, index=False, compression="zstd")
@@ -308,11 +264,7 @@ def write_verdict_files(
 
 
 def format_verdicts(pack: Mapping[str, Any]) -> str:
-    """Format all rows of all views as CSV.
-
-    Args:
-        pack: Data of the page.
-    """
+    """Format all rows of all views as CSV."""
     rows = [
         {**dict(zip(ViewKey._fields, key, strict=True)), **row}
         for key, view in pack["views"].items()
@@ -374,15 +326,7 @@ def read_page_data(folder: Path) -> dict[str, Any]:
 
 
 def decide_again(pack: Mapping[str, Any], runs: Path) -> dict[str, Any]:
-    """Decide the parts of a page again from the runs of a study.
-
-    Args:
-        pack: Data of the page.
-        runs: File runs.parquet of the report.
-
-    Raises:
-        ValueError: If the file lacks runs of a filter of the page.
-    """
+    """Decide the parts of a page again from the runs of a study."""
     try:
         check_parquet(runs)
         table = pd.read_parquet(runs)

@@ -40,14 +40,7 @@ def render_template(
 ) -> Path:
     """Write a page as Markdown and HTML from templates.
 
-    Args:
-        template: Name of the templates without suffixes.
-        folder: Target folder.
-        context: Variables of the templates.
-        home: Folder of the templates.
-
-    Returns:
-        Path of the HTML page.
+    Returns path of the HTML page.
     """
     css = (_HERE / "style.css").read_text(encoding="utf-8")
     for kind, name in (("md", "report.md"), ("html", "index.html")):
@@ -60,13 +53,7 @@ def render_template(
 def write_json(folder: RecordedFolder, name: str, typed: Sequence[Any]) -> str:
     """Write dataclasses as JSON, compressed and with nine digits if there are thousands.
 
-    Args:
-        folder: Target folder.
-        name: File name without suffix.
-        typed: Dataclass instances.
-
-    Returns:
-        File name.
+    Returns file name.
     """
     many = len(typed) > _MANY
     rows = [to_json_types(asdict(row), 9 if many else None) for row in typed]
@@ -79,14 +66,7 @@ def write_json(folder: RecordedFolder, name: str, typed: Sequence[Any]) -> str:
 def render_figure(
     drawing: FigureSpec, prefix: str, folder: RecordedFolder, formats: Sequence[str]
 ) -> dict[str, Any]:
-    """Write the files of a figure and return its template variables.
-
-    Args:
-        drawing: Figure.
-        prefix: Prefix of the file names.
-        folder: Folder of the report.
-        formats: Formats of the figure.
-    """
+    """Write the files of a figure and return its template variables."""
     contents = draw_figure(drawing, formats)
     for suffix, content in contents.items():
         folder.write(f"figures/{prefix}_{drawing.name}.{suffix}", content)
@@ -102,26 +82,12 @@ def render_figure(
 def render_figures(
     drawings: Sequence[FigureSpec], prefix: str, folder: RecordedFolder, formats: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Write the files of figures and return their template variables.
-
-    Args:
-        drawings: Figures.
-        prefix: Prefix of the file names.
-        folder: Folder of the report.
-        formats: Formats of the figures.
-    """
+    """Write the files of figures and return their template variables."""
     return [render_figure(drawing, prefix, folder, formats) for drawing in drawings]
 
 
 def write_table(folder: RecordedFolder, name: str, table: pd.DataFrame, note: str = "") -> None:
-    """Write a table as CSV and LaTeX.
-
-    Args:
-        folder: Folder of the report.
-        name: File name without suffix.
-        table: Table.
-        note: Note below the LaTeX table and in the last column of the CSV file.
-    """
+    """Write a table as CSV and LaTeX."""
     text = format_csv(table.assign(note=note) if note else table)
     folder.write(f"tables/{name}.csv", text)
     folder.write(f"tables/{name}.tex", format_latex(table, note))
@@ -134,12 +100,7 @@ def _data_address(suffix: str, content: bytes) -> str:
 
 
 def to_json_types(value: Any, digits: int | None = None) -> Any:
-    """Convert a value to JSON types, with infinity as text.
-
-    Args:
-        value: Value, list or mapping.
-        digits: Number of significant digits, None for all.
-    """
+    """Convert a value to JSON types, with infinity as text."""
     if isinstance(value, Mapping):
         return {name: to_json_types(item, digits) for name, item in value.items()}
     if isinstance(value, list | tuple):
@@ -152,12 +113,7 @@ def to_json_types(value: Any, digits: int | None = None) -> Any:
 
 
 def template_environment(home: Path, *, is_html: bool) -> jinja2.Environment:
-    """Return the environment of templates of HTML or Markdown. Each value is escaped once.
-
-    Args:
-        home: Folder of the templates.
-        is_html: Whether pages are HTML.
-    """
+    """Return the environment of templates of HTML or Markdown. Each value is escaped once."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(home),
         autoescape=True,
@@ -235,12 +191,7 @@ def format_markdown(table: pd.DataFrame) -> str:
 
 
 def format_latex(table: pd.DataFrame, note: str = "") -> str:
-    """Format a table as a booktabs tabular.
-
-    Args:
-        table: Table.
-        note: Note below the last rule.
-    """
+    """Format a table as a booktabs tabular."""
     layout = "".join("r" if _is_number(table[name]) else "l" for name in table)
     rows = [
         [str(name) for name in table],

@@ -84,17 +84,7 @@ def load_conditions(
 
     Jobs that differ in their runs alone and continue each other are joined.
 
-    Args:
-        study: Name of the folder in `results`.
-        results: Folder of all studies.
-        allow_mixed_versions: Accept several versions, and several seeds, runs or lengths within a
-            condition.
-        keys: Keys of the jobs that are read, None for all.
-        same_data: Whether jobs with other settings of scenario or noise are conditions of their own,
-            such as "flight[gps_sd=2.0]". Otherwise these settings are part of the labels.
-
-    Returns:
-        Conditions sorted by scenario, noise and model.
+    Returns conditions sorted by scenario, noise and model.
     """
     files = sorted((Path(results) / study).glob("*.npz"))
     paths = [path for path in files if keys is None or path.stem in keys]
@@ -146,11 +136,7 @@ def _separate_data(
 
 
 def list_stored_studies(results: Path) -> list[str]:
-    """List the studies with results, without the folder of datasheets.
-
-    Args:
-        results: Folder of all studies.
-    """
+    """List the studies with results, without the folder of datasheets."""
     return sorted({path.parent.name for path in results.glob("*/*.npz")} - {DATASHEETS})
 
 
@@ -259,11 +245,7 @@ _LOCATION_SETTINGS = ("scenario.cache_dir", *DATA_FOLDERS)  # settings that do n
 def parse_label(label: str) -> tuple[str, dict[str, str]]:
     """Split a label into its name and its settings.
 
-    Args:
-        label: Label such as "sir" or "sir[particles=100]", or the name of a scenario with settings.
-
-    Returns:
-        Name, and values as text by setting.
+    Returns name, and values as text by setting.
     """
     name, _, text = label.partition("[")
     pairs = re.split(r",(?=[\w.]+=)", text.removesuffix("]")) if text else []
@@ -274,10 +256,6 @@ def make_distinct_label(meta: Mapping[str, Any], twins: Sequence[Mapping[str, An
     """Extend a label by the settings in which jobs of that label differ.
 
     Settings of the filter alone are used if they suffice.
-
-    Args:
-        meta: Metadata of a job.
-        twins: Metadata of all jobs of the same label in its condition.
     """
     if len(twins) == 1:
         return str(meta["label"])
@@ -291,11 +269,7 @@ def make_distinct_label(meta: Mapping[str, Any], twins: Sequence[Mapping[str, An
 
 
 def list_data_settings(metadata: Sequence[Mapping[str, Any]]) -> list[str]:
-    """List the settings of scenario and noise in which jobs of one filter differ.
-
-    Args:
-        metadata: Metadata of the jobs of a scenario, noise regime and model.
-    """
+    """List the settings of scenario and noise in which jobs of one filter differ."""
     by_label: dict[str, list[dict[str, Any]]] = {}
     for meta in metadata:
         config = {name: meta["config"].get(name) for name in _DATA_SETTINGS}
@@ -305,12 +279,7 @@ def list_data_settings(metadata: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def name_data(meta: Mapping[str, Any], settings: Sequence[str]) -> tuple[str, str]:
-    """Return the names of scenario and noise regime of a job, with settings of its data.
-
-    Args:
-        meta: Metadata of the job.
-        settings: Names of `list_data_settings`.
-    """
+    """Return the names of scenario and noise regime of a job, with settings of its data."""
     names = []
     for group in _DATA_SETTINGS:
         of_group = [name for name in settings if name.partition(".")[0] == group]
@@ -321,22 +290,13 @@ def name_data(meta: Mapping[str, Any], settings: Sequence[str]) -> tuple[str, st
 
 
 def list_differing(configs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """List the settings in which flat configurations differ, without locations.
-
-    Args:
-        configs: Configurations of `flatten_settings`.
-    """
+    """List the settings in which flat configurations differ, without locations."""
     names = sorted(set().union(*configs) - set(_LOCATION_SETTINGS))
     return [name for name in names if len({repr(config.get(name)) for config in configs}) > 1]
 
 
 def flatten_settings(config: Any, path: str = "") -> dict[str, Any]:
-    """Flatten a configuration to dotted names; stages of a filter are numbered.
-
-    Args:
-        config: Node of a configuration.
-        path: Name of the node, empty for the whole.
-    """
+    """Flatten a configuration to dotted names; stages of a filter are numbered."""
     if isinstance(config, list) and any(isinstance(stage, Mapping) for stage in config):
         config = dict(enumerate(config))
     if not isinstance(config, Mapping):

@@ -38,24 +38,6 @@ def load_frame(
     """Read all metrics of all runs of a study.
 
     Runs with the errors of another run are left out, as in a report, and a warning states them.
-
-    Args:
-        study: Name of the folder in `results`.
-        results: Folder of all studies.
-        start_time_s: Time before which steps are ignored, in seconds.
-        allow_mixed_versions: Accept several versions, and several seeds, runs or lengths within a
-            condition.
-        convergence_threshold: Bounds by group in displayed units. They add the metrics "converged",
-            in seconds, and "time_to_converge", the same as a share of the record and at most 1.
-
-    Returns:
-        Columns study, key, scenario, family, noise, model, filter, label, particles, seed, run, lost,
-        keeps_track, group, component, unit, metric, value, with the metrics of `metrics.METRICS`. A lost run has
-        infinite errors and scores, and NaN elsewhere.
-
-    Raises:
-        FileNotFoundError: If results of the study are missing. The message lists other studies.
-        ValueError: if files do not belong together. The message lists them.
     """
     conditions = load_conditions(study, results, allow_mixed_versions=allow_mixed_versions)
     rows = [
@@ -72,11 +54,7 @@ def load_frame(
 
 
 def list_main_groups(conditions: Sequence[Condition]) -> dict[tuple[str, str, str], str]:
-    """Return the main group by scenario, noise and model.
-
-    Args:
-        conditions: Conditions of the study.
-    """
+    """Return the main group by scenario, noise and model."""
     return {
         (c.scenario, c.noise, c.model): main_component_group(c.jobs[0].meta["state"]).group
         for c in conditions
@@ -84,27 +62,14 @@ def list_main_groups(conditions: Sequence[Condition]) -> dict[tuple[str, str, st
 
 
 def select_indices(size: int, most: int = 180) -> np.ndarray:
-    """Select at most `most` evenly spaced indices of `size`.
-
-    Args:
-        size: Number of elements.
-        most: Number of indices at most. A column of print is 250 points wide.
-    """
+    """Select at most `most` evenly spaced indices of `size`."""
     return np.unique(np.linspace(0, size - 1, min(size, most)).astype(int))
 
 
 def drop_before(result: store.JobResult, start_time_s: float) -> store.JobResult:
     """Remove the steps before a time.
 
-    Args:
-        result: Job.
-        start_time_s: Time of the first step retained, in seconds.
-
-    Returns:
-        The job without earlier steps.
-
-    Raises:
-        ValueError: if no step remains.
+    Returns the job without earlier steps.
     """
     time = result.data["time"]
     mask = time >= start_time_s
@@ -119,9 +84,7 @@ def drop_before(result: store.JobResult, start_time_s: float) -> store.JobResult
 def select_steps(result: store.JobResult, mask: np.ndarray) -> store.JobResult:
     """Select steps; scores without a selected step are removed.
 
-    Args:
-        result: Job.
-        mask: Mask of the selected steps, [T].
+    Shapes: mask [T].
     """
     if mask.all():
         return result
@@ -161,18 +124,7 @@ def to_long_rows(
     start_time_s: float,
     converged: Mapping[str, float],
 ) -> pd.DataFrame:
-    """Return the rows of one job; see `load_frame`.
-
-    Args:
-        condition: Condition of the job.
-        job: File of the job.
-        result: Arrays of the job.
-        start_time_s: Time before which steps are ignored, in seconds.
-        converged: Bounds by group in displayed units.
-
-    Returns:
-        The rows of the job.
-    """
+    """Return the rows of one job; see `load_frame`."""
     lost = result.data["lost"]
     scored = drop_before(result, start_time_s)
     keeps = status.keeps_track(scored.data, scored.meta)

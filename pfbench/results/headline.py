@@ -14,15 +14,7 @@ from pfbench.stats.error_measures import Array
 
 
 def main_rmse(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> float:
-    """Compute the RMSE of the main group over all valid runs.
-
-    Args:
-        outputs: Arrays of a result.
-        meta: Metadata of the result.
-
-    Returns:
-        RMSE in the displayed unit; infinite if no run is valid.
-    """
+    """Compute the RMSE of the main group over all valid runs."""
     group = main_component_group(meta["state"])
     errors = group.scale * outputs["error"][..., group.places].astype(float)
     square = (errors**2).sum(-1)[~np.asarray(outputs["lost"], dtype=bool)]
@@ -42,12 +34,7 @@ HINTS = {
 def describe_runs(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> str:
     """Describe error and status of the runs, such as "position RMSE 833 m; 100 of 100 runs diverged".
 
-    Args:
-        outputs: Arrays of a result.
-        meta: Metadata of the result.
-
-    Returns:
-        Magnitude with unit, counts of `status.count_statuses`, and the threshold.
+    Returns magnitude with unit, counts of `status.count_statuses`, and the threshold.
     """
     group = main_component_group(meta["state"])
     count = status.count_statuses(outputs, meta)

@@ -30,13 +30,7 @@ class OlderResult(NamedTuple):
 
 
 def list_changed(before: Inputs, after: Inputs, groups: Sequence[str] = ()) -> list[str]:
-    """List the inputs of two jobs whose content differs, or that one of them lacks, for people.
-
-    Args:
-        before: Inputs of one job.
-        after: Inputs of the other job.
-        groups: Groups of the configuration. Empty for all.
-    """
+    """List the inputs of two jobs whose content differs, or that one of them lacks, for people."""
     groups = groups or tuple({**before, **after})
     old, new = _flatten(before, groups), _flatten(after, groups)
     differing = [key for key in {**old, **new} if old.get(key) != new.get(key)]
@@ -49,11 +43,7 @@ def select_newest_inputs(items: Sequence[Item]) -> tuple[list[Item], list[OlderR
     For each name the digest of the result that was computed last counts. Of two results of one job
     with other inputs of the filter, such as its code, the later one counts.
 
-    Args:
-        items: Files and metadata of the results of a study.
-
-    Returns:
-        The results that are compared, and the others of jobs that were not run again since.
+    Returns the results that are compared, and the others of jobs that were not run again since.
     """
     if not any(meta.get("inputs") for _, meta in items):
         return list(items), []
@@ -83,11 +73,7 @@ def select_newest_inputs(items: Sequence[Item]) -> tuple[list[Item], list[OlderR
 
 
 def describe_older(older: Sequence[OlderResult]) -> str:
-    """State in one line which results are not compared, and why; empty if there are none.
-
-    Args:
-        older: Results that are not compared.
-    """
+    """State in one line which results are not compared, and why; empty if there are none."""
     if not older:
         return ""
     changed = list(dict.fromkeys(name for result in older for name in result.changed))

@@ -30,12 +30,8 @@ Part = tuple[Path, dict[str, Any]]
 def find_consecutive_parts(items: Sequence[Part]) -> list[list[Part]]:
     """Group the jobs that differ in their runs alone and continue each other.
 
-    Args:
-        items: Files and metadata of jobs.
-
-    Returns:
-        Groups in the order of their first job, each sorted by its first run. A job that has a gap
-        or an overlap with its neighbours is a group of its own.
+    Returns groups in the order of their first job, each sorted by its first run. A job that has a
+    gap or an overlap with its neighbours is a group of its own.
     """
     groups: dict[str, list[Part]] = {}
     for path, meta in items:
@@ -53,11 +49,7 @@ def find_consecutive_parts(items: Sequence[Part]) -> list[list[Part]]:
 def join_metadata(metadata: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Join the metadata of consecutive parts: sums of runs and times, maximum of memory.
 
-    Args:
-        metadata: Metadata of the parts, by first run.
-
-    Returns:
-        Metadata of all runs. Other entries are those of the first piece.
+    Returns metadata of all runs. Other entries are those of the first piece.
     """
     first, shares = metadata[0], _shares(metadata)
     if len(metadata) == 1:
@@ -92,12 +84,7 @@ def join_arrays(
 ) -> dict[str, np.ndarray]:
     """Join the arrays of consecutive parts along the axis of runs.
 
-    Args:
-        outputs: Arrays of the parts, see `store.JobResult`. An array that a part lacks is left out.
-        metadata: Metadata of the parts.
-
-    Returns:
-        Arrays of all runs. A PCRB of the parts becomes its root mean square.
+    Returns arrays of all runs. A PCRB of the parts becomes its root mean square.
     """
     if len(outputs) == 1:
         return dict(outputs[0])
@@ -118,12 +105,7 @@ def join_arrays(
 def select_run(result: store.JobResult, index: int) -> store.JobResult:
     """Select one run of a result.
 
-    Args:
-        result: Result.
-        index: Index of the run on the axis of runs.
-
-    Returns:
-        The same metadata, and arrays whose axis of runs has length 1.
+    Returns the same metadata, and arrays whose axis of runs has length 1.
     """
     data = {
         name: array if name in _SHARED else array[index : index + 1]
@@ -133,17 +115,7 @@ def select_run(result: store.JobResult, index: int) -> store.JobResult:
 
 
 def read_joined(paths: Sequence[Path]) -> store.JobResult:
-    """Read the parts of a job that were computed one after the other.
-
-    Args:
-        paths: Files by first run.
-
-    Returns:
-        All runs as one result.
-
-    Raises:
-        ValueError: if a file cannot be read, or the parts do not have the same times.
-    """
+    """Read the parts of a job that were computed one after the other."""
     parts = [store.read_result(path) for path in paths]
     first = parts[0]
     for path, piece in zip(paths, parts, strict=True):

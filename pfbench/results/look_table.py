@@ -53,22 +53,7 @@ def read_look_table(
     list_pairs: Callable[[Collection[str]], list[tuple[str, str]]],
     metric: LookMetric | None = None,
 ) -> LookTable:
-    """Read the main metric of the jobs of a look.
-
-    Args:
-        study: Name of the study.
-        results: Folder of all studies.
-        keys: Keys of all jobs until the look.
-        list_pairs: Function that lists the planned pairs of labels.
-        metric: Metric that decides, None for the root mean square error of all steps.
-
-    Returns:
-        The table and its pairs.
-
-    Raises:
-        FileNotFoundError: if no result exists.
-        ValueError: if results do not belong together, or lack the metric.
-    """
+    """Read the main metric of the jobs of a look."""
     metric = metric or LookMetric()
     conditions = load_conditions(study, results, keys=keys)
     table = pd.concat(

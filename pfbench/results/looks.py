@@ -99,13 +99,6 @@ def find_looks(
 
     Labels of one method with different settings share colour and differ in marker. A label without
     a node `paper` has its label as name, the grey of its family, and the next free marker.
-
-    Args:
-        labels: Labels such as "sir" or "sir[particles=100]".
-        blocks: Nodes `paper` that results store, by label, for methods that are not installed.
-
-    Returns:
-        Looks by label, in the order of the labels.
     """
     looks = {}
     settings = name_settings(labels)
@@ -120,11 +113,7 @@ def find_looks(
 
 
 def study_looks(conditions: Sequence[Condition]) -> dict[str, MethodLook]:
-    """Return the looks of all filters of a study, also of a user's own filters.
-
-    Args:
-        conditions: Conditions of the study.
-    """
+    """Return the looks of all filters of a study, also of a user's own filters."""
     blocks: dict[str, Mapping[str, Any]] = {}
     worlds: dict[str, dict[str, None]] = {}  # distinct, in the order of the conditions
     foreign: dict[str, dict[str, None]] = {}
@@ -145,24 +134,13 @@ def study_looks(conditions: Sequence[Condition]) -> dict[str, MethodLook]:
 
 
 def find_stored_world(look: Mapping[str, Any], scenarios: Collection[str]) -> str:
-    """Return the words for another world on which a filter of a stored page was tuned, else empty.
-
-    Args:
-        look: Look of the filter. An early page does not state the world, which then follows from the data.
-        scenarios: Keys of the scenarios of the page.
-    """
+    """Return the words for another world on which a filter of a stored page was tuned, else empty."""
     worlds = (find_foreign_world(look["tuning"], parse_label(key)[0]) for key in scenarios)
     return str(look.get("tuned_on", next(filter(None, worlds), "")))
 
 
 def add_tuning(look: MethodLook, data: str, foreign: str) -> MethodLook:
-    """Return the look of a tuned filter with the data of its tuning and the name of another world.
-
-    Args:
-        look: Look of a filter.
-        data: Data of its tuning, empty for the installed words.
-        foreign: Words for the world if it is not that of all conditions, else empty.
-    """
+    """Return the look of a tuned filter with the data of its tuning and the name of another world."""
     look = replace(look, tuning=data or look.tuning, tuned_on=foreign)
     if not foreign:
         return look
@@ -171,15 +149,7 @@ def add_tuning(look: MethodLook, data: str, foreign: str) -> MethodLook:
 
 
 def study_part_names(conditions: Sequence[Condition], group: str) -> dict[str, PartName]:
-    """Return the names of the scenarios or regimes of a study.
-
-    Args:
-        conditions: Conditions of the study.
-        group: "scenario" or "noise".
-
-    Returns:
-        Names by key, in the order of the conditions.
-    """
+    """Return the names of the scenarios or regimes of a study."""
     names = {}
     keys = [c.scenario if group == "scenario" else c.noise for c in conditions]
     settings = name_settings(keys)
@@ -205,11 +175,7 @@ def _add_text(name: str, text: str | None) -> str:
 
 
 def plan_look_pairs(looks: Mapping[str, MethodLook]) -> list[tuple[str, str]]:
-    """List the planned pairs of a study.
-
-    Args:
-        looks: Looks by label.
-    """
+    """List the planned pairs of a study."""
     methods = {parse_label(key)[0]: look for key, look in looks.items()}
     tuned = sorted(key for key, look in methods.items() if look.tuning and not look.proposed)
     return list_planned_pairs(looks, {key: look.baselines for key, look in methods.items()}, tuned)
@@ -288,12 +254,8 @@ def _separate_markers(looks: Mapping[str, MethodLook]) -> dict[str, MethodLook]:
 def name_settings(labels: Sequence[str]) -> dict[str, str]:
     """Write the settings of labels in words.
 
-    Args:
-        labels: Labels such as "sir" or "sir[particles=100]".
-
-    Returns:
-        Text by label, for labels with settings. It has the values alone if all labels have one common
-        setting with several numbers or texts. Else it is like "max ratio = 1000, stages = 2".
+    Returns text by label, for labels with settings. It has the values alone if all labels have one
+    common setting with several numbers or texts. Else it is like "max ratio = 1000, stages = 2".
     """
     settings = {label: _split(label) for label in labels if "[" in label}
     if _find_common_name(settings.values()):
@@ -305,21 +267,13 @@ def name_settings(labels: Sequence[str]) -> dict[str, str]:
 
 
 def describe_settings(labels: Sequence[str]) -> str:
-    """Say what the values in brackets are where names show values alone; else empty.
-
-    Args:
-        labels: Labels of all filters.
-    """
+    """Say what the values in brackets are where names show values alone; else empty."""
     name = _find_common_name([_split(label) for label in labels if "[" in label])
     return f"In brackets: {name}." if name else ""
 
 
 def describe_data_settings(names: Iterable[str]) -> str:
-    """Say in which settings of their data scenarios or noise regimes differ; else empty.
-
-    Args:
-        names: Keys of scenarios and noise regimes.
-    """
+    """Say in which settings of their data scenarios or noise regimes differ; else empty."""
     settings = dict.fromkeys(key for name in names for key, _ in _split(name))
     if not settings:
         return ""
@@ -363,12 +317,7 @@ def count_tuned(looks: Mapping[str, MethodLook]) -> dict[str, int]:
 
 
 def describe_tuning(tuned: Mapping[str, int], filters: int) -> str:
-    """Say how many filters have tuned parameters, and on which data; empty if none has.
-
-    Args:
-        tuned: Numbers of tuned filters, by the data on which they were tuned.
-        filters: Number of all filters.
-    """
+    """Say how many filters have tuned parameters, and on which data; empty if none has."""
     return " ".join(
         f"Parameters of {number} of {filters} filters were tuned on {data}."
         for data, number in tuned.items()
@@ -376,11 +325,7 @@ def describe_tuning(tuned: Mapping[str, int], filters: int) -> str:
 
 
 def describe_foreign_knobs(worlds: Collection[str]) -> str:
-    """Say that tuned filters of a page were tuned on other worlds; empty if none was.
-
-    Args:
-        worlds: Words for the other world of each filter, empty for one that was not tuned on another.
-    """
+    """Say that tuned filters of a page were tuned on other worlds; empty if none was."""
     names = sorted({world for world in worlds if world})
     number = sum(bool(world) for world in worlds)
     return (

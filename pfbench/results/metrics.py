@@ -84,12 +84,7 @@ def mean_trace(result: store.JobResult, name: str) -> Array:
     Ancestors and unique particles are counted where a run was resampled. Without moves their
     numbers are equal.
 
-    Args:
-        result: Job.
-        name: Name of the trace.
-
-    Returns:
-        Mean of each run, [R]; NaN without the trace.
+    Returns mean of each run, [R]; NaN without the trace.
     """
     data, lost, particles = result.data, result.data["lost"], result.meta.get("particles")
     is_count = name in _PARTICLE_COUNTS
@@ -153,12 +148,7 @@ def compute_energy_score(data: MetricInput) -> ByComponent:
 
 
 def compute_interval_coverage(data: MetricInput, level: int) -> ByComponent:
-    """Compute the coverage of a central interval.
-
-    Args:
-        data: Data of a group.
-        level: Probability of the interval, percent.
-    """
+    """Compute the coverage of a central interval."""
     if "pit" not in data.result.data or data.group is None:
         return {}
     pit = data.result.data["pit"][..., data.group.places]
@@ -238,12 +228,7 @@ def _has_evidence(result: store.JobResult, of_counts: bool) -> bool:
 def count_trace(result: store.JobResult, name: str) -> Array:
     """Sum a trace of counts over time.
 
-    Args:
-        result: Job.
-        name: Name of the trace.
-
-    Returns:
-        Sum of each run, [R]; NaN for lost runs, and without the trace.
+    Returns sum of each run, [R]; NaN for lost runs, and without the trace.
     """
     lost, trace = result.data["lost"], result.data.get(name)
     if trace is None:
@@ -318,12 +303,7 @@ class Metric:
 def compute_metric(name: str, data: MetricInput) -> ByComponent:
     """Compute one metric of the table.
 
-    Args:
-        name: Name of the metric.
-        data: Data of the job.
-
-    Returns:
-        Values [R] by component.
+    Returns values [R] by component.
     """
     return {metric.name: metric for metric in METRICS}[name].compute(data)
 
@@ -334,15 +314,7 @@ def scored_arrays() -> tuple[str, ...]:
 
 
 def table_columns(result: store.JobResult, group: ComponentGroup) -> dict[str, float]:
-    """Compute the columns that metrics of a group add to a table, averaged over valid runs.
-
-    Args:
-        result: Job.
-        group: Group.
-
-    Returns:
-        Values by column head, without metrics of missing data.
-    """
+    """Compute the columns that metrics of a group add to a table, averaged over valid runs."""
     data = MetricInput(result, group, group.state_group)
     columns = {}
     for metric in METRICS:
@@ -464,12 +436,7 @@ METRICS: tuple[Metric, ...] = (
 def data_by_scope(result: store.JobResult, scope: MetricScope) -> list[MetricInput]:
     """List the inputs of a scope: one per group, or one for the job.
 
-    Args:
-        result: Job.
-        scope: "components", "group" or "job".
-
-    Returns:
-        Inputs in the order of the state.
+    Returns inputs in the order of the state.
     """
     state = result.meta["state"]
     if scope == "components":

@@ -43,14 +43,7 @@ _KEYS = {
 
 
 def check_paper_blocks(values: Mapping[str, Any]) -> None:
-    """Check the nodes `paper` of a configuration.
-
-    Args:
-        values: Resolved configuration.
-
-    Raises:
-        ValueError: If a key is unknown or a value does not fit.
-    """
+    """Check the nodes `paper` of a configuration."""
     for group in PARTS:
         node = values.get(group)
         block = node.get(PAPER) if isinstance(node, Mapping) else None
@@ -65,11 +58,7 @@ def check_paper_blocks(values: Mapping[str, Any]) -> None:
 def remove_nested_blocks(values: Mapping[str, Any]) -> dict[str, Any]:
     """Remove the nodes `paper` of parts that other parts contain, such as a guide filter.
 
-    Args:
-        values: Resolved configuration.
-
-    Returns:
-        Configuration with the nodes of scenario, noise and filter themselves only.
+    Returns configuration with the nodes of scenario, noise and filter themselves only.
     """
     return {
         key: {k: v if k == PAPER else remove_all_blocks(v) for k, v in node.items()}
@@ -82,11 +71,7 @@ def remove_nested_blocks(values: Mapping[str, Any]) -> dict[str, Any]:
 def remove_all_blocks(node: Any) -> Any:
     """Remove all nodes `paper` from a part, those of parts inside it included.
 
-    Args:
-        node: Part of a resolved configuration.
-
-    Returns:
-        The part without these nodes.
+    Returns the part without these nodes.
     """
     if isinstance(node, list):
         return [remove_all_blocks(item) for item in node]
@@ -155,12 +140,7 @@ _MARK = re.compile(r" \(tuned(?: on ([^()]*))?\)")
 
 
 def add_world(name: str, world: str) -> str:
-    """Return the name of a tuned filter with the world of its tuning.
-
-    Args:
-        name: Name such as "Gated EKF (tuned)".
-        world: Words for the world.
-    """
+    """Return the name of a tuned filter with the world of its tuning."""
     settings = _MARK.search(name)
     tail = name[settings.end() :] if settings else ""
     head = name[: settings.start()] if settings else name
@@ -168,32 +148,18 @@ def add_world(name: str, world: str) -> str:
 
 
 def read_world(name: str) -> str:
-    """Return the words for the world in the name of a filter, empty for one without.
-
-    Args:
-        name: Name, as `add_world` makes it.
-    """
+    """Return the words for the world in the name of a filter, empty for one without."""
     stated = _MARK.search(name)
     return (stated[1] or "") if stated else ""
 
 
 def list_tuned_worlds(data: str) -> dict[str, str]:
-    """List the worlds that the data of a tuning state: models by scenario.
-
-    Args:
-        data: Data of a tuning, as a result stores them; several are separated by commas.
-    """
+    """List the worlds that the data of a tuning state: models by scenario."""
     return dict(_DATA.findall(data))
 
 
 def find_foreign_world(data: str, scenario: str, model: str = "") -> str:
-    """Return the words for the world of a tuning, empty if it is that of the job or not stated.
-
-    Args:
-        data: Data of the tuning, as a result stores them.
-        scenario: Scenario of the job.
-        model: Model of the job, empty if it is not known.
-    """
+    """Return the words for the world of a tuning, empty if it is that of the job or not stated."""
     stated = list_tuned_worlds(data)
     if not stated or (scenario in stated and model in ("", stated[scenario])):
         return ""
@@ -202,22 +168,13 @@ def find_foreign_world(data: str, scenario: str, model: str = "") -> str:
 
 
 def name_world(world: Mapping[str, Any], choices: Mapping[str, str]) -> str:
-    """Name the world of a tuning; its model only where the scenario is the same.
-
-    Args:
-        world: World of the tuning, as its file states it.
-        choices: Names of the chosen files of the job by group.
-    """
+    """Name the world of a tuning; its model only where the scenario is the same."""
     scenario, model = world.get("scenario", ""), world.get("model", "another model")
     return f"{scenario} with {model}" if scenario == choices.get("scenario") else f"{scenario}"
 
 
 def describe_foreign(values: Mapping[str, Any]) -> str:
-    """Return " (tuned on WORLD)" for a filter with the knobs of another world; empty for another filter.
-
-    Args:
-        values: Resolved configuration of a job.
-    """
+    """Return " (tuned on WORLD)" for a filter with the knobs of another world; empty for another filter."""
     words = _MARK.search((values["filter"].get(PAPER) or {}).get("name", ""))
     return f" (tuned on {words[1]})" if words and words[1] else ""
 
@@ -232,15 +189,7 @@ _NODE = re.compile(rf"^{PAPER}:.*\n(?:[ \t]+.*\n?|[ \t]*\n)*", re.MULTILINE)
 
 @cache
 def read_paper_block(group: str, name: str) -> Mapping[str, Any]:
-    """Read the node `paper` of an installed file; a variant does not inherit that of its parent.
-
-    Args:
-        group: Group of the configuration: scenario, noise or filter.
-        name: Name of the file without suffix.
-
-    Returns:
-        The node, empty without a file or without a node.
-    """
+    """Read the node `paper` of an installed file; a variant does not inherit that of its parent."""
     path = conf_dir() / group / f"{name}.yaml"
     if not _NAME.fullmatch(name) or not path.is_file():
         return {}
@@ -256,11 +205,7 @@ def list_named_parts(group: str) -> list[str]:
 
 
 def plan_installed_pairs(labels: Collection[str]) -> list[tuple[str, str]]:
-    """List the planned pairs of filters by the baselines that installed files state.
-
-    Args:
-        labels: Labels of filters.
-    """
+    """List the planned pairs of filters by the baselines that installed files state."""
     methods = {parse_label(label)[0] for label in labels}
     blocks = {method: read_paper_block("filter", method) for method in methods}
     tuned = sorted(method for method, block in blocks.items() if block.get("tuning"))
@@ -284,11 +229,7 @@ def experiments_dir() -> Path:
 
 
 def name_run_command(study: str) -> str:
-    """Return the command that runs the jobs of a study: its experiment, or words to complete.
-
-    Args:
-        study: Name of the study.
-    """
+    """Return the command that runs the jobs of a study: its experiment, or words to complete."""
     if (experiments_dir() / f"{study}.yaml").is_file():
         return f"pfbench run -m +experiment={study}"
     return f"pfbench run study={study} scenario=NAME noise=NAME filter=NAME"
@@ -320,16 +261,6 @@ def list_planned_pairs(
 
     Where a study varies a setting, the filters of a pair have the same value of it. A filter without
     the setting is compared with each value.
-
-    Args:
-        labels: Filters of the study, with their settings.
-        baselines: Baselines of the paper of each proposed method, by label without settings.
-        tuned: Tuned baselines, labels without settings.
-
-    Returns:
-        Proposed methods with each baseline of their paper, and with each tuned baseline. Without such
-        a pair: all pairs of at most five filters, or each filter with the first of `REFERENCES` that
-        the study has.
     """
     labels = sorted(set(labels), key=natural_sort_key)
     methods = {label: parse_label(label)[0] for label in labels}

@@ -190,12 +190,7 @@ def format_slug(text: str) -> str:
 def compute_run_quantiles(values: np.ndarray, q: Sequence[float]) -> np.ndarray:
     """Compute quantiles over runs.
 
-    Args:
-        values: Values, [R, T]. NaN marks a missing value.
-        q: Probabilities, n of them.
-
-    Returns:
-        Quantiles, [n, T]. NaN where all runs are missing.
+    Shapes: values [R, T].
     """
     result = np.full((len(q), values.shape[1]), np.nan)
     finite_mask = ~np.isnan(values)
@@ -222,14 +217,7 @@ _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 def use_log_if_wide(
     axis: Axes, side: Axis, values: Sequence[np.ndarray], narrow: bool = False
 ) -> None:
-    """Use a logarithmic scale if the values span more than a factor of 10.
-
-    Args:
-        axis: Panel.
-        side: Its x or y axis.
-        values: Plotted values, in arrays of any shape.
-        narrow: Whether space is short, so that fewer ticks are labelled.
-    """
+    """Use a logarithmic scale if the values span more than a factor of 10."""
     positive = _finite(values)
     positive = positive[positive > 0]
     if positive.size and np.quantile(positive, 0.995) > 10 * np.quantile(positive, 0.005):
@@ -238,13 +226,7 @@ def use_log_if_wide(
 
 
 def set_plain_ticks(side: Axis, values: Sequence[float] | np.ndarray, narrow: bool = False) -> None:
-    """Label a logarithmic axis with plain numbers.
-
-    Args:
-        side: Axis.
-        values: Values that the axis spans.
-        narrow: Place ticks at 1 and 3 instead of 1, 2 and 5, where space is short.
-    """
+    """Label a logarithmic axis with plain numbers."""
     positive = _finite([np.asarray(values)])
     positive = positive[positive > 0]
     span = positive.max() / positive.min() if positive.size else 1.0
@@ -324,15 +306,7 @@ class FigureSpec(NamedTuple):
 
 
 def draw_figure(drawing: FigureSpec, formats: Sequence[str]) -> dict[str, bytes]:
-    """Draw a figure in several formats. Equal figures give equal bytes.
-
-    Args:
-        drawing: Figure.
-        formats: File formats, svg or png.
-
-    Returns:
-        Content of the file of each format.
-    """
+    """Draw a figure in several formats. Equal figures give equal bytes."""
     with matplotlib.rc_context(RC):
         figure = drawing.make()
         engine = figure.get_layout_engine()

@@ -79,13 +79,7 @@ def is_diverged(error: Array, lost: Flags, threshold: float) -> Flags:
 def is_overconfident(nees: Array, dof: int, lost: Flags) -> Flags:
     """Return the valid runs [R] whose mean NEES exceeds the 0.999 quantile of its distribution.
 
-    Args:
-        nees: Normalised estimation error squared of one group, [R, T].
-        dof: Degrees of freedom of the group.
-        lost: Lost runs, [R].
-
-    Returns:
-        Mask, [R].
+    Returns mask, [R]. Shapes: nees [R, T], lost [R].
     """
     with np.errstate(over="ignore"):
         mean = finite_mean(np.asarray(nees, dtype=np.float64), axis=1)
@@ -99,14 +93,7 @@ def is_severely_overconfident(
 
     With factor 100 the error is ten of the filter's standard deviations on average over the run.
 
-    Args:
-        nees: Normalised estimation error squared, [R, T, G].
-        dofs: Degrees of freedom of each group, [G].
-        lost: Lost runs, [R].
-        factor: Multiple of the degrees of freedom.
-
-    Returns:
-        Mask, [R].
+    Returns mask, [R]. Shapes: nees [R, T, G], dofs [G], lost [R].
     """
     with np.errstate(over="ignore"):
         mean = finite_mean(np.asarray(nees, dtype=np.float64), axis=1)
@@ -121,15 +108,7 @@ def divergence_threshold(meta: Mapping[str, Any]) -> float | None:
 
 
 def scenario_family(meta: Mapping[str, Any], scenario: str) -> str:
-    """Return the family of a job's scenario: scenarios of one trajectory have one family.
-
-    Args:
-        meta: Metadata of a job.
-        scenario: Name of the scenario, used without its settings if it states no family.
-
-    Returns:
-        The name.
-    """
+    """Return the family of a job's scenario: scenarios of one trajectory have one family."""
     return str(_paper_block(meta).get("family") or scenario.partition("[")[0])
 
 
@@ -143,12 +122,7 @@ def _paper_block(meta: Mapping[str, Any]) -> Mapping[str, Any]:
 def keeps_track(data: Mapping[str, Array], meta: Mapping[str, Any]) -> Flags:
     """Return the runs [R] that are neither lost nor diverged.
 
-    Args:
-        data: Arrays of a result.
-        meta: Metadata of the result. Without a threshold, only lost runs do not keep track.
-
-    Returns:
-        Mask, [R].
+    Returns mask, [R].
     """
     lost = np.asarray(data["lost"], dtype=bool)
     threshold = divergence_threshold(meta)
@@ -161,12 +135,7 @@ def keeps_track(data: Mapping[str, Array], meta: Mapping[str, Any]) -> Flags:
 def count_statuses(data: Mapping[str, Array], meta: Mapping[str, Any]) -> StatusCounts:
     """Count the runs of a job by status.
 
-    Args:
-        data: Arrays of a result.
-        meta: Metadata of the result.
-
-    Returns:
-        The numbers of runs.
+    Returns the numbers of runs.
     """
     lost, groups = np.asarray(data["lost"], dtype=bool), meta["state"]["groups"]
     dofs = [len(components) for components in groups.values()]
@@ -222,11 +191,7 @@ def compute_whiteness(z: Array) -> WhitenessResult:
     Method of Bar-Shalom, Li, Kirubarajan 2001, section 5.4.2. Steps without a measurement in any
     run are left out, so that the autocorrelation is between successive measurements.
 
-    Args:
-        z: Normalised residuals, [R, T, K]; NaN without a measurement.
-
-    Returns:
-        Moments and their 95 % limits.
+    Returns moments and their 95 % limits. Shapes: z [R, T, K].
     """
     z = np.asarray(z, dtype=np.float64)
     values = z[~np.isnan(z)]
@@ -251,13 +216,7 @@ def compute_whiteness(z: Array) -> WhitenessResult:
 def coverage_per_run(pit: Array, lost: Flags, level: float) -> Array:
     """Compute the share of truths in the central interval of each run.
 
-    Args:
-        pit: Probability integral transform, [R, S, K]; NaN without truth.
-        lost: Lost runs, [R].
-        level: Probability of the interval, 0 to 1.
-
-    Returns:
-        Share, [R]; NaN for a lost run.
+    Returns share, [R]; NaN for a lost run. Shapes: pit [R, S, K], lost [R].
     """
     pit = np.asarray(pit, dtype=np.float64)
     # Stored in single precision: a truth on the limit counts as inside.

@@ -39,11 +39,7 @@ class StepTimes(NamedTuple):
 
     @classmethod
     def from_metadata(cls, meta: Mapping[str, Any]) -> StepTimes | None:
-        """Return the times in the metadata of a job, None if it was not measured in rounds.
-
-        Args:
-            meta: Metadata of the job.
-        """
+        """Return the times in the metadata of a job, None if it was not measured in rounds."""
         times = meta.get(STEP_TIME)
         return None if times is None else cls(np.array(times["rounds"]), times["group"])
 
@@ -62,12 +58,7 @@ class StepTimes(NamedTuple):
 def write_step_times(folder: Path, conditions: Mapping[str, Mapping[str, Any]]) -> Path:
     """Write the measurements of a study.
 
-    Args:
-        folder: Folder of the results of the study.
-        conditions: Measurements by key of the condition, see `measurement_key`.
-
-    Returns:
-        Path of the file.
+    Returns path of the file.
     """
     # in the types of JSON: the version of torch has a class of its own
     content = json.loads(json.dumps({"format": _FORMAT, "conditions": dict(conditions)}))
@@ -78,14 +69,7 @@ def write_step_times(folder: Path, conditions: Mapping[str, Mapping[str, Any]]) 
 
 
 def read_step_times(folder: Path) -> Conditions:
-    """Read the measurements of a study by key of the condition; empty without a file.
-
-    Args:
-        folder: Folder of the results of the study.
-
-    Raises:
-        ValueError: If the file is damaged.
-    """
+    """Read the measurements of a study by key of the condition; empty without a file."""
     path = folder / STEP_TIMES
     if not path.exists():
         return {}
@@ -107,30 +91,18 @@ def read_step_times(folder: Path) -> Conditions:
 
 
 def measurement_key(jobs: Sequence[tuple[str, str]]) -> str:
-    """Return the key of the measurement of a condition: it changes with its jobs and their version.
-
-    Args:
-        jobs: Key and commit of each job.
-    """
+    """Return the key of the measurement of a condition: it changes with its jobs and their version."""
     return hash_content(sorted(jobs))[:16]
 
 
 def read_commit(meta: Mapping[str, Any]) -> str:
-    """Return the commit of a job, or the digest of its sources without one; empty if not known.
-
-    Args:
-        meta: Metadata of the job.
-    """
+    """Return the commit of a job, or the digest of its sources without one; empty if not known."""
     versions = meta.get("versions", {})
     return str(versions.get("commit") or versions.get("build") or "")
 
 
 def select_job_times(conditions: Conditions) -> dict[tuple[str, str], StepTimes]:
-    """Return the times of each job by its key and its commit.
-
-    Args:
-        conditions: Measurements of `read_step_times`.
-    """
+    """Return the times of each job by its key and its commit."""
     return {
         (key, job["commit"]): StepTimes(np.array(job[entry["clock"]]), group)
         for group, entry in conditions.items()
@@ -141,15 +113,7 @@ def select_job_times(conditions: Conditions) -> dict[tuple[str, str], StepTimes]
 def add_step_times(
     items: Sequence[tuple[Path, dict[str, Any]]], folder: Path
 ) -> list[tuple[Path, dict[str, Any]]]:
-    """Add the times of `pfbench cost` to the metadata of the jobs that were measured.
-
-    Args:
-        items: Files and metadata of jobs.
-        folder: Folder of the results of the study.
-
-    Raises:
-        ValueError: If the file of the times is damaged.
-    """
+    """Add the times of `pfbench cost` to the metadata of the jobs that were measured."""
     times = select_job_times(read_step_times(folder))
     measured_times = [times.get((str(meta["key"]), read_commit(meta))) for _, meta in items]
     return [
@@ -161,11 +125,7 @@ def add_step_times(
 def estimate_cost_ratio(pairs: Sequence[tuple[Array, Array]]) -> EffectEstimate:
     """Estimate the mean log ratio of the times of two filters over conditions, paired by round.
 
-    Args:
-        pairs: Times of both filters in each condition, [K] each.
-
-    Returns:
-        Estimate with the degrees of freedom of Welch and Satterthwaite.
+    Returns estimate with the degrees of freedom of Welch and Satterthwaite. Shapes: pairs [K].
     """
     ratios = [np.log(first / second) for first, second in pairs]
     value = float(np.mean([ratio.mean() for ratio in ratios]))
@@ -181,19 +141,7 @@ def estimate_cost_ratio(pairs: Sequence[tuple[Array, Array]]) -> EffectEstimate:
 def describe_costs(
     times: Sequence[Mapping[str, StepTimes]], label: str, baseline: str, alpha: float
 ) -> dict[str, float]:
-    """Describe the cost of a filter in some conditions: times in ms, and their ratio to a baseline.
-
-    Args:
-        times: Times by label in each condition.
-        label: Label of the filter.
-        baseline: Label of the baseline.
-        alpha: Probability outside the interval of the ratio.
-
-    Returns:
-        Median and quartiles of the rounds (`ms`, `ms_low`, `ms_high`), averaged over conditions on the logarithmic scale,
-        and the ratio (`cost`, `cost_low`, `cost_high`). Empty if times of the filter are
-        missing in a condition, without a ratio if those of the baseline are missing or of other rounds.
-    """
+    """Describe the cost of a filter in some conditions: times in ms, and their ratio to a baseline."""
     if not times or not all(label in by_label for by_label in times):
         return {}
     quartiles = [np.quantile(by_label[label].seconds, (0.25, 0.5, 0.75)) for by_label in times]

@@ -61,16 +61,7 @@ def write_result(path: str | Path, meta: Mapping[str, Any], data: Mapping[str, A
 
     The failure note of the same key and temporary files of interrupted writes are removed.
 
-    Args:
-        path: `<folder>/<key>.npz`. The folder is created.
-        meta: See `JobResult`. `format` is added.
-        data: See `JobResult`. Tensors must be converted first.
-
-    Returns:
-        The path.
-
-    Raises:
-        ValueError: If a part is missing, is not a plain array, or has an inconsistent shape.
+    Returns the path.
     """
     path = Path(path)
     full = {"format": FORMAT, **meta}
@@ -91,13 +82,7 @@ def write_result(path: str | Path, meta: Mapping[str, Any], data: Mapping[str, A
 
 
 def read_result(path: str | Path) -> JobResult:
-    """Read a job.
-
-    Raises:
-        FileNotFoundError: If the file does not exist.
-        DamagedResultError: If the file is damaged or is the result of another job.
-        ValueError: If it is not a result of pfbench, or has another format.
-    """
+    """Read a job."""
     path = Path(path)
     with _opened(path) as file:
         meta = _meta(path, file)
@@ -128,13 +113,7 @@ def write_failure(
 ) -> Path | None:
     """Write the failure note of a job.
 
-    Args:
-        path: `<folder>/<key>.npz`.
-        choices: Names of scenario, noise, filter and model.
-        error: Error of the job.
-
-    Returns:
-        The note `<key>.failed.json`, or None if a result of that key exists, which is kept.
+    Returns the note `<key>.failed.json`, or None if a result of that key exists, which is kept.
     """
     path = Path(path)
     if path.exists():
@@ -156,9 +135,6 @@ def list_results(folder: str | Path) -> Iterator[JobResult]:
     """Read all finished jobs of a folder, sorted by scenario, noise, label, seed and key.
 
     Arrays are read one job at a time.
-
-    Raises:
-        ValueError: If a file cannot be read, see `read_result`.
     """
     paths = sorted(Path(folder).glob("*.npz"), key=_rank)
     return map(read_result, paths)
@@ -327,15 +303,7 @@ _KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
 
 
 def check_metadata(path: Path, meta: Any) -> None:
-    """Check that the metadata have the format and all required keys.
-
-    Args:
-        path: File, for the message.
-        meta: Metadata.
-
-    Raises:
-        ValueError: If the format differs or a key is missing.
-    """
+    """Check that the metadata have the format and all required keys."""
     version = meta.get("format") if isinstance(meta, dict) else None
     if version != FORMAT:
         raise ValueError(f"{path} must have format {FORMAT}, got {version}. Run the job again.")
@@ -374,16 +342,7 @@ def _find_state_fault(state: Any) -> str:
 
 
 def check_arrays(path: Path, meta: Mapping[str, Any], data: Mapping[str, np.ndarray]) -> None:
-    """Check the names, types and shapes of the arrays of a result.
-
-    Args:
-        path: File, for the message.
-        meta: Metadata.
-        data: Arrays by name.
-
-    Raises:
-        ValueError: If an array is missing, is pickled, or has an inconsistent shape.
-    """
+    """Check the names, types and shapes of the arrays of a result."""
     missing = [name for name in _AXES if name not in data]
     if missing:
         raise ValueError(
@@ -497,17 +456,6 @@ def compute_config_key(config: Mapping[str, Any], ignore: tuple[str, ...] = ()) 
     The version of the random number generator is part of it. In single precision the engine is, too:
     sums that are rounded in another order may choose other ancestors. In double precision the
     results of all engines agree to rounding.
-
-    Args:
-        config: Plain nested dictionary with string keys.
-        ignore: Dotted paths that change where a job runs but not what it computes, such as
-            `results` or `data.root`. A path covers all keys below it and may be missing.
-
-    Returns:
-        The key.
-
-    Raises:
-        ValueError: If JSON cannot represent a value (NaN included).
     """
     if config.get("dtype") == "float32":
         ignore = tuple(path for path in ignore if path != "engine")
@@ -525,12 +473,7 @@ def compute_config_key(config: Mapping[str, Any], ignore: tuple[str, ...] = ()) 
 
 
 def extend_key(key: str, inputs: Inputs) -> str:
-    """Return the key of a job with inputs. Its first half stays that of the configuration.
-
-    Args:
-        key: Key of the configuration.
-        inputs: Inputs. Without any the key is unchanged.
-    """
+    """Return the key of a job with inputs. Its first half stays that of the configuration."""
     if not inputs:
         return key
     text = json.dumps([key, inputs], sort_keys=True)
@@ -538,22 +481,12 @@ def extend_key(key: str, inputs: Inputs) -> str:
 
 
 def list_same_configuration(path: Path, suffix: str) -> list[Path]:
-    """List the files of other inputs next to a result, whose keys have the same first half.
-
-    Args:
-        path: File of the result.
-        suffix: End of their names.
-    """
+    """List the files of other inputs next to a result, whose keys have the same first half."""
     return [f for f in path.parent.glob(f"{path.stem[:_HALF]}*{suffix}") if f != path]
 
 
 def list_not_finite(node: Any, key: str) -> Iterator[tuple[str, float]]:
-    """Yield the keys and values of all numbers that are infinite or NaN.
-
-    Args:
-        node: Resolved configuration or a part of it.
-        key: Its key.
-    """
+    """Yield the keys and values of all numbers that are infinite or NaN."""
     if isinstance(node, Mapping | list):
         pairs = node.items() if isinstance(node, Mapping) else enumerate(node)
         for name, value in pairs:

@@ -32,28 +32,12 @@ class Scenario(Protocol):
 
 
 def check_duration(name: str, value: float) -> None:
-    """Check that a time is positive.
-
-    Args:
-        name: Configuration key.
-        value: Time, s.
-
-    Raises:
-        ValueError: If the time is not positive.
-    """
+    """Check that a time is positive."""
     if not value > 0.0:
         raise ValueError(f"{name} must be positive, got {value}. Set a time in seconds.")
 
 
 def check_added_sd(name: str, sd: float) -> None:
-    """Check the standard deviation of errors that are added to recorded measurements.
-
-    Args:
-        name: Configuration key.
-        sd: Standard deviation.
-
-    Raises:
-        ValueError: If the standard deviation is negative.
-    """
+    """Check the standard deviation of errors that are added to recorded measurements."""
     if not sd >= 0.0:
         raise ValueError(f"{name} must be at least 0, got {sd}. Use 0 for no added errors.")

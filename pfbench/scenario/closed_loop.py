@@ -37,15 +37,7 @@ class ClosedLoopIns:
     def begin(self, record: Record, groups: dict[str, tuple[int, ...]]) -> FeedbackRun:
         """Start a pass that does not affect any other pass.
 
-        Args:
-            record: Measurements and inputs of the uncorrected INS.
-            groups: Component groups of the model.
-
-        Returns:
-            The pass before its first step.
-
-        Raises:
-            ValueError: If the first nine states are not errors of attitude, velocity and position.
+        Returns the pass before its first step.
         """
         if any(groups.get(name) != indices for name, indices in _LAYOUT.items()):
             raise ValueError(
@@ -62,10 +54,6 @@ class ClosedLoopRun:
     Navigation has double precision for every precision of the filter. The record of each step has
     this pass as its `feedback`.
 
-    Args:
-        course: INS and sensor data of the flight.
-        record: Measurements and inputs of the uncorrected INS.
-
     Attributes:
         t: Latest step. -1 before the first.
     """
@@ -76,12 +64,7 @@ class ClosedLoopRun:
     def begin(self, record: Record, groups: dict[str, tuple[int, ...]]) -> FeedbackRun:
         """Continue this pass from its current step.
 
-        Args:
-            record: Not used.
-            groups: Not used.
-
-        Returns:
-            This pass.
+        Returns this pass.
         """
         return self
 
@@ -103,12 +86,8 @@ class ClosedLoopRun:
 
         The attitude becomes C(alpha) C. Sensor biases remain states and do not correct the sensors.
 
-        Args:
-            mean: Estimated state, [R, D].
-
-        Returns:
-            The estimate relative to the uncorrected INS, [R, D], and a function that maps states
-            [R, N, D] to their values after the correction.
+        Returns the estimate relative to the uncorrected INS, [R, D], and a function that maps
+        states [R, N, D] to their values after the correction. Shapes: mean [R, D].
         """
         alpha, dv, dp = mean[:, :9].to(self.ins.vel).split(3, -1)
         dcm = attitude.dcm_from_euler(alpha) @ self.ins.dcm

@@ -44,16 +44,7 @@ class OracleNoiseModel(ModelWrapper):
     regime's family, with shift and scale relative to the normal distribution of the inner model. All
     other properties are those of the inner model. It is linear only with normal errors.
 
-    Args:
-        model: Inner model with normal measurement noise.
-        regime: Noise regime of the episode.
-        channels: Measurement channels of the episode.
-        time: Times of the steps, s, [T].
-
-    Raises:
-        ValueError: If the regime does not define a distribution at each step. Methods raise it for a
-            record of a different length, and for measurement noise that is not normal. A regime that
-            is not normal also needs independent components.
+    Shapes: time [T].
     """
 
     def __init__(
@@ -118,13 +109,8 @@ class OracleNoiseModel(ModelWrapper):
     def transition(self, x: Tensor, u: OracleNoiseInputs) -> Distribution | None:
         """Return the transition distribution with scaled process noise.
 
-        Args:
-            x: Particles, [R, N, D].
-            u: Inputs of the step.
-
-        Returns:
-            Distribution with batch [R, N]. None if the inner model does not define it, or if scaled
-            noise is not additive.
+        Returns distribution with batch [R, N]. None if the inner model does not define it, or if
+        scaled noise is not additive. Shapes: x [R, N, D].
         """
         distribution = self.model.transition(x, u.inputs)
         if distribution is None or not self.scales_process:

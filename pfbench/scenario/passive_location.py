@@ -92,16 +92,8 @@ def first_fix(
     quarter of the interval between the limits. Across the line of sight it is range times bearing
     standard deviation. The mean velocity is 0. [ours]
 
-    Args:
-        z: First measurement, as in `FirstMeasurement`, [R, 5].
-        platform: Aircraft at that time, as given to the filters, [R or 1, ...].
-        sd: Standard deviations of the measurement, [5].
-        velocity_sd: Standard deviation of the emitter velocity, m/s per axis.
-        limits: Smallest and largest range, m.
-
-    Returns:
-        Mean, [R, 4], Cholesky factor of the covariance, [R, 4, 4], and a mask of runs with clipped
-        range, [R].
+    Returns mean, [R, 4], Cholesky factor of the covariance, [R, 4, 4], and a mask of runs with
+    clipped range, [R]. Shapes: z [R, 5], platform [R or 1, ...].
     """
     bearing, elevation, turning, rising, doppler = z.unbind(-1)
     wavelength = SPEED_OF_LIGHT / platform.carrier

@@ -133,14 +133,7 @@ _KEY = "episode_key"  # name of the key in a file, which shows that a file has a
 def load_or_build(folder: str | Path | None, recipe: object, build: Callable[[], Arrays]) -> Arrays:
     """Load tensors from the cache, or build and store them.
 
-    Args:
-        folder: Folder of the cache. None disables it.
-        recipe: All that decides the tensors. Its `repr` is the key, so it must consist of frozen
-            dataclasses and plain values.
-        build: Builds the tensors.
-
-    Returns:
-        The tensors by name.
+    Returns the tensors by name.
     """
     if folder is None:
         return build()
@@ -164,12 +157,7 @@ def load_or_build(folder: str | Path | None, recipe: object, build: Callable[[],
 
 
 def _read(path: Path) -> Arrays:
-    """Read a file of the cache.
-
-    Raises:
-        ValueError: If its digest is not that of its content, or its key is that of other episodes.
-            Other errors are those of numpy.
-    """
+    """Read a file of the cache."""
     # opened here, since numpy leaves a damaged file open
     check_zip(path)
     with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:

@@ -100,12 +100,7 @@ def decide_consistency(
 ) -> list[ConsistencyBand]:
     """Compare mean NEES and NIS of each filter and group with their expectation.
 
-    Args:
-        table: Rows of `load_frame`, of all groups.
-        options: Options, None for the defaults.
-
-    Returns:
-        One record per filter, quantity and group, in one family.
+    Returns one record per filter, quantity and group, in one family.
     """
     options = options or DecisionOptions()
     members = list(_list_members(table, options.shared_runs))
@@ -118,14 +113,8 @@ def decide_consistency(
 def estimate_ratio(value: Array, weights: Array, shared_runs: bool = True) -> QuestionEffect:
     """Estimate the logarithm of a mean ratio, whose error follows from the spread over runs.
 
-    Args:
-        value: Ratios, [..., W, C, N]; NaN for an absent run.
-        weights: Weights of the conditions, [W, C].
-        shared_runs: Whether a run has the same random numbers in all worlds.
-
-    Returns:
-        Effect, whose value is 0 if the mean ratio is 1. The p-value is NaN with fewer than 10 runs or
-        without variation over runs.
+    Returns effect, whose value is 0 if the mean ratio is 1. The p-value is NaN with fewer than 10
+    runs or without variation over runs. Shapes: value [..., W, C, N], weights [W, C].
     """
     worlds = combine_conditions(trimmed_effects(np.minimum(value, _LARGEST), 0.0), weights)
     mean = estimate_in_these_worlds(worlds, shared_runs)

@@ -145,17 +145,7 @@ DIRECTION_HOLDS: Final = "direction holds, size inconclusive"
 
 
 def pair_word(low: float, high: float, is_decided: bool, margin: float) -> tuple[str, str]:
-    """Return the decision on a pair and its size.
-
-    Args:
-        low: Lower end of the simultaneous interval.
-        high: Upper end.
-        is_decided: Whether the interval excludes 0.
-        margin: Margin of equivalence, positive, in the unit of the interval.
-
-    Returns:
-        better, worse, equivalent or inconclusive, and the statement about the margin.
-    """
+    """Return the decision on a pair and its size."""
     if is_decided and high <= 0:
         return BETTER, _size(-high, -low, margin)
     if is_decided and low >= 0:
@@ -172,18 +162,7 @@ def pair_word(low: float, high: float, is_decided: bool, margin: float) -> tuple
 def claim_word(
     low: float, high: float, is_decided: bool, margin: float, states_size: bool = True
 ) -> str:
-    """Return the decision on the claim that the first filter is better.
-
-    Args:
-        low: Lower end of the simultaneous interval.
-        high: Upper end.
-        is_decided: Whether the interval excludes 0.
-        margin: Margin that the claim states, or that of equivalence.
-        states_size: Whether the claim states the margin, or a direction alone.
-
-    Returns:
-        holds, fails, "direction holds, size inconclusive", or inconclusive.
-    """
+    """Return the decision on the claim that the first filter is better."""
     is_better = is_decided and high <= 0
     if is_better and (high < -margin or not states_size):
         return HOLDS
@@ -193,16 +172,7 @@ def claim_word(
 
 
 def combine_words(track: str, error: str, is_trade_off: bool) -> str:
-    """Return the decision on a pair from its decisions on track and error.
-
-    Args:
-        track: Word of the shares that keep track.
-        error: Word of the error.
-        is_trade_off: Whether both point to different filters by more than their margins.
-
-    Returns:
-        One word of the pair.
-    """
+    """Return the decision on a pair from its decisions on track and error."""
     decided = {word for word in (track, error) if word in (BETTER, WORSE)}
     if is_trade_off or len(decided) == 2:
         return TRADE_OFF

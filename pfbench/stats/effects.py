@@ -53,14 +53,7 @@ def paired_log_ratio(a: Array, b: Array, succeeds_a: Flags, succeeds_b: Flags) -
     A failed run is a run that does not keep track. Its loss is not used, since a filter that stops
     early can have a small loss.
 
-    Args:
-        a: Losses of the first filter, [...], positive.
-        b: Losses of the second filter in the same runs, [...].
-        succeeds_a: Runs in which the first filter keeps track, [...].
-        succeeds_b: Runs in which the second filter keeps track, [...].
-
-    Returns:
-        log(a / b): infinite where only one filter fails, 0 where both do, NaN without a loss.
+    Shapes: a [...], b [...], succeeds_a [...], succeeds_b [...].
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         d = np.where(a == b, 0.0, np.log(a) - np.log(b))
@@ -70,13 +63,8 @@ def paired_log_ratio(a: Array, b: Array, succeeds_a: Flags, succeeds_b: Flags) -
 def order_failed_runs(d: Array, succeeds_a: Flags, succeeds_b: Flags) -> Array:
     """Place failed runs at the ends of the order of differences; rounding counts as equality.
 
-    Args:
-        d: Differences, [...].
-        succeeds_a: Runs in which the first filter keeps track, [...].
-        succeeds_b: Runs in which the second filter keeps track, [...].
-
-    Returns:
-        Differences, [...]: +inf where only a fails, -inf where only b fails, 0 where both do.
+    Returns differences, [...]: +inf where only a fails, -inf where only b fails, 0 where both do.
+    Shapes: d [...], succeeds_a [...], succeeds_b [...].
     """
     d = np.where(np.abs(d) <= LOG_TOLERANCE, 0.0, d)
     failed = np.where(succeeds_b, np.inf, -np.inf)
@@ -87,13 +75,7 @@ def order_failed_runs(d: Array, succeeds_a: Flags, succeeds_b: Flags) -> Array:
 def trimmed_effects(d: Array, trim: float = TRIM_SHARE) -> ConditionEffects:
     """Compute trimmed means of differences and the contributions of the runs.
 
-    Args:
-        d: Differences, [..., N]; NaN marks a run that a condition does not have.
-        trim: Share of runs removed at each end; 0 gives the mean.
-
-    Returns:
-        Locations and contributions. The location is infinite if failed runs reach into the
-        middle, and NaN if they do so from both ends or for a condition without runs.
+    Shapes: d [..., N].
     """
     runs = np.count_nonzero(~np.isnan(d), axis=-1)
     cut = np.floor(trim * runs + 1e-9).astype(int)
@@ -121,13 +103,7 @@ def log_levels(value: Array, keeps_track: Flags, present: Flags) -> ConditionEff
 
     The difference of two levels is transitive, unlike a location of paired differences.
 
-    Args:
-        value: Errors, [..., N].
-        keeps_track: Runs that keep track, [..., N]. The others lie at the upper end.
-        present: Runs that exist, [..., N].
-
-    Returns:
-        Levels and contributions of the runs.
+    Shapes: value [..., N], keeps_track [..., N], present [..., N].
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         log_error = np.where(keeps_track, np.log(value), np.inf)
@@ -135,12 +111,7 @@ def log_levels(value: Array, keeps_track: Flags, present: Flags) -> ConditionEff
 
 
 def subtract_levels(a: ConditionEffects, b: ConditionEffects) -> ConditionEffects:
-    """Subtract the levels of two filters; contributions are subtracted run by run.
-
-    Args:
-        a: Levels of the first filter.
-        b: Levels of the second filter in the same runs.
-    """
+    """Subtract the levels of two filters; contributions are subtracted run by run."""
     with np.errstate(invalid="ignore"):  # lost runs decide both
         location = a.location - b.location
     parts = np.where(np.isfinite(location)[..., None], a.parts - b.parts, 0.0)
@@ -152,9 +123,7 @@ def subtract_levels(a: ConditionEffects, b: ConditionEffects) -> ConditionEffect
 def is_identical(d: Array, axes: int | tuple[int, ...] = -1) -> Flags:
     """Return whether all differences agree with 0 to the stored precision.
 
-    Args:
-        d: Differences, [...]; NaN is left out.
-        axes: Axes over which all differences must be 0.
+    Shapes: d [...].
     """
     return np.asarray(np.all(np.isnan(d) | (np.abs(d) <= LOG_TOLERANCE), axis=axes))
 
@@ -173,12 +142,7 @@ def log_ratio(a: Array, b: Array) -> Array:
     Where one of the two is lost, the result lies beyond all others. Where both are lost, or the
     ratio differs from 1 by less than the stored precision, it is 0.
 
-    Args:
-        a: Losses of the first filter, [n], non-negative, infinite where lost.
-        b: Losses of the second filter, [n].
-
-    Returns:
-        log(a / b), [n].
+    Shapes: a [n], b [n].
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         d = np.log(a) - np.log(b)
@@ -266,13 +230,7 @@ class EffectEstimate(NamedTuple):
 def combine_conditions(conditions: ConditionEffects, weights: Array) -> WorldEffects:
     """Average the conditions of each world; contributions are added run by run.
 
-    Args:
-        conditions: Effects of the conditions, with axes [..., W, C] and runs [..., W, C, N].
-        weights: Weights of the conditions of a world, [W, C]; 0 for absent conditions. They sum to
-            1 for each world.
-
-    Returns:
-        Effects of the worlds.
+    Returns effects of the worlds. Shapes: conditions [..., W, C], weights [W, C].
     """
     used = weights > 0
     with np.errstate(invalid="ignore"):
@@ -285,13 +243,7 @@ def combine_conditions(conditions: ConditionEffects, weights: Array) -> WorldEff
 def estimate_in_these_worlds(worlds: WorldEffects, shared_runs: bool = True) -> EffectEstimate:
     """Estimate the mean effect of the worlds of a study; question (a).
 
-    Args:
-        worlds: Effects of the worlds.
-        shared_runs: Whether a run has the same random numbers in all worlds. If not, the worlds
-            are independent, and the degrees of freedom are those of Welch and Satterthwaite.
-
-    Returns:
-        Estimate whose standard error describes other runs of the same study.
+    Returns estimate whose standard error describes other runs of the same study.
     """
     count = worlds.location.shape[-1]
     with np.errstate(invalid="ignore"):  # lost runs at both ends
@@ -314,12 +266,7 @@ def estimate_in_new_world(worlds: WorldEffects, shared_runs: bool = True) -> Eff
     The SD over worlds contains the errors of the worlds, but not the error that all worlds share. Its
     variance is the mean covariance of two worlds over runs, and is added if it is positive [ours].
 
-    Args:
-        worlds: Effects of the worlds.
-        shared_runs: Whether a run has the same random numbers in all worlds.
-
-    Returns:
-        Estimate with W - 1 degrees of freedom.
+    Returns estimate with W - 1 degrees of freedom.
     """
     count = worlds.location.shape[-1]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -343,12 +290,7 @@ def common_variance(worlds: WorldEffects) -> Array:
 def prediction_interval(locations: Array, alpha: float) -> tuple[Array, Array]:
     """Compute the interval of the effect of one new world.
 
-    Args:
-        locations: Effects of the worlds, [..., W].
-        alpha: Probability outside the interval.
-
-    Returns:
-        Lower and upper end, [...]; infinite for one world.
+    Returns lower and upper end, [...]; infinite for one world. Shapes: locations [..., W].
     """
     count = locations.shape[-1]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -431,16 +373,7 @@ def fit_world_posterior(
     The prior of the mean is flat, and that of the SD between worlds half-normal. Given the SD, the
     mean is normal. The SD is integrated with 61 Gauss-Legendre points that are dense near zero.
 
-    Args:
-        locations: Effects of the worlds, [..., W] with W >= 2.
-        errors: Standard errors of the effects, [..., W], positive.
-        prior_sd: Scale of the prior of the SD between worlds.
-
-    Returns:
-        Posterior.
-
-    Raises:
-        ValueError: if fewer than two worlds exist or the scale is not positive.
+    Shapes: locations [..., W], errors [..., W].
     """
     if locations.shape[-1] < 2 or not prior_sd > 0:
         raise ValueError(
@@ -469,13 +402,7 @@ def moderated_p_values(means: Array, sds: Array, worlds: int) -> Array:
     Half of the estimated degrees of freedom of the prior are used, at most W - 1, because pairs
     share filters [ours]. As published, the test is too liberal below 8 worlds.
 
-    Args:
-        means: Mean effects over worlds, [..., P].
-        sds: SD over worlds, [..., P], positive.
-        worlds: Number of worlds, at least 2.
-
-    Returns:
-        Two-sided p-values, [..., P].
+    Returns two-sided p-values, [..., P]. Shapes: means [..., P], sds [..., P].
     """
     df = worlds - 1
     e = 2 * np.log(sds) - digamma(df / 2) + np.log(df / 2)

@@ -17,12 +17,8 @@ Flags = NDArray[np.bool_]
 def rmse_per_run(error: Array, lost: Flags) -> Array:
     """Compute the root mean square over time of the norm of the error, for each run.
 
-    Args:
-        error: Components of one group, [R, T, K].
-        lost: Lost runs, [R].
-
-    Returns:
-        RMSE, [R]; infinite for a lost run, NaN for a run without truth.
+    Returns RMSE, [R]; infinite for a lost run, NaN for a run without truth. Shapes: error
+    [R, T, K], lost [R].
     """
     return _set_lost(np.sqrt(finite_mean(_squared_norm(error), axis=1)), lost)
 
@@ -30,9 +26,7 @@ def rmse_per_run(error: Array, lost: Flags) -> Array:
 def max_error(error: Array, lost: Flags) -> Array:
     """Compute the maximum norm over time of each run [R], infinite if lost.
 
-    Args:
-        error: Components of one group, [R, T, K].
-        lost: Lost runs, [R].
+    Shapes: error [R, T, K], lost [R].
     """
     square = _squared_norm(error)
     largest = np.max(np.where(np.isnan(square), -np.inf, square), axis=1, initial=-np.inf)
@@ -42,12 +36,7 @@ def max_error(error: Array, lost: Flags) -> Array:
 def mean_per_run(trace: Array, lost: Flags) -> Array:
     """Average a trace, such as ESS or NEES, over time.
 
-    Args:
-        trace: Values, [R, T].
-        lost: Lost runs, [R].
-
-    Returns:
-        Means, [R]; NaN for a lost run.
+    Returns means, [R]; NaN for a lost run. Shapes: trace [R, T], lost [R].
     """
     return np.where(lost, np.nan, finite_mean(np.asarray(trace, dtype=np.float64), axis=1))
 
@@ -55,12 +44,8 @@ def mean_per_run(trace: Array, lost: Flags) -> Array:
 def mean_score_per_run(score: Array, lost: Flags) -> Array:
     """Average a negatively oriented score over steps and components, for each run.
 
-    Args:
-        score: Scores, [R, S] or [R, S, K].
-        lost: Lost runs, [R].
-
-    Returns:
-        Mean score, [R]; infinite for a lost run, NaN for a run without truth.
+    Returns mean score, [R]; infinite for a lost run, NaN for a run without truth. Shapes: score
+    [R, S], lost [R].
     """
     values = np.asarray(score, dtype=np.float64)
     return _set_lost(finite_mean(values.reshape(len(values), -1), axis=1), lost)
@@ -69,15 +54,8 @@ def mean_score_per_run(score: Array, lost: Flags) -> Array:
 def convergence_time(time: Array, error: Array, lost: Flags, bound: float) -> Array:
     """Find the first step from which on the norm of the error stays at or below a bound.
 
-    Args:
-        time: Time of the steps, [T], in seconds.
-        error: Components of one group, [R, T, K].
-        lost: Lost runs, [R].
-        bound: Bound in the unit of the error.
-
-    Returns:
-        Seconds, [R]; infinite if the last error exceeds the bound or the run was lost, NaN
-        without truth.
+    Returns seconds, [R]; infinite if the last error exceeds the bound or the run was lost, NaN
+    without truth. Shapes: time [T], error [R, T, K], lost [R].
     """
     norm = np.sqrt(_squared_norm(error))
     has_truth = ~np.isnan(norm)
@@ -90,12 +68,7 @@ def convergence_time(time: Array, error: Array, lost: Flags, bound: float) -> Ar
 
 
 def finite_mean(values: Array, axis: int) -> Array:
-    """Average the values that are not NaN; NaN without values, where nanmean would warn.
-
-    Args:
-        values: Values of any shape.
-        axis: Axis of the average.
-    """
+    """Average the values that are not NaN; NaN without values, where nanmean would warn."""
     valid = ~np.isnan(values)
     count = valid.sum(axis=axis)
     total = np.where(valid, values, 0.0).sum(axis=axis)

@@ -49,17 +49,7 @@ def order_filters(
 ) -> tuple[FilterRanking, FilterRanking]:
     """Compare all pairs of filters for both questions.
 
-    Args:
-        table: Table as in `planned_pairs.decide_planned_pairs`.
-        rule: Rule of the metric, None for the log ratio of errors.
-        options: Options, None for the defaults.
-        planned: Records of planned pairs, whose words stay. The other pairs are a family.
-
-    Returns:
-        Orders for the questions (a) and (b).
-
-    Raises:
-        ValueError: if the table is not valid or two filters share no run.
+    Returns orders for the questions (a) and (b).
     """
     rule, options = rule or MetricRule(), options or DecisionOptions()
     study = to_study_runs(table)
@@ -88,13 +78,7 @@ def rank_by_decisions(
 ) -> FilterRanking:
     """Derive the top group and rank intervals from decisions on all pairs.
 
-    Args:
-        filters: Labels.
-        decisions: Decisions on all pairs.
-        question: Question of the decisions.
-
-    Returns:
-        Order of the filters.
+    Returns order of the filters.
     """
     losses, gains = (dict.fromkeys(filters, 0) for _ in range(2))
     for decision in decisions:

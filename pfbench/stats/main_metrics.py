@@ -44,13 +44,7 @@ def select_main_metrics(
 ) -> pd.DataFrame:
     """Select the rows of the main group of each condition, under one name and component.
 
-    Args:
-        table: Rows of `load_frame`.
-        mains: Main group by scenario, noise and model.
-        name: Name of the group in the selected rows.
-
-    Returns:
-        Rows of the norm, of the mean CRPS, and of the log score.
+    Returns rows of the norm, of the mean CRPS, and of the log score.
     """
     keys = zip(table["scenario"], table["noise"], table["model"], strict=True)
     main = pd.Series(list(keys), index=table.index).map(mains).fillna("")
@@ -70,12 +64,7 @@ def tidy_other_groups(
 ) -> dict[str, pd.DataFrame]:
     """Arrange the root mean square errors of all groups but the main one for decisions.
 
-    Args:
-        table: Rows of `load_frame`, of all groups.
-        mains: Main group by scenario, noise and model.
-
-    Returns:
-        Table by name of the group, of the conditions in which it is not the main group.
+    Returns table by name of the group, of the conditions in which it is not the main group.
     """
     keys = zip(table["scenario"], table["noise"], table["model"], strict=True)
     main = pd.Series(list(keys), index=table.index).map(mains)
@@ -87,26 +76,14 @@ def tidy_other_groups(
 
 
 def main_rule(metric: str, group: str) -> MetricRule:
-    """Return the rule of the main metric of a study.
-
-    Args:
-        metric: One of `MAIN_METRICS`.
-        group: Name of the main group.
-
-    Raises:
-        ValueError: if the metric cannot decide a study.
-    """
+    """Return the rule of the main metric of a study."""
     check_main_metric(metric)
     rule = RULES[metric]
     return replace(rule, name=f"{group} {rule.name}", group=group)
 
 
 def check_main_metric(metric: str) -> None:
-    """Check the name of the main metric.
-
-    Raises:
-        ValueError: if the metric cannot decide a study.
-    """
+    """Check the name of the main metric."""
     if metric not in MAIN_METRICS:
         raise ValueError(
             f"report.metric must be one of {', '.join(MAIN_METRICS)}, got {metric}. "
@@ -117,16 +94,7 @@ def check_main_metric(metric: str) -> None:
 def tidy_main(rows: pd.DataFrame, metric: str, group: str) -> pd.DataFrame:
     """Arrange the main metric for decisions.
 
-    Args:
-        rows: Rows of `select_main_metrics`.
-        metric: One of `MAIN_METRICS`.
-        group: Name of the main group.
-
-    Returns:
-        Table with the columns of `study_runs.to_study_runs`.
-
-    Raises:
-        ValueError: if the metric is not one of `MAIN_METRICS`, or a condition lacks its values.
+    Returns table with the columns of `study_runs.to_study_runs`.
     """
     check_main_metric(metric)
     conditions = ["scenario", "noise", "model", "label"]
@@ -145,13 +113,8 @@ def tidy_main(rows: pd.DataFrame, metric: str, group: str) -> pd.DataFrame:
 def tidy_secondary(rows: pd.DataFrame, group: str) -> dict[str, pd.DataFrame]:
     """Arrange each metric with a rule for decisions.
 
-    Args:
-        rows: Rows of `select_main_metrics`.
-        group: Name of the main group.
-
-    Returns:
-        Table by name of the metric. A run that keeps track without a value is left out. For a share
-        of runs, lost runs are left out, too.
+    Returns table by name of the metric. A run that keeps track without a value is left out. For a
+    share of runs, lost runs are left out, too.
     """
     tables = {}
     for metric, rule in RULES.items():
@@ -186,9 +149,7 @@ def select_conditions(present: Flags) -> CommonConditions:
     The selection that keeps more results wins. If both keep equally many, no filter is left out.
     If neither has two filters, nothing is selected.
 
-    Args:
-        present: Whether a filter has results in a condition, [F, C]. Filters without any result
-            and conditions without any are left out.
+    Shapes: present [F, C].
     """
     filters, conditions = np.asarray(present.any(axis=1)), np.asarray(present.any(axis=0))
     shared = np.asarray(conditions & present[filters].all(axis=0))
@@ -205,11 +166,7 @@ def select_conditions(present: Flags) -> CommonConditions:
 def select_common_runs(table: pd.DataFrame) -> pd.DataFrame:
     """Select the runs of `select_conditions`, from which an order of filters is taken.
 
-    Args:
-        table: Table of `to_study_runs`.
-
-    Returns:
-        The runs of at least two filters in the same conditions; empty if there are none.
+    Returns the runs of at least two filters in the same conditions; empty if there are none.
     """
     labels, filters = pd.factorize(table["filter"])
     names, conditions = pd.factorize(pd.MultiIndex.from_frame(table[_CONDITION]))

@@ -78,16 +78,7 @@ def location_effects(
     If lost runs decide a location, or ties hide all spread, the effect is the difference of the
     shares of runs won.
 
-    Args:
-        d: Differences, [..., W, C, N], negative if the first filter is better, infinite where one
-            filter failed, NaN for an absent run.
-        weights: Weights of the conditions, [W, C]; 0 for an absent one.
-        trim: Share removed at each end; 0 for the mean.
-        shared_runs: Whether a run has the same random numbers in all worlds.
-        conditions: Locations of the conditions, None for trimmed means of the differences.
-
-    Returns:
-        Effects.
+    Returns effects. Shapes: d [..., W, C, N], weights [W, C].
     """
     conditions = trimmed_effects(d, trim) if conditions is None else conditions
     worlds = combine_conditions(conditions, weights)
@@ -110,14 +101,7 @@ def share_effects(d: Array, weights: Array, shared_runs: bool = True, key: str =
     The interval has one run added to each side [after Agresti, Min 2005], so that it exists for
     shares of 0 and 1. For a new world, the error over worlds is at least the error over runs.
 
-    Args:
-        d: Differences -1, 0 or 1, [..., W, C, N], NaN for an absent run.
-        weights: Weights of the conditions, [W, C].
-        shared_runs: Whether a run has the same random numbers in all worlds.
-        key: Name of the comparison, for random exchanges.
-
-    Returns:
-        Effects.
+    Returns effects. Shapes: d [..., W, C, N], weights [W, C].
     """
     worlds = combine_conditions(trimmed_effects(d, 0.0), weights)
     contributions = run_contributions(d, weights, shared_runs)
@@ -137,10 +121,7 @@ def share_effects(d: Array, weights: Array, shared_runs: bool = True, key: str =
 def estimate_share_difference(d: Array, weights: Array, shared_runs: bool = True) -> EffectEstimate:
     """Estimate the difference of shares in these worlds, as `share_effects` does, without a test.
 
-    Args:
-        d: Differences -1, 0 or 1, [..., W, C, N], NaN for an absent run.
-        weights: Weights of the conditions, [W, C].
-        shared_runs: Whether a run has the same random numbers in all worlds.
+    Shapes: d [..., W, C, N], weights [W, C].
     """
     contributions = run_contributions(d, weights, shared_runs)
     return _shrunk_share(contributions, _run_count(d, weights, shared_runs))
@@ -257,16 +238,7 @@ class PairComparison(NamedTuple):
 
 
 def paired_differences(pair: PairRuns, rule: MetricRule) -> Array:
-    """Compute the differences of a metric, [W, C, N]; NaN for an absent run.
-
-    Args:
-        pair: Runs of both filters.
-        rule: Rule of the metric.
-
-    Returns:
-        Differences, negative where the first filter is better; infinite where only one of two
-        trimmed values is of a run that keeps track.
-    """
+    """Compute the differences of a metric, [W, C, N]; NaN for an absent run."""
     sign = -1.0 if rule.higher_is_better else 1.0
     succeeds = (pair.keeps_a, pair.keeps_b)
     if rule.scale == "log ratio":
@@ -284,13 +256,7 @@ def paired_differences(pair: PairRuns, rule: MetricRule) -> Array:
 def compare_metric(pair: PairRuns, rule: MetricRule, options: DecisionOptions) -> PairComparison:
     """Compare a metric of a pair.
 
-    Args:
-        pair: Runs of both filters.
-        rule: Rule of the metric.
-        options: Options.
-
-    Returns:
-        PairComparison for both questions.
+    Returns PairComparison for both questions.
     """
     d, shared = paired_differences(pair, rule), options.shared_runs
     margin = rule.margin if rule.margin is not None else options.log_margin
@@ -312,13 +278,7 @@ def compare_metric(pair: PairRuns, rule: MetricRule, options: DecisionOptions) -
 def compare_track(pair: PairRuns, group: str, options: DecisionOptions) -> PairComparison:
     """Compare the shares of runs that keep track.
 
-    Args:
-        pair: Runs of both filters.
-        group: Group of the state.
-        options: Options.
-
-    Returns:
-        PairComparison for both questions.
+    Returns PairComparison for both questions.
     """
     d = np.where(pair.present, pair.keeps_b.astype(float) - pair.keeps_a, np.nan)
     effects = share_effects(d, pair.weights, options.shared_runs, _key(pair, TRACK))

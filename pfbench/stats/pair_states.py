@@ -93,12 +93,7 @@ def average_over_conditions(pair: PairRuns, rule: MetricRule | None = None) -> A
     A run of all conditions is one unit, because its conditions share random numbers. Infinite
     values decide by the sum of the weights of their signs.
 
-    Args:
-        pair: Runs of both filters.
-        rule: Rule of the metric, None for the log ratio of errors.
-
-    Returns:
-        Averages of the runs that all conditions have, [n], in the order of the runs.
+    Returns averages of the runs that all conditions have, [n], in the order of the runs.
     """
     d = paired_differences(pair, rule or MetricRule())
     used = pair.weights > 0
@@ -229,18 +224,11 @@ class LookSchedule:
 class LookRecord:
     """Plan and looks of a study in one file.
 
-    Args:
-        path: File, whose folder is created.
-        request: Plan of the study, values that JSON can represent.
-
     Attributes:
         path: File.
         request: Plan of the study.
         looks: Lines of the looks so far.
         state: Reason why the study has finished, or empty.
-
-    Raises:
-        ValueError: if the file is of another plan, or is damaged.
     """
 
     def __init__(self, path: Path, request: Mapping[str, Any]) -> None:
@@ -261,12 +249,7 @@ class LookRecord:
         self.looks, self.state = list(stored["looks"]), str(stored["state"])
 
     def write(self, looks: Sequence[str], state: str = "") -> None:
-        """Write the looks so far.
-
-        Args:
-            looks: Lines of the looks.
-            state: Reason why the study has finished, empty while it has not.
-        """
+        """Write the looks so far."""
         self.looks, self.state = list(looks), state
         content = {"request": self.request, "looks": self.looks, "state": state}
         text = json.dumps({**content, DIGEST: hash_content(content)}, indent=1)

@@ -101,18 +101,8 @@ def decide_secondary_metrics(
 ) -> list[Decision]:
     """Decide the secondary metrics of planned pairs in one family per question.
 
-    Args:
-        tables: Table by name of the metric, as in `decide_planned_pairs`.
-        pairs: Labels of the planned pairs.
-        rules: Rules of the metrics.
-        options: Options, None for the defaults.
-
-    Returns:
-        Records of question (a), then of question (b). A pair without a common
-        run of a metric lacks its record.
-
-    Raises:
-        ValueError: if a table or a pair is not valid.
+    Returns records of question (a), then of question (b). A pair without a common run of a metric
+    lacks its record.
     """
     options = options or DecisionOptions()
     check_pairs(pairs)
@@ -139,11 +129,7 @@ def decision_frame(decisions: Sequence[Decision]) -> pd.DataFrame:
 
 
 def check_pairs(pairs: Pairs) -> None:
-    """Check that pairs exist and that no pair occurs twice, in any order.
-
-    Raises:
-        ValueError: if a pair occurs twice or none exists.
-    """
+    """Check that pairs exist and that no pair occurs twice, in any order."""
     names = [frozenset(pair) for pair in pairs]
     if not names or len(set(names)) < len(names):
         raise ValueError(
@@ -155,12 +141,7 @@ def check_pairs(pairs: Pairs) -> None:
 def add_pair_words(decisions: Sequence[Decision], options: DecisionOptions) -> list[Decision]:
     """Combine the words of track and error of each pair.
 
-    Args:
-        decisions: Records of one question, track before error for each pair.
-        options: Options with the margins of a trade-off.
-
-    Returns:
-        Records with the word of the pair.
+    Returns records with the word of the pair.
     """
     combined: list[Decision] = []
     for track, error in zip(decisions[::2], decisions[1::2], strict=True):
@@ -243,13 +224,7 @@ def record_family(
 ) -> list[Decision]:
     """Test a family for one question and describe its decisions.
 
-    Args:
-        comparisons: Members of the family.
-        question: "a" or "b".
-        context: Context of the records.
-
-    Returns:
-        One record per comparison, in order.
+    Returns one record per comparison, in order.
     """
     if not comparisons:
         return []
@@ -262,12 +237,7 @@ def record_family(
 
 
 def effect_of(comparison: PairComparison, question: Question) -> QuestionEffect:
-    """Return the effect of a comparison for a question.
-
-    Args:
-        comparison: PairComparison.
-        question: "a" or "b".
-    """
+    """Return the effect of a comparison for a question."""
     return comparison.effects.same_worlds if question == "a" else comparison.effects.new_world
 
 
@@ -280,15 +250,7 @@ def describe(
 ) -> Decision:
     """Describe one decision of a family.
 
-    Args:
-        comparison: PairComparison.
-        question: "a" or "b".
-        tests: Tests of the family.
-        k: Index of the comparison in the family.
-        context: Context of the records.
-
-    Returns:
-        Record.
+    Returns Record.
     """
     pair, effects, options = comparison.pair, comparison.effects, context.options
     effect = effect_of(comparison, question)
@@ -440,12 +402,7 @@ def decide_family(members: QuestionEffect, alpha: float) -> FamilyTests:
     Intervals have level 1 - alpha / M. If Holm's test decides and the interval includes 0, its end
     becomes 0. An interval of a comparison that is not decided includes 0.
 
-    Args:
-        members: Comparisons.
-        alpha: Error of the family.
-
-    Returns:
-        Decisions and intervals.
+    Returns decisions and intervals.
     """
     size = np.isfinite(members.p).sum(axis=-1)
     low, high = members.estimate.interval(alpha / np.maximum(size, 1)[..., None])

@@ -69,13 +69,8 @@ def wilcoxon_signed_rank_rows(
     exact up to 13 differences, and up to 50 if none are tied, otherwise normal. All rows are
     tested at once, since one call of scipy per pair dominated the time of a report.
 
-    Args:
-        d: Differences, [K, n].
-        alternative: "two-sided", or the side of zero on which the centre is claimed to lie.
-
-    Returns:
-        Statistic and p-value of each row, [K]. The statistic is the smaller rank sum of a
-        two-sided test, else the sum of the positive ranks. A row of zeros has p = 1.
+    Returns statistic and p-value of each row, [K]. The statistic is the smaller rank sum of a
+    two-sided test, else the sum of the positive ranks. A row of zeros has p = 1. Shapes: d [K, n].
     """
     n = d.shape[1]
     size = np.abs(d)
@@ -160,14 +155,8 @@ _TOLERANCE = 1e-9
 def run_contributions(d: Array, weights: Array, shared_runs: bool = True) -> Array:
     """Compute the contribution of each run to a mean over worlds and conditions.
 
-    Args:
-        d: Differences, [..., W, C, N], 0 if the filters agree; NaN for an absent run.
-        weights: Weights of the conditions of a world, [W, C], with sum 1 for each world.
-        shared_runs: Whether a run has the same random numbers in all worlds, so that its
-            contributions are exchanged together.
-
-    Returns:
-        Contributions, [..., N], or [..., W * N] for worlds with runs that are not shared.
+    Returns contributions, [..., N], or [..., W * N] for worlds with runs that are not shared.
+    Shapes: d [..., W, C, N], weights [W, C].
     """
     runs = np.count_nonzero(~np.isnan(d), axis=-1)
     share = weights / np.maximum(runs, 1) / d.shape[-3]
@@ -180,14 +169,7 @@ def run_contributions(d: Array, weights: Array, shared_runs: bool = True) -> Arr
 def flip_p_value(contributions: Array, seed: int = 0, key: str = "") -> float:
     """Test whether contributions are symmetric around zero, two-sided.
 
-    Args:
-        contributions: Contribution of each run, [N].
-        seed: Seed of random exchanges. They are used only without a common step.
-        key: Name of the comparison. Each comparison has a stream of its own, so that further
-            comparisons do not change its p-value.
-
-    Returns:
-        p-value; 1 if all contributions are 0.
+    Returns p-value; 1 if all contributions are 0. Shapes: contributions [N].
     """
     x = contributions[np.abs(contributions) > _TOLERANCE]
     if not x.size:
@@ -250,12 +232,8 @@ _CONCENTRATION = 8.0  # of the symmetric beta mixture
 def log_e_value(below: Array | int, runs: Array | int) -> Array:
     """Compute the logarithm of the e-value against equal shares on both sides.
 
-    Args:
-        below: Runs with a difference below the value tested, [...].
-        runs: Runs with a difference that is not equal to it, [...].
-
-    Returns:
-        Logarithms, [...]. The hypothesis is rejected at level alpha at 1 / alpha.
+    Returns logarithms, [...]. The hypothesis is rejected at level alpha at 1 / alpha. Shapes: below
+    [...], runs [...].
     """
     a = _CONCENTRATION
     k, n = np.asarray(below, dtype=np.float64), np.asarray(runs, dtype=np.float64)
@@ -265,8 +243,7 @@ def log_e_value(below: Array | int, runs: Array | int) -> Array:
 def sign_log_e_value(d: Array) -> Array:
     """Compute the logarithm of the e-value of a median of 0.
 
-    Args:
-        d: Differences, [..., n]; zeros are left out, infinite values count by their sign.
+    Shapes: d [..., n].
     """
     return log_e_value((d < 0).sum(axis=-1), (d != 0).sum(axis=-1))
 
@@ -274,12 +251,7 @@ def sign_log_e_value(d: Array) -> Array:
 def confidence_sequence(d: Array, alpha: float) -> tuple[Array, Array]:
     """Compute the interval of the median that holds at all numbers of runs together.
 
-    Args:
-        d: Differences, [..., n].
-        alpha: Probability that the interval ever misses the median.
-
-    Returns:
-        Lower and upper end, two order statistics; infinite if the runs are too few.
+    Shapes: d [..., n].
     """
     n = d.shape[-1]
     k = least_count(n, alpha)
@@ -291,12 +263,7 @@ def confidence_sequence(d: Array, alpha: float) -> tuple[Array, Array]:
 
 
 def least_count(runs: int, alpha: float) -> int:
-    """Return the least number of runs below a value at which the value is not rejected.
-
-    Args:
-        runs: Number of runs.
-        alpha: Level.
-    """
+    """Return the least number of runs below a value at which the value is not rejected."""
     plausible = log_e_value(np.arange(runs + 1, dtype=np.float64), runs) < np.log(1 / alpha)
     return int(np.argmax(plausible)) if plausible.any() else runs + 1
 
@@ -304,12 +271,6 @@ def least_count(runs: int, alpha: float) -> int:
 def combine_e_values(log_e: Array, comparisons: int, alpha: float = 0.05) -> bool:
     """Decide from e-values of independent samples, with Bonferroni's correction.
 
-    Args:
-        log_e: Logarithms of e-values of independent samples, [W]. They are multiplied.
-        comparisons: Number of comparisons that share the error.
-        alpha: Error of all comparisons.
-
-    Returns:
-        Whether the product reaches comparisons / alpha.
+    Returns whether the product reaches comparisons / alpha. Shapes: log_e [W].
     """
     return bool(np.sum(log_e) >= np.log(comparisons / alpha))

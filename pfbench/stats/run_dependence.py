@@ -34,13 +34,7 @@ class RunAssessment(NamedTuple):
 
 
 def assess_runs(table: pd.DataFrame, value: str, run: list[str]) -> RunAssessment:
-    """Find copies of runs, and test the other runs for errors that are alike in neighbouring runs.
-
-    Args:
-        table: One row per filter, scenario, regime and run.
-        value: Column of the error, a number with many digits.
-        run: Columns that name a run, in the order of the runs.
-    """
+    """Find copies of runs, and test the other runs for errors that are alike in neighbouring runs."""
     copies = find_copied_runs(table, value, run)
     dependence = describe_dependence(drop_runs(table, copies, run), value, run)
     return RunAssessment(copies, " ".join(filter(None, (describe_copies(copies), dependence))))
@@ -50,14 +44,6 @@ def find_copied_runs(table: pd.DataFrame, value: str, run: list[str]) -> dict[An
     """Find runs whose errors are equal, digit by digit, to those of an earlier run.
 
     A condition in which all runs of a filter have one error is left out: its data are not random.
-
-    Args:
-        table: One row per filter, scenario, regime and run.
-        value: Column of the error, a number with many digits.
-        run: Columns that name a run.
-
-    Returns:
-        The earlier run by each copy. A run is a copy if the errors of one filter agree in all conditions.
     """
     wide = table.pivot_table(value, ["filter", "scenario", "regime"], run, dropna=False)
     copies: dict[Any, Any] = {}
@@ -79,13 +65,7 @@ def find_copied_runs(table: pd.DataFrame, value: str, run: list[str]) -> dict[An
 
 
 def drop_runs(table: pd.DataFrame, runs: dict[Any, Any], run: list[str]) -> pd.DataFrame:
-    """Remove the rows of some runs.
-
-    Args:
-        table: Table with the columns of a run.
-        runs: Runs, as the keys of `find_copied_runs`.
-        run: Columns that name a run.
-    """
+    """Remove the rows of some runs."""
     if not runs:
         return table
     index = pd.MultiIndex.from_frame(table[run]) if len(run) > 1 else pd.Index(table[run[0]])
@@ -93,11 +73,7 @@ def drop_runs(table: pd.DataFrame, runs: dict[Any, Any], run: list[str]) -> pd.D
 
 
 def describe_copies(copies: dict[Any, Any]) -> str:
-    """Describe copies in one sentence, empty without any.
-
-    Args:
-        copies: Result of `find_copied_runs`.
-    """
+    """Describe copies in one sentence, empty without any."""
     if not copies:
         return ""
     copy, original = next(iter(copies.items()))
@@ -112,11 +88,7 @@ def describe_copies(copies: dict[Any, Any]) -> str:
 def lag_p_values(values: Array) -> Array:
     """Test for errors that are alike in neighbouring runs, one-sided, by ranks.
 
-    Args:
-        values: Series in the order of the runs, [..., n].
-
-    Returns:
-        p-values, [...]; 1 for fewer than 10 runs.
+    Returns p-values, [...]; 1 for fewer than 10 runs. Shapes: values [..., n].
     """
     n = values.shape[-1]
     if n < _FEWEST:
@@ -131,13 +103,7 @@ def lag_p_values(values: Array) -> Array:
 
 
 def describe_dependence(table: pd.DataFrame, value: str, run: list[str]) -> str:
-    """Describe errors that correlate from run to run, empty if none is shown.
-
-    Args:
-        table: One row per filter, scenario, regime and run.
-        value: Column of the error.
-        run: Columns that name a run, in the order of the runs.
-    """
+    """Describe errors that correlate from run to run, empty if none is shown."""
     # Ranks within a condition, since a run that some conditions lack has another mean error than the others.
     ranks = table.groupby(["filter", "scenario", "regime"], sort=False)[value].rank(pct=True)
     wide = table.assign(rank=ranks - 0.5).pivot_table("rank", "filter", run, dropna=False)
@@ -178,12 +144,7 @@ def select_independent_runs(
 ) -> IndependentRows:
     """Leave out copies of runs, as a report does.
 
-    Args:
-        rows: Rows of `to_long_rows`, of all conditions.
-        mains: Main group by scenario, noise and model. Its error shows the copies.
-
-    Returns:
-        The rows of the other runs, with a sentence on what is left out.
+    Returns the rows of the other runs, with a sentence on what is left out.
     """
     main = select_main_metrics(rows, mains, "main")
     errors = main[main["metric"] == "rmse"]

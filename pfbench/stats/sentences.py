@@ -59,11 +59,7 @@ def describe_pair(track: Decision, error: Decision) -> str:
 def describe_total(decisions: Sequence[Decision]) -> str:
     """Describe how many pairs are decided, and the error control.
 
-    Args:
-        decisions: Records of `decide_planned_pairs`.
-
-    Returns:
-        Two sentences.
+    Returns two sentences.
     """
     errors = [d for d in decisions if d.metric != TRACK]
     pairs = len({(d.a, d.b) for d in errors})
@@ -82,13 +78,7 @@ def describe_total(decisions: Sequence[Decision]) -> str:
 def describe_ranking(same_worlds: FilterRanking, new: FilterRanking, label: str) -> str:
     """Describe the top group and the rank of one filter.
 
-    Args:
-        same_worlds: Order for question (a).
-        new: Order for question (b).
-        label: Filter.
-
-    Returns:
-        Two sentences.
+    Returns two sentences.
     """
     (first, last), (first_new, last_new) = same_worlds.ranks[label], new.ranks[label]
     return (
@@ -125,20 +115,12 @@ def _describe_here(error: Decision) -> str:
 
 
 def describe_runs_won(error: Decision) -> str:
-    """Describe the difference of the shares of runs that the first and the second filter win.
-
-    Args:
-        error: Record of the error, on the scale of runs won.
-    """
+    """Describe the difference of the shares of runs that the first and the second filter win."""
     return format_effect(error, -error.estimate, -error.high, -error.low)
 
 
 def describe_shares(track: Decision) -> str:
-    """Describe the shares of runs in which two filters keep track, and their difference.
-
-    Args:
-        track: Record of the share of runs that keep track.
-    """
+    """Describe the shares of runs in which two filters keep track, and their difference."""
     shares = f"{format_percent(track.share_a)} and {format_percent(track.share_b)} % of runs"
     if track.word == IDENTICAL or not (math.isfinite(track.low) and math.isfinite(track.high)):
         return shares
@@ -225,14 +207,7 @@ _TENFOLD, _MILLION = math.log(10.0), math.log(1e6)
 
 
 def format_effect(decision: Decision, value: float, low: float, high: float) -> str:
-    """Format an effect as "26 % smaller (18 to 33 %)".
-
-    Args:
-        decision: Record that gives the scale.
-        value: Effect.
-        low: Lower end of its interval.
-        high: Upper end.
-    """
+    """Format an effect as "26 % smaller (18 to 33 %)"."""
     if decision.scale == "log ratio":
         return _format_change(value, low, high)
     if decision.scale == "difference":
@@ -262,13 +237,7 @@ def _format_ratio(log_ratio: float) -> str:
 
 
 def format_range(error: Decision, low: float, high: float) -> str:
-    """Format two ends as "45 % smaller to 2 % larger".
-
-    Args:
-        error: Record that gives the scale.
-        low: Lower end.
-        high: Upper end.
-    """
+    """Format two ends as "45 % smaller to 2 % larger"."""
     if error.scale != "log ratio":
         return f"{low:.3g} to {high:.3g}"
     words = [
@@ -306,12 +275,7 @@ def format_level(error: Decision) -> str:
 
 
 def format_count(number: int, noun: str) -> str:
-    """Format a count with its noun.
-
-    Args:
-        number: Count.
-        noun: Noun, singular.
-    """
+    """Format a count with its noun."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
@@ -321,12 +285,7 @@ def format_percent(share: float) -> str:
 
 
 def format_digits(value: float, digits: int = 3) -> str:
-    """Format a number with significant digits, without an exponent below 1e6.
-
-    Args:
-        value: Number.
-        digits: Number of significant digits.
-    """
+    """Format a number with significant digits, without an exponent below 1e6."""
     if not math.isfinite(value):
         return (
             "no number of" if math.isnan(value) else ("any amount" if value > 0 else "-any amount")
@@ -339,11 +298,7 @@ def format_digits(value: float, digits: int = 3) -> str:
 
 
 def percent(log_ratio: float) -> str:
-    """Format a log ratio as a change in percent with two digits, without its sign.
-
-    Args:
-        log_ratio: Log ratio.
-    """
+    """Format a log ratio as a change in percent with two digits, without its sign."""
     value = abs(100 * math.expm1(min(log_ratio, 20.0)))
     digits = 0 if value >= 10 else 1 if value >= 1 else 2
     return f"{value:.{digits}f}" if value < 1e4 else f"{value:.1e}"

@@ -67,9 +67,6 @@ class LookPlan:
         alpha: Error of all planned pairs together.
         comparisons: Number of comparisons that share the error. Each has an equal part.
         spending: Error spent by a share of the runs: "pocock" or "obrien_fleming".
-
-    Raises:
-        ValueError: if the runs do not increase, or a number is out of range.
     """
 
     runs: tuple[int, ...] = (20, 40, 80, 160, 320)
@@ -97,13 +94,7 @@ class LookPlan:
 
 
 def spent_error(time: float, alpha: float, spending: Spending) -> float:
-    """Return the error that may be spent until a share of the runs.
-
-    Args:
-        time: Share of the runs, 0 to 1.
-        alpha: Error of all looks, two-sided.
-        spending: Spending function of Lan and DeMets.
-    """
+    """Return the error that may be spent until a share of the runs."""
     if spending == "pocock":
         return float(alpha * np.log1p(np.expm1(1.0) * time))
     return float(4 * ndtr(ndtri(alpha / 4) / np.sqrt(time)))
@@ -117,14 +108,6 @@ def boundary_scores(
 
     The distribution of the sum of runs that have not yet decided is integrated from look to look
     with Gauss-Legendre points.
-
-    Args:
-        times: Shares of the runs at the looks, increasing, the last one at most 1.
-        alpha: Error of all looks.
-        spending: Spending function.
-
-    Returns:
-        One score per look.
     """
     nodes, node_weights = np.polynomial.legendre.leggauss(_NODES)
     scores: list[float] = []
@@ -147,12 +130,7 @@ def repeated_interval(
 ) -> tuple[Array, Array]:
     """Intersect the intervals of all looks so far.
 
-    Args:
-        estimates: Estimates of question (a) at the looks so far.
-        levels: Two-sided levels of the looks, at least as many.
-
-    Returns:
-        Lower and upper end. If the intervals of two looks do not overlap, the last one remains.
+    Returns lower and upper end. If the intervals of two looks do not overlap, the last one remains.
     """
     ends = [estimate.interval(level) for estimate, level in zip(estimates, levels, strict=False)]
     low = np.max([end[0] for end in ends], axis=0)
@@ -162,15 +140,7 @@ def repeated_interval(
 
 
 def repeated_p_value(p: Sequence[float], plan: LookPlan) -> float:
-    """Compute the least error of the plan at which some look so far shows a difference.
-
-    Args:
-        p: p-values at the looks so far.
-        plan: Plan of the looks.
-
-    Returns:
-        p-value of one comparison, at least 1e-8, before the multiplication by their number.
-    """
+    """Compute the least error of the plan at which some look so far shows a difference."""
     times = tuple(n / plan.runs[-1] for n in plan.runs)
 
     def is_shown(alpha: float) -> bool:
@@ -211,19 +181,7 @@ def decide_at_looks(
 ) -> list[Decision]:
     """Decide planned pairs for question (a) with all looks that the runs allow.
 
-    Args:
-        table: Table as in `planned_pairs.decide_planned_pairs`, with all runs so far.
-        pairs: Labels of the planned pairs.
-        plan: Plan of the looks. Its `comparisons` is replaced by two per pair, and its `alpha` is
-            used.
-        rule: Rule of the main metric, None for the log ratio of errors.
-        options: Options, None for the defaults.
-
-    Returns:
-        Two records per pair, track before error.
-
-    Raises:
-        ValueError: if the table or a pair is not valid, or the runs do not reach the first look.
+    Returns two records per pair, track before error.
     """
     rule, options = rule or MetricRule(), options or DecisionOptions()
     study = to_study_runs(table)
@@ -250,13 +208,8 @@ def is_complete(decisions: Sequence[Decision]) -> bool:
 def decide_looks(effects: Sequence[PairEffects], plan: LookPlan) -> FamilyTests:
     """Test one comparison with the effects of all looks so far.
 
-    Args:
-        effects: Effects of question (a) at the looks so far, with leading axes [...].
-        plan: Plan of the looks.
-
-    Returns:
-        Repeated intervals and decisions, [...]. An interval agrees with the decision as in
-        `family_tests.decide_family`.
+    Returns repeated intervals and decisions, [...]. An interval agrees with the decision as in
+    `family_tests.decide_family`. Shapes: effects [...].
     """
     levels = plan.levels
     low, high = repeated_interval([e.same_worlds.estimate for e in effects], levels)

@@ -87,19 +87,7 @@ class StudySetting:
         effect: float = 0.0,
         fixed_worlds: bool = False,
     ) -> SimulatedPairs:
-        """Draw studies.
-
-        Args:
-            rng: Generator.
-            studies: Number of studies S.
-            effect: Mean log ratio: over the worlds of each study if they are fixed, else over all
-                possible worlds.
-            fixed_worlds: Whether the effects of the worlds of each study average to `effect`
-                exactly, as question (a) requires.
-
-        Returns:
-            Studies.
-        """
+        """Draw studies."""
         shape = (studies, self.worlds, self.regimes, self.runs)
         worlds = self.world_sd * rng.standard_normal((studies, self.worlds, 1, 1))
         worlds = worlds + self.regime_sd * rng.standard_normal((*shape[:3], 1))
@@ -137,13 +125,7 @@ class StudySetting:
 
 
 def draw_run_noise(rng: np.random.Generator, noise: NoiseName, size: tuple[int, ...]) -> Array:
-    """Draw noise of unit variance.
-
-    Args:
-        rng: Generator.
-        noise: Name of the distribution.
-        size: Shape.
-    """
+    """Draw noise of unit variance."""
     if noise == "t3":
         return rng.standard_t(3, size) / np.sqrt(3.0)
     return rng.standard_normal(size) if noise == "normal" else rng.standard_exponential(size) - 1.0
@@ -154,14 +136,7 @@ def assess_pairs(
 ) -> tuple[PairEffects, PairEffects]:
     """Estimate track and error of simulated studies by the functions of a report.
 
-    Args:
-        pairs: Simulated studies.
-        weights: Weights of the conditions, [W, R].
-        shared_runs: Whether runs share draws over worlds.
-        estimate: Estimate of the log ratio, as in `DecisionOptions`.
-
-    Returns:
-        Effects of track and of error.
+    Returns effects of track and of error. Shapes: weights [W, R].
     """
     d = order_failed_runs(pairs.d, pairs.keeps_a, pairs.keeps_b)
     track = share_effects(pairs.keeps_b.astype(float) - pairs.keeps_a, weights, shared_runs)
@@ -177,14 +152,7 @@ def assess_pairs(
 
 @cache
 def _noise_centre(noise: NoiseName, shares: tuple[float, ...], ratio: float | None) -> float:
-    """Compute the location of skewed noise, so that the effect is exact.
-
-    Args:
-        noise: Name of the distribution.
-        shares: Shares of the variance of the noise.
-        ratio: SD of the mean log error over that of the noise for a difference of levels, None for
-            the trimmed mean of the noise.
-    """
+    """Compute the location of skewed noise, so that the effect is exact."""
     if noise != "exponential":
         return 0.0
     rng = np.random.default_rng(0)

@@ -84,15 +84,7 @@ class PairRuns(NamedTuple):
 def to_study_runs(table: pd.DataFrame) -> StudyRuns:
     """Arrange a table as arrays.
 
-    Args:
-        table: Columns filter, scenario, family, regime, run, value and keeps_track, one row per run
-            of a filter. `run` names the random numbers of a run: runs of equal name share them.
-
-    Returns:
-        Arrays of the study.
-
-    Raises:
-        ValueError: if a column is missing, the table is empty, or a run occurs twice.
+    Returns arrays of the study.
     """
     missing = [name for name in COLUMNS if name not in table.columns]
     if missing or table.empty:
@@ -130,16 +122,7 @@ def to_study_runs(table: pd.DataFrame) -> StudyRuns:
 def select_pair(study: StudyRuns, a: str, b: str) -> PairRuns:
     """Select the runs that two filters share.
 
-    Args:
-        study: Arrays of the study.
-        a: Label of the first filter.
-        b: Label of the second filter.
-
-    Returns:
-        Runs of both filters; worlds without a common run are left out.
-
-    Raises:
-        ValueError: if results of a filter are missing, or both share no run.
+    Returns runs of both filters; worlds without a common run are left out.
     """
     unknown = [label for label in (a, b) if label not in study.filters]
     if unknown or a == b:
@@ -165,13 +148,7 @@ def select_pair(study: StudyRuns, a: str, b: str) -> PairRuns:
 
 
 def have_common_runs(study: StudyRuns, a: str, b: str) -> bool:
-    """Return whether two filters share a run.
-
-    Args:
-        study: Arrays of the study.
-        a: Label of the first filter.
-        b: Label of the second filter.
-    """
+    """Return whether two filters share a run."""
     if a not in study.filters or b not in study.filters:
         return False
     i, j = study.filters.index(a), study.filters.index(b)
@@ -179,12 +156,7 @@ def have_common_runs(study: StudyRuns, a: str, b: str) -> bool:
 
 
 def first_runs(study: StudyRuns, runs: int) -> StudyRuns:
-    """Select the first runs of a study, in the order of their names.
-
-    Args:
-        study: Arrays of the study.
-        runs: Number of runs.
-    """
+    """Select the first runs of a study, in the order of their names."""
     columns = {
         name: getattr(study, name)[..., :runs] for name in ("value", "keeps_track", "present")
     }
@@ -216,9 +188,7 @@ def _index_conditions(
 def condition_weights(scenario: np.ndarray, present: Flags) -> Array:
     """Compute weights [W, C]: equal for scenarios of a world, and for regimes of a scenario.
 
-    Args:
-        scenario: Index of the scenario of each condition within its world, [W, C].
-        present: Conditions with a run, [W, C].
+    Shapes: scenario [W, C], present [W, C].
     """
     weights = np.zeros(scenario.shape)
     for row, used, names in zip(weights, present, scenario, strict=True):
@@ -265,11 +235,7 @@ def tidy_runs(
 
 
 def tidy_rows(rows: pd.DataFrame) -> pd.DataFrame:
-    """Arrange the rows of one metric and component in the form of `to_study_runs`.
-
-    Args:
-        rows: Rows of `load_frame`, one per run of a filter in a condition.
-    """
+    """Arrange the rows of one metric and component in the form of `to_study_runs`."""
     models = rows.groupby("scenario")["model"].transform("nunique")
     regime = rows["noise"].astype(str).where(models == 1, rows["noise"] + " / " + rows["model"])
     scenario = rows["scenario"].astype(str)

@@ -39,17 +39,7 @@ def min_pairs(alpha: float) -> int:
 def compute_power(
     effect: float, pairs: int, alpha: float = 0.05, efficiency: float = EFFICIENCY
 ) -> float:
-    """Compute the probability that the two-sided paired signed-rank test shows an effect.
-
-    Args:
-        effect: Mean difference in standard deviations of the difference.
-        pairs: Runs that both filters have.
-        alpha: Level. Before Holm's correction, the level of the family divided by its size.
-        efficiency: Efficiency of the test relative to the t test.
-
-    Returns:
-        Power, 0 to 1.
-    """
+    """Compute the probability that the two-sided paired signed-rank test shows an effect."""
     z = float(-ndtri(alpha / 2))
     if pairs < min_pairs(alpha):
         return 0.0
@@ -59,17 +49,7 @@ def compute_power(
 def required_runs(
     effect: float, alpha: float = 0.05, power: float = POWER, efficiency: float = EFFICIENCY
 ) -> float:
-    """Compute the runs required to show an effect; infinite for no effect.
-
-    Args:
-        effect: Mean difference in standard deviations of the difference.
-        alpha: Level.
-        power: Power required.
-        efficiency: Efficiency of the test relative to the t test.
-
-    Returns:
-        Number of runs.
-    """
+    """Compute the runs required to show an effect; infinite for no effect."""
     if effect == 0:
         return math.inf
     z = float(-ndtri(alpha / 2))
@@ -83,15 +63,6 @@ def required_runs_proportion(
     """Compute the runs required to show on which side of a limit a probability lies.
 
     Normal approximation with a continuity correction [Fleiss, Levin, Paik 2003].
-
-    Args:
-        proportion: Probability.
-        limit: Limit of the probability.
-        alpha: One-sided level.
-        power: Power required.
-
-    Returns:
-        Number of runs, infinite if the probability equals the limit.
     """
     if proportion == limit:
         return math.inf
@@ -145,16 +116,7 @@ class DetectableEffects(NamedTuple):
 
 
 def t_test_power(score: float, df: float, alpha: float) -> float:
-    """Compute the power of the two-sided t test.
-
-    Args:
-        score: Effect divided by the standard error.
-        df: Degrees of freedom.
-        alpha: Level.
-
-    Returns:
-        Power, 0 to 1.
-    """
+    """Compute the power of the two-sided t test."""
     if df <= 0:
         return 0.0
     limit = float(-stdtrit(df, alpha / 2))
@@ -163,16 +125,7 @@ def t_test_power(score: float, df: float, alpha: float) -> float:
 
 
 def detectable_score(df: float, alpha: float, power: float = POWER) -> float:
-    """Compute the effect in standard errors that the two-sided t test shows with a given power.
-
-    Args:
-        df: Degrees of freedom.
-        alpha: Level.
-        power: Power required.
-
-    Returns:
-        Score, infinite without degrees of freedom.
-    """
+    """Compute the effect in standard errors that the two-sided t test shows with a given power."""
     if df <= 0:
         return math.inf
     limit = float(-stdtrit(df, alpha / 2))
@@ -186,17 +139,7 @@ def detectable_score(df: float, alpha: float, power: float = POWER) -> float:
 def required_worlds(
     effect: float, comparisons: int = 1, alpha: float = 0.05, power: float = POWER
 ) -> float:
-    """Compute the worlds required to show an effect in a new world.
-
-    Args:
-        effect: Mean effect in standard deviations over worlds.
-        comparisons: Size of the family. Each comparison is tested at alpha / comparisons.
-        alpha: Error of the family.
-        power: Power required.
-
-    Returns:
-        Number of worlds, infinite for no effect.
-    """
+    """Compute the worlds required to show an effect in a new world."""
     level = alpha / comparisons
     return _least(lambda w: t_test_power(effect * math.sqrt(w), w - 1, level) >= power, 2, effect)
 
@@ -204,17 +147,7 @@ def required_worlds(
 def required_runs_per_condition(
     effect: float, comparisons: int = 1, alpha: float = 0.05, power: float = POWER
 ) -> float:
-    """Compute the runs required to show an effect in the worlds of a study.
-
-    Args:
-        effect: Effect in standard deviations over runs of the mean over worlds.
-        comparisons: Size of the family.
-        alpha: Error of the family.
-        power: Power required.
-
-    Returns:
-        Number of runs per condition, at least 10, infinite for no effect.
-    """
+    """Compute the runs required to show an effect in the worlds of a study."""
     level = alpha / comparisons
     return _least(
         lambda n: t_test_power(effect * math.sqrt(n), middle_runs(n) - 1, level) >= power,
@@ -298,16 +231,7 @@ _LARGEST_RATIO = 1000.0
 def describe_study_size(runs: int, worlds: int, pairs: int) -> str:
     """Describe the least differences that a study shows, before it runs.
 
-    Args:
-        runs: Runs per condition.
-        worlds: Number of worlds, families of scenarios.
-        pairs: Number of planned pairs of filters.
-
-    Returns:
-        One or two sentences on errors, for the worlds of the study and for a new one.
-
-    Raises:
-        ValueError: if a number is not positive.
+    Returns one or two sentences on errors, for the worlds of the study and for a new one.
     """
     effects = detectable_effects(runs, worlds, pairs)
     size = f"{_count(runs, 'run')} and {_count(worlds, 'world')}"

@@ -182,14 +182,7 @@ def _with_particles(method: Any, n: int) -> Any:
 
 
 def has_particles(method: object) -> bool:
-    """Return whether a filter is a dataclass with a field `particles`.
-
-    Args:
-        method: Filter, or another object.
-
-    Returns:
-        False for a class.
-    """
+    """Return whether a filter is a dataclass with a field `particles`."""
     is_instance = is_dataclass(method) and not isinstance(method, type)
     return is_instance and "particles" in {field.name for field in fields(method)}  # type: ignore[arg-type]
 

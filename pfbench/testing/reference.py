@@ -191,16 +191,6 @@ def case_or_default(
     """Return a given model with its records, or a default case.
 
     The default is a walk with constant velocity and a record [6, 1] with a missing measurement.
-
-    Args:
-        model: State-space model, or None.
-        y: Its records, or None.
-
-    Returns:
-        Model and records.
-
-    Raises:
-        ValueError: If only one of them is given.
     """
     if model is None and y is None:
         record = [[0.8], [2.9], [1.2], [np.nan], [3.0], [6.5]]

@@ -41,17 +41,7 @@ def check_means(
 ) -> LawCheck:
     """Check that independent deviations average to zero.
 
-    Args:
-        statement: Statement in words, for the message.
-        deviations: Deviations from the expectation by name, each [runs], scaled to about 1.
-        limit: Largest number of standard errors.
-        max_error: Largest standard error with which the test can decide.
-
-    Returns:
-        The deviation with the most standard errors.
-
-    Raises:
-        AssertionError: If an average exceeds the limit, or its standard error `max_error`.
+    Returns the deviation with the most standard errors.
     """
     worst = LawCheck(statement, 0.0, limit)
     for name, values in deviations.items():
@@ -75,17 +65,7 @@ def check_p_values(
 ) -> LawCheck:
     """Check that no p-value is below the limit.
 
-    Args:
-        statement: Statement in words, for the message.
-        p_values: p-values by the name of the comparison.
-        limit: Smallest p-value.
-        **details: Further numbers for the result and the message.
-
-    Returns:
-        The smallest p-value.
-
-    Raises:
-        AssertionError: If a p-value is below the limit.
+    Returns the smallest p-value.
     """
     name, smallest = min(p_values.items(), key=lambda item: item[1])
     numbers = "".join(f", {key} {value:.3g}" for key, value in details.items())
@@ -102,20 +82,7 @@ def check_p_values(
 def find_kind(
     tester: str, stage: object, kinds: Mapping[str, tuple[str, ...]], example: str
 ) -> str:
-    """Return the kind of a stage, by the arguments of its call.
-
-    Args:
-        tester: Name of the function that tests the stage.
-        stage: Stage of a user.
-        kinds: Arguments of the call, by kind.
-        example: Python code of a stage, for the message.
-
-    Returns:
-        The first kind whose arguments the call takes.
-
-    Raises:
-        ValueError: If the stage is a class, or if its call takes the arguments of no kind.
-    """
+    """Return the kind of a stage, by the arguments of its call."""
     if callable(stage) and not isinstance(stage, type):
         for kind, arguments in kinds.items():
             if takes_arguments(stage, len(arguments)):
@@ -127,15 +94,7 @@ def find_kind(
 
 
 def describe_subject(item: object, example: str) -> str:
-    """Return what a test received, with the remedy.
-
-    Args:
-        item: Object that is not of the right kind.
-        example: Python code of an object that is.
-
-    Returns:
-        End of a message, two sentences.
-    """
+    """Return what a test received, with the remedy."""
     if isinstance(item, type):
         return f"the class {item.__name__}. Pass an instance, such as {example}."
     if _is_filter(item):
@@ -145,18 +104,7 @@ def describe_subject(item: object, example: str) -> str:
 
 
 def check_subject(tester: str, method: object, model: object, y: object, dimensions: str) -> None:
-    """Check the types of a filter, its model and the measurements.
-
-    Args:
-        tester: Name of the function that tests the filter.
-        method: Filter.
-        model: State-space model, or None.
-        y: Measurements, or None.
-        dimensions: Axes of the measurements, such as `R, T, Dy`.
-
-    Raises:
-        ValueError: If one of them is of another type, or has another number of axes.
-    """
+    """Check the types of a filter, its model and the measurements."""
     check_is_filter(method)
     if model is not None:
         check_is_model(tester, model)
@@ -170,31 +118,14 @@ def check_subject(tester: str, method: object, model: object, y: object, dimensi
 
 
 def check_is_model(tester: str, model: object) -> None:
-    """Check that a model is an instance of `StateSpaceModel`.
-
-    Args:
-        tester: Name of the function that uses the model.
-        model: Model.
-
-    Raises:
-        ValueError: If it is not.
-    """
+    """Check that a model is an instance of `StateSpaceModel`."""
     if not isinstance(model, StateSpaceModel):
         got = describe_subject(model, "linear_walk(1.0, 0.5, 1.0)")
         raise ValueError(f"{tester}: model must be a StateSpaceModel, got {got}")
 
 
 def check_count(tester: str, least: int = 1, **counts: object) -> None:
-    """Check numbers of runs, particles or paths.
-
-    Args:
-        tester: Name of the function.
-        least: Smallest number.
-        **counts: Numbers by the name of the argument.
-
-    Raises:
-        ValueError: If a number is not whole or is too small.
-    """
+    """Check numbers of runs, particles or paths."""
     for name, value in counts.items():
         check_whole_number(f"{tester}: {name}", value, least, "Choose a larger one.")
 
@@ -202,19 +133,7 @@ def check_count(tester: str, least: int = 1, **counts: object) -> None:
 def compute_twice(
     subject: str, compute: Callable[[], Any], values: Callable[[Any], Mapping[str, Any]]
 ) -> Any:
-    """Return a result that is computed twice with the same inputs and the same random stream.
-
-    Args:
-        subject: What computes the result, for the message.
-        compute: Function without arguments.
-        values: Function from a result to its tensors or arrays by name.
-
-    Returns:
-        The first result.
-
-    Raises:
-        AssertionError: If the results differ.
-    """
+    """Return a result that is computed twice with the same inputs and the same random stream."""
     first, second = compute(), compute()
     later = values(second)
     for name, value in values(first).items():
@@ -229,15 +148,7 @@ def compute_twice(
 
 
 def takes_arguments(stage: Callable[..., object], count: int) -> bool:
-    """Return whether a call takes a number of positional arguments.
-
-    Args:
-        stage: Object that can be called.
-        count: Number of arguments.
-
-    Returns:
-        True for a built-in function, which states no arguments.
-    """
+    """Return whether a call takes a number of positional arguments."""
     try:
         inspect.signature(stage).bind(*range(count))
     except ValueError:

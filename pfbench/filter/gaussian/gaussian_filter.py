@@ -267,14 +267,7 @@ def adapt_innovation(
 ) -> tuple[Innovation, dict[str, Tensor], dict[str, Tensor]]:
     """Apply all adaptations to an innovation.
 
-    Args:
-        noise_adaptations: Noise adaptations in order.
-        gain_adaptations: Gain adaptations in order, applied last.
-        innovation: Innovation of the step.
-        belief: Belief at t-1.
-
-    Returns:
-        The innovation, the values for the next step, and the diagnostics [R] of this step.
+    Returns the innovation, the values for the next step, and the diagnostics [R] of this step.
     """
     memory: dict[str, Tensor] = {}
     for adaptation in noise_adaptations:
@@ -303,17 +296,7 @@ def check_adaptations(
     gain_adaptations: Sequence[GainAdaptation],
     iterations: int,
 ) -> None:
-    """Check that adaptations do not judge one innovation twice.
-
-    Args:
-        noise_adaptations: Noise adaptations of the filter.
-        gain_adaptations: Gain adaptations of the filter.
-        iterations: Number of updates.
-
-    Raises:
-        ValueError: If iterations is not a whole number from 1, or above 1 with an adaptation that uses the innovation, or
-            if two noise adaptations use it.
-    """
+    """Check that adaptations do not judge one innovation twice."""
     check_whole_number("filter.iterations", iterations, 1, "Use 1 for a single update.")
     if iterations > 1 and (noise_adaptations or gain_adaptations):
         raise ValueError(
@@ -339,13 +322,7 @@ def check_point_reach(rule: LinearisationRule, chart: Chart, covariance: Tensor)
     A point beyond half a turn has the shorter angle on the other side. Closer points fail too, because
     the first measurements move the mean: benchmarks/point_reach.md.
 
-    Args:
-        rule: Linearisation rule. One without points is valid.
-        chart: Chart of the state.
-        covariance: Initial covariance, [R, d, d].
-
-    Raises:
-        ValueError: If the angle of a point exceeds `rule.largest_angle`.
+    Shapes: covariance [R, d, d].
     """
     if not isinstance(rule, SigmaPointLinearisation) or rule.largest_angle is None or chart.flat:
         return

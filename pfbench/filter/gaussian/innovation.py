@@ -71,12 +71,8 @@ class Innovation(NamedTuple):
         R of a group is divided by its weight. The additional noise of a group is independent of the
         others, so that a large error of one group does not reach another [ours].
 
-        Args:
-            weight: Weights, [R, k], equal within a group.
-            group_mask: 1 where two components belong to one group, [R, k, k].
-
-        Returns:
-            The innovation. A weight of 0 is the smallest that leaves R finite.
+        Returns the innovation. A weight of 0 is the smallest that leaves R finite. Shapes: weight
+        [R, k], group_mask [R, k, k].
         """
         factor = 1.0 / weight.clamp(min=_SMALLEST_WEIGHT)
         shared = factor.clamp(max=1.0).sqrt()
@@ -172,17 +168,7 @@ def compute_innovation(
 ) -> Innovation:
     """Compute the innovation by statistical linearisation.
 
-    Args:
-        linearisation: Linearisation rule.
-        model: State-space model of the step.
-        state_at: Map of whitened coordinates xi [R, P, d] to states [R, P, D].
-        template: Tensor of the runs and dtype, [R, ...].
-        record: Measurement and inputs of the step.
-        root: Derivative of the state in xi at 0, [R, d, d]. None if it is not known.
-        reader: Use of a distribution that is not normal. None takes its mean and covariance.
-
-    Returns:
-        The innovation, without the root of the predicted covariance.
+    Shapes: state_at [R, P, d], template [R, ...], root [R, d, d].
     """
 
     def observe_points(xi: Tensor) -> tuple[Tensor, Tensor]:
@@ -227,18 +213,7 @@ def linearise_about_posterior(
 ) -> Innovation:
     """Compute the innovation about the updated distribution, in the coordinates of the prior.
 
-    Args:
-        linearisation: Linearisation rule.
-        model: State-space model of the step.
-        mean: Predicted mean, [R, D].
-        root: Root of the predicted covariance, [R, d, d].
-        shift: Updated mean of xi, [R, d].
-        updated: Upper triangular root of the updated covariance of xi, [R, d, d].
-        record: Measurement and inputs of the step.
-        reader: Use of a distribution that is not normal.
-
-    Returns:
-        The innovation.
+    Shapes: mean [R, D], root [R, d, d], shift [R, d], updated [R, d, d].
     """
 
     def state_at(xi: Tensor) -> Tensor:
@@ -285,13 +260,6 @@ def principal_axes(innovation: Innovation, groups: Sequence[int] | None = None) 
     One block matrix contains all groups. Its blocks are separated by multiples of more than its
     trace. No axis mixes two groups, even if both have the eigenvalue 0, and the observed
     components may differ between runs.
-
-    Args:
-        innovation: Innovation with predicted and nominal covariance.
-        groups: Group number of each component. None groups components of equal nominal variance.
-
-    Returns:
-        The principal axes of all groups.
     """
     group_mask, joint_mask = axes_by_group(innovation, groups)
     root = compute_group_root(innovation.nominal, joint_mask)
@@ -323,15 +291,7 @@ def principal_axes(innovation: Innovation, groups: Sequence[int] | None = None) 
 def axes_by_group(innovation: Innovation, groups: Sequence[int] | None) -> tuple[Tensor, Tensor]:
     """Return masks of component pairs: of one group, and of one group and observed.
 
-    Args:
-        innovation: Innovation of the step.
-        groups: Group number of each component. None groups components of equal nominal variance.
-
-    Returns:
-        Two masks, both [R, k, k].
-
-    Raises:
-        ValueError: If `groups` does not have one number for each component.
+    Returns two masks, both [R, k, k].
     """
     observed_mask = innovation.observed_mask
     k = observed_mask.shape[-1]
@@ -352,12 +312,8 @@ def axes_by_group(innovation: Innovation, groups: Sequence[int] | None) -> tuple
 def compute_group_root(noise: Tensor, joint_mask: Tensor) -> Tensor:
     """Compute a lower triangular noise root without correlations between groups.
 
-    Args:
-        noise: Noise covariance, [R, k, k].
-        joint_mask: Mask of observed component pairs of one group, [R, k, k].
-
-    Returns:
-        Root [R, k, k], with 1 on the diagonal of unobserved components.
+    Returns root [R, k, k], with 1 on the diagonal of unobserved components. Shapes: noise
+    [R, k, k], joint_mask [R, k, k].
     """
     return factor(
         torch.where(
@@ -371,13 +327,8 @@ def compute_group_root(noise: Tensor, joint_mask: Tensor) -> Tensor:
 def whitened_measurement(root: Tensor, covariance: Tensor, joint_mask: Tensor) -> Tensor:
     """Compute R^-1/2 C R^-1/2 within groups.
 
-    Args:
-        root: Root of the noise from `compute_group_root`, [R, k, k].
-        covariance: Covariance C, [R, k, k].
-        joint_mask: Mask of observed component pairs of one group, [R, k, k].
-
-    Returns:
-        Whitened covariance [R, k, k], 0 for unobserved components.
+    Returns whitened covariance [R, k, k], 0 for unobserved components. Shapes: root [R, k, k],
+    covariance [R, k, k], joint_mask [R, k, k].
     """
     half = torch.linalg.solve_triangular(
         root, torch.where(joint_mask, covariance, 0.0), upper=False
@@ -402,15 +353,7 @@ def diagonal_axes(a: Tensor) -> Tensor:
 
 
 def check_weight(name: str, value: float) -> None:
-    """Check that a value lies in (0, 1].
-
-    Args:
-        name: Configuration key for the message.
-        value: Value to check.
-
-    Raises:
-        ValueError: If the value is outside (0, 1].
-    """
+    """Check that a value lies in (0, 1]."""
     if not 0.0 < value <= 1.0:
         raise ValueError(f"{name} must be in (0, 1], got {value}. Set a number in this range.")
 
@@ -425,15 +368,11 @@ class ObservationReader(Protocol):
     def observe(self, model: StateSpaceModel, distribution: Any) -> tuple[Tensor, Tensor]:
         """Return location [R, P, k] and covariance [R or 1, P or 1, k, k] for the linearisation.
 
-        Args:
-            model: State-space model.
-            distribution: Observation distribution at P points, batch [R, P].
+        Shapes: distribution [R, P].
         """
 
     def read_parameters(self, model: StateSpaceModel, distribution: Any) -> tuple[Tensor, ...]:
         """Return other values of the distribution at the mean, [R, ...].
 
-        Args:
-            model: State-space model.
-            distribution: Observation distribution at the mean of the state, batch [R, 1].
+        Shapes: distribution [R, 1].
         """

@@ -145,13 +145,6 @@ class ChartModel(ModelWrapper):
     Propagation and measurement are of the inner model. The noise gain is that of the inner model in a
     left chart. In a right chart it depends on the state, so the noise passes through the linearisation
     rule.
-
-    Args:
-        model: Model with a method `group_chart`.
-        side: `left` or `right`.
-
-    Raises:
-        ValueError: If the model does not define an invariant chart.
     """
 
     def __init__(self, model: StateSpaceModel, side: str) -> None:
@@ -178,18 +171,7 @@ class ChartModel(ModelWrapper):
 
 
 def find_group_chart(model: StateSpaceModel, side: str) -> Chart:
-    """Return the invariant chart of a model.
-
-    Args:
-        model: State-space model.
-        side: `left` or `right`.
-
-    Returns:
-        The chart.
-
-    Raises:
-        ValueError: If the model has none.
-    """
+    """Return the invariant chart of a model."""
     inner = model
     while isinstance(inner, ModelWrapper):
         inner = inner.model
@@ -207,13 +189,7 @@ def find_group_chart(model: StateSpaceModel, side: str) -> Chart:
 def chart_derivative(old: Chart, new: Chart, mean: Tensor) -> Tensor:
     """Compute the derivative of a difference in a new chart in the difference in an old one.
 
-    Args:
-        old: Chart of the argument.
-        new: Chart of the value.
-        mean: State at which both differences are zero, [R, D].
-
-    Returns:
-        Derivative, [R, d, d].
+    Returns derivative, [R, d, d]. Shapes: mean [R, D].
     """
     centre = mean.unsqueeze(1)
     return jacobian(lambda d: old.add(centre, d), centre, old.dimension, new.subtract)
@@ -222,14 +198,7 @@ def chart_derivative(old: Chart, new: Chart, mean: Tensor) -> Tensor:
 def change_covariance(old: Chart, new: Chart, mean: Tensor, covariance: Tensor) -> Tensor:
     """Return a covariance in a new chart, to first order.
 
-    Args:
-        old: Chart of the covariance.
-        new: Chart of the result.
-        mean: State about which both are defined, [R, D].
-        covariance: [R, d, d].
-
-    Returns:
-        Covariance, [R, d, d].
+    Returns covariance, [R, d, d]. Shapes: mean [R, D], covariance [R, d, d].
     """
     slope = chart_derivative(old, new, mean)
     return slope @ covariance @ slope.mT

@@ -46,11 +46,7 @@ class GaussianStep(NamedTuple):
 def kalman_gain_update(innovation: Innovation) -> tuple[Tensor, Tensor, Tensor]:
     """Compute the whitened posterior.
 
-    Args:
-        innovation: Innovation of the step.
-
-    Returns:
-        Mean [R, d], square root [R, d, d] and log evidence of the step [R], NaN without a root.
+    Returns mean [R, d], square root [R, d, d] and log evidence of the step [R], NaN without a root.
     """
     r, observed_mask, m, omega, *_ = innovation
     shift, root, distance, scales, ok = _updated(m, r, omega)
@@ -112,13 +108,7 @@ def _triangle(white: Tensor) -> tuple[Tensor, Tensor]:
 def repair_fit(fit: Fit, addend: Tensor, is_active: bool) -> tuple[Fit, Tensor]:
     """Return a fit whose Omega + addend has a root.
 
-    Args:
-        fit: Linearised map or innovation.
-        addend: Covariance that is added to Omega before the root is taken, [R, k, k].
-        is_active: Whether to change the fit at all.
-
-    Returns:
-        The fit, and the runs that were changed, bool [R].
+    Returns the fit, and the runs that were changed, bool [R]. Shapes: addend [R, k, k].
     """
     if not is_active:
         return fit, fit.omega.new_zeros(len(fit.omega), dtype=torch.bool)
@@ -131,13 +121,8 @@ def remove_negative_eigenvalues(
 ) -> tuple[Tensor, Tensor]:
     """Remove negative eigenvalues from Omega - noise where Omega + addend is not positive.
 
-    Args:
-        omega: Omega, [R, k, k].
-        noise: Noise covariance in Omega, [R, k, k].
-        addend: Covariance that is added to Omega before the root is taken, [R, k, k].
-
-    Returns:
-        Omega, [R, k, k], and the runs that were changed, bool [R].
+    Returns omega, [R, k, k], and the runs that were changed, bool [R]. Shapes: omega [R, k, k],
+    noise [R, k, k], addend [R, k, k].
     """
     bad = ~factor(addend + omega)[1]
     if not bad.is_cuda and not bool(bad.any()):  # the check costs next to nothing on the CPU
@@ -160,14 +145,8 @@ def move_root(chart: Chart, prior: Tensor, correction: Tensor, root: Tensor) -> 
     difference from the updated mean is ((m (+) (s + e)) (-) (m (+) s)) = J e + O(e^2) for d = s + e. On a
     group J is the right or left Jacobian of its exponential at s.
 
-    Args:
-        chart: Chart of the state.
-        prior: Predicted mean m, [R, D].
-        correction: s, [R, d].
-        root: Root of the covariance of d, [R, d, d].
-
-    Returns:
-        Root of the covariance about the updated mean, [R, d, d].
+    Returns root of the covariance about the updated mean, [R, d, d]. Shapes: prior [R, D],
+    correction [R, d], root [R, d, d].
 
     References:
         M. Mueller, M. Hehn and R. D'Andrea (2017), Covariance correction step for Kalman filtering
@@ -212,23 +191,11 @@ class MeasurementUpdate(ObservationReader, Protocol):
     has_evidence: bool = False
 
     def __call__(self, innovation: Innovation) -> WhitenedPosterior:
-        """Compute the whitened posterior.
-
-        Args:
-            innovation: Innovation of the step. `parameters` contains the values of `read_parameters`.
-        """
+        """Compute the whitened posterior."""
 
 
 def check_measurement_update(update: object, adaptations: Sequence[object]) -> None:
-    """Check that an update has the calls of one, and that no adaptation comes with it.
-
-    Args:
-        update: Update, None for normal errors.
-        adaptations: Noise and gain adaptations of the filter.
-
-    Raises:
-        ValueError: If it lacks a call, or if there are adaptations.
-    """
+    """Check that an update has the calls of one, and that no adaptation comes with it."""
     if update is None:
         return
     if isinstance(update, type) or not all(
@@ -250,15 +217,7 @@ def check_measurement_update(update: object, adaptations: Sequence[object]) -> N
 def measurement_posterior(
     update: MeasurementUpdate | None, innovation: Innovation
 ) -> WhitenedPosterior:
-    """Compute the whitened posterior.
-
-    Args:
-        update: Update, None for normal errors.
-        innovation: Innovation of the step.
-
-    Returns:
-        The posterior.
-    """
+    """Compute the whitened posterior."""
     if update is not None:
         return update(innovation)
     return WhitenedPosterior(*kalman_gain_update(innovation), innovation, {})

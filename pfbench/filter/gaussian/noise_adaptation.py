@@ -201,13 +201,7 @@ class ConstrainedNoiseAdaptation(NoiseAdaptation):
 def scale_columns(m: Tensor, state_factor: float, noise_factor: Tensor | float) -> Tensor:
     """Scale the columns of the state and of the noise in M.
 
-    Args:
-        m: Slope [R, d, d + W].
-        state_factor: Factor on the columns of the state.
-        noise_factor: Factor on the columns of the noise.
-
-    Returns:
-        Scaled slope [R, d, d + W].
+    Returns scaled slope [R, d, d + W]. Shapes: m [R, d, d + W].
     """
     d = m.shape[-2]
     return torch.cat([m[..., :d] * state_factor, m[..., d:] * noise_factor], -1)
@@ -227,9 +221,6 @@ class ScalarNoiseAdaptation(NoiseAdaptation):
     Attributes:
         forgetting_factor: Weight of the newest step.
         max_r_factor: Largest factor, at least 1.
-
-    Raises:
-        ValueError: If an argument is outside its range.
     """
 
     forgetting_factor: float = 0.2

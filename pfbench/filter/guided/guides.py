@@ -359,12 +359,7 @@ MEAN, COVARIANCE, _CARRIED = "guide.mean", "guide.covariance", "guide.carries."
 def pack_guide_belief(new: GaussianStep, shape: tuple[int, int]) -> dict[str, Tensor]:
     """Pack the state of the guide filter into the memory of a particle belief.
 
-    Args:
-        new: Step of the guide filter, its runs axis flattened over `shape`.
-        shape: Runs and guides per run.
-
-    Returns:
-        Memory tensors, [*shape, ...].
+    Returns memory tensors, [*shape, ...].
     """
     memory = {COVARIANCE: new.root @ new.root.mT} | {
         _CARRIED + name: value for name, value in new.memory.items()
@@ -377,13 +372,8 @@ def unpack_guide_belief(
 ) -> GaussianBelief:
     """Unpack the Gaussian belief of the guide filter from memory.
 
-    Args:
-        memory: Memory of a particle belief.
-        mean: Means, [R, N or 1, D].
-        covariance: Covariances, [R, N or 1, d, d].
-
-    Returns:
-        Gaussian belief with R N or R runs.
+    Returns gaussian belief with R N or R runs. Shapes: mean [R, N or 1, D], covariance
+    [R, N or 1, d, d].
     """
     carried = {
         k.removeprefix(_CARRIED): v.flatten(0, 1)
@@ -397,14 +387,7 @@ def unpack_guide_belief(
 def compute_log_ratio(xi: Tensor, z: Tensor, log_det: Tensor, widen: float) -> Tensor:
     """Compute log N(xi; 0, I) - log q(xi) for xi = m + sqrt(widen) U z.
 
-    Args:
-        xi: Whitened coordinates, [R, N, d].
-        z: Standard normal numbers, [R, N, d].
-        log_det: log |det U|, [R, N or 1].
-        widen: Factor on the proposal covariance.
-
-    Returns:
-        Log ratio, [R, N].
+    Returns log ratio, [R, N]. Shapes: xi [R, N, d], z [R, N, d], log_det [R, N or 1].
     """
     return (
         compute_half_square(z)
@@ -420,11 +403,7 @@ def standardise_noise(distribution: Distribution) -> bool:
 
 
 def check_covariance_factor(widen: float) -> None:
-    """Check that the covariance factor is positive.
-
-    Raises:
-        ValueError: If it is not positive.
-    """
+    """Check that the covariance factor is positive."""
     if not widen > 0.0:
         raise ValueError(
             f"proposal.covariance_factor must be positive, got {widen}. Use 1 for no change."
@@ -432,14 +411,7 @@ def check_covariance_factor(widen: float) -> None:
 
 
 def check_normal_guide(guide_filter: object) -> None:
-    """Check that a guide filter takes the measurement errors as normal.
-
-    Args:
-        guide_filter: Gaussian filter of the proposal.
-
-    Raises:
-        ValueError: If it has an update for another distribution.
-    """
+    """Check that a guide filter takes the measurement errors as normal."""
     update = getattr(guide_filter, "measurement_update", None)
     if update is not None:
         raise ValueError(

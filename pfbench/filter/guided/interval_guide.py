@@ -257,14 +257,8 @@ class NoiseInterval(NamedTuple):
     ) -> list[Tensor]:
         """Propagate the particles from the start.
 
-        Args:
-            model: State-space model.
-            z: Whitened noise, [R, N, L, W], or one step of it for all steps.
-            steps: Number of steps. All by default.
-
-        Returns:
-            States at the start and after each step, [R, N, D]. Those of a shorter interval are its start
-            until it begins.
+        Returns states at the start and after each step, [R, N, D]. Those of a shorter interval are
+        its start until it begins. Shapes: z [R, N, L, W].
         """
         noise, x = model.noise, self.start
         states = [x]
@@ -279,12 +273,7 @@ class NoiseInterval(NamedTuple):
 def pack_interval(memory: dict[str, Tensor], interval: NoiseInterval) -> dict[str, Tensor]:
     """Store an interval in the memory of particles, as long as its longest run.
 
-    Args:
-        memory: Memory of the particles before the step.
-        interval: Interval after the step.
-
-    Returns:
-        The memory. Without steps it holds the lengths alone.
+    Returns the memory. Without steps it holds the lengths alone.
     """
     rest = {name: a for name, a in memory.items() if not name.startswith(_PREFIX)}
     rest[_LENGTH] = interval.length.to(interval.start)[:, None]  # always: closed loops refuse it
@@ -300,15 +289,7 @@ def pack_interval(memory: dict[str, Tensor], interval: NoiseInterval) -> dict[st
 
 
 def unpack_interval(belief: ParticleBelief, record: Record) -> NoiseInterval:
-    """Return the interval in the memory of particles.
-
-    Args:
-        belief: Particles before the step.
-        record: Record of the step, whose inputs have the structure of the stored ones.
-
-    Returns:
-        The interval, with length 0 and the particles as its start if there is none.
-    """
+    """Return the interval in the memory of particles."""
     memory, x = belief.memory, belief.x
     if _START not in memory:
         length = torch.zeros(len(x), dtype=torch.long, device=x.device)

@@ -33,23 +33,14 @@ def flatten_parameters(modules: Mapping[str, nn.Module]) -> Weights:
 
 
 def write_checkpoint(path: str | Path, content: Mapping[str, Any]) -> None:
-    """Write a checkpoint atomically.
-
-    Args:
-        path: File to write.
-        content: Tensors, numbers, texts, lists and dicts.
-    """
+    """Write a checkpoint atomically."""
     full = {"format": CHECKPOINT_FORMAT, **content}
     full[DIGEST] = hash_content(full)
     write_atomically(Path(path), lambda file: torch.save(full, file))
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """Read a checkpoint: tensors, numbers, texts, lists and dicts, never code.
-
-    Raises:
-        ValueError: If the file does not exist, is damaged or has another format.
-    """
+    """Read a checkpoint: tensors, numbers, texts, lists and dicts, never code."""
     if not Path(path).is_file():
         raise ValueError(
             f"checkpoint must be an existing file, got {path}. Use the path that `pfbench train` "
@@ -89,11 +80,7 @@ def hash_weights(networks: Mapping[str, Weights]) -> str:
 
 
 def replace_checkpoint_by_hash(config: Any) -> Any:
-    """Replace each checkpoint path in a configuration by the hash of its weights.
-
-    Raises:
-        ValueError: As for `read_checkpoint`.
-    """
+    """Replace each checkpoint path in a configuration by the hash of its weights."""
     if isinstance(config, Mapping):
         return {
             key: _hash_label(value)
@@ -109,17 +96,7 @@ def replace_checkpoint_by_hash(config: Any) -> Any:
 def checkpoint_provenance(
     config: Any, scenario: str, seed: int, runs: Tensor
 ) -> dict[str, Any] | None:
-    """Return hash, training data and cost of a filter's checkpoint, if it has one.
-
-    Args:
-        config: Configuration of the filter.
-        scenario: Scenario of the job.
-        seed: Seed of the job.
-        runs: Run numbers of the job.
-
-    Raises:
-        ValueError: If runs of this job were used for training or validation, or as for `read_checkpoint`.
-    """
+    """Return hash, training data and cost of a filter's checkpoint, if it has one."""
     path = next(_checkpoints(config), None)
     if path is None:
         return None
@@ -161,16 +138,7 @@ def _hash_label(path: str) -> str:
 
 
 def load_parameters(path: str, weights: Weights, modules: Mapping[str, nn.Module]) -> None:
-    """Load weights into modules.
-
-    Args:
-        path: Checkpoint file, for messages.
-        weights: Weights by name.
-        modules: Modules by name.
-
-    Raises:
-        ValueError: If a weight is missing, surplus or of another shape (names the first one).
-    """
+    """Load weights into modules."""
     expected = flatten_parameters(modules)
     for name in sorted(expected.keys() | weights.keys()):
         stored, shape = (tuple(a[name].shape) if name in a else None for a in (weights, expected))

@@ -138,10 +138,6 @@ class OptimalTransportResampler(Resampler):
         iterations: Number of Sinkhorn iterations.
         threshold: As in `EssResampler`.
 
-    Raises:
-        ValueError: If epsilon is not positive, iterations is below 1, or the threshold is outside
-            [0, 1]. On use, if particles have a past or a memory.
-
     References:
         Reich 2013. Corenflos et al. 2021.
     """
@@ -201,14 +197,7 @@ class OptimalTransportResampler(Resampler):
 def compute_transport_plan(x: Tensor, log_a: Tensor, epsilon: float, iterations: int) -> Tensor:
     """Return the transport plan; its rows sum to a exactly, its columns to 1/N nearly.
 
-    Args:
-        x: Points, [R, N, d].
-        log_a: Log weights a, [R, N].
-        epsilon: Weight of the entropy.
-        iterations: Number of Sinkhorn iterations.
-
-    Returns:
-        P, [R, N, N].
+    Returns p, [R, N, N]. Shapes: x [R, N, d], log_a [R, N].
     """
     cost = -(x.unsqueeze(2) - x.unsqueeze(1)).square().sum(-1) / epsilon
     log_b = torch.full_like(log_a, -math.log(log_a.shape[1]))
@@ -235,17 +224,7 @@ def sample_from(
     are sampled by their inverse cdf. A mixture of diagonal normals selects a component first.
     Its gradient is the implicit one, component by component.
 
-    Args:
-        distribution: Distribution with batch [R, N] or [R, 1] and event [W].
-        z: Standard normal numbers, [R, N, W].
-        draws: Random stream for further numbers.
-        purpose: Label of further numbers.
-
-    Returns:
-        Samples, [R, N, W].
-
-    Raises:
-        ValueError: If the distribution cannot be sampled from standard normal numbers.
+    Returns samples, [R, N, W]. Shapes: distribution [R, N], z [R, N, W].
 
     References:
         M. Figurnov, S. Mohamed and A. Mnih (2018), Implicit reparameterization gradients.

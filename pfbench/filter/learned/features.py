@@ -58,16 +58,7 @@ class FeatureContext(NamedTuple):
 def make_feature_context(
     model: StateSpaceModel, belief: ParticleBelief, record: Record
 ) -> FeatureContext:
-    """Compute the quantities of the next step.
-
-    Args:
-        model: State-space model.
-        belief: Belief before the step.
-        record: Record of the step.
-
-    Returns:
-        The quantities.
-    """
+    """Compute the quantities of the next step."""
     x, w = belief.x, normalise_log_weights(belief.log_w).unsqueeze(-1)
     start = (model.origin.expand(1, -1) if record.start is None else record.start).unsqueeze(1)
     if record.spread is None:
@@ -149,9 +140,6 @@ class InputFeature(Feature):
 
     Attributes:
         input_scales: {name of an input tensor: value that is scaled to 1}.
-
-    Raises:
-        ValueError: On use, if the inputs do not have a name.
     """
 
     input_scales: Mapping[str, float]

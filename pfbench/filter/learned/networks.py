@@ -65,9 +65,7 @@ def bounded_log_scale(log_scale: Tensor) -> Tensor:
 def independent_heads(mean: Tensor, sd: Tensor) -> Distribution:
     """Return the normal distribution N(mean, diag(sd^2)).
 
-    Args:
-        mean: Mean, [..., W].
-        sd: Standard deviations, [..., W].
+    Shapes: mean [..., W], sd [..., W].
     """
     return Independent(Normal(mean, sd, validate_args=False), 1, validate_args=False)
 
@@ -261,18 +259,7 @@ def build_networks(
 
     The global random state of torch does not change.
 
-    Args:
-        learnable: Source of the weights.
-        make: Makes the modules by name.
-        sizes: Numbers of features, noise components and hidden units.
-        model: State-space model, which determines dtype and device.
-        fresh: Start from untrained weights.
-
-    Returns:
-        The modules by name.
-
-    Raises:
-        ValueError: If no checkpoint is set, or it belongs to another model or network.
+    Returns the modules by name.
     """
     path = learnable.checkpoint
     if path is None and not fresh:

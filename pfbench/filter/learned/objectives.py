@@ -185,11 +185,7 @@ class ExpectedSquaredJump(Objective):
 
 
 def find_learned_parts(method: TrainableFilter) -> dict[str, LearnedPart]:
-    """Return the trainable parts of a filter, by their name in a checkpoint.
-
-    Raises:
-        ValueError: If the filter does not have a network.
-    """
+    """Return the trainable parts of a filter, by their name in a checkpoint."""
     stages = [
         getattr(method, "gain", None),
         getattr(method, "proposal", None),
@@ -216,17 +212,8 @@ def simulate_from_model(
 ) -> tuple[Record, Tensor, Tensor]:
     """Simulate a record from the model, with the inputs, initial states and gaps of a record.
 
-    Args:
-        model: State-space model.
-        record: Prepared record of R runs and T steps. Its measurements only give the gaps.
-        draws: Random stream.
-
-    Returns:
-        The record with simulated measurements, the states from the initial one on [R, T + 1, D],
-        and the noise [R, T, W].
-
-    Raises:
-        ValueError: If a distribution of the model cannot be drawn.
+    Returns the record with simulated measurements, the states from the initial one on
+    [R, T + 1, D], and the noise [R, T, W].
     """
     initial = initial_law(model, len(record.y), record.spread)
     x = draw_initial_state(model, initial, draws.at_step(0), "imagined", start=record.start)

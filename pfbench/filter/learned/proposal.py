@@ -262,17 +262,7 @@ def fit_frame(
     belief: ParticleBelief,
     record: Record,
 ) -> NoisePosterior | None:
-    """Return the map from noise of the network to standardised noise.
-
-    Args:
-        guide: Guided proposal, or None.
-        model: State-space model.
-        belief: Belief before the step.
-        record: Record of the step.
-
-    Returns:
-        The map, None for the identity.
-    """
+    """Return the map from noise of the network to standardised noise."""
     return None if guide is None else guide.fit_posterior(model, belief, record)
 
 
@@ -286,16 +276,7 @@ def to_frame(
 ) -> tuple[Tensor, Tensor]:
     """Map standardised noise of given parents to noise of the network.
 
-    Args:
-        guide: Guided proposal, or None.
-        model: State-space model.
-        belief: Belief before the step.
-        record: Record of the step.
-        parent: Parents, [R, D].
-        xi: Standardised noise, [R, 1, W].
-
-    Returns:
-        zeta [R, 1, W] and log |det U| [R, 1].
+    Returns zeta [R, 1, W] and log |det U| [R, 1]. Shapes: parent [R, D], xi [R, 1, W].
     """
     joined = append_states(belief, parent.unsqueeze(1))
     with torch.no_grad():  # the frame does not depend on the network
@@ -309,12 +290,7 @@ def to_frame(
 def append_states(belief: ParticleBelief, states: Tensor) -> ParticleBelief:
     """Append states with weight 0 to the particles.
 
-    Args:
-        belief: Belief with N particles.
-        states: States to append, [R, M, D].
-
-    Returns:
-        Belief with N + M particles.
+    Returns belief with N + M particles. Shapes: states [R, M, D].
     """
     log_w = torch.full_like(states[..., 0], -torch.inf)
     return belief._replace(

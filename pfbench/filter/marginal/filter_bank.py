@@ -155,13 +155,7 @@ def split_normal(
     Weights are those of the density at the means with the variance that the components leave. The
     variance of the components is then set so that the mixture has variance 1.
 
-    Args:
-        points: Number n of components.
-        template: Tensor of the dtype and device.
-        overlap: Standard deviation of a component at first, in distances of two.
-
-    Returns:
-        Means [n], log weights [n], and the standard deviation of every component.
+    Returns means [n], log weights [n], and the standard deviation of every component.
     """
     if points == 1:
         return template.new_zeros(1), template.new_zeros(1), template.new_ones(())

@@ -250,18 +250,7 @@ class StatePartition(NamedTuple):
 
 
 def partition_state(model: StateSpaceModel, sampled: Sequence[str] | None) -> StatePartition:
-    """Return the partition by names, or by the model's declaration.
-
-    Args:
-        model: State-space model.
-        sampled: Names of sampled groups or states, or None.
-
-    Returns:
-        The partition.
-
-    Raises:
-        ValueError: If a name is unknown, or no name is set and nothing is declared linear.
-    """
+    """Return the partition by names, or by the model's declaration."""
     d = len(model.names)
     if sampled is None:
         linear = list(range(d)) if model.linear else sorted(model.linear_given)
@@ -291,15 +280,8 @@ def predict_with_root(
 ) -> tuple[Tensor, Tensor]:
     """Predict particles without noise and linearise about the prediction.
 
-    Args:
-        model: State-space model.
-        x: Particles, [R, N, D].
-        root: Root of the conditional covariance, [R, N or 1, l, l].
-        u: Inputs of the step.
-        split: Partition of the state.
-
-    Returns:
-        Prediction [R, N, D] and root A [R, N or 1, d, m] of the joint normal distribution.
+    Returns prediction [R, N, D] and root A [R, N or 1, d, m] of the joint normal distribution.
+    Shapes: x [R, N, D], root [R, N or 1, l, l].
     """
     chart, noise, gain = model.chart, model.noise, model.noise_gain(u)
     d, w = len(split.linear), 0 if gain is not None else model.noise_dim
@@ -326,14 +308,8 @@ def linearise_measurement(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Linearise the measurement in l, in units of the measurement noise.
 
-    Args:
-        model: State-space model.
-        x: Particles, [R, N, D].
-        record: Record of the step.
-        split: Partition of the state.
-
-    Returns:
-        H [R, N or 1, k, l] and y - y_hat [R, N, k], 0 if unobserved, and log scale [R, N].
+    Returns h [R, N or 1, k, l] and y - y_hat [R, N, k], 0 if unobserved, and log scale [R, N].
+    Shapes: x [R, N, D].
     """
     distribution: Any = model.observation(x, record.u)
     check_normal(model, "the measurement's noise", distribution)
@@ -370,28 +346,13 @@ def linearise_measurement(
 def embed_components(values: Tensor, indices: list[int], d: int) -> Tensor:
     """Embed components in a state difference, with 0 for all others.
 
-    Args:
-        values: Components, [..., l], with or without tangents.
-        indices: Indices of the components.
-        d: Dimension of the difference.
-
-    Returns:
-        Difference, [..., d].
+    Returns difference, [..., d]. Shapes: values [..., l].
     """
     return values @ torch.eye(d, dtype=values.dtype, device=values.device)[indices]
 
 
 def check_normal(model: StateSpaceModel, label: str, distribution: Distribution) -> None:
-    """Check that a noise distribution is normal.
-
-    Args:
-        model: State-space model, for the message.
-        label: Name of the noise, for the message.
-        distribution: Distribution to check.
-
-    Raises:
-        ValueError: If it is not normal.
-    """
+    """Check that a noise distribution is normal."""
     if not is_normal(distribution):
         raise ValueError(
             f"filter RaoBlackwellisedFilter must have a model where {label} is normal, got "

@@ -161,11 +161,7 @@ class StateHistory(PathHistory):
 def combine_histories(histories: Sequence[PathHistory | None]) -> PathHistory | None:
     """Merge the histories that several moves require.
 
-    Args:
-        histories: History of each move, or None for a move without one.
-
-    Returns:
-        The joint history, or None if all moves work without one.
+    Returns the joint history, or None if all moves work without one.
     """
     joint: PathHistory | None = None
     for history in histories:
@@ -192,13 +188,7 @@ def get_transition(
 ) -> torch.distributions.Distribution:
     """Return the distribution of the next state of a model with a transition density.
 
-    Args:
-        model: State-space model.
-        x: States, [R, N, D].
-        record: Record of the step.
-
-    Raises:
-        ValueError: If the transition density does not exist.
+    Shapes: x [R, N, D].
     """
     distribution = model.transition(x, record.u)
     if distribution is None:

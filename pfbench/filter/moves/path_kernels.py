@@ -110,13 +110,7 @@ class PathStatistics(PathHistory):
 def fisher_information(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
     """Compute the Fisher information of a measurement, by moments if not normal.
 
-    Args:
-        model: State-space model.
-        x: State, [R, 1, D].
-        record: Record of the step.
-
-    Returns:
-        Information matrix, [R, d, d].
+    Returns information matrix, [R, d, d]. Shapes: x [R, 1, D].
     """
     observed_mask, h = ~torch.isnan(record.y), measurement_jacobian(model, x, record)[:, 0]
     distribution: Any = model.observation(x, record.u)
@@ -289,14 +283,8 @@ def propagate_path(
 ) -> tuple[Tensor, Tensor]:
     """Propagate a path from its start with fixed noises.
 
-    Args:
-        model: State-space model.
-        start: First states, [R, N, D].
-        noise: Noises, [R, N, K, W].
-        past: Records of the K + 1 states, or empty.
-
-    Returns:
-        States [R, N, K+1, D] and log p(y_j | x_j) [R, N, K+1].
+    Returns states [R, N, K+1, D] and log p(y_j | x_j) [R, N, K+1]. Shapes: start [R, N, D], noise
+    [R, N, K, W].
     """
     x, states = start, [start]
     values = [model.log_likelihood(record.y, x, record.u) for record in past[:1]] or [

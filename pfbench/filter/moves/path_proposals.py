@@ -68,12 +68,7 @@ class SegmentProposal(Protocol):
 def measurement_log_density(model: StateSpaceModel, path: PathSegment) -> Tensor:
     """Compute log p(y_j | x_j) along the end of a path.
 
-    Args:
-        model: State-space model.
-        path: End of a path.
-
-    Returns:
-        Log densities, [R, N, L+1].
+    Returns log densities, [R, N, L+1].
     """
     return stack_history(
         [
@@ -86,12 +81,7 @@ def measurement_log_density(model: StateSpaceModel, path: PathSegment) -> Tensor
 def transition_log_density(model: StateSpaceModel, path: PathSegment) -> Tensor:
     """Compute log p(x_j | x_j-1) along the end of a path.
 
-    Args:
-        model: State-space model.
-        path: End of a path.
-
-    Returns:
-        Log densities, [R, N, L+1].
+    Returns log densities, [R, N, L+1].
     """
     x = path.states
     return stack_history(
@@ -105,15 +95,7 @@ def transition_log_density(model: StateSpaceModel, path: PathSegment) -> Tensor:
 def driving_noise(model: StateSpaceModel, path: PathSegment) -> Tensor:
     """Compute the noises that lead from state to state.
 
-    Args:
-        model: State-space model.
-        path: End of a path.
-
-    Returns:
-        Noises, [R, N, L+1, W].
-
-    Raises:
-        ValueError: If the states of the model do not determine the noise.
+    Returns noises, [R, N, L+1, W].
     """
     noises = []
     for j, record in enumerate(path.records):

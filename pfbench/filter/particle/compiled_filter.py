@@ -220,13 +220,8 @@ class CompiledStep:
     ) -> list[tuple[ParticleBelief, StepSummary]]:
         """Take all steps of a record in one call, without a check of numbers between them.
 
-        Args:
-            belief: Belief before the first step.
-            record: Measurements [R, T, Dy] and inputs of these steps.
-            draws: Random stream at the first step.
-
-        Returns:
-            Belief and summary after each step before the first one with a NaN particle.
+        Returns belief and summary after each step before the first one with a NaN particle. Shapes:
+        record [R, T, Dy].
         """
         first, steps, carried = int(draws.step), record.y.shape[1], 3 + len(self.memory)
         state = _belief_to_storage(belief)
@@ -271,20 +266,7 @@ def compile_step(
 ) -> CompiledStep:
     """Record and compile a filter's step.
 
-    Args:
-        method: Filter without moves.
-        model: Model of the step.
-        belief: Belief of the shapes to be compiled.
-        record: Record of one step.
-        draws: Random stream of the step.
-        counter: Counter of likelihood evaluations. Its value is restored.
-
-    Returns:
-        The compiled step.
-
-    Raises:
-        Exception: If the step cannot be recorded or compiled, or if its numbers are not those of
-            the uncompiled step. torch raises many kinds.
+    Returns the compiled step.
     """
     names: list[list[str]] = []
     step = _make_tensor_function(method, model, belief, record, draws, names)
@@ -345,10 +327,7 @@ def _check_agreement(out: Sequence[Tensor], expected: Sequence[Tensor], carried:
     their spread as the scale. Sums that are rounded in another order may choose other ancestors, so a
     few particles may differ: almost none in double precision.
 
-    Args:
-        out: Results of the compiled step, in storage layout [..., R, N].
-        expected: Those of the uncompiled step.
-        carried: Number of tensors that the step carries.
+    Shapes: out [..., R, N].
     """
     for k, (a, b) in enumerate(zip(out[:carried], expected[:carried], strict=True)):
         if a.shape != b.shape:
@@ -379,12 +358,7 @@ def tensors_in(tree: Any) -> list[Tensor]:
 def replace_tensors(tree: Any, tensors: Iterator[Tensor]) -> Any:
     """Replace the tensors of nested tuples and dicts.
 
-    Args:
-        tree: Nested tuples and dicts.
-        tensors: The new tensors, in the order of `tensors_in`.
-
-    Returns:
-        The same structure with the new tensors.
+    Returns the same structure with the new tensors.
     """
     if isinstance(tree, Tensor):
         return next(tensors)

@@ -119,15 +119,7 @@ def _draw_from_normal(
 
 
 def refuse_history(belief: ParticleBelief, method_name: str) -> None:
-    """Check that particles store no window and no memory of their own.
-
-    Args:
-        belief: Weighted particles.
-        method_name: Name of the method, for the message.
-
-    Raises:
-        ValueError: If new particles would lose a past or a memory.
-    """
+    """Check that particles store no window and no memory of their own."""
     stored = [
         *belief.window,
         *(name for name, value in belief.memory.items() if value.shape[1] != 1),

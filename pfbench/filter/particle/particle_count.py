@@ -30,15 +30,7 @@ class ParticleCount(Protocol):
 def count_particles(stage: ParticleCount, belief: ParticleBelief) -> Tensor:
     """Compute the number of active particles by a stage, and check it if the stage is a user's own.
 
-    Args:
-        stage: Particle count.
-        belief: Belief before resampling.
-
-    Returns:
-        Numbers, [R or 1, 1].
-
-    Raises:
-        ValueError: If a number is not between 1 and the number of slots.
+    Returns numbers, [R or 1, 1].
     """
     n, (runs, slots) = stage(belief), belief.log_w.shape
     if type(stage).__module__.startswith("pfbench.") or is_capturing():

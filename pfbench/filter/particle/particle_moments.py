@@ -31,12 +31,6 @@ def compute_once(function: Callable[[], T]) -> Callable[[], T]:
     """Make a function that computes its value at the first call only.
 
     One is made at each step, and `functools.cache` takes 5 microseconds to make.
-
-    Args:
-        function: Function of nothing.
-
-    Returns:
-        The function.
     """
     values: list[T] = []
 
@@ -67,13 +61,7 @@ class StepSummary(NamedTuple):
 def summarise(model: StateSpaceModel, belief: ParticleBelief, trace: dict[str, Tensor]) -> StepInfo:
     """Return mean and variance of particles for a report, without a copy of them.
 
-    Args:
-        model: State-space model.
-        belief: Weighted particles.
-        trace: Numbers per run, {name: [R]}.
-
-    Returns:
-        Information of the step.
+    Shapes: trace [R].
     """
     return make_step_info(
         model,
@@ -88,13 +76,7 @@ def weighted_mean_variance(
 ) -> tuple[Tensor, Tensor]:
     """Return the mean [R, D] and, in the chart about it, the variance [R, d].
 
-    Args:
-        model: State-space model.
-        belief: Particles.
-        w: Normalised weights, [R, N].
-
-    Returns:
-        Mean and variance.
+    Shapes: w [R, N].
     """
     if model.chart.flat:
         mean, variance = _flat_moments(belief.x, w)
@@ -115,16 +97,7 @@ def make_step_info(
 ) -> StepInfo:
     """Make the information of a step from particles, their mean and their variance.
 
-    Args:
-        model: State-space model.
-        belief: Weighted particles.
-        mean: Their mean, [R, D].
-        variance: Their variance in the chart, [R, d].
-        trace: Numbers per run, {name: [R]}.
-        nis: Computes the NIS and the observed components, [R] each.
-
-    Returns:
-        Information of the step; covariances are computed on request.
+    Shapes: mean [R, D], variance [R, d], trace [R], nis [R].
     """
 
     def deviations() -> tuple[Tensor, Tensor]:
@@ -151,15 +124,9 @@ def compute_nis(
 ) -> tuple[Tensor, Tensor]:
     """Compute the normalised innovation squared (NIS) of predicted particles.
 
-    Args:
-        model: State-space model.
-        x: Predicted particles, [R, N, D].
-        log_w: Log weights before the measurement update, [R, N].
-        record: Record of the step; NaN marks a missing component.
-
-    Returns:
-        NIS [R] and the number of observed components [R], which is its expectation. The NIS is NaN
-        where the mean or variance of the observation distribution is infinite.
+    Returns NIS [R] and the number of observed components [R], which is its expectation. The NIS is
+    NaN where the mean or variance of the observation distribution is infinite. Shapes: x [R, N, D],
+    log_w [R, N].
     """
     predicted_y: Any = model.observation(x, record.u)
     observed_mask = ~torch.isnan(record.y)
@@ -182,14 +149,8 @@ def predict_moments(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute the moments of a measurement predicted by weighted particles.
 
-    Args:
-        model: State-space model.
-        y: Mean measurement of each particle, [R, N, k].
-        covariance: Covariance of the measurement noise, [R, N or 1, k, k].
-        w: Normalised weights, [R, N].
-
-    Returns:
-        Mean [R, k], covariance due to the particles [R, k, k], and mean noise covariance [R or 1, k, k].
+    Returns mean [R, k], covariance due to the particles [R, k, k], and mean noise covariance
+    [R or 1, k, k]. Shapes: y [R, N, k], covariance [R, N or 1, k, k], w [R, N].
     """
     y_hat = around_first(model.residual)(y, w)
     deviations = torch.where(w.unsqueeze(-1) > 0.0, model.residual(y, y_hat.unsqueeze(1)), 0.0)

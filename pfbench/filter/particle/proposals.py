@@ -108,16 +108,7 @@ class RecordStartedFilter(Protocol):
     """A filter whose initial belief may use the record."""
 
     def init_from_record(self, model: StateSpaceModel, record: Record, draws: RandomStream) -> Any:
-        """Return the initial belief.
-
-        Args:
-            model: State-space model.
-            record: All steps of the record, prepared by the model.
-            draws: Random stream of step 0.
-
-        Returns:
-            Belief of all runs.
-        """
+        """Return the initial belief."""
 
 
 @dataclass(frozen=True)
@@ -146,12 +137,7 @@ def hold_resampling(log_a: Tensor, belief: ParticleBelief) -> tuple[Tensor, Part
     A particle that fits later measurements has a small weight until these are processed. Resampling
     by the weights would remove it.
 
-    Args:
-        log_a: Log resampling probabilities, [R, N].
-        belief: Weighted particles.
-
-    Returns:
-        Log resampling probabilities, and the particles with one such step less in their memory.
+    Shapes: log_a [R, N].
     """
     remaining = belief.memory[HELD_STEPS]
     equal = torch.full_like(log_a, -math.log(log_a.shape[1]))
@@ -162,16 +148,7 @@ def hold_resampling(log_a: Tensor, belief: ParticleBelief) -> tuple[Tensor, Part
 def draw_noise(model: StateSpaceModel, n: int, draws: RandomStream) -> Tensor:
     """Draw noise from the model's noise distribution.
 
-    Args:
-        model: State-space model with noise of dimension W.
-        n: Number of particles.
-        draws: Random stream of R runs.
-
-    Returns:
-        Noise w, [R, n, W].
-
-    Raises:
-        ValueError: If the distribution cannot be drawn, see `draw_values`.
+    Returns noise w, [R, n, W].
     """
     if has_standard_noise(model):
         return draws.normal("noise", n, model.noise_dim)
@@ -189,13 +166,7 @@ def has_standard_noise(model: StateSpaceModel) -> bool:
 def draw_standardised_noise(model: StateSpaceModel, z: Tensor, draws: RandomStream) -> Tensor:
     """Draw standardised noise from the model's noise distribution.
 
-    Args:
-        model: State-space model.
-        z: Standard normal numbers at hand, [R, N, W]. They are the noise if it is standard normal.
-        draws: Random stream for other noise.
-
-    Returns:
-        Noise minus its mean, divided by its standard deviation, [R, N, W].
+    Returns noise minus its mean, divided by its standard deviation, [R, N, W]. Shapes: z [R, N, W].
     """
     if has_standard_noise(model):
         return z
@@ -205,12 +176,7 @@ def draw_standardised_noise(model: StateSpaceModel, z: Tensor, draws: RandomStre
 def scale_noise(model: StateSpaceModel, xi: Tensor) -> Tensor:
     """Convert standardised noise to the noise of the model.
 
-    Args:
-        model: State-space model.
-        xi: Standardised noise, [R, N, W].
-
-    Returns:
-        Noise, [R, N, W].
+    Returns noise, [R, N, W]. Shapes: xi [R, N, W].
     """
     return xi if has_standard_noise(model) else model.noise.mean + model.noise.stddev * xi
 
@@ -218,13 +184,7 @@ def scale_noise(model: StateSpaceModel, xi: Tensor) -> Tensor:
 def log_noise_density(model: StateSpaceModel, w: Tensor, xi: Tensor) -> Tensor:
     """Compute log p(w) as a density of the standardised noise.
 
-    Args:
-        model: State-space model.
-        w: Noise of the model, [R, N, W].
-        xi: The same noise, standardised, [R, N, W].
-
-    Returns:
-        Log density, [R, N].
+    Returns log density, [R, N]. Shapes: w [R, N, W], xi [R, N, W].
     """
     if has_standard_noise(model):
         return log_standard_normal(xi)
@@ -257,12 +217,7 @@ class DefensiveSelection(NamedTuple):
     def log_mixture(self, log_p: Tensor, log_q: Tensor) -> Tensor:
         """Compute the log density of the mixture, log(fraction p + (1 - fraction) q).
 
-        Args:
-            log_p: Log density p of the model, [R, N].
-            log_q: Log density q of the other particles, [R, N].
-
-        Returns:
-            Log density, [R, N].
+        Returns log density, [R, N]. Shapes: log_p [R, N], log_q [R, N].
         """
         return torch.logaddexp(
             log_p + torch.log(self.fraction), log_q + torch.log1p(-self.fraction)
@@ -271,11 +226,7 @@ class DefensiveSelection(NamedTuple):
     def bound_log_ratio(self, log_ratio: Tensor) -> Tensor:
         """Compute log p minus the log density of the mixture, which is at most -log fraction.
 
-        Args:
-            log_ratio: log p - log q, [R, N].
-
-        Returns:
-            Log ratio, [R, N].
+        Returns log ratio, [R, N]. Shapes: log_ratio [R, N].
         """
         return -torch.logaddexp(torch.log(self.fraction), torch.log1p(-self.fraction) - log_ratio)
 
@@ -287,14 +238,7 @@ def choose_defensive_particles(
 
     The choice is random, because neighbours after resampling are copies of one particle.
 
-    Args:
-        fraction: Fraction of the active particles.
-        active_mask: Active particles, [R, N].
-        draws: Random stream.
-        purpose: Label of the draw.
-
-    Returns:
-        Mask and fraction.
+    Returns mask and fraction. Shapes: active_mask [R, N].
     """
     count = active_mask.sum(1, keepdim=True).clamp(min=1).to(draws.dtype)
     u = draws.uniform(purpose, active_mask.shape[1], 1).squeeze(-1)
@@ -305,16 +249,7 @@ def choose_defensive_particles(
 
 
 def check_fraction(name: str, value: float, below_one: bool = False) -> None:
-    """Check that a value is a fraction.
-
-    Args:
-        name: Configuration key.
-        value: Its value.
-        below_one: Whether 1 is refused.
-
-    Raises:
-        ValueError: If it is outside [0, 1], or [0, 1).
-    """
+    """Check that a value is a fraction."""
     if below_one and value == 1.0:
         raise ValueError(f"{name} must be below 1, got {value}. Use BootstrapProposal for 1.")
     if not 0.0 <= value <= 1.0:
@@ -337,13 +272,8 @@ class AffineMap(NamedTuple):
     ) -> tuple[Tensor, Tensor]:
         """Map samples of density p, except the defensive ones, and compute the ratio.
 
-        Args:
-            e: Samples, [R, N, k].
-            selection: Defensive selection, None for no particle.
-            log_p: Log density, [R, N].
-
-        Returns:
-            New samples and log p - log q, where q is p under the map, mixed with p.
+        Returns new samples and log p - log q, where q is p under the map, mixed with p. Shapes: e
+        [R, N, k], log_p [R, N].
         """
         new = batch_product(self.matrix, e) + self.offset
         log_det = torch.linalg.slogdet(self.matrix)[1]

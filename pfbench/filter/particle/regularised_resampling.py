@@ -249,14 +249,9 @@ class ThompsonTaylorResampler(Resampler):
 def nearest_neighbours(z: Tensor, active_mask: Tensor, m: int) -> Tensor:
     """Find the m nearest active points of each point, including itself.
 
-    Args:
-        z: Points, [R, N, d].
-        active_mask: Active points, [R, N].
-        m: Number of neighbours.
-
-    Returns:
-        Indices in ascending order, [R, N, m]. Copies of a particle are equally near, and rounding
-        decides between them; in this order that does not matter.
+    Returns indices in ascending order, [R, N, m]. Copies of a particle are equally near, and
+    rounding decides between them; in this order that does not matter. Shapes: z [R, N, d],
+    active_mask [R, N].
     """
     block = max(1, _PAIRS // max(1, z.shape[0] * z.shape[1]))
     penalty = torch.where(active_mask, 0.0, torch.inf).unsqueeze(1)

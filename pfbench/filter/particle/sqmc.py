@@ -75,13 +75,7 @@ class ShiftedPoints(PointSet, Protocol):
     def shift_points(self, axes: range, n: int, shift: Tensor) -> Tensor:
         """Compute points 0 to n - 1 under a shift.
 
-        Args:
-            axes: Axes of the set, w of them.
-            n: Number of points.
-            shift: Uniform shift, [w, R, 1].
-
-        Returns:
-            Points in (0, 1), [w, R, n].
+        Shapes: shift [w, R, 1].
         """
 
     @override
@@ -147,15 +141,6 @@ def halton_points(skip: int, n: int, axes: range, permuted: bool = False) -> Ten
     """Compute Halton points without shift, in base 2 for example 1/2, 1/4, 3/4, 1/8.
 
     The set begins with point `skip` + 1.
-
-    Args:
-        skip: Number of points omitted.
-        n: Number of points.
-        axes: Indices of the prime bases, w of them.
-        permuted: True permutes the digits of each base.
-
-    Returns:
-        Points, [w, n].
     """
     bases = first_primes(axes.stop)
     return torch.stack([_radical_inverse(skip + 1, n, bases[a], permuted) for a in axes])
@@ -176,15 +161,7 @@ def _radical_inverse(start: int, n: int, base: int, permuted: bool) -> Tensor:
 
 @cache
 def sobol_digits(n: int, axes: range) -> Tensor:
-    """Return Sobol points without shift, times 2^30.
-
-    Args:
-        n: Number of points.
-        axes: Axes of the set, w of them.
-
-    Returns:
-        Points, int64 [w, n].
-    """
+    """Return Sobol points without shift, times 2^30."""
     points = SobolEngine(axes.stop).draw(n, dtype=torch.float64)
     return (points * 2.0**_POINT_BITS).long().T[axes.start :].contiguous()
 
@@ -288,12 +265,7 @@ def compute_hilbert_order(chart: Chart, belief: ParticleBelief) -> Tensor:
     See [Gerber and Chopin 2015, section 3.3]. The logistic function maps their deviations from the
     mean, in standard deviations, to the unit cube.
 
-    Args:
-        chart: Chart of the state.
-        belief: Weighted particles.
-
-    Returns:
-        Slots in order, [R, N].
+    Returns slots in order, [R, N].
     """
     mean, covariance = weighted_mean_cov(chart, belief)
     d = chart.subtract(belief.x, mean.unsqueeze(1))
@@ -308,12 +280,7 @@ def compute_hilbert_order(chart: Chart, belief: ParticleBelief) -> Tensor:
 def compute_hilbert_index(cells: Tensor, bits: int) -> Tensor:
     """Compute the index of cells on the Hilbert curve of a cube [Skilling 2004].
 
-    Args:
-        cells: Integer coordinates, [..., k].
-        bits: The cube has 2^bits cells on a side.
-
-    Returns:
-        Index, int64 [...].
+    Returns index, int64 [...]. Shapes: cells [..., k].
     """
     x = list(cells.unbind(-1))
     for level in reversed(range(1, bits)):

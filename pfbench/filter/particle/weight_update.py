@@ -72,16 +72,7 @@ class MemoryWeightUpdate(ABC):
     ) -> UpdatedWeights:
         """Compute the weights after the measurement.
 
-        Args:
-            model: State-space model of the step.
-            log_w: Log weights before the measurement, [R, N].
-            x: Particles, [R, N, D].
-            log_ratio: Density ratio of the proposal, [R, N].
-            record: Record of the step.
-            memory: Memory of the particles at t-1, with the values of this update.
-
-        Returns:
-            Weights, values for the next step and numbers for the report.
+        Shapes: log_w [R, N], x [R, N, D], log_ratio [R, N].
         """
 
 
@@ -96,17 +87,8 @@ def compute_updated_weights(
 ) -> UpdatedWeights:
     """Apply a weight update with or without memory.
 
-    Args:
-        weight_update: Weight update of the filter.
-        model: State-space model of the step.
-        log_w: Log weights before the measurement, [R, N].
-        x: Particles, [R, N, D].
-        log_ratio: Density ratio of the proposal, [R, N].
-        record: Record of the step.
-        memory: Memory of the particles at t-1.
-
-    Returns:
-        Weights, values for the next step and numbers for the report.
+    Returns weights, values for the next step and numbers for the report. Shapes: log_w [R, N], x
+    [R, N, D], log_ratio [R, N].
     """
     if isinstance(weight_update, MemoryWeightUpdate):
         return weight_update.update_weights(model, log_w, x, log_ratio, record, memory)
@@ -171,13 +153,7 @@ def deactivate_invalid_particles(
 
     Otherwise one NaN would spread to the estimate of its run, because 0 * NaN is NaN.
 
-    Args:
-        x: Particles, [R, N, D].
-        log_w: Log weights, [R, N].
-        parents: Particles before the step, [R, N, D].
-
-    Returns:
-        Particles and log weights.
+    Returns particles and log weights. Shapes: x [R, N, D], log_w [R, N], parents [R, N, D].
     """
     if is_capturing():  # the caller of the graph checks, and repeats the step
         return x, log_w

@@ -71,9 +71,6 @@ class OneStepResponse(DmcResponse):
         uncontrolled_states: Names of the states without an input, such as the azimuth.
         units: Unit of each state's input in SI units, all 1 if None. They determine how far each
             state is shifted.
-
-    Raises:
-        ValueError: On use, if a name is not a state, or the number of units is not that of states.
     """
 
     uncontrolled_states: Sequence[str] = ()
@@ -147,19 +144,7 @@ class DmcController:
 
 
 def state_indices(model: StateSpaceModel, key: str, names: Sequence[str]) -> list[int]:
-    """Return the indices of states by name.
-
-    Args:
-        model: State-space model.
-        key: Configuration key, for messages.
-        names: Names of states.
-
-    Returns:
-        Index of each name.
-
-    Raises:
-        ValueError: If a name is not a state.
-    """
+    """Return the indices of states by name."""
     unknown = [name for name in names if name not in model.names]
     if unknown:
         raise ValueError(
@@ -187,13 +172,7 @@ def select_defensive(
 ) -> DefensiveSelection | None:
     """Draw the particles that are not shifted, or return None if there are none.
 
-    Args:
-        fraction: Fraction that is not shifted.
-        log_w: Log weights, [R, N].
-        draws: Random stream.
-
-    Returns:
-        Selection of these particles.
+    Shapes: log_w [R, N].
     """
     if fraction == 0.0:
         return None
@@ -203,13 +182,7 @@ def select_defensive(
 def keep_selected(selection: DefensiveSelection | None, old: Tensor, new: Tensor) -> Tensor:
     """Return `old` for selected particles and `new` for the others.
 
-    Args:
-        selection: Selection, or None for no particle.
-        old: Values of selected particles, [R, N, ...].
-        new: Values of the others, [R, N, ...].
-
-    Returns:
-        Values, [R, N, ...].
+    Returns values, [R, N, ...]. Shapes: old [R, N, ...], new [R, N, ...].
     """
     return new if selection is None else torch.where(selection.mask.unsqueeze(-1), old, new)
 
@@ -219,13 +192,7 @@ def predict_without_noise(
 ) -> tuple[Tensor, Tensor]:
     """Compute noise-free predictions.
 
-    Args:
-        model: State-space model.
-        belief: Belief before the step.
-        record: Record of the step.
-
-    Returns:
-        Predictions [R, N, D] and weights [R, N], 0 where the prediction is not finite.
+    Returns predictions [R, N, D] and weights [R, N], 0 where the prediction is not finite.
     """
     x = model.propagate(belief.x, record.u, mean_noise(model, belief.x))
     x, log_w = deactivate_invalid_particles(x, belief.log_w, belief.x)
@@ -235,11 +202,6 @@ def predict_without_noise(
 def replace_invalid(sample: ProposalSample, belief: ParticleBelief) -> tuple[Tensor, Tensor]:
     """Restore the parents of non-finite particles, with weight 0.
 
-    Args:
-        sample: Sample of the proposal.
-        belief: Belief before the step.
-
-    Returns:
-        Particles [R, N, D] and log ratio [R, N].
+    Returns particles [R, N, D] and log ratio [R, N].
     """
     return deactivate_invalid_particles(sample.x, sample.log_ratio, belief.x)

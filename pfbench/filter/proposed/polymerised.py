@@ -129,14 +129,8 @@ def divide_cells(
 ) -> Tensor:
     """Assign particles to cells that are numbered from 0 without gaps in each run.
 
-    Args:
-        partition: Partition.
-        p: Differences from the mean, [R, N, k].
-        active_mask: Mask of active particles, [R, N].
-        covariance: Covariance of the particles, [R, k, k].
-
-    Returns:
-        Cell of each particle, [R, N].
+    Returns cell of each particle, [R, N]. Shapes: p [R, N, k], active_mask [R, N], covariance
+    [R, k, k].
     """
     index = partition(p, active_mask, covariance)
     key = index[..., 0]
@@ -268,12 +262,7 @@ class ScaledCentrePlacement(ParticlePlacement):
 def select_rows(a: Tensor, index: Tensor) -> Tensor:
     """Select rows of a tensor by index.
 
-    Args:
-        a: Rows, [R, M, d].
-        index: Row of each slot, [R, N].
-
-    Returns:
-        Selected rows, [R, N, d].
+    Returns selected rows, [R, N, d]. Shapes: a [R, M, d], index [R, N].
     """
     return a.gather(1, index.unsqueeze(-1).expand(-1, -1, a.shape[-1]))
 
@@ -432,14 +421,8 @@ def aggregate_cells(cell: Tensor, w: Tensor, d: Tensor, covariance: Tensor) -> C
 
     The polymer of a cell with weight 0 is the plain mean of its particles.
 
-    Args:
-        cell: Cell of each particle, [R, N].
-        w: Weights, [R, N].
-        d: Differences from the weighted mean, [R, N, d].
-        covariance: Covariance of the particles, [R, d, d].
-
-    Returns:
-        Particles aggregated by cell.
+    Returns particles aggregated by cell. Shapes: cell [R, N], w [R, N], d [R, N, d], covariance
+    [R, d, d].
     """
     zero = torch.zeros_like(w)
     weight = zero.scatter_add(1, cell, w)

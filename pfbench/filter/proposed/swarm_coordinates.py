@@ -162,13 +162,7 @@ class PosteriorFitness(Fitness):
 def observed_components(model: StateSpaceModel, mean: Tensor, u: Any) -> Tensor:
     """Return the components on which mean or variance of the measurement depends.
 
-    Args:
-        model: State-space model.
-        mean: State at which the derivative is taken, [R, 1, D].
-        u: Inputs of the step.
-
-    Returns:
-        Indices of the components, [k].
+    Shapes: mean [R, 1, D].
     """
 
     def moments_of_y(at: Tensor, xi: Tensor) -> Tensor:

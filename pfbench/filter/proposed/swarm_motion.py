@@ -152,12 +152,7 @@ class InertiaVelocity(VelocityUpdate):
 def match_memory_layout(a: Tensor, template: Tensor) -> Tensor:
     """Copy a tensor into the memory layout of another one, for faster loops.
 
-    Args:
-        a: Tensor to copy.
-        template: Tensor of the same shape and the new layout.
-
-    Returns:
-        Copy of the tensor.
+    Returns copy of the tensor.
     """
     return torch.empty_like(template, dtype=a.dtype).copy_(a)
 
@@ -165,12 +160,7 @@ def match_memory_layout(a: Tensor, template: Tensor) -> Tensor:
 def select_particle(q: Tensor, i: Tensor) -> Tensor:
     """Select one particle per run.
 
-    Args:
-        q: Positions, [R, N, k].
-        i: Slot of each run, [R].
-
-    Returns:
-        Positions, [R, 1, k].
+    Returns positions, [R, 1, k]. Shapes: q [R, N, k], i [R].
     """
     return q.gather(1, i[:, None, None].expand(-1, 1, q.shape[-1]))
 
@@ -178,13 +168,7 @@ def select_particle(q: Tensor, i: Tensor) -> Tensor:
 def select_swarm_by_run(active: Tensor, new: SwarmState, old: SwarmState) -> SwarmState:
     """Select the swarm of each run.
 
-    Args:
-        active: Mask of the runs that take `new`, [R].
-        new: Swarm of active runs.
-        old: Swarm of other runs.
-
-    Returns:
-        Swarm.
+    Returns swarm. Shapes: active [R].
     """
     return SwarmState(
         *(
@@ -217,12 +201,7 @@ def safe_seeds(u: Tensor) -> Tensor:
 def logistic_map(z: Tensor, spare: Tensor) -> Tensor:
     """Compute the next values, and restart sequences at a fixed point.
 
-    Args:
-        z: Values, [R, N, k].
-        spare: Seeds of restarted sequences, [R, N, k].
-
-    Returns:
-        Next values, [R, N, k].
+    Returns next values, [R, N, k]. Shapes: z [R, N, k], spare [R, N, k].
     """
     z = 4.0 * z * (1.0 - z)
     stuck = (z < _STUCK) | (z > 1.0 - _STUCK) | ((z - 0.75).abs() < _STUCK)

@@ -156,15 +156,7 @@ def advance_branches(
 ) -> BranchSteps:
     """Take a step of a Gaussian filter for all branches, folded into the axis of runs.
 
-    Args:
-        linearisation: Linearisation rule of the filter.
-        model: State-space model of the step.
-        branches: Branches before the step, [R, K, ...].
-        factors: Factors on Q and on R of each branch, [K] each.
-        record: Measurement and inputs of the step.
-
-    Returns:
-        The results.
+    Returns the results. Shapes: branches [R, K, ...], factors [K].
     """
     runs, k = branches.mean.shape[:2]
 
@@ -197,13 +189,8 @@ def mixture_moments(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute mean and covariance of a mixture.
 
-    Args:
-        chart: Chart of the state.
-        branches: Components of the mixture, [R, K, ...].
-        weight: Weights, [R, K]. Components of weight 0 may be NaN.
-
-    Returns:
-        Mean [R, D], covariance [R, d, d], and the offsets of the components from the mean [R, K, d].
+    Returns mean [R, D], covariance [R, d, d], and the offsets of the components from the mean
+    [R, K, d]. Shapes: branches [R, K, ...], weight [R, K].
     """
     heaviest = weight.argmax(1)
     centre = branches.mean[torch.arange(len(weight), device=weight.device), heaviest]
@@ -249,18 +236,7 @@ class HypothesisFilter(ABC):
     ) -> GaussianBelief:
         """Compute the belief at step 0: equal branches, and the stationary distribution of hypotheses.
 
-        Args:
-            model: State-space model.
-            runs: Number of runs R.
-            draws: Random stream, not used.
-            start: States about which the initial distribution is placed, [R, D].
-            spread: Cholesky factors of the initial covariances, [R, d, d].
-
-        Returns:
-            The belief.
-
-        Raises:
-            ValueError: If mean or variance of the initial or the noise distribution is not finite.
+        Shapes: start [R, D], spread [R, d, d].
         """
         belief = GaussianFilter(self.linearisation).init(model, runs, draws, start, spread)
         log_law = (
@@ -281,17 +257,7 @@ class HypothesisFilter(ABC):
     def step(
         self, model: StateSpaceModel, belief: GaussianBelief, record: Record, draws: RandomStream
     ) -> tuple[GaussianBelief, StepInfo]:
-        """Compute the belief after a measurement.
-
-        Args:
-            model: State-space model of the step.
-            belief: Belief at t-1.
-            record: Measurement and inputs of step t.
-            draws: Random stream of the step.
-
-        Returns:
-            Belief at t and diagnostics.
-        """
+        """Compute the belief after a measurement."""
         branches, number, log_prior = self._predict_branches(model, belief)
         parts = self.hypotheses.process_factors, self.hypotheses.measurement_factors
         factors = [torch.tensor(f, dtype=torch.float64).to(belief.mean)[number] for f in parts]
@@ -311,11 +277,7 @@ class HypothesisFilter(ABC):
         return GaussianBelief(mean, covariance, log_z, memory), info
 
     def log_transition(self, template: Tensor) -> Tensor:
-        """Return log probabilities of hypothesis j after i, [M, M].
-
-        Args:
-            template: Tensor of the dtype and device.
-        """
+        """Return log probabilities of hypothesis j after i, [M, M]."""
         rows = [list(row) for row in self.hypotheses.transition]
         return torch.tensor(rows, dtype=torch.float64).to(template).log()
 
@@ -346,11 +308,7 @@ def branch_memory(
 ) -> dict[str, Tensor]:
     """Return the memory of branches by name.
 
-    Args:
-        offset: Means minus the estimate, [R, K, d].
-        covariance: Covariances, [R, K, d, d].
-        log_weight: Log weights, [R, K].
-        log_next: Log probabilities of the next hypothesis, [R, K, M].
+    Shapes: offset [R, K, d], covariance [R, K, d, d], log_weight [R, K], log_next [R, K, M].
     """
     return {
         OFFSET: offset,

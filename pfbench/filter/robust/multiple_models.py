@@ -168,14 +168,8 @@ def select_unbiased(log_w: Tensor, count: int, level: Tensor) -> tuple[Tensor, T
     systematic resampling, and receive the weight 1 / c. The expected squared error of the weights
     is the smallest one [Fearnhead and Clifford 2003].
 
-    Args:
-        log_w: Log weights, [R, L], logsumexp 0.
-        count: Number K of draws, at most L.
-        level: Uniform random number of each run, [R, 1].
-
-    Returns:
-        Indices [R, K], the heaviest first, and log weights [R, K]. Where fewer than K weights are
-        positive, the last ones are -inf.
+    Returns indices [R, K], the heaviest first, and log weights [R, K]. Where fewer than K weights
+    are positive, the last ones are -inf. Shapes: log_w [R, L], level [R, 1].
     """
     w, order = log_w.exp().sort(1, descending=True)
     rest = w.flip(1).cumsum(1).flip(1)[:, :count]  # sum of the weights from each one on

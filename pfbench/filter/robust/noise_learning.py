@@ -129,25 +129,14 @@ class VariationalNoiseAdaptation(RobustUpdate):
 def scale_variances(noise: Tensor, factor: Tensor) -> Tensor:
     """Multiply variances by factors; correlations do not change.
 
-    Args:
-        noise: Covariance, [R, k, k].
-        factor: Factors, [R, k].
+    Shapes: noise [R, k, k], factor [R, k].
     """
     root = factor.sqrt()
     return noise * root.unsqueeze(-1) * root.unsqueeze(-2)
 
 
 def check_factor_bounds(name: str, lowest: float, largest: float) -> None:
-    """Check the bounds of a factor on the model's variance.
-
-    Args:
-        name: Class for the message.
-        lowest: Smallest factor.
-        largest: Largest factor.
-
-    Raises:
-        ValueError: If 1 does not lie between them, or the smallest is not positive.
-    """
+    """Check the bounds of a factor on the model's variance."""
     if not 0.0 < lowest <= 1.0 <= largest:
         raise ValueError(
             f"{name}.min_factor must be in (0, 1] and max_factor at least 1, got "
@@ -156,15 +145,7 @@ def check_factor_bounds(name: str, lowest: float, largest: float) -> None:
 
 
 def check_forgetting(name: str, value: float) -> None:
-    """Check that a forgetting factor lies in (0, 1).
-
-    Args:
-        name: Class for the message.
-        value: Value to check.
-
-    Raises:
-        ValueError: If it does not.
-    """
+    """Check that a forgetting factor lies in (0, 1)."""
     if not 0.0 < value < 1.0:
         raise ValueError(f"{name}.forgetting_factor must be in (0, 1), got {value}. Use 0.98.")
 

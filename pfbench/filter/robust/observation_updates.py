@@ -210,19 +210,7 @@ def read_student(distribution: Any) -> StudentParameters | None:
 
 
 def read_normal_mixture(distribution: Any) -> NormalMixtureParameters | None:
-    """Return the parameters of a mixture of normal distributions, else None.
-
-    Args:
-        distribution: Mixture of vectors, or independent components that are mixtures: MixtureSameFamily, or a
-            distribution with `weights` and `components`. With independent components each combination of
-            their parts is a part.
-
-    Returns:
-        The parameters.
-
-    Raises:
-        ValueError: If there are more than 256 parts.
-    """
+    """Return the parameters of a mixture of normal distributions, else None."""
     if _is_normal(distribution):
         location = distribution.mean
         covariance = distribution_covariance(distribution).unsqueeze(-3)
@@ -247,12 +235,8 @@ def normal_mixture_moments(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Compute the moments of a mixture, with differences that wrap angles.
 
-    Args:
-        parameters: Parameters with batch [R, P].
-        model: State-space model, for its residual.
-
-    Returns:
-        Mean [R, P, k], offsets of the parts from it [R, P, J, k], covariance [R, P, k, k].
+    Returns mean [R, P, k], offsets of the parts from it [R, P, J, k], covariance [R, P, k, k].
+    Shapes: parameters [R, P].
     """
     w, location = parameters.log_weight.exp(), parameters.location
     parts = location.shape[2]

@@ -45,9 +45,6 @@ class ComponentGrouping:
             `component` for single components, or `satellite` for ranges followed by as many range
             rates.
         groups: Group number of each component, which replaces `kind`.
-
-    Raises:
-        ValueError: If the kind is not one of these. On use, if the groups do not fit.
     """
 
     kind: str = "component"
@@ -66,15 +63,7 @@ class ComponentGrouping:
             )
 
     def numbers(self, components: int) -> Sequence[int] | None:
-        """Return the group number of each component, None for groups of equal variance.
-
-        Args:
-            components: Number of measured components k.
-
-        Raises:
-            ValueError: If satellites need as many ranges as rates, and k is odd, or if `groups` has
-                another number of entries.
-        """
+        """Return the group number of each component, None for groups of equal variance."""
         if self.groups is not None:
             if len(self.groups) != components:
                 raise ValueError(
@@ -94,13 +83,7 @@ class ComponentGrouping:
     def apply(self, innovation: Innovation, covariance: Tensor) -> GroupDistances:
         """Build the distances by group, in units of a covariance.
 
-        Args:
-            innovation: Innovation of the step.
-            covariance: Covariance of the measurement, [R, k, k]. Its correlations between groups
-                are ignored [ours].
-
-        Returns:
-            The distances.
+        Returns the distances. Shapes: covariance [R, k, k].
         """
         group_mask, joint_mask = axes_by_group(innovation, self.numbers(innovation.r.shape[-1]))
         root = compute_group_root(covariance, joint_mask)
@@ -189,21 +172,11 @@ class ResidualLoss(RobustUpdate, ABC):
 
     @abstractmethod
     def residual_weight(self, squared: Tensor, size: Tensor) -> Tensor:
-        """Compute the weight of groups.
-
-        Args:
-            squared: Squared distances d^2 of the residual by group.
-            size: Observed components of the group.
-        """
+        """Compute the weight of groups."""
 
     @abstractmethod
     def log_density(self, squared: Tensor, size: Tensor) -> Tensor:
-        """Compute minus the loss of groups in whitened coordinates, with its constant.
-
-        Args:
-            squared: Squared distances d^2 of the residual by group.
-            size: Observed components of the group.
-        """
+        """Compute minus the loss of groups in whitened coordinates, with its constant."""
 
 
 class InnovationWeight(RobustUpdate, ABC):
@@ -215,23 +188,15 @@ class InnovationWeight(RobustUpdate, ABC):
     ) -> tuple[Tensor, GroupDistances, dict[str, Tensor]]:
         """Compute the weight of each component.
 
-        Args:
-            innovation: Innovation of the step.
-            memory: Values of this update from the step before, by name.
-
-        Returns:
-            Weights [R, k], 0 for a rejected component, the groups, and values by name, [R, ...].
+        Returns weights [R, k], 0 for a rejected component, the groups, and values by name,
+        [R, ...].
         """
 
 
 def updated_residual(innovation: Innovation) -> tuple[Tensor, Tensor]:
     """Compute the residual after the update, and the covariance of its prediction.
 
-    Args:
-        innovation: Innovation of the step, with the noise in use.
-
-    Returns:
-        e = r - M xi+ [R, k], and M P+ M' with the error of the linearisation [R, k, k].
+    Returns e = r - M xi+ [R, k], and M P+ M' with the error of the linearisation [R, k, k].
     """
     shift, root, _ = kalman_gain_update(innovation)
     half = innovation.m @ root
@@ -247,40 +212,19 @@ def finite_weight(weight: Tensor) -> Tensor:
 def count_downweighted(groups: GroupDistances, weight: Tensor) -> dict[str, Tensor]:
     """Count the fixes of the step whose weight is below 1/2.
 
-    Args:
-        groups: Groups of components.
-        weight: Weights, [R, k].
-
-    Returns:
-        The count [R] by the name of its trace.
+    Returns the count [R] by the name of its trace. Shapes: weight [R, k].
     """
     return {"downweighted": groups.count_groups(weight < DOWNWEIGHTED)}
 
 
 def check_efficiency(name: str, efficiency: float) -> None:
-    """Check that an efficiency is between 0 and 1.
-
-    Args:
-        name: Class for the message.
-        efficiency: Value to check.
-
-    Raises:
-        ValueError: If it is not.
-    """
+    """Check that an efficiency is between 0 and 1."""
     if not 0.0 < efficiency < 1.0:
         raise ValueError(f"{name}.efficiency must be in (0, 1), got {efficiency}. Use 0.95.")
 
 
 def check_threshold(name: str, threshold: float | None) -> None:
-    """Check that a threshold is positive.
-
-    Args:
-        name: Class for the message.
-        threshold: Value to check, None for a threshold by efficiency.
-
-    Raises:
-        ValueError: If it is not positive.
-    """
+    """Check that a threshold is positive."""
     if threshold is not None and not threshold > 0.0:
         raise ValueError(
             f"{name}.threshold must be positive, got {threshold}. Use null for the threshold of "
@@ -305,43 +249,22 @@ _SMALLEST = 1e-3  # smallest threshold
 
 
 def huber_weight(squared: Tensor, threshold: Tensor) -> Tensor:
-    """Compute min(1, c / d).
-
-    Args:
-        squared: Squared distances d^2.
-        threshold: Thresholds c.
-    """
+    """Compute min(1, c / d)."""
     return (threshold / squared.clamp(min=1e-300).sqrt()).clamp(max=1.0)
 
 
 def cauchy_weight(squared: Tensor, threshold: Tensor) -> Tensor:
-    """Compute 1 / (1 + d^2 / c^2).
-
-    Args:
-        squared: Squared distances d^2.
-        threshold: Thresholds c.
-    """
+    """Compute 1 / (1 + d^2 / c^2)."""
     return 1.0 / (1.0 + squared / threshold.square())
 
 
 def welsch_weight(squared: Tensor, threshold: Tensor) -> Tensor:
-    """Compute exp(-d^2 / (2 c^2)).
-
-    Args:
-        squared: Squared distances d^2.
-        threshold: Thresholds c.
-    """
+    """Compute exp(-d^2 / (2 c^2))."""
     return torch.exp(-0.5 * squared / threshold.square())
 
 
 def huber_log_density(squared: Tensor, size: Tensor, threshold: Tensor) -> Tensor:
-    """Compute the log density exp(-d^2 / 2) up to c and exp(-c d + c^2 / 2) beyond, normalised.
-
-    Args:
-        squared: Squared distances d^2.
-        size: Number of components k.
-        threshold: Thresholds c.
-    """
+    """Compute the log density exp(-d^2 / 2) up to c and exp(-c d + c^2 / 2) beyond, normalised."""
     c, half = threshold, 0.5 * size.clamp(min=1.0)
     distance = squared.clamp(min=0.0).sqrt()
     loss = torch.where(distance <= c, 0.5 * squared, c * distance - 0.5 * c.square())
@@ -354,13 +277,7 @@ def huber_log_density(squared: Tensor, size: Tensor, threshold: Tensor) -> Tenso
 
 
 def student_log_density(squared: Tensor, size: Tensor, dof: float) -> Tensor:
-    """Compute the log density of Student's t in k components; normal for infinite dof.
-
-    Args:
-        squared: Squared distances d^2.
-        size: Number of components k.
-        dof: Degrees of freedom nu.
-    """
+    """Compute the log density of Student's t in k components; normal for infinite dof."""
     if math.isinf(dof):
         return -0.5 * squared - 0.5 * size * LOG_2PI
     half = 0.5 * (dof + size)
@@ -369,13 +286,7 @@ def student_log_density(squared: Tensor, size: Tensor, dof: float) -> Tensor:
 
 
 def welsch_log_loss(squared: Tensor, size: Tensor, threshold: Tensor) -> Tensor:
-    """Compute -c^2 (1 - exp(-d^2 / (2 c^2))), with the constant of the normal density.
-
-    Args:
-        squared: Squared distances d^2.
-        size: Number of components k.
-        threshold: Thresholds c.
-    """
+    """Compute -c^2 (1 - exp(-d^2 / (2 c^2))), with the constant of the normal density."""
     c2 = threshold.square()
     return c2 * torch.expm1(-0.5 * squared / c2) - 0.5 * size * LOG_2PI
 
@@ -384,16 +295,7 @@ WeightFunction = Callable[[Tensor, Tensor], Tensor]
 
 
 def compute_efficiency(weight: WeightFunction, threshold: float, k: int) -> float:
-    """Compute the asymptotic efficiency of a weight at the normal law.
-
-    Args:
-        weight: Function of squared distances and thresholds.
-        threshold: Threshold c.
-        k: Number of components.
-
-    Returns:
-        Variance of the optimal estimate divided by that of the weighted one, at most 1.
-    """
+    """Compute the asymptotic efficiency of a weight at the normal law."""
     squared, probability = _chi_nodes(k)
     values = weight(squared, torch.tensor(threshold, dtype=torch.float64))
     a = (values * squared * probability).sum() / k
@@ -414,17 +316,7 @@ def _chi_nodes(k: int) -> tuple[Tensor, Tensor]:
 
 @lru_cache(maxsize=256)
 def threshold_for_efficiency(weight: WeightFunction, efficiency: float, k: int) -> float:
-    """Compute the threshold c at which a weight has an efficiency.
-
-    Args:
-        weight: Function of squared distances and thresholds, increasing in c.
-        efficiency: Efficiency in (0, 1).
-        k: Number of components.
-
-    Returns:
-        The threshold. NaN if every threshold has a larger efficiency: Huber's weight of small
-        thresholds has an efficiency of (E d)^2 / k, 0.64 for k = 1 and 0.95 for k = 10.
-    """
+    """Compute the threshold c at which a weight has an efficiency."""
     low, high = _SMALLEST, 1.0 / _SMALLEST
     if compute_efficiency(weight, low, k) > efficiency:
         return math.nan
@@ -440,14 +332,7 @@ def threshold_table(
 ) -> Tensor:
     """Return the threshold of each group, [R, k].
 
-    Args:
-        weight: Function of squared distances and thresholds.
-        threshold: Threshold of all groups; None for that of the efficiency.
-        efficiency: Efficiency in (0, 1).
-        count: Number of observed components of the group, [R, k].
-
-    Raises:
-        ValueError: If every threshold of a group has a larger efficiency.
+    Shapes: count [R, k].
     """
     if threshold is not None:
         return torch.full_like(count, threshold)
@@ -476,9 +361,7 @@ def _check_efficiency_reached(
 def quantile_table(probability: float, count: Tensor) -> Tensor:
     """Return the quantile of chi-square for the size of each group, [R, k].
 
-    Args:
-        probability: Probability of a smaller value.
-        count: Degrees of freedom, [R, k].
+    Shapes: count [R, k].
     """
     return _look_up([float(special.chdtri(n, 1.0 - probability)) for n in _counts(count)], count)
 

@@ -56,10 +56,6 @@ class MEstimationUpdate(ResidualLoss):
         iterations: Number of reweightings, equal for all runs.
         grouping: Components with a common weight, see ComponentGrouping.
         groups: Group number of each component, instead of `grouping`.
-
-    Raises:
-        ValueError: If an argument is outside its range. On use, if every threshold of a group has a
-            larger efficiency.
     """
 
     threshold: float | None = None
@@ -83,8 +79,7 @@ class MEstimationUpdate(ResidualLoss):
     def table(self, size: Tensor) -> Tensor:
         """Return the threshold of each group.
 
-        Args:
-            size: Observed components of the group, [R, k].
+        Shapes: size [R, k].
         """
         return threshold_table(self.weight, self.threshold, self.efficiency, size)
 
@@ -416,12 +411,7 @@ class ScaledNoise(NoiseAdaptation):
 def scale_process_noise(predicted: AffineApproximation, factor: Tensor) -> AffineApproximation:
     """Multiply the process noise in a prediction by a factor.
 
-    Args:
-        predicted: Linearised prediction.
-        factor: Factor, [R or 1].
-
-    Returns:
-        The prediction.
+    Returns the prediction. Shapes: factor [R or 1].
     """
     f = factor[:, None, None]
     omega = predicted.omega + (f - 1.0) * predicted.noise

@@ -186,12 +186,7 @@ class BackwardStep(NamedTuple):
     def log_density(self, candidates: Tensor, paths: Tensor) -> Tensor:
         """Return log p(next state of a path | particle).
 
-        Args:
-            candidates: Slots of particles, [R, m, B].
-            paths: Paths, [R, m].
-
-        Returns:
-            Log densities, [R, m, B].
+        Returns log densities, [R, m, B]. Shapes: candidates [R, m, B], paths [R, m].
         """
         size = candidates.shape[-1]
         parts = []
@@ -206,12 +201,7 @@ class BackwardStep(NamedTuple):
 def draw_by_weight(log_w: Tensor, u: Tensor) -> Tensor:
     """Draw slots by log weights [R, N].
 
-    Args:
-        log_w: Log weights, [R, N].
-        u: Uniform numbers, [R, ...].
-
-    Returns:
-        Slots, [R, ...].
+    Returns slots, [R, ...]. Shapes: log_w [R, N], u [R, ...].
     """
     cumulative = torch.softmax(log_w, -1).nan_to_num().cumsum(-1)
     return _invert(cumulative, u.to(cumulative).flatten(1)).view(u.shape)
@@ -384,11 +374,6 @@ def _largest_log_density(distribution: Distribution) -> Tensor:
 def gather_states(x: Tensor, slots: Tensor) -> Tensor:
     """Gather [R, m, D] of x [R, N, D] by slots [R, m].
 
-    Args:
-        x: States, [R, N, D].
-        slots: Slots, [R, m].
-
-    Returns:
-        States, [R, m, D].
+    Returns states, [R, m, D]. Shapes: x [R, N, D], slots [R, m].
     """
     return x.gather(1, slots.unsqueeze(-1).expand(-1, -1, x.shape[-1]))

@@ -107,11 +107,7 @@ def _backward_gain(
 
 
 def check_no_feedback(record: Record) -> None:
-    """Raise an error if the record has feedback.
-
-    Raises:
-        ValueError: If it has.
-    """
+    """Raise an error if the record has feedback."""
     if record.feedback is not None:
         raise ValueError(
             "smoothing: record must not depend on the filter, got one with feedback. "
@@ -226,14 +222,8 @@ def smooth_initial_state(
 ) -> tuple[Tensor, Tensor]:
     """Compute the distribution of the initial state, given all measurements.
 
-    Args:
-        method: Gaussian filter without noise or gain adaptations.
-        model: State-space model of the filter.
-        record: Measurements [R, T, Dy] and inputs, prepared by the model.
-        passes: Number of linearisations after that of the filter.
-
-    Returns:
-        Mean [R, D] and covariance in the chart, [R, d, d]. NaN where a covariance is not positive.
+    Returns mean [R, D] and covariance in the chart, [R, d, d]. NaN where a covariance is not
+    positive. Shapes: record [R, T, Dy].
     """
     draws = PhiloxStream(0, torch.arange(len(record.y)))
     belief = method.init(model, len(record.y), draws, record.start, record.spread)

@@ -23,12 +23,7 @@ CellKey = tuple[str, str]
 
 
 def make_curves(results: Mapping[str, JobResult], conditions: int = 1) -> dict[str, Any]:
-    """Compute quantiles over runs of the error of the main group at up to 60 instants, or 24 of a large study.
-
-    Args:
-        results: Results of the filters of a condition by label.
-        conditions: Number of conditions of the study.
-    """
+    """Compute quantiles over runs of the error of the main group at up to 60 instants, or 24 of a large study."""
     first = next(iter(results.values()))
     group = main_component_group(first.meta["state"])
     most = CURVE_INSTANTS if len(results) * conditions <= _MANY else FEW_CURVE_INSTANTS
@@ -47,11 +42,7 @@ def make_curves(results: Mapping[str, JobResult], conditions: int = 1) -> dict[s
 
 
 def compute_error_norms(results: Mapping[str, JobResult]) -> dict[str, Array]:
-    """Compute the norm of the error of the main group in displayed units, [R, T] by label; NaN in lost runs.
-
-    Args:
-        results: Results of the filters of a condition by label.
-    """
+    """Compute the norm of the error of the main group in displayed units, [R, T] by label; NaN in lost runs."""
     norms = {}
     for label, result in results.items():
         group = main_component_group(result.meta["state"])
@@ -65,9 +56,7 @@ def compute_error_norms(results: Mapping[str, JobResult]) -> dict[str, Array]:
 def select_truth_steps(norms: Iterable[Array], most: int) -> np.ndarray:
     """Select evenly spaced steps among those with truth.
 
-    Args:
-        norms: Errors of the filters, [R, T].
-        most: Number of steps at most.
+    Shapes: norms [R, T].
     """
     has_truth = np.any([np.isfinite(norm).any(axis=0) for norm in norms], axis=0)
     steps = np.flatnonzero(has_truth) if has_truth.any() else np.arange(has_truth.size)
@@ -75,11 +64,7 @@ def select_truth_steps(norms: Iterable[Array], most: int) -> np.ndarray:
 
 
 def list_calibration(table: pd.DataFrame) -> dict[CellKey, Any]:
-    """List coverage and NEES ratio of each filter, by cell and by scope.
-
-    Args:
-        table: Table of `build_run_table`.
-    """
+    """List coverage and NEES ratio of each filter, by cell and by scope."""
     columns = {"coverage_50": "c50", "coverage_90": "c90", "nees_ratio": "nees_ratio"}
     cells = table.groupby(["scenario", "regime", "filter"], sort=False)[list(columns)].mean()
     cells = cells.rename(columns=columns)
@@ -100,11 +85,7 @@ def list_calibration(table: pd.DataFrame) -> dict[CellKey, Any]:
 
 
 def list_runs(table: pd.DataFrame) -> dict[CellKey, Any]:
-    """List the RMS error of each run, None for a lost one, by cell.
-
-    Args:
-        table: Table of `build_run_table`.
-    """
+    """List the RMS error of each run, None for a lost one, by cell."""
     runs: dict[CellKey, Any] = {}
     for (world, regime), rows in table.groupby(["scenario", "regime"], sort=False):
         values = rows.pivot_table("rmse", "run", "filter", dropna=False)
@@ -135,24 +116,14 @@ _PLANES = (("position_E", "position_N"), ("x", "y"))  # components east and nort
 
 
 def count_carried_runs(filters: int, conditions: int) -> int:
-    """Count the runs of a condition whose tracks a page carries.
-
-    Args:
-        filters: Number of filters.
-        conditions: Number of conditions.
-    """
+    """Count the runs of a condition whose tracks a page carries."""
     return max(_MIN_RUNS, _TRACKS // max(1, filters * conditions))
 
 
 def select_telling_runs(errors: Array, most: int) -> list[int]:
     """Select runs in turn: the most typical, the worst, the best, and the largest disagreement.
 
-    Args:
-        errors: Errors, [F, N]; NaN for a lost or an absent run.
-        most: Number of runs at most.
-
-    Returns:
-        Indices of the runs, the most telling first.
+    Returns indices of the runs, the most telling first. Shapes: errors [F, N].
     """
     runs = errors.shape[1]
     with warnings.catch_warnings(), np.errstate(divide="ignore"):
@@ -177,14 +148,8 @@ def make_tracks(
 ) -> dict[str, Any]:
     """Collect the most telling runs of a condition.
 
-    Args:
-        results: Results of all filters by label.
-        errors: RMS errors, [F, N], in the order of the results; NaN for a lost run.
-        numbers: Numbers of the runs, [N].
-        most: Number of runs at most.
-
-    Returns:
-        Entry of the page: instants, unit, numbers, error, traces, and the plane if there is one.
+    Returns entry of the page: instants, unit, numbers, error, traces, and the plane if there is
+    one. Shapes: errors [F, N], numbers [N].
     """
     first = next(iter(results.values()))
     group = main_component_group(first.meta["state"])

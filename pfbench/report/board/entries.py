@@ -58,23 +58,14 @@ class StudyNames(NamedTuple):
 
 
 def list_metrics(table: pd.DataFrame, main: str = "rmse") -> list[str]:
-    """List the metrics of a board: that which decides first, then all that have values.
-
-    Args:
-        table: Table of `build_run_table`.
-        main: Metric that decides the study.
-    """
+    """List the metrics of a board: that which decides first, then all that have values."""
     names = [name for name in METRIC_NAMES if name in table]
     names.sort(key=lambda name: name != main)
     return [name for name in names if name in (main, "rmse") or table[name].notna().any()]
 
 
 def format_interval_level(alpha: float) -> str:
-    """Format the level of an interval in percent.
-
-    Args:
-        alpha: Probability outside the interval.
-    """
+    """Format the level of an interval in percent."""
     return f"{100 * (1 - alpha):g} %"
 
 
@@ -117,12 +108,7 @@ def filter_entry(look: MethodLook) -> dict[str, Any]:
 
 
 def regime_entries(table: pd.DataFrame, regimes: Mapping[str, PartName]) -> list[dict[str, Any]]:
-    """List the entries of the noise regimes.
-
-    Args:
-        table: Table of `build_run_table`.
-        regimes: Names by key.
-    """
+    """List the entries of the noise regimes."""
     entries = []
     for key in table["regime"].unique():
         noise, _, model = key.partition(" + ")
@@ -151,11 +137,7 @@ def cell_entries(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def budget_entries(conditions: Sequence[Condition]) -> list[dict[str, Any]]:
-    """List the entries of the budgets, each with the reason why the study lacks it.
-
-    Args:
-        conditions: Conditions of the study.
-    """
+    """List the entries of the budgets, each with the reason why the study lacks it."""
     jobs = [job.meta for condition in conditions for job in condition.jobs]
     kinds = {str(meta["config"].get("budget", SAME_N)) for meta in jobs}
     return [
@@ -166,12 +148,7 @@ def budget_entries(conditions: Sequence[Condition]) -> list[dict[str, Any]]:
 
 
 def metric_entries(table: pd.DataFrame, main: str) -> list[dict[str, Any]]:
-    """List the entries of the metrics.
-
-    Args:
-        table: Table of `build_run_table`.
-        main: Metric that decides the study.
-    """
+    """List the entries of the metrics."""
     units, groups = table["unit"].unique(), table["group"].unique()
     unit, group = units[0] if len(units) == 1 else "", groups[0] if len(groups) == 1 else "main"
     return [
@@ -198,21 +175,7 @@ METRIC_NAMES = {
 def build_run_table(
     conditions: Sequence[Condition], start_time_s: float = 0.0, metric: str = "rmse"
 ) -> pd.DataFrame:
-    """Build the table of a study.
-
-    Args:
-        conditions: Conditions of the study.
-        start_time_s: Time before which steps are ignored, s.
-        metric: Metric that decides the study, one of `main_metrics.MAIN_METRICS`.
-
-    Returns:
-        Columns filter, scenario, family, regime, model, particles, seed, run, lost, keeps_track,
-        unit, group, the metrics of `SHOWN_METRICS`, coverage_50, coverage_90, nees_ratio and ms.
-        A run without a value has NaN.
-
-    Raises:
-        ValueError: If a job lacks values of the metric that decides.
-    """
+    """Build the table of a study."""
     parts = [
         job_rows((condition, regime, job.label), drop_before(job.load(), start_time_s), metric)
         for condition, regime in zip(conditions, name_regimes(conditions), strict=True)
@@ -222,15 +185,7 @@ def build_run_table(
 
 
 def join_rows(parts: Sequence[pd.DataFrame], metric: str) -> pd.DataFrame:
-    """Join the rows of all jobs.
-
-    Args:
-        parts: Rows of `job_rows`.
-        metric: Metric that decides the study.
-
-    Raises:
-        ValueError: If a job lacks values of that metric.
-    """
+    """Join the rows of all jobs."""
     for rows in parts:
         if (rows[metric].isna() & rows["keeps_track"]).all() and rows["keeps_track"].any():
             where = " / ".join(rows[["scenario", "regime", "filter"]].iloc[0])
@@ -242,11 +197,7 @@ def join_rows(parts: Sequence[pd.DataFrame], metric: str) -> pd.DataFrame:
 
 
 def name_regimes(conditions: Sequence[Condition]) -> list[str]:
-    """Name the regime of each condition: the noise, with the model if a scenario has several.
-
-    Args:
-        conditions: Conditions of the study.
-    """
+    """Name the regime of each condition: the noise, with the model if a scenario has several."""
     models = Counter((c.scenario, c.noise) for c in conditions)
     return [
         c.noise if models[c.scenario, c.noise] == 1 else f"{c.noise} + {c.model}"
@@ -257,13 +208,7 @@ def name_regimes(conditions: Sequence[Condition]) -> list[str]:
 def job_rows(
     origin: tuple[Condition, str, str], result: store.JobResult, metric: str = "rmse"
 ) -> pd.DataFrame:
-    """Build the rows of one job.
-
-    Args:
-        origin: Condition, name of its regime, and label of the filter.
-        result: Result of the job.
-        metric: Metric that decides the study.
-    """
+    """Build the rows of one job."""
     condition, regime, label = origin
     meta, lost = result.meta, np.asarray(result.data["lost"], dtype=bool)
     group = main_component_group(meta["state"])

@@ -45,8 +45,7 @@ class StudyArrays(NamedTuple):
     def select(self, mask: Flags) -> StudyArrays:
         """Select conditions.
 
-        Args:
-            mask: Selected conditions, [C].
+        Shapes: mask [C].
         """
         values = {name: value[:, mask] for name, value in self.values.items()}
         return StudyArrays(
@@ -77,23 +76,14 @@ class FilterLevels(NamedTuple):
     off: Flags
 
     def difference(self, i: int, j: int) -> EffectEstimate:
-        """Estimate the difference of the levels of two filters.
-
-        Args:
-            i: Index of the first filter.
-            j: Index of the second filter.
-        """
+        """Estimate the difference of the levels of two filters."""
         middle = float(min(self.middle[i], self.middle[j]))
         with np.errstate(invalid="ignore"):  # both levels are infinite
             difference = self.level[i] - self.level[j]
         return self._estimate(difference, self.parts[i] - self.parts[j], middle)
 
     def single(self, i: int) -> EffectEstimate:
-        """Estimate the level of one filter.
-
-        Args:
-            i: Index of the filter.
-        """
+        """Estimate the level of one filter."""
         return self._estimate(self.level[i], self.parts[i], float(self.middle[i]))
 
     def _estimate(self, value: float, parts: Array, middle: float) -> EffectEstimate:
@@ -132,12 +122,7 @@ class Selection(NamedTuple):
 
 
 def arrange_runs(table: pd.DataFrame, filters: tuple[str, ...]) -> StudyArrays:
-    """Arrange the runs of a study as arrays.
-
-    Args:
-        table: Table of `build_run_table`.
-        filters: Labels of all filters of the study.
-    """
+    """Arrange the runs of a study as arrays."""
     conditions = table[_CONDITION].drop_duplicates().sort_values(_CONDITION).reset_index(drop=True)
     c, n = (
         table.groupby(columns, dropna=False, observed=True).ngroup().to_numpy()
@@ -158,12 +143,7 @@ def arrange_runs(table: pd.DataFrame, filters: tuple[str, ...]) -> StudyArrays:
 
 
 def compute_condition_levels(runs: StudyArrays, metric: str) -> ConditionEffects:
-    """Compute the level of each filter in each condition.
-
-    Args:
-        runs: Runs of the study.
-        metric: Column of the error. Of the log score, the level is minus its trimmed mean.
-    """
+    """Compute the level of each filter in each condition."""
     value = runs.values[metric]
     if metric == LOG_SCORE:
         value = np.exp(np.minimum(-value, _LARGEST_LOG))
@@ -173,17 +153,7 @@ def compute_condition_levels(runs: StudyArrays, metric: str) -> ConditionEffects
 def compare_track_shares(
     runs: StudyArrays, first: str, second: str, alpha: float = 0.05
 ) -> tuple[float, float]:
-    """Compute the interval of the difference of the shares of runs that keep track.
-
-    Args:
-        runs: Runs of the conditions of a view, which have equal weight.
-        first: Label of the filter from whose share the other one is subtracted.
-        second: Label of the other filter.
-        alpha: Probability outside the interval.
-
-    Returns:
-        Ends of the interval.
-    """
+    """Compute the interval of the difference of the shares of runs that keep track."""
     i, j = (runs.filters.index(label) for label in (first, second))
     d = np.where(
         runs.present[i] & runs.present[j], runs.keeps[i].astype(float) - runs.keeps[j], np.nan
@@ -196,9 +166,7 @@ def compare_track_shares(
 def average_levels(levels: ConditionEffects, conditions: pd.DataFrame) -> FilterLevels:
     """Average the levels of conditions: worlds, their scenarios, and regimes have equal weight.
 
-    Args:
-        levels: Levels of the conditions, [F, C].
-        conditions: Family, scenario and regime of the conditions, C rows.
+    Shapes: levels [F, C].
     """
     keys = list(zip(conditions["family"], conditions["scenario"], strict=True))
     regimes = Counter(keys)

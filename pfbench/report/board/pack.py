@@ -76,15 +76,8 @@ def build_pack(
 ) -> dict[str, Any]:
     """Build all data of the page of a study but its files.
 
-    Args:
-        study: Name of the study.
-        conditions: Conditions of the study.
-        options: Options of the report.
-        data: Data of the results, None to read them.
-
-    Returns:
-        Dictionary of plain values. Views have the key `ViewKey`, and data of cells (world, regime).
-        None is a value that does not exist.
+    Returns dictionary of plain values. Views have the key `ViewKey`, and data of cells (world,
+    regime). None is a value that does not exist.
     """
     data = data or read_study(conditions, options)
     table = data.table
@@ -166,16 +159,7 @@ class StudyData(NamedTuple):
 def read_study(
     conditions: Sequence[Condition], options: ReportOptions, *, has_metrics: bool = False
 ) -> StudyData:
-    """Read the results of a study, one condition at a time.
-
-    Args:
-        conditions: Conditions of the study.
-        options: Options of the report.
-        has_metrics: Whether to collect all metrics.
-
-    Raises:
-        ValueError: If a job lacks values of the metric that decides.
-    """
+    """Read the results of a study, one condition at a time."""
     rows, metrics, notes = [], [], MethodNotes()
     data = StudyData(pd.DataFrame(), pd.DataFrame(), {}, {}, notes, {})
     start, converged = options.start_time_s, options.convergence_threshold
@@ -407,15 +391,7 @@ def _describe_baseline(looks: Mapping[str, MethodLook], requested: str, baseline
 
 
 def select_baselines(looks: Mapping[str, MethodLook], baseline: str = "") -> list[str]:
-    """Select the baselines that a reader may choose, the one of the opening view first.
-
-    Args:
-        looks: Looks by label.
-        baseline: Label of the first baseline, empty for the default.
-
-    Raises:
-        ValueError: If the study lacks it.
-    """
+    """Select the baselines that a reader may choose, the one of the opening view first."""
     if baseline and baseline not in looks:
         raise ValueError(
             f"report.baseline must be a filter of the study, got {baseline}. "
@@ -443,12 +419,7 @@ class MethodNotes:
         self._choices: dict[str, dict[str, None]] = {}
 
     def add(self, label: str, result: JobResult) -> None:
-        """Add a job.
-
-        Args:
-            label: Label of the filter.
-            result: Result of the job.
-        """
+        """Add a job."""
         meta = result.meta
         status = count_statuses(result.data, meta)._asdict()
         counts = self._counts.setdefault(label, Counter())
@@ -462,14 +433,7 @@ class MethodNotes:
             self._choices.setdefault(str(text), {})[label] = None
 
     def to_entries(self, looks: Mapping[str, MethodLook]) -> dict[str, Any]:
-        """Return the entries of the page.
-
-        Args:
-            looks: Looks by label.
-
-        Returns:
-            `filter_notes`, one per filter, and `choices`, each with the names of its filters.
-        """
+        """Return the entries of the page."""
         notes = []
         for label, counts in self._counts.items():
             particles = [n for n in self._particles[label] if n != "None"]

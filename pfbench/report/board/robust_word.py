@@ -55,13 +55,7 @@ def describe_robustness(
 
     The scenarios that have both regimes are compared, with equal weight, by the levels of the board.
 
-    Args:
-        table: Table of `build_run_table`.
-        looks: Looks by label.
-        options: Options of the report.
-
-    Returns:
-        Sentences, empty for a study without outliers.
+    Returns sentences, empty for a study without outliers.
     """
     noise, scenario = table["regime"].str.partition(" + ")[0], table["scenario"]
     regimes = (OUTLIER_REGIME, NOMINAL_REGIME)
@@ -143,12 +137,7 @@ def find_robust_filters(
 def describe_robust_filters(names: Mapping[str, str], robust: tuple[str, ...]) -> str:
     """Describe which filters are robust.
 
-    Args:
-        names: Name by label of the filters that were compared with the control.
-        robust: Labels of the robust filters.
-
-    Returns:
-        A sentence, empty without a comparison.
+    Returns a sentence, empty without a comparison.
     """
     if not names:
         return ""

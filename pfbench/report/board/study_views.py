@@ -69,15 +69,7 @@ def build_views(
     words: Mapping[tuple[str, str], str],
     times: Mapping[CellKey, Mapping[str, StepTimes]] | None = None,
 ) -> dict[ViewKey, dict[str, Any]]:
-    """Build all views that have runs. The first one opens the page.
-
-    Args:
-        table: Table of `build_run_table`.
-        names: Names of the parts.
-        options: Options of the report.
-        words: Words of planned pairs, which decide in the view of all conditions.
-        times: Times in rounds by label, of each scenario and regime; None without any.
-    """
+    """Build all views that have runs. The first one opens the page."""
     runs = arrange_runs(table, tuple(names.looks))
     selections = _list_selections(runs, table, names, options)
     views: dict[ViewKey, dict[str, Any]] = {}
@@ -291,13 +283,7 @@ _NEAR = 0.1  # distance from 1 that is shown in percent with digits of its own
 def decide_planned(
     table: pd.DataFrame, looks: Mapping[str, MethodLook], options: ReportOptions
 ) -> list[Decision]:
-    """Decide the planned pairs that share runs.
-
-    Args:
-        table: Table of `build_run_table`.
-        looks: Looks by label.
-        options: Options of the report.
-    """
+    """Decide the planned pairs that share runs."""
     keys = ["family", "scenario", "regime", "seed", "run"]
     number = table.groupby(keys, sort=False, dropna=False, observed=True).ngroup()
     by_filter = {label: set(numbers) for label, numbers in number.groupby(table["filter"])}
@@ -313,11 +299,7 @@ def decide_planned(
 
 
 def planned_words(planned: Sequence[Decision]) -> dict[tuple[str, str], str]:
-    """Return the words of planned pairs for the verdict on the first filter against the second.
-
-    Args:
-        planned: Decisions on the planned pairs.
-    """
+    """Return the words of planned pairs for the verdict on the first filter against the second."""
     words = {}
     for d in planned:
         if d.question == "a" and d.metric != TRACK:
@@ -333,15 +315,7 @@ def planned_entries(
     worlds: Mapping[str, PartName],
     options: ReportOptions,
 ) -> list[dict[str, Any]]:
-    """List the entries of planned pairs, in ratios.
-
-    Args:
-        planned: Decisions on the planned pairs.
-        table: Table of `build_run_table`.
-        looks: Looks by label of the filter.
-        worlds: Names of the scenarios by key.
-        options: Options of the report.
-    """
+    """List the entries of planned pairs, in ratios."""
     if not planned:
         return []
     errors = {(d.question, d.a, d.b): d for d in planned if d.metric != TRACK}
@@ -421,11 +395,7 @@ def _list_cells(
 
 
 def round_ratio(log_ratio: float) -> float | None:
-    """Return a ratio with four digits, and four of its distance from 1 if it is near; None without a number.
-
-    Args:
-        log_ratio: Log ratio.
-    """
+    """Return a ratio with four digits, and four of its distance from 1 if it is near; None without a number."""
     if not math.isfinite(log_ratio):
         return None
     distance = math.expm1(min(log_ratio, 700.0))

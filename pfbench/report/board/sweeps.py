@@ -35,11 +35,6 @@ def list_sweeps(
     """List the settings that a study varies, with the errors of the filters in each condition.
 
     Filters without the setting are constant lines.
-
-    Args:
-        views: Views of the study.
-        looks: Looks by label.
-        metric: Metric of the errors.
     """
     settings = [item for label in looks for item in read_settings(label)]
     sweeps = []
@@ -65,11 +60,7 @@ def list_sweeps(
 
 
 def read_settings(label: str) -> list[LabelSetting]:
-    """Read the settings of a label.
-
-    Args:
-        label: Label of a filter.
-    """
+    """Read the settings of a label."""
     method, values = parse_label(label)
     settings = []
     for name, value in values.items():

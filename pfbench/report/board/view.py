@@ -96,13 +96,7 @@ class BoardRow:
 
 
 def show_row(row: BoardRow, *, has_limit: bool) -> dict[str, Any]:
-    """Return the values of a row for the page.
-
-    Args:
-        row: Row.
-        has_limit: Whether all scenarios of the view state a divergence threshold. Otherwise a run that is not lost
-            need not keep track: the share does not exist, and a filter without an error has lost runs.
-    """
+    """Return the values of a row for the page."""
     values = dict(vars(row))
     if not has_limit:
         values |= {"track": math.nan, "words": row.words.replace("track not kept", "runs lost")}
@@ -130,13 +124,7 @@ class Scope(NamedTuple):
 
 
 def build_rows(scope: Scope, baseline: str, options: ViewOptions) -> list[BoardRow]:
-    """Build the rows of a view, ordered by level. Filters without a level follow in the order of their tracks.
-
-    Args:
-        scope: Filters in the conditions of the view.
-        baseline: Label of the baseline.
-        options: Options.
-    """
+    """Build the rows of a view, ordered by level. Filters without a level follow in the order of their tracks."""
     filters, levels = scope.filters, scope.levels
     level = levels.level
     track = np.array([scope.descriptions[label]["track"] for label in filters])
@@ -217,12 +205,7 @@ def _ratio(levels: FilterLevels, i: int, base: int, alpha: float) -> tuple[float
 
 
 def describe_filters(runs: StudyArrays, alpha: float = 0.05) -> dict[str, dict[str, Any]]:
-    """Describe track, lost runs, calibration and cost of each filter.
-
-    Args:
-        runs: Runs of the conditions of a view.
-        alpha: Probability outside the interval of the coverage.
-    """
+    """Describe track, lost runs, calibration and cost of each filter."""
     lost = np.nansum(runs.values["lost"], axis=(1, 2))
     names = ("keeps_track", "coverage_90", "nees_ratio", "ms")
     with warnings.catch_warnings():
@@ -283,19 +266,7 @@ def describe_view(
 ) -> str:
     """Describe a view: failures, the best filter, the best proposed method, ties.
 
-    Args:
-        rows: Rows ordered by level.
-        looks: Looks by label.
-        baseline: Label of the baseline.
-        scope: Worlds and regimes in words, such as "in these 3 worlds".
-        metric: Name of the metric in a sentence.
-        level: Level of an interval, as text.
-        track_interval: Interval of the difference of the shares of runs in which two filters keep track;
-            None for sentences without it.
-        has_limit: Whether all scenarios state a divergence threshold. Otherwise only lost runs are known.
-
-    Returns:
-        Sentences. Names of filters are enclosed in double square brackets.
+    Returns sentences. Names of filters are enclosed in double square brackets.
     """
     ranked = [row for row in rows if row.rank is not None]
     failures = _describe_failures(rows, looks)
@@ -323,32 +294,18 @@ def describe_view(
 
 
 def count_words(number: int, noun: str) -> str:
-    """Format a count with its noun.
-
-    Args:
-        number: Count.
-        noun: Noun, singular.
-    """
+    """Format a count with its noun."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def count_failing(number: int, total: int) -> str:
-    """Format the subject and verb of a sentence on the filters that do not keep track.
-
-    Args:
-        number: Number of these filters.
-        total: Number of all filters.
-    """
+    """Format the subject and verb of a sentence on the filters that do not keep track."""
     verb = "does" if number == 1 else "do"
     return f"{number} of {count_words(total, 'filter')} {verb} not keep track"
 
 
 def name_lost_runs(text: str) -> str:
-    """Replace the words on tracks in a sentence on conditions without a divergence threshold.
-
-    Args:
-        text: Sentence of this module.
-    """
+    """Replace the words on tracks in a sentence on conditions without a divergence threshold."""
     for words, lost in _LOST_WORDS.items():
         text = re.sub(words, lost, text)
     return text

@@ -26,23 +26,13 @@ Escape = Callable[[str], str]
 
 
 class FigureSetting:
-    """Setting of the figures of a paper.
-
-    Args:
-        page: Page format.
-        escape: Function of each name that is written, the identity for PDF.
-    """
+    """Setting of the figures of a paper."""
 
     def __init__(self, page: PageFormat, escape: Escape = str) -> None:
         self.page, self.escape = page, escape
 
     def make_figure(self, height: float, *, is_wide: bool = False) -> Figure:
-        """Create a figure of exactly one column, or of the whole text.
-
-        Args:
-            height: Height in inches.
-            is_wide: Whether it is as wide as the text.
-        """
+        """Create a figure of exactly one column, or of the whole text."""
         width = (self.page.text if is_wide else self.page.column) / POINTS_PER_INCH
         return Figure(figsize=(width, height), layout="constrained")
 
@@ -54,11 +44,7 @@ class FigureSetting:
 
 
 def mark_style(look: LookData) -> dict[str, Any]:
-    """Return the arguments of `Axes.plot` for the mark of a filter: filled if it is proposed.
-
-    Args:
-        look: LookData of the filter.
-    """
+    """Return the arguments of `Axes.plot` for the mark of a filter: filled if it is proposed."""
     colour = str(look["colour"])
     face = colour if look["proposed"] else "white"
     return {
@@ -68,22 +54,12 @@ def mark_style(look: LookData) -> dict[str, Any]:
 
 
 def line_style(look: LookData) -> dict[str, Any]:
-    """Return the arguments of `Axes.plot` for the curve of a filter: solid if it is proposed.
-
-    Args:
-        look: LookData of the filter.
-    """
+    """Return the arguments of `Axes.plot` for the curve of a filter: solid if it is proposed."""
     return {**mark_style(look), "linestyle": "-" if look["proposed"] else (0, (3.5, 1.5))}
 
 
 def label_rows(axis: Axes, names: Sequence[str], setting: FigureSetting) -> None:
-    """Write the names of rows at the left axis, the first on top.
-
-    Args:
-        axis: Panel with a row per unit of y.
-        names: Names.
-        setting: Setting of the figures.
-    """
+    """Write the names of rows at the left axis, the first on top."""
     axis.set_yticks(range(len(names)), [setting.escape(name) for name in names])
     axis.set_ylim(len(names) - 0.4, -0.6)
     axis.tick_params(axis="y", length=0)
@@ -91,13 +67,7 @@ def label_rows(axis: Axes, names: Sequence[str], setting: FigureSetting) -> None
 
 
 def use_ratio_scale(axis: Axes, low: float, high: float) -> None:
-    """Use a logarithmic x axis with plain numbers and a line at 1.
-
-    Args:
-        axis: Panel.
-        low: Lower limit.
-        high: Upper limit.
-    """
+    """Use a logarithmic x axis with plain numbers and a line at 1."""
     axis.set_xscale("log")
     axis.set_xlim(low, high)
     set_plain_ticks(axis.xaxis, np.array([low, high]))
@@ -105,15 +75,7 @@ def use_ratio_scale(axis: Axes, low: float, high: float) -> None:
 
 
 def ratio_limits(values: Sequence[float], most: float = 3.0) -> tuple[float, float]:
-    """Return limits of an axis of ratios that outliers do not stretch.
-
-    Args:
-        values: Ratios and ends of intervals.
-        most: Largest upper limit, relative to the upper quartile or 1.
-
-    Returns:
-        Lower and upper limit, with 1 between them.
-    """
+    """Return limits of an axis of ratios that outliers do not stretch."""
     finite = np.array([v for v in values if np.isfinite(v) and v > 0] or [1.0])
     quartiles = np.quantile(finite, [0.25, 0.75])
     low = max(float(finite.min()), min(1.0, float(quartiles[0])) / most)
@@ -128,18 +90,7 @@ def draw_interval(
     look: LookData,
     limits: tuple[float, float],
 ) -> bool:
-    """Draw a value with its interval; outside the limits a triangle at the edge.
-
-    Args:
-        axis: Panel.
-        y: Row.
-        ends: Value, lower and upper end.
-        look: LookData of the filter.
-        limits: Limits of the x axis.
-
-    Returns:
-        True if the value is within the limits.
-    """
+    """Draw a value with its interval; outside the limits a triangle at the edge."""
     value, low, high = ends
     colour = str(look["colour"])
     inner = limits[0] * 1.02, limits[1] / 1.02

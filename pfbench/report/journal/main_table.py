@@ -43,24 +43,14 @@ def _fit_always(_: LatexTable) -> bool:
 def make_main_tables(pack: Pack, fits: Fits = _fit_always) -> list[LatexTable]:
     """Build the main table: one, or one per regime above eight conditions.
 
-    Args:
-        pack: Data of the report.
-        fits: Whether a table fits the page. The worlds of one that does not are split.
-
-    Returns:
-        Tables of the paper. Above 16 conditions they lack intervals, see `make_supplement`.
+    Returns tables of the paper. Above 16 conditions they lack intervals, see `make_supplement`.
     """
     cells = list_cells(pack)
     return _split(pack, cells, "main", fits, has_intervals=len(cells) <= WITH_INTERVALS)
 
 
 def make_supplement(pack: Pack, fits: Fits = _fit_always) -> list[LatexTable]:
-    """Build the tables with intervals that the main tables lack, one per regime; empty if they have them.
-
-    Args:
-        pack: Data of the report.
-        fits: Whether a table fits the page. The worlds of one that does not are split.
-    """
+    """Build the tables with intervals that the main tables lack, one per regime; empty if they have them."""
     cells = list_cells(pack)
     if len(cells) <= WITH_INTERVALS:
         return []
@@ -229,12 +219,7 @@ class ErrorColumn(NamedTuple):
 
 
 def format_error_value(value: Any, digits: int = 3) -> str:
-    """Format an error with some significant digits, without an exponent below a million.
-
-    Args:
-        value: Error; None if no number exists.
-        digits: Number of digits.
-    """
+    """Format an error with some significant digits, without an exponent below a million."""
     if not is_number(value):
         return "--"
     if value and not 1e-4 <= abs(value) < 1e6:
@@ -246,13 +231,7 @@ def format_error_value(value: Any, digits: int = 3) -> str:
 
 
 def make_column(pack: Pack, world: str, regime: str) -> ErrorColumn:
-    """Collect the entries of one condition, in a unit without many zeros.
-
-    Args:
-        pack: Data of the report.
-        world: Key of the world.
-        regime: Key of the regime.
-    """
+    """Collect the entries of one condition, in a unit without many zeros."""
     rows = find_rows(pack, world, regime)
     values = [row["value"] for row in rows.values() if is_number(row["value"])]
     unit = next((str(row["unit"]) for row in rows.values() if row["unit"]), "")
@@ -283,14 +262,7 @@ def describe_columns(
 ) -> str:
     """Write the caption of a table of errors: metric, interval, marks and lost runs.
 
-    Args:
-        pack: Data of the report.
-        cells: Worlds and regimes of the columns.
-        has_intervals: State the intervals.
-        has_one_regime: State the regime, which the head lacks.
-
-    Returns:
-        LaTeX.
+    Returns LaTeX.
     """
     metric = escape_latex(str(pack["metrics"][0]["name"]))
     level = f"{100 * (1 - float(pack['alpha'])):g}"

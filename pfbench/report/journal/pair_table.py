@@ -35,11 +35,7 @@ _ROUNDS = "Times: medians of rounds in which the filters took turns; ratio to th
 
 
 def make_planned_table(pack: Pack) -> LatexTable | None:
-    """Build the table of the planned pairs; None without a pair that has an effect.
-
-    Args:
-        pack: Data of the report.
-    """
+    """Build the table of the planned pairs; None without a pair that has an effect."""
     ratios, won = list_pairs(pack, has_won=False), list_pairs(pack, has_won=True)
     if not (ratios or won):
         return None
@@ -99,12 +95,7 @@ def _describe_pairs(worlds: int, has_ratio: bool, has_won: bool) -> str:
 
 
 def make_cost_table(pack: Pack, particles: Mapping[str, str]) -> LatexTable:
-    """Build the table of cost and reliability of each filter over all conditions.
-
-    Args:
-        pack: Data of the report.
-        particles: Number of particles by filter, as text; several numbers as a range.
-    """
+    """Build the table of cost and reliability of each filter over all conditions."""
     rows = find_rows(pack)
     has_rounds = any(is_number(row.get("cost")) for row in rows.values())
     columns = [

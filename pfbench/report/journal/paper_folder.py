@@ -45,11 +45,7 @@ Plot = Callable[[Pack, FigureSetting], Figure]
 def select_figures(pack: Pack) -> dict[str, Plot]:
     """Select the figures for which a study has data.
 
-    Args:
-        pack: Data of the report.
-
-    Returns:
-        Functions that draw them, by file name.
+    Returns functions that draw them, by file name.
     """
     rows = find_rows(pack).values()
     has_ratio = any(is_number(row["ratio"]) for row in rows)
@@ -72,16 +68,7 @@ def write_paper(
 ) -> list[str]:
     """Write the files of a paper except its data.
 
-    Args:
-        pack: Data of the report.
-        page: Page format.
-        folder: Target folder.
-
-    Returns:
-        Remarks for the user: tables in a supplement, and figures without PGF.
-
-    Raises:
-        ValueError: If a table does not fit the page. Nothing is written then.
+    Returns remarks for the user: tables in a supplement, and figures without PGF.
     """
     tables = _format_tables(pack, page)
     plots = select_figures(pack)
@@ -120,24 +107,13 @@ def _list_remarks(pack: Pack, tables: Iterable[str], plots: Iterable[str]) -> li
 
 
 def draw_paper_figure(plot: Plot, pack: Pack, setting: FigureSetting) -> Figure:
-    """Draw a figure in the settings of a page.
-
-    Args:
-        plot: Function that draws it.
-        pack: Data of the report.
-        setting: Setting of the figures.
-    """
+    """Draw a figure in the settings of a page."""
     with setting.applied():
         return plot(pack, setting)
 
 
 def render_pdf(figure: Figure, page: PageFormat) -> bytes:
-    """Render a figure as PDF of its exact size, with fonts as TrueType. Equal figures give equal bytes.
-
-    Args:
-        figure: Figure.
-        page: Page format.
-    """
+    """Render a figure as PDF of its exact size, with fonts as TrueType. Equal figures give equal bytes."""
     buffer = io.BytesIO()
     with FigureSetting(page).applied():
         figure.savefig(buffer, format="pdf", metadata=_PDF_METADATA)
@@ -145,13 +121,7 @@ def render_pdf(figure: Figure, page: PageFormat) -> bytes:
 
 
 def render_pgf(plot: Plot, pack: Pack, page: PageFormat) -> str:
-    """Render a figure as PGF, whose text has the fonts of the document. It needs pdflatex.
-
-    Args:
-        plot: Function that draws it.
-        pack: Data of the report.
-        page: Page format.
-    """
+    """Render a figure as PGF, whose text has the fonts of the document. It needs pdflatex."""
     setting, buffer = FigureSetting(page, escape_latex), io.StringIO()
     with setting.applied():
         plot(pack, setting).savefig(buffer, format="pgf")
@@ -241,23 +211,14 @@ CAPTIONS = {
 
 
 def format_methods(paragraphs: Sequence[str]) -> str:
-    """Format the methods paragraph as LaTeX.
-
-    Args:
-        paragraphs: Plain text.
-    """
+    """Format the methods paragraph as LaTeX."""
     text = "\n\n".join(escape_latex(paragraph) for paragraph in paragraphs)
     text = text.replace(r" \%", r"\,\%")
     return text.replace("with pfbench in", f"with pfbench{cite([SELF])} in", 1) + "\n"
 
 
 def format_caption(name: str, pack: Pack) -> str:
-    """Format the caption of a figure.
-
-    Args:
-        name: Name of the figure.
-        pack: Data of the report.
-    """
+    """Format the caption of a figure."""
     looks = {str(look["key"]): look for look in pack["filters"]}
     baseline = looks.get(str(pack["baselines"][0])) if pack["baselines"] else None
     regime = str(pack["regimes"][0]["name"]).lower()
@@ -289,14 +250,7 @@ def format_document(
 ) -> str:
     """Format paper.tex.
 
-    Args:
-        pack: Data of the report.
-        page: Page format.
-        figures: Names of the figures, and whether each is as wide as the text.
-        tables: Names of the files of tables without suffix.
-
-    Returns:
-        The document. It needs the other files of its folder.
+    Returns the document. It needs the other files of its folder.
     """
     title, is_elsevier = escape_latex(str(pack["title"])), page.name == "elsevier"
     heading = [rf"\title{{{title}}}", r"\author{Authors}"]

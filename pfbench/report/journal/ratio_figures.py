@@ -37,12 +37,7 @@ _HALF_DIAMOND = 0.26  # rows
 
 
 def plot_leaderboard(pack: Pack, setting: FigureSetting) -> Figure:
-    """Plot the error of each filter relative to the baseline, with its interval.
-
-    Args:
-        pack: Data of the report.
-        setting: Setting of the figures.
-    """
+    """Plot the error of each filter relative to the baseline, with its interval."""
     looks, rows = filters_by_key(pack), find_rows(pack)
     rows_with_ratio = {key: row for key, row in rows.items() if is_number(row["ratio"])}
     figure = setting.make_figure(MARGIN + ROW * max(len(rows_with_ratio), 2))
@@ -75,10 +70,6 @@ def plot_planned(pack: Pack, setting: FigureSetting) -> Figure:
     """Plot the planned pairs: effect in these worlds, each world, and a new world.
 
     Ratios of errors have a logarithmic axis. Differences of runs won have a panel with a linear axis below.
-
-    Args:
-        pack: Data of the report.
-        setting: Setting of the figures.
     """
     kinds = [(has_won, list_pairs(pack, has_won=has_won)) for has_won in (False, True)]
     kinds = [(has_won, pairs) for has_won, pairs in kinds if pairs]
@@ -120,12 +111,7 @@ def _plot_pairs(
 
 
 def plot_error_against_cost(pack: Pack, setting: FigureSetting) -> Figure:
-    """Plot error against time per step, with the filters that no filter surpasses in both.
-
-    Args:
-        pack: Data of the report.
-        setting: Setting of the figures.
-    """
+    """Plot error against time per step, with the filters that no filter surpasses in both."""
     looks, rows = filters_by_key(pack), find_rows(pack)
     rows_with_ratio = {
         k: row for k, row in rows.items() if is_number(row["ratio"]) and is_number(row["ms"])
@@ -167,12 +153,7 @@ def _set_cost_axes(axis: Axes, cost: np.ndarray, limits: tuple[float, float]) ->
 def list_front_corners(points: np.ndarray, top: float) -> np.ndarray:
     """Return the corners of the steps of points that no point surpasses in both coordinates.
 
-    Args:
-        points: Points, [n, 2]; smaller is better.
-        top: Upper end of the first step.
-
-    Returns:
-        Corners, [m, 2].
+    Shapes: points [n, 2].
     """
     corners, least = [], top
     for x, y in points[np.lexsort((points[:, 1], points[:, 0]))]:
@@ -244,12 +225,7 @@ def place_labels(
     to its point, and overlap with marks, with the path, and with other labels and their lines.
     Later passes place every label again. The panel must have its final layout.
 
-    Args:
-        axis: Panel.
-        points: All marks in data coordinates, [n, 2].
-        labels: Label texts by row of `points`.
-        reach: Radius of each mark in points of print, [n].
-        path: Corners of a line through the panel in data coordinates, [m, 2]; NaN for a gap.
+    Shapes: points [n, 2], reach [n], path [m, 2].
     """
     scale = 72 / axis.figure.dpi
     marks, corners = (axis.transData.transform(values) * scale for values in (points, path))
@@ -417,11 +393,7 @@ def is_equal_drawing(first: bytes, second: bytes) -> bool:
 
 
 def render_headline(pack: Pack) -> bytes:
-    """Draw the error of each filter relative to the baseline as SVG. Equal data give equal bytes.
-
-    Args:
-        pack: Data of the page.
-    """
+    """Draw the error of each filter relative to the baseline as SVG. Equal data give equal bytes."""
     setting, buffer = FigureSetting(find_page_format(width=_WIDTH)), io.BytesIO()
     with setting.applied(), matplotlib.rc_context(_SVG):
         plot_leaderboard(pack, setting).savefig(buffer, format="svg", metadata={"Date": None})

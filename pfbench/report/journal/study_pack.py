@@ -29,18 +29,7 @@ def filters_by_family(pack: Pack) -> list[list[str]]:
 def find_rows(
     pack: Pack, world: str = ALL, regime: str = ALL, *, metric: str = "", baseline: str = ""
 ) -> dict[str, Row]:
-    """Return the rows of a view by filter.
-
-    Args:
-        pack: Data of the report.
-        world: Key of a world, or "all".
-        regime: Key of a regime, or "all".
-        metric: Key of a metric, the first by default.
-        baseline: Key of a baseline, the first by default.
-
-    Returns:
-        Rows in order; empty if the view does not exist.
-    """
+    """Return the rows of a view by filter."""
     metric = metric or str(pack["metrics"][0]["key"])
     baseline = baseline or next(iter(map(str, pack["baselines"])), "")
     view = pack["views"].get((metric, world, regime, baseline), {"rows": ()})
@@ -55,23 +44,12 @@ def list_cells(pack: Pack) -> list[tuple[str, str]]:
 
 
 def name_of(pack: Pack, kind: str, key: str) -> str:
-    """Return the name of a world or a regime.
-
-    Args:
-        pack: Data of the report.
-        kind: "worlds" or "regimes".
-        key: Key.
-    """
+    """Return the name of a world or a regime."""
     return next((str(node["name"]) for node in pack[kind] if node["key"] == key), key)
 
 
 def name_with_star(pack: Pack, key: str) -> str:
-    """Return the name of a filter, with a star if it is a proposed method.
-
-    Args:
-        pack: Data of the report.
-        key: Key of the filter.
-    """
+    """Return the name of a filter, with a star if it is a proposed method."""
     look = filters_by_key(pack)[key]
     return f"{look['name']}{'*' if look['proposed'] else ''}"
 
@@ -84,12 +62,8 @@ def is_number(value: Any) -> bool:
 def list_pairs(pack: Pack, *, has_won: bool) -> list[Pack]:
     """List the planned pairs with a ratio of errors, or those with a difference of runs won.
 
-    Args:
-        pack: Data of the report.
-        has_won: Select pairs that are decided by runs won; their effect is in percentage points.
-
-    Returns:
-        Entries of the pairs, whose `estimate`, `low`, `high` and `new_world` are those of the effect.
+    Returns entries of the pairs, whose `estimate`, `low`, `high` and `new_world` are those of the
+    effect.
     """
     if not has_won:
         return [pair for pair in pack["planned"] if is_number(pair["estimate"])]

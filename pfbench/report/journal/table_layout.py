@@ -76,40 +76,19 @@ class LatexTable(NamedTuple):
 
 
 def text_cell(text: str, *, size: float = SIZE, is_bold: bool = False, span: int = 1) -> LatexCell:
-    """Return a cell with a text, which is escaped.
-
-    Args:
-        text: Text.
-        size: Size of its font.
-        is_bold: Whether it is bold.
-        span: Number of columns, centred if there are several.
-    """
+    """Return a cell with a text, which is escaped."""
     tex = rf"\textbf{{{escape_latex(text)}}}" if is_bold else escape_latex(text)
     return LatexCell(tex, text_width(text, size, is_bold=is_bold), span)
 
 
 def number_column(digits: int, places: int, is_close: bool = False) -> Column:
-    """Return a column of siunitx with numbers aligned at the decimal point.
-
-    Args:
-        digits: Digits before the point.
-        places: Digits after the point.
-        is_close: Whether a thin space separates it from the column before.
-    """
+    """Return a column of siunitx with numbers aligned at the decimal point."""
     text = "0" * (digits + places) + ("." if places else "")
     return Column(f"S[table-format={digits}.{places}]", is_close, text_width(text, SIZE))
 
 
 def measure_table(table: LatexTable, separation: float) -> float:
-    r"""Compute the width of a table.
-
-    Args:
-        table: Table.
-        separation: \\tabcolsep in points.
-
-    Returns:
-        Width in points.
-    """
+    r"""Compute the width of a table."""
     widths = [column.width for column in table.columns]
     gaps = [_gap(column, separation) if i else 0.0 for i, column in enumerate(table.columns)]
     rows = [*table.head, *(row for group in table.groups for row in group)]
@@ -128,12 +107,7 @@ def measure_table(table: LatexTable, separation: float) -> float:
 
 
 def fit_table(table: LatexTable, width: float) -> float | None:
-    """Return the largest separation of columns with which a table fits, or None.
-
-    Args:
-        table: Table.
-        width: Available width in points.
-    """
+    """Return the largest separation of columns with which a table fits, or None."""
     fitting = (s for s in _SEPARATIONS if measure_table(table, s) <= width - _SLACK)
     return next(fitting, None)
 
@@ -141,13 +115,7 @@ def fit_table(table: LatexTable, width: float) -> float | None:
 def format_table(table: LatexTable, separation: float, *, is_wide: bool) -> str:
     r"""Format a table as LaTeX.
 
-    Args:
-        table: Table.
-        separation: \\tabcolsep in points.
-        is_wide: Whether it spans both columns of the page.
-
-    Returns:
-        The environment `table`, for booktabs, siunitx and xcolor.
+    Returns the environment `table`, for booktabs, siunitx and xcolor.
     """
     star = "*" if is_wide else ""
     specs = "".join((r"@{\,}" if column.is_close else "") + column.spec for column in table.columns)

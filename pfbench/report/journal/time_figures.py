@@ -34,11 +34,7 @@ _WIDE = 4.0  # inches, width from which a legend has four columns
 def select_curves(pack: Pack) -> list[str]:
     """Select the filters whose curves are shown: proposed ones, the first of the board, and baselines.
 
-    Args:
-        pack: Data of the report.
-
-    Returns:
-        Keys in the order of the report, nine at most.
+    Returns keys in the order of the report, nine at most.
     """
     looks = filters_by_key(pack)
     rows = list(find_rows(pack))
@@ -49,12 +45,7 @@ def select_curves(pack: Pack) -> list[str]:
 
 
 def plot_over_time(pack: Pack, setting: FigureSetting) -> Figure:
-    """Plot the median error over time in each world under the first noise regime.
-
-    Args:
-        pack: Data of the report.
-        setting: Setting of the figures.
-    """
+    """Plot the median error over time in each world under the first noise regime."""
     regime, looks = str(pack["regimes"][0]["key"]), filters_by_key(pack)
     worlds = [str(world["key"]) for world in pack["worlds"]]
     worlds = [world for world in worlds if (world, regime) in pack["curves"]][:_PANELS]
@@ -80,12 +71,7 @@ def plot_over_time(pack: Pack, setting: FigureSetting) -> Figure:
 
 
 def plot_calibration(pack: Pack, setting: FigureSetting) -> Figure:
-    """Plot the coverage of 50 and 90 % regions, and NEES relative to its expectation.
-
-    Args:
-        pack: Data of the report.
-        setting: Setting of the figures.
-    """
+    """Plot the coverage of 50 and 90 % regions, and NEES relative to its expectation."""
     looks, values = filters_by_key(pack), pack["calibration"].get((ALL, ALL), {})
     keys = [key for key in find_rows(pack) if key in values] or [
         key for key in looks if key in values

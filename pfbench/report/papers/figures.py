@@ -38,18 +38,7 @@ def paper_figures(
     selection: Sequence[str] | None = None,
     start_time_s: float = 0.0,
 ) -> list[FigureSpec]:
-    """List the paper figures of a study.
-
-    Args:
-        study: Name of the study; "paper_000_linear" belongs to paper 000.
-        conditions: Conditions of the study.
-        style: Line styles by label.
-        selection: Names of figures, None for the figures of the study's paper.
-        start_time_s: Start time of measures, s. Curves over time show all times.
-
-    Raises:
-        ValueError: If a figure does not exist, or data for a requested figure are missing.
-    """
+    """List the paper figures of a study."""
     if unknown := sorted(set(selection or ()) - set(FIGURES)):
         raise ValueError(
             f"report.paper_figures must be paper figures, got {', '.join(unknown)}. "

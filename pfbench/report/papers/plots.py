@@ -32,13 +32,7 @@ ResultsWithGroup = Mapping[str, tuple[store.JobResult, ComponentGroup]]
 def plot_errors(
     results: ResultsWithGroup, style: Mapping[str, LineStyle], before: bool = False
 ) -> Figure:
-    """Plot the signed error over time, 5 to 95 % and median of the runs, a panel per component.
-
-    Args:
-        results: Result and component group by label.
-        style: Line styles by label.
-        before: Whether to add the band of the error at the first step.
-    """
+    """Plot the signed error over time, 5 to 95 % and median of the runs, a panel per component."""
     components = list(
         dict.fromkeys(name for _, block in results.values() for name in block.components)
     )
@@ -71,15 +65,7 @@ def plot_paper_trace(
     style: Mapping[str, LineStyle],
     printed: Sequence[float],
 ) -> Figure:
-    """Plot a trace over time, and the limits that the paper prints.
-
-    Args:
-        results: Results by label.
-        name: Name of the trace.
-        unit: Label of the y axis.
-        style: Line styles by label.
-        printed: Lower and upper limit in the paper, or NaN.
-    """
+    """Plot a trace over time, and the limits that the paper prints."""
     figure, (axis,) = stacked_axes(1, 2.0)
     for label, result in results.items():
         time, values = _valid_runs(result, result.data[name])
@@ -94,12 +80,7 @@ def plot_paper_trace(
 
 
 def plot_escape(factors: Mapping[str, tuple[float, int]], style: Mapping[str, LineStyle]) -> Figure:
-    """Plot escape factors over the iterations, as repaired and as printed.
-
-    Args:
-        factors: Size of the factor and number of iterations by label.
-        style: Line styles by label.
-    """
+    """Plot escape factors over the iterations, as repaired and as printed."""
     figure, (axis,) = stacked_axes(1, 2.0)
     for label, (size, most) in factors.items():
         k = np.arange(most + 1)
@@ -116,12 +97,7 @@ def plot_escape(factors: Mapping[str, tuple[float, int]], style: Mapping[str, Li
 def plot_relative_errors(
     experiments: Mapping[str, Mapping[str, store.JobResult]], style: Mapping[str, LineStyle]
 ) -> Figure:
-    """Plot the horizontal error in % of the range over time, a panel per experiment.
-
-    Args:
-        experiments: Results by experiment and label.
-        style: Line styles by label.
-    """
+    """Plot the horizontal error in % of the range over time, a panel per experiment."""
     figure, panels = stacked_axes(len(experiments), 1.6)
     for (name, results), axis in zip(experiments.items(), panels, strict=True):
         lines = []
@@ -214,10 +190,7 @@ def plot_against(
 ) -> Figure:
     """Plot the median and the band over runs by experiment.
 
-    Args:
-        values: Values of the runs [n] by experiment and label.
-        style: Line styles by label.
-        ylabel: Label of the y axis.
+    Shapes: values [n].
     """
     labels = list(dict.fromkeys(label for runs in values.values() for label in runs))
     figure, (axis,) = stacked_axes(1, 2.1)
@@ -243,14 +216,7 @@ def plot_maxima(
     start: float,
     printed: Mapping[str, Sequence[float]],
 ) -> Figure:
-    """Plot maximum error and RMSE by component, with crosses at values of the paper.
-
-    Args:
-        results: Result and component group by label.
-        style: Line styles by label.
-        start: Start time of the measures, s.
-        printed: Maximum errors of the paper by label.
-    """
+    """Plot maximum error and RMSE by component, with crosses at values of the paper."""
     components = dict.fromkeys(name for _, block in results.values() for name in block.components)
     # In the order of the printed values.
     names = sorted(components, key=lambda name: "NEU".find(name[-1]))
@@ -296,12 +262,7 @@ def mean_relative_error(result: store.JobResult) -> np.ndarray:
 
 
 def mean_trace_per_run(result: store.JobResult, name: str) -> np.ndarray:
-    """Compute the mean over time of a trace of each valid run.
-
-    Args:
-        result: Result of a filter.
-        name: Name of the trace.
-    """
+    """Compute the mean over time of a trace of each valid run."""
     valid = result.data[name][~result.data["lost"]]
     return error_measures.mean_per_run(valid, np.zeros(len(valid), dtype=bool))
 

@@ -98,12 +98,7 @@ class PaperFigureInput(NamedTuple):
 
 
 def make_error_figures(source: PaperFigureInput, before: bool = False) -> list[FigureSpec]:
-    """Return figures of the error over time, one per condition and group.
-
-    Args:
-        source: Figure and its data.
-        before: Whether to add the band of the error at the first step.
-    """
+    """Return figures of the error over time, one per condition and group."""
     figures = []
     for data, group, results in source.list_groups():
         text = f"{source.format_head(data)}: error of {group} over time, {describe_band(data)}."
@@ -116,14 +111,7 @@ def make_error_figures(source: PaperFigureInput, before: bool = False) -> list[F
 def make_trace_figures(
     name: str, words: str, unit: str, source: PaperFigureInput
 ) -> list[FigureSpec]:
-    """Return figures of a trace over time, one per condition.
-
-    Args:
-        name: Name of the trace.
-        words: Quantity, as text.
-        unit: Label of the y axis.
-        source: Figure and its data.
-    """
+    """Return figures of a trace over time, one per condition."""
     figures = []
     low, high = source.figure.printed.get("", (np.nan, np.nan))
     for data in source.data:
@@ -253,13 +241,7 @@ def describe_band(*conditions: PaperFigureData) -> str:
 
 
 def make_parameter_figures(name: str, remark: str, source: PaperFigureInput) -> list[FigureSpec]:
-    """Return figures of the error over time for each value of a parameter, one per condition.
-
-    Args:
-        name: Name of the parameter, as text.
-        remark: What the figure of the paper leaves open.
-        source: Figure and its data. Its filters are labels `filter[key=value]`.
-    """
+    """Return figures of the error over time for each value of a parameter, one per condition."""
     figures = []
     for data, group, results in source.list_groups():
         if len(results) < 2:
@@ -287,11 +269,7 @@ _KILOMETRE = 1e3
 
 
 def plot_flight(result: store.JobResult) -> Figure:
-    """Plot the true track of the first run from above, and its height over time.
-
-    Args:
-        result: Result with the track of the truth.
-    """
+    """Plot the true track of the first run from above, and its height over time."""
     steps = select_indices(len(result.data["time"]))
     track = result.data["track"][0, steps].astype(np.float64) / _KILOMETRE
     figure = Figure(figsize=(COLUMN, 3.6), layout="constrained")
@@ -306,11 +284,7 @@ def plot_flight(result: store.JobResult) -> Figure:
 
 
 def plot_flight_velocity(result: store.JobResult) -> Figure:
-    """Plot the velocity of the first run, from differences of its true positions.
-
-    Args:
-        result: Result with the track of the truth.
-    """
+    """Plot the velocity of the first run, from differences of its true positions."""
     time = result.data["time"]
     velocity = np.gradient(result.data["track"][0].astype(np.float64), time, axis=0)
     steps = select_indices(len(time))
@@ -325,11 +299,7 @@ def plot_flight_velocity(result: store.JobResult) -> Figure:
 
 
 def make_flight_figures(source: PaperFigureInput) -> list[FigureSpec]:
-    """Return the figure of the flight of each scenario.
-
-    Args:
-        source: Figure and its data.
-    """
+    """Return the figure of the flight of each scenario."""
     return [
         FigureSpec(
             format_slug(scenario),
@@ -342,11 +312,7 @@ def make_flight_figures(source: PaperFigureInput) -> list[FigureSpec]:
 
 
 def make_flight_velocity_figures(source: PaperFigureInput) -> list[FigureSpec]:
-    """Return the figure of the velocity of each scenario.
-
-    Args:
-        source: Figure and its data.
-    """
+    """Return the figure of the velocity of each scenario."""
     return [
         FigureSpec(
             format_slug(scenario),

@@ -22,12 +22,7 @@ def encode_pack(pack: Mapping[str, Any], limit: int) -> str:
     The tracks of single runs are the largest part. If the text exceeds the limit, the page carries
     fewer runs of each condition, in the order of the pack.
 
-    Args:
-        pack: Data of the page, as `pfbench.report.board` makes it.
-        limit: Greatest number of characters.
-
-    Returns:
-        Text of `compress_pack`.
+    Returns text of `compress_pack`.
     """
     base = {
         **pack,
@@ -61,18 +56,7 @@ def _nest(values: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
 
 
 def encode_views(views: Mapping[tuple[str, ...], Any], filters: Sequence[str]) -> dict[str, Any]:
-    """Encode views as columns, which compress better side by side than view by view.
-
-    Args:
-        views: Views by key. Each has a row of each filter.
-        filters: Labels of the filters.
-
-    Returns:
-        Keys of the scopes, baselines, texts by scope and baseline, and columns by name. A place is a
-        scenario with a regime. `fixed` columns, by place and filter, are the same for all metrics
-        and baselines. `shared` ones, by scope and row, are the same for all baselines. All
-        others are `separate`, by view and row.
-    """
+    """Encode views as columns, which compress better side by side than view by view."""
     scopes: dict[tuple[str, ...], dict[str, Any]] = {}
     for key, view in views.items():
         scopes.setdefault(tuple(key[:-1]), {})[key[-1]] = view
@@ -173,14 +157,7 @@ def encode_levels(
 ) -> dict[str, Any]:
     """Encode numbers as levels of equal ratio. Level 0 is a missing value.
 
-    Args:
-        values: Numbers, None or NaN where missing. Nested lists are flattened in the page.
-        bits: 8, or up to 16 in two bytes.
-        is_signed: Numbers of both signs: the upper half of the levels is positive, the middle is 0.
-        is_smooth: Store differences of neighbouring levels, which compress better for curves.
-
-    Returns:
-        Range of the absolute values, number of bits, flags and the bytes of the levels.
+    Returns range of the absolute values, number of bits, flags and the bytes of the levels.
     """
     numbers = np.array(values, dtype=float).ravel()
     size = np.abs(numbers)
@@ -213,14 +190,7 @@ def _pack_levels(levels: Levels, bits: int, is_smooth: bool) -> bytes:
 def encode_decimals(values: Sequence[Any]) -> dict[str, Any]:
     """Encode positive numbers of at most four digits exactly: mantissa and exponent. None is a missing value.
 
-    Args:
-        values: Numbers. Nested lists are flattened in the page.
-
-    Returns:
-        Number of values, and their bytes.
-
-    Raises:
-        ValueError: If a number is negative or has more digits.
+    Returns number of values, and their bytes.
     """
     numbers = np.array(values, dtype=float).ravel()
     usable = np.isfinite(numbers) & (numbers != 0)
@@ -246,11 +216,7 @@ def _split_bytes(numbers: Levels) -> bytes:
 def compress_pack(pack: Mapping[str, Any]) -> str:
     """Compress a pack and all its codes, with the same text for equal content.
 
-    Args:
-        pack: Plain values and codes.
-
-    Returns:
-        Length of the JSON, JSON and bytes of all codes, as gzip in base 85.
+    Returns length of the JSON, JSON and bytes of all codes, as gzip in base 85.
     """
     codes: list[bytes] = []
     text = json.dumps(

@@ -39,15 +39,7 @@ _SECTIONS = (
 def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
     """Write index.html and report.md of a study. Equal packs give equal bytes.
 
-    Args:
-        pack: Data of the page, as `pfbench.report.board` makes it.
-        folder: Target folder.
-
-    Returns:
-        Path of index.html.
-
-    Raises:
-        ValueError: If a colour is not of the form #rrggbb.
+    Returns path of index.html.
     """
     pack = {**dict.fromkeys(_OPTIONAL, ()), **pack}
     pack["budgets"] = offer_budgets(pack)
@@ -86,13 +78,7 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
 
 
 def write_markdown(pack: Mapping[str, Any], folder: RecordedFolder) -> None:
-    """Write report.md of a study, one screen.
-
-    Args:
-        pack: Data of the page. `headline` names the figure headline.svg of a published study, and
-            `headline_note` the filters that it does not show.
-        folder: Target folder.
-    """
+    """Write report.md of a study, one screen."""
     context = {
         "pack": {"headline": "", "headline_note": "", "failures": (), **pack},
         "choices": pack.get("choices", ()),
@@ -152,12 +138,7 @@ _NAMED = 4  # filters with severely overconfident runs in the first lines
 
 
 def format_short(value: float | None, digits: int = 3) -> str:
-    """Format a number with significant digits, as the script of the page does.
-
-    Args:
-        value: Number, or None for a dash.
-        digits: Number of significant digits.
-    """
+    """Format a number with significant digits, as the script of the page does."""
     if value is None:
         return _DASH
     rounded = Context(prec=digits, rounding=ROUND_HALF_UP).create_decimal(Decimal(value))
@@ -170,41 +151,24 @@ def format_short(value: float | None, digits: int = 3) -> str:
 
 
 def format_share(value: float | None) -> str:
-    """Format a share as percent.
-
-    Args:
-        value: Share, or None for a dash.
-    """
+    """Format a share as percent."""
     if value is None:
         return _DASH
     return f"{Decimal(100 * value).quantize(Decimal(1), ROUND_HALF_UP)} %"
 
 
 def format_interval(low: float | None, high: float | None) -> str:
-    """Format an interval in brackets, or nothing where it is missing.
-
-    Args:
-        low: Lower end.
-        high: Upper end.
-    """
+    """Format an interval in brackets, or nothing where it is missing."""
     return "" if low is None or high is None else f"[{format_short(low)}, {format_short(high)}]"
 
 
 def format_sentence(text: str) -> Markup:
-    """Escape a sentence and make [[names]] bold.
-
-    Args:
-        text: Sentence of the board.
-    """
+    """Escape a sentence and make [[names]] bold."""
     return Markup(re.sub(r"\[\[(.*?)\]\](?!\])", r"<b>\1</b>", str(escape(text))))
 
 
 def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the sentence and the table of the opening view.
-
-    Args:
-        pack: Data of the page.
-    """
+    """Return the sentence and the table of the opening view."""
     key, view = next(iter(pack["views"].items()))
     metric, world, regime, baseline = key
     names = {f["key"]: f for f in pack["filters"]}
@@ -231,22 +195,14 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def describe_page_knobs(pack: Mapping[str, Any]) -> str:
-    """Say which filters of a page were tuned on other worlds; empty for none, or for a page without the data.
-
-    Args:
-        pack: Data of the page.
-    """
+    """Say which filters of a page were tuned on other worlds; empty for none, or for a page without the data."""
     looks = pack.get("facts", {}).get("looks", ())
     worlds = [world["key"] for world in pack["worlds"]]
     return describe_foreign_knobs([find_stored_world(look, worlds) for look in looks])
 
 
 def describe_overconfidence(pack: Mapping[str, Any]) -> str:
-    """Name the filters with severely overconfident runs, the largest share first; empty without any.
-
-    Args:
-        pack: Data of the page.
-    """
+    """Name the filters with severely overconfident runs, the largest share first; empty without any."""
     names = {look["key"]: look["name"] for look in pack["filters"]}
     notes = [note for note in pack.get("filter_notes", ()) if note["severely_overconfident"]]
     notes.sort(key=lambda note: -note["severely_overconfident"] / note["runs"])
@@ -302,11 +258,7 @@ def _row(row: Mapping[str, Any], look: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def describe_pairs(pack: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return the planned comparisons as texts.
-
-    Args:
-        pack: Data of the page.
-    """
+    """Return the planned comparisons as texts."""
     names = {f["key"]: f["name"] for f in pack["filters"]}
     return [
         {
@@ -321,11 +273,7 @@ def describe_pairs(pack: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def name_effects(pack: Mapping[str, Any]) -> str:
-    """Name the effects of the planned pairs, as the head of a column: ratio, runs won, or both.
-
-    Args:
-        pack: Data of the page.
-    """
+    """Name the effects of the planned pairs, as the head of a column: ratio, runs won, or both."""
     has_won = [bool(pair.get("won")) for pair in pack["planned"]]
     names = ("Ratio", *["runs won"] * any(has_won))
     return "Runs won" if has_won and all(has_won) else " or ".join(names)
@@ -370,9 +318,6 @@ def offer_budgets(pack: Mapping[str, Any]) -> list[dict[str, Any]]:
     The limit is the time per step, over all conditions, of the filter that is the slowest with its
     fewest particles. Each filter is shown with the most particles that do not exceed the limit. A filter
     without particles is shown if it does not exceed the limit.
-
-    Args:
-        pack: Data of the page.
     """
     budgets = [dict(budget) for budget in pack["budgets"]]
     limit, filters = select_equal_time(pack)
@@ -389,12 +334,8 @@ def offer_budgets(pack: Mapping[str, Any]) -> list[dict[str, Any]]:
 def select_equal_time(pack: Mapping[str, Any]) -> tuple[float, list[str]]:
     """Select the filters of `offer_budgets`.
 
-    Args:
-        pack: Data of the page.
-
-    Returns:
-        Limit in ms per step, and keys of filters. No keys if fewer than two filters have several numbers
-        of particles with a time.
+    Returns Limit in ms per step, and keys of filters. No keys if fewer than two filters have
+    several numbers of particles with a time.
     """
     notes = {note["filter"]: str(note["particles"]) for note in pack["filter_notes"]}
     rows = next(iter(pack["views"].values()))["rows"]

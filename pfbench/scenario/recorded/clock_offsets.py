@@ -44,12 +44,7 @@ class ClockOffset(NamedTuple):
     agreement: str
 
     def describe(self, name: str, reference: str) -> str:
-        """Return a note with the change that removes the offset.
-
-        Args:
-            name: Table with the offset.
-            reference: Table that is taken as right.
-        """
+        """Return a note with the change that removes the offset."""
         size, is_late = abs(self.late_s), self.late_s > 0.0
         is_leap = abs(size - LEAP_SECONDS) < 0.1
         size = LEAP_SECONDS if is_leap else size
@@ -62,15 +57,7 @@ class ClockOffset(NamedTuple):
 
 
 def find_imu_offset(imu: ImuLog, reference: ReferenceLog) -> ClockOffset | None:
-    """Find the lag at which the integrated angular rate turns as the reference.
-
-    Args:
-        imu: IMU samples.
-        reference: Reference motion.
-
-    Returns:
-        The offset of the IMU, or None if no lag explains the turns much better than none.
-    """
+    """Find the lag at which the integrated angular rate turns as the reference."""
     time, true = _reference_turns(reference)
     step = np.diff(time)
     short = step < max(1.6 * _WINDOW, 2.5 * float(np.median(step))) if len(step) else step > 0.0
@@ -112,15 +99,7 @@ def _reference_turns(reference: ReferenceLog) -> tuple[Array, Array]:
 
 
 def find_fix_offset(fixes: GnssLog, reference: ReferenceLog) -> ClockOffset | None:
-    """Find the lag at which the fixes move as the reference, up to a constant and a lever arm.
-
-    Args:
-        fixes: Fixes.
-        reference: Reference motion.
-
-    Returns:
-        The offset of the fixes, or None if no lag explains them much better than none.
-    """
+    """Find the lag at which the fixes move as the reference, up to a constant and a lever arm."""
     rows = np.flatnonzero(np.isfinite(fixes.position[:, 0]))
     rows = rows[:: max(1, len(rows) // _MOST)]
     time, position = fixes.time[rows], fixes.position[rows]

@@ -19,13 +19,8 @@ def integrate_windows(imu: ImuLog, time: Array) -> tuple[Tensor, Tensor]:
     Neighbouring pieces of a window are joined in pairs until one is begin, so that memory grows with
     the samples alone. `preintegrate` joins them in the order of time and gives the same to rounding.
 
-    Args:
-        imu: IMU samples, which cover all windows.
-        time: Borders of the windows, s, [n + 1].
-
-    Returns:
-        Rotation from the body at the end of each window to that at its start, quaternion, [n, 4].
-        Velocity increment in body axes at the start, without gravity, m/s, [n, 3].
+    Returns rotation from the body at the end of each window to that at its start, quaternion,
+    [n, 4]. Velocity increment in body axes at the start, without gravity, m/s, [n, 3].
     """
     window, spans, mean = list_pieces(imu, time)
     force, rate = torch.from_numpy(mean).split(3, -1)

@@ -33,14 +33,7 @@ FixCodes = str | Sequence[int] | None
 
 
 def check_fix_codes(codes: FixCodes) -> None:
-    """Check the configuration key `scenario.fix_codes`.
-
-    Args:
-        codes: Name of a program, codes of the fixes to use, or None for 0 and 1.
-
-    Raises:
-        ValueError: If the program is not known, or the codes are not whole numbers.
-    """
+    """Check the configuration key `scenario.fix_codes`."""
     is_list = not isinstance(codes, str | None) and len(codes) > 0
     if codes is None or (isinstance(codes, str) and codes in PROGRAMS):
         return
@@ -55,15 +48,7 @@ def check_fix_codes(codes: FixCodes) -> None:
 def select_usable(table: LogTable, codes: FixCodes) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
     """Select the fixes to use by the column `fix`.
 
-    Args:
-        table: Table of fixes. Without the column all are used.
-        codes: Name of a program, codes of the fixes to use, or None for 0 and 1.
-
-    Returns:
-        Mask of used fixes, [n], and a note with the number of fixes of each code.
-
-    Raises:
-        ValueError: If a code is not one of the program, or no fix is used.
+    Returns mask of used fixes, [n], and a note with the number of fixes of each code.
     """
     if "fix" not in table.rows:
         return np.ones(len(table.rows), bool), ()

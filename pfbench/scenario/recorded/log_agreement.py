@@ -64,15 +64,7 @@ COMMON_TIME = 2.0  # s at an end of a table that other tables do not cover, with
 def compare_reference(table: LogTable, reference: ReferenceLog) -> tuple[str, ...]:
     """Compare positions and velocities of a reference.
 
-    Args:
-        table: Table of the reference, for messages.
-        reference: Reference motion.
-
-    Returns:
-        Notes.
-
-    Raises:
-        ValueError: If positions and velocities contradict each other.
+    Returns notes.
     """
     dt = np.diff(reference.time)
     expected = 0.5 * dt[:, None] * (reference.velocity[1:] + reference.velocity[:-1])
@@ -89,17 +81,7 @@ def compare_reference(table: LogTable, reference: ReferenceLog) -> tuple[str, ..
 def compare_inertial(table: LogTable, imu: ImuLog, reference: ReferenceLog, gravity: float) -> tuple[str, ...]:  # fmt: skip
     """Compare dead reckoning of the IMU with the reference between rows, and over about a second.
 
-    Args:
-        table: Table of the reference, for messages.
-        imu: IMU samples.
-        reference: Reference motion.
-        gravity: Gravity, m/s^2.
-
-    Returns:
-        Notes.
-
-    Raises:
-        ValueError: If IMU and reference contradict each other.
+    Returns notes.
     """
     inside = np.flatnonzero((reference.time >= imu.time[0]) & (reference.time <= imu.time[-1]))
     stride = max(1, round(WINDOW / float(np.median(np.diff(reference.time)))))
@@ -147,17 +129,7 @@ def compare_fixes(
 ) -> tuple[GnssLog, tuple[str, ...]]:
     """Compare fixes with the reference, and outside of it with the previous fix.
 
-    Args:
-        table: Table of the fixes, for messages.
-        fixes: Fixes.
-        reference: Reference motion.
-        limits: Limits of the platform.
-
-    Returns:
-        The fixes, without those that `limits.drop_fixes` drops, and notes.
-
-    Raises:
-        ValueError: If a fix is beyond the limits and is not to be dropped, or no fix would be left.
+    Returns the fixes, without those that `limits.drop_fixes` drops, and notes.
     """
     true = interpolate(reference, fixes.time)
     position_error = np.linalg.norm(fixes.position - true[:, 7:], axis=1)
@@ -240,17 +212,7 @@ def compare_wheels(
 ) -> tuple[str, ...]:
     """Compare wheel speed and yaw rate with the reference.
 
-    Args:
-        table: Table of the odometry, for messages.
-        speed: Wheel speed, m/s, [T].
-        yaw_rate: Yaw rate, clockwise from above, rad/s, [T].
-        reference: Reference motion at the same times.
-
-    Returns:
-        Notes.
-
-    Raises:
-        ValueError: If odometry and reference contradict each other.
+    Returns notes. Shapes: speed [T], yaw_rate [T].
     """
     east, north = reference.velocity[:, :2].T
     true_speed = np.hypot(east, north)
@@ -268,11 +230,7 @@ def compare_wheels(
 def compare_times(tables: tuple[tuple[str, Array], ...]) -> tuple[str, ...]:
     """Name tables that begin later or end earlier than the others.
 
-    Args:
-        tables: Names and times, s, [n] each.
-
-    Returns:
-        Notes.
+    Returns notes. Shapes: tables [n].
     """
     first = min(time[0] for _, time in tables)
     last = max(time[-1] for _, time in tables)
@@ -288,13 +246,7 @@ def describe_missing_times(name: str, time: Array, steps: Array) -> tuple[str, .
 
     A clock that jumps forward leaves a hole. The rows after it still agree with each other.
 
-    Args:
-        name: Name of the table.
-        time: Increasing times of its rows, s, [n].
-        steps: Times of the steps, s, [T].
-
-    Returns:
-        Notes.
+    Returns notes. Shapes: time [n], steps [T].
     """
     missing, interval = max(time[0] - steps[0], steps[-1] - time[-1]), np.diff(time)
     longest = COMMON_TIME + 2 * np.median(interval) if len(interval) else 0.0
@@ -355,15 +307,7 @@ def check_orbits(
 ) -> None:
     """Check radius, smoothness and velocity of satellites.
 
-    Args:
-        name: Name of the table, for messages.
-        names: Names of the S satellites.
-        time: Times, s, [K].
-        position: Earth-fixed positions, m, [K, S, 3]. NaN where missing.
-        velocity: Velocities, m/s, [K, S, 3], or None.
-
-    Raises:
-        ValueError: If a satellite leaves the range of orbits, jumps, or moves against its velocity.
+    Shapes: time [K], position [K, S, 3], velocity [K, S, 3].
     """
     for s, satellite in enumerate(names):
         rows = np.flatnonzero(np.isfinite(position[:, s, 0]))
@@ -396,18 +340,7 @@ def compare_ranges(
 ) -> tuple[str, ...]:
     """Compare range residuals with the median of each epoch and system.
 
-    Args:
-        name: Name of the table, for messages.
-        names: Names of the S satellites. The first letter is the system.
-        time: Times, s, [K].
-        residual: Corrected pseudoranges minus distances from the reference, m, [K, S].
-        limits: Limits of the platform.
-
-    Returns:
-        Notes.
-
-    Raises:
-        ValueError: If a residual is beyond `limits.fix_error_m`.
+    Returns notes. Shapes: time [K], residual [K, S].
     """
     return _judge_residuals(
         f"{name}: pseudorange residual",
@@ -424,17 +357,7 @@ def compare_rates(
 ) -> tuple[str, ...]:
     """Compare residuals of range rates with the median of each epoch and system.
 
-    Args:
-        name: Name of the table, for messages.
-        names: Names of the S satellites.
-        time: Times, s, [K].
-        residual: Range rates minus those from the reference, m/s, [K, S].
-
-    Returns:
-        Notes.
-
-    Raises:
-        ValueError: If a residual is beyond 200 m/s.
+    Returns notes. Shapes: time [K], residual [K, S].
     """
     return _judge_residuals(
         f"{name}: range rate residual", names, time, residual, (RATE_NOTE, LARGEST_RATE), "m/s"
@@ -446,15 +369,8 @@ def compare_directions(
 ) -> tuple[str, ...]:
     """Check recorded directions against those from the reference.
 
-    Args:
-        name: Name of the table, for messages.
-        names: Names of the S satellites.
-        time: Times, s, [K].
-        azimuth: Errors of the azimuth, rad, [K, S].
-        elevation: Errors of the elevation, rad, [K, S].
-
-    Returns:
-        A note if a direction is off by more than a degree.
+    Returns a note if a direction is off by more than a degree. Shapes: time [K], azimuth [K, S],
+    elevation [K, S].
     """
     # near the zenith the azimuth is free, and angles wrap
     off = np.nan_to_num(np.maximum(np.abs(np.sin(0.5 * azimuth)) * 2.0, np.abs(elevation)))

@@ -29,16 +29,7 @@ _LEAST_FORCE = 1.0  # m/s^2; a force that biases do not hide [ours]
 
 
 def check_force(imu: ImuLog, reference: ReferenceLog, name: str) -> None:
-    """Check unit, gravity and axes of the specific force.
-
-    Args:
-        imu: IMU samples.
-        reference: Reference motion, with which the remedies are tried.
-        name: Name of the table, for the message.
-
-    Raises:
-        ValueError: If gravity does not have its size in the force, or points the wrong way.
-    """
+    """Check unit, gravity and axes of the specific force."""
     typical = float(np.median(np.linalg.norm(imu.force, axis=1)))
     up = float(np.median(imu.force[:, 2]))
     has_gravity = 5.0 < typical < 20.0
@@ -119,14 +110,7 @@ def _force_error(imu: ImuLog, reference: ReferenceLog, gravity: float = STANDARD
 def check_overlap(imu_name: str, imu_time: Array, name: str, time: Array) -> None:
     """Check that two tables have a common time.
 
-    Args:
-        imu_name: Name of the IMU table, for the message.
-        imu_time: Times of the IMU table, s, [n].
-        name: Name of the second table, for the message.
-        time: Times of the second table, s, [m].
-
-    Raises:
-        ValueError: If the tables do not overlap.
+    Shapes: imu_time [n], time [m].
     """
     if min(imu_time[-1], time[-1]) <= max(imu_time[0], time[0]):
         raise ValueError(
@@ -146,17 +130,6 @@ def check_rotation(
     """Compare angular rates with the reference.
 
     Rates of slow vehicles in deg/s pass all absolute limits.
-
-    Args:
-        imu: IMU samples.
-        reference: Reference motion.
-        names: Names of the tables of IMU and reference, for the message.
-        others: Returns references with other units and signs of the attitude, by the change that
-            makes the table so.
-        offset: Offset of the clock, which explains the rates if no unit and no sign does.
-
-    Raises:
-        ValueError: If the rates have another scale or sign than the reference.
     """
     rates = _mean_rates(imu, reference)
     if rates is None:
@@ -242,14 +215,7 @@ def check_position_scale(table: LogTable, time: Array, expected: Array, displace
 
     A slow axis is judged only if both are correlated, since noise of the velocity reduces the slope.
 
-    Args:
-        table: Table of the reference, for messages.
-        time: Times of the rows, s, [n + 1].
-        expected: Integrated velocities, m, [n, 3].
-        displacement: Changes of position, m, [n, 3].
-
-    Raises:
-        ValueError: If an axis has another scale.
+    Shapes: expected [n, 3], displacement [n, 3].
     """
     window = ((time[1:] - time[0]) / WINDOW - 1e-9).astype(int)
     starts = np.flatnonzero(np.diff(window, prepend=-1))
@@ -276,14 +242,7 @@ def _is_correlated(x: Array, y: Array) -> bool:
 def check_turn_scale(table: LogTable, x: Array, y: Array, window: float) -> None:
     """Check that rotations of the reference have the scale of those of the IMU.
 
-    Args:
-        table: Table of the reference, for messages.
-        x: Rotations of the IMU in each window, rad, [n, 3].
-        y: Rotations of the reference, rad, [n, 3].
-        window: Typical length of the windows, s.
-
-    Raises:
-        ValueError: If an axis has another scale.
+    Shapes: x [n, 3], y [n, 3].
     """
     if len(x) < FEWEST_WINDOWS or window < 0.5 * WINDOW:
         return  # between neighbouring rows, noise has a larger part
@@ -309,14 +268,7 @@ _BRAKING, _SLOW = 10.0, 1.0  # m/s^2, hard braking on a road; m/s, noise of the 
 
 
 def check_geocentric(table: LogTable) -> None:
-    """Check that Earth-fixed and geodetic positions are the same, if a table has both.
-
-    Args:
-        table: Table.
-
-    Raises:
-        ValueError: If a position differs by more than a metre.
-    """
+    """Check that Earth-fixed and geodetic positions are the same, if a table has both."""
     if not table.has(_GEOCENTRIC):
         return
     geodetic = parse_numbers(table, _GEODETIC) * [np.pi / 180, np.pi / 180, 1.0]
@@ -336,16 +288,7 @@ def check_wheel_direction(table: LogTable, time: Array, speed: Array) -> tuple[s
 
     The reference velocity of a road vehicle does not show whether it moves backwards.
 
-    Args:
-        table: Table of the odometry, for messages.
-        time: Times, s, [T].
-        speed: Wheel speed, m/s, [T]. Negative when reversing.
-
-    Returns:
-        A note if most of the drive is backwards.
-
-    Raises:
-        ValueError: If the sign changes faster than the vehicle can brake.
+    Returns a note if most of the drive is backwards. Shapes: time [T], speed [T].
     """
     change, largest = np.abs(np.diff(speed)), 2.0 * _SLOW + _BRAKING * np.diff(time)
     wrong = np.flatnonzero((speed[1:] * speed[:-1] < 0.0) & (change > largest))

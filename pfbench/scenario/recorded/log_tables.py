@@ -58,13 +58,7 @@ _LARGEST_NUMBERS = {"G": 63, "R": 32, "E": 36, "C": 63, "J": 202, "I": 14, "S": 
 def list_tables(root: str | None, folder: str, names: Iterable[str]) -> list[Path]:
     """List the files of tables, which `read_table` would read.
 
-    Args:
-        root: Folder of all data sets. None gives no files.
-        folder: Name of the data set.
-        names: File names without .parquet or .csv.
-
-    Returns:
-        The files that exist.
+    Returns the files that exist.
     """
     paths = (
         Path(root or "") / folder / f"{name}{suffix}" for name in names for suffix in _SUFFIXES
@@ -73,15 +67,7 @@ def list_tables(root: str | None, folder: str, names: Iterable[str]) -> list[Pat
 
 
 def find_table(folder: Path, name: str) -> Path:
-    """Return the file of a table.
-
-    Args:
-        folder: Folder of the table.
-        name: File name without .parquet or .csv.
-
-    Raises:
-        ValueError: If the file does not exist, or there is one of each kind.
-    """
+    """Return the file of a table."""
     files = list_tables(str(folder), "", (name,))
     if not files:
         raise ValueError(
@@ -101,21 +87,7 @@ def read_table(
     select: dict[str, int | None],
     limits: PlausibleLimits | None = None,
 ) -> LogTable:
-    """Read a table and select rows.
-
-    Args:
-        folder: Folder of the table.
-        name: File name without .parquet or .csv.
-        select: Required value by column, for columns in the table. None accepts a single value.
-        limits: Limits of the platform. None for the default limits.
-
-    Returns:
-        The selected rows.
-
-    Raises:
-        ValueError: If the file does not exist, is ambiguous or damaged, a selection is missing or not in the
-            file, or the table has fewer than two rows.
-    """
+    """Read a table and select rows."""
     file = find_table(folder, name)
     content = read_table_file(file)
     table = LogTable(
@@ -161,16 +133,7 @@ def _selected(table: LogTable, column: str, value: int | None) -> LogTable:
 def parse_numbers(table: LogTable, columns: Sequence[str]) -> Array:
     """Convert columns to numbers.
 
-    Args:
-        table: Table.
-        columns: Names of k columns.
-
-    Returns:
-        Numbers, [n, k].
-
-    Raises:
-        ValueError: If a column is missing, contains text, NaN or infinity, or leaves the range of
-            its quantity in `plausible_limits`.
+    Returns numbers, [n, k].
     """
     missing = [column for column in columns if column not in table.rows]
     if missing:
@@ -198,15 +161,7 @@ def parse_numbers(table: LogTable, columns: Sequence[str]) -> Array:
 def convert_column(table: LogTable, column: str) -> Array:
     """Convert a column to numbers.
 
-    Args:
-        table: Table.
-        column: Name of the column.
-
-    Returns:
-        Numbers, [n]. NaN where the column does not contain one.
-
-    Raises:
-        ValueError: If the column cannot be converted.
+    Returns numbers, [n]. NaN where the column does not contain one.
     """
     try:
         return pd.to_numeric(table.rows[column], errors="coerce").to_numpy(dtype=np.float64)
@@ -220,12 +175,7 @@ def convert_column(table: LogTable, column: str) -> Array:
 def parse_satellites(table: LogTable, numbers: Array) -> list[str]:
     """Return the name of the satellite of each row, such as G07.
 
-    Args:
-        table: Table. Without a column `sys` all satellites are of GPS.
-        numbers: Satellite numbers, [n].
-
-    Raises:
-        ValueError: If a value is not the letter of a system or not a number of this system.
+    Shapes: numbers [n].
     """
     systems = table.rows["sys"] if "sys" in table.rows else ["G"] * len(table.rows)
     for i, (system, number) in enumerate(zip(systems, numbers, strict=True)):
@@ -244,18 +194,7 @@ def parse_satellites(table: LogTable, numbers: Array) -> list[str]:
 
 
 def read_times(table: LogTable, longest: float) -> Array:
-    """Read and check the column t.
-
-    Args:
-        table: Table.
-        longest: Longest plausible median interval, s.
-
-    Returns:
-        Increasing times, s, [n].
-
-    Raises:
-        ValueError: As `parse_numbers`, `check_increasing` and `check_seconds`.
-    """
+    """Read and check the column t."""
     time = parse_numbers(table, ("t",))[:, 0]
     check_increasing(table, time)
     check_seconds(table, time, longest)
@@ -265,12 +204,7 @@ def read_times(table: LogTable, longest: float) -> Array:
 def check_increasing(table: LogTable, time: Array) -> None:
     """Check that times increase.
 
-    Args:
-        table: Table, for the message.
-        time: Times, s, [n].
-
-    Raises:
-        ValueError: At the first time that is not later than the previous one.
+    Shapes: time [n].
     """
     back = np.flatnonzero(np.diff(time) <= 0)
     if back.size:
@@ -286,13 +220,7 @@ def check_increasing(table: LogTable, time: Array) -> None:
 def check_seconds(table: LogTable, time: Array, longest: float) -> None:
     """Check that times are in seconds.
 
-    Args:
-        table: Table, for the message.
-        time: Times, [n].
-        longest: Longest plausible median interval, s.
-
-    Raises:
-        ValueError: If the median interval is longer. The message suggests a unit.
+    Shapes: time [n].
     """
     typical = float(np.median(np.diff(time)))
     if typical <= longest:
@@ -447,13 +375,7 @@ _LARGEST_WIDENING = 100.0  # times the limit
 def check_range(table: LogTable, column: str, values: Array) -> None:
     """Check that values are in the range of their quantity.
 
-    Args:
-        table: Table, for the message.
-        column: Name of the column.
-        values: Values, [n].
-
-    Raises:
-        ValueError: If a value is out of range. The message names file, column and row.
+    Shapes: values [n].
     """
     quantity = table.limits.select(LIMIT_COLUMNS[column])
     outside = np.flatnonzero((values < quantity.least) | (values > quantity.largest))
@@ -523,15 +445,7 @@ def _join(remedies: Sequence[str]) -> str:
 def check_changes(table: LogTable, columns: Sequence[str], time: Array, values: Array) -> None:
     """Check that columns do not change faster than their quantities can.
 
-    Args:
-        table: Table.
-        columns: Names of columns.
-        time: Times, s, [n].
-        values: Values of the k columns, [n, k].
-
-    Raises:
-        ValueError: If a value differs from the previous one by more than `rate` times the interval
-            plus `allowance` in `plausible_limits`.
+    Shapes: time [n], values [n, k].
     """
     for column, series in zip(columns, values.T, strict=True):
         quantity = table.limits.select(LIMIT_COLUMNS[column])

@@ -107,18 +107,7 @@ def read_sky(
 
     Each epoch is assigned to the nearest time within a tolerance.
 
-    Args:
-        folder: Folder of the log.
-        time: Times, s, [K].
-        mask_deg: Smallest elevation, degrees.
-        origin: lat_deg, lon_deg, h_m of the local frame. None if the file contains it.
-
-    Returns:
-        The measurements.
-
-    Raises:
-        ValueError: If a column or the origin is missing, an epoch contains a satellite twice, or
-            the times do not match any epoch.
+    Shapes: time [K].
     """
     table = read_table(folder, SKY, {})
     value = dict(zip(_COLUMNS, parse_numbers(table, _COLUMNS).T, strict=True))
@@ -178,16 +167,8 @@ def subtract_nominal_ranges(
 
     Nominal ranges and rates are those of a receiver at rest at the start.
 
-    Args:
-        gnss_log: Raw measurements relative to the start.
-        time: Times, s, [K].
-        velocity: Velocity of the receiver at the first time, East, North, Up, m/s, [3].
-
-    Returns:
-        Reduced ranges, m, and rates, m/s, [K, 2 S], and a note for the report.
-
-    Raises:
-        ValueError: If the first time does not have a GPS satellite.
+    Returns reduced ranges, m, and rates, m/s, [K, 2 S], and a note for the report. Shapes: time
+    [K].
     """
     reach = np.linalg.norm(gnss_log.satellite_position, axis=-1)
     line = gnss_log.satellite_position / reach[..., None]
@@ -222,12 +203,7 @@ def _mean(values: Array, sd: Array) -> float:
 def make_step_inputs(u: PreintegratedImu, gnss_log: RawGnssLog) -> TightMemsInputs:
     """Build the inputs of the steps.
 
-    Args:
-        u: Preintegrated IMU samples.
-        gnss_log: Raw measurements relative to the start, at the start and the step ends.
-
-    Returns:
-        Inputs of the tightly coupled model.
+    Returns inputs of the tightly coupled model.
     """
     # finite values replace missing inputs, since a NaN would propagate to gradients
     observed_mask = np.isfinite(gnss_log.range)[1:]
@@ -438,17 +414,7 @@ def check_sky(
 ) -> tuple[str, ...]:
     """Check satellites, ranges and range rates against the reference.
 
-    Args:
-        gnss_log: Raw measurements relative to the origin of the log.
-        time: Times, s, [K].
-        motion: Attitude, velocity and position of the reference, [K, 10].
-        limits: Limits of the platform.
-
-    Returns:
-        Notes.
-
-    Raises:
-        ValueError: If a satellite jumps, or a range or range rate is impossible.
+    Returns notes. Shapes: time [K], motion [K, 10].
     """
     name, names = "pseudorange", gnss_log.names
     # a sphere about the Earth's centre, which lies below the origin of the log

@@ -87,20 +87,7 @@ def resample_log(
 ) -> ResampledLog:
     """Resample a log to filter steps.
 
-    Args:
-        log: Log.
-        interval: Time between used fixes, s.
-        step: Longest step, s.
-        velocity: Whether velocities are required.
-        start: Start, s of the log. None for the start of the data common to IMU and reference.
-        end: End, s of the log. None for the end of the data common to IMU and reference.
-
-    Returns:
-        The log on filter steps.
-
-    Raises:
-        ValueError: If the common time contains fewer than two fixes or no usable one, required
-            velocities are not recorded, or the reference has a gap at the start.
+    Returns the log on filter steps.
     """
     low = max(log.imu.time[0], log.reference.time[0], -np.inf if start is None else start)
     high = min(log.imu.time[-1], log.reference.time[-1], np.inf if end is None else end)
@@ -164,14 +151,7 @@ def select_fixes(time: Array, interval: float, low: float, high: float) -> NDArr
 
     The tolerance is half the median time between recorded fixes.
 
-    Args:
-        time: Times of the fixes, s, [n].
-        interval: Time between selected fixes, s.
-        low: Earliest time, s.
-        high: Latest time, s.
-
-    Returns:
-        Indices of the selected fixes.
+    Returns indices of the selected fixes. Shapes: time [n].
     """
     tolerance = 0.5 * float(np.median(np.diff(time)))
     selection: list[int] = []
@@ -184,12 +164,8 @@ def select_fixes(time: Array, interval: float, low: float, high: float) -> NDArr
 def divide_interval(fixes: Array, step: float) -> tuple[Array, NDArray[np.bool_]]:
     """Divide the time between fixes evenly.
 
-    Args:
-        fixes: Times of the fixes, s, [n].
-        step: Longest step, s.
-
-    Returns:
-        Times from the first to the last fix, s, [T + 1], and a mask of the fixes, [T + 1].
+    Returns times from the first to the last fix, s, [T + 1], and a mask of the fixes, [T + 1].
+    Shapes: fixes [n].
     """
     pieces = np.maximum(1, np.ceil(np.diff(fixes) / step - 1e-6).astype(int))
     ends = np.concatenate([[0], np.cumsum(pieces)])
@@ -203,13 +179,8 @@ def interpolate(motion: ReferenceLog, time: Array) -> Array:
 
     Velocity and position are linear between samples. The attitude follows the shortest rotation.
 
-    Args:
-        motion: Reference.
-        time: Times, s, [T].
-
-    Returns:
-        Attitude, velocity and position, [T, 10]. NaN in a gap of about two sample intervals or
-        more.
+    Returns attitude, velocity and position, [T, 10]. NaN in a gap of about two sample intervals or
+    more. Shapes: time [T].
     """
     longest = 1.9 * float(np.median(np.diff(motion.time)))
     after = np.clip(np.searchsorted(motion.time, time - TIME_TOLERANCE), 1, len(motion.time) - 1)
@@ -237,12 +208,8 @@ def interpolate(motion: ReferenceLog, time: Array) -> Array:
 def split_samples(imu: ImuLog, grid: Array) -> tuple[Array, Array, Array]:
     """Split linearly interpolated IMU samples at grid points.
 
-    Args:
-        imu: IMU samples.
-        grid: Grid points, s, [T + 1].
-
-    Returns:
-        Mean force, m/s^2, and rate, rad/s, of the pieces, [T, S, 3], and their durations, s, [T, S].
+    Returns mean force, m/s^2, and rate, rad/s, of the pieces, [T, S, 3], and their durations, s,
+    [T, S].
     """
     step, durations, mean = list_pieces(imu, grid)
     piece_index = np.arange(len(step)) - np.searchsorted(step, step)
@@ -255,12 +222,7 @@ def split_samples(imu: ImuLog, grid: Array) -> tuple[Array, Array, Array]:
 def list_pieces(imu: ImuLog, grid: Array) -> tuple[NDArray[np.intp], Array, Array]:
     """List the pieces between samples and grid points.
 
-    Args:
-        imu: IMU samples.
-        grid: Grid points, s, [T + 1].
-
-    Returns:
-        Step of each piece, [P], duration, s, [P], mean force, m/s^2, and rate, rad/s, [P, 6].
+    Returns step of each piece, [P], duration, s, [P], mean force, m/s^2, and rate, rad/s, [P, 6].
     """
     inside = imu.time[(imu.time > grid[0]) & (imu.time < grid[-1])]
     nodes = np.union1d(inside, grid)
@@ -339,17 +301,7 @@ def assemble(
 ) -> Episode:
     """Build the episode of runs over resampled logs.
 
-    Args:
-        legs: Resampled logs.
-        time: Times of the steps of the longest log, s, [T].
-        log_index: Index of each run's log, [R].
-        tuning: Parameters that the filter assumes, for the initial errors.
-        receiver: Standard deviations of added errors.
-        noise: Noise regime.
-        draws: Random stream of the runs.
-
-    Returns:
-        Episode with R runs.
+    Returns Episode with R runs. Shapes: time [T], log_index [R].
     """
     t, longest = torch.from_numpy(time), max(legs, key=lambda leg: len(leg.time))
     fix_mask = torch.from_numpy(longest.fix_steps)

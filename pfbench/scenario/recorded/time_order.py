@@ -30,12 +30,7 @@ _FEW_ROWS = 0.01  # share of rows with a wrong time
 def find_order_remedy(time: Array, row: Callable[[int], str]) -> str:
     """Find what makes times increase.
 
-    Args:
-        time: Times that do not increase, [n].
-        row: Describes a row of the file by its index.
-
-    Returns:
-        A sentence. The change that it names was tried on the times.
+    Shapes: time [n].
     """
     back = np.flatnonzero(np.diff(time) < 0.0) + 1
     if not back.size:
@@ -113,13 +108,7 @@ def _longest_part(time: Array) -> tuple[int, int]:
 def find_overlap_remedy(time: Array, reference: Array, name: str) -> str:
     """Find the shift of one table that makes it overlap a second one.
 
-    Args:
-        time: Times of the table, s, [n].
-        reference: Times of the second table, s, [m].
-        name: Name of the table.
-
-    Returns:
-        A sentence. With the shift that it names, the shorter table overlaps by half or more.
+    Shapes: time [n], reference [m].
     """
     distance = 0.5 * float(reference[0] + reference[-1] - time[0] - time[-1])
     shortest = min(time[-1] - time[0], reference[-1] - reference[0])

@@ -105,17 +105,6 @@ def read_motion(folder: str | Path, name: str, origin: Sequence[float]) -> Recor
     forward-right-down axes. North and East of any map grid are accepted. The meridian convergence
     of the grid rotates the track slightly, which does not affect the motion. The height is -pd above
     the height of the origin, not above its tangent plane [ours].
-
-    Args:
-        folder: Folder of the table.
-        name: Name of the table, without .parquet or .csv.
-        origin: lat_deg, lon_deg, h_m of pn = pe = pd = 0.
-
-    Returns:
-        The recorded motion.
-
-    Raises:
-        ValueError: If the table or the origin is invalid.
     """
     if len(origin) != 3 or not abs(origin[0]) <= 89.0:
         raise ValueError(
@@ -155,13 +144,6 @@ def check_single_velocities(table: LogTable, motion: ReferenceLog) -> None:
     The mean of both neighbours is as far from a single outlier as each of them. Smooth motion
     leaves it by half of the change between rows at most, so the limit is half of that of a change:
     5 m/s and 10 g [ours].
-
-    Args:
-        table: Table of the trajectory, for messages.
-        motion: Trajectory.
-
-    Raises:
-        ValueError: If a velocity leaves the mean of its neighbours by more than the limit.
     """
     if len(motion.time) < 3:
         return

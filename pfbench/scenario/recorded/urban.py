@@ -277,12 +277,7 @@ def _check_drive(drive: UrbanLog, tables: tuple[LogTable, LogTable, LogTable]) -
 def rotate_heading(satellite: Array, at: Array) -> Array:
     """Rotate satellites from Earth-fixed axes at transmission to those at reception.
 
-    Args:
-        satellite: Satellite positions, m, [..., 3].
-        at: Position of the receiver, m, [..., 3].
-
-    Returns:
-        Satellite positions, m, [..., 3].
+    Returns satellite positions, m, [..., 3]. Shapes: satellite [..., 3], at [..., 3].
     """
     angle = earth.OMEGA / LIGHT * np.linalg.norm(satellite - at, axis=-1)
     c, s = np.cos(angle), np.sin(angle)
@@ -323,12 +318,7 @@ def select_stretch(drive: UrbanLog, start: float | None, end: float | None) -> U
 def select_epochs(time: Array, interval: float) -> NDArray[np.bool_]:
     """Select epochs at intervals from the first one.
 
-    Args:
-        time: Times of the epochs, s, [T].
-        interval: Time between selected epochs, s.
-
-    Returns:
-        Mask [T] of the first epochs at or after 0, interval, 2 interval, ...
+    Returns mask [T] of the first epochs at or after 0, interval, 2 interval, ... Shapes: time [T].
     """
     count = np.floor((time - time[0] + _SAME_TIME) / interval)
     return np.diff(count, prepend=-1.0) > 0
@@ -351,11 +341,7 @@ def interpolate_reference(drive: UrbanLog) -> dict[str, Tensor]:
 def line_of_sight_directions(drive: UrbanLog) -> dict[str, Tensor]:
     """Compute azimuth and elevation from the start, for the datasheet.
 
-    Args:
-        drive: Drive.
-
-    Returns:
-        Azimuth and elevation, rad, [T - 1, S], without the first epoch, and encoded names.
+    Returns azimuth and elevation, rad, [T - 1, S], without the first epoch, and encoded names.
     """
     origin = torch.from_numpy(drive.position[0])
     positions = torch.from_numpy(
@@ -372,12 +358,7 @@ def line_of_sight_directions(drive: UrbanLog) -> dict[str, Tensor]:
 def reduce_ranges(drive: UrbanLog, clock_drift: float) -> tuple[Tensor, UrbanInputs]:
     """Subtract the ranges from the start and the nominal clock drift.
 
-    Args:
-        drive: Drive.
-        clock_drift: Nominal drift of the receiver clock, m/s.
-
-    Returns:
-        Reduced pseudoranges, m, [T, S], and the inputs of the T - 1 steps.
+    Returns reduced pseudoranges, m, [T, S], and the inputs of the T - 1 steps.
     """
     origin = torch.from_numpy(drive.position[0])
     at = earth.ecef(origin).numpy()

@@ -89,18 +89,7 @@ def fit_clock(
 
     The clock and the inter-system bias are nuisance parameters.
 
-    Args:
-        data: Residuals of a contiguous part of a drive.
-        log_density: Function of errors [n] and unconstrained parameters [k] that returns log
-            densities [n].
-        begin: Initial parameters, [k].
-        knot: Time between the knots of the clock, s.
-
-    Returns:
-        Parameters, [k], and the clock.
-
-    Raises:
-        ValueError: If the search does not converge.
+    Returns parameters, [k], and the clock. Shapes: log_density [n], begin [k].
     """
     t, n = data.time.numpy(), max(2, 1 + round(float(np.ptp(data.time.numpy())) / knot))
     knots = np.linspace(t.min(), t.max(), n)
