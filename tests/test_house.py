@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import json
 import re
 import subprocess
 import sys
@@ -13,6 +14,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import house_figures
+import pytest
 from checkout import ROOT
 
 PACKAGE = ROOT / "pfbench"
@@ -226,6 +229,50 @@ def test_functions_are_short() -> None:
     assert functions == {}
 
 
+def check_figures(figures: house_figures.Figures) -> None:
+    """Compare with the stored figures: none rises, and a fall is stored before the next rise."""
+    stored = json.loads(house_figures.STORED.read_text())["figures"]
+    command = "python tests/house_figures.py --store"
+    assert house_figures.list_rises(figures, stored) == [], (
+        f"name what they bought: {command} --capability NAME"
+    )
+    fallen = [name for name, value in figures.items() if value < 0.98 * stored[name]]
+    assert fallen == [], f"store them: {command}"
+
+
+def test_the_figures_of_the_house_only_fall() -> None:
+    check_figures(house_figures.measure())
+    more = house_figures.measure()
+    more["statements of filter"] += 1
+    with pytest.raises(AssertionError, match="name what they bought"):
+        check_figures(more)
+
+
+@pytest.mark.slow
+def test_a_step_a_run_and_a_report_enter_few_modules() -> None:
+    check_figures(house_figures.measure_reading())
+
+
+def test_the_counts_of_the_house_are_of_statements_and_names() -> None:
+    source = '''"""Text."""
+from typing import NamedTuple
+A, _B = 1, 2
+class C(NamedTuple):
+    """Text."""
+    x: int; y: int
+def f(): return A
+'''
+    tree = ast.parse(source)
+    assert house_figures.count_statements(tree) == 7
+    assert house_figures.public_names(tree) == 3
+    assert house_figures.long_records(tree) == 0
+    fields = "".join(f"    x{k}: int\n" for k in range(13))
+    assert house_figures.long_records(ast.parse(f"class C(NamedTuple):\n{fields}")) == 1
+    imports = "from pfbench import a\ndef f():\n    from pfbench.b import c"
+    known = {"pfbench", "pfbench.a", "pfbench.b", "pfbench.d"}
+    assert house_figures.list_imports(ast.parse(imports), known) == {"pfbench.a", "pfbench.b"}
+
+
 def test_the_command_line_imports_lazily() -> None:
     names = [name for file in (PACKAGE / "cli").glob("*.py") for name in imported_at_import(file)]
     assert not [
@@ -237,9 +284,7 @@ def test_a_report_needs_no_engine() -> None:
     modules = [
         module_name(f)
         for f in FILES
-        if module_name(f).startswith(
-            ("pfbench.report", "pfbench.results", "pfbench.claims", "pfbench.judge")
-        )
+        if module_name(f).startswith(tuple(f"pfbench.{folder}" for folder in STORED))
     ]
     code = (
         f"import sys, {', '.join(modules)}; print([m for m in {NO_ENGINE!r} if m in sys.modules])"
