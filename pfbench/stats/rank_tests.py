@@ -20,7 +20,7 @@ from pfbench.stats.error_measures import Array
 # Wilcoxon's signed-rank test, and Holm's correction.
 
 _SIGNS_ENUMERATED = 13  # tied differences up to which all signs are enumerated, as in scipy
-_EXACT = 50  # untied differences up to which the distribution is exact, as in scipy
+EXACT_DIFFERENCES = 50  # untied differences up to which the distribution is exact, as in scipy
 Alternative = Literal["two-sided", "greater", "less"]
 
 
@@ -81,7 +81,7 @@ def wilcoxon_signed_rank_rows(
     above = np.where(d > 0, ranks, 0.0).sum(axis=1) + half_zero
     below = np.where(d < 0, ranks, 0.0).sum(axis=1) + half_zero
     more, less, two_sided = (np.ones(len(d)) for _ in range(3))
-    exact = ~has_ties & (n <= _EXACT)
+    exact = ~has_ties & (n <= EXACT_DIFFERENCES)
     if exact.any():
         more[exact], less[exact] = _exact_tails(n, above[exact])
     enumerated = has_ties & (n <= _SIGNS_ENUMERATED)
@@ -101,14 +101,14 @@ def wilcoxon_signed_rank_rows(
 
 def _exact_tails(n: int, above: Array) -> tuple[Array, Array]:
     """Return P(T >= above) and P(T <= above) of the rank sum of n untied differences."""
-    cumulative = _rank_sum_cdf(n)
+    cumulative = rank_sum_cdf(n)
     index = np.rint(above).astype(int)  # untied ranks are integers
     # By symmetry, so that small tails are not differences from 1.
     return cumulative[cumulative.size - 1 - index], cumulative[index]
 
 
 @cache
-def _rank_sum_cdf(n: int) -> Array:
+def rank_sum_cdf(n: int) -> Array:
     """Return the distribution function of the positive rank sum of n untied differences."""
     count = np.zeros(n * (n + 1) // 2 + 1, dtype=np.int64)  # at most 2^50: sums are exact
     count[0] = 1

@@ -1,0 +1,284 @@
+"""Whether one filter is better than another: effects of paired losses, and verdicts of a family of them.
+
+All pages decide here. The loss of a run is the logarithm of its error, bounded by the cap of the world: a run
+that is lost costs as much as an error at the cap, and no filter, pair or world leaves a table for one lost run.
+
+A verdict needs two tests that agree: Wilcoxon's signed-rank test, whose estimate is that of Hodges and Lehmann
+and whose interval is printed, and the t test of the trimmed mean. The first asks which filter has the smaller
+error in most runs; with skewed differences it rejects although the means are equal, and the second does not.
+
+References:
+    F. Wilcoxon (1945), Individual comparisons by ranking methods.
+    J. L. Hodges and E. L. Lehmann (1963), Estimates of location based on rank tests.
+    S. Holm (1979), A simple sequentially rejective multiple test procedure.
+    O. Guilbaud (2008), Simultaneous confidence regions corresponding to Holm's step-down procedure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from scipy.special import ndtri, stdtr, stdtrit
+
+from pfbench.stats.effects import LOG_TOLERANCE, MIN_RUNS, trimmed_effects
+from pfbench.stats.error_measures import Array, Flags
+from pfbench.stats.rank_tests import (
+    EXACT_DIFFERENCES,
+    holm,
+    rank_sum_cdf,
+    wilcoxon_signed_rank_rows,
+)
+
+Unit = Literal["run", "block", "world"]
+Word = Literal["better", "worse", "equal", "identical", "not decided"]
+BETTER_THAN: Final = "better"
+WORSE_THAN: Final = "worse"
+EQUAL: Final = "equal"
+SAME_RUNS: Final = "identical"
+NOT_DECIDED: Final = "not decided"
+EQUALITY_MARGIN = math.log(1.05)  # log ratios within it are equal [ours]
+ALPHA = 0.05
+
+
+class Effect(NamedTuple):
+    """Effect of the first filter of a pair against the second.
+
+    Attributes:
+        a: Name of the first filter.
+        b: Name of the second filter.
+        unit: What was drawn independently: a run, a block of time or a world.
+        differences: Log ratios of their losses, [n]; negative where the first filter is better.
+        p: p-value of the signed-rank test, two-sided; 1 without a difference.
+        p_trimmed: p-value of the trimmed mean.
+    """
+
+    a: str
+    b: str
+    unit: Unit
+    differences: Array
+    p: float
+    p_trimmed: float
+
+    @property
+    def location(self) -> float:
+        """Log ratio by Hodges and Lehmann: the median of all means of two differences."""
+        return float(np.median(_pair_means(self.differences)))
+
+    def interval(self, alpha: float) -> tuple[float, float]:
+        """Return the interval of the log ratio that belongs to the signed-rank test."""
+        means = _pair_means(self.differences)
+        k = _count_outside(len(self.differences), alpha)
+        return (float(means[k - 1]), float(means[-k])) if k else (-math.inf, math.inf)
+
+    def trimmed_interval(self, alpha: float) -> tuple[float, float]:
+        """Return the interval of the log ratio that belongs to the trimmed mean."""
+        value, error, df = _trimmed_mean(self.differences)
+        width = stdtrit(df, 1 - alpha / 2) * error
+        return value - width, value + width
+
+
+class Verdict(NamedTuple):
+    """Verdict on a pair, with one interval: the simultaneous one of its family.
+
+    Attributes:
+        a: Name of the first filter.
+        b: Name of the second filter.
+        word: better, worse, equal, identical or not decided, of the first filter.
+        ratio: Error of the first filter divided by that of the second.
+        low: Lower end of the interval of the ratio.
+        high: Upper end.
+        p: p-value of the signed-rank test with Holm's correction.
+        n: Number of runs, blocks or worlds.
+        reason: Why nothing is decided; empty otherwise.
+    """
+
+    a: str
+    b: str
+    word: Word
+    ratio: float
+    low: float
+    high: float
+    p: float
+    n: int
+    reason: str
+
+
+def bound_losses(error: Array, keeps_track: Flags, cap: float) -> Array:
+    """Return the losses of runs: the logarithm of the error, at most that of the cap.
+
+    Args:
+        error: Errors, [...], not negative. NaN and infinity count as the cap.
+        keeps_track: Runs that keep track, [...]. The others count as the cap.
+        cap: Largest error that counts, positive, in the unit of the error.
+
+    Raises:
+        ValueError: If the cap is not a positive number.
+    """
+    if not (cap > 0 and math.isfinite(cap)):
+        raise ValueError(
+            f"cap must be a positive number, got {cap}. State the divergence threshold of the world."
+        )
+    counts = keeps_track & np.isfinite(error)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(np.where(counts, np.minimum(np.abs(error), cap), cap)))
+
+
+def compare(a: tuple[str, Array], b: tuple[str, Array], unit: Unit = "run") -> Effect:
+    """Compare the losses of two filters in the same runs, blocks or worlds.
+
+    Args:
+        a: Name and losses of the first filter, [n].
+        b: Name and losses of the second filter, [n].
+        unit: What was drawn independently.
+
+    Raises:
+        ValueError: If the losses do not belong to the same units.
+    """
+    return compare_all([(a, b)], unit)[0]
+
+
+def compare_all(
+    pairs: Sequence[tuple[tuple[str, Array], tuple[str, Array]]], unit: Unit = "run"
+) -> list[Effect]:
+    """Compare several pairs, those of equal length in one call of the test."""
+    differences = []
+    for (name, first), (other, second) in pairs:
+        if np.shape(first) != np.shape(second) or np.ndim(first) != 1:
+            raise ValueError(
+                f"{name} and {other} must have losses of the same {unit}s, got {np.shape(first)} and "
+                f"{np.shape(second)}. Select common {unit}s."
+            )
+        with np.errstate(invalid="ignore"):
+            d = np.where(np.equal(first, second), 0.0, np.subtract(first, second))
+        differences.append(np.where(np.abs(d) <= LOG_TOLERANCE, 0.0, d))
+    p = np.ones(len(pairs))
+    sizes = np.array([len(d) for d in differences], dtype=int)
+    for size in np.unique(sizes[sizes > 0]):
+        rows = np.flatnonzero(sizes == size)
+        p[rows] = wilcoxon_signed_rank_rows(np.stack([differences[k] for k in rows]))[1]
+    return [
+        Effect(a[0], b[0], unit, d, float(value), _trimmed_p(d))
+        for (a, b), d, value in zip(pairs, differences, p, strict=True)
+    ]
+
+
+def decide(
+    effects: Sequence[Effect], margin: float = EQUALITY_MARGIN, alpha: float = ALPHA
+) -> list[Verdict]:
+    """Decide a family of pairs with Holm's correction.
+
+    Args:
+        effects: Effects of all pairs of the family.
+        margin: Log ratio within which two filters are equal.
+        alpha: Error rate of the family.
+
+    Returns:
+        A verdict for each effect. "better" and "worse" need both tests after Holm's correction; "equal" needs
+        the interval within the margin.
+    """
+    tested = [is_testable(effect) for effect in effects]
+    corrected = np.full((2, len(effects)), np.nan)
+    for row, name in enumerate(("p", "p_trimmed")):
+        values = [getattr(effect, name) for effect, yes in zip(effects, tested, strict=True) if yes]
+        corrected[row, tested] = holm(values)
+    level = alpha / max(sum(tested), 1)
+    return [
+        _decide_one(effect, (p, q), level, margin, alpha)
+        for effect, p, q in zip(effects, *corrected, strict=True)
+    ]
+
+
+def is_testable(effect: Effect) -> bool:
+    """Return whether a pair has enough units, and differences that vary over them."""
+    return len(effect.differences) >= MIN_RUNS and np.ptp(effect.differences) > LOG_TOLERANCE
+
+
+def find_largest_p(effects: Sequence[Effect]) -> float:
+    """Return the largest one-sided p-value of both tests: whether the first filter beats all others.
+
+    The test of the union of the hypotheses needs no correction for their number.
+    """
+    if not effects or not all(map(is_testable, effects)):
+        return 1.0
+    signed = wilcoxon_less([effect.differences for effect in effects])
+    trimmed = [_trimmed_p(effect.differences, "less") for effect in effects]
+    return max(*signed, *trimmed)
+
+
+def wilcoxon_less(differences: Sequence[Array]) -> list[float]:
+    """Return one-sided p-values of signed-rank tests: whether differences lie below 0."""
+    return [float(wilcoxon_signed_rank_rows(d[None], "less")[1][0]) for d in differences]
+
+
+def _decide_one(
+    effect: Effect, p: tuple[float, float], level: float, margin: float, alpha: float
+) -> Verdict:
+    """Decide one pair: `p` has the corrected p-values of both tests."""
+    names, n = (effect.a, effect.b), len(effect.differences)
+    if n == 0:
+        return Verdict(
+            *names, NOT_DECIDED, math.nan, 0.0, math.inf, math.nan, 0, f"no common {effect.unit}s"
+        )
+    if not effect.differences.any():
+        return Verdict(*names, SAME_RUNS, 1.0, 1.0, 1.0, math.nan, n, f"all {effect.unit}s agree")
+    location = effect.location
+    if not is_testable(effect):
+        reason = f"{n} {effect.unit}s, {MIN_RUNS} are required" if n < MIN_RUNS else "no variation"
+        return Verdict(*names, NOT_DECIDED, math.exp(location), 0.0, math.inf, math.nan, n, reason)
+    low, high = effect.interval(level)
+    is_signed, is_trimmed = p[0] < alpha, p[1] < alpha
+    if is_signed:  # the interval that belongs to Holm's test may end at 0
+        low, high = (low, min(high, 0.0)) if location < 0 else (max(low, 0.0), high)
+    else:
+        low, high = min(low, 0.0), max(high, 0.0)
+    trimmed = _trimmed_mean(effect.differences)[0]
+    word: Word = NOT_DECIDED
+    reason = ""
+    if -margin < low and high < margin:
+        word = EQUAL
+    elif is_signed and is_trimmed and trimmed * location > 0:
+        word = BETTER_THAN if location < 0 else WORSE_THAN
+    elif is_signed:
+        reason = "the trimmed mean does not agree"
+    ends = (math.exp(location), math.exp(low), math.exp(high))
+    return Verdict(*names, word, *ends, float(p[0]), n, reason)
+
+
+def _pair_means(d: Array) -> Array:
+    """Return the sorted means of all pairs of differences, each with itself too."""
+    i, j = np.triu_indices(len(d))
+    return np.sort((d[i] + d[j]) / 2)
+
+
+@cache
+def _count_outside(n: int, alpha: float) -> int:
+    """Return the number of means of pairs up to the end of the interval; 0 if it has none."""
+    if n <= EXACT_DIFFERENCES:
+        return int(np.searchsorted(rank_sum_cdf(n), alpha / 2, side="right"))
+    centre, sd = n * (n + 1) / 4, math.sqrt(n * (n + 1) * (2 * n + 1) / 24)
+    return max(int(centre + ndtri(alpha / 2) * sd), 0)
+
+
+def _trimmed_mean(d: Array) -> tuple[float, float, float]:
+    """Return the trimmed mean of differences, its standard error and its degrees of freedom."""
+    effect = trimmed_effects(d)
+    h = int(effect.middle)
+    if h < 2:
+        return float(effect.location), math.inf, 1.0
+    variance = h / (h - 1) * float((effect.parts**2).sum())
+    return float(effect.location), math.sqrt(variance), h - 1.0
+
+
+def _trimmed_p(d: Array, alternative: str = "two-sided") -> float:
+    """Return the p-value of the trimmed mean; 1 where the middle runs do not differ."""
+    if len(d) < 2:
+        return 1.0
+    value, error, df = _trimmed_mean(d)
+    if value == 0:
+        return 1.0
+    t = value / error if error > 0 else math.copysign(math.inf, value)
+    return float(stdtr(df, t)) if alternative == "less" else float(2 * stdtr(df, -abs(t)))

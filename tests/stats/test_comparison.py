@@ -1,0 +1,167 @@
+"""Effects of pairs and verdicts of families, held against scipy and against their error rates."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from pfbench.stats.comparison import (
+    EQUAL,
+    EQUALITY_MARGIN,
+    NOT_DECIDED,
+    SAME_RUNS,
+    WORSE_THAN,
+    bound_losses,
+    compare,
+    compare_all,
+    decide,
+    find_largest_p,
+)
+from pfbench.stats.rank_tests import holm
+
+
+def pair(d: np.ndarray) -> tuple[tuple[str, np.ndarray], tuple[str, np.ndarray]]:
+    return ("a", d), ("b", np.zeros(len(d)))
+
+
+@pytest.mark.parametrize("n", [10, 23, 50, 80])
+def test_p_values_and_intervals_are_those_of_scipy(n: int) -> None:
+    rng = np.random.default_rng(n)
+    d = rng.standard_t(3, n) * 0.3 - 0.1
+    effect = compare(*pair(d))
+    assert effect.p == pytest.approx(stats.wilcoxon(d).pvalue, rel=1e-9 if n <= 50 else 2e-2)
+    i, j = np.triu_indices(n)
+    assert effect.location == np.median((d[i] + d[j]) / 2)
+    low, high = effect.interval(0.05)
+    for end, side in ((low, -1), (high, 1)):  # inversion of the test: just inside and just outside
+        inside, outside = (stats.wilcoxon(d - end + s * 1e-9).pvalue for s in (side, -side))
+        assert min(inside, outside) < 0.05 < max(inside, outside) or n > 50
+    trimmed = effect.trimmed_interval(0.05)
+    keep = np.sort(d)[math.floor(0.2 * n) : n - math.floor(0.2 * n)]
+    value = keep.mean()
+    assert sum(trimmed) / 2 == pytest.approx(value)
+    yuen = stats.ttest_ind(
+        d, np.zeros(n), equal_var=False, trim=0.2
+    )  # all of its error is that of d
+    assert effect.p_trimmed == pytest.approx(yuen.pvalue, rel=1e-6)
+
+
+def test_losses_end_at_the_cap_and_a_lost_run_costs_the_cap() -> None:
+    error = np.array([1.0, 50.0, 1e9, math.nan, 2.0, math.inf])
+    keeps = np.array([True, True, True, True, False, True])
+    loss = np.exp(bound_losses(error, keeps, 100.0))
+    assert loss == pytest.approx([1.0, 50.0, 100.0, 100.0, 100.0, 100.0])
+    assert np.array_equal(
+        bound_losses(error * 1e3, keeps, 100.0)[2:], bound_losses(error, keeps, 100.0)[2:]
+    )
+    for cap in (0.0, math.inf, math.nan):
+        with pytest.raises(ValueError, match="cap must be a positive number"):
+            bound_losses(error, keeps, cap)
+
+
+def test_words_of_clear_cases() -> None:
+    rng = np.random.default_rng(2)
+    x = rng.normal(size=60)
+    half, same = x + 0.1 * rng.normal(size=60) - 0.7, x + 0.004 * rng.normal(size=60)
+    names = {"x": x, "half": half, "same": same, "twin": x}
+    pairs = [("half", "x"), ("x", "half"), ("same", "x"), ("twin", "x")]
+    verdicts = decide(compare_all([((a, names[a]), (b, names[b])) for a, b in pairs]))
+    assert [v.word for v in verdicts] == ["better", "worse", EQUAL, SAME_RUNS]
+    assert verdicts[0].ratio == pytest.approx(0.5, abs=0.02)
+    assert verdicts[0].low < verdicts[0].ratio < verdicts[0].high < 1
+    few = decide([compare(("a", half[:9]), ("b", x[:9]))])[0]
+    assert (few.word, few.reason) == (NOT_DECIDED, "9 runs, 10 are required")
+    constant = decide([compare(("a", x - 1), ("b", x))])[0]
+    assert (constant.word, constant.reason) == (NOT_DECIDED, "no variation")
+    assert decide([compare(("a", x[:0]), ("b", x[:0]))])[0].reason == "no common runs"
+    assert decide([]) == []
+    with pytest.raises(ValueError, match="a and b must have losses of the same runs"):
+        compare(("a", x), ("b", x[:3]))
+
+
+def test_a_verdict_depends_on_other_pairs_by_the_size_of_the_family_only() -> None:
+    rng = np.random.default_rng(3)
+    effects = [compare(*pair(rng.normal(-0.2, 0.3, 40))) for _ in range(5)]
+    alone, more = decide(effects[:1])[0], decide(effects)[0]
+    assert (alone.ratio, alone.n) == (more.ratio, more.n)
+    assert more.low < alone.low < alone.high < more.high
+    assert [v.p for v in decide(effects)] == pytest.approx(holm([e.p for e in effects]))
+
+
+def test_skewed_differences_with_equal_trimmed_means_are_not_decided_by_ranks_alone() -> None:
+    rng = np.random.default_rng(4)
+    d = rng.exponential(size=(400, 100))
+    centre = stats.trim_mean(rng.exponential(size=200_000), 0.2)
+    words = [decide([compare(*pair(row - centre))])[0] for row in d]
+    signed = np.mean([v.p < 0.05 for v in words])
+    decided = np.mean([v.word in ("better", WORSE_THAN) for v in words])
+    assert signed > 0.09  # what the second test is for
+    assert decided < 0.05 + 3 * math.sqrt(0.05 * 0.95 / 400)
+
+
+def test_the_first_filter_beats_all_others_only_if_it_beats_each() -> None:
+    rng = np.random.default_rng(5)
+    best = rng.normal(size=50)
+    worse = [best + rng.normal(0.5, 0.3, 50) for _ in range(3)]
+    all_worse = [compare(("a", best), ("b", other)) for other in worse]
+    assert find_largest_p(all_worse) < 1e-4
+    as_good = compare(("a", best), ("c", best + rng.normal(0, 0.3, 50)))
+    assert find_largest_p([*all_worse, as_good]) > 0.01
+    assert find_largest_p([]) == find_largest_p([compare(("a", best), ("b", best))]) == 1.0
+
+
+def false_words(
+    lost: float, n: int, pairs: int, studies: int, shift: float = 0.0
+) -> dict[str, float]:
+    """Share of studies with a word about filters whose true log ratio is the shift, with shared lost runs."""
+    rng = np.random.default_rng(int(1000 * lost) + n)
+    words: dict[str, int] = {"decided": 0, EQUAL: 0, "uncorrected": 0}
+    for _ in range(studies):
+        base = rng.normal(size=n)
+        hard = rng.uniform(size=n)
+        losses = []
+        for _ in range(pairs + 1):
+            is_lost = rng.uniform(size=n) < lost * 2 * hard
+            error = np.exp(base + 0.3 * rng.standard_t(3, n))
+            losses.append(bound_losses(error, ~is_lost, 30.0))
+        effects = compare_all(
+            [((f"{k}", losses[k + 1] + shift), ("0", losses[0])) for k in range(pairs)]
+        )
+        found = {verdict.word for verdict in decide(effects)}
+        words["decided"] += bool(found & {"better", "worse"})
+        words[EQUAL] += EQUAL in found
+        words["uncorrected"] += any(effect.p < 0.05 for effect in effects)
+    return {word: count / studies for word, count in words.items()}
+
+
+@pytest.mark.parametrize(("lost", "n"), [(0.0, 20), (0.4, 30), (0.1, 100)])
+def test_filters_that_are_alike_are_called_different_at_the_level(lost: float, n: int) -> None:
+    studies = 300
+    rates = false_words(lost, n, 6, studies)
+    bound = 0.05 + 2.5 * math.sqrt(0.05 * 0.95 / studies)
+    assert rates["decided"] <= bound
+    assert rates["uncorrected"] > bound  # the control: without a correction the rate is too large
+
+
+def test_filters_that_differ_by_the_margin_are_called_equal_at_the_level() -> None:
+    studies = 300
+    assert false_words(0.0, 100, 1, studies, EQUALITY_MARGIN)[EQUAL] <= 0.05 + 2.5 * math.sqrt(
+        0.05 * 0.95 / studies
+    )
+    rng = np.random.default_rng(7)  # and it can say so
+    assert decide([compare(*pair(rng.normal(0, 0.1, 300)))])[0].word == EQUAL
+
+
+def test_signed_ranks_of_all_pairs_are_antisymmetric() -> None:
+    rng = np.random.default_rng(6)
+    losses = {name: rng.normal(size=30) for name in "abc"}
+    for a, b in itertools.combinations(losses, 2):
+        one = compare((a, losses[a]), (b, losses[b]))
+        other = compare((b, losses[b]), (a, losses[a]))
+        assert (one.p, one.p_trimmed) == pytest.approx((other.p, other.p_trimmed))
+        assert one.location == pytest.approx(-other.location)
+        assert one.interval(0.1) == pytest.approx(tuple(-x for x in other.interval(0.1)[::-1]))
