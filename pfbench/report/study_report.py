@@ -25,6 +25,8 @@ from pfbench.report.board.pack import StudyFacts, decide_parts
 from pfbench.report.journal.ratio_figures import HEADLINE, write_headline
 from pfbench.report.methods_text import MethodsFacts
 from pfbench.report.options import ReportOptions
+from pfbench.report.overview.page import BOARD_PAGE, write_overview
+from pfbench.report.overview.tables import build_overview, has_overview
 from pfbench.report.papers import figures
 from pfbench.report.provenance import renew_bibliography
 from pfbench.report.study_page import write_page
@@ -97,7 +99,18 @@ def write_report(
         write_page_data(pack, folder)
         write_headline(pack, folder)
         pack["downloads"] += list_figure_files(folder.path)
+        return write_pages(pack, data.table, folder)
+
+
+def write_pages(
+    pack: Mapping[str, Any], table: pd.DataFrame | None, folder: RecordedFolder
+) -> Path:
+    """Write the page of a study; one with several proposed methods in several worlds has a page before it."""
+    facts = StudyFacts.from_pack(pack)
+    if table is None or not has_overview(table, facts.looks):
         return write_page(pack, folder)
+    write_page(pack, folder, BOARD_PAGE)
+    return write_overview(build_overview(table, facts.looks, facts.worlds), pack, folder)
 
 
 def list_job_settings(conditions: Sequence[Condition], planned: int | None) -> list[list[str]]:
@@ -362,6 +375,7 @@ def rebuild_page(folder: Path) -> Path:
     pack, runs = read_page_data(folder), folder / "runs.parquet"
     if has_runs := runs.is_file():
         pack = decide_again(pack, runs)
+    table = pd.read_parquet(runs) if has_runs else None
     pack["bibtex"] = renew_bibliography(pack)
     with RecordedFolder(folder, is_complete=False) as target:
         if has_runs:
@@ -370,4 +384,4 @@ def rebuild_page(folder: Path) -> Path:
         pack["replay_first"] = name_run_command(str(pack["study"]))
         stored = [d for d in pack["downloads"] if (folder / d["href"]).is_file()]
         pack["downloads"] = stored + list_figure_files(folder)
-        return write_page(pack, target)
+        return write_pages(pack, table, target)

@@ -31,12 +31,12 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">", "p", "h")  # of mat
 _COLOUR = re.compile(r"#[0-9a-f]{6}")
 
 # keys of the node by part, each with its requirement
-_TEXTS = ("name", "long_name", "words", "unit", "cite", "family", "tuning")
+_TEXTS = ("name", "long_name", "summary", "words", "unit", "cite", "family", "tuning")
 _KEYS = {
     "scenario": ("name", "words", "unit", "family", "divergence_threshold"),
     "noise": ("name", "words", "family"),
     "filter": (
-        "name", "long_name", "family", "proposed", "colour", "marker", "cite", "baselines",
+        "name", "long_name", "summary", "family", "proposed", "colour", "marker", "cite", "baselines",
         "tuning",
     ),
 }  # fmt: skip

@@ -1,7 +1,7 @@
-"""Whether one filter is better than another: effects of paired losses, and verdicts of a family of them.
+"""Comparison of two filters: the effect on paired losses, and the verdicts on a family of effects.
 
-All pages decide here. The loss of a run is the logarithm of its error, bounded by the cap of the world: a run
-that is lost costs as much as an error at the cap, and no filter, pair or world leaves a table for one lost run.
+All pages decide here. The loss of a run is the logarithm of its error, at most that of the cap of the world. A
+lost run has the loss of the cap, so that no filter, pair or world leaves a table for one lost run.
 
 A verdict needs two tests that agree: Wilcoxon's signed-rank test, whose estimate is that of Hodges and Lehmann
 and whose interval is printed, and the t test of the trimmed mean. The first asks which filter has the smaller
@@ -37,9 +37,9 @@ Unit = Literal["run", "block", "world"]
 Word = Literal["better", "worse", "equal", "identical", "not decided"]
 BETTER_THAN: Final = "better"
 WORSE_THAN: Final = "worse"
-EQUAL: Final = "equal"
+EQUAL_WORD: Final = "equal"
 SAME_RUNS: Final = "identical"
-NOT_DECIDED: Final = "not decided"
+NO_DECISION: Final = "not decided"
 EQUALITY_MARGIN = math.log(1.05)  # log ratios within it are equal [ours]
 ALPHA = 0.05
 
@@ -66,13 +66,16 @@ class Effect(NamedTuple):
     @property
     def location(self) -> float:
         """Log ratio by Hodges and Lehmann: the median of all means of two differences."""
-        return float(np.median(_pair_means(self.differences)))
+        return self.estimate(ALPHA)[0]
 
-    def interval(self, alpha: float) -> tuple[float, float]:
-        """Return the interval of the log ratio that belongs to the signed-rank test."""
-        means = _pair_means(self.differences)
+    def estimate(self, alpha: float) -> tuple[float, float, float]:
+        """Return the log ratio, and the ends of its interval that belongs to the signed-rank test."""
+        i, j = np.triu_indices(len(self.differences))
+        means = np.sort((self.differences[i] + self.differences[j]) / 2)
         k = _count_outside(len(self.differences), alpha)
-        return (float(means[k - 1]), float(means[-k])) if k else (-math.inf, math.inf)
+        low, high = (float(means[k - 1]), float(means[-k])) if k else (-math.inf, math.inf)
+        middle = means[[(len(means) - 1) // 2, len(means) // 2]]
+        return float(middle.mean()), low, high
 
     def trimmed_interval(self, alpha: float) -> tuple[float, float]:
         """Return the interval of the log ratio that belongs to the trimmed mean."""
@@ -146,15 +149,13 @@ def compare_all(
 ) -> list[Effect]:
     """Compare several pairs, those of equal length in one call of the test."""
     differences = []
-    for (name, first), (other, second) in pairs:
+    for (name, first), (name_b, second) in pairs:
         if np.shape(first) != np.shape(second) or np.ndim(first) != 1:
             raise ValueError(
-                f"{name} and {other} must have losses of the same {unit}s, got {np.shape(first)} and "
+                f"{name} and {name_b} must have losses of the same {unit}s, got {np.shape(first)} and "
                 f"{np.shape(second)}. Select common {unit}s."
             )
-        with np.errstate(invalid="ignore"):
-            d = np.where(np.equal(first, second), 0.0, np.subtract(first, second))
-        differences.append(np.where(np.abs(d) <= LOG_TOLERANCE, 0.0, d))
+        differences.append(subtract_losses(first, second))
     p = np.ones(len(pairs))
     sizes = np.array([len(d) for d in differences], dtype=int)
     for size in np.unique(sizes[sizes > 0]):
@@ -180,38 +181,48 @@ def decide(
         A verdict for each effect. "better" and "worse" need both tests after Holm's correction; "equal" needs
         the interval within the margin.
     """
-    tested = [is_testable(effect) for effect in effects]
-    corrected = np.full((2, len(effects)), np.nan)
-    for row, name in enumerate(("p", "p_trimmed")):
-        values = [getattr(effect, name) for effect, yes in zip(effects, tested, strict=True) if yes]
-        corrected[row, tested] = holm(values)
-    level = alpha / max(sum(tested), 1)
+    if not effects:
+        return []
+    tested = [
+        is_testable(effect) for effect in effects
+    ]  # the others cannot be decided, but stay in the family
+    corrected = [
+        holm([getattr(e, name) if yes else 1.0 for e, yes in zip(effects, tested, strict=True)])
+        for name in ("p", "p_trimmed")
+    ]
     return [
-        _decide_one(effect, (p, q), level, margin, alpha)
+        _decide_one(effect, (p, q), alpha / len(effects), margin, alpha)
         for effect, p, q in zip(effects, *corrected, strict=True)
     ]
 
 
 def is_testable(effect: Effect) -> bool:
     """Return whether a pair has enough units, and differences that vary over them."""
-    return len(effect.differences) >= MIN_RUNS and np.ptp(effect.differences) > LOG_TOLERANCE
+    return _varies(effect.differences)
 
 
-def find_largest_p(effects: Sequence[Effect]) -> float:
-    """Return the largest one-sided p-value of both tests: whether the first filter beats all others.
+def find_largest_p(losses: Array, baselines: Sequence[Array]) -> float:
+    """Return the largest one-sided p-value of both tests: whether a filter is better than all others.
 
-    The test of the union of the hypotheses needs no correction for their number.
+    The test of the union of the hypotheses needs no correction for their number. Shapes: losses [n].
     """
-    if not effects or not all(map(is_testable, effects)):
+    differences = [subtract_losses(losses, baseline) for baseline in baselines]
+    if not differences or not all(map(_varies, differences)):
         return 1.0
-    signed = wilcoxon_less([effect.differences for effect in effects])
-    trimmed = [_trimmed_p(effect.differences, "less") for effect in effects]
-    return max(*signed, *trimmed)
+    signed = wilcoxon_signed_rank_rows(np.stack(differences), "less")[1]
+    return max(float(signed.max()), *(_trimmed_p(d, "less") for d in differences))
 
 
-def wilcoxon_less(differences: Sequence[Array]) -> list[float]:
-    """Return one-sided p-values of signed-rank tests: whether differences lie below 0."""
-    return [float(wilcoxon_signed_rank_rows(d[None], "less")[1][0]) for d in differences]
+def subtract_losses(first: Array, second: Array) -> Array:
+    """Return log ratios of losses [n]; those within the stored precision are 0."""
+    with np.errstate(invalid="ignore"):
+        d = np.where(np.equal(first, second), 0.0, np.subtract(first, second))
+    return np.where(np.abs(d) <= LOG_TOLERANCE, 0.0, d)
+
+
+def _varies(d: Array) -> bool:
+    """Return whether there are enough differences, and they are not all equal."""
+    return len(d) >= MIN_RUNS and bool(np.ptp(d) > LOG_TOLERANCE)
 
 
 def _decide_one(
@@ -221,37 +232,30 @@ def _decide_one(
     names, n = (effect.a, effect.b), len(effect.differences)
     if n == 0:
         return Verdict(
-            *names, NOT_DECIDED, math.nan, 0.0, math.inf, math.nan, 0, f"no common {effect.unit}s"
+            *names, NO_DECISION, math.nan, 0.0, math.inf, math.nan, 0, f"no common {effect.unit}s"
         )
     if not effect.differences.any():
         return Verdict(*names, SAME_RUNS, 1.0, 1.0, 1.0, math.nan, n, f"all {effect.unit}s agree")
-    location = effect.location
+    location, low, high = effect.estimate(level)
     if not is_testable(effect):
         reason = f"{n} {effect.unit}s, {MIN_RUNS} are required" if n < MIN_RUNS else "no variation"
-        return Verdict(*names, NOT_DECIDED, math.exp(location), 0.0, math.inf, math.nan, n, reason)
-    low, high = effect.interval(level)
+        return Verdict(*names, NO_DECISION, math.exp(location), 0.0, math.inf, math.nan, n, reason)
     is_signed, is_trimmed = p[0] < alpha, p[1] < alpha
     if is_signed:  # the interval that belongs to Holm's test may end at 0
         low, high = (low, min(high, 0.0)) if location < 0 else (max(low, 0.0), high)
     else:
         low, high = min(low, 0.0), max(high, 0.0)
     trimmed = _trimmed_mean(effect.differences)[0]
-    word: Word = NOT_DECIDED
+    word: Word = NO_DECISION
     reason = ""
     if -margin < low and high < margin:
-        word = EQUAL
+        word = EQUAL_WORD
     elif is_signed and is_trimmed and trimmed * location > 0:
         word = BETTER_THAN if location < 0 else WORSE_THAN
     elif is_signed:
         reason = "the trimmed mean does not agree"
     ends = (math.exp(location), math.exp(low), math.exp(high))
     return Verdict(*names, word, *ends, float(p[0]), n, reason)
-
-
-def _pair_means(d: Array) -> Array:
-    """Return the sorted means of all pairs of differences, each with itself too."""
-    i, j = np.triu_indices(len(d))
-    return np.sort((d[i] + d[j]) / 2)
 
 
 @cache

@@ -36,10 +36,10 @@ _SECTIONS = (
 )  # fmt: skip
 
 
-def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
-    """Write index.html and report.md of a study. Equal packs give equal bytes.
+def write_page(pack: Mapping[str, Any], folder: RecordedFolder, name: str = "index.html") -> Path:
+    """Write the page and report.md of a study. Equal packs give equal bytes.
 
-    Returns path of index.html.
+    Returns path of the page.
     """
     pack = {**dict.fromkeys(_OPTIONAL, ()), **pack}
     pack["budgets"] = offer_budgets(pack)
@@ -72,9 +72,9 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
     html = template_environment(_HERE, is_html=True).get_template("page.html.jinja")
     script_data = {key: value for key, value in pack.items() if key not in _STATIC}
     data = encode_pack(script_data, PAGE_BYTES - len(html.render(context).encode()))
-    folder.write("index.html", html.render({**context, "data": Markup(data)}))
+    folder.write(name, html.render({**context, "data": Markup(data)}))
     write_markdown(pack, folder)
-    return folder.path / "index.html"
+    return folder.path / name
 
 
 def write_markdown(pack: Mapping[str, Any], folder: RecordedFolder) -> None:

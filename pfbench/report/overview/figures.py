@@ -1,0 +1,315 @@
+"""Figures of the first page, drawn by seaborn: worlds by methods, and methods against each other.
+
+Each is drawn for a page, for a telephone and for a column of a journal, never scaled.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from pfbench.report.overview.tables import Overview, WorldRow
+from pfbench.results.plotting import RC
+from pfbench.stats.world_table import WorldResult, count_wins
+
+BLUE, ORANGE, GREY, INK = "#2166ac", "#c4561a", "#d4d4d4", "#1b1b1b"
+_SCALE = math.log(3.0)  # log ratio of the strongest colour
+_DPI = 96  # a pixel of CSS
+GROUPS = {
+    True: "Worlds that Kalman filters fit",
+    False: "Worlds that they do not fit",
+    None: "Worlds",
+}
+
+_KEY = (
+    (BLUE, "smaller error"), (ORANGE, "larger error"), ("white", "not decided; = within 5 %"),
+    (GREY, "loses track (runs kept)"),
+)  # fmt: skip
+
+
+class Format(NamedTuple):
+    """Size of a figure.
+
+    Attributes:
+        name: Suffix of its files.
+        width: Width [px].
+        font: Size of text [pt].
+        row: Height of a row [px].
+        label_width: Width of the names of rows [px].
+        note_width: Width of the notes at the right [px]; 0 for none.
+        top: Height of the names of columns [px].
+    """
+
+    name: str
+    width: int
+    font: float
+    row: int
+    label_width: int
+    note_width: int
+    top: int
+
+
+HEAT_FORMATS = (
+    Format("", 860, 7.6, 30, 208, 178, 104),
+    Format("_390", 374, 6.6, 27, 96, 34, 92),
+    Format("_column", 336, 6.5, 19, 88, 34, 84),
+)
+MATRIX_FORMATS = (
+    Format("", 520, 7.4, 27, 122, 56, 88),
+    Format("_390", 374, 6.6, 27, 104, 40, 84),
+    Format("_column", 336, 6.5, 19, 96, 34, 80),
+)
+
+
+def palette() -> Colormap:
+    """Return the colours from better to worse."""
+    import seaborn  # takes a second
+
+    colours: Colormap = seaborn.color_palette(
+        f"blend:{BLUE},#a9cde6,#fbfbfb,#f3b98f,{ORANGE}", as_cmap=True
+    )
+    return colours
+
+
+def draw_heat_map(overview: Overview, size: Format) -> Figure:
+    """Draw the ratio of each method to the reference of each world.
+
+    Colour marks what is decided, a grey ground a filter that loses track, = equality within 5 %.
+    """
+    columns = list(overview.methods) if size.name else [*overview.methods, *overview.conventional]
+    names = [overview.names[label] for label in columns]
+    table = {(cell.world, cell.filter): cell for cell in overview.cells}
+    groups = group_worlds(overview)
+    foot = size.row * (1 if size.width > 600 else 2)
+    with matplotlib.rc_context({**RC, "font.size": size.font, "axes.grid": False}):
+        figure, panels = _lay_out(size, [(title, len(rows)) for title, rows in groups], foot)
+        for axes, (_, worlds) in zip(panels, groups, strict=True):
+            cells = [[_cell(table, w, label, overview) for label in columns] for w in worlds]
+            values = np.array([[cell.value for cell in row] for row in cells])
+            _draw_grid(axes, values, _SCALE, palette(), np.isnan(values))
+            _fill_cells(axes, cells, size)
+            axes.set_yticks(np.arange(len(worlds)) + 0.5, [_short(w.name, size) for w in worlds])
+            if not size.name:
+                _name_references(axes, worlds, len(columns), size)
+        if panels:
+            _name_columns(panels[0], names, len(overview.methods), size)
+        _draw_key(figure, size, foot)
+    return figure
+
+
+def draw_matrices(overview: Overview, size: Format) -> Figure:
+    """Draw in how many worlds the method of a row is better and worse than that of a column, by group of worlds."""
+    methods = overview.methods
+    names = [overview.names[method] for method in methods]
+    groups = group_worlds(overview)
+    with matplotlib.rc_context({**RC, "font.size": size.font, "axes.grid": False}):
+        rows = [(f"{title} ({len(worlds)})", len(methods)) for title, worlds in groups]
+        figure, panels = _lay_out(size, rows, 8)
+        for axes, (_, worlds) in zip(panels, groups, strict=True):
+            wins = count_wins(overview.pairs, [world.key for world in worlds])
+            balance = np.array([[wins[a, b] - wins[b, a] for b in methods] for a in methods])
+            texts = [
+                [_count_text(wins[a, b], wins[b, a], a == b) for b in methods] for a in methods
+            ]
+            colours = palette().reversed()
+            _draw_grid(axes, balance, len(worlds), colours, np.eye(len(methods), dtype=bool))
+            _fill_counts(axes, texts, colours(Normalize(-len(worlds), len(worlds))(balance)), size)
+            axes.set_yticks(np.arange(len(methods)) + 0.5, names)
+        if panels:
+            _name_columns(panels[0], names, len(methods), size)
+    return figure
+
+
+def group_worlds(overview: Overview) -> list[tuple[str, list[WorldRow]]]:
+    """Return the worlds by title: those that Kalman filters fit, those that they do not fit, and others."""
+    groups = [(GROUPS[k], [w for w in overview.worlds if w.kalman_fits is k]) for k in GROUPS]
+    return [(title, worlds) for title, worlds in groups if worlds]
+
+
+def _lay_out(
+    size: Format, groups: Sequence[tuple[str, int]], foot: int
+) -> tuple[Figure, list[Axes]]:
+    """Return a figure with titles and axes of groups of rows, one below the other."""
+    gap = _gap(size)
+    height = size.top + sum(gap + rows * size.row for _, rows in groups) + foot
+    figure = Figure(figsize=(size.width / _DPI, height / _DPI), dpi=_DPI)
+    across, y, panels = size.width - size.label_width - size.note_width, size.top, []
+    for title, rows in groups:
+        middle = 1 - (y + 0.55 * gap) / height
+        figure.text(4 / size.width, middle, title, color="#555555", weight="bold", va="center")
+        y += gap + rows * size.row
+        box = (
+            size.label_width / size.width,
+            1 - y / height,
+            across / size.width,
+            rows * size.row / height,
+        )
+        panels.append(figure.add_axes(box))
+    return figure, panels
+
+
+def _gap(size: Format) -> int:
+    """Return the height of the title of a group of rows."""
+    return round(0.85 * size.row)
+
+
+def _draw_grid(
+    axes: Axes, values: np.ndarray, scale: float, colours: Colormap, mask: np.ndarray
+) -> None:
+    """Draw coloured cells without axes."""
+    import seaborn
+
+    seaborn.heatmap(
+        values, ax=axes, cmap=colours, vmin=-scale, vmax=scale, cbar=False, linewidths=1.2, linecolor="white",
+        mask=mask, xticklabels=False, yticklabels=False,
+    )  # fmt: skip
+    axes.set_facecolor("#ececec")
+    axes.set(xlabel="", ylabel="")
+    axes.tick_params(length=0, pad=3)
+
+
+def to_svg(figure: Figure) -> str:
+    """Return a figure as SVG, equal for equal figures."""
+    buffer = io.StringIO()
+    with matplotlib.rc_context(RC):
+        figure.savefig(buffer, format="svg", dpi=_DPI, metadata={"Date": None, "Creator": None})
+    return buffer.getvalue()
+
+
+class _Drawn(NamedTuple):
+    """Text, log ratio of the colour (NaN for none), and look of a cell."""
+
+    text: str
+    value: float = math.nan
+    is_grey: bool = False
+    is_strong: bool = False
+
+
+def _cell(
+    table: Mapping[tuple[str, str], WorldResult], world: WorldRow, label: str, overview: Overview
+) -> _Drawn:
+    """Return how a cell is drawn."""
+    cell = table.get((world.key, label))
+    if cell is None:
+        return _Drawn("1" if world.reference == overview.names[label] else "–")
+    if cell.loses_track:
+        return _Drawn(f"{100 * cell.track_share:.0f} %", is_grey=True)
+    word, ratio = cell.verdict.word, cell.verdict.ratio
+    if word in ("equal", "identical"):
+        return _Drawn("=")
+    star = any(w.wins for w in overview.winners if (w.world, w.filter) == (world.key, label))
+    text = f"{format_ratio(ratio)}{'☆' if star else ''}"
+    if word == "not decided":
+        return _Drawn(text)
+    return _Drawn(text, math.log(ratio), is_strong=word == "better")
+
+
+def format_ratio(value: float) -> str:
+    """Format a ratio of errors in few letters."""
+    if value >= 9.95:
+        return f"{value:.0f}"
+    return f"{value:.2f}" if value < 1.995 else f"{value:.1f}"
+
+
+def _fill_cells(axes: Axes, cells: Sequence[Sequence[_Drawn]], size: Format) -> None:
+    """Write the text of each cell, and draw those without a colour."""
+    colours, norm = palette(), Normalize(-_SCALE, _SCALE)
+    for i, row in enumerate(cells):
+        for j, cell in enumerate(row):
+            is_decided = not math.isnan(cell.value)
+            ground = colours(norm(cell.value)) if is_decided else (1.0, 1.0, 1.0)
+            if not is_decided:
+                face = GREY if cell.is_grey else "white"
+                axes.add_patch(
+                    Rectangle((j + 0.03, i + 0.04), 0.94, 0.92, fc=face, ec="#dcdcdc", lw=0.6)
+                )
+            ink = choose_ink(ground) if is_decided else "#444444" if cell.is_grey else "#6a6a6a"
+            axes.text(
+                j + 0.5, i + 0.5, cell.text, ha="center", va="center", color=ink, fontsize=size.font,
+                weight="bold" if cell.is_strong else "normal", style="italic" if cell.is_grey else "normal",
+            )  # fmt: skip
+
+
+def choose_ink(ground: Sequence[float]) -> str:
+    """Return white or black, whichever has the larger contrast on a ground: at least 4.5 (WCAG)."""
+    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in ground[:3]]
+    luminance = float(np.dot((0.2126, 0.7152, 0.0722), linear))
+    return "white" if 1.05 / (luminance + 0.05) > (luminance + 0.05) / 0.05 else "#000000"
+
+
+def _count_text(wins: int, losses: int, is_same: bool) -> str:
+    """Return the text of a cell of a matrix."""
+    if is_same:
+        return ""
+    return f"{wins}–{losses}" if wins or losses else "·"
+
+
+def _fill_counts(
+    axes: Axes, texts: Sequence[Sequence[str]], grounds: np.ndarray, size: Format
+) -> None:
+    """Write the counts of wins into the cells of a matrix."""
+    for i, row in enumerate(texts):
+        for j, text in enumerate(row):
+            axes.text(
+                j + 0.5, i + 0.5, text, ha="center", va="center", color=choose_ink(grounds[i, j]), fontsize=size.font
+            )  # fmt: skip
+
+
+def _name_columns(axes: Axes, names: Sequence[str], methods: int, size: Format) -> None:
+    """Write the names of columns above the axes and their title, those of the methods in bold."""
+    y = -0.12 - _gap(size) / size.row
+    for j, name in enumerate(names):
+        axes.text(
+            j + 0.4, y, name, rotation=42, rotation_mode="anchor", ha="left", va="bottom", fontsize=size.font,
+            color=INK if j < methods else "#555555", weight="bold" if j < methods < len(names) else "normal",
+        )  # fmt: skip
+
+
+def _name_references(axes: Axes, worlds: Sequence[WorldRow], columns: int, size: Format) -> None:
+    """Write the reference of each world and its error at the right of the row."""
+    for i, world in enumerate(worlds):
+        text = f"1 = {world.reference}, {format_reference_error(world.level, world.unit)}"
+        axes.text(
+            columns + 0.2, i + 0.5, text, va="center", fontsize=0.9 * size.font, color="#555555"
+        )
+
+
+def format_reference_error(value: float, unit: str) -> str:
+    """Format an error with its unit."""
+    if unit == "m" and value >= 1000:
+        return f"{value / 1000:.1f} km"
+    return f"{value:.0f} {unit}".strip() if value >= 10 else f"{value:.2g} {unit}".strip()
+
+
+def _draw_key(figure: Figure, size: Format, foot: int) -> None:
+    """Draw the key of the colours below the map."""
+    height = figure.get_size_inches()[1] * _DPI
+    in_row = 4 if size.width > 600 else 2
+    side = 0.36 * size.row
+    for k, (colour, text) in enumerate(_KEY):
+        x = 6 + (k % in_row) * (size.width - 12) / in_row
+        y = foot - 6 - (k // in_row) * 0.62 * size.row
+        figure.add_artist(Rectangle(
+            (x / size.width, (y - side) / height), side / size.width, side / height,
+            fc=colour, ec="#999999", lw=0.6, transform=figure.transFigure,
+        ))  # fmt: skip
+        position = ((x + side + 5) / size.width, (y - side / 2) / height)
+        figure.text(*position, text, va="center", fontsize=0.9 * size.font, color="#444444")
+
+
+def _short(name: str, size: Format) -> str:
+    """Break a long name of a world into two lines where the figure is narrow."""
+    limit = 34 if size.width > 600 else 17
+    if len(name) <= limit:
+        return name
+    space = name.rfind(" ", 0, limit)
+    return f"{name[:space]}\n{name[space + 1 :]}" if space > 0 else name

@@ -1,0 +1,127 @@
+"""Writer of the first page of a study: index.html with its figures, report.md, and the tables as CSV."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from markupsafe import Markup
+
+from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.overview import figures
+from pfbench.report.overview.tables import Overview, tell_story
+from pfbench.report.writers import format_csv, template_environment
+from pfbench.results.conditions import parse_label
+from pfbench.results.paper_block import read_paper_block
+
+BOARD_PAGE = "worlds.html"  # the page of each world, which is the first page of other studies
+_HERE = Path(__file__).parent
+_NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+
+
+def write_overview(overview: Overview, pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
+    """Write the first page of a study: index.html, report.md, heat_map.svg, matrices.svg, cells.csv and pairs.csv.
+
+    Returns path of index.html.
+    """
+    pictures = {
+        **{f"heat_map{f.name}": figures.to_svg(figures.draw_heat_map(overview, f)) for f in figures.HEAT_FORMATS},
+        **{f"matrices{f.name}": figures.to_svg(figures.draw_matrices(overview, f)) for f in figures.MATRIX_FORMATS},
+    }  # fmt: skip
+    for name, text in pictures.items():
+        if not name.endswith("_390"):
+            folder.write(f"{name}.svg", text)
+    folder.write("cells.csv", format_csv(list_verdicts(overview)))
+    folder.write("pairs.csv", format_csv(list_comparisons(overview)))
+    context = {
+        "pack": pack,
+        "overview": overview,
+        "headline": word_headline(overview),
+        "setting": describe_setting(overview),
+        "stories": [tell_story(overview, m, _summary(m)) for m in overview.methods],
+        "count": spell_number(len(overview.methods)),
+        "pictures": {name: Markup(_data_address(text)) for name, text in pictures.items()},
+        "decided": sum(pair.verdict.word in ("better", "worse") for pair in overview.pairs),
+        "board": BOARD_PAGE,
+        "css": Markup(
+            "\n".join(
+                path.read_text(encoding="utf-8")
+                for path in (_HERE.parent / "style.css", _HERE / "page.css")
+            )
+        ),
+    }
+    for kind, name in (("html", "index.html"), ("md", "report.md")):
+        environment = template_environment(_HERE, is_html=kind == "html")
+        folder.write(name, environment.get_template(f"page.{kind}.jinja").render(context))
+    return folder.path / "index.html"
+
+
+def word_headline(overview: Overview) -> str:
+    """Word the two sentences that open the page, at most 55 words."""
+    worlds = {world.key: world.name for world in overview.worlds}
+    winners = [winner for winner in overview.winners if winner.wins]
+    if winners:
+        wins = [f"{overview.names[w.filter]} ({worlds[w.world]})" for w in winners[:3]]
+        more = f" and {len(winners) - 3} more" if len(winners) > 3 else ""
+        first = f"Better than every conventional filter with as many particles: {', '.join(wins)}{more}."
+    else:
+        methods = spell_number(len(overview.methods))
+        first = f"None of the {methods} is shown to be better than every conventional filter in any of {len(worlds)} worlds."
+    cells = [cell for cell in overview.cells if cell.filter in overview.methods]
+    words = [cell.verdict.word for cell in cells]
+    lost = sum(cell.loses_track for cell in cells)
+    second = (
+        f"Against the best Kalman filter of each world they are better in {words.count('better')} of {len(cells)} cells, "
+        f"equal in {words.count('equal') + words.count('identical')} and worse in {words.count('worse')}"
+    )
+    return f"{first} {second}" + (f"; in {lost} they lose track." if lost else ".")
+
+
+def describe_setting(overview: Overview) -> str:
+    """Describe worlds, runs and losses in a line."""
+    runs = sorted({world.runs for world in overview.worlds})
+    counts = f"{runs[0]}" if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
+    return (
+        f"{len(overview.worlds)} worlds · {counts} paired runs each · a lost run counts as an error at the track limit · "
+        "the reference of a world was chosen on another seed"
+    )
+
+
+def spell_number(number: int) -> str:
+    """Return a small number in letters."""
+    return _NUMBERS[number] if number < len(_NUMBERS) else str(number)
+
+
+def list_verdicts(overview: Overview) -> pd.DataFrame:
+    """List the filters against the reference of each world."""
+    references = {world.key: world.reference for world in overview.worlds}
+    winners = {(w.world, w.filter): w for w in overview.winners}
+    rows: list[dict[str, Any]] = []
+    for cell in overview.cells:
+        winner = winners.get((cell.world, cell.filter))
+        verdict = {k: v for k, v in cell.verdict._asdict().items() if k not in ("a", "b")}
+        rows.append({
+            "world": cell.world, "filter": cell.filter, "reference": references[cell.world], **verdict,
+            "track_share": cell.track_share, "loses_track": cell.loses_track,
+            "p_every_baseline": winner.p if winner else "", "is_winner": winner.wins if winner else "",
+            "ms_per_step": overview.times.get((cell.world, cell.filter), ""),
+        })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def list_comparisons(overview: Overview) -> pd.DataFrame:
+    """List all pairs of methods in each world."""
+    return pd.DataFrame([{"world": p.world, **p.verdict._asdict()} for p in overview.pairs])
+
+
+def _summary(label: str) -> str:
+    """Return the line of a method that its file states."""
+    return str(read_paper_block("filter", parse_label(label)[0]).get("summary", ""))
+
+
+def _data_address(svg: str) -> str:
+    """Return a picture as an address, for a page of one file."""
+    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()

@@ -1,0 +1,252 @@
+"""Tables of the first page: worlds, cells, pairs, winners and ranks, decided once from the table of runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from pfbench.results.conditions import parse_label
+from pfbench.results.looks import MethodLook, PartName
+from pfbench.results.paper_block import conf_dir
+from pfbench.stats.world_table import (
+    MeanRanks,
+    Winner,
+    World,
+    WorldPair,
+    WorldResult,
+    build_world,
+    compare_methods,
+    decide_cells,
+    find_winners,
+    rank_methods,
+)
+
+FEWEST_METHODS, FEWEST_WORLDS = 3, 2  # from which a study has this page
+CENTRAL = "nominal"  # regime of the page, if a world has several
+CONVENTIONAL = (
+    "sir",
+    "rpf",
+    "ekf_bank",
+    "gpf",
+)  # conventional filters that stand next to the methods
+_FAMILIES = ("particle", "guided", "swarm", "gaussian", "learned", "kalman", "")
+
+
+class WorldRow(NamedTuple):
+    """A world of the page.
+
+    Attributes:
+        key: Name of the scenario, with its model if the study has several.
+        name: Name for a reader.
+        reference: Name of the conventional filter that is best on the seed of the tuning.
+        level: Error of the reference, geometric mean over runs with lost runs at the cap.
+        unit: Unit of the error.
+        runs: Number of runs.
+        kalman_fits: Whether Kalman filters fit the world; None without a tuning.
+    """
+
+    key: str
+    name: str
+    reference: str
+    level: float
+    unit: str
+    runs: int
+    kalman_fits: bool | None
+
+
+class Overview(NamedTuple):
+    """All that the first page shows.
+
+    Attributes:
+        worlds: Worlds, those that Kalman filters fit first.
+        methods: Proposed methods, in the order of the page.
+        conventional: Conventional filters that stand next to them.
+        names: Names of all filters.
+        cells: Methods and conventional filters against the reference of each world.
+        pairs: All pairs of methods in each world.
+        winners: Methods that are better than every conventional filter of a world.
+        ranks: Mean ranks over the worlds.
+        times: Median time of a step [ms] by world and filter.
+        left_out: Worlds that are not on the page, with the reason.
+    """
+
+    worlds: tuple[WorldRow, ...]
+    methods: tuple[str, ...]
+    conventional: tuple[str, ...]
+    names: Mapping[str, str]
+    cells: Sequence[WorldResult]
+    pairs: Sequence[WorldPair]
+    winners: Sequence[Winner]
+    ranks: MeanRanks
+    times: Mapping[tuple[str, str], float]
+    left_out: Mapping[str, str]
+
+
+class WorldFacts(NamedTuple):
+    """Facts of a world that the file of its tuning states, from another seed than that of a study.
+
+    Attributes:
+        reference: Best conventional filter.
+        kalman_fits: Whether Kalman filters fit the world; None if it is not known.
+        cap: Largest error that counts; NaN if it is not stated.
+    """
+
+    reference: str
+    kalman_fits: bool | None
+    cap: float
+
+
+@cache
+def read_world_facts(scenario: str, model: str) -> WorldFacts | None:
+    """Read the facts of a world from the installed files of tunings, the nominal regime first; None without one."""
+    candidates: list[tuple[bool, WorldFacts]] = []
+    for path in sorted(Path(conf_dir() / "tuned").glob("*.yaml")):
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        world = content.get("world") or {}
+        if (world.get("scenario"), world.get("model")) == (scenario, model) and content.get("best"):
+            cap = float((content.get("fit") or {}).get("cap", math.nan))
+            facts = WorldFacts(str(content["best"]), content.get("kalman_fits"), cap)
+            candidates.append((world.get("regimes") != [CENTRAL], facts))
+    return min(candidates, key=lambda item: item[0])[1] if candidates else None
+
+
+def has_overview(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> bool:
+    """Return whether a study has several proposed methods in several worlds."""
+    methods = [label for label in looks if looks[label].proposed]
+    return len(methods) >= FEWEST_METHODS and table["scenario"].nunique() >= FEWEST_WORLDS
+
+
+def build_overview(
+    table: pd.DataFrame, looks: Mapping[str, MethodLook], parts: Mapping[str, PartName]
+) -> Overview:
+    """Decide all that the first page shows.
+
+    Returns tables of one study. A world without a stated reference, or without runs of it, is left out with the
+    reason.
+    """
+    methods = order_methods([label for label in looks if looks[label].proposed], looks)
+    by_name = {parse_label(label)[0]: label for label in looks}
+    conventional = tuple(
+        by_name[name] for name in CONVENTIONAL if name in by_name and name not in methods
+    )
+    worlds, rows, left_out = [], [], {}
+    for key, group in table.groupby("scenario", observed=True, sort=False):
+        try:
+            world = _build_world(central_rows(group), parts[str(key)], by_name)
+        except ValueError as error:
+            left_out[parts[str(key)].name] = str(error)
+            continue
+        worlds.append(world)
+        rows.append(_describe_world(world, parts[str(key)], looks))
+    order = sorted(range(len(worlds)), key=lambda k: worlds[k].kalman_fits is False)
+    worlds, rows = [worlds[k] for k in order], [rows[k] for k in order]
+    baselines = [label for label in looks if label not in methods]
+    return Overview(
+        tuple(rows), methods, conventional, {label: look.name for label, look in looks.items()},
+        decide_cells(worlds, [*methods, *conventional]), compare_methods(worlds, methods),
+        find_winners(worlds, methods, baselines), rank_methods(worlds, methods),
+        _list_times(table, [row.key for row in rows]), left_out,
+    )  # fmt: skip
+
+
+def order_methods(labels: Sequence[str], looks: Mapping[str, MethodLook]) -> tuple[str, ...]:
+    """Order methods: those of particles first, those of one Gaussian last."""
+    return tuple(sorted(labels, key=lambda label: _FAMILIES.index(looks[label].family)))
+
+
+def central_rows(rows: pd.DataFrame) -> pd.DataFrame:
+    """Select the central noise regime of a world."""
+    regimes: Collection[str] = rows["regime"].unique()
+    return rows[rows["regime"] == (CENTRAL if CENTRAL in regimes else next(iter(regimes)))]
+
+
+def _build_world(rows: pd.DataFrame, name: PartName, labels: Mapping[str, str]) -> World:
+    """Build a world with the reference and the cap that its tuning states."""
+    models = rows["model"].unique() if "model" in rows else [""]
+    facts = read_world_facts(name.key, str(models[0]))
+    if facts is None:
+        raise ValueError(
+            f"tuned must have a file of scenario={name.key} with model={models[0]}, got none. "
+            f"Run pfbench tune scenario={name.key} model={models[0]}."
+        )
+    cap = name.limit if name.limit else facts.cap
+    return build_world(
+        rows, labels.get(facts.reference, facts.reference), float(cap), facts.kalman_fits
+    )
+
+
+def _describe_world(world: World, name: PartName, looks: Mapping[str, MethodLook]) -> WorldRow:
+    """Return the row of a world."""
+    losses = world.losses[world.reference]
+    return WorldRow(
+        world.name, name.name, looks[world.reference].name, float(np.exp(losses.mean())), name.unit,
+        len(losses), world.kalman_fits,
+    )  # fmt: skip
+
+
+def _list_times(table: pd.DataFrame, worlds: Sequence[str]) -> dict[tuple[str, str], float]:
+    """List the times of a step by world and filter."""
+    selected = table[table["scenario"].isin(list(worlds))]
+    groups = selected.groupby(["scenario", "filter"], observed=True)
+    return {(str(key[0]), str(key[1])): float(rows["ms"].median()) for key, rows in groups}
+
+
+def tell_story(overview: Overview, method: str, summary: str) -> dict[str, str]:
+    """Return what a method is, where it wins and loses, and the time of its step, with numbers from the tables."""
+    cells = [cell for cell in overview.cells if cell.filter == method]
+    names = {world.key: world.name for world in overview.worlds}
+    lost = [names[c.world] for c in cells if c.loses_track]
+    by_word: dict[str, list[WorldResult]] = {
+        "better": [],
+        "worse": [],
+        "equal": [],
+        "identical": [],
+    }
+    for cell in cells:
+        if not cell.loses_track:
+            by_word.setdefault(cell.verdict.word, []).append(cell)
+    better = sorted(by_word["better"], key=lambda c: c.verdict.ratio)
+    worse = sorted(by_word["worse"], key=lambda c: -c.verdict.ratio)
+    losses = [_join([f"{names[c.world]} {c.verdict.ratio:.2f}" for c in worse])]
+    losses += [f"loses track in {_join(lost)}"] * bool(lost)
+    return {
+        "name": overview.names[method],
+        "is": summary,
+        "wins": _join([f"{names[c.world]} {c.verdict.ratio:.2f}" for c in better]) or "None shown.",
+        "equal": _join([names[c.world] for c in (*by_word["equal"], *by_word["identical"])]) or "–",
+        "loses": ". ".join(filter(None, losses)) or "None shown.",
+        "time": format_times(overview, method),
+    }
+
+
+def format_times(overview: Overview, method: str) -> str:
+    """Return the range over worlds of the time of a step, relative to that of the reference of the world."""
+    labels = {name: label for label, name in overview.names.items()}
+    ratios = [
+        overview.times[world.key, method] / overview.times[world.key, labels[world.reference]]
+        for world in overview.worlds
+        if (world.key, method) in overview.times
+    ]
+    finite = [ratio for ratio in ratios if np.isfinite(ratio)]
+    if not finite:
+        return "–"
+    low, high = (format_factor(value) for value in (min(finite), max(finite)))
+    return low if low == high else f"{low} to {high}"
+
+
+def format_factor(value: float) -> str:
+    """Format a factor with two digits."""
+    return f"{value:.0f}" if value >= 9.95 else f"{value:.2g}"
+
+
+def _join(items: Sequence[str], most: int = 3) -> str:
+    """Join items, and count those after the first ones."""
+    more = len(items) - most
+    return "; ".join(items[:most]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,315 @@
+"""The first page of a study of methods in worlds: held against scipy, and against what it must not depend on."""
+
+from __future__ import annotations
+
+import math
+import re
+import subprocess
+import sys
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from checkout import ROOT
+from scipy import stats
+
+from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.overview import figures
+from pfbench.report.overview.page import list_verdicts, word_headline, write_overview
+from pfbench.report.overview.tables import (
+    Overview,
+    build_overview,
+    central_rows,
+    has_overview,
+    read_world_facts,
+    tell_story,
+)
+from pfbench.results.looks import MethodLook, PartName, find_looks
+from pfbench.stats.world_table import (
+    SHARED_SEEDS,
+    World,
+    build_world,
+    compare_methods,
+    decide_cells,
+    find_winners,
+    rank_methods,
+)
+
+RUNS = ROOT / "tests" / "all_seven_runs.parquet"
+WORLDS = ("azimuth", "passive_1", "sar_flight_short")
+MODELS = {
+    "azimuth": "sins_gps_azimuth",
+    "passive_1": "passive_location",
+    "sar_flight_short": "sins_sar",
+}
+
+
+@pytest.fixture(scope="module")
+def table() -> pd.DataFrame:
+    runs = pd.read_parquet(RUNS)
+    runs = runs[runs["scenario"].isin(WORLDS) & (runs["regime"] == "nominal")]
+    runs = runs.astype(dict.fromkeys(("scenario", "filter", "regime"), "str"))
+    return runs.assign(model=runs["scenario"].map(MODELS))
+
+
+@pytest.fixture(scope="module")
+def looks(table: pd.DataFrame) -> dict[str, MethodLook]:
+    return find_looks(sorted(table["filter"].unique()))
+
+
+@pytest.fixture(scope="module")
+def parts(table: pd.DataFrame) -> dict[str, PartName]:
+    limits = table.groupby("scenario")["threshold"].first()
+    return {key: PartName(key, key, key, "m", float(limits[key])) for key in WORLDS}
+
+
+@pytest.fixture(scope="module")
+def overview(
+    table: pd.DataFrame, looks: dict[str, MethodLook], parts: dict[str, PartName]
+) -> Overview:
+    return build_overview(table, looks, parts)
+
+
+def losses(table: pd.DataFrame, world: str, label: str) -> np.ndarray:
+    rows = table[(table["scenario"] == world) & (table["filter"] == label)].sort_values("run")
+    cap = float(rows["threshold"].iloc[0])
+    kept = rows["keeps_track"].to_numpy(bool)
+    return np.log(np.where(kept, np.minimum(rows["rmse"].to_numpy(float), cap), cap))
+
+
+def adjust(p: list[float]) -> np.ndarray:
+    order = np.argsort(p)
+    steps = np.maximum.accumulate(np.array(p)[order] * np.arange(len(p), 0, -1))
+    return np.minimum(steps, 1.0)[np.argsort(order)]
+
+
+def test_pairs_of_methods_are_those_of_scipy(table: pd.DataFrame, overview: Overview) -> None:
+    assert len(overview.methods) == 7
+    assert len(overview.pairs) == len(WORLDS) * 21
+    p = []
+    for pair in overview.pairs:
+        d = losses(table, pair.world, pair.verdict.a) - losses(table, pair.world, pair.verdict.b)
+        d = np.where(np.abs(d) <= 1e-6, 0.0, d)
+        p.append(float(stats.wilcoxon(d, zero_method="zsplit").pvalue) if d.any() else 1.0)
+        i, j = np.triu_indices(len(d))
+        assert pair.verdict.ratio == pytest.approx(math.exp(np.median((d[i] + d[j]) / 2)))
+    corrected = adjust(p)
+    stated = np.array([pair.verdict.p for pair in overview.pairs])
+    tested = ~np.isnan(stated)
+    assert stated[tested] == pytest.approx(corrected[tested], rel=1e-6, abs=1e-12)
+    decided = np.array([pair.verdict.word in ("better", "worse") for pair in overview.pairs])
+    assert decided.sum() > 20
+    assert (corrected[decided] < 0.05).all()
+
+
+def test_400_of_588_pairs_of_the_old_study_reject(parts: dict[str, PartName]) -> None:
+    runs = pd.read_parquet(RUNS)
+    methods = [
+        "mcmc_rpf", "qmc_polymerised", "fm_mssrckf", "cofm_mssrckf", "cofm_amssrcpf", "dmc_reconstructed",
+        "cpso_escape",
+    ]  # fmt: skip
+    runs = runs[runs["filter"].isin([*methods, "ekf"])]
+    worlds = [
+        build_world(rows, "ekf", float(rows["threshold"].iloc[0]))
+        for _, rows in runs.groupby(["scenario", "regime"], observed=True)
+    ]
+    assert sum(pair.verdict.p < 0.05 for pair in compare_methods(worlds, methods)) == 400
+    assert rank_methods(worlds, methods).reason == SHARED_SEEDS
+
+
+def test_another_filter_changes_no_number(
+    table: pd.DataFrame, looks: dict[str, MethodLook], parts: dict[str, PartName]
+) -> None:
+    fewer = table[table["filter"] != "gpf"]
+    first = build_overview(table, looks, parts)
+    second = build_overview(fewer, {k: v for k, v in looks.items() if k != "gpf"}, parts)
+    assert [p.verdict for p in first.pairs] == [p.verdict for p in second.pairs]
+    ratios = {(c.world, c.filter): (c.verdict.ratio, c.track_share) for c in first.cells}
+    assert all(ratios[c.world, c.filter] == (c.verdict.ratio, c.track_share) for c in second.cells)
+
+
+def test_a_lost_run_counts_as_the_cap_and_an_error_beyond_it_changes_nothing() -> None:
+    rng = np.random.default_rng(1)
+    rows = pd.DataFrame({
+        "scenario": "w", "filter": np.repeat(["a", "b"], 20), "run": np.tile(np.arange(20), 2), "seed": 1,
+        "rmse": np.exp(rng.normal(size=40)), "keeps_track": True, "lost": False,
+    })  # fmt: skip
+    capped, beyond, lost = rows.copy(), rows.copy(), rows.copy()
+    capped.loc[3, "rmse"], beyond.loc[3, "rmse"] = 50.0, 1e7
+    lost.loc[3, "lost"] = True
+    worlds = [build_world(table, "b", 50.0) for table in (capped, beyond, lost)]
+    cells = [decide_cells([world], ["a"])[0] for world in worlds]
+    assert cells[0].verdict == cells[1].verdict == cells[2].verdict
+    assert (cells[0].track_share, cells[2].track_share) == (1.0, 0.95)
+    with pytest.raises(ValueError, match=r"w must have runs of its reference ekf, got none"):
+        build_world(rows, "ekf", 50.0)
+
+
+def make_world(rng: np.random.Generator, name: str, shifts: dict[str, float], seed: int) -> World:
+    base = rng.normal(size=40)
+    losses = {k: pd.Series(base + v + rng.normal(0, 0.2, 40)) for k, v in shifts.items()}
+    kept = {k: pd.Series(np.ones(40, bool)) for k in shifts}
+    return World(name, "ekf", None, 100.0, losses, kept, seed)
+
+
+def test_a_winner_is_better_than_every_baseline() -> None:
+    rng = np.random.default_rng(2)
+    clear = make_world(rng, "clear", {"m": -0.8, "ekf": 0.0, "sir": 0.2}, 1)
+    tied = make_world(rng, "tied", {"m": -0.8, "ekf": 0.0, "sir": -0.8}, 2)
+    found = find_winners([clear, tied], ["m"], ["ekf", "sir"])
+    assert [winner.wins for winner in found] == [True, False]
+
+
+def test_a_method_with_the_same_errors_is_called_a_winner_at_the_level() -> None:
+    rng = np.random.default_rng(3)
+    names = ["m", "ekf", "sir"]
+    false = 0
+    for _ in range(150):
+        worlds = [make_world(rng, str(k), dict.fromkeys(names, 0.0), k) for k in range(4)]
+        false += any(winner.wins for winner in find_winners(worlds, ["m"], names[1:]))
+        cells = decide_cells(worlds, ["m", "sir"])
+        false += any(cell.verdict.word in ("better", "worse") for cell in cells)
+    assert false / 300 <= 0.05 + 2.5 * math.sqrt(0.05 * 0.95 / 300)
+
+
+def test_a_filter_loses_track_where_fewer_than_80_percent_of_runs_are_shown_to_keep_it() -> None:
+    rng = np.random.default_rng(4)
+    said = []
+    for share in (0.5, 0.8):
+        words = 0
+        for _ in range(200):
+            world = make_world(rng, "w", {"m": 0.0, "ekf": 0.0}, 1)
+            world.keeps_track["m"].iloc[:] = rng.uniform(size=40) < share  # type: ignore[index]
+            words += decide_cells([world], ["m"])[0].loses_track
+        said.append(words / 200)
+    assert said[0] > 0.9
+    assert said[1] <= 0.05 + 2.5 * math.sqrt(0.05 * 0.95 / 200)
+
+
+def test_ranks_are_those_of_scipy() -> None:
+    rng = np.random.default_rng(5)
+    methods = ["a", "b", "c"]
+    worlds = [
+        make_world(rng, str(k), {"a": 0.0, "b": 0.3, "c": 0.6, "ekf": 0.0}, k) for k in range(6)
+    ]
+    ranks = rank_methods(worlds, methods)
+    assert ranks.means == {"a": 1.0, "b": 2.0, "c": 3.0}
+    levels = np.array([[w.losses[m].mean() for m in methods] for w in worlds])
+    chi = stats.friedmanchisquare(*levels.T).statistic
+    assert chi == pytest.approx(12)
+    assert ranks.p < 1e-6
+    assert ranks.critical_difference == pytest.approx(2.343 * math.sqrt(3 * 4 / 36), rel=1e-3)
+    assert rank_methods(worlds[:1], methods).reason == "ranks need two worlds and three methods"
+
+
+def test_the_reference_is_that_of_the_tuning_and_not_of_the_runs(
+    table: pd.DataFrame,
+    looks: dict[str, MethodLook],
+    parts: dict[str, PartName],
+    overview: Overview,
+) -> None:
+    facts = read_world_facts("passive_1", "passive_location")
+    assert facts is not None
+    assert overview.names[facts.reference] in {world.reference for world in overview.worlds}
+    better = table.copy()
+    better.loc[better["filter"] == "ukf", "rmse"] *= 0.1
+    changed = build_overview(better, looks, parts)
+    assert [w.reference for w in changed.worlds] == [w.reference for w in overview.worlds]
+    without = table[~((table["scenario"] == "passive_1") & (table["filter"] == facts.reference))]
+    left = build_overview(without, looks, parts).left_out
+    assert list(left) == ["passive_1"]
+    assert f"must have runs of its reference {facts.reference}" in left["passive_1"]
+    unknown = build_overview(table.assign(model="other"), looks, parts)
+    assert unknown.worlds == ()
+    assert "Run pfbench tune scenario=azimuth model=other" in unknown.left_out["azimuth"]
+
+
+def test_sentences_are_short_and_state_numbers_of_the_tables(overview: Overview) -> None:
+    headline = word_headline(overview)
+    assert len(headline.split()) <= 55
+    assert not re.search(r"robust|points|planned|trade-off|consistent", headline)
+    words = [c.verdict.word for c in overview.cells if c.filter in overview.methods]
+    assert f"better in {words.count('better')} of {len(words)} cells" in headline
+    cells = list_verdicts(overview).set_index(["world", "filter"])
+    for method in overview.methods:
+        story = tell_story(overview, method, "")
+        for world, ratio in re.findall(r"(\w+) (\d+\.\d+)", f"{story['wins']}; {story['loses']}"):
+            assert f"{cells.loc[(world, method), 'ratio']:.2f}" == ratio
+
+
+@pytest.mark.parametrize("kind", ["heat map", "matrices"])
+def test_figures_are_small_readable_and_inside_their_paper(kind: str, overview: Overview) -> None:
+    formats = figures.HEAT_FORMATS if kind == "heat map" else figures.MATRIX_FORMATS
+    draw = figures.draw_heat_map if kind == "heat map" else figures.draw_matrices
+    for size in formats:
+        figure = draw(overview, size)
+        svg = figures.to_svg(figure)
+        assert len(svg) < 60_000
+        assert svg == figures.to_svg(draw(overview, size))
+        box = figure.bbox
+        texts = [t for axes in figure.axes for t in (*axes.texts, *axes.get_yticklabels())]
+        for text in (*texts, *figure.texts):
+            assert text.get_fontsize() >= 5.8
+            extent = text.get_window_extent()
+            assert -1 <= extent.x0 <= extent.x1 <= box.x1 + 1, text.get_text()
+            assert -1 <= extent.y0 <= extent.y1 <= box.y1 + 1, text.get_text()
+
+
+def test_ink_has_contrast_on_every_ground() -> None:
+    def luminance(colour: tuple[float, ...]) -> float:
+        linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in colour]
+        return float(np.dot((0.2126, 0.7152, 0.0722), linear))
+
+    for value in np.linspace(0, 1, 51):
+        ground = figures.palette()(value)[:3]
+        ink = figures.choose_ink(ground)
+        rgb = (
+            (1.0, 1.0, 1.0)
+            if ink == "white"
+            else tuple(int(ink[k : k + 2], 16) / 255 for k in (1, 3, 5))
+        )
+        low, high = sorted((luminance(ground), luminance(rgb)))
+        assert (high + 0.05) / (low + 0.05) >= 4.5
+
+
+def test_the_page_has_its_figures_tables_and_stories(overview: Overview, tmp_path: Path) -> None:
+    pack = {"title": "A title", "generated": {"version": "0", "commit": "abc", "date": ""}}
+    with RecordedFolder(tmp_path / "study") as folder:
+        page = write_overview(overview, pack, folder).read_text()
+    assert {f.name for f in (tmp_path / "study").iterdir()} >= {
+        "index.html", "report.md", "cells.csv", "pairs.csv", "heat_map.svg", "matrices_column.svg",
+    }  # fmt: skip
+    assert page.count("data:image/svg+xml;base64,") == 4
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    text = (tmp_path / "study" / "report.md").read_text()
+    for method in overview.methods:
+        assert overview.names[method] in page
+        assert overview.names[method] in text
+    assert "The seven against each other" in page
+    assert word_headline(overview) in page.replace("&#39;", "'")
+
+
+def test_which_studies_have_the_page(table: pd.DataFrame, looks: dict[str, MethodLook]) -> None:
+    assert has_overview(table, looks)
+    assert not has_overview(table[table["scenario"] == "azimuth"], looks)
+    assert not has_overview(table, {k: v for k, v in looks.items() if not v.proposed})
+    both = pd.DataFrame({"regime": ["outliers", "nominal"], "x": [1, 2]})
+    assert list(central_rows(both)["x"]) == [2]
+    assert list(central_rows(both[:1])["x"]) == [1]
+
+
+def test_pictures_of_the_page_are_the_only_use_of_seaborn() -> None:
+    code = "import sys, pfbench.report, pfbench.report.study_report, pfbench.cli.main; print('seaborn' in sys.modules)"
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    assert run.stdout.strip() == "False"
+
+
+def test_pairs_of_methods_are_all_pairs(overview: Overview) -> None:
+    expected = {frozenset(pair) for pair in combinations(overview.methods, 2)}
+    for world in overview.worlds:
+        found = [p.verdict for p in overview.pairs if p.world == world.key]
+        assert {frozenset((v.a, v.b)) for v in found} == expected
