@@ -3,7 +3,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 STUDY  ?= quickstart
 
-.PHONY: demo studies report test test-fast test-slow mutants recompute faults faults-short format lint bench clean
+.PHONY: demo studies report test test-fast test-slow test-nightly mutants recompute faults faults-short format lint bench clean
 
 # Python compiles modules at first import. Compiling all installed packages took half of the set-up time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -22,14 +22,17 @@ report: $(VENV)/.installed      ## all reports, from results/ or stored runs
 	$(BIN)/pfbench report all
 	$(BIN)/python docs/publish_reports.py
 
-test: $(VENV)/.installed        ## fast and slow tests
-	$(BIN)/python -m pytest -n 2 -m "slow or not slow"
+test: $(VENV)/.installed        ## fast and slow tests, without those of the night
+	$(BIN)/python -m pytest -n 2 -m "not nightly"
+
+test-nightly: $(VENV)/.installed   ## the tests of tests/nightly.txt: half an hour
+	$(BIN)/python -m pytest -n 2 -m nightly
 
 test-fast: $(VENV)/.installed
 	$(BIN)/python -m pytest -n 2
 
 test-slow: $(VENV)/.installed
-	$(BIN)/python -m pytest -n 2 -m slow
+	$(BIN)/python -m pytest -n 2 -m "slow and not nightly"
 
 mutants: $(VENV)/.installed     ## plant each fault of tests/mutants.toml and check that a test fails
 	$(BIN)/python tests/mutants.py

@@ -14,6 +14,8 @@ os.environ["TORCHINDUCTOR_CPP_CACHE_PRECOMPILE_HEADERS"] = "0"
 
 import checkout  # noqa: E402
 import composed_once  # noqa: E402
+import nightly  # noqa: E402
+import pytest  # noqa: E402
 import torch  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
@@ -22,6 +24,11 @@ settings.load_profile("busy")  # a machine with other work is no fault of a test
 composed_once.install()
 sys.addaudithook(checkout.refuse_own_files)
 torch.set_num_threads(1)  # with xdist, more threads than cores make everything slower
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests of tests/nightly.txt, before `-m` selects."""
+    nightly.mark(items)
 
 
 def pytest_collection_finish() -> None:

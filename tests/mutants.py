@@ -65,7 +65,18 @@ def plant(fault: dict[str, Any], root: Path) -> None:
 def run_tests(tests: list[str], root: Path) -> int:
     """Return the exit status of pytest in a copy; 1 says that a test failed."""
     environment = os.environ | {"PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        "-p",
+        "no:cacheprovider",
+        "-m",
+        "not slow",
+        *tests,
+    ]
     try:
         return subprocess.run(
             command, cwd=root, env=environment, capture_output=True, timeout=TIMEOUT
