@@ -19,12 +19,7 @@ import pfbench
 FOLDERS = [name for name in pfbench.__all__ if name not in ("__version__", "load")]
 DOTTED = re.compile(r"(?<![\w/.])pfbench(?:\.[A-Za-z_]\w*)+")
 COMMAND = re.compile(r"-m pfbench[\w.]*")
-RENAMED = "renamed.md"  # old names, and where modules went
-PAGES = [
-    page
-    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md"))
-    if page.name != RENAMED
-]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
 YAML = [file for folder in ("conf", "experiments") for file in (ROOT / folder).rglob("*.yaml")]
 SCRIPTS = [file for folder in ("docs", "experiments") for file in (ROOT / folder).glob("*.py")]
 
