@@ -21,7 +21,8 @@ PAGES = [
     *(f / "report.md" for f in list_published() if f.name.startswith("learn_")),  # no template
 ]
 TEMPLATES = sorted(PACKAGE.rglob("*.jinja"))
-SCRIPTS = [*sorted((ROOT / "experiments").glob("*.py")), ROOT / "docs" / "methods" / "pictures.py"]
+PICTURES = ROOT / "experiments" / "analyses" / "method_pictures.py"
+SCRIPTS = [*sorted((ROOT / "experiments").glob("*.py")), PICTURES]
 PROSE_CHECKS = ("long sentences", "openings", "archaic phrases", "messages")
 LONGEST_SENTENCE = 30  # words
 
