@@ -45,3 +45,10 @@ def test_links_and_images_exist():
             assert path.exists(), f"{page.name} links to {target}"
             if anchor and path.suffix == ".md":
                 assert anchor in heading_anchors(path), f"{page.name} links to {target}#{anchor}"
+
+
+def test_pages_show_every_picture_and_stand_alone_in_docs():
+    files = [f for name in ("docs", "benchmarks") for f in (ROOT / name).rglob("*.*")]
+    assert {f.suffix for f in files if f.is_relative_to(ROOT / "docs")} == {".md", ".png"}
+    pages = " ".join(page.read_text() for page in LINKING_PAGES)
+    assert [f.name for f in files if f.suffix == ".png" and f"]({f.name})" not in pages] == []
