@@ -20,7 +20,7 @@ demo: $(VENV)/.installed        ## quickstart study: run, compare, report
 
 report: $(VENV)/.installed      ## all reports, from results/ or stored runs
 	$(BIN)/pfbench report all
-	$(BIN)/python docs/publish_reports.py
+	$(BIN)/python experiments/analyses/publish_reports.py
 
 test: $(VENV)/.installed        ## fast and slow tests, without those of the night
 	$(BIN)/python -m pytest -n 2 -m "not nightly"
@@ -38,7 +38,7 @@ mutants: $(VENV)/.installed     ## plant each fault of tests/mutants.toml and ch
 	$(BIN)/python tests/mutants.py
 
 studies: $(VENV)/.installed     ## run all published studies, cheapest first: about four hours on one idle core; repeat to continue
-	$(BIN)/python docs/run_studies.py
+	$(BIN)/python experiments/analyses/run_studies.py
 
 recompute: $(VENV)/.installed      ## compute the decisions of a report a second time, without code of pfbench; STUDY= for all published ones
 	$(BIN)/python tests/recompute.py $(STUDY)

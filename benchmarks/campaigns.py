@@ -1,4 +1,4 @@
-"""What a user waits for: whole processes, from their start to their end. Writes campaigns.json, campaigns.md and campaigns.png.
+"""What a user waits for: whole processes, from their start to their end. Writes campaigns.json and campaigns.md.
 
     make bench      (or: python benchmarks/campaigns.py --numba .venv-bench/bin/python --jax .venv-peers/bin/python --rounds 3)
 
@@ -28,7 +28,6 @@ import numpy as np
 import problems
 import workload
 from compare import (
-    COLOURS,
     COUNT,
     DEFAULT,
     DEFAULT32,
@@ -36,12 +35,10 @@ from compare import (
     NUMBA,
     disagreements,
     fastest,
-    own,
     peer,
     ratio,
     starting,
 )
-from matplotlib.figure import Figure
 from race import (
     HERE,
     QUALITIES,
@@ -244,37 +241,6 @@ def section(study: Study, found: Mapping[Contestant, Result], bad: list[str]) ->
     ]
 
 
-def draw(found: Mapping[Study, Mapping[Contestant, Result]], path: Path) -> None:
-    """Median CPU time of each contestant's process, quartiles as bars; one panel for each study."""
-    sizes = [len(results) for results in found.values()]
-    figure = Figure(figsize=(6.5, 0.6 + 0.6 * len(sizes) + 0.22 * sum(sizes)), layout="constrained")
-    axes = figure.subplots(len(sizes), 1, height_ratios=sizes, squeeze=False)[:, 0]
-    for axis, (study, results) in zip(axes, found.items(), strict=True):
-        for place, (who, result) in enumerate(results.items()):
-            low, middle, high = np.quantile(result.cpu, [0.25, 0.5, 0.75]) / 1e3
-            colour = COLOURS["pfbench"] if own(who) else "#777777"
-            axis.plot([low, high], [place, place], color=colour, lw=1.5)
-            axis.plot(middle, place, "o", color=colour, ms=5)
-            axis.annotate(
-                f"{middle:.3g}",
-                (high, place),
-                (6, 0),
-                textcoords="offset points",
-                va="center",
-                fontsize=8,
-            )
-        axis.set(xlim=(0, None), ylim=(len(results) - 0.4, -0.6))
-        axis.set_yticks(range(len(results)), [who.label for who in results], fontsize=8)
-        axis.margins(x=0.12)
-        axis.set_title(f"{study.name}: {study.said}", fontsize=9, loc="left")
-        axis.tick_params(axis="x", labelsize=8)
-        axis.spines[["top", "right"]].set_visible(False)
-    axes[-1].set_xlabel(
-        "CPU time in s of a whole process, one thread (median, quartiles)", fontsize=8
-    )
-    figure.savefig(path, dpi=150, metadata={"Software": None})
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
@@ -288,9 +254,7 @@ def main() -> None:
         "--scale", type=float, default=1.0, help="below 1: fewer runs and steps, to try it out"
     )
     parser.add_argument("--only", default="", help="studies whose names begin so")
-    parser.add_argument(
-        "--out", type=Path, default=HERE, help="folder for campaigns.md and campaigns.png"
-    )
+    parser.add_argument("--out", type=Path, default=HERE, help="folder for campaigns.md")
     chosen = parser.parse_args()
     places = {
         name: path
@@ -334,7 +298,6 @@ def main() -> None:
         ", ".join([f"{cpu_name()}; Python {platform.python_version()}", *map(" ".join, versions.items())]) + ".", "",
     ]  # fmt: skip
     (chosen.out / "campaigns.md").write_text("\n".join(page))
-    draw(found, chosen.out / "campaigns.png")
     print("\n".join(page))
     sys.exit("; ".join(wrong) if wrong else 0)
 

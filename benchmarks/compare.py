@@ -1,4 +1,4 @@
-"""W1 to W5: pfbench, its peers and a fused C loop side by side in one run. Writes compare.json, compare.md and compare.png.
+"""W1 to W5: pfbench, its peers and a fused C loop side by side in one run. Writes compare.json and compare.md.
 
     make bench      (or: python benchmarks/compare.py --numba .venv-bench/bin/python --jax .venv-peers/bin/python --rounds 9)
 
@@ -20,7 +20,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import problems
 import workload
-from matplotlib.figure import Figure
 from race import HERE, Contestant, Result, cpu_name, load_results, race, store_results
 
 TOLERANCE = 4.5  # standard errors, in some hundred comparisons
@@ -62,7 +61,6 @@ GAUSSIAN = (
     Contestant("Stone Soup", "jax", ("peer_stonesoup.py", "ckf")),
 )
 LIBRARIES = ("JAX", "particles", "cuthbert", "Pyro SMCFilter", "FilterPy", "dynamax", "Stone Soup")
-COLOURS = {"pfbench": "#0072B2", "fused C": "#D55E00"}  # Okabe and Ito 2008; all others grey
 
 
 class Case(NamedTuple):
@@ -276,35 +274,6 @@ def _goal(value: float, must: float) -> str:
     return f"{abs(must):g}, {'met' if value >= must else 'missed'}"
 
 
-def draw(found: Mapping[Case, Mapping[Contestant, Result]], path: Path) -> None:
-    """One panel for each workload: median CPU time of each contestant on a logarithmic axis, quartiles as bars."""
-    figure = Figure(
-        figsize=(7.5, 0.5 + sum(0.42 + 0.17 * len(results) for results in found.values())),
-        layout="constrained",
-    )
-    axes = figure.subplots(
-        len(found), 1, height_ratios=[len(results) for results in found.values()], squeeze=False
-    )[:, 0]
-    for axis, (case, results) in zip(axes, found.items(), strict=True):
-        for place, (who, result) in enumerate(results.items()):
-            low, middle, high = np.quantile(result.cpu, [0.25, 0.5, 0.75])
-            colour = COLOURS.get("pfbench" if own(who) else who.label, "#777777")
-            axis.plot([low, high], [place, place], color=colour, lw=1.5)
-            axis.plot(middle, place, "o", color=colour, ms=4)
-            told = f"{middle:,.0f}" if middle >= 100.0 else f"{middle:.3g}"
-            axis.annotate(
-                told, (high, place), (5, 0), textcoords="offset points", va="center", fontsize=7
-            )
-        axis.set(xscale="log", ylim=(len(results) - 0.4, -0.6))
-        axis.set_yticks(range(len(results)), [who.label for who in results], fontsize=7)
-        axis.set_title(f"{case.name}: {case.said}", fontsize=8, loc="left")
-        axis.margins(x=0.15)
-        axis.tick_params(axis="x", which="both", labelsize=7)
-        axis.spines[["top", "right"]].set_visible(False)
-    axes[-1].set_xlabel("CPU time in ms, one thread (median, quartiles)", fontsize=8)
-    figure.savefig(path, dpi=150, metadata={"Software": None})
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
@@ -325,9 +294,7 @@ def main() -> None:
     parser.add_argument(
         "--without", default="", help="contestants that take no part, by parts of their labels"
     )
-    parser.add_argument(
-        "--out", type=Path, default=HERE, help="folder for compare.md and compare.png"
-    )
+    parser.add_argument("--out", type=Path, default=HERE, help="folder for compare.md")
     chosen = parser.parse_args()
     places = {
         name: path
@@ -377,7 +344,6 @@ def main() -> None:
         "",
     ]  # fmt: skip
     (chosen.out / "compare.md").write_text("\n".join(page))
-    draw(found, chosen.out / "compare.png")
     print("\n".join(page))
     sys.exit("; ".join(wrong) if wrong else 0)
 

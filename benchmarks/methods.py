@@ -4,7 +4,7 @@
 
 All methods filter the same flights, one core, one after the other in interleaved rounds; Gaussian filters have no particles and
 are on the same axis. Results are stored in methods.json. Filters that are not in it are measured beside SIR, and with
---below those again whose stored ratio is smaller. --page writes page and figure from the stored results alone.
+--below those again whose stored ratio is smaller. --page writes the page from the stored results alone.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from typing import Any
 
 import torch
 from hydra import compose, initialize_config_module
-from matplotlib.figure import Figure
 from race import cpu_name
 
 from pfbench import job
@@ -182,44 +181,6 @@ def main() -> None:
         stored = measure(stored, options)
         STORE.write_text(json.dumps(stored, indent=1) + "\n")
     (HERE / "methods.md").write_text(page(stored))
-    draw(stored)
-
-
-def draw(stored: dict[str, Any]) -> None:
-    """One bar per method on a logarithmic axis."""
-    order, rows, setting = order_of(stored), stored["rows"], stored["setting"]
-    figure = Figure(figsize=(6.5, 0.6 + 0.19 * len(order)), layout="constrained")
-    axis = figure.subplots()
-    for place, name in enumerate(order):
-        colour = "#E69F00" if rows[name]["particles"] == "none" else "#0072B2"
-        low, middle, high = rows[name]["ratio"]
-        axis.plot([low, high], [place, place], color=colour, lw=1)
-        axis.plot(middle, place, "o" if colour == "#0072B2" else "s", color=colour, ms=4)
-        said = f"{middle:.2g}" if middle < 9.5 else f"{middle:.0f}"
-        axis.annotate(
-            said,
-            (high, place),
-            (5, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=7,
-        )
-    axis.axvline(1.0, color="0.6", lw=0.8, zorder=0)
-    axis.set_yticks(range(len(order)), order, fontsize=7)
-    axis.set_ylim(len(order) - 0.4, -0.6)
-    axis.set(xscale="log")
-    axis.margins(x=0.08)
-    axis.set_xlabel(
-        "cost of a step, times that of SIR\ncircles: particles, squares: Gaussian filters and mixtures",
-        fontsize=8,
-    )
-    axis.set_title(
-        f"18-state INS/GNSS, {setting['runs']} runs, {setting['particles']} particles, one core",
-        fontsize=9,
-    )
-    axis.tick_params(axis="x", labelsize=8)
-    axis.spines[["top", "right"]].set_visible(False)
-    figure.savefig(HERE / "methods.png", dpi=150, metadata={"Software": None})
 
 
 if __name__ == "__main__":

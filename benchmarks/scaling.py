@@ -1,4 +1,4 @@
-"""What a job costs against N, D, R and T, and three promises of whole jobs. Writes scaling.md and scaling.png.
+"""What a job costs against N, D, R and T, and three promises of whole jobs. Writes scaling.md.
 
     python benchmarks/scaling.py [--rounds 5] [--scale 1.0]
 
@@ -22,7 +22,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from race import cpu_name
 
 from pfbench.core import Episode, PhiloxStream
@@ -44,7 +43,6 @@ AXES = {
     "T": (10, 30, 100, 300),
 }
 SAID = {"N": "particles", "D": "states", "R": "runs", "T": "steps"}
-COLOURS = {"N": "#0072B2", "D": "#E69F00", "R": "#009E73", "T": "#CC79A7"}
 SWEEP = (
     "scenario=linear_walk",
     "filter=sir",
@@ -164,32 +162,11 @@ def promise(what: str, values: list[float], wanted: str, kept: bool) -> str:
     return f"| {what} | {middle:.3g} ({low:.3g} to {high:.3g}) | {wanted} | {'kept' if kept else '**missed**'} |"
 
 
-def draw(found: dict[str, list[tuple[int, float]]], path: Path) -> None:
-    figure = Figure(figsize=(6.0, 4.0), layout="constrained")
-    axes = figure.subplots()
-    for axis, points in found.items():
-        sizes, times = np.array(points, dtype=float).T
-        label = f"{SAID[axis]} {axis}: exponent {slope(points):.2f}"
-        axes.loglog(sizes / USUAL[axis], times, "o-", color=COLOURS[axis], ms=4, label=label)
-    axes.set_xlabel(
-        "size, the usual one = 1: "
-        + ", ".join(f"{axis} = {value}" for axis, value in USUAL.items()),
-        fontsize=8,
-    )
-    axes.set_ylabel("CPU time in ms, one thread", fontsize=8)
-    axes.legend(fontsize=8, frameon=False)
-    axes.tick_params(labelsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=150, metadata={"Software": None})
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--scale", type=float, default=1.0, help="below 1: smaller, to try it out")
-    parser.add_argument(
-        "--out", type=Path, default=HERE, help="folder for scaling.md and scaling.png"
-    )
+    parser.add_argument("--out", type=Path, default=HERE, help="folder for scaling.md")
     chosen = parser.parse_args()
     torch.set_num_threads(1)
     process_memory.keep_freed_memory()
@@ -217,7 +194,6 @@ def main() -> None:
         f"{cpu_name()}, {os.cpu_count()} cores; Python {platform.python_version()}, torch {torch.__version__}.", "",
     ]  # fmt: skip
     (chosen.out / "scaling.md").write_text("\n".join(lines))
-    draw(found, chosen.out / "scaling.png")
     print("\n".join(lines))
 
 

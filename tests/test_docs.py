@@ -6,15 +6,15 @@ import pytest
 from checkout import ROOT, list_published
 
 # use_your_data.md and write_a_scenario.md also run shell commands: their own tests run all blocks
-# glossary.md and renamed.md contain tables only
-TABLES = {"glossary.md", "renamed.md"}
+# glossary.md contains tables only
 ALL_PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 METHODS = (
     page
     for page in sorted((ROOT / "docs" / "methods").glob("*.md"))
     if "```python" in page.read_text()
 )
-PAGES = [*(page for page in ALL_PAGES if page.name not in TABLES | {"use_your_data.md"}), *METHODS]
+NOT_RUN = {"glossary.md", "use_your_data.md"}
+PAGES = [*(page for page in ALL_PAGES if page.name not in NOT_RUN), *METHODS]
 LINKING_PAGES = (
     ROOT / "README.md",
     ROOT / "reports" / "README.md",
@@ -45,3 +45,10 @@ def test_links_and_images_exist():
             assert path.exists(), f"{page.name} links to {target}"
             if anchor and path.suffix == ".md":
                 assert anchor in heading_anchors(path), f"{page.name} links to {target}#{anchor}"
+
+
+def test_pages_show_every_picture_and_stand_alone_in_docs():
+    files = [f for name in ("docs", "benchmarks") for f in (ROOT / name).rglob("*.*")]
+    assert {f.suffix for f in files if f.is_relative_to(ROOT / "docs")} == {".md", ".png"}
+    pages = " ".join(page.read_text() for page in LINKING_PAGES)
+    assert [f.name for f in files if f.suffix == ".png" and f"]({f.name})" not in pages] == []

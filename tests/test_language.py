@@ -12,18 +12,17 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
-import yaml
 from checkout import ROOT, list_published
 
 PACKAGE = ROOT / "pfbench"
-RENAMED = ROOT / "docs" / "renamed.md"
 PAGES = [
     ROOT / "README.md",
     *sorted((ROOT / "docs").rglob("*.md")),
     *(f / "report.md" for f in list_published() if f.name.startswith("learn_")),  # no template
 ]
 TEMPLATES = sorted(PACKAGE.rglob("*.jinja"))
-SCRIPTS = [*sorted((ROOT / "experiments").glob("*.py")), ROOT / "docs" / "methods" / "pictures.py"]
+PICTURES = ROOT / "experiments" / "analyses" / "method_pictures.py"
+SCRIPTS = [*sorted((ROOT / "experiments").glob("*.py")), PICTURES]
 PROSE_CHECKS = ("long sentences", "openings", "archaic phrases", "messages")
 LONGEST_SENTENCE = 30  # words
 
@@ -127,7 +126,6 @@ ARCHAIC = re.compile(
 )
 MESSAGE = re.compile(r"\b(must|is not|are not|does not|do not|cannot|expected|needs?|requires?)\b")
 COMMENT = re.compile(r"(?:^|\s)# ([^\n]*)$", re.MULTILINE)
-OLD_AND_NEW = re.compile(r"`([\w.]+)` → `([\w.]+)`")
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -398,75 +396,3 @@ def test_planted_violations_are_found() -> None:
 def test_plain_text_passes() -> None:
     assert not any(violations_of_source(PLAIN_SOURCE).values())
     assert not any(violations_of_page("A filter.\n" + PLAIN_PAGE.split("\n", 1)[1]).values())
-
-
-def renamed_names(text: str) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the renamed modules and classes of docs/renamed.md, old: new."""
-    modules = dict(
-        re.findall(r"^\| `(pfbench[\w.]+)` \| `(pfbench[\w.]+)` \|$", text, re.MULTILINE)
-    )
-    section = text[text.index("## Classes and functions") : text.index("## Attributes")]
-    names = dict(OLD_AND_NEW.findall(section))
-    return modules, {old: new for old, new in names.items() if old[0].isupper()}
-
-
-def defined_classes(source: str) -> set[str]:
-    return {node.name for node in tree_of(source).body if isinstance(node, ast.ClassDef)}
-
-
-def old_modules_named(text: str, old: set[str], current: set[str]) -> set[str]:
-    """Return the dotted names in a text that lie in an old module and not in a current one."""
-    return {
-        name
-        for name in re.findall(r"\bpfbench(?:\.\w+)+", text)
-        for stem in [name, name.rpartition(".")[0]]
-        if stem in old and stem not in current
-    }
-
-
-def test_no_renamed_class_or_module_remains() -> None:
-    modules, classes = renamed_names(RENAMED.read_text())
-    assert len(modules) > 100
-    assert len(classes) > 200
-    files = sorted(PACKAGE.rglob("*.py"))
-    defined = set().union(*(defined_classes(file.read_text()) for file in files))
-    assert defined & (set(classes) - set(classes.values())) <= REMAINING
-    current = {
-        ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-        for file in files
-    }
-    texts = [*files, *PAGES, *TEMPLATES, *(ROOT / "conf").rglob("*.yaml")]
-    texts += [*(ROOT / "experiments").glob("*.yaml"), *(ROOT / "tests").rglob("*.py")]
-    old = {
-        str(file.relative_to(ROOT)): names
-        for file in texts
-        if file not in (RENAMED, Path(__file__))
-        and (names := old_modules_named(file.read_text(), set(modules), current))
-    }
-    assert old == {}
-
-
-# old names of one folder that are current names of another
-REMAINING = {"FilterPass", "Innovation"}
-
-
-def test_an_old_name_is_found() -> None:
-    modules, classes = renamed_names(RENAMED.read_text())
-    assert "Cloud" in defined_classes("class Cloud: pass") & set(classes)
-    assert old_modules_named("see pfbench.draws.MonteCarlo", set(modules), set()) == {
-        "pfbench.draws.MonteCarlo"
-    }
-
-
-def test_the_page_of_renamed_names_lists_the_keys_of_the_program() -> None:
-    table = yaml.safe_load((PACKAGE / "cli" / "renamed_keys.yaml").read_text())
-    pairs = set(OLD_AND_NEW.findall(RENAMED.read_text()))
-    groups = [table["config"], *table["keys"].values()]
-    missing = [
-        (old, new)
-        for group in groups
-        for old, new in group.items()
-        if "*" not in old and " " not in new and (old, new) not in pairs
-    ]
-    assert missing == []
-    assert all(old in RENAMED.read_text() for group in table["choices"].values() for old in group)

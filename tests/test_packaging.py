@@ -116,7 +116,7 @@ def builds_without_network() -> bool:
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Built from a copy of what is in the checkout: building leaves folders behind."""
+    """Built from a copy of what is in the checkout, in git as there: building leaves folders behind."""
     home = tmp_path_factory.mktemp("wheel")
     source = home / "source"
     source.mkdir()
@@ -125,6 +125,10 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copytree(ROOT / name, source / name, ignore=leave)
     for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source / name)
+    if shutil.which("git") is not None:  # setuptools-scm offers every file in git to the wheel
+        mine = ("git", "-C", str(source), "-c", "user.name=a", "-c", "user.email=a@b")
+        for words in (("init", "-q"), ("add", "."), ("commit", "-qm", "all")):
+            subprocess.run([*mine, *words], check=True)
     command = [
         sys.executable,
         "-m",

@@ -19,14 +19,12 @@ import pfbench
 FOLDERS = [name for name in pfbench.__all__ if name not in ("__version__", "load")]
 DOTTED = re.compile(r"(?<![\w/.])pfbench(?:\.[A-Za-z_]\w*)+")
 COMMAND = re.compile(r"-m pfbench[\w.]*")
-RENAMED = "renamed.md"  # old names, and where modules went
-PAGES = [
-    page
-    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md"))
-    if page.name != RENAMED
-]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
 YAML = [file for folder in ("conf", "experiments") for file in (ROOT / folder).rglob("*.yaml")]
-SCRIPTS = [file for folder in ("docs", "experiments") for file in (ROOT / folder).glob("*.py")]
+# the pictures of methods show internals, which have no public name
+SCRIPTS = [
+    file for file in (ROOT / "experiments").rglob("*.py") if file.name != "method_pictures.py"
+]
 
 
 @cache

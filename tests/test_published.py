@@ -22,7 +22,9 @@ from pfbench.report.study_report import read_page_data, rebuild_page
 
 
 def load(name: str) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    spec = importlib.util.spec_from_file_location(
+        name, ROOT / "experiments" / "analyses" / f"{name}.py"
+    )
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -213,7 +215,9 @@ def test_the_numbers_of_pages_are_those_of_the_published_files() -> None:
     for page in numbers.PAGES:
         text = page.read_text()
         blocks |= set(re.findall(r"<!-- numbers:(\w+) -->", text)) - {"end"}
-        assert numbers.fill_blocks(text) == text, "run: python docs/readme_numbers.py"
+        assert numbers.fill_blocks(text) == text, (
+            "run: python experiments/analyses/readme_numbers.py"
+        )
     assert set(numbers.BLOCKS) < blocks
     methods = [page for page in numbers.PAGES if page.name != "README.md"]
     assert sum("<!-- numbers:paper_" in page.read_text() for page in methods) == 8
@@ -315,41 +319,3 @@ def test_the_cost_of_a_study_is_the_computing_time_of_its_jobs(
     monkeypatch.setattr(studies, "read_metadata", lambda path: {"seconds": seconds[path.stem]})
     assert studies.measure_cost("s", tmp_path) == 7.0
     assert studies.measure_cost("none", tmp_path) == 0.0
-
-
-def test_old_and_new_decisions_are_compared_in_the_direction_of_the_early_page() -> None:
-    """The pairs are stored in either direction; a change by other runs is not one by the rule."""
-    script = load("compare_decisions")
-    head = "| method | baseline | cells | p | across cells |\n|---|---|--:|--:|---|\n"
-    rows = "| a | b | 24 | 0.1 | a |\n| a | c | 24 | 0.1 | c |\n| a | d | 24 | 0.1 | no difference shown |\n\n| x |"
-    early = script.read_early_words(head + rows)
-    assert early == {("a", "b"): "better", ("a", "c"): "worse", ("a", "d"): "inconclusive"}
-    new = {"word": "inconclusive"}
-    planned = [
-        {"a": "b", "b": "a", "word": "worse", "estimate": 2.0, "low": 1.5, "high": 2.5, "new_world": new},
-        {"a": "a", "b": "c", "word": "better", "estimate": None, "reason": "runs won: 5; x", "new_world": None},
-    ]  # fmt: skip
-    rule = {("a", "b"): "inconclusive", ("a", "c"): "better", ("a", "d"): "inconclusive"}
-    text = script.compare(early, rule, planned)
-    assert (
-        "| `a` | `b` | better | inconclusive | better | of `b`: 2 (1.5 to 2.5) | inconclusive | yes |"
-        in text
-    )
-    assert "| `a` | `c` | worse | better | better | runs won: 5 | not tested |  |" in text
-    assert "changes 1 of 3 decisions, and the present runs change 2." in text
-    assert "decides 1, the present one 2 in these worlds and 0 in a new world. 1 pairs" in text
-
-
-def test_the_table_of_earlier_decisions_is_that_of_the_stored_files() -> None:
-    script = load("compare_decisions")
-    text = script.PAGE.read_text()
-    assert script.fill_page(text) == text, "run: python docs/compare_decisions.py"
-    changed = text.replace("| `mcmc_rpf` | `sir` | better |", "| `mcmc_rpf` | `sir` | worse |", 1)
-    assert changed != text
-    assert script.fill_page(changed) == text
-    has_history = not subprocess.run(
-        ["git", "-C", str(ROOT), "cat-file", "-e", f"{script.FIRST}:reports/all_seven/report.md"],
-        capture_output=True,
-        check=False,
-    ).returncode
-    assert not has_history or script.read_history() == script.read_stored_words()

@@ -8,8 +8,7 @@ import errno
 import re
 import tempfile
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -51,10 +50,7 @@ def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
     text = f"{error}".strip() or type(error).__name__
     if message := _format_hydra_error(text, words):
         return message
-    if not is_named(error):
-        text = describe_unknown(error)
-    renamed = next((find_renamed(word) for word in words if find_renamed(word)), None)
-    return f"{text} {renamed[0]}: renamed to {renamed[1]}" if renamed else text
+    return text if is_named(error) else describe_unknown(error)
 
 
 def _format_hydra_error(text: str, words: Sequence[str]) -> str:
@@ -114,44 +110,8 @@ def suggest_similar(name: str, options: Sequence[str]) -> str:
     return f" Similar: {', '.join(best[:3])}." if best else ""
 
 
-def find_renamed(word: str) -> tuple[str, str] | None:
-    """Find the new name of a renamed key or choice."""
-    key, _, value = word.lstrip("+~").partition("=")
-    table = _renamed_keys()
-    if new := table["choices"].get(key, {}).get(value):
-        return f"{key}={value}", f"{key}={new}"
-    group, *parts = key.split(".")
-    if not parts:
-        return (key, table["config"][key]) if key in table["config"] else None
-    new_parts = [
-        _rename_last(table["keys"].get(group, {}), parts[: i + 1]) for i in range(len(parts))
-    ]
-    new_key = ".".join([group, *new_parts])
-    return (key, new_key) if new_key != key else None
-
-
-def _rename_last(table: Mapping[str, str], path: Sequence[str]) -> str:
-    """Rename the last key of a path by the longest entry that matches its end."""
-    pattern = ["*" if name.isdigit() else name for name in path]
-    ends = [".".join(["", *pattern]), *(".".join(pattern[i:]) for i in range(len(pattern)))]
-    return next((table[end] for end in ends if end in table), path[-1])
-
-
-@cache
-def _renamed_keys() -> dict[str, Any]:
-    """Read the table of renamed keys."""
-    import yaml
-
-    table: dict[str, Any] = yaml.safe_load(
-        Path(__file__).with_name("renamed_keys.yaml").read_text()
-    )
-    return table
-
-
 def _format_unknown_choice(group: str, name: str, options: Sequence[str]) -> str:
     """Format an error about a choice that does not exist."""
-    if renamed := find_renamed(f"{group}={name}"):
-        return f"{renamed[0]}: renamed to {renamed[1]}"
     if group != "experiment" and name.lower() in options:
         return f"{group}={name} does not exist. Names are in lower case: {group}={name.lower()}"
     is_listed = "/" not in group
@@ -168,8 +128,6 @@ def _format_refusal(text: str, cause: BaseException, words: Sequence[str]) -> st
     if unknown := re.search(r"got an unexpected keyword argument '(\w+)'", message):
         return _format_unknown_key(f"{key}.{unknown[1]}", words)
     target = re.search(r"Error loading '([\w.]+)'", message)
-    if target and (new := _renamed_keys()["targets"].get(target[1])):
-        return f"{key}._target_={target[1]}: renamed to {new}"
     if target and (module := re.search(r"No module named '([\w.]+)'", message)):
         return (
             f"{key}._target_ must be importable, got {target[1]}: the module {module[1]} is not "
@@ -194,11 +152,7 @@ def _format_refusal(text: str, cause: BaseException, words: Sequence[str]) -> st
 def _format_unknown_key(name: str, words: Sequence[str]) -> str:
     """Format an error about a key that does not exist."""
     override = next((word for word in words if word.lstrip("+~").startswith(f"{name}=")), name)
-    renamed, keys = find_renamed(name), _composed_keys(words, name)
-    # a misspelt key may be an old key of another scenario: scenario.step for scenario.steps
-    siblings = [key for key in keys if key.rpartition(".")[0] == name.rpartition(".")[0]]
-    if renamed and (renamed[1] in keys or not suggest_similar(name, siblings)):
-        return f"{renamed[0]}: renamed to {renamed[1]}"
+    keys = _composed_keys(words, name)
     if name in keys and {"-m", "--multirun"} & set(words):
         return (
             f"{override}: not all jobs of this sweep have the key {name}. "

@@ -263,7 +263,7 @@ def _is_memory_limit(value: Any) -> bool:
 # --------------------------------------------------------------------------------------------------
 # Metadata of a job: all that a report states about how its results were computed.
 
-# parts of a checkout that decide results
+# parts of a checkout that decide results; analyses read them only
 _DECIDING = ("pfbench", "conf", "experiments", "pyproject.toml", "setup.py")
 _TIMEOUT = 10  # s, of git
 
@@ -344,12 +344,12 @@ def _read_build() -> tuple[str, str]:
 def describe_commit(checkout: Path) -> str:
     """Return the commit of a checkout, with "-dirty" if a tracked file that decides results is changed.
 
-    Pages, reports and tests do not count.
+    Pages, reports, analyses and tests do not count.
     """
     present = [name for name in _DECIDING if (checkout / name).exists()]
     commands = (
         ("rev-parse", "--show-cdup", "--short", "HEAD"),  # the first is empty at the top
-        ("diff", "--no-ext-diff", "--name-only", "HEAD", "--", *present),
+        ("diff", "--no-ext-diff", "--name-only", "HEAD", "--", *present, ":!experiments/analyses"),
     )
     try:
         commit, changed = (_run_git(checkout, *command) for command in commands)

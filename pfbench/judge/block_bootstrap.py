@@ -11,7 +11,7 @@ Errors whose size varies slowly have two faults: their squares hide the slow cor
 hold most of the variance. The correlation time of the length is therefore also that of the log ratio of
 the squared errors [ours]. The degrees of freedom are those of as many equal normal blocks as have the same
 kurtosis: 3 (sum u^2)^2 / sum u^4 for block sums u [after Satterthwaite; factor ours].
-`benchmarks/judge_blocks.py` measures the share of false alarms for two equal programs.
+A table of docs/judge.md has the share of false alarms for two equal programs.
 
 References:
     D. N. Politis and J. P. Romano (1994), The stationary bootstrap.

@@ -13,7 +13,7 @@ from checkout import ROOT
 
 from pfbench import job
 
-sys.path.insert(0, str(ROOT / "docs"))  # scripts, not a package
+sys.path.insert(0, str(ROOT / "experiments" / "analyses"))  # scripts, not a package
 import ceiling
 
 ROW: dict[str, Any] = {

@@ -19,7 +19,7 @@ from pfbench.report.board.pack import StudyFacts
 from pfbench.report.options import ReportOptions
 from pfbench.results.looks import find_looks
 
-sys.path.insert(0, str(ROOT / "docs"))  # scripts, not a package
+sys.path.insert(0, str(ROOT / "experiments" / "analyses"))  # scripts, not a package
 import recorded_wins
 import robustness
 
@@ -48,7 +48,7 @@ def test_the_page_is_that_of_the_published_reports(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(robustness, "BLOCKS", blocks)
     monkeypatch.setattr(robustness, "_study_tables", cache(robustness._study_tables))
     text = robustness.PAGE.read_text()
-    assert robustness.fill_page(text) == text, "run: python docs/robustness.py"
+    assert robustness.fill_page(text) == text, "run: python experiments/analyses/robustness.py"
     number = text.partition("| `gate` | ")[2].partition(" ")[0]
     assert float(number) > 0
     changed = text.replace(f"| `gate` | {number} ", "| `gate` | 99.9 ", 1)

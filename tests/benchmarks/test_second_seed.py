@@ -15,7 +15,7 @@ from checkout import ROOT
 from pfbench.files import RecordedFolder
 from pfbench.report import read_page_data, write_page_data
 
-sys.path.insert(0, str(ROOT / "docs"))  # scripts, not a package
+sys.path.insert(0, str(ROOT / "experiments" / "analyses"))  # scripts, not a package
 import merge_study
 import robustness
 import second_seed

@@ -11,7 +11,7 @@ import pytest
 from checkout import ROOT
 from scipy import stats
 
-sys.path.insert(0, str(ROOT / "docs"))  # scripts, not a package
+sys.path.insert(0, str(ROOT / "experiments" / "analyses"))  # scripts, not a package
 import paired_errors
 import terrain_wins
 

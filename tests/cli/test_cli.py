@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-import hydra
 import pytest
 import torch
-import yaml
 from command_line import pfbench
 
 import pfbench as package
 from pfbench import job
-from pfbench.cli import check, messages
+from pfbench.cli import check
 from pfbench.job import run_job
 
 WALK = ("scenario=linear_walk", "scenario.steps=5", "runs=2", "particles=20")
@@ -250,71 +248,6 @@ def test_each_command_refuses_a_missing_folder_and_a_flag(
     assert said.err.count(message) == 1
     assert "usage:" not in said.err
     assert "Traceback" not in said.err
-
-
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [
-        ("told=true", "told: renamed to oracle_noise"),
-        ("fresh=true", "fresh: renamed to overwrite"),
-        ("+told2=true", ""),
-        ("told.x=true", ""),
-        ("filter.weigh=1", "filter.weigh: renamed to filter.weight_update"),
-        ("filter.size.step=2", "filter.size.step: renamed to filter.particle_count.increment"),
-        ("scenario=t003", "scenario=t003: renamed to scenario=flight_300s"),
-        ("noise=q_only", "noise=q_only: renamed to noise=variance_q"),
-        ("budget=same N", "budget=same N: renamed to budget=particles"),
-        ("scenario.steps=3", ""),
-    ],
-)
-def test_a_renamed_key_names_the_new_one(tmp_path: Path, word: str, message: str) -> None:
-    renamed = messages.find_renamed(word)
-    assert (f"{renamed[0]}: renamed to {renamed[1]}" if renamed else "") == message
-    if message:
-        said = pfbench("run", *WALK, word, home=tmp_path)
-        assert said.code == 2
-        assert message in said.err
-
-
-def test_renamed_keys_in_lists_and_below_renamed_keys() -> None:
-    renamed = messages.find_renamed("filter.moves.0.kernel.depth=3")
-    assert renamed == ("filter.moves.0.kernel.depth", "filter.moves.0.kernel.lag")
-    renamed = messages.find_renamed("filter.proposal.guide.adaptations.1.keep")
-    assert renamed is not None
-    assert renamed[1] == "filter.proposal.guide_filter.noise_adaptations.1.forgetting_factor"
-
-
-def test_a_renamed_class_names_the_new_one() -> None:
-    targets = messages._renamed_keys()["targets"]
-    assert len(targets) > 150
-    assert all(callable(hydra.utils.get_object(new)) for new in targets.values())
-    old = next(old for old, new in targets.items() if new == "pfbench.filter.EssResampler")
-    with pytest.raises(hydra.errors.InstantiationException) as caught:
-        hydra.utils.instantiate({"a": {"_target_": old}})
-    message = messages.format_error(caught.value)
-    assert message == f"a._target_={old}: renamed to pfbench.filter.EssResampler"
-
-
-def test_no_key_or_choice_in_use_is_listed_as_renamed() -> None:
-    conf = Path(messages.__file__).parents[2] / "conf"
-    words = []
-    for file in conf.glob("*/*.yaml"):
-        group = file.parent.name
-        content = yaml.safe_load(file.read_text()) or {}
-        words += [f"{group}={file.stem}"]
-        words += [f"{group}.{key}" for key in messages._dotted_keys(content)]
-    words += list(yaml.safe_load((conf / "config.yaml").read_text()))
-    assert len(words) > 500
-    assert [word for word in words if messages.find_renamed(word)] == []
-
-
-def test_renamed_choices_lead_to_existing_ones() -> None:
-    conf, table = Path(messages.__file__).parents[2] / "conf", messages._renamed_keys()
-    for group in ("scenario", "noise"):
-        assert [
-            n for n in table["choices"][group].values() if not (conf / group / f"{n}.yaml").exists()
-        ] == []
-    assert set(table["config"].values()) <= set(yaml.safe_load((conf / "config.yaml").read_text()))
 
 
 @no_cuda

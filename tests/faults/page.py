@@ -1,4 +1,4 @@
-"""The page of the harness: docs/reliability.md, whose table is generated from docs/reliability.json."""
+"""The page of the harness: docs/reliability.md, whose table is generated from experiments/analyses/reliability.json."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from checkout import ROOT
 from faults import readers
 from faults.tally import BAD, Tally
 
-DATA = ROOT / "docs" / "reliability.json"
+DATA = ROOT / "experiments" / "analyses" / "reliability.json"
 PAGE = ROOT / "docs" / "reliability.md"
 _BLOCK = re.compile(r"<!-- numbers:reliability -->\n.*?<!-- numbers:end -->", re.DOTALL)
 

@@ -21,9 +21,10 @@ def git(folder: Path, *words: str) -> str:
 
 
 def test_only_files_that_decide_results_mark_a_commit(tmp_path: Path) -> None:
-    files = ("pfbench/a.py", "conf/b.yaml", "setup.py", "reports/x/report.md", "docs/c.md")
+    decide = ("pfbench/a.py", "conf/b.yaml", "experiments/e.yaml", "setup.py")
+    others = ("reports/x/report.md", "docs/c.md", "experiments/analyses/d.json")
     assert describe_commit(tmp_path) == ""
-    for name in files:
+    for name in decide + others:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("old")
     git(tmp_path, "init", "-q")
@@ -31,10 +32,10 @@ def test_only_files_that_decide_results_mark_a_commit(tmp_path: Path) -> None:
     git(tmp_path, "commit", "-qm", "first")
     commit = git(tmp_path, "rev-parse", "--short", "HEAD")
     (tmp_path / "pfbench" / "a.py").touch()
-    for name in files[3:]:
+    for name in others:
         (tmp_path / name).write_text("new")
     assert describe_commit(tmp_path) == commit
-    for name in files[:3]:
+    for name in decide:
         (tmp_path / name).write_text("new")
         assert describe_commit(tmp_path) == f"{commit}-dirty", name
         git(tmp_path, "add", name)

@@ -30,7 +30,7 @@ from pfbench.nav.trajectory import TrajectoryStart
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.flights import TerrainFlight
 
-sys.path.insert(0, str(ROOT / "docs"))  # scripts, not a package
+sys.path.insert(0, str(ROOT / "experiments" / "analyses"))  # scripts, not a package
 import terrain_limit
 
 TERRAIN = RandomTerrain(height_sd=60.0, shortest_m=300.0, longest_m=8000.0)

@@ -34,7 +34,9 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_study_is_published_from_the_data_of_its_page(study: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(study, tmp_path / "demo"))
-    publish_study = runpy.run_path(str(ROOT / "docs" / "publish_reports.py"))["publish_study"]
+    publish_study = runpy.run_path(str(ROOT / "experiments/analyses/publish_reports.py"))[
+        "publish_study"
+    ]
     publish_study(folder)
     first = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     text = (folder / "report.md").read_text()
@@ -69,7 +71,9 @@ def test_a_published_figure_names_the_filters_that_it_does_not_show(
     study: Path, tmp_path: Path
 ) -> None:
     folder = Path(shutil.copytree(study, tmp_path / "demo"))
-    publish_study = runpy.run_path(str(ROOT / "docs" / "publish_reports.py"))["publish_study"]
+    publish_study = runpy.run_path(str(ROOT / "experiments/analyses/publish_reports.py"))[
+        "publish_study"
+    ]
     publish_study(folder)
     assert "Not shown" not in (folder / "report.md").read_text()
     pack = read_page_data(folder)
@@ -110,7 +114,7 @@ def test_a_page_is_made_again_without_results(study: Path, tmp_path: Path) -> No
 def test_a_table_of_the_readme_is_the_opening_view(
     study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    numbers = runpy.run_path(str(ROOT / "docs" / "readme_numbers.py"))
+    numbers = runpy.run_path(str(ROOT / "experiments/analyses/readme_numbers.py"))
     monkeypatch.setitem(numbers["board_table"].__globals__, "TOP", tmp_path)
     (tmp_path / "reports" / "demo").mkdir(parents=True)
     shutil.copy(study / "verdicts.csv", tmp_path / "reports" / "demo")

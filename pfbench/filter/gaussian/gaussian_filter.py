@@ -320,7 +320,7 @@ def check_point_reach(rule: LinearisationRule, chart: Chart, covariance: Tensor)
     """Check the largest angle between the mean and a point of the initial distribution.
 
     A point beyond half a turn has the shorter angle on the other side. Closer points fail too, because
-    the first measurements move the mean: benchmarks/point_reach.md.
+    the first measurements move the mean: docs/methods/invariant.md.
 
     Shapes: covariance [R, d, d].
     """

@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from typing import Any
 
+import heading_cases
 import numpy as np
 import pytest
 import torch
@@ -128,3 +129,13 @@ def test_filters_of_sigma_points_refuse_at_their_start(name: str) -> None:
         return
     with pytest.raises(ValueError, match=r"got 165 degrees .*points\.alpha=0\.6"):
         method_of(name).init(model, 2, draws, None, spread)
+
+
+def test_the_spread_decides_at_ninety_degrees() -> None:
+    """Points at 2 rad settle, points at 6 rad do not: the table of docs/methods/invariant.md with few runs."""
+    near, far = (
+        heading_cases.measure(heading_cases.unscented_filter(alpha), 90.0, 6)
+        for alpha in (0.33, 1.0)
+    )
+    assert near["settled"] == 6
+    assert far["settled"] == 0

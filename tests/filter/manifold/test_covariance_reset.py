@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from typing import Any
 
+import heading_cases
 import numpy as np
 import pytest
 import torch
-from checkout import ROOT
 from torch import Tensor
 
 from pfbench.core.chart import SIDES, Chart, EuclideanBlock, LieGroupBlock
@@ -25,9 +24,6 @@ from pfbench.filter import (
     run_filter,
 )
 from pfbench.model import StateSpaceModel
-
-sys.path.insert(0, str(ROOT / "benchmarks"))  # scripts, not a package
-import heading_errors
 
 EKF = GaussianFilter(TaylorLinearisation())
 CKF = GaussianFilter(SigmaPointLinearisation(CubaturePoints()))
@@ -104,7 +100,7 @@ def test_after_a_large_correction_the_covariance_is_that_of_the_exact_posterior(
 
 def test_with_a_reset_the_side_of_the_chart_does_not_matter_to_the_ekf() -> None:
     """Left and right differences of one state differ by a matrix, and the reset carries it to the new mean."""
-    model, record, _ = heading_errors.draw(90.0, 4, 8.0, seed=3)
+    model, record, _ = heading_cases.draw(90.0, 4, 8.0, seed=3)
     gaps = {}
     for reset in (True, False):
         method = replace(EKF, reset_covariance=reset)

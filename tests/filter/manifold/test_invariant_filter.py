@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import replace
 
+import heading_cases
 import numpy as np
 import pytest
 import torch
-from checkout import ROOT
 from filter_cases import method_of
 from scipy.spatial.transform import Rotation
 
@@ -29,9 +28,6 @@ from pfbench.filter.gaussian.invariant import ChartModel
 from pfbench.model import StrapdownTotal, linear_walk
 from pfbench.nav.strapdown import PreintegratedImu
 
-sys.path.insert(0, str(ROOT / "benchmarks"))  # scripts, not a package
-import heading_errors
-
 EKF = GaussianFilter(TaylorLinearisation())
 CKF = GaussianFilter(SigmaPointLinearisation(CubaturePoints()))
 LEFT = InvariantFilter(EKF, "left")
@@ -44,7 +40,7 @@ def skew(a: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_step_is_linear_in_errors_of_any_size(side: str) -> None:
     """The differences after a step are a matrix without the state times those before [Barrau and Bonnabel 2017]."""
-    model, u = StrapdownTotal(heading_errors.tuning(90.0)), heading_errors.weave(4.0)
+    model, u = StrapdownTotal(heading_cases.tuning(90.0)), heading_cases.weave(4.0)
     u = PreintegratedImu(*(a[:, 6] for a in u))
     rng, span = np.random.default_rng(1), float(u.duration[0])
     d = np.concatenate(
@@ -76,14 +72,14 @@ def test_the_covariance_of_the_invariant_filter_does_not_depend_on_the_heading(
     is_invariant: bool,
 ) -> None:
     """Two starts of one record with headings 70 degrees apart have equal covariances in the left chart alone."""
-    model, record, _ = heading_errors.draw(45.0, 1, 6.0, seed=3)
+    model, record, _ = heading_cases.draw(45.0, 1, 6.0, seed=3)
     other = torch.from_numpy(Rotation.from_euler("z", 70, degrees=True).as_quat()[[3, 0, 1, 2]])
     chart = model.group_chart("left")
     covariances = []
     for q in (model.origin[:4], other):
 
         def in_left_chart(t: int, info: StepInfo) -> dict[str, torch.Tensor]:
-            slope = heading_errors.change(model, chart, info.mean)
+            slope = heading_cases.change(model, chart, info.mean)
             return {"covariance": (slope @ info.covariance() @ slope.mT)[:, :9, :9]}
 
         start = torch.cat([q, model.origin[4:]])[None]
@@ -103,7 +99,7 @@ def test_the_covariance_of_the_invariant_filter_does_not_depend_on_the_heading(
 
 def test_at_ninety_degrees_the_invariant_filter_states_its_error() -> None:
     runs, seconds = 6, 30.0
-    left, plain = (heading_errors.measure(m, 90.0, runs, seconds) for m in (LEFT, EKF))
+    left, plain = (heading_cases.measure(m, 90.0, runs, seconds) for m in (LEFT, EKF))
     # a mean over time has at most the variance of one time, 2 / 15 for a chi-square of 15 over 15
     error = math.sqrt(2 / 15 / runs)
     assert abs(left["nees_10_30"] - 1.0) < 3 * error
@@ -115,10 +111,10 @@ def test_at_ninety_degrees_the_invariant_filter_states_its_error() -> None:
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_without_errors_of_attitude_all_charts_are_one(method: GaussianFilter, side: str) -> None:
     tuning = replace(
-        heading_errors.tuning(1e-4), attitude_sd_deg=[1e-4] * 3, gyro_density=1e-8,
+        heading_cases.tuning(1e-4), attitude_sd_deg=[1e-4] * 3, gyro_density=1e-8,
         gyro_bias_sd_deg_s=1e-6, gyro_bias_walk=1e-12,
     )  # fmt: skip
-    _, record, _ = heading_errors.draw(1e-4, 2, 4.0, seed=3)
+    _, record, _ = heading_cases.draw(1e-4, 2, 4.0, seed=3)
     model, draws = StrapdownTotal(tuning), PhiloxStream(1, torch.arange(2))
     plain = run_filter(method, model, record, draws)
     other = run_filter(InvariantFilter(method, side), model, record, draws)
@@ -128,7 +124,7 @@ def test_without_errors_of_attitude_all_charts_are_one(method: GaussianFilter, s
 
 
 def test_particles_are_the_same_in_any_chart() -> None:
-    model, record, _ = heading_errors.draw(1.0, 2, 3.0, seed=3)
+    model, record, _ = heading_cases.draw(1.0, 2, 3.0, seed=3)
     draws, method = PhiloxStream(1, torch.arange(2)), ParticleFilter(300)
     plain, left = (
         run_filter(m, model, record, draws) for m in (method, InvariantFilter(method, "left"))

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import replace
 from typing import Any
 
+import heading_cases
 import numpy as np
 import oracles
 import pytest
 import torch
-from checkout import ROOT
 from filter_cases import method_of
 from scipy.integrate import trapezoid
 from torch import Tensor
@@ -34,9 +33,6 @@ from pfbench.filter.whitening import split_root
 from pfbench.model import LinearGaussian, StrapdownTotal
 from pfbench.model.base import StateSpaceModel
 from pfbench.testing import check_causality, check_convergence, check_evidence, check_independence
-
-sys.path.insert(0, str(ROOT / "benchmarks"))  # scripts, not a package
-import heading_errors
 
 EKF = GaussianFilter(TaylorLinearisation())
 # noise that makes both states uncertain again, so that particles are split at many steps
@@ -192,7 +188,7 @@ def test_the_grid_itself_is_fine_enough() -> None:
 def test_every_run_settles_at_150_degrees_and_states_its_error() -> None:
     runs = 6
     ours, single = (
-        heading_errors.measure(m, 150.0, runs, 30.0) for m in (GaussianSplitFilter(EKF, 32), EKF)
+        heading_cases.measure(m, 150.0, runs, 30.0) for m in (GaussianSplitFilter(EKF, 32), EKF)
     )
     assert ours["settled"] == runs > single["settled"]
     # a mean over time has at most the variance of one time, 2 / 15 for a chi-square of 15 over 15
@@ -201,7 +197,7 @@ def test_every_run_settles_at_150_degrees_and_states_its_error() -> None:
 
 @pytest.mark.parametrize("filter_", [EKF, InvariantFilter(EKF, "left")], ids=["plain", "left"])
 def test_particles_are_merged_when_the_heading_is_known(filter_: Any) -> None:
-    model, record, _ = heading_errors.draw(150.0, 4, 30.0, seed=3)
+    model, record, _ = heading_cases.draw(150.0, 4, 30.0, seed=3)
     counts = run_filter(
         GaussianSplitFilter(filter_, 32), model, record, PhiloxStream(2, torch.arange(4))
     ).trace["components"]
@@ -233,7 +229,7 @@ def test_what_cannot_be_split_says_why() -> None:
             ValueError, match=r"filter\.filter must be a Gaussian filter without adaptations"
         ):
             GaussianSplitFilter(inner, 8)  # type: ignore[arg-type]
-    draws, model = PhiloxStream(1, torch.arange(1)), StrapdownTotal(heading_errors.tuning(45.0))
+    draws, model = PhiloxStream(1, torch.arange(1)), StrapdownTotal(heading_cases.tuning(45.0))
     with pytest.raises(ValueError, match=r"must have one unit.*got \['m/s', 'rad'\].*Select"):
         GaussianSplitFilter(EKF, 8, ["attitude", "velocity"]).init(model, 1, draws)
     with pytest.raises(ValueError, match=r"must be groups .*got \['heading'\]"):

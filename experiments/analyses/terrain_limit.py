@@ -1,7 +1,7 @@
-"""Exact filter of terrain navigation on the runs of the studies: `python docs/terrain_limit.py`.
+"""Exact filter of terrain navigation on the runs of the studies: `python experiments/analyses/terrain_limit.py`.
 
 A point-mass filter has the density on a grid of position errors and drops cells of no weight. Its mean has the
-smallest mean square error of all filters. It shares no code with the filters of pfbench and writes docs/terrain_limit.json.
+smallest mean square error of all filters. It shares no code with the filters of pfbench and writes terrain_limit.json.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import yaml
 from pfbench import job
 from pfbench.model import TerrainAided, TerrainWaves
 
-TOP = Path(__file__).parents[1]
-STORE = TOP / "docs" / "terrain_limit.json"
+TOP = Path(__file__).parents[2]
+STORE = Path(__file__).with_name("terrain_limit.json")
 STUDIES = ("terrain_start", "terrain_rough", "terrain_recorded")
 REACH = 4.5  # half width of the grid, initial standard deviations
 CELLS_PER_NOISE = (

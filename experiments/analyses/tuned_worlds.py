@@ -14,7 +14,7 @@ import yaml
 from pfbench.files import markdown_head, markdown_row
 
 METHODS = ("ekf_scaled", "gate", "huber", "student")
-TUNED = Path(__file__).parents[1] / "conf" / "tuned"
+TUNED = Path(__file__).parents[2] / "conf" / "tuned"
 NAMES = {"r_factor": "R", "q_factor": "Q"}
 
 

@@ -1,7 +1,8 @@
 """Whether the verdicts of the studies `robust_*` hold for another seed: the block `seeds` of docs/robustness.md.
 
-`python docs/second_seed.py FOLDER` stores the runs of the second seed in docs/second_seed.parquet. FOLDER has a report of
-each study, written by `pfbench report reports_dir=FOLDER` from the jobs of the same experiment with another seed.
+`python experiments/analyses/second_seed.py FOLDER` stores the runs of the second seed in second_seed.parquet. FOLDER has
+a report of each study, written by `pfbench report reports_dir=FOLDER` from the jobs of the same experiment with another
+seed.
 Both seeds are decided by the same rules, each for the filters and the conditions that both have.
 """
 

@@ -1,7 +1,7 @@
-"""Errors of robust and adaptive filters in each world and noise regime: `python docs/robustness.py`.
+"""Errors of robust and adaptive filters in each world and noise regime: `python experiments/analyses/robustness.py`.
 
 It writes the blocks of docs/robustness.md from the published reports of the studies `robust_*` and from the stored
-limits of docs/ceiling.json. A test fails if a block differs from them.
+limits of ceiling.json. A test fails if a block differs from them.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from pfbench.files import markdown_head, markdown_row
 from pfbench.report import StudyFacts, compare_with_control, find_robust_filters, read_page_data
 from pfbench.results import order_statistic_interval
 
-TOP = Path(__file__).parents[1]
+TOP = Path(__file__).parents[2]
 PAGE = TOP / "docs" / "robustness.md"
 STUDIES = ("robust_flight", "robust_simulated", "robust_quad", "robust_car", "robust_canyon")
 RECORDED = ("robust_quad", "recorded_quad", "robust_car", "recorded_car", "robust_canyon")

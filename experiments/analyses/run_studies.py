@@ -1,14 +1,14 @@
 """Run all published studies, cheapest first: `make studies`.
 
 Each study is a sweep that resumes: finished jobs are skipped, so the command can be stopped and repeated. Progress
-is printed per study. `docs/study_costs.json` has the computing time of each study in seconds on one core: measured
+is printed per study. `experiments/analyses/study_costs.json` has the computing time of each study in seconds on one core: measured
 from its results where it has run, else estimated from the times per step of its published report.
 
-    python docs/run_studies.py                 all studies
-    python docs/run_studies.py --hours=2       only studies that end within 2 hours of computing time
-    python docs/run_studies.py paper_003       these studies
-    python docs/run_studies.py --list          the plan, without a run
-    python docs/run_studies.py --cost          only `pfbench cost` of the studies that have results
+    python experiments/analyses/run_studies.py                 all studies
+    python experiments/analyses/run_studies.py --hours=2       only studies that end within 2 hours of computing time
+    python experiments/analyses/run_studies.py paper_003       these studies
+    python experiments/analyses/run_studies.py --list          the plan, without a run
+    python experiments/analyses/run_studies.py --cost          only `pfbench cost` of the studies that have results
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from pathlib import Path
 
 from pfbench.results import read_metadata
 
-TOP = Path(__file__).parents[1]
-COSTS = TOP / "docs" / "study_costs.json"
+TOP = Path(__file__).parents[2]
+COSTS = Path(__file__).with_name("study_costs.json")
 _PARTS = ("world", "pcrb", "scores", "filter")  # of the seconds of a job
 LEARNED = "neural_ckf"  # the filter whose network a study named learned_* trains first
 

@@ -1,4 +1,4 @@
-"""Reduce the generated reports to the files that git stores: `python docs/publish_reports.py`.
+"""Reduce the generated reports to the files that git stores: `python experiments/analyses/publish_reports.py`.
 
 Git stores report.md, one figure (`headline.svg` or .png) and the numbers of each report. The command draws
 the figure of a study from the data of its page. For other reports it copies a figure and removes
@@ -26,7 +26,7 @@ from pfbench.report import (
     write_page_data,
 )
 
-REPORTS = Path(__file__).parents[1] / "reports"
+REPORTS = Path(__file__).parents[2] / "reports"
 
 # Figure of each report that is not of a study, relative to its folder and without suffix.
 HEADLINES = {

@@ -1,4 +1,4 @@
-"""Write the numbers of README.md, of the pages of methods and of train_a_proposal.md: `python docs/readme_numbers.py`.
+"""Write the numbers of README.md, of the pages of methods and of train_a_proposal.md: `python experiments/analyses/readme_numbers.py`.
 
 Each block between `<!-- numbers:NAME -->` and `<!-- numbers:end -->` is generated from the published
 reports and the benchmark pages. A block without a function of its own is the table of the study of its
@@ -22,7 +22,7 @@ from typing import Any
 from pfbench.claims import read_claims
 from pfbench.files import markdown_bullets
 
-TOP = Path(__file__).parents[1]
+TOP = Path(__file__).parents[2]
 PAGES = (
     TOP / "README.md",
     TOP / "docs" / "train_a_proposal.md",
@@ -342,7 +342,7 @@ def learned_gain() -> str:
 
 def tuned_worlds() -> str:
     """Table of all tuned worlds."""
-    table: str = run_path(str(TOP / "docs" / "tuned_worlds.py"))["tuned_worlds"]()
+    table: str = run_path(str(Path(__file__).with_name("tuned_worlds.py")))["tuned_worlds"]()
     return table
 
 

@@ -1,4 +1,4 @@
-"""The figures of the method pages: `python docs/methods/pictures.py`, or with names of functions for some of them."""
+"""The figures of the method pages: `python experiments/analyses/method_pictures.py`, or with names of functions for some of them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -55,6 +56,7 @@ from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
 from pfbench.filter.particle.resampling import EssResampler, Resampler, Systematic
 from pfbench.filter.particle.sqmc import HaltonPoints
+from pfbench.filter.proposed import swarm_motion
 from pfbench.filter.proposed.dmc_controller import DmcController
 from pfbench.filter.proposed.polymerised import (
     AxisAlignedCells,
@@ -70,7 +72,7 @@ from pfbench.filter.proposed.swarm_coordinates import AllComponents, LikelihoodF
 from pfbench.filter.proposed.swarm_weighting import PrintedWeighting
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 
-HERE = Path(__file__).parent
+PAGES = Path(__file__).parents[2] / "docs" / "methods"
 
 
 def dmc_reconstructed() -> None:
@@ -121,7 +123,7 @@ def dmc_reconstructed() -> None:
         axis.set(xlabel="position (measured, dotted)")
     axes[0].set_ylabel("velocity (not measured)")
     axes[0].legend(loc="upper left", frameon=False)
-    figure.savefig(HERE / "dmc_reconstructed.png", dpi=80)
+    figure.savefig(PAGES / "dmc_reconstructed.png", dpi=80)
 
 
 def mssrckf() -> None:
@@ -173,7 +175,7 @@ def mssrckf() -> None:
     right.set(aspect="equal", title="after a turn: ellipses of 2 sd", xlabel="east", ylabel="north")
     left.legend(fontsize=8, loc="upper center", ncols=4, columnspacing=0.7, handletextpad=0.1)
     right.legend(fontsize=8, loc="lower center")
-    figure.savefig(HERE / "mssrckf.png", dpi=80)
+    figure.savefig(PAGES / "mssrckf.png", dpi=80)
 
 
 def fm_mssrckf() -> None:
@@ -186,7 +188,7 @@ def fm_mssrckf() -> None:
         },
         q=400.0,
     )
-    figure.savefig(HERE / "fm_mssrckf.png", dpi=80)
+    figure.savefig(PAGES / "fm_mssrckf.png", dpi=80)
 
 
 def fm_mssrckf_step() -> None:
@@ -252,7 +254,7 @@ def fm_mssrckf_step() -> None:
         ncols=3,
         frameon=False,
     )
-    figure.savefig(HERE / "fm_mssrckf_step.png", dpi=80)
+    figure.savefig(PAGES / "fm_mssrckf_step.png", dpi=80)
 
 
 def cofm_mssrckf() -> None:
@@ -270,7 +272,7 @@ def cofm_mssrckf() -> None:
         },
         r=9.5,
     )
-    figure.savefig(HERE / "cofm_mssrckf.png", dpi=80)
+    figure.savefig(PAGES / "cofm_mssrckf.png", dpi=80)
 
 
 def _errors(
@@ -399,7 +401,7 @@ def cpso_escape() -> None:
         axis.set(xlabel="position (measured, dotted)", ylim=(-4, 8))
     axes[0].set_ylabel("velocity (not measured)")
     axes[0].legend(loc="upper left", frameon=False)
-    figure.savefig(HERE / "cpso_escape.png", dpi=80)
+    figure.savefig(PAGES / "cpso_escape.png", dpi=80)
 
 
 def enkf() -> None:
@@ -437,7 +439,7 @@ def enkf() -> None:
         axis.set(title=title, xlabel="position (measured, dotted)")
     axes[0].set_ylabel("velocity (not measured)")
     axes[0].legend(loc="upper left", frameon=False)
-    figure.savefig(HERE / "enkf.png", dpi=80)
+    figure.savefig(PAGES / "enkf.png", dpi=80)
 
 
 def rbpf() -> None:
@@ -489,7 +491,7 @@ def rbpf() -> None:
         axis.set(title=title, xlabel="position (measured)")
     axes[0].set_ylabel("velocity (not measured)")
     axes[1].legend(loc="upper left", frameon=False)
-    figure.savefig(HERE / "rbpf.png", dpi=80)
+    figure.savefig(PAGES / "rbpf.png", dpi=80)
 
 
 def qmc_polymerised() -> None:
@@ -521,7 +523,7 @@ def qmc_polymerised() -> None:
     shades = ["#0072B2", "#E69F00", "#009E73", "#CC79A7"]
     axes[0].collections[0].set_color([shades[int(k) % 4] for k in number])
     axes[1].legend(loc="lower right", frameon=False, fontsize=9)
-    figure.savefig(HERE / "qmc_polymerised.png", dpi=75)
+    figure.savefig(PAGES / "qmc_polymerised.png", dpi=75)
 
 
 def gpf() -> None:
@@ -543,7 +545,7 @@ def gpf() -> None:
     for axis, (title, resampler) in zip(axes, panels.items(), strict=True):
         _scatter_resampled(axis, model, cloud, resampler, title)
     axes[1].legend(loc="lower right", frameon=False, fontsize=9)
-    figure.savefig(HERE / "gpf.png", dpi=75)
+    figure.savefig(PAGES / "gpf.png", dpi=75)
 
 
 def _plain(d: int) -> LinearGaussian:
@@ -636,7 +638,7 @@ def mcmc_rpf() -> None:
         axis.set_xlabel("position")
     axes[0].set_ylabel("velocity")
     axes[0].legend(frameon=False, fontsize=9)
-    figure.savefig(HERE / "mcmc_rpf.png", dpi=90)
+    figure.savefig(PAGES / "mcmc_rpf.png", dpi=90)
     plt.close(figure)
 
 
@@ -668,7 +670,54 @@ def cofm_amssrcpf() -> None:
         axis.set_xlabel("position")
     axes[0].set_ylabel("velocity")
     axes[0].legend(frameon=False, fontsize=9)
-    figure.savefig(HERE / "cofm_amssrcpf.png", dpi=90)
+    figure.savefig(PAGES / "cofm_amssrcpf.png", dpi=90)
+    plt.close(figure)
+
+
+def escape_factor() -> None:
+    """Figure 1 of Tian et al. and their chaotic map: the factor over the iterations, two sequences, the distribution of many."""
+    blue, orange, most = "#0072B2", "#D55E00", 150  # iterations, as in their figure
+    figure, (factor, orbit, histogram) = plt.subplots(1, 3, figsize=(12, 3.4), layout="constrained")
+    k = np.arange(most + 1)
+    intended = [
+        swarm_motion.InertiaVelocity(escape_coefficient=0.12).compute_escape_factor(i / most)
+        for i in k
+    ]
+    factor.plot(
+        k,
+        0.12 - 0.12 * np.cos(k * np.pi) / most,
+        color=orange,
+        ls="--",
+        label="as printed [eq. 35]",
+    )
+    factor.plot(k, intended, color=blue, label="as intended: rises as in their figure")
+    factor.set(title="escape factor c3 = c4", xlabel="iteration", ylabel="c3", ylim=(0, 0.26))
+    factor.legend(fontsize=8, loc="upper left")
+
+    z = torch.tensor([0.3, 0.3 + 1e-6], dtype=torch.float64)
+    sequence = [z]
+    for _ in range(40):
+        sequence.append(swarm_motion.logistic_map(sequence[-1], z))
+    both = torch.stack(sequence)
+    orbit.plot(both[:, 0], color=blue, marker="o", ms=3, label="from 0.3")
+    orbit.plot(both[:, 1], color=orange, ls="--", marker="s", ms=3, label="from 0.3 + 1e-6")
+    orbit.set(title="z' = 4 z (1 - z) [eq. 31]", xlabel="iteration", ylabel="z")
+    orbit.legend(fontsize=8, loc="lower left")
+
+    generator = torch.Generator().manual_seed(1)
+    values = swarm_motion.iterate_logistic(
+        torch.rand(200_000, dtype=torch.float64, generator=generator)
+    )
+    histogram.hist(
+        values.numpy(), bins=50, range=(0, 1), density=True, color="0.75", label="200 000 sequences"
+    )
+    at = np.linspace(0.004, 0.996, 400)
+    histogram.plot(
+        at, 1 / (np.pi * np.sqrt(at * (1 - at))), color=blue, label="arcsine distribution"
+    )
+    histogram.set(title="distribution after 50 iterations", xlabel="z", ylabel="density")
+    histogram.legend(fontsize=8, loc="upper center")
+    figure.savefig(PAGES / "escape_factor.png", dpi=80)
     plt.close(figure)
 
 

@@ -1,4 +1,4 @@
-"""Put newer jobs into a published study: `python docs/merge_study.py FOLDER STUDY ...`.
+"""Put newer jobs into a published study: `python experiments/analyses/merge_study.py FOLDER STUDY ...`.
 
 FOLDER/STUDY is a report of some jobs of the study on the same runs, written by `pfbench report reports_dir=FOLDER`.
 A filter that was tuned anew, or that the published study lacks, is taken from it. All other filters of it are a check:
@@ -27,7 +27,7 @@ from pfbench.report import (
     write_page_data,
 )
 
-REPORTS = Path(__file__).parents[1] / "reports"
+REPORTS = Path(__file__).parents[2] / "reports"
 RUN = ["scenario", "regime", "seed", "run"]
 TOLERANCE = 1e-5  # relative, of errors that are stored in single precision
 Pack = dict[str, Any]

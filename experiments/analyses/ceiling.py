@@ -3,7 +3,7 @@
 The cubature filter, the iterated smoother of the same rule, sampled smoothed paths and the posterior Cramer-Rao bound
 see the same runs. Results are kept in ceiling.json after each scenario. A second call goes on with those that are missing.
 
-Run: python docs/ceiling.py [--again] [SCENARIO ...]; --page writes the page from the stored results alone.
+Run: python experiments/analyses/ceiling.py [--again] [SCENARIO ...]; --page writes the page from the stored results alone.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from pfbench.filter import (
 )
 from pfbench.model import StateSpaceModel
 
-HERE = Path(__file__).parent
-STORE, PAGE = HERE / "ceiling.json", HERE / "ceiling.md"
+STORE = Path(__file__).with_name("ceiling.json")
+PAGE = Path(__file__).parents[2] / "docs" / "ceiling.md"
 PASSES, PARTICLES, PATHS, CHAIN_STEPS = 4, 500, 50, 10
 CONVERGED = 0.1  # largest shift of the last pass, in standard deviations
 MODEL_OF_THE_DATA = (0.5, 2.0)  # range of the smoother's NEES for simulated sensors
@@ -327,7 +327,7 @@ def page(store: dict[str, Any]) -> str:
         EXAMPLE,
         "## Scenarios without a PCRB\n\n" + "\n".join(missing),
         "## Scenarios without a smoother\n\n" + "\n".join(refused),
-        "To measure them again: `python docs/ceiling.py --again`. Numbers are stored in `docs/ceiling.json`.",
+        "To measure them again: `python experiments/analyses/ceiling.py --again`. Numbers are stored in `experiments/analyses/ceiling.json`.",
     ]
     return "\n\n".join(parts) + "\n"
 

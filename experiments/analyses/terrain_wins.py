@@ -21,8 +21,8 @@ from second_seed import read_runs
 from pfbench.files import markdown_head, markdown_row
 from pfbench.results import holm, wilcoxon_signed_rank
 
-LIMITS = Path(__file__).parents[1] / "docs" / "terrain_limit.json"
-REPORTS = Path(__file__).parents[1] / "reports"
+LIMITS = Path(__file__).with_name("terrain_limit.json")
+REPORTS = Path(__file__).parents[2] / "reports"
 PARTICLES = "rpf"  # the particle filter that is compared
 BANKS = ("ekf_bank", "ekf_bank_dense")
 STUDIES = {
