@@ -52,7 +52,8 @@ def test_git_stores_only_the_published_files_of_a_report() -> None:
     assert studies > set(load("publish_reports").HEADLINES)
     for study in studies:
         figures = [name for name in stored if name.startswith(f"reports/{study}/headline.")]
-        text = (ROOT / "reports" / study / "report.md").read_text()
+        worlds = ROOT / "reports" / study / "worlds.md"
+        text = (worlds if worlds.exists() else worlds.with_name("report.md")).read_text()
         assert len(figures) == text.count("](headline."), study
         assert len(figures) == 1 or "No filter has an error to compare" in text, study
         assert f"reports/{study}/report.md" in stored
@@ -96,7 +97,12 @@ def check_published_page(folder: Path, copy: Path) -> None:
     for name in files:
         (copy / name).symlink_to(folder / name)
     page = rebuild_page(copy).read_text()
-    for name in ("report.md", *files):
+    if has_first_page := (folder / "worlds.md").exists():
+        assert "heat_map.svg" in (folder / "report.md").read_text()
+        page = (copy / "worlds.html").read_text()
+        drawings = [(path / "heat_map.svg").read_bytes() for path in (copy, folder)]
+        assert is_equal_drawing(*drawings), folder.name
+    for name in ("report.md", *["worlds.md"] * has_first_page, *files):
         assert (copy / name).read_bytes() == (folder / name).read_bytes(), f"{folder.name}: {name}"
     links = re.findall(r'href="([^#"]+)" download', page)
     assert set(links) == {"verdicts.csv", "runs.parquet"}, folder.name

@@ -1,7 +1,8 @@
 """Reduce the generated reports to the files that git stores: `python experiments/analyses/publish_reports.py`.
 
 Git stores report.md, one figure (`headline.svg` or .png) and the numbers of each report. The command draws
-the figure of a study from the data of its page. For other reports it copies a figure and removes
+the figure of a study from the data of its page. A study of several methods in several worlds has its first page in
+report.md with two figures, and worlds.md. For other reports it copies a figure and removes
 the references to all others from report.md. The results of a script in `experiments/` are stored with six
 digits in `results.json.gz`, and its page is made of them. `make report` runs it after the reports. A second run
 changes nothing.
@@ -17,12 +18,16 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from pfbench.files import RecordedFolder
 from pfbench.report import (
     PAGE_DATA,
+    find_overview,
     read_page_data,
     write_headline,
     write_markdown,
+    write_overview,
     write_page_data,
 )
 
@@ -52,13 +57,19 @@ def publish_study(folder: Path) -> None:
         folder: Folder of the report, with the data of its page.
     """
     pack = read_page_data(folder)
+    runs = folder / "runs.parquet"
+    overview = find_overview(pack, pd.read_parquet(runs)) if runs.is_file() else None
     with RecordedFolder(folder, is_complete=False) as target:
         target.remove("headline.png")
         has_figure = write_headline(pack, target)
         pack["headline"] = CAPTION if has_figure else ""
         pack["headline_note"] = describe_absent(pack) if has_figure else ""
         write_page_data(pack, target)
-        write_markdown(pack, target)
+        if overview is None:
+            write_markdown(pack, target)
+        else:
+            write_markdown(pack, target, "worlds.md")
+            write_overview(overview, pack, target)
 
 
 def describe_absent(pack: Mapping[str, Any]) -> str:

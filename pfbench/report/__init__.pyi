@@ -12,6 +12,7 @@ from pfbench.report.journal.ratio_figures import (
     write_headline as write_headline,
 )
 from pfbench.report.journal.table_layout import text_width as text_width
+from pfbench.report.overview.page import write_overview as write_overview
 from pfbench.report.papers.specs import (
     PaperFigure as PaperFigure,
     PaperFigureInput as PaperFigureInput,
@@ -19,6 +20,7 @@ from pfbench.report.papers.specs import (
 from pfbench.report.study_page import write_markdown as write_markdown
 from pfbench.report.study_report import (
     PAGE_DATA as PAGE_DATA,
+    find_overview as find_overview,
     read_page_data as read_page_data,
     rebuild_page as rebuild_page,
     write_page_data as write_page_data,

@@ -26,7 +26,7 @@ from pfbench.report.journal.ratio_figures import HEADLINE, write_headline
 from pfbench.report.methods_text import MethodsFacts
 from pfbench.report.options import ReportOptions
 from pfbench.report.overview.page import BOARD_PAGE, write_overview
-from pfbench.report.overview.tables import build_overview, has_overview
+from pfbench.report.overview.tables import Overview, build_overview, has_overview
 from pfbench.report.papers import figures
 from pfbench.report.provenance import renew_bibliography
 from pfbench.report.study_page import write_page
@@ -106,11 +106,27 @@ def write_pages(
     pack: Mapping[str, Any], table: pd.DataFrame | None, folder: RecordedFolder
 ) -> Path:
     """Write the page of a study; one with several proposed methods in several worlds has a page before it."""
-    facts = StudyFacts.from_pack(pack)
-    if table is None or not has_overview(table, facts.looks):
+    overview = find_overview(pack, table)
+    if overview is None:
         return write_page(pack, folder)
     write_page(pack, folder, BOARD_PAGE)
-    return write_overview(build_overview(table, facts.looks, facts.worlds), pack, folder)
+    return write_overview(overview, pack, folder)
+
+
+def find_overview(pack: Mapping[str, Any], table: pd.DataFrame | None) -> Overview | None:
+    """Decide the first page of a study with several proposed methods in several worlds.
+
+    Args:
+        pack: Data of the page.
+        table: Runs of the study, None if they are not there.
+
+    Returns:
+        Tables of the page; None for other studies.
+    """
+    facts = StudyFacts.from_pack(pack)
+    if table is None or not has_overview(table, facts.looks):
+        return None
+    return build_overview(table, facts.looks, facts.worlds)
 
 
 def list_job_settings(conditions: Sequence[Condition], planned: int | None) -> list[list[str]]:

@@ -13,6 +13,7 @@ from markupsafe import Markup
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.overview import figures
 from pfbench.report.overview.tables import Overview, tell_story
+from pfbench.report.study_page.page_writer import describe_page_knobs
 from pfbench.report.writers import format_csv, template_environment
 from pfbench.results.conditions import parse_label
 from pfbench.results.paper_block import read_paper_block
@@ -25,7 +26,13 @@ _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight"
 def write_overview(overview: Overview, pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
     """Write the first page of a study: index.html, report.md, heat_map.svg, matrices.svg, cells.csv and pairs.csv.
 
-    Returns path of index.html.
+    Args:
+        overview: Tables of the page.
+        pack: Data of the page of each world.
+        folder: Folder of the report.
+
+    Returns:
+        Path of index.html.
     """
     pictures = {
         **{f"heat_map{f.name}": figures.to_svg(figures.draw_heat_map(overview, f)) for f in figures.HEAT_FORMATS},
@@ -41,6 +48,7 @@ def write_overview(overview: Overview, pack: Mapping[str, Any], folder: Recorded
         "overview": overview,
         "headline": word_headline(overview),
         "setting": describe_setting(overview),
+        "foreign_knobs": describe_page_knobs(pack) if "worlds" in pack else "",
         "stories": [tell_story(overview, m, _summary(m)) for m in overview.methods],
         "count": spell_number(len(overview.methods)),
         "pictures": {name: Markup(_data_address(text)) for name, text in pictures.items()},

@@ -73,12 +73,14 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder, name: str = "ind
     script_data = {key: value for key, value in pack.items() if key not in _STATIC}
     data = encode_pack(script_data, PAGE_BYTES - len(html.render(context).encode()))
     folder.write(name, html.render({**context, "data": Markup(data)}))
-    write_markdown(pack, folder)
+    write_markdown(pack, folder, "report.md" if name == "index.html" else f"{Path(name).stem}.md")
     return folder.path / name
 
 
-def write_markdown(pack: Mapping[str, Any], folder: RecordedFolder) -> None:
-    """Write report.md of a study, one screen."""
+def write_markdown(
+    pack: Mapping[str, Any], folder: RecordedFolder, name: str = "report.md"
+) -> None:
+    """Write the page of a study as Markdown, one screen."""
     context = {
         "pack": {"headline": "", "headline_note": "", "failures": (), **pack},
         "choices": pack.get("choices", ()),
@@ -88,7 +90,7 @@ def write_markdown(pack: Mapping[str, Any], folder: RecordedFolder) -> None:
         "level": _format_level(pack),
     }
     template = template_environment(_HERE, is_html=False).get_template("report.md.jinja")
-    folder.write("report.md", template.render(context))
+    folder.write(name, template.render(context))
 
 
 def _format_level(pack: Mapping[str, Any]) -> str:
