@@ -275,7 +275,11 @@ def test_ink_has_contrast_on_every_ground() -> None:
 
 
 def test_the_page_has_its_figures_tables_and_stories(overview: Overview, tmp_path: Path) -> None:
-    pack = {"title": "A title", "generated": {"version": "0", "commit": "abc", "date": ""}}
+    pack = {
+        "study": "s",
+        "title": "A title",
+        "generated": {"version": "0", "commit": "abc", "date": ""},
+    }
     with RecordedFolder(tmp_path / "study") as folder:
         page = write_overview(overview, pack, folder).read_text()
     assert {f.name for f in (tmp_path / "study").iterdir()} >= {
