@@ -27,8 +27,7 @@ from race import cpu_name
 
 from pfbench.core import Episode, PhiloxStream
 from pfbench.filter import ParticleFilter, run_filter
-from pfbench.filter.loop import Watch
-from pfbench.filter.run_batches import choose_run_batch
+from pfbench.filter.loop import Watch, choose_run_batch
 from pfbench.job import ScoreRecorder
 from pfbench.kernels import dispatch, process_memory
 from pfbench.model import LinearGaussian

@@ -26,8 +26,8 @@ from pfbench.core.record import Episode
 from pfbench.filter.exactness import has_bounded_weights, has_covariance, has_evidence
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.learned.checkpoint import replace_checkpoint_by_hash
+from pfbench.filter.loop import choose_run_batch
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.run_batches import choose_run_batch
 from pfbench.job.config import JobConfig
 from pfbench.job.inputs import describe_unnamed_files, find_inputs
 from pfbench.job.model_fit import instantiate_parts

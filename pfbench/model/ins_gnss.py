@@ -11,8 +11,8 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core.channels import describe_misfit
+from pfbench.core.density import dense_normal, independent_normal, normal_batch
 from pfbench.core.linear_algebra import affine_map, factor
-from pfbench.core.normal import dense_normal, independent_normal, normal_batch
 from pfbench.core.record import Record
 from pfbench.model.base import StateSpaceModel
 from pfbench.nav import attitude, error_dynamics

@@ -13,7 +13,7 @@ from typing_extensions import override
 from pfbench.core import chart as quaternion
 from pfbench.core.channels import EACH_SATELLITE, name_channels
 from pfbench.core.chart import Chart, EuclideanBlock, LieGroupBlock, QuaternionBlock
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.parameter_checks import check_positive, check_tuning
 from pfbench.core.record import Record
 from pfbench.model.base import StateSpaceModel, check_truth_sizes

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, MultivariateNormal, Normal
 from typing_extensions import override
 
-from pfbench.core.normal import dense_normal, independent_normal
+from pfbench.core.density import dense_normal, independent_normal
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels, Record
 from pfbench.model.base import ModelWrapper, StateSpaceModel

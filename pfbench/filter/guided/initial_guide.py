@@ -17,7 +17,7 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.guided.guides import check_covariance_factor
-from pfbench.filter.particle.proposals import InitialProposal
+from pfbench.filter.particle.stages import InitialProposal
 from pfbench.filter.smoothing.gaussian_smoother import smooth_initial_state
 from pfbench.filter.whitening import LOG_2PI
 from pfbench.model.base import StateSpaceModel, initial_law
