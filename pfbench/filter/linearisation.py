@@ -21,8 +21,6 @@ from pfbench.kernels.dispatch import is_capturing
 from pfbench.model.base import StateSpaceModel
 
 _POINTS = 200_000  # states differentiated at a time
-
-
 _PROBES = 4  # states and noises at which additive noise is verified
 
 

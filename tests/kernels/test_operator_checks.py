@@ -26,7 +26,7 @@ from pfbench.kernels import (
     operator_sources,
     step_compiler,
 )
-from pfbench.kernels.operator_checks import check_arguments
+from pfbench.kernels.manifest import check_arguments
 from pfbench.kernels.step_compiler import compile_function
 
 COMPILER = shutil.which("c++") or shutil.which("g++")

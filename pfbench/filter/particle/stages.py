@@ -12,9 +12,9 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.density import StandardNormal
-from pfbench.core.distribution_sampling import draw_values
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
+from pfbench.core.simulate import draw_values
 from pfbench.filter.belief import (
     ParticleBelief,
     add_log_weights,
