@@ -32,9 +32,10 @@ from torch.utils._pytree import tree_leaves
 
 from pfbench.core import PhiloxStream, Record, map_inputs
 from pfbench.filter import EssResampler, FilterResult, ParticleFilter, Systematic, run_filter
+from pfbench.filter.loop import choose_run_batch
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
-from pfbench.filter.run_batches import choose_run_batch
-from pfbench.kernels import dispatch, process_memory
+from pfbench.job import memory as process_memory
+from pfbench.kernels import dispatch
 from pfbench.model import StateSpaceModel
 
 HERE = Path(__file__).parent

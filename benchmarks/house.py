@@ -23,13 +23,14 @@ from workload import ins_model
 
 from pfbench import job
 from pfbench.core import PhiloxStream, Record
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.linear_algebra import affine_map
-from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.filter import EssResampler, ParticleFilter, Systematic, run_filter
+from pfbench.filter.loop import choose_run_batch
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
-from pfbench.filter.run_batches import choose_run_batch
+from pfbench.job import memory as process_memory
 from pfbench.job.filter_pass import choose_engine
-from pfbench.kernels import dispatch, process_memory
+from pfbench.kernels import dispatch
 from pfbench.model import StateSpaceModel, StochasticVolatility, UnivariateGrowth
 from pfbench.model.ins_gnss import LooseStep
 

@@ -26,7 +26,8 @@ from race import cpu_name
 from pfbench import job
 from pfbench.core import PhiloxStream, Record, map_inputs
 from pfbench.filter import ParticleFilter, run_filter
-from pfbench.kernels import dispatch, process_memory
+from pfbench.job import memory as process_memory
+from pfbench.kernels import dispatch
 from pfbench.noise import NominalNoise
 
 HERE = Path(__file__).parent

@@ -26,10 +26,9 @@ from race import cpu_name
 
 from pfbench.core import Episode, PhiloxStream
 from pfbench.filter import ParticleFilter, run_filter
-from pfbench.filter.loop import Watch
-from pfbench.filter.run_batches import choose_run_batch
-from pfbench.job import ScoreRecorder
-from pfbench.kernels import dispatch, process_memory
+from pfbench.filter.loop import Watch, choose_run_batch
+from pfbench.job import ScoreRecorder, memory as process_memory
+from pfbench.kernels import dispatch
 from pfbench.model import LinearGaussian
 from pfbench.noise import NominalNoise
 from pfbench.scenario import ModelSimulation

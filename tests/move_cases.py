@@ -11,7 +11,7 @@ from torch import Tensor
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.moves.metropolis import McmcKernel, Move
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.stages import EssResampler, Systematic
 
 
 def moving(*moves: Move, n: int = 40, threshold: float = 1.0) -> ParticleFilter:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pfbench.core.chart import Chart, QuaternionBlock
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.record import Record
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian

@@ -52,10 +52,15 @@ from pfbench.filter.moves.metropolis import MetropolisHastings, StateHistory as 
 from pfbench.filter.moves.path_kernels import NoiseFlowKernel
 from pfbench.filter.particle.gaussian_particle_filter import GaussianResampler
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import EssResampler, Resampler, Systematic
 from pfbench.filter.particle.sqmc import HaltonPoints
+from pfbench.filter.particle.stages import (
+    BootstrapProposal,
+    EssResampler,
+    Proposal,
+    Resampler,
+    Systematic,
+)
 from pfbench.filter.proposed import swarm_motion
 from pfbench.filter.proposed.dmc_controller import DmcController
 from pfbench.filter.proposed.polymerised import (

@@ -12,25 +12,25 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pfbench.cli.application import make_application
-from pfbench.cli.compose import check_words, replace_config_dir
-from pfbench.cli.messages import format_error, notes_of
-from pfbench.cli.terminal import end_with_parent
-from pfbench.cli.until_decided import (
-    GrowingSweep,
+from pfbench.cli.compose import (
     StudyPlan,
-    check_has_sweep,
+    check_words,
     plan_study,
+    replace_config_dir,
     wants_until_decided,
 )
+from pfbench.cli.messages import format_error, notes_of
+from pfbench.cli.terminal import end_with_parent
 from pfbench.files.command_start import start_work
 from pfbench.files.reader_notes import NOTE, SWEEP_LOG, append_line
 from pfbench.job.config import JobConfig, expand_filter_sets, register_experiments
 from pfbench.job.trust import ENVIRONMENT
+from pfbench.results.paper_block import conf_dir
 
 # --------------------------------------------------------------------------------------------------
 # Command `pfbench run`: one job, or a sweep.
@@ -51,13 +51,17 @@ Finished jobs are skipped: repeat an interrupted command to resume.
   pfbench list               scenarios, noise regimes, filters and experiments
   pfbench run --cfg job      all keys with their values"""
 
+
 _RETRIES = 3  # of a sweep that lost a process, as many as Ray allows
+
 # errors of joblib and Ray about a process that another program ended
 _LOST_PROCESS = {
     "TerminatedWorkerError", "LocalRayletDiedError", "NodeDiedError", "ObjectLostError",
     "OwnerDiedError", "RaySystemError", "WorkerCrashedError",
 }  # fmt: skip
+
 _FLAGS = ("-m", "--multirun")
+
 _PRINTING_FLAGS = {"--cfg", "-c", "--info", "-i", "--hydra-help", "--version", "--resolve"}
 
 
@@ -76,6 +80,8 @@ def run_jobs(words: Sequence[str]) -> None:
     if plan and flags:
         plan.check_comparable()
     if plan and wants_until_decided(plan):
+        from pfbench.cli.until_decided import GrowingSweep, check_has_sweep
+
         check_has_sweep(flags)
         sweep = GrowingSweep.from_plan(plan)
         others = [word for word in overrides if not re.match(r"(runs|first_run)=", word)]
@@ -91,10 +97,12 @@ def run_jobs(words: Sequence[str]) -> None:
 
 def _run_alone(overrides: Sequence[str], plan: StudyPlan | None) -> None:
     """Run one job, and print what its runs can show once its data are valid."""
+    # what was checked is what runs, unless a word may have another value in Hydra's application
+    checked = plan.first if plan and not any("${" in word for word in overrides) else None
 
     @functools.wraps(run_task)
     def run_with_plan(cfg: Any) -> float:
-        return run_task(cfg, lambda: print_study_size(plan))
+        return run_task(cfg, lambda: print_study_size(plan), checked)
 
     sys.argv = ["pfbench run", *overrides]
     with hide_hydra_line():
@@ -164,8 +172,10 @@ def delay_keys_of_swept_groups(words: Sequence[str]) -> list[str]:
     ]
 
 
-def run_task(cfg: Any, announce: Callable[[], None] | None = None) -> float:
-    """Run one job of a Hydra application.
+def run_task(
+    cfg: Any, announce: Callable[[], None] | None = None, checked: JobConfig | None = None
+) -> float:
+    """Run one job of a Hydra application, by its configuration that is resolved and checked if there is one.
 
     Returns the root mean square error of the main group, for sweepers that optimise.
     """
@@ -182,7 +192,7 @@ def run_task(cfg: Any, announce: Callable[[], None] | None = None) -> float:
     end_with_parent()
     counter = "" if number is None else f"[{number + 1}{f'/{total}' if total else ''}] "
     try:
-        outcome = job.run(cfg, choices, counter, announce)
+        outcome = job.run(checked or cfg, choices, counter, announce)
     except Exception as error:
         note_outcome(number, "failed")
         if number is None:
@@ -225,7 +235,9 @@ def run_with_retries(sweep: Callable[[], Any]) -> None:
 
 log = logging.getLogger("pfbench")
 
+
 _HYDRA_LINE = "Error executing job with overrides"
+
 _OTHER_TERMINAL = ("slurm", "ray_cluster")  # launchers whose jobs print elsewhere
 
 
@@ -379,3 +391,75 @@ def note_outcome(number: int | None, status: str) -> None:
         return
     with contextlib.suppress(OSError):  # of a full disk: the job reports it
         append_line(path, f"{number} {status}")
+
+
+# --------------------------------------------------------------------------------------------------
+# Hydra's application, by the loader of pfbench.
+
+
+def make_application(task: Callable[[Any], Any]) -> Callable[[], None]:
+    """Make the application that runs a task for each job."""
+    import hydra
+
+    full = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(task)
+
+    def run() -> None:
+        words = sys.argv[1:]
+        flags = [word for word in words if word.startswith("-")]
+        if set(flags) <= set(_FLAGS):
+            overrides = [word for word in words if word not in flags]
+            _run_overrides(task, overrides, is_multirun=bool(flags))
+        else:
+            with _shared_loader():
+                full()
+
+    return run
+
+
+@contextmanager
+def _shared_loader() -> Iterator[None]:
+    """Let Hydra's own application load by the loader of pfbench, which checks what it loads."""
+    from hydra._internal import hydra as module
+
+    from pfbench.job.shared_loader import SharedLoader
+
+    hydra: Any = module
+    by_hydra = hydra.ConfigLoaderImpl
+    hydra.ConfigLoaderImpl = SharedLoader
+    try:
+        yield
+    finally:
+        hydra.ConfigLoaderImpl = by_hydra
+
+
+def _run_overrides(task: Callable[[Any], Any], overrides: list[str], *, is_multirun: bool) -> None:
+    """Run the jobs of overrides, as `hydra.main` does."""
+    from hydra import version
+    from hydra._internal import utils
+    from hydra._internal.hydra import Hydra
+    from hydra.core.global_hydra import GlobalHydra
+
+    from pfbench.job.shared_loader import SharedLoader
+
+    version.setbase("1.3")
+    name = utils.detect_task_name(*utils.detect_calling_file_or_module_from_task_function(task))
+    application = Hydra(name, SharedLoader(utils.create_config_search_path(str(conf_dir()))))
+    GlobalHydra.instance().initialize(application)
+    try:
+        mode = application.get_mode("config", overrides) if _can_set_mode(overrides) else None
+        utils._run_app(
+            run=not is_multirun,
+            multirun=is_multirun,
+            mode=mode,
+            hydra=application,
+            config_name="config",
+            task_function=task,
+            overrides=overrides,
+        )
+    finally:
+        GlobalHydra.instance().clear()
+
+
+def _can_set_mode(overrides: Sequence[str]) -> bool:
+    """Return whether overrides can set `hydra.mode`, which no file of pfbench sets. Other files need a search path."""
+    return any(re.match(r"[+~]*hydra\b", word) for word in overrides)

@@ -7,7 +7,6 @@ from pfbench.core.chart import (
     LieGroupBlock as LieGroupBlock,
     QuaternionBlock as QuaternionBlock,
 )
-from pfbench.core.distribution_sampling import NumberSource as NumberSource
 from pfbench.core.random_stream import PhiloxStream as PhiloxStream, RandomStream as RandomStream
 from pfbench.core.record import (
     Episode as Episode,
@@ -15,3 +14,4 @@ from pfbench.core.record import (
     Record as Record,
     map_inputs as map_inputs,
 )
+from pfbench.core.simulate import NumberSource as NumberSource

@@ -6,6 +6,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -132,7 +133,7 @@ class Chart:
         """Number of components of a difference, d."""
         return sum(block.dimension for block in self.blocks)
 
-    @property
+    @cached_property
     def flat(self) -> bool:
         """True if all components are Euclidean."""
         return all(isinstance(block, EuclideanBlock) for block in self.blocks)

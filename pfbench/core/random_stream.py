@@ -18,7 +18,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.parameter_checks import check_run_numbers
-from pfbench.kernels import cuda, dispatch, philox
+from pfbench.kernels import cuda, dispatch
 from pfbench.kernels.dispatch import compilable
 
 Draw: TypeAlias = Callable[..., Tensor]
@@ -80,6 +80,8 @@ def _normals(
 
     Seed and purpose are the key. (quarter, component, step, run) is the counter of four numbers.
     """
+    from pfbench.kernels import philox
+
     return philox.compute_normals((seed, purpose, step, runs, components, quarters), philox.SINGLE)
 
 
@@ -87,6 +89,8 @@ def _normals_float64(
     seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
 ) -> Tensor:
     """Draw standard normal numbers, float64 [w, R, 4 q]."""
+    from pfbench.kernels import philox
+
     return philox.compute_normals((seed, purpose, step, runs, components, quarters), philox.DOUBLE)
 
 
@@ -94,6 +98,8 @@ def _uniforms(
     seed: Tensor, purpose: int, step: Tensor, runs: Tensor, components: int, quarters: int
 ) -> Tensor:
     """Draw uniform numbers on the open interval (0, 1), float64 [w, R, 4 q]."""
+    from pfbench.kernels import philox
+
     return philox.compute_uniforms((seed, purpose, step, runs, components, quarters))
 
 

@@ -119,16 +119,6 @@ from pfbench.filter.moves.path_proposals import (
     SegmentProposal as SegmentProposal,
     SmoothedSegment as SmoothedSegment,
 )
-from pfbench.filter.particle.auxiliary_weights import (
-    AdditiveTempering as AdditiveTempering,
-    AuxiliaryWeights as AuxiliaryWeights,
-    LookAheadWeights as LookAheadWeights,
-    PowerTempering as PowerTempering,
-    TemperedPosterior as TemperedPosterior,
-    TemperedWeights as TemperedWeights,
-    Tempering as Tempering,
-    UniformTempering as UniformTempering,
-)
 from pfbench.filter.particle.compiled_filter import CallCounter as CallCounter
 from pfbench.filter.particle.gaussian_particle_filter import (
     GaussianPredictionProposal as GaussianPredictionProposal,
@@ -138,41 +128,45 @@ from pfbench.filter.particle.particle_count import (
     CountLimits as CountLimits,
     EssStepCount as EssStepCount,
     EssTargetCount as EssTargetCount,
-    ParticleCount as ParticleCount,
 )
-from pfbench.filter.particle.particle_filter import (
-    ParticleFilter as ParticleFilter,
-    Stage as Stage,
-)
-from pfbench.filter.particle.proposals import (
-    BootstrapProposal as BootstrapProposal,
-    InitialProposal as InitialProposal,
-    Proposal as Proposal,
-    ProposalSample as ProposalSample,
-)
+from pfbench.filter.particle.particle_filter import ParticleFilter as ParticleFilter
 from pfbench.filter.particle.regularised_resampling import (
     GaussianSmoothing as GaussianSmoothing,
     RegularisedResampler as RegularisedResampler,
     SmoothingKernel as SmoothingKernel,
     ThompsonTaylorResampler as ThompsonTaylorResampler,
 )
-from pfbench.filter.particle.resampling import (
-    EssResampler as EssResampler,
-    Resampler as Resampler,
-    ResamplingScheme as ResamplingScheme,
-    Systematic as Systematic,
-)
 from pfbench.filter.particle.sqmc import (
     HaltonPoints as HaltonPoints,
     HilbertSortedResampler as HilbertSortedResampler,
-    PointSet as PointSet,
     SobolPoints as SobolPoints,
     SqmcProposal as SqmcProposal,
     SqmcScheme as SqmcScheme,
 )
-from pfbench.filter.particle.weight_update import (
-    FlooredWeightUpdate as FlooredWeightUpdate,
+from pfbench.filter.particle.stages import (
+    AuxiliaryWeights as AuxiliaryWeights,
+    BootstrapProposal as BootstrapProposal,
+    EssResampler as EssResampler,
+    InitialProposal as InitialProposal,
+    ParticleCount as ParticleCount,
+    PointSet as PointSet,
+    Proposal as Proposal,
+    ProposalSample as ProposalSample,
+    Resampler as Resampler,
+    ResamplingScheme as ResamplingScheme,
+    Stage as Stage,
+    Systematic as Systematic,
     WeightUpdate as WeightUpdate,
+)
+from pfbench.filter.particle.weights import (
+    AdditiveTempering as AdditiveTempering,
+    FlooredWeightUpdate as FlooredWeightUpdate,
+    LookAheadWeights as LookAheadWeights,
+    PowerTempering as PowerTempering,
+    TemperedPosterior as TemperedPosterior,
+    TemperedWeights as TemperedWeights,
+    Tempering as Tempering,
+    UniformTempering as UniformTempering,
 )
 from pfbench.filter.proposed.dmc_controller import (
     DmcController as DmcController,

@@ -1,10 +1,10 @@
-"""Belief, which the next step needs, information of a step for reports, and log weights of particles."""
+"""Belief, which the next step needs, information of a step for reports, log weights and moments of particles."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -335,12 +335,162 @@ def has_long_rows(a: Tensor, *_: Tensor) -> bool:
 _add_terms = compilable(
     _separate_sum, operator=dispatch.sum_log_weights, keep_in_graph=False, use_torch_compiler=False
 )
+
+
 _totals = compilable(
     _separate_totals, operator=dispatch.sum_and_squares, keep_in_graph=has_long_rows
 )
+
+
 normalise_updated_weights = compilable(
     _separate_normalise,
     operator=dispatch.normalise_weights,
     keep_in_graph=False,
     use_torch_compiler=False,
 )
+
+
+# --------------------------------------------------------------------------------------------------
+# Moments and diagnostics of weighted particles, for the information of a step.
+
+T = TypeVar("T")
+
+
+def compute_once(function: Callable[[], T]) -> Callable[[], T]:
+    """Make a function that computes its value at the first call only.
+
+    One is made at each step, and `functools.cache` takes 5 microseconds to make.
+    """
+    values: list[T] = []
+
+    def call() -> T:
+        if not values:
+            values.append(function())
+        return values[0]
+
+    return call
+
+
+class StepSummary(NamedTuple):
+    """Moments and diagnostics of one filter step.
+
+    Attributes:
+        mean: Mean of the particles, [R, D].
+        variance: Variance in the chart, [R, d].
+        predicted_log_w: Log weights before the measurement update, [R, N], not normalised.
+        trace: Numbers per run, {name: [R]}.
+    """
+
+    mean: Tensor
+    variance: Tensor
+    predicted_log_w: Tensor
+    trace: dict[str, Tensor]
+
+
+def summarise(model: StateSpaceModel, belief: ParticleBelief, trace: dict[str, Tensor]) -> StepInfo:
+    """Return mean and variance of particles for a report, without a copy of them.
+
+    Shapes: trace [R].
+    """
+    return make_step_info(
+        model,
+        belief,
+        *weighted_mean_variance(model, belief, normalise_log_weights(belief.log_w)),
+        trace,
+    )
+
+
+def weighted_mean_variance(
+    model: StateSpaceModel, belief: ParticleBelief, w: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the mean [R, D] and, in the chart about it, the variance [R, d].
+
+    Shapes: w [R, N].
+    """
+    if model.chart.flat:
+        mean, variance = _flat_moments(belief.x, w)
+        return mean, variance
+    mean = model.chart.mean(belief.x, w)
+    return mean, (
+        w.unsqueeze(-2) @ model.chart.subtract(belief.x, mean.unsqueeze(1)).square()
+    ).squeeze(-2)
+
+
+def make_step_info(
+    model: StateSpaceModel,
+    belief: ParticleBelief,
+    mean: Tensor,
+    variance: Tensor,
+    trace: dict[str, Tensor],
+    nis: Callable[[], tuple[Tensor, Tensor]] | None = None,
+) -> StepInfo:
+    """Make the information of a step from particles, their mean and their variance.
+
+    Shapes: mean [R, D], variance [R, d], trace [R], nis [R].
+    """
+
+    def deviations() -> tuple[Tensor, Tensor]:
+        return model.chart.subtract(belief.x, mean.unsqueeze(1)), belief.log_w
+
+    def covariance() -> Tensor:
+        d, log_w = deviations()
+        return (normalise_log_weights(log_w).unsqueeze(-1) * d).mT @ d
+
+    @compute_once
+    def w() -> Tensor:  # once for all groups; the weights are normalised already
+        return exponentiate(belief.log_w, belief.weights)
+
+    def group_covariance(groups: Tensor) -> Tensor:
+        if model.chart.flat:
+            return compute_spread(belief.x, mean, w(), groups)
+        return compute_spread(deviations()[0], torch.zeros_like(variance), w(), groups)
+
+    return StepInfo(mean, variance, covariance, trace, deviations, nis, group_covariance)
+
+
+def _count_distinct(copy_of: Tensor, log_w: Tensor) -> Tensor:
+    """Count distinct values below 2 N in copy_of [R, N] at active slots, [R]."""
+    marks = torch.zeros(len(copy_of), 2 * copy_of.shape[1], dtype=log_w.dtype, device=log_w.device)
+    return (marks.scatter_add_(1, copy_of, (log_w > -torch.inf).to(log_w.dtype)) > 0.0).sum(1)
+
+
+count_distinct_ancestors = compilable(_count_distinct, operator=dispatch.count_unique)
+
+
+def _separate_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """Return weighted mean and variance [R, D], by matrix products."""
+    mean = w.unsqueeze(-2) @ x
+    d = x - mean
+    return mean.squeeze(-2), (w.unsqueeze(-2) @ (d * d)).squeeze(-2)
+
+
+def _fused_moments(x: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
+    """Return weighted mean and variance [R, D] of numbers [R, N, D] by weights [R, N]."""
+    components = x.permute(2, 0, 1)
+    mean = (w * components).sum(-1)
+    d = components - mean.unsqueeze(-1)
+    return mean.T, (w * d * d).sum(-1).T
+
+
+def _separate_spread(x: Tensor, mean: Tensor, w: Tensor, groups: Tensor) -> Tensor:
+    """Return covariances [R, G, s, s] of groups [G, s] of numbers [R, N, k]."""
+    deviations = x.permute(0, 2, 1)[:, groups] - mean[:, groups].unsqueeze(-1)  # [R, G, s, N]
+    return (w[:, None, None] * deviations) @ deviations.mT
+
+
+compute_spread = compilable(
+    _separate_spread, operator=dispatch.group_covariance, keep_in_graph=False
+)
+
+
+_flat_moments = compilable(
+    _fused_moments,
+    eager=_separate_moments,
+    operator=dispatch.weighted_moments,
+    keep_in_graph=has_long_rows,
+)
+
+
+def join_runs(batches: list[Tensor]) -> Tensor:
+    """Concatenate batches of runs; return a single batch unchanged."""
+    return batches[0] if len(batches) == 1 else torch.cat(batches)

@@ -40,9 +40,8 @@ from torch import Tensor
 
 from pfbench.core.density import has_finite_moments
 from pfbench.core.record import Record, map_inputs
-from pfbench.filter.belief import ParticleBelief, StepInfo
-from pfbench.filter.particle.particle_moments import compute_nis, compute_once
-from pfbench.filter.run_batches import join_runs
+from pfbench.filter.belief import ParticleBelief, StepInfo, compute_once, join_runs
+from pfbench.filter.linearisation import compute_nis
 from pfbench.model.base import ModelWrapper, StateSpaceModel, initial_law
 
 HEALTH = (
@@ -85,6 +84,7 @@ class HealthMonitor:
 
     Attributes:
         steps: Checked steps, at most ten of those with a measurement.
+        visited: These steps, and perhaps that of the first measurement: others need no `check`.
     """
 
     def __init__(self, record: Record, fits_tails: bool = False) -> None:
@@ -107,7 +107,9 @@ class HealthMonitor:
         self._undefined = torch.zeros_like(self._collapsed)
         self._implausible = torch.zeros_like(self._collapsed)
         self._fits_tails, self._tails = fits_tails, list[Tensor]()
-        self._first = observed[0] if observed else -1
+        # the prior is widest before the first measurement, so that this step is decisive, except in float64
+        decisive = observed[:1] if record.y.dtype != torch.float64 else []
+        self.visited = self.steps | frozenset(decisive)
 
     def check(
         self,
@@ -125,9 +127,8 @@ class HealthMonitor:
             with uncounted_observation(model):
                 nis = info.nis()[0] if info.nis is not None else None
             self._nis[t] = torch.full_like(info.mean[:, 0], torch.nan) if nis is None else nis
-        # the prior is widest before the first measurement, so that this step is decisive
         is_judged = info.cloud is None and info.has_covariance and info.mean.dtype != torch.float64
-        if is_judged and (t in self.steps or t == self._first):
+        if is_judged and t in self.visited:
             self._collapsed |= is_ill_conditioned(info.covariance())
 
     def _check_particles(

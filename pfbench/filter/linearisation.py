@@ -11,8 +11,12 @@ from torch.autograd import forward_ad
 from torch.distributions import Distribution, Independent, MultivariateNormal, Normal
 
 from pfbench.core.density import has_finite_moments
-from pfbench.core.linear_algebra import jacobian
+from pfbench.core.linear_algebra import jacobian, shared_distribution_covariance, squared_length
 from pfbench.core.record import Record
+from pfbench.filter.belief import (
+    compute_spread,
+    normalise_log_weights,
+)
 from pfbench.kernels.dispatch import is_capturing
 from pfbench.model.base import StateSpaceModel
 
@@ -272,3 +276,61 @@ def check_noise_gain(model: StateSpaceModel, x: Tensor, u: Any) -> None:
             "overrides propagate must override noise_gain, too. pfbench.testing.check_jacobians "
             "shows the size of the error."
         )
+
+
+def around_first(
+    residual: Callable[[Tensor, Tensor], Tensor],
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """Make the weighted mean of values that may wrap: the mean of residuals to the first value."""
+
+    def mean(y: Tensor, w: Tensor) -> Tensor:
+        return y[:, 0] + (w.unsqueeze(-1) * residual(y, y[:, :1])).sum(1)
+
+    return mean
+
+
+# --------------------------------------------------------------------------------------------------
+# Moments of a measurement that weighted particles predict.
+
+
+def compute_nis(
+    model: StateSpaceModel, x: Tensor, log_w: Tensor, record: Record
+) -> tuple[Tensor, Tensor]:
+    """Compute the normalised innovation squared (NIS) of predicted particles.
+
+    Returns NIS [R] and the number of observed components [R], which is its expectation. The NIS is
+    NaN where the mean or variance of the observation distribution is infinite. Shapes: x [R, N, D],
+    log_w [R, N].
+    """
+    predicted_y: Any = model.observation(x, record.u)
+    observed_mask = ~torch.isnan(record.y)
+    if not has_finite_moments(predicted_y):
+        return torch.full_like(log_w[:, 0], torch.nan), observed_mask.sum(1)
+    y, covariance = predicted_y.mean, shared_distribution_covariance(predicted_y)
+    if y.shape[1] == 1:  # no spread
+        y_hat = y[:, 0] + model.residual(y[:, 0], y[:, 0])  # infinite becomes NaN
+        covariance = covariance[:, 0]
+    else:
+        w = normalise_log_weights(log_w)
+        y_hat, spread, noise = predict_moments(model, y, covariance, w)
+        covariance = spread + noise
+    r = torch.where(observed_mask, model.residual(record.y.nan_to_num(), y_hat), 0.0)
+    return squared_length(r, mask_covariance(covariance, observed_mask)), observed_mask.sum(1)
+
+
+def predict_moments(
+    model: StateSpaceModel, y: Tensor, covariance: Tensor, w: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Compute the moments of a measurement predicted by weighted particles.
+
+    Returns mean [R, k], covariance due to the particles [R, k, k], and mean noise covariance
+    [R or 1, k, k]. Shapes: y [R, N, k], covariance [R, N or 1, k, k], w [R, N].
+    """
+    y_hat = around_first(model.residual)(y, w)
+    deviations = torch.where(w.unsqueeze(-1) > 0.0, model.residual(y, y_hat.unsqueeze(1)), 0.0)
+    noise = (
+        (w[..., None, None] * covariance).sum(1) if covariance.shape[1] > 1 else covariance[:, 0]
+    )
+    all_components = torch.arange(y.shape[-1], device=y.device).unsqueeze(0)
+    spread = compute_spread(deviations, torch.zeros_like(y_hat), w, all_components).squeeze(1)
+    return y_hat, spread, noise

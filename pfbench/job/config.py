@@ -153,7 +153,7 @@ def resolve_config(
     )
     names = {str(group): str(name) for group, name in (choices or {}).items()}
     _, packages = split_trust([f"trust=[{','.join(trusted)}]"])
-    select_knobs(tree, names, trusted)
+    has_knobs = _take_knobs(tree, names, trusted)
     try:
         values = remove_nested_blocks(resolve_values(tree))
     except InterpolationKeyError as error:
@@ -166,9 +166,26 @@ def resolve_config(
             raise
         raise explained from error
     knobs = values.pop(TUNED, {})  # the filter has them
-    check_tuned_seed(values, names.get("scenario"), knobs)
-    mark_foreign(values, names, knobs.get("world", {}), trusted)
+    if has_knobs:
+        check_tuned_seed(values, names.get("scenario"), knobs)
+        mark_foreign(values, names, knobs.get("world", {}), trusted)
     return JobConfig(values, names, is_shared, packages)
+
+
+def _take_knobs(tree: Any, choices: Mapping[str, str], trusted: Sequence[str]) -> bool:
+    """Replace the node `tuned` by the knobs of one world.
+
+    Returns whether the filter has knobs or says on which data it was tuned. Most filters do neither.
+    """
+    from omegaconf import flag_override
+
+    if re.search(r"\btun(ed|ing)\b", str(tree["filter"])):
+        select_knobs(tree, choices, trusted)
+        return True
+    if TUNED in tree:
+        with flag_override(tree, ["struct", "readonly"], [False, False]):
+            tree[TUNED] = {}
+    return False
 
 
 def list_groups() -> dict[str, list[Path]]:

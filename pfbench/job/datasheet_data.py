@@ -22,7 +22,7 @@ from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 from pfbench.results.conditions import DATASHEETS, main_component_group
 from pfbench.results.store import compute_config_key, extend_key
-from pfbench.scenario.oracle_noise import RecordingRegime
+from pfbench.scenario.base import RecordingRegime
 
 RUNS = 20  # default: spreads to a sixth, in seconds [ours]
 _CONFIG_KEYS = ("scenario", "model", "noise", "seed", "first_run", "runs", "pcrb")

@@ -7,32 +7,45 @@ sweep. Folders, data of the user, the environment and Hydra's own settings are t
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from pfbench.files import limits
-from pfbench.job.trust import UntrustedConfigError, check_study
+from pfbench.job.trust import UntrustedConfigError
 from pfbench.results.paper_block import conf_dir
 
-WRITTEN = ("results_dir", "reports_dir", "episode_cache_dir", "cache_dir", "checkpoint_path")
-READ = ("data", "root", "folder", "checkpoint")  # keys of the user's data: at any depth, but `data`
-SETTINGS = ("trust", "overwrite", "memory_limit_gib", "hydra")
+FOLDER_KEYS = ("results_dir", "reports_dir", "episode_cache_dir")
+_WRITTEN = (*FOLDER_KEYS, "cache_dir", "checkpoint_path")
+
+_READ = (
+    "data",
+    "root",
+    "folder",
+    "checkpoint",
+)  # keys of the user's data: at any depth, but `data`
+
+_SETTINGS = ("trust", "overwrite", "memory_limit_gib", "hydra")
+
 # what a file may give such keys: nothing, or what the command line gives
 _REFERENCES = {
     "cache_dir": ("${episode_cache_dir}",),
     "root": ("${data.root}",),
     "checkpoint": ("${checkpoint}",),
 }
+
 _IN_RESULTS = re.compile(r"\$\{results_dir\}(?:/(?!\.\.?(?:/|$))[\w.-]+)+")
+
 _RESOLVERS = (
     "",
     "oc.select",
     "oc.dict.keys",
 )  # "" for none; others read the environment, compute or list values
+
 _PATH = re.compile(r"^[/~\\]|^[A-Za-z]:[/\\]|(^|[/\\])\.\.([/\\]|$)")
+
 _PLAIN_KEY = re.compile(r"[\w.\[\]@-]+")
 
 
@@ -42,7 +55,7 @@ def check_content(file: Path, values: Mapping[str, Any], *, is_own: bool) -> Non
         key = path[-1]
         if path[0] == "hydra":
             _check_hydra_value(file, path, value, is_own)
-        elif path[0] == "data" or key in WRITTEN or key in SETTINGS or key in READ[1:]:
+        elif path[0] == "data" or key in _WRITTEN or key in _SETTINGS or key in _READ[1:]:
             _check_protected(file, path, value, is_own)
         if isinstance(key, str) and "${" in key:
             _refuse(file, path, "be a plain name", key, "Write the name itself.")
@@ -141,11 +154,11 @@ def _check_protected(file: Path, path: tuple[Any, ...], value: Any, is_own: bool
     """Check a value of a key that only the command line may set."""
     key = path[-1]
     is_top = len(path) == 1
-    if key in SETTINGS and not is_top:
+    if key in _SETTINGS and not is_top:
         return  # the same name elsewhere is none of them
     is_nothing = value is None or value == "???" or (key == "overwrite" and value is False)
-    is_whole = isinstance(value, Mapping) and key in READ  # its own keys are checked
-    is_data = key in READ or path[0] == "data"
+    is_whole = isinstance(value, Mapping) and key in _READ  # its own keys are checked
+    is_data = key in _READ or path[0] == "data"
     if is_nothing or is_whole or _is_reference(path, value) or (is_own and is_data):
         return
     remedy = _own_remedy(file) if is_data else ""
@@ -178,7 +191,7 @@ def _check_interpolation(file: Path, path: tuple[Any, ...], text: str, is_own: b
     except GrammarParseError as error:
         _refuse(file, path, "be a valid interpolation", text, f"{error}".splitlines()[0])
     for resolver, key in _list_interpolations(tree):
-        names_user = not is_own and {*WRITTEN, *READ, "hydra"} & set(re.findall(r"\w+", key))
+        names_user = not is_own and {*_WRITTEN, *_READ, "hydra"} & set(re.findall(r"\w+", key))
         if resolver not in _RESOLVERS or not _PLAIN_KEY.fullmatch(key) or names_user:
             got = f"the resolver {resolver} in {text}" if resolver not in _RESOLVERS else text
             _refuse(
@@ -273,78 +286,3 @@ def _refuse(file: Path, path: Sequence[Any], requirement: str, value: Any, remed
     raise UntrustedConfigError(
         f"{file}: {_join(path)} must {requirement}, got {value!r:.80}. {remedy}"
     )
-
-
-# --------------------------------------------------------------------------------------------------
-# Check of a composed configuration: what only the command line may set is as the command line sets it.
-#
-# `pfbench.job.file_rules` checks each file. Here the result is compared with a composition of the
-# same words without any file of a search path, whatever way a file may have found.
-
-FOLDER_KEYS = ("results_dir", "reports_dir", "episode_cache_dir")
-_SETTINGS = (*FOLDER_KEYS, "trust", "overwrite", "memory_limit_gib")
-_DATA = ("data", "checkpoint")  # a folder of the user's own may name them
-# parts of the node `hydra` that differ between jobs and lead to nothing
-_OF_A_JOB = ("overrides", "runtime", "searchpath")
-_OF_A_NAME = ("name", "override_dirname", "config_name", "num", "id")
-
-
-def check_composed(
-    tree: Any, words: Sequence[str], compose_reference: Callable[[list[str]], Any] | None
-) -> None:
-    """Check a composed configuration."""
-    check_study(tree._get_node("study")._value() if "study" in tree else None)  # not resolved
-    for group, name in tree.hydra.runtime.choices.items():
-        if isinstance(name, str) and (name.startswith("/") or ".." in name.split("/")):
-            raise UntrustedConfigError(
-                f"{group} must be the name of a file in its group, got {name!r}. Use its name."
-            )
-    if compose_reference is None:
-        return
-    launcher = tree.hydra.runtime.choices.get("hydra/launcher")
-    is_shipped = launcher in launchers()  # another one is of a folder of the user's own
-    pattern = r"[+~]*hydra/launcher" if is_shipped else r"[+~]*hydra[/.]launcher"
-    others = [word for word in _list_setting_words(words) if not re.match(pattern, word)]
-    reference = compose_reference(
-        [*others, f"hydra/launcher={launcher if is_shipped else 'basic'}"]
-    )
-    for (key, value), (_, expected) in zip(
-        _list_settings(tree, words), _list_settings(reference, words), strict=True
-    ):
-        if value != expected and (is_shipped or key != "hydra.launcher"):
-            raise UntrustedConfigError(
-                f"{key} must be set on the command line, got {value!r:.200} from a file. "
-                f"Remove the key from the file, and add {key}=... to the command."
-            )
-
-
-def _list_setting_words(words: Sequence[str]) -> list[str]:
-    """Return the words that set what is compared, without the search path."""
-    keys = "|".join((*_SETTINGS, *_DATA, "hydra"))
-    return [
-        word
-        for word in words
-        if re.match(rf"[+~]*({keys})\b", word) and not re.match(r"[+~]*hydra\.searchpath\b", word)
-    ]
-
-
-def _list_settings(tree: Any, words: Sequence[str]) -> Iterator[tuple[str, Any]]:
-    """Yield key and value of each setting that is compared."""
-    values = to_plain(tree)
-    is_own = any("own://" in word or "pkg://" in word for word in words)
-    for key in (*_SETTINGS, *(() if is_own else _DATA)):
-        yield key, values.get(key)
-    hydra = {key: value for key, value in values["hydra"].items() if key not in _OF_A_JOB}
-    hydra["job"] = {k: v for k, v in hydra["job"].items() if k not in _OF_A_NAME}
-    hydra["sweeper"] = {k: v for k, v in (hydra["sweeper"] or {}).items() if k != "params"}
-    for key, value in sorted(hydra.items()):
-        yield f"hydra.{key}", value
-
-
-def to_plain(tree: Any) -> dict[str, Any]:
-    """Return an unresolved configuration as plain dictionaries and lists."""
-    from omegaconf import OmegaConf
-
-    content = OmegaConf.to_container(tree, resolve=False)
-    assert isinstance(content, dict)
-    return {str(key): value for key, value in content.items()}

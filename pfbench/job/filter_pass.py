@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable
 from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -16,9 +16,7 @@ from tqdm import tqdm
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode
 from pfbench.filter.belief import StepInfo
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.loop import FilterResult, Watch, run_filter
-from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.memory import MemoryTrimmer, peak_above, start_peak_measurement
 from pfbench.job.plan import JobPlan
@@ -27,6 +25,9 @@ from pfbench.kernels import dispatch
 from pfbench.kernels.cpp_library import is_library_loaded
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
+
+if TYPE_CHECKING:
+    from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 
 log = logging.getLogger("pfbench")
 
@@ -201,6 +202,8 @@ def _count_numbers(method: Any, model: StateSpaceModel) -> int:
     """Return the normal numbers of a step of one run that cost as much as the step."""
     if isinstance(method, ParticleFilter):
         return method.particles * model.noise_dim
+    from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+
     # linear algebra costs as much as eight normal numbers per entry of a covariance
     return 8 * model.chart.dimension**2 if isinstance(method, GaussianFilter) else 0
 
@@ -220,4 +223,6 @@ def _compile_step(
             reason = "its moves use past states"
         log.info("engine=compiled: only inner loops are compiled, not the step (%s)", reason)
         return None
+    from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
+
     return CompiledParticleFilter(method, counter, clock)

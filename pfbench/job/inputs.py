@@ -41,13 +41,23 @@ def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Input
 
 def check_unchanged(before: Inputs, values: Mapping[str, Any], trusted: Sequence[str] = ()) -> None:
     """Raise ValueError if a file was written while a job read it."""
-    changed = list_changed(before, find_inputs(values, trusted))
+    after = find_inputs(values, trusted)
+    if after == before:
+        return
+    changed = list_changed(before, after)
     files = [name for name in changed if not name.startswith(CODE_OF)]  # loaded before
     if files:
         raise ValueError(
             f"{' and '.join(files)} must not change while a job reads it, got other content at its end. "
             "Run the job again."
         )
+
+
+def names_checkpoint(node: Any) -> bool:
+    """Return whether a filter names a checkpoint of trained weights."""
+    if isinstance(node, Mapping):
+        return isinstance(node.get("checkpoint"), str) or any(map(names_checkpoint, node.values()))
+    return isinstance(node, list) and any(map(names_checkpoint, node))
 
 
 def describe_unnamed_files(scenario: Any, trusted: Sequence[str] = ()) -> tuple[str, ...]:

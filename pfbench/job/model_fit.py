@@ -19,7 +19,7 @@ _PARTS = ("model", "scenario")
 
 def check_fit(model: Any, scenario: Any, tree: Mapping[str, Any], trusted: Sequence[str]) -> None:
     """Check that a model reads what a scenario provides."""
-    from pfbench.core.channels import describe_misfit
+    from pfbench.core.record import describe_misfit
 
     if difference := describe_misfit(model, scenario):
         raise _refusal(difference, list_fitting_models(tree, trusted))
@@ -81,7 +81,7 @@ def is_fitting(tree: Mapping[str, Any], trusted: Sequence[str] = ()) -> bool:
     """Return whether model and scenario of a configuration can be built and fit."""
     from omegaconf import OmegaConf
 
-    from pfbench.core.channels import describe_misfit
+    from pfbench.core.record import describe_misfit
 
     nodes = OmegaConf.create(_plain_values(tree))
     try:

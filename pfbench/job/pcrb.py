@@ -32,7 +32,7 @@ from pfbench.core.record import Episode, Record, iterate_steps
 from pfbench.model.base import StateSpaceModel, StaticModel, initial_law
 from pfbench.noise.base import NominalNoise
 from pfbench.results.store import Inputs
-from pfbench.scenario.oracle_noise import RecordingRegime
+from pfbench.scenario.base import RecordingRegime
 from pfbench.scenario.simulated import load_or_build
 
 _TOLERANCE = 1e-9  # of differences between Jacobians, in predicted standard deviations

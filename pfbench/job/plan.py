@@ -24,21 +24,18 @@ import pfbench
 from pfbench.core.parameter_checks import RUN_NUMBERS
 from pfbench.core.record import Episode
 from pfbench.filter.exactness import has_bounded_weights, has_covariance, has_evidence
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.learned.checkpoint import replace_checkpoint_by_hash
+from pfbench.filter.loop import choose_run_batch
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.run_batches import choose_run_batch
 from pfbench.job.config import JobConfig
-from pfbench.job.inputs import describe_unnamed_files, find_inputs
+from pfbench.job.inputs import describe_unnamed_files, find_inputs, names_checkpoint
+from pfbench.job.memory import keep_freed_memory
 from pfbench.job.model_fit import instantiate_parts
 from pfbench.job.trust import hash_package
-from pfbench.kernels.process_memory import keep_freed_memory
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 from pfbench.results.paper_block import PAPER, PARTS
 from pfbench.results.store import PLACE_SETTINGS, Inputs, compute_config_key, extend_key
-from pfbench.scenario.base import Scenario
-from pfbench.scenario.oracle_noise import RecordingRegime
+from pfbench.scenario.base import RecordingRegime, Scenario
 
 # --------------------------------------------------------------------------------------------------
 # Plan of a job: a checked configuration and its objects, each built once.
@@ -167,7 +164,10 @@ def job_key(values: Mapping[str, Any], inputs: Inputs | None = None) -> str:
         16 hexadecimal digits. The first half depends on the settings alone.
     """
     inputs = find_inputs(values) if inputs is None else inputs
-    values = {**values, "filter": replace_checkpoint_by_hash(values.get("filter"))}
+    if names_checkpoint(values.get("filter")):
+        from pfbench.filter.learned.checkpoint import replace_checkpoint_by_hash
+
+        values = {**values, "filter": replace_checkpoint_by_hash(values["filter"])}
     defaults = (k for k, default in DEFAULTS_NOT_IN_KEY.items() if values.get(k) == default)
     return extend_key(compute_config_key(values, (*IGNORED_IN_KEY, *defaults)), inputs)
 
@@ -278,7 +278,6 @@ def make_metadata(
     values, method = plan.values, plan.method
     device = values["device"]
     unnamed = describe_unnamed_files(values["scenario"], plan.config.trusted)
-    is_exact_kalman = model.linear and isinstance(method, GaussianFilter) and method.plain
     return {
         "label": plan.config.choices["filter"],
         "seed": values["seed"],
@@ -289,7 +288,7 @@ def make_metadata(
         "dtype": values["dtype"],
         "device": device if device == "cpu" else torch.cuda.get_device_name(device),
         "threads": values["threads"],
-        "is_exact": method.is_exact or is_exact_kalman,
+        "is_exact": method.is_exact or _is_kalman_filter(model, method),
         "has_bounded_weights": has_bounded_weights(method),
         "has_evidence": has_evidence(method),
         "has_counts": model.has_counts,
@@ -299,6 +298,13 @@ def make_metadata(
         "state": describe_state(model),
         **make_provenance(),
     }
+
+
+def _is_kalman_filter(model: StateSpaceModel, method: Any) -> bool:
+    """Return whether a filter is the Kalman filter of a linear model."""
+    from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+
+    return model.linear and isinstance(method, GaussianFilter) and method.plain
 
 
 def describe_state(model: StateSpaceModel) -> dict[str, Any]:

@@ -21,20 +21,19 @@ from pfbench.files.atomic_write import (
     write_atomically,
 )
 from pfbench.files.command_start import start_work
-from pfbench.filter.learned.checkpoint import checkpoint_provenance
 from pfbench.job.budget import EpisodeSource, apply_budget, max_runs_in_memory
 from pfbench.job.config import CHOICES, JobConfig, resolve_config
 from pfbench.job.filter_pass import TimedFilterPass, pass_filter
-from pfbench.job.inputs import check_unchanged, find_inputs
+from pfbench.job.inputs import check_unchanged, find_inputs, names_checkpoint
 from pfbench.job.pcrb import compute_pcrb, lacks_bound
 from pfbench.job.plan import JobPlan, build_plan, check_settings, job_key, make_metadata
 from pfbench.job.trust import list_user_packages, trusted_packages
 from pfbench.results import store
 from pfbench.results.conditions import DATASHEETS
-from pfbench.results.headline import describe_runs, main_rmse
 from pfbench.results.inputs import list_changed
 from pfbench.results.joined_runs import join_arrays, join_metadata
 from pfbench.results.paper_block import describe_foreign
+from pfbench.results.status import describe_runs, main_rmse
 from pfbench.results.store import Inputs, list_same_configuration
 
 if TYPE_CHECKING:
@@ -176,10 +175,8 @@ def compute_job(
     """
     episodes = episodes or EpisodeSource(plan)
     start_work()
-    values, total = plan.values, len(plan.runs)
-    trained = checkpoint_provenance(
-        values["filter"], plan.config.choices["scenario"], values["seed"], plan.runs
-    )
+    total = len(plan.runs)
+    trained = _describe_training(plan)
     plan, allocation = apply_budget(plan, episodes)
     size = max_runs_in_memory(plan, episodes)
     pcrb = _timed_pcrb(plan, episodes.joint, plan.runs) if episodes.joint else None
@@ -191,8 +188,7 @@ def compute_job(
         result = pass_filter(plan, episode, runs, title)
         batch_metadata.append(_batch_metadata(plan, episode, result, batch_pcrb))
         batch_outputs.append(result.arrays(episode, batch_pcrb[0]))
-    _check_durations(batch_metadata, batch_outputs)
-    meta, outputs = join_metadata(batch_metadata), join_arrays(batch_outputs, batch_metadata)
+    meta, outputs = _join_batches(batch_metadata, batch_outputs)
     if pcrb:  # the batches share it
         outputs |= {"pcrb": batch_outputs[0]["pcrb"]} if "pcrb" in outputs else {}
         meta["seconds"]["pcrb"] = pcrb[2]
@@ -201,6 +197,17 @@ def compute_job(
         meta["particles"] = allocation.particles
     bought = allocation.to_metadata() if allocation else None
     return {**meta, "budget_allocation": bought, "trained": trained}, outputs
+
+
+def _describe_training(plan: JobPlan) -> dict[str, Any] | None:
+    """Return what a report states about the trained weights of a filter, None if it has none."""
+    values = plan.values
+    if not names_checkpoint(values["filter"]):
+        return None
+    from pfbench.filter.learned.checkpoint import checkpoint_provenance
+
+    scenario = plan.config.choices["scenario"]
+    return checkpoint_provenance(values["filter"], scenario, values["seed"], plan.runs)
 
 
 def _read_finished(path: Path, values: Mapping[str, Any]) -> store.JobResult | None:
@@ -274,14 +281,19 @@ def _batch_metadata(
     return {**meta, "runs": runs, "pcrb": pcrb[1], "seconds": {"pcrb": pcrb[2], **result.seconds}}
 
 
-def _check_durations(metadata: Sequence[dict[str, Any]], outputs: Sequence[dict[str, Any]]) -> None:
-    """Raise ValueError if the runs of two batches have different durations."""
+def _join_batches(
+    metadata: Sequence[dict[str, Any]], outputs: Sequence[dict[str, Any]]
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Join metadata and arrays of batches. ValueError if the runs of two have different durations."""
+    if len(outputs) == 1:
+        return metadata[0], outputs[0]
     if any(batch["time"].shape != outputs[0]["time"].shape for batch in outputs):
         size = metadata[0]["runs"]
         raise ValueError(
             "memory must be enough for all runs together, since they have different durations, got "
             f"enough for {size} runs. Split the job (runs={size}, first_run=...)."
         )
+    return join_metadata(metadata), join_arrays(outputs, metadata)
 
 
 # --------------------------------------------------------------------------------------------------

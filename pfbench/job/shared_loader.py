@@ -8,21 +8,16 @@ own settings and `conf/config.yaml`. All else is Hydra's. `tests/config/test_com
 from __future__ import annotations
 
 import copy
-import io
 import os
 import pickle
-import stat
+import re
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from functools import cache
-from importlib.util import find_spec
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-import yaml
 from hydra._internal import defaults_list as hydra_defaults
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import CachingConfigRepository, ConfigRepository
-from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra._internal.defaults_list import Overrides
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.config_search_path import ConfigSearchPath
@@ -36,14 +31,17 @@ from omegaconf import DictConfig, OmegaConf, flag_override
 
 from pfbench.files import limits
 from pfbench.job.file_rules import (
-    check_composed,
+    FOLDER_KEYS,
     check_content,
     check_defaults,
     check_group,
     check_place,
-    to_plain,
+    launchers,
 )
-from pfbench.job.trust import UntrustedConfigError, trusted_packages
+from pfbench.job.trust import UntrustedConfigError, check_study, trusted_packages
+
+if TYPE_CHECKING:
+    from pfbench.job.search_folders import ForeignFolder
 
 _Object = TypeVar("_Object")
 
@@ -209,11 +207,12 @@ class _SharedRepository(CachingConfigRepository):
 
     def initialize_sources(self, config_search_path: ConfigSearchPath) -> None:
         """Add the folders of a search path before the last source, the schemas."""
-        folders = [
-            open_folder(str(entry.provider), str(entry.path), self._trusted)
-            for entry in config_search_path.get_path()
-            if str(entry.provider).startswith(_SEARCH_PATH)
-        ]
+        folders: list[ForeignFolder] = []
+        for entry in config_search_path.get_path():
+            if str(entry.provider).startswith(_SEARCH_PATH):
+                from pfbench.job.search_folders import open_folder
+
+                folders.append(open_folder(str(entry.provider), str(entry.path), self._trusted))
         *others, schema = self.delegate.sources
         self.delegate.sources = [*others, *folders, schema]
         self.has_search_path = bool(folders)
@@ -256,6 +255,8 @@ class _SharedRepository(CachingConfigRepository):
         """Return the source of a file, which must be the only one if it is in a search path."""
         if not self.has_search_path:
             return next((s for s in self.delegate.sources if _has_file(s, config_path)), None)
+        from pfbench.job.search_folders import ForeignFolder
+
         holders = [source for source in self.delegate.sources if _has_file(source, config_path)]
         folder = next((source for source in holders if isinstance(source, ForeignFolder)), None)
         if folder is not None:
@@ -284,6 +285,8 @@ class _StoredNode:
 
 def _name_file(source: ConfigSource, config_path: str) -> str:
     """Return the place of a file, for messages."""
+    from pfbench.job.search_folders import ForeignFolder
+
     group, _, name = config_path.rpartition("/")
     if isinstance(source, ForeignFolder):
         return f"{source.file_of(config_path)}"
@@ -335,175 +338,74 @@ hydra_defaults._create_interpolation_map = _collect_choices
 
 
 # --------------------------------------------------------------------------------------------------
-# Folders of a search path as Hydra's sources, each file checked where it is read.
+# Check of a composed configuration: what only the command line may set is as the command line sets it.
 #
-# Hydra asks a source for each file that it loads: by a choice, a defaults list, a sweep. A source of this
-# module refuses links, pipes and devices, and measures a file before it builds anything from it.
+# `pfbench.job.file_rules` checks each file. Here the result is compared with a composition of the
+# same words without any file of a search path, whatever way a file may have found.
+
+_SETTINGS = (*FOLDER_KEYS, "trust", "overwrite", "memory_limit_gib")
+_DATA = ("data", "checkpoint")  # a folder of the user's own may name them
+# parts of the node `hydra` that differ between jobs and lead to nothing
+_OF_A_JOB = ("overrides", "runtime", "searchpath")
+_OF_A_NAME = ("name", "override_dirname", "config_name", "num", "id")
 
 
-class ForeignFolder(FileConfigSource):
-    """Folder of files that another person may have written: `file://FOLDER`.
-
-    Attributes:
-        is_own: Whether the user says that the files are his own.
-    """
-
-    is_own = False
-
-    def file_of(self, config_path: str) -> Path:
-        """Return the path of a configuration."""
-        return Path(self.path, self._normalize_file_name(config_path))
-
-    def is_group(self, config_path: str) -> bool:
-        """Return whether a folder exists."""
-        return _is_kind(Path(self.path), config_path, stat.S_IFDIR)
-
-    def is_config(self, config_path: str) -> bool:
-        """Return whether a file exists."""
-        return _is_kind(Path(self.path), self._normalize_file_name(config_path), stat.S_IFREG)
-
-    def load_config(self, config_path: str) -> ConfigResult:
-        """Read a file as Hydra does, after its measures."""
-        file = self.file_of(config_path)
-        text = _read(file)
-        _check_measures(file, text)
-        header = ConfigSource._get_header_dict(text[:512])  # as many as Hydra reads
-        config = OmegaConf.load(_NamedText(text, file))
-        return ConfigResult(self.provider, self.full_path(), config, header)
-
-
-class OwnFolder(ForeignFolder):
-    """Folder whose files the user has written: `own://FOLDER`."""
-
-    is_own = True
-
-    @staticmethod
-    def scheme() -> str:
-        """Return the scheme of the path."""
-        return "own"
-
-
-class _NamedText(io.StringIO):
-    """Text with the name of its file, for the messages of the reader."""
-
-    def __init__(self, text: str, file: Path) -> None:
-        super().__init__(text)
-        self.name = f"{file}"
-
-
-def open_folder(provider: str, path: str, trusted: Sequence[str]) -> ForeignFolder:
-    """Return the source of an entry of `hydra.searchpath`."""
-    scheme, _, name = path.rpartition("://")
-    if scheme == "pkg":
-        folder, scheme = _find_package(name, trusted), "own"
-    elif scheme in ("", "file", "own"):
-        folder = name
-    else:
-        raise ValueError(
-            f"hydra.searchpath must have folders (file://FOLDER, own://FOLDER for files of your own) or "
-            f"packages (pkg://MODULE), got {path}. Copy the files into a folder."
-        )
-    if not os.path.isdir(folder):
-        raise ValueError(
-            f"hydra.searchpath must have existing folders, got {folder}. Use file:// and a full path."
-        )
-    kind = OwnFolder if scheme == "own" else ForeignFolder
-    return kind(provider, f"{kind.scheme()}://{folder}")
-
-
-def _find_package(name: str, trusted: Sequence[str]) -> str:
-    """Return the folder of a trusted package."""
-    if not any(name == package or name.startswith(f"{package}.") for package in trusted):
-        raise UntrustedConfigError(
-            f"hydra.searchpath must have packages that you trust, got pkg://{name}. If you trust it, add "
-            f"trust=[{name.partition('.')[0]}] on the command line."
-        )
-    try:
-        spec = find_spec(name)
-    except ModuleNotFoundError:
-        spec = None
-    folders = list(spec.submodule_search_locations or ()) if spec else []
-    return folders[0] if folders else name
-
-
-def _is_kind(root: Path, name: str, kind: int) -> bool:
-    """Return whether a path in a folder is of a kind, and refuse what is neither file nor folder."""
-    path = root / name
-    if not os.path.lexists(path):
-        return False
-    mode = path.lstat().st_mode
-    inside = os.path.normpath(os.path.realpath(root) + os.sep + name)
-    if stat.S_ISLNK(mode) or os.path.realpath(path) != inside:
-        raise UntrustedConfigError(
-            f"{path} must be a file or a folder below {root}, got a link or a path out of it. "
-            "Copy the file into the folder."
-        )
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-        raise UntrustedConfigError(f"{path} must be a file, got a pipe or a device. Remove it.")
-    return stat.S_IFMT(mode) == kind
-
-
-def _read(file: Path) -> str:
-    """Read the text of a file that may have become a link, a pipe or a large file since it was found."""
-    with open(os.open(file, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as stream:
-        is_file = stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
-        content = stream.read(limits.CONFIG_BYTES + 1) if is_file else b""
-    if len(content) > limits.CONFIG_BYTES:
-        _refuse(file, f"{limits.CONFIG_BYTES} bytes")
-    try:
-        text = content.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise UntrustedConfigError(
-            f"{file} must be text in UTF-8, got the byte 0x{content[error.start]:02x}. Save it as UTF-8."
-        ) from error
-    return text.replace("\r\n", "\n").replace("\r", "\n")  # as Python opens a text
-
-
-def _check_measures(file: Path, text: str) -> None:
-    """Check form, size and depth of a file, which is not built for it. Hydra reports an error of YAML."""
-    root: yaml.Event | None = None
-    try:
-        for event, values, depth in _measure(text):
-            root = root or (event if isinstance(event, yaml.NodeEvent) else None)
-            if values > limits.CONFIG_VALUES:
-                _refuse(file, f"{limits.CONFIG_VALUES} values with its aliases expanded")
-            if depth > limits.CONFIG_DEPTH:
-                _refuse(file, f"{limits.CONFIG_DEPTH} levels")
-            if len(getattr(event, "value", "")) > limits.CONFIG_TEXT:
-                _refuse(file, f"{limits.CONFIG_TEXT} characters in a text")
-    except yaml.YAMLError:
+def check_composed(
+    tree: Any, words: Sequence[str], compose_reference: Callable[[list[str]], Any] | None
+) -> None:
+    """Check a composed configuration."""
+    check_study(tree._get_node("study")._value() if "study" in tree else None)  # not resolved
+    for group, name in tree.hydra.runtime.choices.items():
+        if isinstance(name, str) and (name.startswith("/") or ".." in name.split("/")):
+            raise UntrustedConfigError(
+                f"{group} must be the name of a file in its group, got {name!r}. Use its name."
+            )
+    if compose_reference is None:
         return
-    if not isinstance(root, yaml.MappingStartEvent):
-        kinds = {yaml.ScalarEvent: "a scalar", yaml.SequenceStartEvent: "a sequence"}
-        kind = kinds.get(type(root), "an empty file")
-        raise UntrustedConfigError(
-            f"{file} must be keys and values, got {kind}. Write key: value on each line, or choose "
-            f"another one: pfbench list {file.parent.name}"
-        )
-
-
-def _measure(text: str) -> Iterator[tuple[yaml.Event, int, int]]:
-    """Yield the events of the parser with the values so far, aliases expanded, and the depth."""
-    values, starts = 0, list[tuple[str | None, int]]()
-    sizes: dict[str | None, int] = {}
-    for event in yaml.parse(text, yaml.SafeLoader):
-        if isinstance(event, yaml.AliasEvent):  # one inside of its own node expands for ever
-            values += sizes.get(event.anchor, limits.CONFIG_VALUES)
-        elif isinstance(event, yaml.ScalarEvent):
-            values, sizes[event.anchor] = values + 1, 1
-        elif isinstance(event, yaml.CollectionStartEvent):
-            starts.append((event.anchor, values))
-            sizes.pop(event.anchor, None)
-            values += 1
-        elif isinstance(event, yaml.CollectionEndEvent):
-            anchor, before = starts.pop()
-            sizes[anchor] = values - before
-        yield event, values, len(starts)
-
-
-def _refuse(file: Path, limit: str) -> None:
-    """Raise the error of a file that is too large."""
-    raise UntrustedConfigError(
-        f"{file} must have at most {limit}, got more. Write a shorter file, or put the numbers into a "
-        "table that a class reads."
+    launcher = tree.hydra.runtime.choices.get("hydra/launcher")
+    is_shipped = launcher in launchers()  # another one is of a folder of the user's own
+    pattern = r"[+~]*hydra/launcher" if is_shipped else r"[+~]*hydra[/.]launcher"
+    others = [word for word in _list_setting_words(words) if not re.match(pattern, word)]
+    reference = compose_reference(
+        [*others, f"hydra/launcher={launcher if is_shipped else 'basic'}"]
     )
+    for (key, value), (_, expected) in zip(
+        _list_settings(tree, words), _list_settings(reference, words), strict=True
+    ):
+        if value != expected and (is_shipped or key != "hydra.launcher"):
+            raise UntrustedConfigError(
+                f"{key} must be set on the command line, got {value!r:.200} from a file. "
+                f"Remove the key from the file, and add {key}=... to the command."
+            )
+
+
+def _list_setting_words(words: Sequence[str]) -> list[str]:
+    """Return the words that set what is compared, without the search path."""
+    keys = "|".join((*_SETTINGS, *_DATA, "hydra"))
+    return [
+        word
+        for word in words
+        if re.match(rf"[+~]*({keys})\b", word) and not re.match(r"[+~]*hydra\.searchpath\b", word)
+    ]
+
+
+def _list_settings(tree: Any, words: Sequence[str]) -> Iterator[tuple[str, Any]]:
+    """Yield key and value of each setting that is compared."""
+    values = to_plain(tree)
+    is_own = any("own://" in word or "pkg://" in word for word in words)
+    for key in (*_SETTINGS, *(() if is_own else _DATA)):
+        yield key, values.get(key)
+    hydra = {key: value for key, value in values["hydra"].items() if key not in _OF_A_JOB}
+    hydra["job"] = {k: v for k, v in hydra["job"].items() if k not in _OF_A_NAME}
+    hydra["sweeper"] = {k: v for k, v in (hydra["sweeper"] or {}).items() if k != "params"}
+    for key, value in sorted(hydra.items()):
+        yield f"hydra.{key}", value
+
+
+def to_plain(tree: Any) -> dict[str, Any]:
+    """Return an unresolved configuration as plain dictionaries and lists."""
+    from omegaconf import OmegaConf
+
+    content = OmegaConf.to_container(tree, resolve=False)
+    assert isinstance(content, dict)
+    return {str(key): value for key, value in content.items()}

@@ -15,7 +15,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from pfbench.kernels.operator_checks import check_first
+from pfbench.kernels.manifest import check_first
 
 # --------------------------------------------------------------------------------------------------
 # Compilation of the kernels of particles.cu by torch's NVRTC, and their launch.

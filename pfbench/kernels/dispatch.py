@@ -14,8 +14,7 @@ from torch.autograd import forward_ad
 
 from pfbench.kernels import cuda
 from pfbench.kernels.cpp_library import is_library_loaded, load_library, use_private_cache
-from pfbench.kernels.manifest import Operator, read_operators
-from pfbench.kernels.operator_checks import check_arguments
+from pfbench.kernels.manifest import Operator, check_arguments, read_operators
 
 # --------------------------------------------------------------------------------------------------
 # Choice between torch operations and operators for the inner loops over particles.

@@ -34,7 +34,7 @@ from pfbench.filter.learned.objectives import (
 from pfbench.filter.learned.proposal import LearnedProposal
 from pfbench.filter.loop import FilterPass
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, Resampler, Systematic
+from pfbench.filter.particle.stages import EssResampler, Resampler, Systematic
 from pfbench.learn.training_data import TrainingData
 from pfbench.model.base import StateSpaceModel, initial_law
 

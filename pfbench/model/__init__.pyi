@@ -1,6 +1,6 @@
 """Public names of `pfbench.model` and the modules that define them."""
 
-from pfbench.core.normal import (
+from pfbench.core.density import (
     independent_normal as independent_normal,
     normal_batch as normal_batch,
 )

@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 from typing_extensions import override
 
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, wrap_angle
-from pfbench.core.normal import independent_normal
+from pfbench.core.density import independent_normal
 from pfbench.core.record import Record
 from pfbench.model.ins_gnss import BIASES, NAVIGATION, InsErrorModel, name_ins_components
 from pfbench.nav import attitude, earth, error_dynamics

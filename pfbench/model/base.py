@@ -8,6 +8,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import torch
@@ -16,10 +17,15 @@ from torch.distributions import Distribution, Independent
 from typing_extensions import override
 
 from pfbench.core.chart import Chart, EuclideanBlock
-from pfbench.core.density import log_density, log_normal_density
+from pfbench.core.density import StandardNormal, dense_normal, log_density, log_normal_density
 from pfbench.core.linear_algebra import gaussian_log_density
-from pfbench.core.normal import StandardNormal, dense_normal
 from pfbench.core.record import Record
+
+
+@cache
+def _euclidean_chart(size: int) -> Chart:
+    """Return a chart of Euclidean components, the same one at each step."""
+    return Chart((EuclideanBlock(size),))
 
 
 @contextmanager
@@ -78,7 +84,7 @@ class StateSpaceModel(nn.Module, ABC):
     @property
     def chart(self) -> Chart:
         """Addition, subtraction and mean of states; Euclidean by default."""
-        return Chart((EuclideanBlock(len(self.names)),))
+        return _euclidean_chart(len(self.names))
 
     @property
     def origin(self) -> Tensor:

@@ -10,10 +10,9 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
-from pfbench.core.channels import describe_misfit
+from pfbench.core.density import dense_normal, independent_normal, normal_batch
 from pfbench.core.linear_algebra import affine_map, factor
-from pfbench.core.normal import dense_normal, independent_normal, normal_batch
-from pfbench.core.record import Record
+from pfbench.core.record import Record, describe_misfit
 from pfbench.model.base import StateSpaceModel
 from pfbench.nav import attitude, error_dynamics
 from pfbench.nav.aiding import LOOSE_CHANNELS, AlignmentErrors, GnssReceiver, ProcessNoiseInflation

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
-from pfbench.core.normal import dense_normal, independent_normal
+from pfbench.core.density import dense_normal, independent_normal
 from pfbench.core.parameter_checks import as_float64, check_positive
 from pfbench.model.base import StateSpaceModel
 

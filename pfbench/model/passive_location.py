@@ -11,7 +11,7 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core.chart import wrap_angle
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.parameter_checks import check_positive
 from pfbench.model.base import StateSpaceModel
 

@@ -10,7 +10,7 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock, wrap_angle
-from pfbench.core.normal import independent_normal
+from pfbench.core.density import independent_normal
 from pfbench.core.record import Record
 from pfbench.model.ins_gnss import (
     BIASES,

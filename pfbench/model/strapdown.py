@@ -11,11 +11,10 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core import chart as quaternion
-from pfbench.core.channels import EACH_SATELLITE, name_channels
 from pfbench.core.chart import Chart, EuclideanBlock, LieGroupBlock, QuaternionBlock
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.parameter_checks import check_positive, check_tuning
-from pfbench.core.record import Record
+from pfbench.core.record import EACH_SATELLITE, Record, name_channels
 from pfbench.model.base import StateSpaceModel, check_truth_sizes
 from pfbench.model.ins_gnss import name_components
 from pfbench.model.strapdown_tuning import AidedTuning, StrapdownTuning, TightTuning

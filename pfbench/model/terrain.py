@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.parameter_checks import check_positive, check_whole_number
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.model.base import StateSpaceModel

@@ -11,11 +11,10 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
-from pfbench.core.channels import name_channels
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.parameter_checks import as_float64, check_positive
-from pfbench.core.record import Record
+from pfbench.core.record import Record, name_channels
 from pfbench.model.base import StateSpaceModel
 
 # --------------------------------------------------------------------------------------------------

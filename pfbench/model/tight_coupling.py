@@ -12,8 +12,8 @@ from typing_extensions import override
 
 from pfbench.core import chart as quaternion
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
+from pfbench.core.density import independent_normal
 from pfbench.core.linear_algebra import affine_map, factor
-from pfbench.core.normal import independent_normal
 from pfbench.core.record import Record, map_inputs
 from pfbench.model.ins_gnss import (
     BIASES,

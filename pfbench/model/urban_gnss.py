@@ -19,10 +19,10 @@ from torch.distributions import Distribution, constraints
 from torch.nn.functional import normalize
 from typing_extensions import override
 
-from pfbench.core.channels import EACH_SATELLITE
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, wrap_angle
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.parameter_checks import check_positive, check_three_positive, check_tuning
+from pfbench.core.record import EACH_SATELLITE
 from pfbench.model.base import StateSpaceModel
 
 # --------------------------------------------------------------------------------------------------

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.channels import name_channels
 from pfbench.core.random_stream import RandomStream
-from pfbench.core.record import MeasurementChannels, fix_channels
+from pfbench.core.record import MeasurementChannels, fix_channels, name_channels
 from pfbench.nav import earth
 from pfbench.nav.imu_errors import DEG_H, UG
 from pfbench.nav.strapdown import InsIntervals
@@ -65,7 +64,7 @@ class AidingData:
 class AidingSensor(Protocol):
     """Instruments that aid an INS.
 
-    One that states `channel_names` and `input_type` (`pfbench.core.channels`) is compared with the model.
+    One that states `channel_names` and `input_type` (`pfbench.core.record`) is compared with the model.
     """
 
     @property

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.channels import EACH_SATELLITE
 from pfbench.core.random_stream import RandomStream
-from pfbench.core.record import MeasurementChannels
+from pfbench.core.record import EACH_SATELLITE, MeasurementChannels
 from pfbench.nav.aiding import AidingData, AidingSensor, FlightSolution
 from pfbench.nav.orbits import (
     Constellation,

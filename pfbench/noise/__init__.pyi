@@ -1,20 +1,18 @@
 """Public names of `pfbench.noise` and the modules that define them."""
 
 from pfbench.noise.base import (
+    ErrorDistribution as ErrorDistribution,
     GlintNoise as GlintNoise,
     LaplaceNoise as LaplaceNoise,
     NoiseRegime as NoiseRegime,
     NominalNoise as NominalNoise,
     OutlierNoise as OutlierNoise,
     StudentTNoise as StudentTNoise,
+    make_normal as make_normal,
 )
 from pfbench.noise.correlated import (
     GaussMarkovNoise as GaussMarkovNoise,
     NonLineOfSightNoise as NonLineOfSightNoise,
-)
-from pfbench.noise.distributions import (
-    ErrorDistribution as ErrorDistribution,
-    make_normal as make_normal,
 )
 from pfbench.noise.error_replay import ErrorReplay as ErrorReplay
 from pfbench.noise.time_windows import (

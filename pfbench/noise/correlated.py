@@ -11,9 +11,15 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
-from pfbench.noise import distributions
-from pfbench.noise.base import LayeredRegime, NoiseRegime, NominalNoise, make_no_distribution_error
-from pfbench.noise.distributions import ErrorDistribution
+from pfbench.noise.base import (
+    ErrorDistribution,
+    LayeredRegime,
+    NoiseRegime,
+    NominalNoise,
+    make_no_distribution_error,
+    make_normal,
+    normal_plus_exponential,
+)
 
 
 @dataclass(frozen=True)
@@ -150,13 +156,13 @@ class NonLineOfSightNoise(LayeredRegime):
             raise make_no_distribution_error(
                 noise="nlos", reason="it affects several components of one source together"
             )
-        if family is not distributions.make_normal or not bool((scale == 1.0).all()):
+        if family is not make_normal or not bool((scale == 1.0).all()):
             raise make_no_distribution_error(
                 noise="nlos", reason="the errors without bias are not nominal"
             )
         probability = self.probability * torch.tensor(affected).to(scale)
         return ErrorDistribution(
-            distributions.normal_plus_exponential(probability, self.mean_delay_sd), shift, scale
+            normal_plus_exponential(probability, self.mean_delay_sd), shift, scale
         )
 
 

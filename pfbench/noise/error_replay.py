@@ -16,8 +16,12 @@ from typing_extensions import override
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
 from pfbench.files.table_file import check_parquet
-from pfbench.noise.base import NoiseRegime, NominalNoise, make_no_distribution_error
-from pfbench.noise.distributions import ErrorDistribution
+from pfbench.noise.base import (
+    ErrorDistribution,
+    NoiseRegime,
+    NominalNoise,
+    make_no_distribution_error,
+)
 
 _TRUTH = ["pn", "pe", "pd"]
 _RECEIVER = ["rx_pn", "rx_pe", "rx_pd"]

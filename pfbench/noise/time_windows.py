@@ -12,8 +12,7 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
-from pfbench.noise.base import LayeredRegime, NoiseRegime, NominalNoise
-from pfbench.noise.distributions import ErrorDistribution
+from pfbench.noise.base import ErrorDistribution, LayeredRegime, NoiseRegime, NominalNoise
 
 # --------------------------------------------------------------------------------------------------
 # Time windows in which a noise regime acts.

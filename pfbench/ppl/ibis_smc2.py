@@ -18,7 +18,7 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
 from pfbench.filter.exactness import check_has_evidence
 from pfbench.filter.loop import FilterPass, prepare_record
-from pfbench.filter.particle.resampling import Systematic
+from pfbench.filter.particle.stages import Systematic
 from pfbench.model.base import StateSpaceModel
 from pfbench.ppl.likelihood import repeat_runs
 from pfbench.ppl.parameterised_model import (

@@ -16,7 +16,7 @@ from pfbench.core.record import Record, map_inputs
 from pfbench.filter.belief import Filter, ParticleBelief, gather_ancestors
 from pfbench.filter.exactness import check_has_evidence, is_every_part_exact
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.resampling import Resampler
+from pfbench.filter.particle.stages import Resampler
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.ppl.model_batch import ModelBatch
 from pfbench.ppl.parameterised_model import ParameterisedModel, Values

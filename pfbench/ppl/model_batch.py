@@ -13,7 +13,7 @@ from torch.distributions import Distribution, MixtureSameFamily, MultivariateNor
 from torch.func import functional_call
 from typing_extensions import override
 
-from pfbench.core.normal import dense_normal, independent_normal
+from pfbench.core.density import dense_normal, independent_normal
 from pfbench.core.record import Record, map_inputs
 from pfbench.model.base import ModelWrapper, StateSpaceModel
 

@@ -12,8 +12,8 @@ from pyro.distributions.torch_distribution import TorchDistributionMixin
 from torch import Tensor
 from torch.distributions import Distribution, Independent, biject_to
 
-from pfbench.core.distribution_sampling import draw_values
 from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.simulate import draw_values
 from pfbench.model.base import StateSpaceModel
 from pfbench.ppl.model_batch import ModelBatch, list_non_buffers
 

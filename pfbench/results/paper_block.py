@@ -262,6 +262,8 @@ def list_planned_pairs(
     Where a study varies a setting, the filters of a pair have the same value of it. A filter without
     the setting is compared with each value.
     """
+    if len(set(labels)) < 2:
+        return []
     labels = sorted(set(labels), key=natural_sort_key)
     methods = {label: parse_label(label)[0] for label in labels}
     against = {m: (*baselines[m], *tuned) for m in methods.values() if baselines.get(m)}

@@ -1,11 +1,10 @@
 """Public names of `pfbench.scenario` and the modules that define them."""
 
-from pfbench.scenario.base import Scenario as Scenario
+from pfbench.scenario.base import RecordingRegime as RecordingRegime, Scenario as Scenario
 from pfbench.scenario.flights import (
     SimulatedFlight as SimulatedFlight,
     TerrainFlight as TerrainFlight,
 )
-from pfbench.scenario.oracle_noise import RecordingRegime as RecordingRegime
 from pfbench.scenario.passive_location import (
     EmitterPrior as EmitterPrior,
     PassiveLocationScenario as PassiveLocationScenario,

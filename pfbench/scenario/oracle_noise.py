@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
@@ -10,13 +9,15 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, MultivariateNormal, Normal
 from typing_extensions import override
 
-from pfbench.core.normal import dense_normal, independent_normal
-from pfbench.core.random_stream import RandomStream
+from pfbench.core.density import dense_normal, independent_normal
 from pfbench.core.record import MeasurementChannels, Record
 from pfbench.model.base import ModelWrapper, StateSpaceModel
-from pfbench.noise import distributions
-from pfbench.noise.base import NoiseRegime, process_variance_factors
-from pfbench.noise.distributions import ErrorDistribution, MixtureDistribution
+from pfbench.noise.base import (
+    MixtureDistribution,
+    NoiseRegime,
+    make_normal,
+    process_variance_factors,
+)
 from pfbench.scenario.closed_loop import ClosedLoopRun
 
 
@@ -59,7 +60,7 @@ class OracleNoiseModel(ModelWrapper):
         self.family, shift, scale = regime.error_distribution(channels, time)
         process = process_variance_factors(regime, time)
         self.scales_process = bool((process != 1.0).any())
-        self.has_normal_errors = self.family is distributions.make_normal
+        self.has_normal_errors = self.family is make_normal
         changes_errors = bool((shift != 0.0).any() or (scale != 1.0).any())
         self.has_nominal_errors = self.has_normal_errors and not changes_errors
         self.linear = model.linear and self.has_normal_errors
@@ -170,76 +171,3 @@ class OracleNoiseModel(ModelWrapper):
         r = torch.where(observed_mask, self.residual(y.unsqueeze(1), centre), 0.0)
         density: Tensor = (distribution.base_dist.log_prob(centre + r) * observed_mask).sum(-1)
         return density
-
-
-# --------------------------------------------------------------------------------------------------
-# Noise regime that remembers the measurement channels of a scenario, for a model with oracle noise.
-
-
-@dataclass(eq=False)
-class RecordingRegime:
-    """Noise regime that records the measurement channels of the scenario.
-
-    All calls go to the inner regime. `OracleNoiseModel` needs the channels.
-
-    Attributes:
-        regime: Inner regime.
-        channels: Latest measurement channels. None before the first draw.
-    """
-
-    regime: NoiseRegime
-    channels: MeasurementChannels | None = None
-
-    def draw_errors(
-        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
-    ) -> Tensor:
-        """Draw errors from the inner regime and record the channels.
-
-        Args:
-            draws: Random stream.
-            channels: Measurement components.
-            time: Times, s, [T].
-
-        Returns:
-            Errors, [R, T, Dy].
-        """
-        self.channels = channels
-        return self.regime.draw_errors(draws, channels, time)
-
-    def process_factors(self, time: Tensor) -> Tensor:
-        """Return the factors on the process noise variance at times [T], s."""
-        return self.regime.process_factors(time)
-
-    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
-        """Return family, shift and scale of the errors at each step.
-
-        Args:
-            channels: Measurement components.
-            time: Times, s, [T].
-        """
-        return self.regime.error_distribution(channels, time)
-
-    def to_oracle_model(self, model: StateSpaceModel, time: Tensor) -> OracleNoiseModel:
-        """Build the model with the true noise of the latest episode.
-
-        Args:
-            model: Model without oracle noise.
-            time: Times of the steps, s, [T].
-
-        Returns:
-            The model with oracle noise.
-
-        Raises:
-            ValueError: If the scenario drew no errors; see `OracleNoiseModel`.
-        """
-        if self.channels is None:
-            raise ValueError(
-                "oracle_noise must be false for a scenario without errors from a noise regime, "
-                "got true. Set oracle_noise=false."
-            )
-        return OracleNoiseModel(model, self.regime, self.channels, time)
-
-
-def regime_name(noise: NoiseRegime) -> str:
-    """Return the class name of a noise regime, for messages. A job wraps it in a `RecordingRegime`."""
-    return type(noise.regime if isinstance(noise, RecordingRegime) else noise).__name__

@@ -24,8 +24,7 @@ from pfbench.model.passive_location import (
     relative_motion,
 )
 from pfbench.noise.base import NoiseRegime, process_variance_factors
-from pfbench.scenario.base import Scenario
-from pfbench.scenario.oracle_noise import regime_name
+from pfbench.scenario.base import Scenario, regime_name
 
 # --------------------------------------------------------------------------------------------------
 # Initial distribution of a passively located emitter, given the first measurement.

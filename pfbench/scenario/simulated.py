@@ -38,8 +38,7 @@ from pfbench.files.limits import check_zip
 from pfbench.kernels.generator_version import GENERATOR_VERSION
 from pfbench.model.base import StateSpaceModel, named_inputs
 from pfbench.noise.base import NoiseRegime, NominalNoise, process_variance_factors
-from pfbench.scenario.base import Scenario
-from pfbench.scenario.oracle_noise import regime_name
+from pfbench.scenario.base import Scenario, regime_name
 
 
 @dataclass(frozen=True)

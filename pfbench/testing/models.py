@@ -13,7 +13,7 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.linearisation import find_observation_jacobian, find_propagation_jacobian
-from pfbench.filter.particle.proposals import Proposal
+from pfbench.filter.particle.stages import Proposal
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.testing.results import (

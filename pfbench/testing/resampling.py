@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.particle.resampling import EssResampler, Resampler, ResamplingScheme
+from pfbench.filter.particle.stages import EssResampler, Resampler, ResamplingScheme
 from pfbench.model.linear_gaussian import local_level
 from pfbench.testing.results import LawCheck, check_count, check_p_values, compute_twice, find_kind
 

@@ -19,9 +19,8 @@ from torch import Tensor
 
 from pfbench import job
 from pfbench.cli.compose import expand_sweep, read_sweep
-from pfbench.core.channels import describe_misfit
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode, Record
+from pfbench.core.record import Episode, Record, describe_misfit
 from pfbench.filter import CubaturePoints, GaussianFilter, SigmaPointLinearisation, run_filter
 from pfbench.job.config import compose_tree
 from pfbench.job.model_fit import is_fitting, list_fitting_models, list_fitting_scenarios

@@ -21,7 +21,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf, _utils
 
 from pfbench import job
-from pfbench.cli import application
+from pfbench.cli import run as run_command
 from pfbench.cli.check import _matching_scenario
 from pfbench.files import command_start
 from pfbench.files.command_start import reset_work, start_work
@@ -176,8 +176,8 @@ def test_no_file_of_pfbench_sets_the_mode_of_hydra() -> None:
         composed = composed_by(shared_loader.SharedLoader, words, RunMode.MULTIRUN)
         assert composed.hydra.mode is None
     for words in (["hydra.mode=RUN"], ["a=1", "++hydra.mode=RUN"], ["hydra={mode: RUN}"]):
-        assert application._can_set_mode(words)
-    assert not application._can_set_mode(["scenario=linear_walk", "hydrate=1", "filter=sir"])
+        assert run_command._can_set_mode(words)
+    assert not run_command._can_set_mode(["scenario=linear_walk", "hydrate=1", "filter=sir"])
 
 
 @pytest.mark.parametrize("words", [[], ["-m"], ["hydra.mode=MULTIRUN"], ["--multirun", "runs=2,3"]])
@@ -199,7 +199,7 @@ def test_an_application_runs_as_that_of_hydra(
     monkeypatch.setattr(sys, "argv", ["pfbench run", *words, "scenario=linear_walk"])
     path = str(job.conf_dir())
     decorated = hydra.main(version_base="1.3", config_path=path, config_name="config")(task)
-    for run in (decorated, application.make_application(task)):
+    for run in (decorated, run_command.make_application(task)):
         seen.append([])
         run()
     assert seen[0] == seen[1]

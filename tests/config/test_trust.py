@@ -14,7 +14,7 @@ from pfbench import job
 from pfbench.cli.compose import check_words
 from pfbench.job import trust
 from pfbench.job.config import compose_tree
-from pfbench.job.file_rules import check_composed
+from pfbench.job.shared_loader import check_composed
 from pfbench.job.trust import UntrustedConfigError
 
 

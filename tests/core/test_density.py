@@ -13,8 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent
 
 from pfbench.core.chart import wrap_angle
-from pfbench.core.density import has_finite_moments
-from pfbench.core.normal import normal_batch
+from pfbench.core.density import has_finite_moments, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.gaussian.ensemble_kalman import EnsembleKalmanFilter
@@ -25,9 +24,9 @@ from pfbench.filter.gaussian.linearisation_rules import (
     TaylorLinearisation,
     UnscentedPoints,
 )
+from pfbench.filter.linearisation import compute_nis
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.particle_moments import compute_nis
 from pfbench.model.base import StateSpaceModel, StaticModel
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.simulated import ModelSimulation

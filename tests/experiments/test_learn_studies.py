@@ -19,7 +19,7 @@ from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
-from pfbench.filter.particle.proposals import BootstrapProposal
+from pfbench.filter.particle.stages import BootstrapProposal
 from pfbench.model.linear_gaussian import local_level
 from pfbench.results import crossed_mean_interval
 

@@ -149,7 +149,7 @@ def plant_follows_links(monkeypatch: pytest.MonkeyPatch) -> None:
     def is_kind(root: Path, name: str, kind: int) -> bool:
         return (root / name).exists() and stat.S_IFMT((root / name).stat().st_mode) == kind
 
-    monkeypatch.setattr("pfbench.job.shared_loader._is_kind", is_kind)
+    monkeypatch.setattr("pfbench.job.search_folders._is_kind", is_kind)
     monkeypatch.setattr("os.O_NOFOLLOW", 0)
 
 

@@ -25,9 +25,9 @@ from pfbench.filter.belief import ParticleBelief, StepInfo
 from pfbench.filter.exactness import has_bounded_weights
 from pfbench.filter.input_check import check_model
 from pfbench.filter.loop import prepare_record, run_filter
-from pfbench.filter.particle.auxiliary_weights import LookAheadWeights
 from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
 from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.weights import LookAheadWeights
 from pfbench.filter.proposed.swarm import SwarmProposal
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian

@@ -23,7 +23,7 @@ from pfbench.filter.loop import FilterPass, FilterResult, prepare_record, run_fi
 from pfbench.model import LinearGaussian, UnivariateGrowth, linear_walk
 from pfbench.noise import NominalNoise
 from pfbench.ppl.pyro_program import simulate
-from pfbench.results import headline, status
+from pfbench.results import status
 from pfbench.scenario import ModelSimulation
 
 RUNS, STEPS = 200, 60
@@ -154,7 +154,7 @@ def test_results_name_the_marks_as_the_filter_does() -> None:
     assert {
         HEALTH.index(name): name for name in status.HEALTH_MARKS.values()
     } == status.HEALTH_MARKS
-    assert set(headline.HINTS) == set(status.HEALTH_MARKS.values())
+    assert set(status.HINTS) == set(status.HEALTH_MARKS.values())
 
 
 UNBOUNDED = LookAheadWeights(defensive_fraction=0.0)

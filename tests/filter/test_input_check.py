@@ -20,7 +20,8 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.moves.metropolis import MetropolisHastings
 from pfbench.filter.moves.path_kernels import NoiseFlowStatKernel
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.weight_update import BayesWeightUpdate, FlooredWeightUpdate
+from pfbench.filter.particle.stages import BayesWeightUpdate
+from pfbench.filter.particle.weights import FlooredWeightUpdate
 from pfbench.kernels import dispatch
 from pfbench.model.base import ModelWrapper
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk

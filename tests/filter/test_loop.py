@@ -16,9 +16,8 @@ from pfbench.filter.gaussian.linearisation_rules import (
     SigmaPointLinearisation,
     TaylorLinearisation,
 )
-from pfbench.filter.loop import run_filter
+from pfbench.filter.loop import choose_run_batch, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.run_batches import choose_run_batch
 from pfbench.model.linear_gaussian import linear_walk, local_level
 from pfbench.model.textbook import UnivariateGrowth
 

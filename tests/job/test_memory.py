@@ -292,7 +292,7 @@ def test_a_limit_that_is_none_is_told(tmp_path: Path, value: str) -> None:
 MEASURED = """
 import sys
 from pfbench.cli.main import main
-from pfbench.kernels import process_memory
+from pfbench.job import memory as process_memory
 main(sys.argv[1:])
 print("kibibytes", process_memory.peak_memory() // 1024)  # not getrusage's: that begins with what the process had that started this one
 """

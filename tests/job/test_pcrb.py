@@ -22,7 +22,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
 )
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.job.pcrb import compute_posterior_bound
 from pfbench.model.ins_gnss import InsGnss
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk

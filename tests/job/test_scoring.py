@@ -14,14 +14,13 @@ from torch import Tensor
 
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.filter.belief import ParticleBelief, StepInfo
+from pfbench.filter.belief import ParticleBelief, StepInfo, make_step_info, summarise
 from pfbench.filter.gaussian.ensemble_kalman import EnsembleKalmanFilter
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.particle_moments import make_step_info, summarise
 from pfbench.job.scoring import LikelihoodCounter, ScoreRecorder, score_normal, score_particles
 from pfbench.kernels import dispatch
 from pfbench.model.linear_gaussian import linear_walk

@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from pfbench.kernels import dispatch
-from pfbench.kernels.manifest import Argument, read_operators
-from pfbench.kernels.operator_checks import check_arguments
+from pfbench.kernels.manifest import Argument, check_arguments, read_operators
 
 OPERATORS = {name: operator.arguments for name, operator in read_operators().items()}
 ON_CPU = [name for name, operator in read_operators().items() if operator.is_on_cpu]

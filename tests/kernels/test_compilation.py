@@ -27,7 +27,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
     UnscentedPoints,
 )
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle import particle_moments, resampling
+from pfbench.filter.particle import stages
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job import filter_pass, scoring
 from pfbench.kernels import cpp_library, dispatch
@@ -85,12 +85,12 @@ def results(x: Tensor, z: Tensor) -> list[Any]:
         torch.tensor([[0.1], [0.5], [0.9]]),
     )
     return [
-        particle_moments._flat_moments(1e3 + x, torch.softmax(z, 1)),
+        belief._flat_moments(1e3 + x, torch.softmax(z, 1)),
         belief.normalise_updated_weights(hidden),
         density.log_normal_density(
             0.1 * x[:, :1], x, torch.full((1, 1, D), 0.7, dtype=dtype), seen
         ),
-        resampling._systematic(a, n, u.double()),
+        stages._systematic(a, n, u.double()),
     ]
 
 
@@ -134,7 +134,7 @@ def test_a_loop_by_hand_copies_evenly(dtype: torch.dtype) -> None:
     a[5] = torch.nan
     n = torch.tensor([[N], [N // 3], [2], [N], [N], [N]], dtype=dtype)
     u = torch.linspace(1.0 - 1e-9, 1e-9, 6, dtype=torch.float64)[:, None]
-    assert torch.equal(dispatch.resample_systematic(a, n, u), resampling._eager_systematic(a, n, u))
+    assert torch.equal(dispatch.resample_systematic(a, n, u), stages._eager_systematic(a, n, u))
     assert torch.equal(
         dispatch.resample_systematic(a[:1], n[:1], u[:1]),
         dispatch.resample_systematic(a, n[:1], u)[:1],
@@ -294,7 +294,7 @@ def test_a_loop_by_hand_weighs_and_averages_in_any_memory_order(
         equal_nan=True,
     )
     torch.testing.assert_close(
-        dispatch.weighted_moments(x, w), particle_moments._separate_moments(x, w), equal_nan=True
+        dispatch.weighted_moments(x, w), belief._separate_moments(x, w), equal_nan=True
     )
     w[2, 3] = torch.nan
     torch.testing.assert_close(
@@ -320,7 +320,7 @@ def test_a_loop_by_hand_spreads_about_the_mean_in_any_memory_order(
         for laid in (x.contiguous(), x.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
             found, wanted = (
                 dispatch.group_covariance(laid, mean, w, groups),
-                particle_moments._separate_spread(x, mean, w, groups),
+                belief._separate_spread(x, mean, w, groups),
             )
             eps = torch.finfo(dtype).eps
             torch.testing.assert_close(found, wanted, equal_nan=True, rtol=1e3 * eps, atol=20 * eps)
@@ -477,7 +477,7 @@ def test_a_gradient_goes_round_the_loops_by_hand() -> None:
         torch.softmax(DRAWS.normal("w", N, 1)[..., 0], -1),
     )
     with dispatch.use_compiled():
-        particle_moments._flat_moments(x, w)[0].sum().backward()
+        belief._flat_moments(x, w)[0].sum().backward()
     torch.testing.assert_close(x.grad, w.unsqueeze(-1).expand_as(x))
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from pfbench.core import linear_algebra, random_stream
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter import belief
-from pfbench.filter.particle import particle_moments, resampling
+from pfbench.filter.particle import stages
 from pfbench.kernels import cuda, cuda as cuda_launch, dispatch
 
 COMPILER = next(
@@ -167,7 +167,7 @@ def test_resampling(loop: Loop, runs: int, n: int, d: int, dtype: torch.dtype) -
         assert (w.gather(1, found) > 0).all()
         counts = torch.zeros(runs, n).scatter_add(1, found, torch.ones(found.shape))
         assert ((counts - wanted * w).abs() < 1.0 + 1e-6 * wanted).all()
-        wanted_ones = resampling._eager_systematic(w, number, u)[:, :wanted]
+        wanted_ones = stages._eager_systematic(w, number, u)[:, :wanted]
         assert torch.equal(found, wanted_ones)
 
 
@@ -179,7 +179,7 @@ def test_resampling_with_numbers_of_their_own(loop: Loop) -> None:
     )
     found, wanted = (
         loop("resample_systematic", w, number, u),
-        resampling._eager_systematic(w, number, u),
+        stages._eager_systematic(w, number, u),
     )
     for r, n in enumerate((30, 7, 1)):
         assert torch.equal(found[r, :n], wanted[r, :n])
@@ -196,15 +196,13 @@ def test_clouds(loop: Loop, runs: int, n: int, d: int, dtype: torch.dtype) -> No
     )
     copy_of = 2 * ancestors % (2 * n - 1)
     assert torch.equal(
-        loop("count_unique", copy_of, w.log()), particle_moments._count_distinct(copy_of, w.log())
+        loop("count_unique", copy_of, w.log()), belief._count_distinct(copy_of, w.log())
     )
     x = x + 1e4 * torch.arange(1, d + 1)
     x[:, 0], w[:, 0] = 1e9, 0.0  # an outlier without weight spoils nothing
     w = w / w.sum(1, keepdim=True)
     mean, variance = loop("weighted_moments", x, w)
-    exact = particle_moments._separate_moments(
-        x.double(), w.double() / w.double().sum(1, keepdim=True)
-    )
+    exact = belief._separate_moments(x.double(), w.double() / w.double().sum(1, keepdim=True))
     deviation = exact[1].sqrt().max()
     written = torch.finfo(dtype).eps * 1e4 * d  # by which a mean of this size can be off at all
     assert (mean - exact[0]).abs().max() < 20 * FINE[dtype] * deviation + 50 * written

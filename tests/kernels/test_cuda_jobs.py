@@ -31,7 +31,7 @@ from pfbench.filter.learned.proposal import LearnedProposal
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.filter.proposed.swarm import SwarmProposal
 from pfbench.kernels import dispatch
 from pfbench.learn.trainer import Training

@@ -14,9 +14,9 @@ import random_calls
 import torch
 
 from pfbench.core import density, linear_algebra, random_stream
-from pfbench.filter import belief, belief as log_weights
+from pfbench.filter import belief
 from pfbench.filter.gaussian import kalman_update, linearisation_rules
-from pfbench.filter.particle import particle_moments, resampling
+from pfbench.filter.particle import stages
 from pfbench.job import scoring
 from pfbench.kernels import (
     cpp_library,
@@ -26,7 +26,7 @@ from pfbench.kernels import (
     operator_sources,
     step_compiler,
 )
-from pfbench.kernels.operator_checks import check_arguments
+from pfbench.kernels.manifest import check_arguments
 from pfbench.kernels.step_compiler import compile_function
 
 COMPILER = shutil.which("c++") or shutil.which("g++")
@@ -92,19 +92,19 @@ def eager_function(name: str) -> Callable[..., Any]:
         "philox_normals": random_stream.draw_normals,
         "philox_normals_float64": random_stream.draw_normals_float64,
         "philox_uniforms": random_stream.draw_uniforms,
-        "resample_systematic": resampling._systematic,
+        "resample_systematic": stages._systematic,
         "gather_particles": belief._gather_components,
         "log_normal": density._quadratic,
         "propagate_affine": linear_algebra._affine,
-        "count_unique": particle_moments.count_distinct_ancestors,
-        "sum_and_squares": log_weights._totals,
-        "sum_log_weights": log_weights._add_terms,
-        "normalise_weights": log_weights.normalise_updated_weights,
-        "weighted_moments": particle_moments._flat_moments,
+        "count_unique": belief.count_distinct_ancestors,
+        "sum_and_squares": belief._totals,
+        "sum_log_weights": belief._add_terms,
+        "normalise_weights": belief.normalise_updated_weights,
+        "weighted_moments": belief._flat_moments,
         "cholesky_factor": linear_algebra.factor,
         "kalman_update": kalman_update._updated,
         "fit_affine": linearisation_rules._fitted,
-        "group_covariance": particle_moments._spread,
+        "group_covariance": belief.compute_spread,
         "squared_mahalanobis": linear_algebra.squared_length,
         "marginal_scores": scoring._marginal_scores,
         "energy_score": scoring._energy_score,
@@ -157,7 +157,7 @@ def test_normalised_weights_at_their_limits(dtype: torch.dtype) -> None:
     rows[8, 0] = torch.inf
     rows[9] -= 2.0 / torch.finfo(dtype).eps
     rows[10] = -3.0
-    expected, result = log_weights._separate_normalise(rows), dispatch.normalise_weights(rows)
+    expected, result = belief._separate_normalise(rows), dispatch.normalise_weights(rows)
     tolerance = 2e-6 if dtype == torch.float32 else 1e-13
     for a, b in zip(result, expected, strict=True):
         torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance)
@@ -179,12 +179,12 @@ def test_the_sum_of_log_weights_has_no_nan(dtype: torch.dtype) -> None:
     total = terms + log_w + log_ratio
     expected = torch.where(torch.isnan(total), -torch.inf, total)
     assert torch.equal(dispatch.sum_log_weights(terms, log_w, log_ratio), expected)
-    assert torch.equal(log_weights._separate_sum(terms, log_w, log_ratio), expected)
+    assert torch.equal(belief._separate_sum(terms, log_w, log_ratio), expected)
     column = torch.tensor([[0.25], [-torch.inf], [torch.nan]], dtype=dtype)
     for a, b in ((column, column), (log_w, column), (column, log_ratio)):
         full = dispatch.sum_log_weights(terms, a.expand_as(terms), b.expand_as(terms))
         assert torch.equal(dispatch.sum_log_weights(terms, a, b), full)
-        assert torch.equal(log_weights._separate_sum(terms, a, b), full)
+        assert torch.equal(belief._separate_sum(terms, a, b), full)
 
 
 def refusal(call: Callable[..., Any], arguments: list[Any]) -> str:

@@ -44,8 +44,7 @@ from pfbench.filter.learned.proposal import LearnedProposal
 from pfbench.filter.loop import run_filter
 from pfbench.filter.moves.metropolis import MetropolisHastings
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.stages import BootstrapProposal, EssResampler, Proposal, Systematic
 from pfbench.learn.trainer import Progress, Training, TrainingState
 from pfbench.learn.training_data import TrainingData, draw_training_data
 from pfbench.learn.training_job import train

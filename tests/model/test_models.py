@@ -15,12 +15,12 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent
 
 from pfbench.core.chart import wrap_angle
+from pfbench.core.density import dense_normal, independent_normal, normal_batch
 from pfbench.core.linear_algebra import (
     distribution_covariance,
     gaussian_log_density,
     shared_distribution_covariance,
 )
-from pfbench.core.normal import dense_normal, independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.model.base import StateSpaceModel, StaticModel

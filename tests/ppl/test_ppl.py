@@ -26,7 +26,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
 )
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.model.base import ModelWrapper, StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
 from pfbench.model.passive_location import PassiveLocation, PlatformInputs, compute_level_attitude

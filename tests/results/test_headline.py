@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pfbench.results.headline import describe_runs
+from pfbench.results.status import describe_runs
 
 RUNS, STEPS = 10, 20
 

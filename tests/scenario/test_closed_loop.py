@@ -40,8 +40,8 @@ from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, cruise, turn
 from pfbench.nav.trajectory import TrajectoryStart
 from pfbench.noise.base import NoiseRegime, NominalNoise
 from pfbench.noise.time_windows import MeasurementOutage, VarianceSurge
+from pfbench.scenario.base import RecordingRegime
 from pfbench.scenario.flights import SimulatedFlight
-from pfbench.scenario.oracle_noise import RecordingRegime
 
 IMU = ImuErrors(
     gyro_bias_deg_h=1.0,

@@ -45,7 +45,8 @@ from pfbench.noise.base import (
 from pfbench.noise.correlated import GaussMarkovNoise, NonLineOfSightNoise
 from pfbench.noise.error_replay import ErrorReplay
 from pfbench.noise.time_windows import BiasStep, MeasurementOutage, VarianceSurge
-from pfbench.scenario.oracle_noise import OracleNoiseModel, RecordingRegime
+from pfbench.scenario.base import RecordingRegime
+from pfbench.scenario.oracle_noise import OracleNoiseModel
 from pfbench.scenario.simulated import ModelSimulation
 
 CONF = job.conf_dir()

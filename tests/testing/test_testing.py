@@ -34,17 +34,18 @@ from pfbench.filter.moves.path_kernels import (
     PathBlockKernel,
 )
 from pfbench.filter.moves.path_proposals import SmoothedSegment
-from pfbench.filter.particle.auxiliary_weights import (
-    LookAheadWeights,
-    TemperedPosterior,
-    TemperedWeights,
-)
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import EssResampler, Multinomial, Residual, Ssp, Systematic
+from pfbench.filter.particle.resampling import Multinomial, Residual, Ssp
 from pfbench.filter.particle.sqmc import HilbertSortedResampler, SqmcProposal, SqmcScheme
-from pfbench.filter.particle.weight_update import BayesWeightUpdate
+from pfbench.filter.particle.stages import (
+    BayesWeightUpdate,
+    BootstrapProposal,
+    EssResampler,
+    ProposalSample,
+    Systematic,
+)
+from pfbench.filter.particle.weights import LookAheadWeights, TemperedPosterior, TemperedWeights
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.ppl.likelihood import SortedResampler

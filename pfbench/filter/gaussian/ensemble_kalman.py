@@ -19,13 +19,10 @@ from typing_extensions import override
 from pfbench.core.linear_algebra import factor, shared_distribution_covariance
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief, StepInfo
-from pfbench.filter.gaussian.linearisation_rules import around_first
-from pfbench.filter.linearisation import check_moments, mask_covariance
+from pfbench.filter.belief import ParticleBelief, StepInfo, summarise
+from pfbench.filter.linearisation import around_first, check_moments, mask_covariance
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.particle_moments import summarise
-from pfbench.filter.particle.proposals import BootstrapProposal
-from pfbench.filter.particle.weight_update import deactivate_invalid_particles
+from pfbench.filter.particle.stages import BootstrapProposal, deactivate_invalid_particles
 from pfbench.filter.whitening import LOG_2PI, log_determinant
 from pfbench.model.base import StateSpaceModel
 

@@ -15,9 +15,8 @@ from pfbench.filter.gaussian.linearisation_rules import (
     AffineApproximation,
     DifferenceSpace,
     LinearisationRule,
-    around_first,
 )
-from pfbench.filter.linearisation import check_moments, find_observation_jacobian
+from pfbench.filter.linearisation import around_first, check_moments, find_observation_jacobian
 from pfbench.model.base import StateSpaceModel
 
 # --------------------------------------------------------------------------------------------------

@@ -25,9 +25,12 @@ from pfbench.kernels import dispatch
 from pfbench.kernels.dispatch import compilable
 
 ConditionalMoments: TypeAlias = Callable[[Tensor], tuple[Tensor, Tensor]]
+
 """xi [R, P, d] -> mean [R, P, k] and covariance [R or 1, P or 1, k, k] given each point."""
 
+
 SigmaPoints: TypeAlias = Callable[[int], tuple[Tensor, Tensor, Tensor]]
+
 """d -> whitened points [P, d], mean weights [P] and covariance weights [P]; sum w_c xi xi' = I."""
 
 
@@ -43,17 +46,6 @@ class DifferenceSpace(NamedTuple):
     subtract: Callable[[Tensor, Tensor], Tensor]
     mean: Callable[[Tensor, Tensor], Tensor]
     slope: Callable[[], Tensor | None] = lambda: None
-
-
-def around_first(
-    residual: Callable[[Tensor, Tensor], Tensor],
-) -> Callable[[Tensor, Tensor], Tensor]:
-    """Make the weighted mean of values that may wrap: the mean of residuals to the first value."""
-
-    def mean(y: Tensor, w: Tensor) -> Tensor:
-        return y[:, 0] + (w.unsqueeze(-1) * residual(y, y[:, :1])).sum(1)
-
-    return mean
 
 
 class AffineApproximation(NamedTuple):
@@ -223,7 +215,9 @@ class CubaturePoints:
 #     B. Jia, M. Xin, Y. Cheng 2012, "Sparse-grid quadrature nonlinear filtering".
 
 _MOST_POINTS = 20_000
+
 _SIZES = (1, 3, 5)  # points of the univariate rules of a sparse grid
+
 _LEVELS = (2, 3)
 
 

@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
+from pfbench.core.density import StandardNormal, dense_normal, independent_normal
 from pfbench.core.linear_algebra import factor
-from pfbench.core.normal import StandardNormal, dense_normal, independent_normal
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief, ParticleBelief, weighted_mean_cov
@@ -27,8 +27,13 @@ from pfbench.filter.linearisation import (
     mean_noise,
     unwrap_independent,
 )
-from pfbench.filter.particle.proposals import BootstrapProposal, Proposal, ProposalSample
-from pfbench.filter.particle.sqmc import IidPoints, PointSet
+from pfbench.filter.particle.stages import (
+    BootstrapProposal,
+    IidPoints,
+    PointSet,
+    Proposal,
+    ProposalSample,
+)
 from pfbench.filter.whitening import (
     LOG_2PI,
     compute_half_square,

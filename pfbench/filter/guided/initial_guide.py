@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.distribution_sampling import draw_values
 from pfbench.core.linear_algebra import factor
 from pfbench.core.parameter_checks import check_whole_number
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
+from pfbench.core.simulate import draw_values
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.guided.guides import check_covariance_factor
-from pfbench.filter.particle.proposals import InitialProposal
+from pfbench.filter.particle.stages import InitialProposal
 from pfbench.filter.smoothing.gaussian_smoother import smooth_initial_state
 from pfbench.filter.whitening import LOG_2PI
 from pfbench.model.base import StateSpaceModel, initial_law

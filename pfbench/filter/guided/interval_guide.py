@@ -32,7 +32,7 @@ from pfbench.filter.linearisation import (
     mean_noise,
     measurement_jacobian,
 )
-from pfbench.filter.particle.proposals import Proposal, ProposalSample, draw_noise
+from pfbench.filter.particle.stages import Proposal, ProposalSample, draw_noise
 from pfbench.filter.whitening import compute_half_square
 from pfbench.model.base import StateSpaceModel, StaticModel
 

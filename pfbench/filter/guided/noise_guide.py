@@ -16,16 +16,15 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
-    AffineApproximation,
-    DifferenceSpace,
-    around_first,
-)
+from pfbench.filter.gaussian.linearisation_rules import AffineApproximation, DifferenceSpace
 from pfbench.filter.guided.guides import check_covariance_factor, check_normal_guide
-from pfbench.filter.linearisation import mask_covariance, mean_noise, unwrap_independent
+from pfbench.filter.linearisation import (
+    around_first,
+    mask_covariance,
+    mean_noise,
+    unwrap_independent,
+)
 from pfbench.filter.particle.proposals import (
-    Proposal,
-    ProposalSample,
     check_fraction,
     choose_defensive_particles,
     draw_standardised_noise,
@@ -33,7 +32,7 @@ from pfbench.filter.particle.proposals import (
     log_standard_normal,
     scale_noise,
 )
-from pfbench.filter.particle.sqmc import IidPoints, PointSet
+from pfbench.filter.particle.stages import IidPoints, PointSet, Proposal, ProposalSample
 from pfbench.filter.whitening import log_determinant
 from pfbench.model.base import StateSpaceModel
 

@@ -28,7 +28,7 @@ from typing_extensions import override
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights, select_by_run
 from pfbench.filter.exactness import is_every_part_exact
-from pfbench.filter.particle.resampling import EssResampler, Resampler, Systematic
+from pfbench.filter.particle.stages import EssResampler, Resampler, Systematic
 from pfbench.model.base import StateSpaceModel
 
 

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.distribution_sampling import draw_values
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
-from pfbench.core.simulate import draw_initial_state, simulate_steps
+from pfbench.core.simulate import draw_initial_state, draw_values, simulate_steps
 from pfbench.filter.belief import StepInfo
 from pfbench.filter.learned.gain_filter import LearnedGain, LearnedGainFilter
 from pfbench.filter.learned.mcmc_kernel import LearnedRandomWalk

@@ -24,13 +24,13 @@ from pfbench.filter.learned.differentiable_resampling import sample_from
 from pfbench.filter.learned.features import Feature, FeatureStack, make_feature_context
 from pfbench.filter.learned.networks import CheckpointSpec, build_networks
 from pfbench.filter.particle.proposals import (
-    ProposalSample,
     check_fraction,
     choose_defensive_particles,
     draw_standardised_noise,
     log_noise_density,
     scale_noise,
 )
+from pfbench.filter.particle.stages import ProposalSample
 from pfbench.model.base import StateSpaceModel, StaticModel
 
 PAST = "learned.past"  # hidden state of a recurrent network in the belief's memory, [R, 1, H]

@@ -20,8 +20,8 @@ from pfbench.filter.gaussian.invariant import ChartModel, InvariantFilter, chang
 from pfbench.filter.gaussian.kalman_update import move_root
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.marginal.rao_blackwellised import partition_state
-from pfbench.filter.particle.resampling import Systematic
-from pfbench.filter.particle.sqmc import PointSet, SobolPoints
+from pfbench.filter.particle.sqmc import SobolPoints
+from pfbench.filter.particle.stages import PointSet, Systematic
 from pfbench.filter.robust.hypotheses import (
     OFFSET,
     Branches,

@@ -38,9 +38,15 @@ from pfbench.filter.linearisation import (
     unwrap_independent,
 )
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.proposals import BootstrapProposal, Proposal, ProposalSample
-from pfbench.filter.particle.resampling import EssResampler, Resampler, Systematic
-from pfbench.filter.particle.weight_update import WeightUpdate
+from pfbench.filter.particle.stages import (
+    BootstrapProposal,
+    EssResampler,
+    Proposal,
+    ProposalSample,
+    Resampler,
+    Systematic,
+    WeightUpdate,
+)
 from pfbench.filter.whitening import LOG_2PI, condition_on, kalman_update_root, log_determinant
 from pfbench.model.base import StateSpaceModel, initial_law
 

@@ -26,6 +26,10 @@ from pfbench.model.base import StateSpaceModel, StaticModel
 # A particle stores everything that a kernel reads. Kernels do not look up parents.
 
 
+#
+# A particle stores everything that a kernel reads. Kernels do not look up parents.
+
+
 class PathHistory(Protocol):
     """History that particles store for a kernel in the window of the belief."""
 

@@ -21,7 +21,7 @@ from pfbench.filter.linearisation import (
     transition_jacobian,
 )
 from pfbench.filter.moves.metropolis import get_transition, stack_history
-from pfbench.filter.particle.proposals import draw_noise
+from pfbench.filter.particle.stages import draw_noise
 from pfbench.model.base import StateSpaceModel
 
 # --------------------------------------------------------------------------------------------------

@@ -16,11 +16,9 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record, map_inputs
-from pfbench.filter.belief import Filter, GaussianBelief, ParticleBelief, StepInfo
-from pfbench.filter.loop import MultiStepFilter
+from pfbench.filter.belief import Filter, GaussianBelief, ParticleBelief, StepInfo, StepSummary
+from pfbench.filter.loop import MultiStepFilter, RecordStartedFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.particle_moments import StepSummary
-from pfbench.filter.particle.proposals import RecordStartedFilter
 from pfbench.kernels import dispatch, step_compiler
 from pfbench.kernels.step_compiler import (
     NativeEntry,

@@ -20,10 +20,15 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
 from pfbench.filter.exactness import is_every_part_exact
-from pfbench.filter.particle.proposals import BootstrapProposal, Proposal, ProposalSample
-from pfbench.filter.particle.resampling import Resampler
-from pfbench.filter.particle.sqmc import IidPoints, PointSet
-from pfbench.filter.particle.weight_update import deactivate_invalid_particles
+from pfbench.filter.particle.stages import (
+    BootstrapProposal,
+    IidPoints,
+    PointSet,
+    Proposal,
+    ProposalSample,
+    Resampler,
+    deactivate_invalid_particles,
+)
 from pfbench.model.base import StateSpaceModel
 
 

@@ -1,65 +1,17 @@
-"""Number of particles, fixed or adaptive."""
+"""Adaptive numbers of particles."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import torch
 from torch import Tensor
 from typing_extensions import override
 
 from pfbench.filter.belief import ParticleBelief, ess
-from pfbench.kernels.dispatch import is_capturing
-
-
-class ParticleCount(Protocol):
-    """Number of active particles of each run, at most the number of slots."""
-
-    @property
-    def is_exact(self) -> bool:
-        """True if the number depends on the belief before resampling alone."""
-
-    def initial_count(self, slots: int) -> int:
-        """Return the initial number."""
-
-    def __call__(self, belief: ParticleBelief) -> Tensor:
-        """Compute the number for the next step, float [R, 1], from the belief before it."""
-
-
-def count_particles(stage: ParticleCount, belief: ParticleBelief) -> Tensor:
-    """Compute the number of active particles by a stage, and check it if the stage is a user's own.
-
-    Returns numbers, [R or 1, 1].
-    """
-    n, (runs, slots) = stage(belief), belief.log_w.shape
-    if type(stage).__module__.startswith("pfbench.") or is_capturing():
-        return n  # within its limits; a check would make the device wait
-    is_valid = n.shape in ((runs, 1), (1, 1)) and bool(((n >= 1) & (n <= slots)).all())
-    if not is_valid:
-        values = f"{list(n.shape)} with values from {float(n.min()):g} to {float(n.max()):g}"
-        raise ValueError(
-            f"particle_count {type(stage).__name__} must return [{runs} or 1, 1] numbers from 1 to "
-            f"{slots} slots, got {values}. Start with more particles, or clamp the number."
-        )
-    return n
-
-
-@dataclass(frozen=True)
-class FixedCount(ParticleCount):
-    """All slots at every step."""
-
-    is_exact = True
-
-    @override
-    def initial_count(self, slots: int) -> int:
-        return slots
-
-    @override
-    def __call__(self, belief: ParticleBelief) -> Tensor:
-        runs, slots = belief.log_w.shape
-        count = torch.full((runs, 1), slots, dtype=torch.float64, device=belief.log_w.device)
-        return count.to(belief.log_w.dtype)
+from pfbench.filter.particle.stages import (
+    ParticleCount,
+)
 
 
 @dataclass(frozen=True)

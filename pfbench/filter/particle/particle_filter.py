@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -23,45 +23,41 @@ from pfbench.filter.belief import (
     Filter,
     ParticleBelief,
     StepInfo,
-    is_equal_for_all,
-    normalise_updated_weights,
-)
-from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
-from pfbench.filter.moves.metropolis import Move, PathHistory, combine_histories
-from pfbench.filter.particle.auxiliary_weights import AuxiliaryWeights, PosteriorWeights
-from pfbench.filter.particle.particle_count import FixedCount, ParticleCount, count_particles
-from pfbench.filter.particle.particle_moments import (
     StepSummary,
-    compute_nis,
     count_distinct_ancestors,
+    is_equal_for_all,
     make_step_info,
+    normalise_updated_weights,
     weighted_mean_variance,
 )
-from pfbench.filter.particle.proposals import (
-    HELD_STEPS,
-    BootstrapProposal,
-    InitialProposal,
-    Proposal,
-    hold_resampling,
-)
-from pfbench.filter.particle.resampling import EssResampler, Resampler, Systematic
-from pfbench.filter.particle.sqmc import IidPoints, PointSet
-from pfbench.filter.particle.weight_update import (
+from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
+from pfbench.filter.linearisation import compute_nis
+from pfbench.filter.particle.stages import (
+    AuxiliaryWeights,
     BayesWeightUpdate,
+    BootstrapProposal,
+    EssResampler,
+    FixedCount,
+    IidPoints,
+    InitialProposal,
     MemoryWeightUpdate,
+    ParticleCount,
+    PointSet,
+    PosteriorWeights,
+    Proposal,
+    Resampler,
+    Systematic,
     WeightUpdate,
     compute_updated_weights,
+    count_particles,
     deactivate_invalid_particles,
 )
 from pfbench.model.base import StateSpaceModel, initial_law
 
+if TYPE_CHECKING:
+    from pfbench.filter.moves.metropolis import Move, PathHistory
 
-class Stage(Protocol):
-    """Stage of a particle filter, which states whether it is asymptotically exact."""
-
-    @property
-    def is_exact(self) -> bool:
-        """True if the weighted particles converge to the posterior as N grows."""
+_HELD_STEPS = "held_steps"  # in the memory of particles: steps left without resampling, [R, 1]
 
 
 @dataclass(frozen=True)
@@ -155,6 +151,10 @@ class ParticleFilter(Filter):
     @property
     def history(self) -> PathHistory | None:
         """History that the moves require."""
+        if not self.moves:
+            return None
+        from pfbench.filter.moves.metropolis import combine_histories
+
         return combine_histories([move.required_history for move in self.moves])
 
     @property
@@ -210,7 +210,7 @@ class ParticleFilter(Filter):
         stream = self.points(draws)
         x, log_ratio = self.initial_proposal(model, record, self.particles, stream)
         log_w, total, *_ = normalise_updated_weights(log_ratio - math.log(self.particles))
-        memory = {HELD_STEPS: torch.full_like(log_w[:, :1], self.initial_proposal.steps)}
+        memory = {_HELD_STEPS: torch.full_like(log_w[:, :1], self.initial_proposal.steps)}
         return ParticleBelief(x=x, log_w=log_w, log_evidence=total.double(), memory=memory)
 
     @override
@@ -269,7 +269,7 @@ class ParticleFilter(Filter):
         trace: dict[str, Tensor] = {}
         log_a = self.auxiliary_weights(model, belief, record)
         if self.initial_proposal is not None:
-            log_a, belief = hold_resampling(log_a, belief)
+            log_a, belief = _hold_resampling(log_a, belief)
         belief, trace["resampled"] = self.resampler(
             model, belief, log_a, count_particles(self.particle_count, belief), draws
         )
@@ -315,3 +315,17 @@ def _check_initial_proposal(moves: tuple[Move, ...], count: ParticleCount) -> No
             "filter.initial_proposal must be used without moves and with a fixed number of "
             f"particles, got {len(moves)} moves and {type(count).__name__}. Remove one of them."
         )
+
+
+def _hold_resampling(log_a: Tensor, belief: ParticleBelief) -> tuple[Tensor, ParticleBelief]:
+    """Make resampling probabilities equal while measurements that placed the particles remain.
+
+    A particle that fits later measurements has a small weight until these are processed. Resampling
+    by the weights would remove it.
+
+    Shapes: log_a [R, N].
+    """
+    remaining = belief.memory[_HELD_STEPS]
+    equal = torch.full_like(log_a, -math.log(log_a.shape[1]))
+    memory = belief.memory | {_HELD_STEPS: (remaining - 1.0).clamp(min=0.0)}
+    return torch.where(remaining > 0.0, equal, log_a), belief._replace(memory=memory)

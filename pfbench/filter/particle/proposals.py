@@ -1,166 +1,21 @@
-"""Proposals: new particles and their density ratio, also mixed with the model."""
+"""Densities of standardised noise, and mixtures of a proposal with the model."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from typing_extensions import override
 
-from pfbench.core.distribution_sampling import draw_values
-from pfbench.core.normal import StandardNormal
 from pfbench.core.random_stream import RandomStream
-from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.linearisation import batch_product
+from pfbench.filter.particle.stages import (
+    draw_noise,
+    has_standard_noise,
+)
 from pfbench.model.base import StateSpaceModel
-
-# --------------------------------------------------------------------------------------------------
-# Proposals: new particles and their density ratio.
-
-HELD_STEPS = "held_steps"  # in the memory of particles: steps left without resampling, [R, 1]
-
-
-class ProposalSample(NamedTuple):
-    """Sample of a proposal.
-
-    Attributes:
-        x: Particles, [R, N, D].
-        log_ratio: log p(w) - log q(w) of their noise, [R, N].
-        memory: As in `ParticleBelief`.
-        w: The noise, [R, N, W], for moves. None if the proposal does not draw noise.
-        trace: Numbers per run for the report, {name: [R]}.
-    """
-
-    x: Tensor
-    log_ratio: Tensor
-    memory: dict[str, Tensor]
-    w: Tensor | None = None
-    trace: dict[str, Tensor] = {}  # noqa: RUF012
-
-
-class Proposal(Protocol):
-    """Proposal distribution of the particles at t."""
-
-    @property
-    def is_exact(self) -> bool:
-        """True if the ratio is that of the densities."""
-
-    @property
-    def has_bounded_weights(self) -> bool:
-        """True if the ratio has a bound for any model. Silence counts as False."""
-        return False
-
-    def __call__(
-        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
-    ) -> ProposalSample:
-        """Draw particles.
-
-        Args:
-            model: State-space model of the step.
-            belief: Parents of the particles, at t-1.
-            record: Record at t.
-            draws: Random stream of the step.
-
-        Returns:
-            Particles at t and their density ratio.
-        """
-
-
-class InitialProposal(Protocol):
-    """Proposal distribution of the particles at step 0."""
-
-    @property
-    def is_exact(self) -> bool:
-        """True if the ratio is that of the densities."""
-
-    @property
-    def has_bounded_weights(self) -> bool:
-        """True if the ratio has a bound for any model. Silence counts as False."""
-        return False
-
-    @property
-    def steps(self) -> int:
-        """Number of the first measurements that the particles depend on."""
-
-    def __call__(
-        self, model: StateSpaceModel, record: Record, n: int, draws: RandomStream
-    ) -> tuple[Tensor, Tensor]:
-        """Draw initial particles.
-
-        Args:
-            model: State-space model.
-            record: All steps of the record, prepared by the model, with initial states and factors.
-            n: Number of particles.
-            draws: Random stream of step 0.
-
-        Returns:
-            Particles [R, n, D] and log p(x_0) - log q(x_0), [R, n].
-        """
-
-
-@runtime_checkable
-class RecordStartedFilter(Protocol):
-    """A filter whose initial belief may use the record."""
-
-    def init_from_record(self, model: StateSpaceModel, record: Record, draws: RandomStream) -> Any:
-        """Return the initial belief."""
-
-
-@dataclass(frozen=True)
-class BootstrapProposal(Proposal):
-    """Noise of the model, x = propagate(x, u, w), with ratio 0.
-
-    References:
-        Gordon, Salmond and Smith 1993.
-    """
-
-    is_exact = True
-    has_bounded_weights = True
-
-    @override
-    def __call__(
-        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
-    ) -> ProposalSample:
-        w = draw_noise(model, belief.x.shape[1], draws)
-        log_ratio = torch.zeros_like(belief.log_w[:, :1]).expand_as(belief.log_w)
-        return ProposalSample(model.propagate(belief.x, record.u, w), log_ratio, belief.memory, w)
-
-
-def hold_resampling(log_a: Tensor, belief: ParticleBelief) -> tuple[Tensor, ParticleBelief]:
-    """Make resampling probabilities equal while measurements that placed the particles remain.
-
-    A particle that fits later measurements has a small weight until these are processed. Resampling
-    by the weights would remove it.
-
-    Shapes: log_a [R, N].
-    """
-    remaining = belief.memory[HELD_STEPS]
-    equal = torch.full_like(log_a, -math.log(log_a.shape[1]))
-    memory = belief.memory | {HELD_STEPS: (remaining - 1.0).clamp(min=0.0)}
-    return torch.where(remaining > 0.0, equal, log_a), belief._replace(memory=memory)
-
-
-def draw_noise(model: StateSpaceModel, n: int, draws: RandomStream) -> Tensor:
-    """Draw noise from the model's noise distribution.
-
-    Returns noise w, [R, n, W].
-    """
-    if has_standard_noise(model):
-        return draws.normal("noise", n, model.noise_dim)
-    return draw_values(model.noise, draws, "noise", n).to(model.anchor.dtype)
-
-
-def has_standard_noise(model: StateSpaceModel) -> bool:
-    """Return whether the noise of a model is standard normal."""
-    if type(model).noise is StateSpaceModel.noise:  # not built at each step
-        return True
-    distribution = model.noise
-    return isinstance(getattr(distribution, "base_dist", distribution), StandardNormal)
 
 
 def draw_standardised_noise(model: StateSpaceModel, z: Tensor, draws: RandomStream) -> Tensor:

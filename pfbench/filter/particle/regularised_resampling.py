@@ -13,7 +13,7 @@ from typing_extensions import override
 from pfbench.core.linear_algebra import factor
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
-from pfbench.filter.particle.resampling import EssResampler, Resampler
+from pfbench.filter.particle.stages import EssResampler, Resampler
 from pfbench.filter.whitening import whiten
 from pfbench.model.base import StateSpaceModel
 

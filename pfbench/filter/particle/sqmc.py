@@ -23,8 +23,15 @@ from pfbench.core.random_stream import DerivedStream, PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, gather_ancestors, weighted_mean_cov
 from pfbench.filter.exactness import is_every_part_exact
-from pfbench.filter.particle.proposals import BootstrapProposal, Proposal, ProposalSample
-from pfbench.filter.particle.resampling import EssResampler, Resampler, ResamplingScheme
+from pfbench.filter.particle.stages import (
+    BootstrapProposal,
+    EssResampler,
+    PointSet,
+    Proposal,
+    ProposalSample,
+    Resampler,
+    ResamplingScheme,
+)
 from pfbench.model.base import StateSpaceModel
 
 # --------------------------------------------------------------------------------------------------
@@ -35,38 +42,8 @@ from pfbench.model.base import StateSpaceModel
 # stream, so the points of a run depend only on seed, run, step and label.
 
 _EDGE = 1e-9  # a shifted point may be 0, and its normal quantile infinite
+
 _POINT_BITS = 30  # of a point of the Sobol engine of torch
-
-
-class PointSet(Protocol):
-    """Point set: n points in w dimensions at a time, as a random stream."""
-
-    @property
-    def is_exact(self) -> bool:
-        """True if each point has the stream's distribution."""
-
-    def __call__(self, draws: RandomStream, first: int = 0) -> RandomStream:
-        """Return the stream of points.
-
-        Args:
-            draws: Random stream of the shifts.
-            first: First axis of the set to use. Two stages with separate axes draw the points of
-                one joint set. With common axes their draws would be dependent.
-
-        Returns:
-            Random stream.
-        """
-
-
-@dataclass(frozen=True)
-class IidPoints(PointSet):
-    """Plain Monte Carlo."""
-
-    is_exact = True
-
-    @override
-    def __call__(self, draws: RandomStream, first: int = 0) -> RandomStream:
-        return draws
 
 
 class ShiftedPoints(PointSet, Protocol):

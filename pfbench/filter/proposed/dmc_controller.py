@@ -19,12 +19,8 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
 from pfbench.filter.linearisation import mean_noise, transition_jacobian
-from pfbench.filter.particle.proposals import (
-    DefensiveSelection,
-    ProposalSample,
-    choose_defensive_particles,
-)
-from pfbench.filter.particle.weight_update import deactivate_invalid_particles
+from pfbench.filter.particle.proposals import DefensiveSelection, choose_defensive_particles
+from pfbench.filter.particle.stages import ProposalSample, deactivate_invalid_particles
 from pfbench.model.base import StateSpaceModel
 
 

@@ -24,8 +24,8 @@ from pfbench.core.linear_algebra import factor
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights, select_by_run
 from pfbench.filter.particle.gaussian_particle_filter import refuse_history
-from pfbench.filter.particle.resampling import Resampler, Systematic
-from pfbench.filter.particle.sqmc import HaltonPoints, PointSet
+from pfbench.filter.particle.sqmc import HaltonPoints
+from pfbench.filter.particle.stages import PointSet, Resampler, Systematic
 from pfbench.filter.whitening import whiten
 from pfbench.model.base import StateSpaceModel
 

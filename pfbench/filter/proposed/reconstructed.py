@@ -25,13 +25,8 @@ from pfbench.filter.linearisation import (
     mean_noise,
     measurement_jacobian,
 )
-from pfbench.filter.particle.proposals import (
-    AffineMap,
-    BootstrapProposal,
-    Proposal,
-    ProposalSample,
-    check_fraction,
-)
+from pfbench.filter.particle.proposals import AffineMap, check_fraction
+from pfbench.filter.particle.stages import BootstrapProposal, Proposal, ProposalSample
 from pfbench.filter.proposed.dmc_controller import (
     DmcController,
     keep_selected,

@@ -21,8 +21,12 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
 from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
-from pfbench.filter.particle.proposals import Proposal, ProposalSample, draw_noise
-from pfbench.filter.particle.weight_update import deactivate_invalid_particles
+from pfbench.filter.particle.stages import (
+    Proposal,
+    ProposalSample,
+    deactivate_invalid_particles,
+    draw_noise,
+)
 from pfbench.filter.proposed.swarm_coordinates import (
     Fitness,
     ObservedComponents,

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import DerivedStream, RandomStream
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
-from pfbench.filter.particle.sqmc import PointSet
+from pfbench.filter.particle.stages import PointSet
 from pfbench.model.base import StateSpaceModel
 
 

@@ -19,13 +19,8 @@ from pfbench.core.linear_algebra import factor, shared_distribution_covariance
 from pfbench.core.record import Record
 from pfbench.filter.belief import normalise_log_weights
 from pfbench.filter.gaussian.innovation import Innovation, diagonal_axes
-from pfbench.filter.linearisation import mask_covariance
-from pfbench.filter.particle.particle_moments import predict_moments
-from pfbench.filter.particle.weight_update import (
-    WEIGHT_UPDATE_MEMORY,
-    MemoryWeightUpdate,
-    UpdatedWeights,
-)
+from pfbench.filter.linearisation import mask_covariance, predict_moments
+from pfbench.filter.particle.stages import WEIGHT_UPDATE_MEMORY, MemoryWeightUpdate, UpdatedWeights
 from pfbench.filter.robust.robust_update import (
     DOWNWEIGHTED,
     GroupDistances,

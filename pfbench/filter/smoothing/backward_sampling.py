@@ -17,7 +17,7 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import Filter, ParticleBelief, StepInfo
 from pfbench.filter.loop import prepare_record, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, Resampler
+from pfbench.filter.particle.stages import EssResampler, Resampler
 from pfbench.filter.smoothing.gaussian_smoother import check_no_feedback
 from pfbench.model.base import StateSpaceModel
 

@@ -29,7 +29,7 @@ from pfbench.filter.robust.observation_updates import (
 from pfbench.filter.robust.updates import InnovationGate, StudentUpdate
 from pfbench.filter.smoothing.gaussian_smoother import smooth
 from pfbench.model.linear_gaussian import LinearGaussian
-from pfbench.noise import distributions as errors
+from pfbench.noise import base as errors
 
 STUDENT, MIXTURE = StudentObservationUpdate(), MixtureObservationUpdate()
 RULES = ("ekf", "ukf", "ckf", "iplf", "iekf")

@@ -25,7 +25,7 @@ from pfbench.filter.gaussian.ensemble_kalman import (
     PerturbedObservationUpdate,
 )
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle.proposals import BootstrapProposal
+from pfbench.filter.particle.stages import BootstrapProposal
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth

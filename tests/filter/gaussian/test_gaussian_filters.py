@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
 from pfbench.core.chart import Chart, EuclideanBlock, wrap_angle
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.linear_algebra import factor
-from pfbench.core.normal import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief

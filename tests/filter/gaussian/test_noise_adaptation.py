@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent
 
 from pfbench.core.chart import wrap_angle
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief

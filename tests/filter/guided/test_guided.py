@@ -37,7 +37,11 @@ from pfbench.filter.gaussian.noise_adaptation import (
 from pfbench.filter.guided.guides import ParticleGuideProposal, SharedGuideProposal
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle.auxiliary_weights import (
+from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.sqmc import SobolPoints
+from pfbench.filter.particle.stages import BootstrapProposal, EssResampler, Proposal, Systematic
+from pfbench.filter.particle.weights import (
     AdditiveTempering,
     PowerTempering,
     TemperedPosterior,
@@ -45,11 +49,6 @@ from pfbench.filter.particle.auxiliary_weights import (
     Tempering,
     UniformTempering,
 )
-from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.proposals import BootstrapProposal, Proposal
-from pfbench.filter.particle.resampling import EssResampler, Systematic
-from pfbench.filter.particle.sqmc import SobolPoints
 from pfbench.filter.proposed.reconstructed import MarginalRatioCorrection, ReconstructedProposal
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian

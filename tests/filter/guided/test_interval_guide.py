@@ -14,7 +14,7 @@ from filter_cases import method_of
 from torch import Tensor
 from torch.distributions import Cauchy, Distribution, Independent, Laplace, StudentT
 
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
@@ -25,7 +25,8 @@ from pfbench.filter.moves.path_kernels import NoiseFlowKernel
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import EssResampler, Multinomial, Systematic
+from pfbench.filter.particle.resampling import Multinomial
+from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.testing import (

@@ -53,8 +53,12 @@ from pfbench.filter.learned.proposal import PAST, LearnedProposal
 from pfbench.filter.loop import run_filter
 from pfbench.filter.moves.metropolis import MetropolisHastings, StateHistory
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.stages import (
+    BootstrapProposal,
+    EssResampler,
+    ProposalSample,
+    Systematic,
+)
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.testing import check_evidence, filter_record, simulate_path_posterior

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pfbench.core.chart import SIDES, Chart, EuclideanBlock, LieGroupBlock
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter import (

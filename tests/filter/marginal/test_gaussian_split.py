@@ -16,7 +16,7 @@ from scipy.integrate import trapezoid
 from torch import Tensor
 from torch.distributions import Distribution
 
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter import (
@@ -28,7 +28,7 @@ from pfbench.filter import (
     TaylorLinearisation,
     run_filter,
 )
-from pfbench.filter.particle.sqmc import IidPoints
+from pfbench.filter.particle.stages import IidPoints
 from pfbench.filter.whitening import split_root
 from pfbench.model import LinearGaussian, StrapdownTotal
 from pfbench.model.base import StateSpaceModel

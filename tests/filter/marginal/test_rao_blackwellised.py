@@ -17,7 +17,7 @@ from torch.distributions import Distribution, Independent
 
 from pfbench import job
 from pfbench.core.chart import Chart, EuclideanBlock, wrap_angle
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record, map_inputs
 from pfbench.filter import linearisation
@@ -33,7 +33,7 @@ from pfbench.filter.marginal.rao_blackwellised import (
 )
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.filter.whitening import condition_on, kalman_update_root
 from pfbench.job import conf_dir
 from pfbench.model.azimuth import (

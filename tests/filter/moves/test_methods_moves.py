@@ -25,7 +25,7 @@ from pfbench.filter.moves.path_kernels import (
 from pfbench.filter.moves.path_proposals import SmoothedSegment
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.testing import filter_record, run_kalman_filter
 

@@ -48,13 +48,17 @@ from pfbench.filter.moves.path_proposals import (
     driving_noise,
 )
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
 from pfbench.filter.particle.regularised_resampling import (
     EpanechnikovSmoothing,
     GaussianSmoothing,
     RegularisedResampler,
 )
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.stages import (
+    BootstrapProposal,
+    EssResampler,
+    ProposalSample,
+    Systematic,
+)
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
 from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth

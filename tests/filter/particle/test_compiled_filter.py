@@ -21,7 +21,7 @@ from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle import compiled_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.proposals import Proposal
+from pfbench.filter.particle.stages import Proposal
 from pfbench.job.scoring import LikelihoodCounter
 from pfbench.kernels import dispatch, step_compiler
 from pfbench.model.base import StateSpaceModel

@@ -18,13 +18,14 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle.auxiliary_weights import LookAheadWeights
 from pfbench.filter.particle.gaussian_particle_filter import (
     GaussianPredictionProposal,
     GaussianResampler,
 )
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.sqmc import HaltonPoints, IidPoints, PointSet, SobolPoints
+from pfbench.filter.particle.sqmc import HaltonPoints, SobolPoints
+from pfbench.filter.particle.stages import IidPoints, PointSet
+from pfbench.filter.particle.weights import LookAheadWeights
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.model.textbook import Lorenz63, Pendulum, UnivariateGrowth

@@ -17,29 +17,24 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, ess
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.auxiliary_weights import (
-    AdditiveTempering,
+from pfbench.filter.particle.particle_count import CountLimits, EssStepCount, EssTargetCount
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.resampling import Multinomial, Stratified
+from pfbench.filter.particle.stages import (
     AuxiliaryWeights,
+    EssResampler,
+    ParticleCount,
     PosteriorWeights,
+    ResamplingScheme,
+    Systematic,
+)
+from pfbench.filter.particle.weights import (
+    AdditiveTempering,
     PowerTempering,
     TemperedPosterior,
     TemperedWeights,
     Tempering,
     UniformTempering,
-)
-from pfbench.filter.particle.particle_count import (
-    CountLimits,
-    EssStepCount,
-    EssTargetCount,
-    ParticleCount,
-)
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import (
-    EssResampler,
-    Multinomial,
-    ResamplingScheme,
-    Stratified,
-    Systematic,
 )
 from pfbench.kernels import dispatch
 from pfbench.model.linear_gaussian import linear_walk

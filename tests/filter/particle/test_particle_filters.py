@@ -21,30 +21,32 @@ from torch.distributions import Distribution, Independent
 from pfbench.core.chart import Chart, EuclideanBlock, wrap_angle
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief, ess, normalise_log_weights
+from pfbench.filter.belief import (
+    ParticleBelief,
+    count_distinct_ancestors,
+    ess,
+    normalise_log_weights,
+)
 from pfbench.filter.loop import run_filter
 from pfbench.filter.moves.metropolis import MetropolisHastings
 from pfbench.filter.moves.path_kernels import NoiseFlowKernel
-from pfbench.filter.particle.auxiliary_weights import LookAheadWeights, PosteriorWeights
 from pfbench.filter.particle.gaussian_particle_filter import (
     GaussianPredictionProposal,
     GaussianResampler,
 )
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.particle_moments import count_distinct_ancestors
-from pfbench.filter.particle.proposals import BootstrapProposal, ProposalSample
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import (
+from pfbench.filter.particle.resampling import Killing, Multinomial, Residual, Ssp, Stratified
+from pfbench.filter.particle.stages import (
+    BayesWeightUpdate,
+    BootstrapProposal,
     EssResampler,
-    Killing,
-    Multinomial,
+    PosteriorWeights,
+    ProposalSample,
     ResamplingScheme,
-    Residual,
-    Ssp,
-    Stratified,
     Systematic,
 )
-from pfbench.filter.particle.weight_update import BayesWeightUpdate, FlooredWeightUpdate
+from pfbench.filter.particle.weights import FlooredWeightUpdate, LookAheadWeights
 from pfbench.kernels import dispatch
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level

@@ -13,13 +13,12 @@ from torch import Tensor
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.particle.sqmc import (
     HaltonPoints,
-    IidPoints,
-    PointSet,
     SobolPoints,
     first_primes,
     halton_points,
     sobol_digits,
 )
+from pfbench.filter.particle.stages import IidPoints, PointSet
 
 SETS: dict[str, PointSet] = {
     "halton": HaltonPoints(),

@@ -23,16 +23,8 @@ from pfbench.filter.belief import (
     weighted_mean_cov,
 )
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import (
-    EssResampler,
-    Killing,
-    Multinomial,
-    ResamplingScheme,
-    Residual,
-    Ssp,
-    Stratified,
-    Systematic,
-)
+from pfbench.filter.particle.resampling import Killing, Multinomial, Residual, Ssp, Stratified
+from pfbench.filter.particle.stages import EssResampler, ResamplingScheme, Systematic
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.testing import check_resampling
 

@@ -15,19 +15,18 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.auxiliary_weights import LookAheadWeights
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, Systematic
 from pfbench.filter.particle.sqmc import (
     HaltonPoints,
     HilbertSortedResampler,
-    PointSet,
     SobolPoints,
     SqmcProposal,
     SqmcScheme,
     compute_hilbert_index,
     compute_hilbert_order,
 )
+from pfbench.filter.particle.stages import EssResampler, PointSet, Systematic
+from pfbench.filter.particle.weights import LookAheadWeights
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 
 WALK = linear_walk(1.0, 0.5, 1.0)

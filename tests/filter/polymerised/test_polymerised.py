@@ -20,14 +20,14 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.auxiliary_weights import LookAheadWeights
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import (
     ThompsonTaylorResampler,
     nearest_neighbours,
 )
-from pfbench.filter.particle.resampling import EssResampler, Systematic
-from pfbench.filter.particle.sqmc import HaltonPoints, IidPoints, SobolPoints
+from pfbench.filter.particle.sqmc import HaltonPoints, SobolPoints
+from pfbench.filter.particle.stages import EssResampler, IidPoints, Systematic
+from pfbench.filter.particle.weights import LookAheadWeights
 from pfbench.filter.proposed.polymerised import (
     AxisAlignedCells,
     CellPartition,

@@ -19,8 +19,13 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
 from pfbench.filter.linearisation import linearised_innovation, measurement_jacobian
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.proposals import BootstrapProposal, Proposal, ProposalSample
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.stages import (
+    BootstrapProposal,
+    EssResampler,
+    Proposal,
+    ProposalSample,
+    Systematic,
+)
 from pfbench.filter.proposed.dmc_controller import DmcController, OneStepResponse, StaticResponse
 from pfbench.filter.proposed.reconstructed import (
     MarginalRatioCorrection,

@@ -18,7 +18,7 @@ from pfbench.filter.moves.metropolis import MetropolisHastings
 from pfbench.filter.moves.path_kernels import NoiseFlowKernel
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.filter.smoothing.backward_sampling import (
     BackwardSampler,
     BackwardStep,

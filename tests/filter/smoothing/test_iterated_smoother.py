@@ -8,7 +8,7 @@ import torch
 from smoothing_cases import SINGULAR, Tumbler, dense, record_of
 from torch import Tensor
 
-from pfbench.core.normal import independent_normal, normal_batch
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.record import Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import (

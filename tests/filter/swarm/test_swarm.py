@@ -24,7 +24,7 @@ from pfbench.core.record import Episode, Record, map_inputs
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import EssResampler, Systematic
+from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.filter.proposed.swarm import ChiSquareStopping, SwarmLimits, SwarmProposal
 from pfbench.filter.proposed.swarm_coordinates import (
     AllComponents,

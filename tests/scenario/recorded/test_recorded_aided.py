@@ -19,7 +19,8 @@ from pfbench.model.strapdown import StrapdownAided
 from pfbench.model.strapdown_tuning import AidedTuning
 from pfbench.noise.base import NominalNoise
 from pfbench.noise.time_windows import MeasurementOutage, VarianceSurge
-from pfbench.scenario.oracle_noise import OracleNoiseModel, RecordingRegime
+from pfbench.scenario.base import RecordingRegime
+from pfbench.scenario.oracle_noise import OracleNoiseModel
 from pfbench.scenario.recorded.drive import (
     BaroMagSensors,
     FixHoldout,

@@ -1,8 +1,4 @@
-"""Auxiliary weights, which are resampling probabilities, and tempering of weights.
-
-The weights after resampling correct for the probabilities, so the filter stays exact.
-`TemperedPosterior` is an exception, because it replaces the weights themselves.
-"""
+"""Weights other than the plain ones: with a look-ahead, tempered or floored."""
 
 from __future__ import annotations
 
@@ -15,48 +11,15 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief
+from pfbench.filter.belief import ParticleBelief, is_resolved
 from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
 from pfbench.filter.particle.proposals import check_fraction
-from pfbench.filter.particle.weight_update import BayesWeightUpdate, WeightUpdate
+from pfbench.filter.particle.stages import (
+    AuxiliaryWeights,
+    BayesWeightUpdate,
+    WeightUpdate,
+)
 from pfbench.model.base import StateSpaceModel
-
-
-class AuxiliaryWeights(Protocol):
-    """Resampling probabilities of the particles at t-1, given the record at t."""
-
-    @property
-    def is_exact(self) -> bool:
-        """True if every particle of positive weight has a positive probability."""
-
-    @property
-    def has_bounded_weights(self) -> bool:
-        """True if weights divided by probabilities have a bound. Silence counts as False."""
-        return False
-
-    def __call__(self, model: StateSpaceModel, belief: ParticleBelief, record: Record) -> Tensor:
-        """Compute log resampling probabilities.
-
-        Args:
-            model: State-space model of the step.
-            belief: Weighted particles at t-1.
-            record: Record at t.
-
-        Returns:
-            Log probabilities [R, N], logsumexp 0.
-        """
-
-
-@dataclass(frozen=True)
-class PosteriorWeights(AuxiliaryWeights):
-    """The weights themselves, as in the plain particle filter."""
-
-    is_exact = True
-    has_bounded_weights = True
-
-    @override
-    def __call__(self, model: StateSpaceModel, belief: ParticleBelief, record: Record) -> Tensor:
-        return belief.log_w
 
 
 @dataclass(frozen=True)
@@ -274,3 +237,40 @@ def _check_strength(strength: float, maximum: float) -> None:
             f"tempering.strength must be from 0 to {maximum:g}, got {strength}. "
             "Use 0 for unchanged weights."
         )
+
+
+@dataclass(frozen=True)
+class FlooredWeightUpdate(WeightUpdate):
+    """Weights as plain numbers plus a floor, as in much code, for comparison [ours].
+
+    The smallest double is e^-745. A particle 38 standard deviations from the measurement gets
+    weight 0, so only the floor remains. If all particles are that far away, all weights become
+    equal. A run is lost if not even the logarithms distinguish its particles, see `is_resolved`.
+
+    Attributes:
+        weight_floor: Number added to each particle's weight before normalisation.
+
+    Raises:
+        ValueError: If the floor is not positive.
+    """
+
+    weight_floor: float = 1e-300
+    is_exact = False
+
+    def __post_init__(self) -> None:
+        if not self.weight_floor > 0.0:
+            raise ValueError(
+                f"weight_update.weight_floor must be positive, got {self.weight_floor}. "
+                "Choose a small number, or BayesWeightUpdate, which needs none."
+            )
+
+    @override
+    def __call__(
+        self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, record: Record
+    ) -> Tensor:
+        log_likelihood = model.log_likelihood(record.y, x, record.u) + log_ratio
+        likelihood = torch.exp(log_likelihood.double()).nan_to_num(nan=0.0)
+        weight = torch.log(torch.exp(log_w.double()) * likelihood + self.weight_floor)
+        comparable = torch.where(log_likelihood == log_likelihood, log_likelihood, -torch.inf)
+        empty = torch.isneginf(log_w) | ~is_resolved(comparable.amax(1, keepdim=True))
+        return torch.where(empty, -torch.inf, weight).to(log_w)
