@@ -274,6 +274,24 @@ def test_ink_has_contrast_on_every_ground() -> None:
         assert (high + 0.05) / (low + 0.05) >= 4.5
 
 
+def test_undecided_cells_have_no_colour_and_lost_tracks_are_grey(overview: Overview) -> None:
+    words = {(c.world, c.filter): c for c in overview.cells}
+    drawn = {
+        key: figures.describe_cell(words, world, key[1], overview)
+        for key in words
+        for world in overview.worlds
+        if world.key == key[0]
+    }
+    assert {c.verdict.word for c in words.values()} >= {"not decided", "worse", "equal"}
+    for key, cell in words.items():
+        is_coloured = cell.verdict.word in ("better", "worse") and not cell.loses_track
+        assert math.isnan(drawn[key].value) != is_coloured
+        assert drawn[key].is_grey == cell.loses_track
+        assert (drawn[key].text == "=") == (cell.verdict.word in ("equal", "identical"))
+        if is_coloured:
+            assert drawn[key].value == pytest.approx(math.log(cell.verdict.ratio))
+
+
 def test_the_page_has_its_figures_tables_and_stories(overview: Overview, tmp_path: Path) -> None:
     pack = {
         "study": "s",

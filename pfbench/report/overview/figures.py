@@ -93,7 +93,9 @@ def draw_heat_map(overview: Overview, size: Format) -> Figure:
     with matplotlib.rc_context({**RC, "font.size": size.font, "axes.grid": False}):
         figure, panels = _lay_out(size, [(title, len(rows)) for title, rows in groups], foot)
         for axes, (_, worlds) in zip(panels, groups, strict=True):
-            cells = [[_cell(table, w, label, overview) for label in columns] for w in worlds]
+            cells = [
+                [describe_cell(table, w, label, overview) for label in columns] for w in worlds
+            ]
             values = np.array([[cell.value for cell in row] for row in cells])
             _draw_grid(axes, values, _SCALE, palette(), np.isnan(values))
             _fill_cells(axes, cells, size)
@@ -185,7 +187,7 @@ def to_svg(figure: Figure) -> str:
     return buffer.getvalue()
 
 
-class _Drawn(NamedTuple):
+class CellLook(NamedTuple):
     """Text, log ratio of the colour (NaN for none), and look of a cell."""
 
     text: str
@@ -194,23 +196,23 @@ class _Drawn(NamedTuple):
     is_strong: bool = False
 
 
-def _cell(
+def describe_cell(
     table: Mapping[tuple[str, str], WorldResult], world: WorldRow, label: str, overview: Overview
-) -> _Drawn:
+) -> CellLook:
     """Return how a cell is drawn."""
     cell = table.get((world.key, label))
     if cell is None:
-        return _Drawn("1" if world.reference == overview.names[label] else "–")
+        return CellLook("1" if world.reference == overview.names[label] else "–")
     if cell.loses_track:
-        return _Drawn(f"{100 * cell.track_share:.0f} %", is_grey=True)
+        return CellLook(f"{100 * cell.track_share:.0f} %", is_grey=True)
     word, ratio = cell.verdict.word, cell.verdict.ratio
     if word in ("equal", "identical"):
-        return _Drawn("=")
+        return CellLook("=")
     star = any(w.wins for w in overview.winners if (w.world, w.filter) == (world.key, label))
     text = f"{format_ratio(ratio)}{'☆' if star else ''}"
     if word == "not decided":
-        return _Drawn(text)
-    return _Drawn(text, math.log(ratio), is_strong=word == "better")
+        return CellLook(text)
+    return CellLook(text, math.log(ratio), is_strong=word == "better")
 
 
 def format_ratio(value: float) -> str:
@@ -220,7 +222,7 @@ def format_ratio(value: float) -> str:
     return f"{value:.2f}" if value < 1.995 else f"{value:.1f}"
 
 
-def _fill_cells(axes: Axes, cells: Sequence[Sequence[_Drawn]], size: Format) -> None:
+def _fill_cells(axes: Axes, cells: Sequence[Sequence[CellLook]], size: Format) -> None:
     """Write the text of each cell, and draw those without a colour."""
     colours, norm = palette(), Normalize(-_SCALE, _SCALE)
     for i, row in enumerate(cells):
