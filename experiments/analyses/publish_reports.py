@@ -23,7 +23,7 @@ import pandas as pd
 from pfbench.files import RecordedFolder
 from pfbench.report import (
     PAGE_DATA,
-    find_overview,
+    find_overviews,
     read_page_data,
     write_headline,
     write_markdown,
@@ -58,18 +58,18 @@ def publish_study(folder: Path) -> None:
     """
     pack = read_page_data(folder)
     runs = folder / "runs.parquet"
-    overview = find_overview(pack, pd.read_parquet(runs)) if runs.is_file() else None
+    overviews = find_overviews(pack, pd.read_parquet(runs)) if runs.is_file() else None
     with RecordedFolder(folder, is_complete=False) as target:
         target.remove("headline.png")
         has_figure = write_headline(pack, target)
         pack["headline"] = CAPTION if has_figure else ""
         pack["headline_note"] = describe_absent(pack) if has_figure else ""
         write_page_data(pack, target)
-        if overview is None:
+        if overviews is None:
             write_markdown(pack, target)
         else:
             write_markdown(pack, target, "worlds.md")
-            write_overview(overview, pack, target)
+            write_overview(overviews, pack, target)
 
 
 def describe_absent(pack: Mapping[str, Any]) -> str:

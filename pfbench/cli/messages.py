@@ -287,18 +287,31 @@ def format_choice_error(text: str, words: Sequence[str]) -> str:
 _STAGES = {
     "claims": "writing the page of the claims",
     "cli": "running the command",
-    "config": "composing the configuration",
     "filter": "running the filter",
     "job": "running the job",
     "judge": "comparing the trajectories",
     "learn": "training the network",
     "model": "evaluating the model",
     "noise": "drawing the errors of the measurements",
-    "replay": "computing the stored run again",
     "report": "writing the page",
     "results": "reading the results",
     "scenario": "drawing the data of the scenario",
+    "stats": "comparing the filters",
 }
+# modules of the folder job with a stage of their own
+_STAGES |= dict.fromkeys(
+    (
+        "config",
+        "file_rules",
+        "model_fit",
+        "search_folders",
+        "shared_loader",
+        "trust",
+        "tuned_knobs",
+    ),
+    "composing the configuration",
+)
+_STAGES |= dict.fromkeys(("replay", "run_selection"), "computing the stored run again")
 _FILE_NAMES = ("path", "file")  # local variables of functions that read or write
 _RAISE = dis.opmap["RAISE_VARARGS"]
 
@@ -323,8 +336,8 @@ def describe_unknown(error: BaseException) -> str:
     """
     frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
     package_frames = [frame for frame in reversed(frames) if _module(frame)[0] == "pfbench"]
-    folders = [_module(frame)[1] for frame in package_frames]
-    stage = next((_STAGES[name] for name in folders if name in _STAGES), "running the command")
+    names = [name for frame in package_frames for name in reversed(_module(frame)[1:])]
+    stage = next((_STAGES[name] for name in names if name in _STAGES), "running the command")
     files = [frame.f_locals.get(name) for frame in package_frames[:3] for name in _FILE_NAMES]
     path = next((value for value in files if isinstance(value, Path)), None)
     name = f"{stage} ({path})" if path else stage

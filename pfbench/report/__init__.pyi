@@ -20,7 +20,7 @@ from pfbench.report.papers.specs import (
 from pfbench.report.study_page import write_markdown as write_markdown
 from pfbench.report.study_report import (
     PAGE_DATA as PAGE_DATA,
-    find_overview as find_overview,
+    find_overviews as find_overviews,
     read_page_data as read_page_data,
     rebuild_page as rebuild_page,
     write_page_data as write_page_data,

@@ -26,7 +26,7 @@ from pfbench.report.journal.ratio_figures import HEADLINE, write_headline
 from pfbench.report.methods_text import MethodsFacts
 from pfbench.report.options import ReportOptions
 from pfbench.report.overview.page import BOARD_PAGE, write_overview
-from pfbench.report.overview.tables import Overview, build_overview, has_overview
+from pfbench.report.overview.tables import Overview, build_overviews, has_overview
 from pfbench.report.papers import figures
 from pfbench.report.provenance import renew_bibliography
 from pfbench.report.study_page import write_page
@@ -106,14 +106,16 @@ def write_pages(
     pack: Mapping[str, Any], table: pd.DataFrame | None, folder: RecordedFolder
 ) -> Path:
     """Write the page of a study; one with several proposed methods in several worlds has a page before it."""
-    overview = find_overview(pack, table)
-    if overview is None:
+    overviews = find_overviews(pack, table)
+    if overviews is None:
         return write_page(pack, folder)
     write_page(pack, folder, BOARD_PAGE)
-    return write_overview(overview, pack, folder)
+    return write_overview(overviews, pack, folder)
 
 
-def find_overview(pack: Mapping[str, Any], table: pd.DataFrame | None) -> Overview | None:
+def find_overviews(
+    pack: Mapping[str, Any], table: pd.DataFrame | None
+) -> dict[int, Overview] | None:
     """Decide the first page of a study with several proposed methods in several worlds.
 
     Args:
@@ -121,12 +123,12 @@ def find_overview(pack: Mapping[str, Any], table: pd.DataFrame | None) -> Overvi
         table: Runs of the study, None if they are not there.
 
     Returns:
-        Tables of the page; None for other studies.
+        Tables of the page by number of particles; None for other studies.
     """
     facts = StudyFacts.from_pack(pack)
     if table is None or not has_overview(table, facts.looks):
         return None
-    return build_overview(table, facts.looks, facts.worlds)
+    return build_overviews(table, facts.looks, facts.worlds)
 
 
 def list_job_settings(conditions: Sequence[Condition], planned: int | None) -> list[list[str]]:

@@ -112,7 +112,7 @@ def test_only_what_pfbench_raises_itself_counts_as_a_sentence() -> None:
     for call, argument in ((parse_label, 3), (natural_sort_key, 3), (int, "x"), (torch.zeros(2).reshape, 3), (np.zeros, -1)):  # fmt: skip
         assert not is_named(error_of(call, argument))
     text = describe_unknown(error_of(natural_sort_key, 3))
-    assert text.startswith("reading the results must succeed, got TypeError: expected string or")
+    assert text.startswith("comparing the filters must succeed, got TypeError: expected string or")
     assert text.endswith(". Check the words of the command and the files that they name.")
 
 

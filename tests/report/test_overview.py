@@ -21,8 +21,11 @@ from pfbench.report.overview.page import list_verdicts, word_headline, write_ove
 from pfbench.report.overview.tables import (
     Overview,
     build_overview,
+    build_overviews,
     central_rows,
     has_overview,
+    list_levels,
+    name_without_level,
     read_world_facts,
     tell_story,
 )
@@ -299,7 +302,7 @@ def test_the_page_has_its_figures_tables_and_stories(overview: Overview, tmp_pat
         "generated": {"version": "0", "commit": "abc", "date": ""},
     }
     with RecordedFolder(tmp_path / "study") as folder:
-        page = write_overview(overview, pack, folder).read_text()
+        page = write_overview({0: overview}, pack, folder).read_text()
     assert {f.name for f in (tmp_path / "study").iterdir()} >= {
         "index.html", "report.md", "cells.csv", "pairs.csv", "heat_map.svg", "matrices_column.svg",
     }  # fmt: skip
@@ -311,6 +314,62 @@ def test_the_page_has_its_figures_tables_and_stories(overview: Overview, tmp_pat
         assert overview.names[method] in text
     assert "The seven against each other" in page
     assert word_headline(overview) in page.replace("&#39;", "'")
+
+
+@pytest.fixture(scope="module")
+def levels(table: pd.DataFrame, parts: dict[str, PartName]) -> dict[int, Overview]:
+    """The same runs as of 100 particles, and with half of the error of particle filters as of 1000."""
+    particle = ["mcmc_rpf", "qmc_polymerised", "cpso_escape", "dmc_reconstructed", "sir", "rpf"]
+    swept = table[table["filter"].isin(particle)]
+    few = swept.assign(filter=swept["filter"] + "[particles=100]")
+    many = swept.assign(
+        filter=swept["filter"] + "[particles=1000]", rmse=swept["rmse"] / 2, ms=swept["ms"] * 9
+    )
+    both = pd.concat([table[~table["filter"].isin(particle)], few, many])
+    return build_overviews(both, find_looks(sorted(both["filter"].unique())), parts)
+
+
+def test_each_number_of_particles_has_its_tables(
+    overview: Overview, levels: dict[int, Overview]
+) -> None:
+    assert list(levels) == [100, 1000]
+    plain = {(c.world, c.filter): c.verdict.ratio for c in overview.cells}
+    for cell in levels[100].cells:
+        assert cell.verdict.ratio == plain[cell.world, cell.filter]
+    assert levels[1000].methods == levels[100].methods == overview.methods
+    assert levels[1000].names["mcmc_rpf"] == overview.names["mcmc_rpf"]
+    half = {(c.world, c.filter): c.verdict.ratio for c in levels[1000].cells}
+    assert half["azimuth", "mcmc_rpf"] == pytest.approx(plain["azimuth", "mcmc_rpf"] / 2, rel=0.1)
+    assert half["azimuth", "fm_mssrckf"] == plain["azimuth", "fm_mssrckf"]
+    points = figures.dose_points(levels, overview.worlds[0], "mcmc_rpf", "particles")
+    assert [point.x for point in points] == [100.0, 1000.0]
+    times = figures.dose_points(levels, overview.worlds[0], "mcmc_rpf", "time")
+    assert times[1].x == pytest.approx(9 * times[0].x)
+
+
+def test_labels_without_their_number_of_particles() -> None:
+    assert name_without_level("sir[particles=100]") == "sir"
+    assert name_without_level("sir[particles=100,budget=time]") == "sir[budget=time]"
+    assert name_without_level("ekf") == "ekf"
+    labels = ["mcmc_rpf", "qmc_polymerised", "cpso_escape"]
+    assert list_levels(find_looks([f"{name}[particles=50]" for name in labels])) == []
+    assert list_levels(find_looks([f"{k}[particles={n}]" for k in labels for n in (9, 50)])) == [
+        9,
+        50,
+    ]
+
+
+def test_the_page_of_several_numbers_shows_them(
+    levels: dict[int, Overview], tmp_path: Path
+) -> None:
+    pack = {"study": "s", "title": "T", "generated": {"version": "0", "commit": "abc", "date": ""}}
+    with RecordedFolder(tmp_path / "study") as folder:
+        page = write_overview(levels, pack, folder).read_text()
+    assert "How many particles are enough?" in page
+    assert "<summary>100 particles</summary>" in page
+    table = pd.read_csv(tmp_path / "study" / "cells.csv")
+    assert set(table["particles"]) == {100, 1000}
+    assert (tmp_path / "study" / "error_by_time.svg").stat().st_size < 60_000
 
 
 def test_which_studies_have_the_page(table: pd.DataFrame, looks: dict[str, MethodLook]) -> None:

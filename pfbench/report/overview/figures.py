@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from pfbench.report.overview.tables import Overview, WorldRow
-from pfbench.results.plotting import RC
+from pfbench.results.plotting import RC, line_styles, set_plain_ticks
 from pfbench.stats.world_table import WorldResult, count_wins
 
 BLUE, ORANGE, GREY, INK = "#2166ac", "#c4561a", "#d4d4d4", "#1b1b1b"
@@ -63,6 +63,7 @@ HEAT_FORMATS = (
     Format("_390", 374, 6.6, 27, 96, 34, 92),
     Format("_column", 336, 6.5, 19, 88, 34, 84),
 )
+DOSE_FORMATS = (Format("", 1360, 7.6, 30, 0, 0, 0), Format("_390", 374, 6.6, 27, 0, 0, 0))
 MATRIX_FORMATS = (
     Format("", 520, 7.4, 27, 122, 56, 88),
     Format("_390", 374, 6.6, 27, 104, 40, 84),
@@ -129,6 +130,87 @@ def draw_matrices(overview: Overview, size: Format) -> Figure:
         if panels:
             _name_columns(panels[0], names, len(methods), size)
     return figure
+
+
+def draw_doses(
+    overviews: Mapping[int, Overview], worlds: Sequence[WorldRow], axis: str, size: Format
+) -> Figure:
+    """Draw the error of methods and conventional filters against the number of particles, or the time of a step.
+
+    A panel is a world. Points have the simultaneous intervals of the heat map; those of neighbours are moved apart.
+    """
+    columns = 1 if size.name else max(len(worlds), 1)
+    rows = -(-len(worlds) // columns)
+    shape = (size.width / _DPI, rows * (250 if size.name else 300) / _DPI)
+    with matplotlib.rc_context({**RC, "font.size": size.font}):
+        figure = Figure(figsize=shape, dpi=_DPI, layout="constrained")
+        for axes, world in zip(
+            np.ravel(figure.subplots(rows, columns, squeeze=False)), worlds, strict=False
+        ):
+            for label in (*_first(overviews).methods, *_first(overviews).conventional):
+                _draw_dose(axes, dose_points(overviews, world, label, axis), label, overviews)
+            axes.set(xscale="log", yscale="log", title=world.name)
+            axes.set_xlabel(
+                "number of particles" if axis == "particles" else "time of a step of a run [ms]"
+            )
+            lines = [np.asarray(line.get_xydata()) for line in axes.lines]
+            points = np.concatenate([*lines, np.ones((1, 2))])
+            set_plain_ticks(axes.xaxis, points[:-1, 0])
+            set_plain_ticks(axes.yaxis, points[:, 1])
+            axes.axhline(1.0, color=INK, lw=1.2)
+        if worlds:
+            figure.axes[0].set_ylabel("error / best Kalman filter")
+            figure.axes[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=size.font)
+    return figure
+
+
+class DosePoint(NamedTuple):
+    """Ratio of errors at a number of particles, with its interval, and its position on the axis."""
+
+    x: float
+    ratio: float
+    low: float
+    high: float
+
+
+def dose_points(
+    overviews: Mapping[int, Overview], world: WorldRow, label: str, axis: str
+) -> list[DosePoint]:
+    """List the ratios of a filter in a world by number of particles."""
+    points = []
+    for level, overview in overviews.items():
+        x = (
+            float(level)
+            if axis == "particles"
+            else overview.times.get((world.key, label), math.nan)
+        )
+        points += [
+            DosePoint(x, cell.verdict.ratio, cell.verdict.low, cell.verdict.high)
+            for cell in overview.cells
+            if (cell.world, cell.filter) == (world.key, label)
+        ]
+    return points
+
+
+def _draw_dose(
+    axes: Axes, points: Sequence[DosePoint], label: str, overviews: Mapping[int, Overview]
+) -> None:
+    """Draw the line of one filter, a proposed one solid."""
+    if not points:
+        return
+    first = _first(overviews)
+    style = line_styles([label])[label]
+    order = [*first.methods, *first.conventional].index(label)
+    x = np.array([point.x for point in points]) * (1 + 0.03 * (order - len(first.methods) / 2))
+    y = np.array([point.ratio for point in points])
+    ends = np.clip([[p.low, p.high] for p in points], y.min() / 10, y.max() * 10)
+    axes.plot(x, y, **style.line(first.names[label]), **style.mark(), ms=4)
+    axes.vlines(x, ends[:, 0], ends[:, 1], color=style.colour, alpha=0.35, lw=1)
+
+
+def _first(overviews: Mapping[int, Overview]) -> Overview:
+    """Return the overview of the fewest particles."""
+    return next(iter(overviews.values()))
 
 
 def group_worlds(overview: Overview) -> list[tuple[str, list[WorldRow]]]:

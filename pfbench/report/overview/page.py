@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.overview import figures
-from pfbench.report.overview.tables import Overview, tell_story
+from pfbench.report.overview.tables import Overview, WorldRow, tell_story
 from pfbench.report.study_page.page_writer import describe_page_knobs
 from pfbench.report.writers import format_csv, template_environment
 from pfbench.results.conditions import parse_label
@@ -23,29 +23,36 @@ _HERE = Path(__file__).parent
 _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 
-def write_overview(overview: Overview, pack: Mapping[str, Any], folder: RecordedFolder) -> Path:
+def write_overview(
+    overviews: Mapping[int, Overview], pack: Mapping[str, Any], folder: RecordedFolder
+) -> Path:
     """Write the first page of a study: index.html, report.md, heat_map.svg, matrices.svg, cells.csv and pairs.csv.
 
+    A study with several numbers of particles has the tables of each, and figures of error against number and time.
+
     Args:
-        overview: Tables of the page.
+        overviews: Tables of the page by number of particles, 0 for a study of one number.
         pack: Data of the page of each world.
         folder: Folder of the report.
 
     Returns:
         Path of index.html.
     """
-    pictures = {
-        **{f"heat_map{f.name}": figures.to_svg(figures.draw_heat_map(overview, f)) for f in figures.HEAT_FORMATS},
-        **{f"matrices{f.name}": figures.to_svg(figures.draw_matrices(overview, f)) for f in figures.MATRIX_FORMATS},
-    }  # fmt: skip
+    level = list(overviews)[len(overviews) // 2]  # the middle number opens the page
+    overview = overviews[level]
+    pictures = draw_pictures(overviews)
     for name, text in pictures.items():
         if not name.endswith("_390"):
             folder.write(f"{name}.svg", text)
-    folder.write("cells.csv", format_csv(list_verdicts(overview)))
-    folder.write("pairs.csv", format_csv(list_comparisons(overview)))
+    for name, tables in (("cells", list_verdicts), ("pairs", list_comparisons)):
+        parts = [tables(item).assign(particles=key or "") for key, item in overviews.items()]
+        folder.write(f"{name}.csv", format_csv(pd.concat(parts)))
     context = {
         "pack": pack,
         "overview": overview,
+        "levels": [key for key in overviews if key],
+        "level": level,
+        "others": [(key, f"_{key}") for key in overviews if key != level],
         "headline": word_headline(overview),
         "setting": describe_setting(overview),
         "foreign_knobs": describe_page_knobs(pack) if "worlds" in pack else "",
@@ -65,6 +72,36 @@ def write_overview(overview: Overview, pack: Mapping[str, Any], folder: Recorded
         environment = template_environment(_HERE, is_html=kind == "html")
         folder.write(name, environment.get_template(f"page.{kind}.jinja").render(context))
     return folder.path / "index.html"
+
+
+def draw_pictures(overviews: Mapping[int, Overview]) -> dict[str, str]:
+    """Draw all figures of the page as SVG: those of the middle number of particles without a suffix of it."""
+    level = list(overviews)[len(overviews) // 2]
+    pictures = {}
+    for key, overview in overviews.items():
+        suffix = "" if key == level else f"_{key}"
+        for size in figures.HEAT_FORMATS:
+            pictures[f"heat_map{suffix}{size.name}"] = figures.draw_heat_map(overview, size)
+        for size in figures.MATRIX_FORMATS:
+            pictures[f"matrices{suffix}{size.name}"] = figures.draw_matrices(overview, size)
+    if len(overviews) > 1:
+        worlds = select_dose_worlds(overviews[level])
+        for axis in ("particles", "time"):
+            for size in figures.DOSE_FORMATS:
+                pictures[f"error_by_{axis}{size.name}"] = figures.draw_doses(
+                    overviews, worlds, axis, size
+                )
+    return {name: figures.to_svg(figure) for name, figure in pictures.items()}
+
+
+def select_dose_worlds(overview: Overview, most: int = 2) -> list[WorldRow]:
+    """Select the worlds in which the most methods are better than the reference; those that it does not fit first."""
+    wins = {
+        world.key: sum(c.verdict.word == "better" for c in overview.cells if c.world == world.key)
+        for world in overview.worlds
+    }
+    order = sorted(overview.worlds, key=lambda w: (w.kalman_fits is not False, -wins[w.key]))
+    return order[:most]
 
 
 def word_headline(overview: Overview) -> str:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +15,7 @@ import pandas as pd
 import yaml
 
 from pfbench.results.conditions import parse_label
-from pfbench.results.looks import MethodLook, PartName
+from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.results.paper_block import conf_dir
 from pfbench.stats.world_table import (
     MeanRanks,
@@ -119,7 +121,7 @@ def read_world_facts(scenario: str, model: str) -> WorldFacts | None:
 
 def has_overview(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> bool:
     """Return whether a study has several proposed methods in several worlds."""
-    methods = [label for label in looks if looks[label].proposed]
+    methods = {parse_label(label)[0] for label in looks if looks[label].proposed}
     return len(methods) >= FEWEST_METHODS and table["scenario"].nunique() >= FEWEST_WORLDS
 
 
@@ -154,6 +156,54 @@ def build_overview(
         find_winners(worlds, methods, baselines), rank_methods(worlds, methods),
         _list_times(table, [row.key for row in rows]), left_out,
     )  # fmt: skip
+
+
+def build_overviews(
+    table: pd.DataFrame, looks: Mapping[str, MethodLook], parts: Mapping[str, PartName]
+) -> dict[int, Overview]:
+    """Decide the tables of each number of particles, with the key 0 for a study of one number.
+
+    A filter without a number of particles is in all of them.
+    """
+    levels = list_levels(looks)
+    if not levels:
+        return {0: build_overview(table, looks, parts)}
+    overviews = {}
+    for level in levels:
+        names = {
+            label: name_without_level(label) for label in looks if _level(label) in (None, level)
+        }
+        rows = table[table["filter"].isin(list(names))]
+        rows = rows.assign(filter=rows["filter"].map(names))
+        present = [name for name in dict.fromkeys(names.values()) if name in set(rows["filter"])]
+        plain = find_looks(present)
+        kinds = {names[label]: looks[label] for label in names}
+        overviews[level] = build_overview(
+            rows,
+            {k: plain[k] if plain[k].family else replace(kinds[k], key=k) for k in present},
+            parts,
+        )
+    return overviews
+
+
+def list_levels(looks: Mapping[str, MethodLook]) -> list[int]:
+    """List the numbers of particles of a study in which several proposed methods have several; else none."""
+    levels = Counter(_level(label) for label, look in looks.items() if look.proposed)
+    several = sorted(n for n, count in levels.items() if n is not None and count >= FEWEST_METHODS)
+    return several if len(several) > 1 else []
+
+
+def name_without_level(label: str) -> str:
+    """Return a label without its number of particles."""
+    name, settings = parse_label(label)
+    others = [f"{key}={value}" for key, value in settings.items() if key != "particles"]
+    return f"{name}[{','.join(others)}]" if others else name
+
+
+def _level(label: str) -> int | None:
+    """Return the number of particles in a label; None without one."""
+    number = parse_label(label)[1].get("particles", "")
+    return int(number) if number.isdigit() else None
 
 
 def order_methods(labels: Sequence[str], looks: Mapping[str, MethodLook]) -> tuple[str, ...]:
