@@ -51,7 +51,7 @@ def test_the_variant_follows_the_processor(monkeypatch: pytest.MonkeyPatch) -> N
 DRAW = """
 import hashlib
 import torch
-from pfbench.kernels import cpp
+from pfbench.kernels import dispatch as cpp
 from pfbench.kernels.cpp_library import choose_variant
 
 torch.set_num_threads(1)

@@ -15,7 +15,7 @@ from pfbench.kernels import cpp_library, cpp_library as private_folder, library_
 LOAD = """
 from pathlib import Path
 import torch
-from pfbench.kernels import cpp, cpp_library
+from pfbench.kernels import cpp_library, dispatch as cpp
 cpp_library._WITH_PACKAGE = Path("no library came with the package")
 try:
     cpp.sum_and_squares(torch.rand(1, 2))

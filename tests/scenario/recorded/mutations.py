@@ -59,7 +59,7 @@ def write_log(folder: Path, suffix: str) -> None:
     write(folder, {name: table.round(9) for name, table in tables(6.0).items()}, suffix)
 
 
-# tolerances: the limits of the notes in pfbench.scenario.plausibility plus the noise of the undamaged log
+# tolerances: the limits of the notes in pfbench.scenario.recorded plus the noise of the undamaged log
 def read_navigation(folder: Path) -> Reading:
     log = read_log(folder)
     imu, fixes, motion = log.imu, log.fixes, log.reference
