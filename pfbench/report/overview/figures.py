@@ -160,7 +160,11 @@ def draw_doses(
             axes.axhline(1.0, color=INK, lw=1.2)
         if worlds:
             figure.axes[0].set_ylabel("error / best Kalman filter")
-            figure.axes[-1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=size.font)
+            handles, names = figure.axes[0].get_legend_handles_labels()
+            if size.name:
+                figure.legend(handles, names, loc="outside lower center", ncols=2)
+            else:
+                figure.legend(handles, names, loc="outside right center")
     return figure
 
 
