@@ -75,7 +75,13 @@ def test_every_method_states_its_own_name_and_look() -> None:
     keys = {
         "name", "long_name", "family", "proposed", "colour", "marker", "cite", "baselines"
     }  # fmt: skip
-    assert [m for m in METHODS if set(read_paper_block("filter", m)) - {"tuning"} != keys] == []
+    blocks = {m: read_paper_block("filter", m) for m in METHODS}
+    assert [m for m in METHODS if set(blocks[m]) - {"tuning", "summary"} != keys] == []
+    summaries = {m: str(block["summary"]) for m, block in blocks.items() if "summary" in block}
+    assert len(summaries) == 7  # the methods of the papers, for the first page of a study
+    assert all(
+        blocks[m]["proposed"] and 5 < len(text.split()) < 20 for m, text in summaries.items()
+    )
     for method in METHODS:
         check_paper_blocks({"filter": {"paper": read_paper_block("filter", method)}})
     assert len({look.name for look in LOOKS.values()}) == len(METHODS)
