@@ -35,8 +35,8 @@ class RawFix:
     noise-free step of the model from the last estimate. Where a measurement is missing the estimate is
     therefore dead reckoning from the last one. Of several solutions the nearest to the prediction is
     taken, in standard deviations of the initial distribution [ours]. A direction counts as measured if
-    the sensors of the step know it better than 100 of these, so that a curved measurement near its turning
-    point, or a state that is known from the start, is not moved by noise alone [ours].
+    the sensors of the step know it better than 100 of these [ours]. Otherwise noise alone would move a
+    state that is known from the start, or one at the turning point of a curved measurement.
 
     The filter states neither a covariance nor an evidence: both are NaN, except that the evidence of a
     valid run is 0 in the belief.
@@ -166,10 +166,9 @@ def _check_determined(model: StateSpaceModel, belief: GaussianBelief, record: Re
             continue
         y = torch.where(is_observed[t], step.y.nan_to_num(), torch.nan)
         slope, _ = _whitened_measurement(step_model, x, step._replace(y=y), scale)
-        projection = (torch.linalg.pinv(slope, atol=1.0, rtol=0.0) @ slope).diagonal(
-            dim1=-2, dim2=-1
-        )
-        share = float((projection[:, group] * variance).sum() / variance.sum())
+        projection = torch.linalg.pinv(slope, atol=1.0, rtol=0.0) @ slope
+        part = projection.diagonal(dim1=-2, dim2=-1)[:, group] * variance
+        share = float((part.sum(-1) / variance.sum(-1)).amax())  # of the best run
         if share >= _DETERMINED:
             return
         largest = max(largest, share)
