@@ -22,7 +22,7 @@ from pfbench.filter.linearisation import (
 from pfbench.model.base import StateSpaceModel, initial_law
 
 _SCALE = "raw_fix_scale"  # _WIDER times the initial standard deviation, or 1 where it is 0, [R, d]
-_WIDER = 100.0  # a direction is observed if a measurement knows it better than 100 initial sd
+_WIDER = 100.0  # a direction is observed if its measured sd is below 100 initial sd
 _DETERMINED = 0.95  # share of the variance of the main group that the measurements must see
 
 
@@ -35,7 +35,7 @@ class RawFix:
     noise-free step of the model from the last estimate. Where a measurement is missing the estimate is
     therefore dead reckoning from the last one. Of several solutions the nearest to the prediction is
     taken, in standard deviations of the initial distribution [ours]. A direction counts as measured if
-    the sensors of the step know it better than 100 of these [ours]. Otherwise noise alone would move a
+    its standard deviation by the sensors of the step is below 100 of these [ours]. Otherwise noise alone would move a
     state that is known from the start, or one at the turning point of a curved measurement.
 
     The filter states neither a covariance nor an evidence: both are NaN, except that the evidence of a
@@ -167,8 +167,8 @@ def _check_determined(model: StateSpaceModel, belief: GaussianBelief, record: Re
         y = torch.where(is_observed[t], step.y.nan_to_num(), torch.nan)
         slope, _ = _whitened_measurement(step_model, x, step._replace(y=y), scale)
         projection = torch.linalg.pinv(slope, atol=1.0, rtol=0.0) @ slope
-        part = projection.diagonal(dim1=-2, dim2=-1)[:, group] * variance
-        share = float((part.sum(-1) / variance.sum(-1)).amax())  # of the best run
+        observed = projection.diagonal(dim1=-2, dim2=-1)[:, group] * variance
+        share = float((observed.sum(-1) / variance.sum(-1)).amax())  # of the best run
         if share >= _DETERMINED:
             return
         largest = max(largest, share)
