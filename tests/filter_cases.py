@@ -45,7 +45,12 @@ DENSE = ("mcmc_bridge", "mcmc_rpf_printed", "mcmc_tail")
 
 BRANCHING = ("gpb1", "imm", "gaussian_sum", "rbpf_discrete", "ekf_bank", "ekf_bank_dense")
 
-REMEMBERING = ("cofm_amssrcpf", "cofm_amssrcpf_printed", "cpf", "fmcpf")
+EACH = ("cofm_amssrcpf_each", "cpf_each", "fmcpf_each")  # a guide filter for each particle
+
+REMEMBERING = ("cofm_amssrcpf", "cofm_amssrcpf_printed", "cpf", "fmcpf", *EACH)
+
+# no step determines the state; that of Benes is known at the start
+WITHOUT_FIXES = ("Benes", "StochasticVolatility", "TerrainAided")
 
 
 def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
@@ -65,10 +70,22 @@ def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
         return "no component that is linear given the rest"
     if _has_far_points(method_of(name), model, record):
         return "must lie within 115 degrees"
+    if name in EACH and not _has_density_in_chart(model, x, first.u):
+        return "transition density in the chart"
+    is_blank = bool(torch.isnan(record.y).all())  # the first steps of a recorded drive
+    if name == "raw_fix" and (is_blank or type(model).__name__ in WITHOUT_FIXES):
+        return "filter=raw_fix must have measurements that determine"
     is_single = not method_past(name) and not name.startswith("rbpf") and name not in BRANCHING
     if record.feedback is not None and not is_single:
         return "scenario with feedback"
     return ""
+
+
+def _has_density_in_chart(model: StateSpaceModel, x: torch.Tensor, u: Any) -> bool:
+    """Return whether additive noise of full rank or a transition gives the density of a step."""
+    chart, gain = model.chart, model.noise_gain(u)
+    is_square = gain is not None and gain.shape[-1] == chart.dimension == chart.size
+    return is_square or (chart.flat and model.transition(x, u) is not None)
 
 
 def _needs_many_points(name: str, model: StateSpaceModel, u: Any) -> bool:

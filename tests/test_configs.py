@@ -170,6 +170,7 @@ def test_every_scenario_runs_with_the_default_filter(scenario: str) -> None:
     assert not torch.equal(first, second)  # runs have their own errors and particles
 
 
+@pytest.mark.filterwarnings("ignore:ParticleGuideProposal")
 @pytest.mark.parametrize("method", [m for m in GROUPS["filter"] if m not in NEEDS_ATTITUDE])
 def test_every_filter_runs(method: str) -> None:
     """Gaussian filters that leave noise and gain alone are the Kalman filter on a linear model, whatever their rule.

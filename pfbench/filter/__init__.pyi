@@ -53,6 +53,7 @@ from pfbench.filter.gaussian.noise_adaptation import (
     FadingMemory as FadingMemory,
     MatrixNoiseAdaptation as MatrixNoiseAdaptation,
 )
+from pfbench.filter.gaussian.raw_fix import RawFix as RawFix
 from pfbench.filter.guided.guides import (
     ParticleGuideProposal as ParticleGuideProposal,
     SharedGuideProposal as SharedGuideProposal,

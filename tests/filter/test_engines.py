@@ -24,6 +24,8 @@ from pfbench.filter.proposed.swarm import SwarmProposal
 from pfbench.kernels import dispatch
 from pfbench.model.linear_gaussian import LinearGaussian
 
+pytestmark = pytest.mark.filterwarnings("ignore:ParticleGuideProposal")  # it says that it is dear
+
 RUNS, STEPS = 3, 4
 Y = torch.tensor(
     [

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from filter_cases import EACH, method_of
 from particle_cases import CASES, WALK, WALK_Y, Drifting, Spiky
 from torch import Tensor
 from torch.distributions import Independent, MultivariateNormal, Normal, StudentT
@@ -657,6 +658,31 @@ def exact_growth(y: Tensor) -> Any:
     )
     mean, variance = estimate.mean[:, -1].mean(0).numpy(), estimate.variance[:, -1].mean(0).numpy()
     return type(CASES["growth"]()[2])(mean, variance + mean**2, float(estimate.log_evidence.mean()))
+
+
+@pytest.mark.filterwarnings("ignore:ParticleGuideProposal")
+@pytest.mark.parametrize("name", EACH)
+def test_a_guide_for_each_particle_gives_the_kalman_filter_on_a_linear_model(name: str) -> None:
+    """Within Monte Carlo error at every step, without a factor on the covariance: the ratio corrects the guide.
+
+    With 200 particles 9 % of them have weight, and the means are off by 0.15 standard deviations.
+    """
+    method = method_of(name)
+    assert isinstance(method.proposal, ParticleGuideProposal)
+    assert method.proposal.covariance_factor == 1.0
+    method = replace(method, particles=2000)
+    if name == "cofm_amssrcpf_each":
+        method = replace(
+            method, particle_count=EssStepCount(10, 0.5, CountLimits(1000, 2000, 1500))
+        )
+    runs, kalman = 50, filter_record(EKF, WALK, WALK_Y, runs=1)
+    found = filter_record(method, WALK, WALK_Y, runs=runs)
+    error, sd = found.mean - kalman.mean, kalman.variance.sqrt()
+    se = error.std(0) / math.sqrt(runs)
+    assert (error.mean(0).abs() < 4.0 * se).all()
+    assert (se < 0.05 * sd[0]).all()
+    ratio = torch.exp(found.log_evidence - kalman.log_evidence)
+    assert abs(float(ratio.mean()) - 1.0) < 4.0 * float(ratio.std()) / math.sqrt(runs)
 
 
 def test_a_guide_for_each_particle_is_told_to_be_dear() -> None:
