@@ -95,6 +95,8 @@ def try_fault(fault: dict[str, Any], baseline: bool = False) -> str:
         for name in FOLDERS:
             shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
         shutil.copy(ROOT / "pyproject.toml", root)
+        (root / "reports").mkdir()
+        shutil.copy(ROOT / "reports" / "README.md", root / "reports")  # tests/checkout.py reads it
         if baseline:
             status = run_tests(fault["tests"], root)
             return "passes" if status == 0 else f"FAILS without the fault: pytest status {status}"
