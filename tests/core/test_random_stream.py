@@ -63,6 +63,7 @@ def streams() -> dict[str, torch.Tensor]:
         "run": s.at_step(1).normal("a", n, 2)[1, :, 0],
         "component": s.at_step(1).normal("a", n, 2)[0, :, 1],
         "purpose": s.at_step(1).normal("b", n, 2)[0, :, 0],
+        "end of a purpose": s.at_step(1).normal("ab", n, 2)[0, :, 0],
         "step": s.at_step(2).normal("a", n, 2)[0, :, 0],
         "seed": source(4, 2).at_step(1).normal("a", n, 2)[0, :, 0],
         "lag": s.at_step(1).normal("a", n, 2)[0, :, 0].roll(1),

@@ -99,6 +99,16 @@ def test_a_weighted_particle_is_as_many_particles() -> None:
 
 
 @pytest.mark.usefixtures("both")
+def test_the_points_that_stand_for_a_cloud_favour_no_side() -> None:
+    """A mirrored cloud has the mirrored score, though three particles do not divide 64 points."""
+    error = torch.tensor([[0.4, -0.3]], dtype=torch.float64)
+    deviation = torch.tensor([[[-1.0, -2.0], [0.0, 0.0], [1.0, 2.0]]], dtype=torch.float64)
+    even = torch.zeros(1, 3, dtype=torch.float64)
+    one, mirrored = (score_particles(sign * error, deviation, even, GROUPS) for sign in (1, -1))
+    torch.testing.assert_close(one.energy_score, mirrored.energy_score)
+
+
+@pytest.mark.usefixtures("both")
 def test_a_point_scores_its_distance() -> None:
     error, covariance = law()
     point = score_particles(

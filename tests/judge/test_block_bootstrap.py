@@ -93,7 +93,10 @@ def test_power_and_direction() -> None:
     decided = 0
     for _ in range(40):
         errors = markov(rng, 1600, 10.0, 4) ** 2
-        result = compare_along_run(0.49 * errors[:2].sum(0), errors[2:].sum(0))
+        first, second = 0.49 * errors[:2].sum(0), errors[2:].sum(0)
+        result = compare_along_run(first, second)
+        rmse = np.sqrt([first.mean(), second.mean()])
+        assert result.estimate.value == pytest.approx(np.log(rmse[0] / rmse[1]))
         assert result.estimate.value < 0
         decided += result.p < 0.05
         low, high = result.estimate.interval(0.05)

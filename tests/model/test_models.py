@@ -287,6 +287,8 @@ def test_the_volatility_weighs_as_its_law_does() -> None:
         rtol=1e-12,
     )
     assert np.all(value[2] == 0.0)
+    law = model.observation(x[:2], ())  # what is drawn has the density that weighs
+    assert np.allclose(value[:2], law.log_prob(y[:2, None]).numpy(), rtol=1e-12)
 
 
 def test_dropping_a_component_equals_a_model_without_it() -> None:

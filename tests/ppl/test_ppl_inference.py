@@ -201,6 +201,17 @@ def test_online_learning_ends_in_the_grid_s_posterior(method, particles) -> None
     assert float(found.acceptance[~found.acceptance.isnan()].mean()) > 0.1
 
 
+def test_moments_of_online_learning_are_those_of_the_weighted_parameters() -> None:
+    found = smc2(NILE, EKF, nile(3), 30, seed=5, threshold=0.0)  # never resampled: still its last
+    w = found.weights.numpy()
+    assert float(found.ess[-1]) == pytest.approx(1.0 / (w**2).sum())
+    for name, values in found.values.items():
+        mean = np.average(values, weights=w)
+        assert float(found.mean[name][-1]) == pytest.approx(mean)
+        variance = np.average((values.numpy() - mean) ** 2, weights=w)
+        assert float(found.sd[name][-1]) == pytest.approx(variance**0.5)
+
+
 RUNS, DRAWS = 40, 19
 
 

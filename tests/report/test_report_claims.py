@@ -356,6 +356,11 @@ PLANTED = {
         {"a": [9.0], "b": [1.0]},
         {"a": [2.0], "b": [1.0]},
     ),
+    "cost, printed below 1": (
+        replace(LESS, statistic="cost", printed=0.1),
+        {"a": [0.12], "b": [1.0]},
+        {"a": [2.0], "b": [1.0]},
+    ),
     "cost, alike": (
         replace(LESS, statistic="cost", low=0.77, high=1.3),
         {"a": [1.0], "b": [1.0]},
@@ -501,6 +506,7 @@ def test_a_share_is_tested_from_one_side() -> None:
     for count in (3, 14):
         (result,) = ruled(share, a=np.arange(20) < count).findings[""]
         assert result.p == pytest.approx(stats.binom.sf(count - 1, 20, 0.5))
+        assert result.p_fails == pytest.approx(min(1.0, 2 * stats.binom.cdf(count, 20, 0.5)))
     open_one = ruled(LESS, **normal(-0.1, 0.5, 20))
     assert claim_tables.claims_table([open_one])["runs required"].iloc[0] > 20
     assert (

@@ -138,6 +138,8 @@ def test_a_study_says_what_it_lacks_for_the_word() -> None:
     assert describe(data).startswith("Robust")
     few = data[(data["filter"] != "gate") | (data["run"] < 8)]
     assert describe(few).startswith("No filter is shown to be robust")
+    half = data[(data["filter"] != "gate") | (data["run"] < 8) | (data["regime"] == "outliers")]
+    assert describe(half).startswith("No filter is shown to be robust")  # few in nominal noise
 
 
 @pytest.mark.parametrize("text", ["", "Robust: [[A & B]] (better)."])

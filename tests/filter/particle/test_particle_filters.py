@@ -422,6 +422,16 @@ def test_too_few_particles_are_refused(particles: int) -> None:
         ParticleFilter(particles)
 
 
+def test_a_prediction_that_is_no_number_excludes_its_parent_alone() -> None:
+    """As one that the measurement excludes; the other parents of the run keep their look-ahead."""
+    before, seen = belief(WALK), Record(torch.full((3, 1), 0.3, dtype=torch.float64))
+    failed, far = before.x.clone(), before.x.clone()
+    failed[:, 0], far[:, 0] = torch.nan, 1e9
+    log_a, expected = (LookAheadWeights()(WALK, before._replace(x=x), seen) for x in (failed, far))
+    assert torch.equal(log_a, expected)
+    assert not torch.allclose(log_a, before.log_w)
+
+
 @pytest.mark.parametrize("power", [0.0, 1.5, math.nan])
 def test_a_power_of_no_use_is_refused(power: float) -> None:
     with pytest.raises(ValueError, match="likelihood_power"):
