@@ -233,12 +233,16 @@ def test_sentences_are_short_and_state_numbers_of_the_tables(overview: Overview)
     headline = word_headline(overview)
     assert len(headline.split()) <= 55
     assert not re.search(r"robust|points|planned|trade-off|consistent", headline)
-    words = [c.verdict.word for c in overview.cells if c.filter in overview.methods]
+    cells_of = [c for c in overview.cells if c.filter in overview.methods]
+    words = ["lost" if c.loses_track else c.verdict.word for c in cells_of]
     assert f"better in {words.count('better')} of {len(words)} cells" in headline
+    assert sum(map(int, re.findall(r"in (\d+)", headline.split("they are")[1]))) == len(words)
     cells = list_verdicts(overview).set_index(["world", "filter"])
     for method in overview.methods:
         story = tell_story(overview, method, "")
-        for world, ratio in re.findall(r"(\w+) (\d+\.\d+)", f"{story['wins']}; {story['loses']}"):
+        for world, ratio in re.findall(
+            r"(\w+) \((\d+\.\d+)\)", f"{story['wins']}; {story['loses']}"
+        ):
             assert f"{cells.loc[(world, method), 'ratio']:.2f}" == ratio
 
 

@@ -32,7 +32,7 @@ GROUPS = {
 
 _KEY = (
     (BLUE, "smaller error"), (ORANGE, "larger error"), ("white", "not decided; = within 5 %"),
-    (GREY, "loses track (runs kept)"),
+    (GREY, "loses track; % of runs that keep it"),
 )  # fmt: skip
 
 
@@ -365,7 +365,7 @@ def _name_columns(axes: Axes, names: Sequence[str], methods: int, size: Format) 
 def _name_references(axes: Axes, worlds: Sequence[WorldRow], columns: int, size: Format) -> None:
     """Write the reference of each world and its error at the right of the row."""
     for i, world in enumerate(worlds):
-        text = f"1 = {world.reference}, {format_reference_error(world.level, world.unit)}"
+        text = f"1 = {world.reference}, {format_reference_error(world.level, world.unit)} RMS"
         axes.text(
             columns + 0.2, i + 0.5, text, va="center", fontsize=0.9 * size.font, color="#555555"
         )

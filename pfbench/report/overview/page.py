@@ -116,13 +116,17 @@ def word_headline(overview: Overview) -> str:
         methods = spell_number(len(overview.methods))
         first = f"None of the {methods} is shown to be better than every conventional filter in any of {len(worlds)} worlds."
     cells = [cell for cell in overview.cells if cell.filter in overview.methods]
-    words = [cell.verdict.word for cell in cells]
-    lost = sum(cell.loses_track for cell in cells)
-    second = (
-        f"Against the best Kalman filter of each world they are better in {words.count('better')} of {len(cells)} cells, "
-        f"equal in {words.count('equal') + words.count('identical')} and worse in {words.count('worse')}"
+    words = ["lost" if cell.loses_track else cell.verdict.word for cell in cells]
+    counts = [
+        f"better in {words.count('better')} of {len(cells)} cells",
+        f"equal in {words.count('equal') + words.count('identical')}",
+        f"not decided in {words.count('not decided')}",
+        f"worse in {words.count('worse')}",
+    ]
+    lost = f" In {words.count('lost')} they lose track." if "lost" in words else ""
+    return (
+        f"{first} Against the best Kalman filter of each world they are {', '.join(counts)}.{lost}"
     )
-    return f"{first} {second}" + (f"; in {lost} they lose track." if lost else ".")
 
 
 def describe_setting(overview: Overview) -> str:
@@ -130,8 +134,8 @@ def describe_setting(overview: Overview) -> str:
     runs = sorted({world.runs for world in overview.worlds})
     counts = f"{runs[0]}" if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
     return (
-        f"{len(overview.worlds)} worlds · {counts} paired runs each · a lost run counts as an error at the track limit · "
-        "the reference of a world was chosen on another seed"
+        f"{len(overview.worlds)} worlds, {counts} paired runs each. A lost run counts as an error at the track limit. "
+        "The best Kalman filter of a world was chosen on another seed. Conventional are all filters but the proposed ones."
     )
 
 

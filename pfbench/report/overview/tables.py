@@ -38,6 +38,7 @@ CONVENTIONAL = (
     "ekf_bank",
     "gpf",
 )  # conventional filters that stand next to the methods
+_WORDS = ("better", "worse", "equal", "identical", "not decided")
 _FAMILIES = ("particle", "guided", "swarm", "gaussian", "learned", "kalman", "")
 
 
@@ -223,7 +224,7 @@ def _build_world(rows: pd.DataFrame, name: PartName, labels: Mapping[str, str]) 
     facts = read_world_facts(name.key, str(models[0]))
     if facts is None:
         raise ValueError(
-            f"tuned must have a file of scenario={name.key} with model={models[0]}, got none. "
+            f"{name.key} must have a tuning that states its best conventional filter, got none. "
             f"Run pfbench tune scenario={name.key} model={models[0]}."
         )
     cap = name.limit if name.limit else facts.cap
@@ -253,24 +254,21 @@ def tell_story(overview: Overview, method: str, summary: str) -> dict[str, str]:
     cells = [cell for cell in overview.cells if cell.filter == method]
     names = {world.key: world.name for world in overview.worlds}
     lost = [names[c.world] for c in cells if c.loses_track]
-    by_word: dict[str, list[WorldResult]] = {
-        "better": [],
-        "worse": [],
-        "equal": [],
-        "identical": [],
-    }
+    by_word: dict[str, list[WorldResult]] = {word: [] for word in _WORDS}
     for cell in cells:
         if not cell.loses_track:
-            by_word.setdefault(cell.verdict.word, []).append(cell)
+            by_word[cell.verdict.word].append(cell)
     better = sorted(by_word["better"], key=lambda c: c.verdict.ratio)
     worse = sorted(by_word["worse"], key=lambda c: -c.verdict.ratio)
-    losses = [_join([f"{names[c.world]} {c.verdict.ratio:.2f}" for c in worse])]
-    losses += [f"loses track in {_join(lost)}"] * bool(lost)
+    losses = [_join([f"{names[c.world]} ({c.verdict.ratio:.2f})" for c in worse])]
+    losses += [f"Loses track: {_join(lost)}"] * bool(lost)
     return {
         "name": overview.names[method],
         "is": summary,
-        "wins": _join([f"{names[c.world]} {c.verdict.ratio:.2f}" for c in better]) or "None shown.",
+        "wins": _join([f"{names[c.world]} ({c.verdict.ratio:.2f})" for c in better])
+        or "None shown.",
         "equal": _join([names[c.world] for c in (*by_word["equal"], *by_word["identical"])]) or "–",
+        "open": _join([names[c.world] for c in by_word["not decided"]]) or "–",
         "loses": ". ".join(filter(None, losses)) or "None shown.",
         "time": format_times(overview, method),
     }
