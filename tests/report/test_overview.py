@@ -236,7 +236,8 @@ def test_sentences_are_short_and_state_numbers_of_the_tables(overview: Overview)
     cells_of = [c for c in overview.cells if c.filter in overview.methods]
     words = ["lost" if c.loses_track else c.verdict.word for c in cells_of]
     assert f"better in {words.count('better')} of {len(words)} cells" in headline
-    assert sum(map(int, re.findall(r"in (\d+)", headline.split("they are")[1]))) == len(words)
+    counts = re.findall(r"(?i)\bin (\d+)", headline.split("they are", 1)[1])
+    assert sum(map(int, counts)) == len(words)
     cells = list_verdicts(overview).set_index(["world", "filter"])
     for method in overview.methods:
         story = tell_story(overview, method, "")
