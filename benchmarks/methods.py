@@ -39,7 +39,11 @@ def methods(particles: int) -> dict[str, Any]:
     """Every filter that can be composed, by the name of its yaml; networks cost the same before they are trained."""
     names = sorted(path.stem for path in (HERE.parent / "conf" / "filter").glob("*.yaml"))
     with initialize_config_module("pfbench.conf", version_base="1.3"):
-        words = (f"particles={particles}", "checkpoint=untrained", "tuned=flight_500s_with_ins_gnss_inflated")
+        words = (
+            f"particles={particles}",
+            "checkpoint=untrained",
+            "tuned=flight_500s_with_ins_gnss_inflated",
+        )
         return {
             name: job.instantiate(compose("config", [f"filter={name}", *words])["filter"])
             for name in names
