@@ -26,7 +26,12 @@ from pfbench.report.journal.ratio_figures import HEADLINE, write_headline
 from pfbench.report.methods_text import MethodsFacts
 from pfbench.report.options import ReportOptions
 from pfbench.report.overview.page import BOARD_PAGE, write_overview
-from pfbench.report.overview.tables import Overview, build_overviews, has_overview
+from pfbench.report.overview.tables import (
+    FEWEST_WORLDS,
+    Overview,
+    build_overviews,
+    has_overview,
+)
 from pfbench.report.papers import figures
 from pfbench.report.provenance import renew_bibliography
 from pfbench.report.study_page import write_page
@@ -128,7 +133,9 @@ def find_overviews(
     facts = StudyFacts.from_pack(pack)
     if table is None or not has_overview(table, facts.looks):
         return None
-    return build_overviews(table, facts.looks, facts.worlds)
+    overviews = build_overviews(table, facts.looks, facts.worlds)
+    enough = all(len(overview.worlds) >= FEWEST_WORLDS for overview in overviews.values())
+    return overviews if enough else None  # without references of worlds there is nothing to show
 
 
 def list_job_settings(conditions: Sequence[Condition], planned: int | None) -> list[list[str]]:

@@ -127,7 +127,7 @@ def bound_losses(error: Array, keeps_track: Flags, cap: float) -> Array:
         )
     counts = keeps_track & np.isfinite(error)
     with np.errstate(divide="ignore"):
-        return np.asarray(np.log(np.where(counts, np.minimum(np.abs(error), cap), cap)))
+        return np.asarray(np.log(np.where(counts, np.minimum(error, cap), cap)))
 
 
 def compare(a: tuple[str, Array], b: tuple[str, Array], unit: Unit = "run") -> Effect:

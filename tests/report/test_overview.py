@@ -8,6 +8,7 @@ import subprocess
 import sys
 from itertools import combinations
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -16,6 +17,7 @@ from checkout import ROOT
 from scipy import stats
 
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report import study_report
 from pfbench.report.overview import figures
 from pfbench.report.overview.page import list_verdicts, word_headline, write_overview
 from pfbench.report.overview.tables import (
@@ -263,6 +265,19 @@ def test_figures_are_small_readable_and_inside_their_paper(kind: str, overview: 
             extent = text.get_window_extent()
             assert -1 <= extent.x0 <= extent.x1 <= box.x1 + 1, text.get_text()
             assert -1 <= extent.y0 <= extent.y1 <= box.y1 + 1, text.get_text()
+
+
+def test_a_study_without_references_keeps_its_first_page(
+    table: pd.DataFrame,
+    looks: dict[str, MethodLook],
+    parts: dict[str, PartName],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    facts = SimpleNamespace(looks=looks, worlds=parts)
+    monkeypatch.setattr(study_report.StudyFacts, "from_pack", lambda pack: facts)
+    assert study_report.find_overviews({}, table) is not None
+    assert study_report.find_overviews({}, table.assign(model="other")) is None
+    assert study_report.find_overviews({}, None) is None
 
 
 def test_ink_has_contrast_on_every_ground() -> None:
