@@ -267,6 +267,22 @@ def test_figures_are_small_readable_and_inside_their_paper(kind: str, overview: 
             assert -1 <= extent.y0 <= extent.y1 <= box.y1 + 1, text.get_text()
 
 
+def test_a_tuning_of_the_current_folder_states_its_world(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the remedy of a world that is left out says."""
+    monkeypatch.chdir(tmp_path)
+    assert read_world_facts("mine", "own") is None
+    file = tmp_path / "conf" / "tuned" / "mine.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text("world: [")
+    assert read_world_facts("mine", "own") is None
+    file.write_text(
+        "world: {scenario: mine, model: own}\nbest: ukf\nkalman_fits: false\nfit: {cap: 7}"
+    )
+    assert read_world_facts("mine", "own") == ("ukf", False, 7.0)
+
+
 def test_a_study_without_references_keeps_its_first_page(
     table: pd.DataFrame,
     looks: dict[str, MethodLook],

@@ -8,12 +8,13 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import yaml
 
+from pfbench.files import limits
 from pfbench.results.conditions import parse_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.results.paper_block import conf_dir
@@ -32,12 +33,8 @@ from pfbench.stats.world_table import (
 
 FEWEST_METHODS, FEWEST_WORLDS = 3, 2  # from which a study has this page
 CENTRAL = "nominal"  # regime of the page, if a world has several
-CONVENTIONAL = (
-    "sir",
-    "rpf",
-    "ekf_bank",
-    "gpf",
-)  # conventional filters that stand next to the methods
+CONVENTIONAL = ("sir", "rpf", "ekf_bank", "gpf")  # that stand next to the methods
+_TUNING_BYTES = 1_000_000
 _WORDS = ("better", "worse", "equal", "identical", "not decided")
 _FAMILIES = ("particle", "guided", "swarm", "gaussian", "learned", "kalman", "")
 
@@ -106,18 +103,34 @@ class WorldFacts(NamedTuple):
     cap: float
 
 
-@cache
 def read_world_facts(scenario: str, model: str) -> WorldFacts | None:
-    """Read the facts of a world from the installed files of tunings, the nominal regime first; None without one."""
+    """Read the facts of a world from the files of tunings, the nominal regime first; None without one.
+
+    They are those of pfbench, and those that `pfbench tune` wrote into `conf` of the current folder.
+    """
     candidates: list[tuple[bool, WorldFacts]] = []
-    for path in sorted(Path(conf_dir() / "tuned").glob("*.yaml")):
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        world = content.get("world") or {}
-        if (world.get("scenario"), world.get("model")) == (scenario, model) and content.get("best"):
-            cap = float((content.get("fit") or {}).get("cap", math.nan))
-            facts = WorldFacts(str(content["best"]), content.get("kalman_fits"), cap)
-            candidates.append((world.get("regimes") != [CENTRAL], facts))
+    for folder in dict.fromkeys((conf_dir().resolve(), Path("conf").resolve())):
+        for path in sorted((folder / "tuned").glob("*.yaml")):
+            content = _read_tuning(path, path.stat().st_mtime_ns)
+            world = content.get("world") or {}
+            if (world.get("scenario"), world.get("model")) != (scenario, model):
+                continue
+            if content.get("best"):
+                cap = float((content.get("fit") or {}).get("cap", math.nan))
+                facts = WorldFacts(str(content["best"]), content.get("kalman_fits"), cap)
+                candidates.append((world.get("regimes") != [CENTRAL], facts))
     return min(candidates, key=lambda item: item[0])[1] if candidates else None
+
+
+@cache
+def _read_tuning(path: Path, changed: int) -> Mapping[str, Any]:
+    """Read a file of a tuning, again if it changed; nothing from a file that is none."""
+    limits.check_is_file(path, _TUNING_BYTES)
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError):
+        return {}  # a composition that uses it says so
+    return content if isinstance(content, dict) else {}
 
 
 def has_overview(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> bool:
