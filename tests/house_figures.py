@@ -2,7 +2,8 @@
 
 Without `--store` it prints the figures beside the stored ones (tests/house_figures.json). A figure that rose is stored
 only with the name of the capability that it bought, and stays in the list of rises. Statements are counted in the
-syntax trees without docstrings: wide lines, packed lines and comments change nothing.
+syntax trees without docstrings: wide lines, packed lines and comments change nothing. Counts of statements may rise by
+1 % of what is stored without a name, so that the mend of an error needs none.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 STORED = Path(__file__).with_suffix(".json")
 Figures = dict[str, int]
 MANY_FIELDS = MANY_IMPORTS = 12
+SLACK = 0.01
 
 
 @cache
@@ -182,11 +184,12 @@ def measure_reading() -> Figures:
 
 
 def list_rises(figures: Figures, stored: Figures) -> list[str]:
-    """Name the figures that rose."""
+    """Name the figures that rose, statements by more than the slack of a mend."""
+    slack = {name: SLACK * name.startswith("statements") for name in figures}
     return [
         f"{name}: {stored.get(name, 0)} -> {value}"
         for name, value in figures.items()
-        if value > stored.get(name, 0)
+        if value > (1 + slack[name]) * stored.get(name, 0)
     ]
 
 
