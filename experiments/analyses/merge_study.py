@@ -7,7 +7,6 @@ their errors must be those of the published study. The page is then decided agai
 
 from __future__ import annotations
 
-import io
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,16 +14,16 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from publish_reports import publish_study
 
 from pfbench.files import RecordedFolder
 from pfbench.report import (
+    RUNS,
     StudyFacts,
     cell_entries,
     count_tuned,
-    read_page_data,
+    format_runs,
+    read_stored_study,
     rebuild_page,
-    write_page_data,
 )
 
 REPORTS = Path(__file__).parents[2] / "reports"
@@ -164,17 +163,14 @@ def merge_study(study: str, folder: Path, reports: Path = REPORTS) -> list[str]:
     Returns:
         Filters that were replaced or added.
     """
-    published, newer = (read_page_data(place / study) for place in (reports, folder))
+    (published, old), (newer, new) = (
+        read_stored_study(place / study) for place in (reports, folder)
+    )
     labels = find_new_filters(published, newer)
-    old, new = (pd.read_parquet(place / study / "runs.parquet") for place in (reports, folder))
     runs = merge_runs(old, new, labels)
-    buffer = io.BytesIO()
-    runs.to_parquet(buffer, index=False, compression="zstd")
     with RecordedFolder(reports / study, is_complete=False) as target:
-        target.write("runs.parquet", buffer.getvalue())
-        write_page_data(merge_packs(published, newer, labels, runs), target)
+        target.write(RUNS, format_runs(runs, merge_packs(published, newer, labels, runs)))
     rebuild_page(reports / study)
-    publish_study(reports / study)
     return labels
 
 

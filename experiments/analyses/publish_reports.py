@@ -1,9 +1,7 @@
 """Reduce the generated reports to the files that git stores: `python experiments/analyses/publish_reports.py`.
 
-Git stores report.md, one figure (`headline.svg` or .png) and the numbers of each report. The command draws
-the figure of a study from the data of its page. A study of several methods in several worlds has its first page in
-report.md with two figures, and worlds.md. For other reports it copies a figure and removes
-the references to all others from report.md. The results of a script in `experiments/` are stored with six
+Git stores report.md, its figures and the runs of each study (runs.parquet), from which the command makes all other
+files of its report. For other reports it copies a figure and removes the references to all others from report.md. The results of a script in `experiments/` are stored with six
 digits in `results.json.gz`, and its page is made of them. `make report` runs it after the reports. A second run
 changes nothing.
 """
@@ -13,23 +11,12 @@ from __future__ import annotations
 import gzip
 import json
 import re
-from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from pfbench.files import RecordedFolder
-from pfbench.report import (
-    PAGE_DATA,
-    find_overviews,
-    read_page_data,
-    write_headline,
-    write_markdown,
-    write_overview,
-    write_page_data,
-)
+from pfbench.report import RUNS, rebuild_page
 
 REPORTS = Path(__file__).parents[2] / "reports"
 
@@ -45,45 +32,8 @@ HEADLINES = {
 }
 RESULTS = "results.json.gz"  # of a script in experiments/
 SUFFIXES = (".svg", ".png")  # of a headline figure, not of the copies that a folder keeps
-CAPTION = "Error of each filter relative to the baseline"
 
 _IMAGE = re.compile(r"^!\[([^\]]*)\]\(([^)]+)\)\n+(\*[^*\n].*\*\n+)?", re.MULTILINE)
-
-
-def publish_study(folder: Path) -> None:
-    """Draw the headline figure of a study, and show it in report.md; no figure if no filter has an error.
-
-    Args:
-        folder: Folder of the report, with the data of its page.
-    """
-    pack = read_page_data(folder)
-    runs = folder / "runs.parquet"
-    overviews = find_overviews(pack, pd.read_parquet(runs)) if runs.is_file() else None
-    with RecordedFolder(folder, is_complete=False) as target:
-        target.remove("headline.png")
-        has_figure = write_headline(pack, target)
-        pack["headline"] = CAPTION if has_figure else ""
-        pack["headline_note"] = describe_absent(pack) if has_figure else ""
-        write_page_data(pack, target)
-        if overviews is None:
-            write_markdown(pack, target)
-        else:
-            write_markdown(pack, target, "worlds.md")
-            write_overview(overviews, pack, target)
-
-
-def describe_absent(pack: Mapping[str, Any]) -> str:
-    """Name the filters that the headline figure does not show, by reason; empty if it shows all.
-
-    Args:
-        pack: Data of the page.
-    """
-    names = {look["key"]: look["name"] for look in pack["filters"]}
-    absent: dict[str, list[str]] = {}
-    for row in next(iter(pack["views"].values()))["rows"]:
-        if row["ratio"] is None:
-            absent.setdefault(row["words"], []).append(names[row["filter"]])
-    return " ".join(f"Not shown, {words}: {', '.join(rows)}." for words, rows in absent.items())
 
 
 def publish_report(folder: Path) -> None:
@@ -180,8 +130,8 @@ def main() -> None:
     for page in sorted(REPORTS.glob("*/report.md")):
         if page.parent.name in HEADLINES:
             publish_report(page.parent)
-        elif (page.parent / PAGE_DATA).is_file():
-            publish_study(page.parent)
+        elif (page.parent / RUNS).is_file():
+            rebuild_page(page.parent)
 
 
 if __name__ == "__main__":

@@ -7,12 +7,12 @@ name. A test fails if a block differs from them.
 
 from __future__ import annotations
 
-import csv
 import gzip
 import json
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from runpy import run_path
@@ -21,6 +21,7 @@ from typing import Any
 
 from pfbench.claims import read_claims
 from pfbench.files import markdown_bullets
+from pfbench.report import read_stored_study
 
 TOP = Path(__file__).parents[2]
 PAGES = (
@@ -98,21 +99,30 @@ def describe_knobs(study: str) -> str:
     return next((f"\n\n{line}" for line in lines if line.startswith("Not tuned here:")), "")
 
 
-def board_table(study: str) -> str:
-    """Table of the opening view of a published study, from verdicts.csv. Rows with equal numbers are joined.
+@cache
+def opening_rows(study: str) -> tuple[str, list[dict[str, Any]]]:
+    """Baseline and rows of the opening view of a published study.
 
     Args:
         study: Name of the study.
     """
-    with (TOP / "reports" / study / "verdicts.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    view = ("metric", "world", "regime", "baseline")
-    first = [row for row in rows if all(row[key] == rows[0][key] for key in view)]
+    views = read_stored_study(TOP / "reports" / study).pack["views"]
+    key, view = next(iter(views.items()))
+    return key.baseline, view["rows"]
+
+
+def board_table(study: str) -> str:
+    """Table of the opening view of a published study. Rows with equal numbers are joined.
+
+    Args:
+        study: Name of the study.
+    """
+    baseline, first = opening_rows(study)
     filters_by_cells: dict[tuple[str, ...], list[str]] = {}
     for row in first:
         level, ratio = (
             f"{_digits(float(row[name]))} [{_digits(float(row[low]))}, {_digits(float(row[high]))}]"
-            if row[name] and row[low] and row[high]
+            if None not in (row[name], row[low], row[high])
             else "–"
             for name, low, high in (
                 ("value", "low", "high"),
@@ -120,7 +130,7 @@ def board_table(study: str) -> str:
             )
         )
         shares = (
-            f"{100 * float(row[name]):.0f} %" if row[name] else "–"
+            f"{100 * float(row[name]):.0f} %" if row[name] is not None else "–"
             for name in ("track", "coverage")
         )
         cells = (level, ratio, *shares)
@@ -129,7 +139,7 @@ def board_table(study: str) -> str:
     head = (
         "filter",
         f"error [{unit}]" if unit else "error",
-        f"ratio to `{rows[0]['baseline']}`",
+        f"ratio to `{baseline}`",
         "track kept",
         "true values in 90 % regions",
     )
@@ -178,7 +188,7 @@ def claims() -> str:
 def all_seven() -> str:
     """Scenarios, first sentences and planned comparisons of the study of all methods."""
     folder = TOP / "reports" / "all_seven"
-    pack = json.loads(gzip.decompress((folder / "page.json.gz").read_bytes()))
+    pack = read_stored_study(folder).pack
     experiment = (TOP / "experiments" / "all_seven.yaml").read_text()
     scenarios = re.search(r"^      scenario: (.+)$", experiment, re.MULTILINE)
     names = "; ".join(world["name"] for world in pack["worlds"])
@@ -260,10 +270,8 @@ def read_script_results(script: str) -> tuple[ModuleType, dict[str, Any]]:
 
 def _planned_equal_time(study: str) -> list[tuple[str, ...]]:
     """Cells of the planned pairs of a learned proposal and a filter that takes less time."""
-    folder = TOP / "reports" / study
-    pack = json.loads(gzip.decompress((folder / "page.json.gz").read_bytes()))
-    with (folder / "verdicts.csv").open(encoding="utf-8", newline="") as file:
-        times = {row["filter"]: float(row["ms"]) for row in csv.DictReader(file) if row["ms"]}
+    pack = read_stored_study(TOP / "reports" / study).pack
+    times = {row["filter"]: float(row["ms"]) for row in opening_rows(study)[1] if row["ms"]}
     words = {"better": "smaller", "worse": "larger"}
     return [
         (

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,8 +18,8 @@ import pandas as pd
 from ceiling import STORE, largest_limit, root_mean
 from recorded_wins import KALMAN, KINDS, Condition, recorded_table
 from second_seed import (
+    compare_better,
     compare_rankings,
-    compare_robust,
     rank_filters,
     read_runs,
     seed_table,
@@ -29,15 +29,20 @@ from terrain_wins import STUDIES as TERRAIN_STUDIES, describe_answer, terrain_ta
 from tuned_worlds import tuned_table
 
 from pfbench.files import markdown_head, markdown_row
-from pfbench.report import StudyFacts, compare_with_control, find_robust_filters, read_page_data
-from pfbench.results import order_statistic_interval
+from pfbench.report import StudyFacts, arrange_study, read_stored_study
+from pfbench.results import (
+    Verdict,
+    compare_filters,
+    compute_losses,
+    decide,
+    order_statistic_interval,
+)
 
 TOP = Path(__file__).parents[2]
 PAGE = TOP / "docs" / "robustness.md"
 STUDIES = ("robust_flight", "robust_simulated", "robust_quad", "robust_car", "robust_canyon")
 RECORDED = ("robust_quad", "recorded_quad", "robust_car", "recorded_car", "robust_canyon")
 CONTROL, NOMINAL, OUTLIERS = "ekf_scaled_tuned", "nominal", "outliers"
-CONTROLS = (CONTROL, "ekf_scaled", "ekf")
 SAMPLED_HYPOTHESES = "rbpf_discrete"  # particles of noise hypotheses, a Kalman filter for each
 LEVEL = 0.95
 _BLOCK = re.compile(r"<!-- numbers:(\w+) -->\n.*?<!-- numbers:end -->", re.DOTALL)
@@ -46,7 +51,7 @@ Row = dict[Any, Any]
 
 
 class Study(NamedTuple):
-    """Stored files of a study: all runs, rows of verdicts.csv of the RMSE per condition, names and options."""
+    """A published study: all runs, rows of the RMSE per condition, names and options."""
 
     runs: pd.DataFrame
     rows: pd.DataFrame
@@ -72,11 +77,15 @@ def read_study(name: str) -> Study:
         name: Name of the study.
     """
     folder = TOP / "reports" / name
-    rows = pd.read_csv(folder / "verdicts.csv")
-    rows = rows[(rows["metric"] == "rmse") & (rows["world"] != "all") & (rows["regime"] != "all")]
-    rows = rows[rows["verdict"] != "missing"].drop_duplicates(["world", "regime", "filter"])
-    facts = StudyFacts.from_pack(read_page_data(folder))
-    return Study(pd.read_parquet(folder / "runs.parquet"), rows, facts)
+    pack, table = read_stored_study(folder)
+    rows = pd.DataFrame([
+        {"world": key.world, "regime": key.regime, **row}
+        for key, view in pack["views"].items()
+        for row in view["rows"]
+        if key.metric == "rmse" and "all" not in (key.world, key.regime) and row["verdict"] != "missing"
+    ])  # fmt: skip
+    rows = rows.drop_duplicates(["world", "regime", "filter"])
+    return Study(table, rows, StudyFacts.from_pack(pack))
 
 
 def _percent(share: float) -> str:
@@ -139,38 +148,53 @@ def _describe_limit(world: str) -> str:
     return f"No limit holds: {stored['reason'].removeprefix('no bound: ').rstrip('.')}. {reached}"
 
 
-def find_robust(study: Study, world: str, controls: Sequence[str]) -> tuple[str, ...]:
-    """Return the filters that fulfil the rule of the word "robust" against each of several controls.
-
-    The level is divided by the number of controls.
+def compare_with_control(
+    runs: pd.DataFrame, facts: StudyFacts, world: str, regime: str
+) -> list[Verdict]:
+    """Compare all filters of a scenario with the control in one regime.
 
     Args:
-        study: Files of a study.
-        world: Scenario with outliers and nominal noise.
-        controls: Labels of the controls.
+        runs: Runs of the study.
+        facts: Other inputs of its decisions.
+        world: Scenario.
+        regime: Noise regime.
     """
-    table = study.runs[study.runs["scenario"] == world]
-    labels = tuple(study.facts.looks)
-    alpha = study.facts.options.alpha / len(controls)
-    evidence = (compare_with_control(table, labels, control=control) for control in controls)
-    sets = [find_robust_filters(pairs or {}, alpha) for pairs in evidence]
-    return tuple(name for name in labels if all(name in names for names in sets))
+    table = runs[(runs["scenario"] == world) & (runs["regime"] == regime)]
+    labels = [label for label in facts.looks if label in set(table["filter"])]
+    if CONTROL not in labels:
+        return []
+    arranged = arrange_study(table, labels, facts.worlds)
+    pairs = [(label, CONTROL) for label in labels if label != CONTROL]
+    return decide(compare_filters(arranged, compute_losses(arranged, "rmse"), pairs))
 
 
-def robust() -> str:
-    """Table of the robust filters in each scenario with outliers and nominal noise."""
-    lines = markdown_head("world", f"against `{CONTROL}`", "against all three controls")
+def format_verdict(verdict: Verdict) -> str:
+    """Format the ratio of a verdict with its simultaneous interval."""
+    return f"{verdict.ratio:.2f} [{verdict.low:.2f}, {verdict.high:.2f}]"
+
+
+def against_control() -> str:
+    """Table of the filters that are better than the control in outliers, with both intervals."""
+    lines = markdown_head("world", "filter", "outliers", "nominal", "verdict in nominal noise")
     for study in map(read_study, STUDIES):
         for world in study.facts.worlds:
-            regimes = set(study.runs.loc[study.runs["scenario"] == world, "regime"])
-            if {OUTLIERS, NOMINAL} <= regimes:
-                names = (find_robust(study, world, c) for c in (CONTROLS[:1], CONTROLS))
-                gains = compare_outliers(study, world)
-                cells = (
-                    ", ".join(f"`{name}` ({gains[name]:+.2g} %)" for name in group) or "none"
-                    for group in names
+            nominal, outliers = (
+                {v.a: v for v in compare_with_control(study.runs, study.facts, world, regime)}
+                for regime in (NOMINAL, OUTLIERS)
+            )
+            better = sorted(
+                (v for v in outliers.values() if v.word == "better"), key=lambda v: v.ratio
+            )
+            lines += [
+                markdown_row(
+                    f"`{world}`", f"`{v.a}`", format_verdict(v),
+                    format_verdict(nominal[v.a]) if v.a in nominal else "–",
+                    nominal[v.a].word if v.a in nominal else "–",
                 )
-                lines.append(markdown_row(f"`{world}`", *cells))
+                for v in better
+            ]  # fmt: skip
+            if outliers and not better:
+                lines.append(markdown_row(f"`{world}`", "none", "–", "–", "–"))
     return "\n".join(lines)
 
 
@@ -182,7 +206,7 @@ def _kind(family: str, label: str) -> str:
 
 
 def seeds() -> str:
-    """Compare the best filters and the verdict "robust" with those of another seed."""
+    """Compare the best filters, and those that are better than the control, with those of another seed."""
     studies = {name: read_study(name) for name in STUDIES if len(read_runs(name))}
     tables = {name: select_common(study.runs, read_runs(name)) for name, study in studies.items()}
     cells = {}
@@ -190,22 +214,11 @@ def seeds() -> str:
         first, second = (rank_filters(runs, studies[name].facts) for runs in pair)
         cells |= {key: compare_rankings(first[key], second[key]) for key in first}
 
-    def decide(
-        name: str, runs: pd.DataFrame, world: str, controls: Sequence[str]
-    ) -> tuple[str, ...]:
-        labels = set(runs["filter"])
-        facts = studies[name].facts
-        looks = {label: look for label, look in facts.looks.items() if label in labels}
-        study = studies[name]._replace(runs=runs, facts=facts._replace(looks=looks))
-        return find_robust(study, world, controls)
+    def decide_better(name: str, runs: pd.DataFrame, world: str) -> list[str]:
+        verdicts = compare_with_control(runs, studies[name].facts, world, OUTLIERS)
+        return [v.a for v in verdicts if v.word == "better"]
 
-    verdicts = "\n\n".join(
-        f"{title}:\n\n{compare_robust(tables, decide, (NOMINAL, OUTLIERS), controls)}"
-        for title, controls in (
-            (f"Against `{CONTROL}`", CONTROLS[:1]),
-            ("Against all three controls", CONTROLS),
-        )
-    )
+    verdicts = compare_better(tables, decide_better, OUTLIERS)
     lacking = [describe_lacking(name, pair) for name, pair in tables.items()]
     lacking += [f"- `{name}`" for name in STUDIES if name not in studies]
     for name in TERRAIN_STUDIES:
@@ -248,18 +261,6 @@ def recorded() -> str:
     conditions = [c for name in RECORDED for c in list_conditions(name, read_study(name).runs)]
     second = [c for name in STUDIES for c in list_conditions(name, read_runs(name))]
     return recorded_table(conditions, {f"{c.study} {c.regime}": c for c in second})
-
-
-def compare_outliers(study: Study, world: str) -> dict[str, float]:
-    """Compare the errors in outliers with those of the control: change of the median in percent, by filter.
-
-    Args:
-        study: Files of a study.
-        world: Scenario with outliers.
-    """
-    runs = study.runs[(study.runs["scenario"] == world) & (study.runs["regime"] == OUTLIERS)]
-    medians = runs.assign(rmse=runs["rmse"].fillna(np.inf)).groupby("filter")["rmse"].median()
-    return {str(label): 100 * (value / medians[CONTROL] - 1) for label, value in medians.items()}
 
 
 def list_conditions(name: str, runs: pd.DataFrame) -> list[Condition]:
@@ -305,7 +306,7 @@ def answer() -> str:
 
 BLOCKS: dict[str, Callable[[], str]] = {
     "tuned": tuned,
-    "robust": robust,
+    "against_control": against_control,
     "seeds": seeds,
     "recorded": recorded,
     "answer": answer,

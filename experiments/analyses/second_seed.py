@@ -8,22 +8,23 @@ Both seeds are decided by the same rules, each for the filters and the condition
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 from scipy import stats
 
 from pfbench.files import markdown_head, markdown_row
-from pfbench.report import StudyFacts, decide_parts
+from pfbench.report import StudyFacts, arrange_study
+from pfbench.results import compare_filters, compute_losses, decide
 
 RUNS = Path(__file__).parent / "second_seed.parquet"
 CONDITION = ["scenario", "regime"]
-_WORSE = ("worse", "not_kept")
+_WORSE = ("worse",)
 SAME, OPEN, CHANGED = "same", "not decided", "changes"
 
 Ranking = list[tuple[str, str]]  # filters with their verdicts, the best first
@@ -85,20 +86,25 @@ def select_common(first: pd.DataFrame, second: pd.DataFrame) -> tuple[pd.DataFra
 
 
 def rank_filters(runs: pd.DataFrame, facts: StudyFacts) -> dict[tuple[str, str], Ranking]:
-    """Rank the filters of each condition by the rules of the page of a study.
+    """Rank the filters of each condition, with the verdict on each against the best of them.
 
     Args:
         runs: Runs of a study.
         facts: Other inputs of its decisions.
     """
-    labels = set(runs["filter"])
-    looks = {label: look for label, look in facts.looks.items() if label in labels}
-    views = decide_parts(runs, facts._replace(looks=looks, times={}))["views"]
+    labels = [label for label in facts.looks if label in set(runs["filter"])]
+    arranged = arrange_study(runs, labels, facts.worlds)
+    losses = compute_losses(arranged, "rmse")
     rankings: dict[tuple[str, str], Ranking] = {}
-    for key, view in views.items():
-        if "all" not in (key.world, key.regime) and key.metric == "rmse":
-            rows = sorted(view["rows"], key=lambda row: row["rank"] or math.inf)  # None: not kept
-            rankings[key.world, key.regime] = [(row["filter"], row["verdict"]) for row in rows]
+    for k, row in arranged.conditions.iterrows():
+        level = np.nanmedian(losses[:, k], axis=1)
+        order = [labels[i] for i in np.argsort(level, kind="stable") if not np.isnan(level[i])]
+        condition = arranged.select(arranged.conditions.index == k)
+        pairs = [(label, order[0]) for label in order[1:]]
+        verdicts = decide(compare_filters(condition, losses[:, [k]], pairs))
+        rankings[row["scenario"], row["regime"]] = [
+            (order[0], "best"), *((v.a, v.word) for v in verdicts)
+        ]  # fmt: skip
     return rankings
 
 
@@ -136,36 +142,34 @@ def seed_table(cells: Mapping[tuple[str, str], BestFilter]) -> str:
     ])  # fmt: skip
 
 
-def compare_robust(
+def compare_better(
     studies: Mapping[str, tuple[pd.DataFrame, pd.DataFrame]],
-    decide: Callable[[str, pd.DataFrame, str, Sequence[str]], Sequence[str]],
-    regimes: tuple[str, str],
-    controls: Sequence[str],
+    decide_better: Callable[[str, pd.DataFrame, str], Sequence[str]],
+    regime: str,
 ) -> str:
-    """Table and sentence on the verdict "robust" of each filter with two seeds.
+    """Table and sentence on the filters that are better than the control in a regime, with two seeds.
 
     Args:
         studies: Runs of both seeds by study, of common filters and conditions.
-        decide: Returns the robust filters of a study by its runs in a scenario, against the controls.
-        regimes: Regimes that the verdict needs.
-        controls: Controls, which are not counted.
+        decide_better: Returns the filters of a study that are better in a scenario, by its runs.
+        regime: Regime that is compared.
     """
-    lines = markdown_head("world", "robust with both seeds", "seed 1 only", "seed 2 only")
+    lines = markdown_head("world", "better with both seeds", "seed 1 only", "seed 2 only")
     number = both = one = 0
     for study, tables in studies.items():
         for world, runs in tables[0].groupby("scenario", sort=False):
-            if not set(regimes) <= set(runs["regime"]):
+            if regime not in set(runs["regime"]):
                 continue
-            sets = [set(decide(study, t, str(world), controls)) - set(controls) for t in tables]
+            sets = [set(decide_better(study, t, str(world))) for t in tables]
             groups = (sets[0] & sets[1], sets[0] - sets[1], sets[1] - sets[0])
-            number += len(set(runs["filter"]) - set(controls))
+            number += runs["filter"].nunique() - 1
             both += len(groups[0])
             one += len(groups[1]) + len(groups[2])
             cells = (", ".join(f"`{name}`" for name in sorted(group)) or "–" for group in groups)
             lines.append(markdown_row(f"`{world}`", *cells))
     return "\n".join([
         *lines, "",
-        f"Of {number} pairs of a filter and a world, without the controls, {both} are robust with both seeds, {one} with one of them "
+        f"Of {number} pairs of a filter and a world, {both} are better than the control with both seeds, {one} with one of them "
         f"and {number - both - one} with none.",
     ])  # fmt: skip
 

@@ -19,6 +19,7 @@ from paired_errors import ALPHA, LOST, compare_with_all, describe_comparison, si
 from second_seed import read_runs
 
 from pfbench.files import markdown_head, markdown_row
+from pfbench.report import read_stored_study
 from pfbench.results import holm, wilcoxon_signed_rank
 
 LIMITS = Path(__file__).with_name("terrain_limit.json")
@@ -204,27 +205,25 @@ def describe_answer(runs: Mapping[str, pd.DataFrame], families: Mapping[str, str
 
 
 def describe_joint(name: str, scenario: str) -> str:
-    """State the verdicts of the report on both banks, which hold for all pairs of filters together.
+    """State the verdicts of the report on both banks against the particle filter, which hold for all filters together.
 
     Args:
         name: Name of the study.
         scenario: Name of the condition in the stored files.
     """
-    table = pd.read_csv(REPORTS / name / "verdicts.csv")
-    is_view = (table["metric"] == "rmse") & (table["world"] == scenario)
-    rows = table[is_view & (table["baseline"] == PARTICLES)].drop_duplicates("filter")
-    found = rows.set_index("filter")
-    best = found.index[found["verdict"] == "best"]
-    words = {"open": "not decided", "equal": "equal"}
+    pack, _ = read_stored_study(REPORTS / name)
+    view = next(
+        view
+        for key, view in pack["views"].items()
+        if (key.metric, key.world, key.baseline) == ("rmse", scenario, PARTICLES)
+    )
+    rows = {row["filter"]: row for row in view["rows"]}
     told = (
-        f"`{bank}` is {words.get(v := found.loc[bank, 'verdict'], v)} "
-        f"({str(found.loc[bank, 'words']).strip(chr(39))})"
+        f"`{bank}` {rows[bank]['ratio']:.2f} [{rows[bank]['ratio_low']:.2f}, {rows[bank]['ratio_high']:.2f}], "
+        f"{rows[bank]['verdict']}"
         for bank in BANKS
     )
-    return (
-        f"The report decides all pairs of filters together, against the smallest error, that of `{best[0]}`: "
-        f"{', '.join(told)}."
-    )
+    return f"The report compares all filters with `{PARTICLES}` together: {'; '.join(told)}."
 
 
 def describe_all_studies(

@@ -197,6 +197,7 @@ PAPERS = {
 
 
 NOT_STATED, NOT_RUN = "not specified in the paper", "not run"
+HOLDS, FAILS = "holds", "fails"
 NO_POWER, LOST = "too few runs", "too many lost runs"
 REASONS = (NOT_STATED, NOT_RUN, NO_POWER, LOST)
 MARKS = ("circular", "vacuous")

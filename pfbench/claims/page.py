@@ -16,7 +16,15 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pfbench.claims.claim_records import PAPERS, Claim, ClaimTest, list_choices, read_claims
+from pfbench.claims.claim_records import (
+    FAILS,
+    HOLDS,
+    PAPERS,
+    Claim,
+    ClaimTest,
+    list_choices,
+    read_claims,
+)
 from pfbench.claims.measurements import (
     Side,
     check_stored_verdicts,
@@ -35,7 +43,6 @@ from pfbench.report import cost, writers, writers as table_formats
 from pfbench.report.papers.figures import FIGURES
 from pfbench.report.provenance import distinct_values
 from pfbench.results.plotting import COLUMN, SMALL, FigureSpec, format_slug, set_plain_ticks
-from pfbench.stats.decision import FAILS, HOLDS
 from pfbench.stats.study_runs import natural_sort_key
 
 # --------------------------------------------------------------------------------------------------
@@ -87,7 +94,7 @@ def write_claims(
         if len(context["made"]):
             writers.write_table(folder, "studies", context["made"])
         drawings = claim_figures(verdicts)
-        context["drawings"] = writers.render_figures(drawings, CLAIMS_STUDY, folder, formats)
+        context["drawings"] = writers.write_figures(drawings, CLAIMS_STUDY, folder, formats)
         return writers.render_template("page", folder, context, Path(__file__).parent)
 
 

@@ -9,9 +9,8 @@ import numpy as np
 import pandas as pd
 from scipy import stats
 
-from pfbench.claims.claim_records import LOST, NO_POWER, NOT_RUN, Claim, ClaimTest
+from pfbench.claims.claim_records import FAILS, HOLDS, LOST, NO_POWER, NOT_RUN, Claim, ClaimTest
 from pfbench.stats import study_size
-from pfbench.stats.decision import FAILS, HOLDS
 from pfbench.stats.effects import beyond_finite, log_ratio
 from pfbench.stats.error_measures import Array
 from pfbench.stats.intervals import order_statistic_interval

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pfbench.cli.compose import compose_study
 from pfbench.cli.report import check_has_results, find_page_data, make_report_options
 from pfbench.job.config import JobConfig
 
 if TYPE_CHECKING:
-    from pfbench.files.recorded_folder import RecordedFolder
-    from pfbench.report.journal.figure_style import PageFormat
+    import pandas as pd
 
 HELP = """\
 pfbench paper study=NAME journal=ieee|elsevier|springer [key=value ...]
@@ -20,8 +19,7 @@ pfbench paper study=NAME width=120mm [key=value ...]
 
 Write the paper export of a study to REPORTS/STUDY/paper/: figures as PDF (and PGF if pdflatex is installed),
 tables, methods paragraph, references, paper.tex, and the values of all runs. A table that does not fit the page
-is refused. Without results, the paper is made of the stored data of the report (page.json.gz, verdicts.csv,
-runs.parquet).
+is refused. Without results, the paper is made of the stored runs of the report (runs.parquet).
 
   pfbench paper study=quickstart journal=ieee
   pfbench paper study=mine width=345pt report.alpha=0.01
@@ -39,18 +37,18 @@ def write_study_paper(words: Sequence[str]) -> None:
     config = compose_study([word for word in words if word.partition("=")[0] not in values])
     from pfbench.files.recorded_folder import RecordedFolder
     from pfbench.report.journal.paper_folder import write_paper
-    from pfbench.report.study_report import read_page_data
+    from pfbench.report.stored_study import RUNS, format_runs, read_stored_study
+    from pfbench.report.study_report import format_verdicts
 
     study, reports = config.values["study"], Path(config.values["reports_dir"])
     stored = find_page_data(config, words)
     if stored is None:
         check_has_results(study, Path(config.values["results_dir"]))
+    pack, table = _read_results(config) if stored is None else read_stored_study(stored.parent)
     with RecordedFolder(reports / study / "paper") as folder:
-        if stored is None:
-            remarks = _write_of_results(config, page, folder)
-        else:
-            remarks = write_paper(read_page_data(stored.parent), page, folder)
-            _copy_data(stored.parent, folder)
+        remarks = write_paper(pack, page, folder)
+        folder.write("verdicts.csv", format_verdicts(pack))
+        folder.write(RUNS, format_runs(table, pack))
     if stored is not None:
         print(f"note: without results, the paper is made of {stored}")
     for remark in remarks:
@@ -58,28 +56,18 @@ def write_study_paper(words: Sequence[str]) -> None:
     print(f"paper: {(folder.path / 'paper.tex').resolve()}")
 
 
-def _write_of_results(config: JobConfig, page: PageFormat, folder: RecordedFolder) -> list[str]:
-    """Write the paper of the results of a study with the values of all views and runs; return remarks."""
+def _read_results(config: JobConfig) -> tuple[dict[str, Any], pd.DataFrame]:
+    """Read and decide the results of a study: data of its page, and values of all runs."""
     from pfbench.report.board import build_pack, read_study
-    from pfbench.report.journal.paper_folder import write_paper
-    from pfbench.report.study_report import write_verdict_files
+    from pfbench.report.stored_study import round_runs
     from pfbench.results.conditions import load_conditions
 
     study, results = config.values["study"], config.values["results_dir"]
     options = make_report_options(config)
     conditions = load_conditions(study, results, allow_mixed_versions=options.allow_mixed_versions)
     data = read_study(conditions, options)
-    pack = build_pack(study, conditions, options, data)
-    remarks = write_paper(pack, page, folder)
-    write_verdict_files(pack, data.table, folder)
-    return remarks
-
-
-def _copy_data(report: Path, folder: RecordedFolder) -> None:
-    """Copy the values of all views and runs that git stores with the data of a page."""
-    for name in ("verdicts.csv", "runs.parquet"):
-        if (report / name).is_file():
-            folder.write(name, (report / name).read_bytes())
+    data = data._replace(table=round_runs(data.table))
+    return build_pack(study, conditions, options, data), data.table
 
 
 def _value(words: Sequence[str], key: str) -> str:

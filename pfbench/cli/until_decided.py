@@ -7,12 +7,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pfbench.job.config import JobConfig
 
 if TYPE_CHECKING:
-    from pfbench.results.look_table import LookTable
+    import pandas as pd
+
+    from pfbench.results.conditions import Condition
     from pfbench.stats.pair_states import LookRecord, LookSchedule, PairState
 
 from pfbench.cli.compose import UNTIL_DECIDED, StudyPlan
@@ -21,6 +23,24 @@ _HOUR = 3600.0
 
 # of the report: the decisions of a study follow from them, so they must not change between looks
 _DECIDING_SETTINGS = ("metric", "alpha", "equivalence_margin", "start_time_s")
+
+
+class LookData(NamedTuple):
+    """Results of a study until a look.
+
+    Attributes:
+        table: One row per filter, condition and run, without copies of runs.
+        conditions: Conditions with their jobs.
+        parts: Number of result files.
+        seconds: Time that the simulation and the filters used, s.
+        warning: Sentence on runs that are not independent; empty if none is shown.
+    """
+
+    table: pd.DataFrame
+    conditions: Sequence[Condition]
+    parts: int
+    seconds: float
+    warning: str
 
 
 @dataclass(frozen=True)
@@ -55,7 +75,7 @@ class GrowingSweep:
         settings = values["until_decided"]
         if not isinstance(settings, Mapping):
             raise ValueError(
-                f"until_decided must have the keys mode, max_runs and max_hours, got {settings}. Leave it out."
+                f"until_decided must have the keys max_runs and max_hours, got {settings}. Leave it out."
             )
         hours = settings["max_hours"]
         if hours is not None and (type(hours) not in (int, float) or not 0 < hours < math.inf):
@@ -70,7 +90,7 @@ class GrowingSweep:
                 f"number of particles at each look, got {values['budget']}. Use budget=particles."
             )
         check_main_metric(values["report"]["metric"])
-        schedule, jobs = LookSchedule(settings["mode"], settings["max_runs"]), plan.compose_jobs()
+        schedule, jobs = LookSchedule(settings["max_runs"]), plan.compose_jobs()
         if all(config.values["filter"] == jobs[0].values["filter"] for config in jobs):
             raise ValueError(
                 "filter must be at least two filters with runs=until-decided, got one per condition. "
@@ -102,15 +122,19 @@ class GrowingSweep:
         folder = self.results / self.study
         return all((folder / f"{key}.npz").exists() for key in self.job_keys(number))
 
-    def read(self, number: int) -> LookTable:
-        """Read the results until a look."""
-        from pfbench.results.look_table import LookMetric, read_look_table
-        from pfbench.results.paper_block import plan_installed_pairs
+    def read(self, number: int) -> LookData:
+        """Read the results until a look: one row per filter, condition and run, without copies of runs."""
+        from pfbench.report.board import build_run_table
+        from pfbench.results.conditions import load_conditions
+        from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
 
-        metric = LookMetric(self.report["metric"], self.report["start_time_s"])
-        return read_look_table(
-            self.study, self.results, self.job_keys(number), plan_installed_pairs, metric
-        )
+        conditions = load_conditions(self.study, self.results, keys=self.job_keys(number))
+        table = build_run_table(conditions, self.report["start_time_s"], self.report["metric"])
+        copies, warning = assess_runs(table, "rmse", RUN)
+        jobs = [job for condition in conditions for job in condition.jobs]
+        seconds = sum(job.meta["seconds"]["world"] + job.meta["seconds"]["filter"] for job in jobs)
+        parts = sum(len(job.parts) for job in jobs)
+        return LookData(drop_runs(table, copies, RUN), conditions, parts, float(seconds), warning)
 
     def run(self, run_part: Callable[[Sequence[str]], None]) -> None:
         """Run look after look until all pairs are decided or a cap is reached."""
@@ -130,10 +154,10 @@ class GrowingSweep:
                 record.write(lines)
                 print(f"{reason}\n{self._next_command()}")
                 return
-            table = self._compute_look(number, run_part)
-            seconds = table.seconds
-            earlier, states = states, self._decide(table)
-            lines.append(format_look(number, self.schedule, states, earlier, table.warning))
+            data = self._compute_look(number, run_part)
+            seconds = data.seconds
+            earlier, states = states, self._decide(data)
+            lines.append(format_look(number, self.schedule, states, earlier, data.warning))
             print(lines[-1], flush=True)
             state = describe_end(number, self.schedule, states)
             record.write(lines, state)
@@ -146,14 +170,13 @@ class GrowingSweep:
         from pfbench.stats.pair_states import RECORD, LookRecord
 
         request = {
-            "until_decided.mode": self.schedule.mode,
             "until_decided.max_runs": self.schedule.max_runs,
             **{f"report.{name}": self.report[name] for name in _DECIDING_SETTINGS},
             "jobs": sorted(self.job_keys(1)),
         }
         return LookRecord(self.results / self.study / RECORD, request)
 
-    def _compute_look(self, number: int, run_part: Callable[[Sequence[str]], None]) -> LookTable:
+    def _compute_look(self, number: int, run_part: Callable[[Sequence[str]], None]) -> LookData:
         """Run the jobs of a look without a result, and read all runs so far."""
         start = self.jobs[0].values["first_run"]
         parts = [
@@ -163,32 +186,37 @@ class GrowingSweep:
         if self.repeats_jobs or not self.has_results(number):
             run_part(parts[-1])
         try:
-            table = self.read(number)
-            is_complete = table.parts == len(self.job_keys(number))
+            data = self.read(number)
+            is_complete = data.parts == len(self.job_keys(number))
         except ValueError:  # parts without their neighbours; another reason is raised again below
             is_complete = False
         if not is_complete:  # damaged files were set aside
             for words in parts:
                 run_part(words)
-            table = self.read(number)
-        return table
+            data = self.read(number)
+        return data
 
-    def _decide(self, table: LookTable) -> list[PairState]:
-        """Decide the planned pairs with the runs so far."""
-        from pfbench.report.options import ReportOptions
-        from pfbench.stats.main_metrics import RULES
-        from pfbench.stats.pair_states import decide_pairs
+    def _decide(self, data: LookData) -> list[PairState]:
+        """Decide the pairs that were fixed in advance with the runs so far."""
+        from pfbench.report.board import arrange_study
+        from pfbench.results.looks import study_part_names
+        from pfbench.results.paper_block import plan_installed_pairs
+        from pfbench.stats.pair_states import decide_at_looks
+        from pfbench.stats.study_runs import share_conditions
 
-        runs, required = table.runs["run"].nunique(), self.schedule.runs[0]
-        if runs < required:
+        count, required = len(data.table[["seed", "run"]].drop_duplicates()), self.schedule.runs[0]
+        if count < required:
             raise ValueError(
-                f"runs must be at least {required} independent ones, got {runs}. {table.warning} Use a "
+                f"runs must be at least {required} independent ones, got {count}. {data.warning} Use a "
                 "scenario whose data differ from run to run, or set a number of runs."
             )
-        names = ("alpha", "equivalence_margin", "metric")
-        report = ReportOptions(**{name: self.report[name] for name in names})
-        rule, options = RULES[report.metric], report.decision_options
-        return decide_pairs(table.runs, table.pairs, self.schedule, options, rule)
+        labels = sorted(data.table["filter"].unique())
+        runs = arrange_study(data.table, labels, study_part_names(data.conditions, "scenario"))
+        pairs = [pair for pair in plan_installed_pairs(labels) if share_conditions(runs, *pair)]
+        margin = math.log1p(self.report["equivalence_margin"])
+        return decide_at_looks(
+            runs, pairs, self.schedule, self.report["metric"], margin, self.report["alpha"]
+        )
 
     def _exceeds_time(self, seconds: float, number: int) -> str:
         """Return why a look must not begin: its expected end exceeds the limit; empty if it may."""

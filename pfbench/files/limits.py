@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import io
 import stat
 import zipfile
 import zlib
@@ -80,14 +81,19 @@ def check_zip(path: Path) -> None:
 def read_gzip(path: Path) -> bytes:
     """Read a gzip file, which does not state its size, up to the limit."""
     check_is_file(path, TABLE_BYTES)
+    return inflate(path, path.read_bytes())
+
+
+def inflate(path: Path, content: bytes) -> bytes:
+    """Inflate gzip content of a file, which does not state its size, up to the limit of the file."""
     most = _most_inflated(path)
     try:
-        with gzip.open(path) as file:
-            content = file.read(most + 1)
+        with gzip.open(io.BytesIO(content)) as file:
+            inflated = file.read(most + 1)
     except (zlib.error, EOFError, gzip.BadGzipFile) as error:
         raise ValueError(f"{path} must be a gzip file, got {error}. Write it again.") from error
-    check_inflated(path, len(content))
-    return content
+    check_inflated(path, len(inflated))
+    return inflated
 
 
 def _most_inflated(path: Path) -> int:

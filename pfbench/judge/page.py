@@ -74,7 +74,7 @@ def write_judgement(
             if len(content):
                 writers.write_table(folder, table, content)
         figures = error_figures(judgement.sequences)
-        context["drawings"] = writers.render_figures(figures, "judge", folder, formats)
+        context["drawings"] = writers.write_figures(figures, "judge", folder, formats)
         return writers.render_template("judge", folder, context, Path(__file__).parent)
 
 

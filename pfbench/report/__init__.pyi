@@ -1,29 +1,33 @@
 """Public names of `pfbench.report` and the modules that define them."""
 
 from pfbench.report.board.entries import cell_entries as cell_entries
-from pfbench.report.board.pack import StudyFacts as StudyFacts, decide_parts as decide_parts
-from pfbench.report.board.robust_word import (
-    compare_with_control as compare_with_control,
-    find_robust_filters as find_robust_filters,
+from pfbench.report.board.pack import (
+    StudyFacts as StudyFacts,
+    arrange_study as arrange_study,
+    decide_parts as decide_parts,
 )
 from pfbench.report.journal.figure_style import find_page_format as find_page_format
 from pfbench.report.journal.ratio_figures import (
     is_equal_drawing as is_equal_drawing,
-    write_headline as write_headline,
+    render_headline as render_headline,
 )
 from pfbench.report.journal.table_layout import text_width as text_width
-from pfbench.report.overview.page import write_overview as write_overview
+from pfbench.report.overview.page import render_overview as render_overview
 from pfbench.report.papers.specs import (
     PaperFigure as PaperFigure,
     PaperFigureInput as PaperFigureInput,
 )
-from pfbench.report.study_page import write_markdown as write_markdown
+from pfbench.report.stored_study import (
+    RUNS as RUNS,
+    format_runs as format_runs,
+    read_stored_study as read_stored_study,
+)
+from pfbench.report.study_page import render_markdown as render_markdown, render_page as render_page
 from pfbench.report.study_report import (
-    PAGE_DATA as PAGE_DATA,
     find_overviews as find_overviews,
-    read_page_data as read_page_data,
     rebuild_page as rebuild_page,
-    write_page_data as write_page_data,
+    render_study as render_study,
+    write_report as write_report,
 )
 from pfbench.results.looks import count_tuned as count_tuned
 from pfbench.results.plotting import (

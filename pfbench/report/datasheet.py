@@ -49,9 +49,7 @@ def write_datasheet(
         "settings": json.dumps(sheet.meta["config"]["scenario"], indent=1),
     }
     with RecordedFolder(Path(out) / "datasheets" / name) as folder:
-        context["drawings"] = writers.render_figures(
-            datasheet_figures(sheet), name, folder, formats
-        )
+        context["drawings"] = writers.write_figures(datasheet_figures(sheet), name, folder, formats)
         for stem, table in tables.items():
             if len(table):
                 writers.write_table(folder, stem, table)

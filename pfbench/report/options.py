@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from pfbench.stats.decision import DecisionOptions
 from pfbench.stats.main_metrics import check_main_metric
 
 _FORMATS = ("svg", "png")
@@ -50,11 +49,10 @@ class ReportOptions:
         equivalence_margin: Relative difference of RMSE up to which filters are equivalent.
         paper_figures: Names of `paper_figures.FIGURES`, None for the paper of the study's name.
         planned: Number of jobs of the experiment, if known.
-        metric: Metric of the main group that decides, one of `main_metrics.MAIN_METRICS`. The others are
-            in the second family.
+        metric: Metric of the main group that decides, one of `main_metrics.MAIN_METRICS`.
         title: Title of the page; empty for the name of the study.
-        baseline: Label of the filter that measures the others in the opening view; empty for the first of
-            `baselines.REFERENCES` that has an error. Planned pairs do not depend on it.
+        baseline: Label of the filter with which the opening view compares the others; empty for the first of
+            `baselines.REFERENCES` that the study has. Pairs compared in advance do not depend on it.
     """
 
     alpha: float = 0.05
@@ -88,8 +86,3 @@ class ReportOptions:
             raise ValueError(
                 f"report.figure_formats must be a subset of {options}, got {list(self.figure_formats)}. Use svg."
             )
-
-    @property
-    def decision_options(self) -> DecisionOptions:
-        """Options of all decisions: planned pairs are decided by the levels of the board."""
-        return DecisionOptions(self.alpha, self.equivalence_margin)

@@ -1,31 +1,24 @@
-"""The report of a study: an offline page, its data as a file, decisions, verdicts and figures."""
+"""The report of a study in three passes: load the results, decide, and write a dictionary of files once."""
 
 from __future__ import annotations
 
-import gzip
-import io
-import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 
-from pfbench.files import limits
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.files.table_file import check_parquet
 from pfbench.report import cost, provenance, writers
 from pfbench.report.board import build_pack, read_study
 from pfbench.report.board.entries import ViewKey
-from pfbench.report.board.pack import StudyFacts, decide_parts
-from pfbench.report.journal.ratio_figures import HEADLINE, write_headline
-from pfbench.report.methods_text import MethodsFacts
+from pfbench.report.board.pack import StudyFacts, arrange_study
+from pfbench.report.journal.ratio_figures import HEADLINE, render_headline
 from pfbench.report.options import ReportOptions
-from pfbench.report.overview.page import BOARD_PAGE, write_overview
+from pfbench.report.overview.page import BOARD_PAGE, render_overview
 from pfbench.report.overview.tables import (
     FEWEST_WORLDS,
     Overview,
@@ -34,36 +27,41 @@ from pfbench.report.overview.tables import (
 )
 from pfbench.report.papers import figures
 from pfbench.report.provenance import renew_bibliography
-from pfbench.report.study_page import write_page
-from pfbench.report.writers import format_csv, write_json
+from pfbench.report.stored_study import RUNS, format_runs, read_stored_study, round_runs
+from pfbench.report.study_page import render_page
+from pfbench.report.writers import format_csv
 from pfbench.results.conditions import (
     Condition,
     component_groups,
     load_conditions,
 )
-from pfbench.results.frame import list_main_groups
 from pfbench.results.looks import study_looks
 from pfbench.results.metrics import METRICS
-from pfbench.results.paper_block import name_run_command, plan_installed_pairs
+from pfbench.results.paper_block import name_run_command
 from pfbench.results.plotting import line_styles
 from pfbench.results.step_times import STEP_TIMES
-from pfbench.stats.consistency_bands import decide_consistency
-from pfbench.stats.decision import Decision, MetricRule
-from pfbench.stats.filter_sets import order_filters
-from pfbench.stats.main_metrics import (
-    RULES,
-    main_rule,
-    select_common_runs,
-    select_main_metrics,
-    tidy_main,
-    tidy_other_groups,
-    tidy_secondary,
+from pfbench.stats.comparison import decide
+from pfbench.stats.consistency_bands import assess_consistency
+from pfbench.stats.study_runs import (
+    compare_filters,
+    compute_losses,
+    natural_sort_key,
+    share_conditions,
 )
-from pfbench.stats.planned_pairs import decide_planned_pairs, decide_secondary_metrics
-from pfbench.stats.study_runs import natural_sort_key
 
-# --------------------------------------------------------------------------------------------------
-# The report of a study: an offline page, its numbers, decisions and figures.
+Files = dict[str, str | bytes]
+_SUMMARISED = ("scenario", "noise", "model", "label", "group", "component", "metric", "unit")
+# group and title of the files that a page offers
+_TITLES = {
+    "verdicts.csv": ("Numbers", "Verdicts of all views (CSV)"),
+    "decisions.csv": ("Numbers", "Verdicts on all pairs (CSV)"),
+    RUNS: ("Numbers", "Values of all runs (Parquet)"),
+    "metrics.csv": ("Numbers", "All metrics, summarised over runs (CSV)"),
+    "consistency.csv": ("Numbers", "NEES and NIS over their expectation (CSV)"),
+    STEP_TIMES: ("Numbers", "Times per step by round (JSON)"),
+    "pfbench.bib": ("LaTeX", "References (BibTeX)"),
+    HEADLINE: ("Figures", "Error relative to the baseline (SVG)"),
+}
 
 
 def write_report(
@@ -74,68 +72,135 @@ def write_report(
 ) -> Path:
     """Write the report of a study to `<out>/<study>/`.
 
-    The folder contains the page (index.html, report.md) with its numbers (verdicts.csv, runs.parquet,
-    metrics.csv, page.json.gz), decisions.json, consistency.json, pfbench.bib, headline.svg, and the figures of the papers. Equal
-    results give equal bytes. Files that an earlier report wrote are removed if this one does not write
-    them and they are unchanged (manifest.json). Other files stay.
+    The folder contains the page (index.html, report.md) with its numbers (verdicts.csv, decisions.csv, metrics.csv,
+    consistency.csv), the runs with all that a page needs (runs.parquet), pfbench.bib, headline.svg, and the figures of
+    the papers. Equal results give equal bytes. Files that an earlier report wrote are removed if this one does not
+    write them and they are unchanged (manifest.json). Other files stay.
 
     Returns path of index.html.
     """
     options = options or ReportOptions()
     conditions = load_conditions(study, results, allow_mixed_versions=options.allow_mixed_versions)
     _check_groups(conditions, options.convergence_threshold)
-    labels = sorted({job.label for c in conditions for job in c.jobs}, key=natural_sort_key)
-    style = line_styles(labels, study_looks(conditions))
-    drawings = figures.paper_figures(
-        study, conditions, style, options.paper_figures, options.start_time_s
-    )
     data = read_study(conditions, options, has_metrics=True)
-    pack = build_pack(study, conditions, options, data)
+    table = round_runs(data.table)
+    pack = build_pack(study, conditions, options, data._replace(table=table))
+    pack["provenance"] += list_job_settings(conditions, options.planned)
+    pack["definitions"] = [(metric.name, metric.caption) for metric in METRICS]
+    pack["paper_figures"], files = _draw_paper_figures(study, conditions, options)
+    files |= {
+        "metrics.csv": format_csv(summarise_metrics(data.metrics)),
+        "consistency.csv": format_csv(assess_consistency(data.metrics, options.alpha)),
+    }
+    times = conditions[0].jobs[0].path.parent / STEP_TIMES
+    if times.is_file():
+        files[STEP_TIMES] = times.read_bytes()
     with RecordedFolder(Path(out) / study) as folder:
-        pack["downloads"] = write_verdict_files(pack, data.table, folder)
-        pack["downloads"] += write_study_files(data.metrics, conditions, options, folder)
-        pack["provenance"] += list_job_settings(conditions, options.planned)
-        pack |= {
-            "paper_figures": writers.render_figures(
-                drawings, "paper", folder, options.figure_formats
-            ),
-            "definitions": [(metric.name, metric.caption) for metric in METRICS],
-        }
-        write_page_data(pack, folder)
-        write_headline(pack, folder)
-        pack["downloads"] += list_figure_files(folder.path)
-        return write_pages(pack, data.table, folder)
+        return _write_all(folder, {**files, **render_study(pack, table, folder.path, files)})
 
 
-def write_pages(
-    pack: Mapping[str, Any], table: pd.DataFrame | None, folder: RecordedFolder
-) -> Path:
-    """Write the page of a study; one with several proposed methods in several worlds has a page before it."""
+def rebuild_page(folder: Path) -> Path:
+    """Write the page of a study again, from the file of its runs.
+
+    Args:
+        folder: Folder of the report.
+
+    Returns:
+        Path of index.html.
+
+    Raises:
+        ValueError: If the file is damaged.
+    """
+    pack, table = read_stored_study(folder)
+    pack["bibtex"] = renew_bibliography(pack)
+    pack["replay_first"] = name_run_command(str(pack["study"]))
+    pack["paper_figures"] = [
+        {**entry, "source": writers.format_data_address(folder / entry["file"])}
+        for entry in pack["paper_figures"]
+    ]
+    others = {name: (folder / name).read_bytes() for name in _TITLES if (folder / name).is_file()}
+    others |= {f"figures/{path.name}": path.read_bytes() for path in (folder / "figures").glob("paper_*.*")}  # fmt: skip
+    with RecordedFolder(folder, is_complete=False) as target:
+        return _write_all(target, render_study(pack, table, folder, others))
+
+
+def render_study(
+    pack: dict[str, Any], table: pd.DataFrame, folder: Path, others: Mapping[str, str | bytes]
+) -> Files:
+    """Render all files of a study that follow from its runs: page, tables, runs, references and figures.
+
+    Args:
+        pack: Data of the page.
+        table: Values of all runs.
+        folder: Folder of the report, whose headline figure stays if it is equal.
+        others: Other files of the folder, which the page offers.
+    """
+    stored = (folder / HEADLINE).read_bytes() if (folder / HEADLINE).is_file() else b""
+    headline = render_headline(pack, stored)
+    pack["headline"] = "Error of each filter relative to the baseline" if headline else ""
+    files: Files = {
+        "verdicts.csv": format_verdicts(pack),
+        "decisions.csv": format_csv(list_decisions(pack, table)),
+        RUNS: format_runs(table, pack),
+        "pfbench.bib": pack["bibtex"],
+        **({HEADLINE: headline} if headline else {}),
+    }
+    pack["downloads"] = list_downloads({**others, **files})
     overviews = find_overviews(pack, table)
     if overviews is None:
-        return write_page(pack, folder)
-    write_page(pack, folder, BOARD_PAGE)
-    return write_overview(overviews, pack, folder)
+        return files | render_page(pack)
+    return files | render_page(pack, BOARD_PAGE) | render_overview(overviews, pack)
 
 
-def find_overviews(
-    pack: Mapping[str, Any], table: pd.DataFrame | None
-) -> dict[int, Overview] | None:
+def find_overviews(pack: Mapping[str, Any], table: pd.DataFrame) -> dict[int, Overview] | None:
     """Decide the first page of a study with several proposed methods in several worlds.
 
     Args:
         pack: Data of the page.
-        table: Runs of the study, None if they are not there.
+        table: Runs of the study.
 
     Returns:
         Tables of the page by number of particles; None for other studies.
     """
     facts = StudyFacts.from_pack(pack)
-    if table is None or not has_overview(table, facts.looks):
+    if not has_overview(table, facts.looks):
         return None
     overviews = build_overviews(table, facts.looks, facts.worlds)
     enough = all(len(overview.worlds) >= FEWEST_WORLDS for overview in overviews.values())
     return overviews if enough else None  # without references of worlds there is nothing to show
+
+
+def list_decisions(pack: Mapping[str, Any], table: pd.DataFrame) -> pd.DataFrame:
+    """Decide all pairs of filters over all conditions that both have, in one family, by the metric of the page."""
+    facts = StudyFacts.from_pack(pack)
+    labels = sorted(facts.looks, key=natural_sort_key)
+    runs = arrange_study(table, labels, facts.worlds)
+    pairs = [pair for pair in combinations(labels, 2) if share_conditions(runs, *pair)]
+    losses, margin = compute_losses(runs, facts.options.metric), math.log1p(pack["margin"])
+    verdicts = decide(compare_filters(runs, losses, pairs), margin, pack["alpha"])
+    return pd.DataFrame([verdict._asdict() for verdict in verdicts])
+
+
+def format_verdicts(pack: Mapping[str, Any]) -> str:
+    """Format all rows of all views as CSV."""
+    rows = [
+        {**dict(zip(ViewKey._fields, key, strict=True)), **row}
+        for key, view in pack["views"].items()
+        for row in view["rows"]
+    ]
+    return format_csv(pd.DataFrame(rows))
+
+
+def list_downloads(files: Mapping[str, str | bytes]) -> list[dict[str, Any]]:
+    """List files as downloads of the page."""
+    entries = []
+    for name, content in files.items():
+        path = Path(name)
+        figure = f"{path.stem.removeprefix('paper_').replace('_', ' ')} ({path.suffix[1:].upper()})"
+        group, title = _TITLES.get(name, ("Figures", figure))
+        size = len(content.encode() if isinstance(content, str) else content)
+        entries.append({"name": title, "href": name, "bytes": size, "group": group})
+    return entries
 
 
 def list_job_settings(conditions: Sequence[Condition], planned: int | None) -> list[list[str]]:
@@ -152,108 +217,13 @@ def list_job_settings(conditions: Sequence[Condition], planned: int | None) -> l
     return [list(row) for row in rows]
 
 
-def _check_groups(conditions: Sequence[Condition], thresholds: Mapping[str, float]) -> None:
-    """Check that the groups with a convergence threshold exist."""
-    states = [job.meta["state"] for condition in conditions for job in condition.jobs]
-    available = sorted({block.group for state in states for block in component_groups(state)})
-    if unknown := sorted(set(thresholds) - set(available)):
-        raise ValueError(
-            "report.convergence_threshold must name groups of the results, "
-            f"got {', '.join(unknown)}. Choose from {', '.join(available)}."
-        )
-
-
-# --------------------------------------------------------------------------------------------------
-# Files of a study next to its page: decisions, consistency of the filters, and all metrics.
-
-MAIN = "main group"  # if scenarios differ in it
-_KEYS = ("scenario", "noise", "model", "label", "group", "component", "metric", "unit")
-
-
-def write_study_files(
-    table: pd.DataFrame,
-    conditions: Sequence[Condition],
-    options: ReportOptions,
-    folder: RecordedFolder,
-) -> list[dict[str, Any]]:
-    """Write decisions.json, consistency.json, metrics.csv, and the times of `pfbench cost` if there are any.
-
-    Returns entries of the downloads of the page.
-    """
-    mains = list_main_groups(conditions)
-    names = set(mains.values())
-    name = names.pop() if len(names) == 1 else MAIN
-    others = tidy_other_groups(table, mains)
-    decisions = decide_study(select_main_metrics(table, mains, name), name, options, others)
-    bands = decide_consistency(table, options.decision_options)
-    files = {
-        "Decisions on all pairs (JSON)": write_json(folder, "decisions", decisions),
-        "Bands of NEES and NIS (JSON)": write_json(folder, "consistency", bands),
-        "All metrics, summarised over runs (CSV)": folder.write(
-            "metrics.csv", format_csv(summarise_metrics(table))
-        ).name,
-    }
-    times = conditions[0].jobs[0].path.parent / STEP_TIMES
-    if times.is_file():
-        files["Times per step by round (JSON)"] = folder.write(STEP_TIMES, times.read_bytes()).name
-    return [
-        {"name": title, "href": file, "bytes": (folder.path / file).stat().st_size, "group": "Numbers"}
-        for title, file in files.items()
-    ]  # fmt: skip
-
-
-def list_figure_files(folder: Path) -> list[dict[str, Any]]:
-    """List the files of figures of a report as downloads: the leaderboard, and figures of the papers.
-
-    Returns entries of the downloads of the page.
-    """
-    files = [folder / HEADLINE, *sorted((folder / "figures").glob("paper_*.*"))]
-    names = {HEADLINE: "Error relative to the baseline"}
-    return [
-        {
-            "name": f"{names.get(file.name) or file.stem.removeprefix('paper_').replace('_', ' ')} ({file.suffix[1:].upper()})",
-            "href": file.relative_to(folder).as_posix(),
-            "bytes": file.stat().st_size,
-            "group": "Figures",
-        }
-        for file in files
-        if file.is_file()
-    ]
-
-
-def decide_study(
-    rows: pd.DataFrame,
-    group: str,
-    options: ReportOptions,
-    others: Mapping[str, pd.DataFrame] | None = None,
-) -> list[Decision]:
-    """Decide planned pairs, the metrics of the second family, and the other pairs."""
-    settings = options.decision_options
-    rule, tidy = main_rule(options.metric, group), tidy_main(rows, options.metric, group)
-    labels = sorted(tidy["filter"].unique(), key=natural_sort_key)
-    pairs = [pair for pair in plan_installed_pairs(labels) if _share_condition(tidy, *pair)]
-    planned = decide_planned_pairs(tidy, pairs, rule, settings) if pairs else []
-    metrics = tidy_secondary(rows, group)
-    metrics.pop(options.metric, None)
-    rules = [replace(RULES[name], group=group) for name in metrics]
-    rules += [MetricRule(f"{name} error", group=name) for name in others or {}]
-    values = [*metrics.values(), *(others or {}).values()]
-    tables = {rule.name: table for rule, table in zip(rules, values, strict=True)}
-    secondary = decide_secondary_metrics(tables, pairs, rules, settings) if pairs else []
-    common = select_common_runs(tidy)
-    orders = order_filters(common, rule, settings, planned) if len(common) else ()
-    return [
-        *planned, *secondary, *(d for order in orders for d in order.decisions if d not in planned)
-    ]  # fmt: skip
-
-
 def summarise_metrics(table: pd.DataFrame) -> pd.DataFrame:
     """Summarise each metric and component of each filter over valid runs.
 
     Returns a row per condition, filter, group, component and metric, with mean, root mean square
     and quantiles over the valid runs. NaN without a value.
     """
-    keys = list(_KEYS)
+    keys = list(_SUMMARISED)
     valid = table["value"].where(~table["lost"] & np.isfinite(table["value"]))
     grouped = table.assign(value=valid, square=valid**2).groupby(keys, sort=False)
     quantiles = grouped["value"].quantile(np.array([0.1, 0.5, 0.9])).unstack()
@@ -267,146 +237,31 @@ def summarise_metrics(table: pd.DataFrame) -> pd.DataFrame:
     return summary.reset_index().rename(columns={"label": "filter"})
 
 
-def _share_condition(tidy: pd.DataFrame, a: str, b: str) -> bool:
-    """Return whether two filters have a condition in common."""
-    conditions = [
-        set(map(tuple, tidy.loc[tidy["filter"] == label, ["scenario", "regime"]].to_numpy()))
-        for label in (a, b)
-    ]
-    return bool(conditions[0] & conditions[1])
+def _draw_paper_figures(
+    study: str, conditions: Sequence[Condition], options: ReportOptions
+) -> tuple[list[dict[str, Any]], Files]:
+    """Draw the figures of the paper of a study; return template variables and files."""
+    labels = sorted({job.label for c in conditions for job in c.jobs}, key=natural_sort_key)
+    style = line_styles(labels, study_looks(conditions))
+    names, start = options.paper_figures, options.start_time_s
+    drawings = figures.paper_figures(study, conditions, style, names, start)
+    entries, files = writers.render_figures(drawings, "paper", options.figure_formats)
+    return entries, dict(files)
 
 
-# --------------------------------------------------------------------------------------------------
-# Files next to the page: verdicts.csv with all that the board shows, runs.parquet and pfbench.bib.
+def _write_all(folder: RecordedFolder, files: Files) -> Path:
+    """Write files to a folder; return the path of the page."""
+    for name, content in files.items():
+        folder.write(name, content)
+    return folder.path / "index.html"
 
 
-def write_verdict_files(
-    pack: Mapping[str, Any], table: pd.DataFrame, folder: RecordedFolder
-) -> list[dict[str, Any]]:
-    """Write verdicts.csv, runs.parquet and pfbench.bib.
-
-    Returns entries of the downloads of the page.
-    """
-    buffer = io.BytesIO()
-    table.to_parquet(buffer, index=False, compression="zstd")
-    contents: list[tuple[str, str, str, str | bytes]] = [
-        ("Numbers", "Verdicts of all views (CSV)", "verdicts.csv", format_verdicts(pack)),
-        ("Numbers", "Values of all runs (Parquet)", "runs.parquet", buffer.getvalue()),
-        ("LaTeX", "References (BibTeX)", "pfbench.bib", pack["bibtex"]),
-    ]
-    downloads = []
-    for group, title, name, content in contents:
-        size = folder.write(name, content).stat().st_size
-        downloads.append({"name": title, "href": name, "bytes": size, "group": group})
-    return downloads
-
-
-def format_verdicts(pack: Mapping[str, Any]) -> str:
-    """Format all rows of all views as CSV."""
-    rows = [
-        {**dict(zip(ViewKey._fields, key, strict=True)), **row}
-        for key, view in pack["views"].items()
-        for row in view["rows"]
-    ]
-    return format_csv(pd.DataFrame(rows))
-
-
-# --------------------------------------------------------------------------------------------------
-# Data of a page as a file, from which the page is written again where the results are missing.
-#
-# All that follows from the runs is decided again from runs.parquet, so that a published page has the
-# rules and the words of the program. Times per step and curves are those of the file.
-
-PAGE_DATA = "page.json.gz"
-_OMITTED: dict[str, Any] = {"paper_figures": [], "tracks": {}}  # too large; they need the results
-_KEYED = ("views", "curves", "calibration", "runs")  # parts with a tuple as key
-
-
-def write_page_data(pack: Mapping[str, Any], folder: RecordedFolder) -> None:
-    """Write the data of a page, without tracks of single runs and figures of the papers.
-
-    Args:
-        pack: Data of the page.
-        folder: Folder of the report.
-    """
-    keyed = {
-        name: {"keys": [list(key) for key in pack[name]], "values": list(pack[name].values())}
-        for name in _KEYED
-    }
-    text = json.dumps({**pack, **_OMITTED, **keyed}, separators=(",", ":"), allow_nan=False)
-    folder.write(PAGE_DATA, gzip.compress(text.encode(), mtime=0))
-
-
-def read_page_data(folder: Path) -> dict[str, Any]:
-    """Read the data of a page.
-
-    Args:
-        folder: Folder of the report.
-
-    Raises:
-        ValueError: If the file is damaged, or lacks facts of the methods paragraph.
-    """
-    path = folder / PAGE_DATA
-    try:
-        pack: dict[str, Any] = json.loads(limits.read_gzip(path))
-        pack["facts"]["looks"]  # a file of an early version has none
-        for name in _KEYED:
-            keys = [tuple(key) for key in pack[name]["keys"]]
-            pack[name] = dict(zip(keys, pack[name]["values"], strict=True))
-    except limits.LimitError:
-        raise
-    except (OSError, EOFError, ValueError, TypeError, KeyError) as error:
+def _check_groups(conditions: Sequence[Condition], thresholds: Mapping[str, float]) -> None:
+    """Check that the groups with a convergence threshold exist."""
+    states = [job.meta["state"] for condition in conditions for job in condition.jobs]
+    available = sorted({block.group for state in states for block in component_groups(state)})
+    if unknown := sorted(set(thresholds) - set(available)):
         raise ValueError(
-            f"{path} must be the data of a page, got {error}. Run the study and write its report again."
-        ) from error
-    MethodsFacts.from_entries(pack.get("methods"), str(path))
-    return pack
-
-
-def decide_again(pack: Mapping[str, Any], runs: Path) -> dict[str, Any]:
-    """Decide the parts of a page again from the runs of a study."""
-    try:
-        check_parquet(runs)
-        table = pd.read_parquet(runs)
-        missing = {look["key"] for look in pack["facts"]["looks"]} - set(table["filter"])
-        parts = {} if missing else decide_parts(table, StudyFacts.from_pack(pack))
-    except (OSError, KeyError, TypeError, ValueError, pa.ArrowException) as error:
-        raise ValueError(
-            f"{runs} must have the runs of the page in its folder, got {error}. "
-            "Run the study and write its report again."
-        ) from error
-    if missing:
-        raise ValueError(
-            f"{runs} must have runs of all filters of the page, got none of "
-            f"{', '.join(sorted(missing))}. Run the study and write its report again."
+            "report.convergence_threshold must name groups of the results, "
+            f"got {', '.join(unknown)}. Choose from {', '.join(available)}."
         )
-    return {**pack, **parts}
-
-
-def rebuild_page(folder: Path) -> Path:
-    """Write the page of a study again, from the data of the page and from its runs if they are there.
-
-    Files that are missing are not offered.
-
-    Args:
-        folder: Folder of the report.
-
-    Returns:
-        Path of index.html.
-
-    Raises:
-        ValueError: If a file is damaged.
-    """
-    pack, runs = read_page_data(folder), folder / "runs.parquet"
-    if has_runs := runs.is_file():
-        pack = decide_again(pack, runs)
-    table = pd.read_parquet(runs) if has_runs else None
-    pack["bibtex"] = renew_bibliography(pack)
-    with RecordedFolder(folder, is_complete=False) as target:
-        if has_runs:
-            target.write("verdicts.csv", format_verdicts(pack))
-            write_page_data(pack, target)
-        pack["replay_first"] = name_run_command(str(pack["study"]))
-        stored = [d for d in pack["downloads"] if (folder / d["href"]).is_file()]
-        pack["downloads"] = stored + list_figure_files(folder)
-        return write_pages(pack, table, target)

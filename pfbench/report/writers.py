@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import base64
-import gzip
 import itertools
-import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +26,6 @@ from pfbench.report import provenance
 from pfbench.results.plotting import FigureSpec, draw_figure, format_slug
 
 _HERE = Path(__file__).parent
-_MANY = 2000  # entries above which a JSON file is compressed
 
 
 def render_template(
@@ -50,40 +46,37 @@ def render_template(
     return folder.path / "index.html"
 
 
-def write_json(folder: RecordedFolder, name: str, typed: Sequence[Any]) -> str:
-    """Write dataclasses as JSON, compressed and with nine digits if there are thousands.
-
-    Returns file name.
-    """
-    many = len(typed) > _MANY
-    rows = [to_json_types(asdict(row), 9 if many else None) for row in typed]
-    text = json.dumps(rows, indent=None if many else 1, allow_nan=False)
-    if not many:
-        return folder.write(f"{name}.json", text + "\n").name
-    return folder.write(f"{name}.json.gz", gzip.compress(text.encode(), mtime=0)).name
-
-
-def render_figure(
-    drawing: FigureSpec, prefix: str, folder: RecordedFolder, formats: Sequence[str]
-) -> dict[str, Any]:
-    """Write the files of a figure and return its template variables."""
-    contents = draw_figure(drawing, formats)
-    for suffix, content in contents.items():
-        folder.write(f"figures/{prefix}_{drawing.name}.{suffix}", content)
-    return {
-        "file": f"figures/{prefix}_{drawing.name}.{max(contents)}",  # svg if available
-        "caption": drawing.caption,
-        "source": min(itertools.starmap(_data_address, contents.items()), key=len),
-        "name": drawing.name,
-        "anchor": format_slug(f"{prefix}_{drawing.name}"),
-    }
-
-
 def render_figures(
+    drawings: Sequence[FigureSpec], prefix: str, formats: Sequence[str]
+) -> tuple[list[dict[str, Any]], dict[str, bytes]]:
+    """Draw figures.
+
+    Returns template variables of each figure, and the files by name.
+    """
+    entries: list[dict[str, Any]] = []
+    files: dict[str, bytes] = {}
+    for drawing in drawings:
+        contents = draw_figure(drawing, formats)
+        stem = f"figures/{prefix}_{drawing.name}"
+        files |= {f"{stem}.{suffix}": content for suffix, content in contents.items()}
+        entries.append({
+            "file": f"{stem}.{max(contents)}",  # svg if available
+            "caption": drawing.caption,
+            "source": min(itertools.starmap(_data_address, contents.items()), key=len),
+            "name": drawing.name,
+            "anchor": format_slug(f"{prefix}_{drawing.name}"),
+        })  # fmt: skip
+    return entries, files
+
+
+def write_figures(
     drawings: Sequence[FigureSpec], prefix: str, folder: RecordedFolder, formats: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Write the files of figures and return their template variables."""
-    return [render_figure(drawing, prefix, folder, formats) for drawing in drawings]
+    entries, files = render_figures(drawings, prefix, formats)
+    for name, content in files.items():
+        folder.write(name, content)
+    return entries
 
 
 def write_table(folder: RecordedFolder, name: str, table: pd.DataFrame, note: str = "") -> None:
@@ -91,6 +84,11 @@ def write_table(folder: RecordedFolder, name: str, table: pd.DataFrame, note: st
     text = format_csv(table.assign(note=note) if note else table)
     folder.write(f"tables/{name}.csv", text)
     folder.write(f"tables/{name}.tex", format_latex(table, note))
+
+
+def format_data_address(path: Path) -> str:
+    """Return a file of an image as a data URI."""
+    return _data_address(path.suffix[1:], path.read_bytes())
 
 
 def _data_address(suffix: str, content: bytes) -> str:

@@ -10,19 +10,28 @@ from pfbench.results.metrics import (
 )
 from pfbench.results.status import is_diverged as is_diverged
 from pfbench.results.store import read_metadata as read_metadata
-from pfbench.stats.decision import DecisionOptions as DecisionOptions
+from pfbench.stats.comparison import (
+    Effect as Effect,
+    Verdict as Verdict,
+    compare as compare,
+    decide as decide,
+)
 from pfbench.stats.intervals import (
     crossed_mean_interval as crossed_mean_interval,
     order_statistic_interval as order_statistic_interval,
 )
 from pfbench.stats.pair_states import (
     LookSchedule as LookSchedule,
-    decide_pairs as decide_pairs,
+    PairState as PairState,
+    decide_at_looks as decide_at_looks,
     describe_end as describe_end,
     format_look as format_look,
 )
-from pfbench.stats.planned_pairs import decide_planned_pairs as decide_planned_pairs
 from pfbench.stats.rank_tests import holm as holm, wilcoxon_signed_rank as wilcoxon_signed_rank
-from pfbench.stats.sentences import describe_pair as describe_pair
-from pfbench.stats.study_runs import tidy_runs as tidy_runs
+from pfbench.stats.study_runs import (
+    StudyRuns as StudyRuns,
+    arrange_runs as arrange_runs,
+    compare_filters as compare_filters,
+    compute_losses as compute_losses,
+)
 from pfbench.stats.study_size import detectable_effects as detectable_effects

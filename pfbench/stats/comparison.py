@@ -24,7 +24,6 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from scipy.special import ndtri, stdtr, stdtrit
 
-from pfbench.stats.effects import LOG_TOLERANCE, MIN_RUNS, trimmed_effects
 from pfbench.stats.error_measures import Array, Flags
 from pfbench.stats.rank_tests import (
     EXACT_DIFFERENCES,
@@ -42,6 +41,14 @@ SAME_RUNS: Final = "identical"
 NO_DECISION: Final = "not decided"
 EQUALITY_MARGIN = math.log(1.05)  # log ratios within it are equal [ours]
 ALPHA = 0.05
+MIN_RUNS = 10  # units that a decision requires [ours]
+TRIM_SHARE = 0.2  # removed at each end; the middle 60 % of the units remain
+# Errors are stored in single precision: smaller differences of a logarithm are rounding. Without
+# the tolerance, EKF and UKF of a linear model would differ by how they round.
+LOG_TOLERANCE = 1e-6
+_ROUNDING = 1e-12  # relative spread of equal values
+_FEW_DIFFERENCES = 200  # of which all means of two are formed
+_HALVINGS = 52  # of the range of the differences: the precision of a double
 
 
 class Effect(NamedTuple):
@@ -70,12 +77,11 @@ class Effect(NamedTuple):
 
     def estimate(self, alpha: float) -> tuple[float, float, float]:
         """Return the log ratio, and the ends of its interval that belongs to the signed-rank test."""
-        i, j = np.triu_indices(len(self.differences))
-        means = np.sort((self.differences[i] + self.differences[j]) / 2)
-        k = _count_outside(len(self.differences), alpha)
-        low, high = (float(means[k - 1]), float(means[-k])) if k else (-math.inf, math.inf)
-        middle = means[[(len(means) - 1) // 2, len(means) // 2]]
-        return float(middle.mean()), low, high
+        n = len(self.differences)
+        k, count = _count_outside(n, alpha), n * (n + 1) // 2
+        ranks = [max(k, 1), (count + 1) // 2, count // 2 + 1, count + 1 - max(k, 1)]
+        low, *middle, high = _select_means(self.differences, ranks)
+        return (middle[0] + middle[1]) / 2, low if k else -math.inf, high if k else math.inf
 
     def trimmed_interval(self, alpha: float) -> tuple[float, float]:
         """Return the interval of the log ratio that belongs to the trimmed mean."""
@@ -258,6 +264,25 @@ def _decide_one(
     return Verdict(*names, word, *ends, float(p[0]), n, reason)
 
 
+def _select_means(d: Array, ranks: Sequence[int]) -> list[float]:
+    """Return some order statistics, from rank 1, of the means of all pairs of differences [n], each with itself.
+
+    For many differences the means are not formed: the number below a value follows from the sorted differences.
+    """
+    if len(d) <= _FEW_DIFFERENCES:
+        means = np.add.outer(d, d)[np.triu_indices(len(d))] / 2
+        means.partition([rank - 1 for rank in ranks])
+        return [float(means[rank - 1]) for rank in ranks]
+    ordered, places = np.sort(d), np.arange(len(d))
+    low, high = (np.full(len(ranks), end) for end in (ordered[0], ordered[-1]))
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        below = np.searchsorted(ordered, 2 * middle[:, None] - ordered, side="right") - places
+        is_enough = np.maximum(below, 0).sum(axis=1) >= ranks
+        low, high = np.where(is_enough, low, middle), np.where(is_enough, middle, high)
+    return [float(value) for value in high]
+
+
 @cache
 def _count_outside(n: int, alpha: float) -> int:
     """Return the number of means of pairs up to the end of the interval; 0 if it has none."""
@@ -268,13 +293,21 @@ def _count_outside(n: int, alpha: float) -> int:
 
 
 def _trimmed_mean(d: Array) -> tuple[float, float, float]:
-    """Return the trimmed mean of differences, its standard error and its degrees of freedom."""
-    effect = trimmed_effects(d)
-    h = int(effect.middle)
-    if h < 2:
-        return float(effect.location), math.inf, 1.0
-    variance = h / (h - 1) * float((effect.parts**2).sum())
-    return float(effect.location), math.sqrt(variance), h - 1.0
+    """Return the trimmed mean of differences, its standard error and its degrees of freedom.
+
+    The error is that of Tukey and McLaughlin, from the winsorised differences.
+    """
+    n, cut = len(d), int(TRIM_SHARE * len(d) + 1e-9)
+    middle = n - 2 * cut
+    ordered = np.sort(d)
+    location = float(ordered[cut : n - cut].mean())
+    if middle < 2:
+        return location, math.inf, 1.0
+    winsorised = np.clip(d, ordered[cut], ordered[n - cut - 1])
+    squares = float(((winsorised - winsorised.mean()) ** 2).sum())
+    if np.ptp(winsorised) <= _ROUNDING * np.abs(winsorised).max():
+        squares = 0.0
+    return location, math.sqrt(squares / (middle * (middle - 1))), middle - 1.0
 
 
 def _trimmed_p(d: Array, alternative: str = "two-sided") -> float:

@@ -1,4 +1,12 @@
-"""A study that adds runs: schedule of the looks, state of each pair, and the lines after each look."""
+"""A study that adds runs: levels of the looks, state of each pair, and the lines after each look.
+
+The error is spent over looks as a function of the share of runs, so that all looks together have the error rate of
+one study. Each look is decided as a study of fixed size by the first runs of the study, at the level of the look.
+
+References:
+    P. Armitage, C. K. McPherson and B. C. Rowe (1969), Repeated significance tests on accumulating data.
+    K. K. G. Lan and D. L. DeMets (1983), Discrete sequential boundaries for clinical trials.
+"""
 
 from __future__ import annotations
 
@@ -6,161 +14,118 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
+from scipy.optimize import brentq
+from scipy.special import ndtr
 
 from pfbench.files.atomic_write import DIGEST, has_valid_digest, hash_content, write_atomically
-from pfbench.stats.decision import (
-    BETTER,
-    INCONCLUSIVE_PAIR,
-    WORSE,
-    Decision,
-    DecisionOptions,
-    MetricRule,
-    pair_word,
-)
+from pfbench.stats.comparison import ALPHA, EQUALITY_MARGIN, NO_DECISION, Verdict, decide
 from pfbench.stats.error_measures import Array
-from pfbench.stats.pair_effects import paired_differences
-from pfbench.stats.planned_pairs import Pairs, check_pairs
-from pfbench.stats.rank_tests import confidence_sequence, sign_log_e_value
-from pfbench.stats.sentences import format_range
-from pfbench.stats.sequential_looks import LookPlan, decide_at_looks, is_complete
-from pfbench.stats.study_runs import PairRuns, select_pair, to_study_runs
+from pfbench.stats.study_runs import StudyRuns, compare_filters, compute_losses
 
-# --------------------------------------------------------------------------------------------------
-# State of each planned pair after a look: a word, and the interval that is valid at all looks.
+_NODES = 121
+_LARGEST = 37.0  # standard score beyond which a normal tail is zero in double precision
 
 
 class PairState(NamedTuple):
     """State of one pair after a look.
 
     Attributes:
-        a: Label of the first filter.
-        b: Label of the second filter.
-        word: Word of the pair, as in a study of fixed size.
+        verdict: Verdict at the look that decided it, or at the last one.
         is_open: Whether the pair requires more runs.
-        interval: Interval of the error of a against b, as text.
     """
 
-    a: str
-    b: str
-    word: str
+    verdict: Verdict
     is_open: bool
-    interval: str
 
     def __str__(self) -> str:
-        relation = f"{self.word} than" if self.word in (BETTER, WORSE) else "/"
-        ending = "" if self.is_open or self.word in (BETTER, WORSE) else f" {self.word}"
-        return f"{self.a} {relation} {self.b}{ending} ({self.interval})"
+        v = self.verdict
+        relation = f"{v.word} than" if v.word in ("better", "worse") else "/"
+        ending = f" {v.word}" if v.word in ("equal", "identical") else ""
+        return f"{v.a} {relation} {v.b}{ending} (ratio {v.low:.3g} to {v.high:.3g})"
 
 
-def decide_pairs(
-    table: pd.DataFrame,
-    pairs: Pairs,
+def decide_at_looks(
+    runs: StudyRuns,
+    pairs: Sequence[tuple[str, str]],
     schedule: LookSchedule,
-    options: DecisionOptions | None = None,
-    rule: MetricRule | None = None,
+    metric: str = "rmse",
+    margin: float = EQUALITY_MARGIN,
+    alpha: float = ALPHA,
 ) -> list[PairState]:
-    """Decide planned pairs with all looks that the runs allow.
+    """Decide pairs with all looks that the runs allow. A pair keeps the verdict of the look that decides it.
 
     Args:
-        table: Table as in `planned_pairs.decide_planned_pairs`, with all runs so far.
-        pairs: Labels of the planned pairs.
+        runs: Runs so far.
+        pairs: Labels of the pairs that were fixed in advance.
         schedule: Looks of the study.
-        options: Options, None for the defaults.
-        rule: Rule of the main metric, None for the log ratio of errors.
-
-    Returns:
-        One state per pair.
+        metric: Column of the error.
+        margin: Log ratio within which two filters are equal.
+        alpha: Error rate of all pairs and looks together.
 
     Raises:
-        ValueError: if the table or a pair is not valid, or the runs do not reach the first look.
+        ValueError: If the runs do not reach the first look.
     """
-    options, rule = options or DecisionOptions(), rule or MetricRule()
-    if schedule.mode == "e_values":
-        return _decide_at_any_time(table, pairs, schedule, options, rule)
-    plan = LookPlan(runs=schedule.runs, alpha=options.alpha)
-    decisions = decide_at_looks(table, pairs, plan, rule, options)
-    return [_to_state(error) for error in decisions[1::2]]
-
-
-def average_over_conditions(pair: PairRuns, rule: MetricRule | None = None) -> Array:
-    """Average the log ratios or differences of each run over the conditions of a pair.
-
-    A run of all conditions is one unit, because its conditions share random numbers. Infinite
-    values decide by the sum of the weights of their signs.
-
-    Returns averages of the runs that all conditions have, [n], in the order of the runs.
-    """
-    d = paired_differences(pair, rule or MetricRule())
-    used = pair.weights > 0
-    d, weights = d[used], pair.weights[used]
-    d = d[:, pair.present[used].all(axis=0)]
-    infinite = np.where(np.isinf(d), np.sign(d), 0.0)
-    side = np.round(weights @ infinite, 12)
-    finite = weights @ np.where(np.isfinite(d), d, 0.0) / weights.sum()
-    average: Array = np.where(side == 0, finite, np.copysign(np.inf, side))
-    return average
-
-
-def _to_state(error: Decision) -> PairState:
-    """Return the state of a pair from the record of its error."""
-    return PairState(
-        error.a,
-        error.b,
-        error.pair_word,
-        not is_complete([error]),
-        _format_ends(error.low, error.high, MetricRule())
-        if error.scale == "log ratio"
-        else f"{error.scale} {format_range(error, error.low, error.high)}",
-    )
-
-
-def _decide_at_any_time(
-    table: pd.DataFrame,
-    pairs: Pairs,
-    schedule: LookSchedule,
-    options: DecisionOptions,
-    rule: MetricRule,
-) -> list[PairState]:
-    """Decide the median of the runs of each pair by e-values, with Bonferroni's correction."""
-    study = to_study_runs(table)
-    check_pairs(pairs)
-    level = options.alpha / len(pairs)
-    states = []
-    for a, b in pairs:
-        d = average_over_conditions(select_pair(study, a, b), rule)
-        looks = [n for n in schedule.runs if n <= d.size] or [d.size]
-        low, high, is_decided = _intersect_looks([d[:n] for n in looks], level)
-        margin = options.log_margin if rule.margin is None else rule.margin
-        word, _ = pair_word(low, high, is_decided, margin)
-        text = _format_ends(low, high, rule)
-        states.append(PairState(a, b, word, word == INCONCLUSIVE_PAIR, text))
+    looks = [n for n in schedule.runs if n <= runs.present.shape[-1]]
+    if not looks:
+        raise ValueError(
+            f"runs must be at least {schedule.runs[0]}, got {runs.present.shape[-1]}. Add runs."
+        )
+    losses, levels = compute_losses(runs, metric), look_levels(schedule.runs, alpha / len(pairs))
+    states: list[PairState] = []
+    for number, level in zip(looks, levels, strict=False):
+        effects = compare_filters(runs, losses[..., :number], pairs)
+        verdicts = decide(effects, margin, level * len(pairs))  # whose first step is the level
+        earlier = states or [PairState(v, True) for v in verdicts]
+        states = [
+            state if not state.is_open else PairState(v, v.word == NO_DECISION)
+            for state, v in zip(earlier, verdicts, strict=True)
+        ]
     return states
 
 
-def _intersect_looks(samples: Sequence[Array], level: float) -> tuple[float, float, bool]:
-    """Return the interval of all looks, and whether the e-value of some look excludes 0."""
-    low, high, sign = -math.inf, math.inf, 0.0
-    for d in samples:
-        ends = [float(end) for end in confidence_sequence(d, level)]
-        joint = max(low, ends[0]), min(high, ends[1])
-        low, high = joint if joint[0] <= joint[1] else (ends[0], ends[1])
-        if not sign and sign_log_e_value(d) >= math.log(1 / level):
-            sign = float(np.sign((d > 0).sum() - (d < 0).sum()))
-    if sign < 0:
-        return min(low, 0.0), min(high, 0.0), True
-    return (max(low, 0.0), max(high, 0.0), True) if sign else (min(low, 0.0), max(high, 0.0), False)
+def look_levels(runs: Sequence[int], alpha: float) -> list[float]:
+    """Return the two-sided levels of the looks of one comparison, which spend its error as Pocock's do."""
+    scores = boundary_scores(tuple(n / runs[-1] for n in runs), alpha)
+    return [2 * float(ndtr(-z)) for z in scores]
 
 
-def _format_ends(low: float, high: float, rule: MetricRule) -> str:
-    """Format the ends of an interval: a ratio, or a difference that is negative if a is better."""
-    if rule.scale == "log ratio":
-        return f"ratio {math.exp(low):.3g} to {math.exp(high):.3g}"
-    return f"{rule.scale} {low:.3g} to {high:.3g}"
+def spent_error(time: float, alpha: float) -> float:
+    """Return the error that may be spent until a share of the runs."""
+    return alpha * math.log1p(math.expm1(1.0) * time)
+
+
+@lru_cache(maxsize=512)
+def boundary_scores(times: tuple[float, ...], alpha: float) -> tuple[float, ...]:
+    """Compute the standard scores at which a look shows a difference, two-sided.
+
+    The distribution of the sum of runs that have not yet decided is integrated from look to look
+    with Gauss-Legendre points.
+    """
+    nodes, node_weights = np.polynomial.legendre.leggauss(_NODES)
+    scores: list[float] = []
+    x, mass, before, spent = np.zeros(1), np.ones(1), 0.0, 0.0
+    for time in times:
+        target = spent_error(time, alpha) - spent
+        sd, root = np.sqrt(time - before), np.sqrt(time)
+        excess = partial(_excess, x, mass, root, sd, target)
+        z = float(brentq(excess, 0.0, _LARGEST, xtol=1e-10)) if target > 0 else _LARGEST
+        scores.append(z)
+        following = z * root * nodes
+        kernel = np.exp(-0.5 * ((following[:, None] - x) / sd) ** 2) / (sd * np.sqrt(2 * np.pi))
+        mass = z * root * node_weights * (kernel @ mass)
+        x, before, spent = following, time, spent + max(target, 0.0)
+    return tuple(scores)
+
+
+def _excess(x: Array, mass: Array, root: float, sd: float, target: float, score: float) -> float:
+    """Return the probability that the next sum exceeds a score, minus the target."""
+    limit = score * root
+    return float(mass @ (ndtr((x - limit) / sd) + ndtr((-x - limit) / sd))) - target
 
 
 # --------------------------------------------------------------------------------------------------
@@ -169,33 +134,24 @@ def _format_ends(low: float, high: float, rule: MetricRule) -> str:
 # A plan is fixed before the first look: levels of the looks that follow from another plan would not
 # hold the error.
 
-LookMode = Literal["looks", "e_values"]
-MODES = ("looks", "e_values")
 FIRST_LOOK = 20
 RECORD = "looks.json"  # in the folder of the results
 
 
 @dataclass(frozen=True)
 class LookSchedule:
-    """Runs per condition at the looks of a study.
+    """Runs per condition at the looks of a study: 20, 40, 80 and so on.
 
     Attributes:
-        mode: "looks" doubles the runs from look to look, with planned levels. "e_values" looks
-            every 20 runs and holds at any number of runs.
         max_runs: Runs per condition at most.
 
     Raises:
-        ValueError: if the mode is unknown or the runs do not reach the first look.
+        ValueError: if the runs do not reach the first look.
     """
 
-    mode: LookMode = "looks"
     max_runs: int = 320
 
     def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise ValueError(
-                f"until_decided.mode must be looks or e_values, got {self.mode}. Use looks."
-            )
         if type(self.max_runs) is not int or self.max_runs < FIRST_LOOK:
             raise ValueError(
                 f"until_decided.max_runs must be a whole number of at least {FIRST_LOOK}, got "
@@ -208,7 +164,7 @@ class LookSchedule:
         looks, following = [], FIRST_LOOK
         while following < self.max_runs:
             looks.append(following)
-            following += following if self.mode == "looks" else FIRST_LOOK
+            following *= 2
         return (*looks, self.max_runs)
 
     def parts(self, number: int) -> list[tuple[int, int]]:
@@ -302,8 +258,8 @@ def format_look(
         One line.
     """
     unresolved = [state for state in states if state.is_open]
-    decided = {(state.a, state.b) for state in earlier if not state.is_open}
-    new = [s for s in states if not s.is_open and (s.a, s.b) not in decided]
+    decided = {state.verdict[:2] for state in earlier if not state.is_open}
+    new = [s for s in states if not s.is_open and s.verdict[:2] not in decided]
     runs, count = schedule.runs[number - 1], len(states) - len(unresolved)
     parts = [f"look {number}, {runs} runs: {count} of {len(states)} pairs decided"]
     parts += [f"new: {_list_states(new)}"] if new else []

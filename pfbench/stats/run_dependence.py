@@ -15,7 +15,6 @@ from scipy.special import ndtr
 from scipy.stats import rankdata
 
 from pfbench.stats.error_measures import Array
-from pfbench.stats.main_metrics import ConditionName, select_main_metrics
 
 ALARM_LEVEL = 0.001  # of the test of all filters together: a study has many readers [ours]
 _FEWEST = 10  # runs of a test
@@ -140,14 +139,16 @@ class IndependentRows(NamedTuple):
 
 
 def select_independent_runs(
-    rows: pd.DataFrame, mains: Mapping[ConditionName, str]
+    rows: pd.DataFrame, mains: Mapping[tuple[str, str, str], str]
 ) -> IndependentRows:
     """Leave out copies of runs, as a report does.
 
     Returns the rows of the other runs, with a sentence on what is left out.
     """
-    main = select_main_metrics(rows, mains, "main")
-    errors = main[main["metric"] == "rmse"]
+    keys = zip(rows["scenario"], rows["noise"], rows["model"], strict=True)
+    main = pd.Series(list(keys), index=rows.index).map(mains)
+    is_norm = (rows["metric"] == "rmse") & (rows["component"] == "norm")
+    errors = rows[is_norm & (rows["group"] == main)]
     regime = errors["noise"].astype(str) + " / " + errors["model"].astype(str)
     table = errors.assign(filter=errors["label"], regime=regime)
     copies, sentence = assess_runs(table, "value", RUN)

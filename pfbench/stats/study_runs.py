@@ -1,258 +1,223 @@
-"""Runs of a study as arrays: filters, worlds, conditions of a world, and runs.
+"""Runs of a study as arrays, and the losses of two filters in a selection of its conditions.
 
-A world is a family of scenarios. Its conditions are the regimes of its scenarios. Scenarios of a
-family have equal weight, and so do regimes of a scenario.
+A world is a family of scenarios. Its conditions are the regimes of its scenarios. Worlds have equal weight, so have
+the scenarios of a world, and the regimes of a scenario. A run of several conditions is one unit: its loss is the
+mean over these conditions, because runs with one number share random numbers.
 """
 
 from __future__ import annotations
 
 import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from pfbench.stats.comparison import Effect, Unit, bound_losses, compare_all
 from pfbench.stats.error_measures import Array, Flags
 
-COLUMNS = ("filter", "scenario", "family", "regime", "run", "value", "keeps_track")
+CONDITION = ["family", "scenario", "regime"]
+LOG_SCORE = (
+    "log_score"  # the only metric that is a logarithm, with larger values for better filters
+)
+CAPPED_METRICS = ("rmse", "crps")  # in the unit of the cap of a world
+_LEAST_ERROR = 1e-300  # an error of exactly 0 has a finite loss
 
 
 class StudyRuns(NamedTuple):
-    """Values of one metric of a study.
+    """Values of all filters F, conditions C and runs N of a study; NaN without a value.
 
     Attributes:
         filters: Labels, [F].
-        worlds: Names of the families, [W].
-        regimes: Number of distinct regimes.
-        scenario: Index of the scenario of each condition within its world, [W, C]; -1 if absent.
-        value: Values, [F, W, C, N]; NaN for an absent run.
-        keeps_track: Runs that keep track, [F, W, C, N].
-        present: Runs that exist, [F, W, C, N].
+        conditions: Family, scenario and regime of each condition, C rows.
+        values: Values by column of the table, [F, C, N].
+        keeps: Runs that keep track, [F, C, N].
+        present: Runs that exist, [F, C, N].
+        caps: Largest error that counts in each condition, [C]; NaN where the world states none.
     """
 
     filters: tuple[str, ...]
-    worlds: tuple[str, ...]
-    regimes: int
-    scenario: np.ndarray
-    value: Array
-    keeps_track: Flags
+    conditions: pd.DataFrame
+    values: Mapping[str, Array]
+    keeps: Flags
     present: Flags
+    caps: Array
 
+    def select(self, mask: Flags) -> StudyRuns:
+        """Select conditions.
 
-class PairRuns(NamedTuple):
-    """Runs that two filters share.
-
-    Attributes:
-        a: Label of the first filter.
-        b: Label of the second filter.
-        worlds: Names of the worlds with a common run, [W].
-        weights: Weights of the conditions, [W, C], with sum 1 for each world.
-        value_a: Values of the first filter, [W, C, N]; NaN for an absent run.
-        value_b: Values of the second filter, [W, C, N].
-        keeps_a: Runs in which the first filter keeps track, [W, C, N].
-        keeps_b: Runs in which the second filter keeps track, [W, C, N].
-        present: Runs that both have, [W, C, N].
-    """
-
-    a: str
-    b: str
-    worlds: tuple[str, ...]
-    weights: Array
-    value_a: Array
-    value_b: Array
-    keeps_a: Flags
-    keeps_b: Flags
-    present: Flags
-
-    @property
-    def runs(self) -> int:
-        """Number of runs of the condition that has the fewest."""
-        return int(self.present.sum(axis=-1)[self.weights > 0].min())
-
-    @property
-    def shares(self) -> tuple[float, float]:
-        """Shares of runs in which the filters keep track; worlds have equal weight."""
-        first, second = (float(self._mean_share(keeps)) for keeps in (self.keeps_a, self.keeps_b))
-        return first, second
-
-    def _mean_share(self, keeps: Flags) -> float:
-        count = np.maximum(self.present.sum(axis=-1), 1)
-        share = (keeps & self.present).sum(axis=-1) / count
-        return float((self.weights * share).sum(axis=-1).mean())
-
-
-def to_study_runs(table: pd.DataFrame) -> StudyRuns:
-    """Arrange a table as arrays.
-
-    Returns arrays of the study.
-    """
-    missing = [name for name in COLUMNS if name not in table.columns]
-    if missing or table.empty:
-        raise ValueError(
-            f"table must have the columns {', '.join(COLUMNS)} and at least one row, got "
-            f"{', '.join(map(str, table.columns))} and {len(table)} rows. Add what is missing."
+        Shapes: mask [C].
+        """
+        values = {name: value[:, mask] for name, value in self.values.items()}
+        return self._replace(
+            conditions=self.conditions[mask],
+            values=values,
+            keeps=self.keeps[:, mask],
+            present=self.present[:, mask],
+            caps=self.caps[mask],
         )
-    keys = ["filter", "scenario", "family", "regime", "run"]
-    if table.duplicated(keys).any():
-        row = table.loc[table.duplicated(keys), keys].iloc[0].to_dict()
-        raise ValueError(
-            f"runs must be unique per filter, scenario, family and regime, got {row} twice. "
-            "Select one metric, group and seed."
-        )
-    filters = tuple(sorted(map(str, table["filter"].unique()), key=natural_sort_key))
-    worlds = tuple(sorted(map(str, table["family"].unique()), key=natural_sort_key))
-    index_of_run = {run: k for k, run in enumerate(sorted(table["run"].unique()))}
-    index_of_condition, scenario = _index_conditions(table, worlds)
-    index = (
-        table["filter"].astype(str).map({name: k for k, name in enumerate(filters)}).to_numpy(),
-        table["family"].astype(str).map({name: k for k, name in enumerate(worlds)}).to_numpy(),
-        np.array([index_of_condition[key] for key in _condition_keys(table)]),
-        table["run"].map(index_of_run).to_numpy(),
-    )
-    shape = (len(filters), *scenario.shape, len(index_of_run))
-    value = np.full(shape, np.nan)
-    keeps, present = np.zeros((2, *shape), dtype=bool)
-    value[index] = table["value"].to_numpy(dtype=np.float64)
-    keeps[index] = table["keeps_track"].to_numpy(dtype=bool)
-    present[index] = True
-    regimes = int(table["regime"].nunique())
-    return StudyRuns(filters, worlds, regimes, scenario, value, keeps, present)
 
 
-def select_pair(study: StudyRuns, a: str, b: str) -> PairRuns:
-    """Select the runs that two filters share.
+def arrange_runs(
+    table: pd.DataFrame, filters: Sequence[str], caps: Mapping[str, float] | None = None
+) -> StudyRuns:
+    """Arrange a table with one row per filter, condition and run as arrays.
 
-    Returns runs of both filters; worlds without a common run are left out.
+    The axis of runs has the numbers of the runs, and of several seeds of a scenario one after the other. `caps` has
+    the largest error that counts by scenario.
     """
-    unknown = [label for label in (a, b) if label not in study.filters]
-    if unknown or a == b:
-        raise ValueError(
-            f"pairs must be two different filters with results, got {a} and {b}. Choose from "
-            f"{', '.join(study.filters)}."
-        )
-    i, j = study.filters.index(a), study.filters.index(b)
-    present = study.present[i] & study.present[j]
-    weights = condition_weights(study.scenario, present.any(axis=-1))
-    used = np.asarray(weights.any(axis=-1))
-    if not used.any():
-        raise ValueError(f"pairs must share a run, got {a} and {b} without one. Run both filters.")
-    worlds = tuple(name for name, is_used in zip(study.worlds, used, strict=True) if is_used)
-    columns = (
-        study.value[i],
-        study.value[j],
-        study.keeps_track[i],
-        study.keeps_track[j],
-        present,
-    )
-    return PairRuns(a, b, worlds, weights[used], *(column[used] for column in columns))
+    conditions = table[CONDITION].drop_duplicates().sort_values(CONDITION).reset_index(drop=True)
+    c = table.groupby(CONDITION, dropna=False, observed=True).ngroup().to_numpy()
+    seed = table.groupby("scenario", observed=True)["seed"].rank(method="dense")
+    n = table.assign(seed=seed).groupby(["seed", "run"]).ngroup().to_numpy()
+    f = pd.Index(filters).get_indexer(pd.Index(table["filter"]))
+    shape = (len(filters), len(conditions), int(n.max(initial=-1)) + 1)
+    _check_unique(table, np.ravel_multi_index((f, c, n), shape))
+
+    def arrange(name: str) -> Array:
+        values = np.full(shape, np.nan)
+        values[f, c, n] = table[name].to_numpy(dtype=np.float64)
+        return values
+
+    numbers = table.select_dtypes(["number", "bool"]).columns
+    values = {str(name): arrange(str(name)) for name in numbers}
+    keeps = values["keeps_track"]
+    known = dict(caps or {})
+    limits = np.array([known.get(str(name), np.nan) for name in conditions["scenario"]])
+    return StudyRuns(tuple(filters), conditions, values, keeps == 1, ~np.isnan(keeps), limits)
 
 
-def have_common_runs(study: StudyRuns, a: str, b: str) -> bool:
-    """Return whether two filters share a run."""
-    if a not in study.filters or b not in study.filters:
-        return False
-    i, j = study.filters.index(a), study.filters.index(b)
-    return bool((study.present[i] & study.present[j]).any())
+def compute_losses(runs: StudyRuns, metric: str) -> Array:
+    """Compute the losses of all runs, [F, C, N]; NaN for a run without a value.
 
-
-def first_runs(study: StudyRuns, runs: int) -> StudyRuns:
-    """Select the first runs of a study, in the order of their names."""
-    columns = {
-        name: getattr(study, name)[..., :runs] for name in ("value", "keeps_track", "present")
-    }
-    return study._replace(**columns)
-
-
-def _condition_keys(table: pd.DataFrame) -> list[tuple[str, str, str]]:
-    names = ("family", "scenario", "regime")
-    return list(zip(*(table[name].astype(str) for name in names), strict=True))
-
-
-def _index_conditions(
-    table: pd.DataFrame, worlds: tuple[str, ...]
-) -> tuple[dict[tuple[str, str, str], int], np.ndarray]:
-    """Return the index of each condition within its world, and the scenarios, [W, C]."""
-    by_world: dict[str, list[tuple[str, str, str]]] = {name: [] for name in worlds}
-    for key in sorted(set(_condition_keys(table))):
-        by_world[key[0]].append(key)
-    scenario = np.full((len(worlds), max(map(len, by_world.values()))), -1)
-    index = {}
-    for w, keys in enumerate(by_world.values()):
-        names = sorted({key[1] for key in keys})
-        for c, key in enumerate(keys):
-            index[key] = c
-            scenario[w, c] = names.index(key[1])
-    return index, scenario
-
-
-def condition_weights(scenario: np.ndarray, present: Flags) -> Array:
-    """Compute weights [W, C]: equal for scenarios of a world, and for regimes of a scenario.
-
-    Shapes: scenario [W, C], present [W, C].
+    A run that does not keep track has the loss of the cap. Without a cap its loss is infinite here, and in a pair
+    that of the largest error of the two filters in this condition.
     """
-    weights = np.zeros(scenario.shape)
-    for row, used, names in zip(weights, present, scenario, strict=True):
-        scenarios = np.unique(names[used])
-        for name in scenarios:
-            of_scenario = used & (names == name)
-            row[of_scenario] = 1 / (len(scenarios) * of_scenario.sum())
-    return weights
+    value = runs.values[metric]
+    is_lost = runs.present & ~runs.keeps
+    if metric == LOG_SCORE:
+        losses = -value
+    else:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            losses = np.log(np.maximum(value, _LEAST_ERROR))
+    losses = np.where(is_lost, np.inf, np.where(runs.present, losses, np.nan))
+    for k, cap in enumerate(runs.caps):
+        if metric in CAPPED_METRICS and np.isfinite(cap):
+            known = ~np.isnan(losses[:, k])
+            bounded = bound_losses(value[:, k], runs.keeps[:, k], float(cap))
+            losses[:, k] = np.where(known, bounded, np.nan)
+    return losses
 
 
-# --------------------------------------------------------------------------------------------------
-# Results of a study in the form that decisions read.
+def weigh_conditions(conditions: pd.DataFrame) -> Array:
+    """Return the weight of each condition, [C], with sum 1."""
+    return _weigh(tuple(zip(conditions["family"], conditions["scenario"], strict=True)))
 
 
-def tidy_runs(
-    frame: pd.DataFrame,
-    metric: str = "rmse",
-    group: str = "position",
-    component: str = "norm",
-) -> pd.DataFrame:
-    """Select one metric of the table of `load_frame` in the form of `to_study_runs`.
+@lru_cache(maxsize=1024)
+def _weigh(keys: tuple[tuple[str, str], ...]) -> Array:
+    """Return the weights of conditions of some worlds and scenarios."""
+    regimes = Counter(keys)
+    scenarios = Counter(family for family, _ in regimes)
+    counts = [len(scenarios) * scenarios[key[0]] * regimes[key] for key in keys]
+    return 1 / np.array(counts, dtype=np.float64)
 
-    Args:
-        frame: Rows of `load_frame`.
-        metric: Name of the metric.
-        group: Group of the state; not used for metrics of a job.
-        component: Component of the group; not used for metrics of a job.
 
-    Returns:
-        Table with the columns of `to_study_runs`.
+def compare_filters(
+    runs: StudyRuns, losses: Array, pairs: Sequence[tuple[str, str]], unit: Unit = "run"
+) -> list[Effect]:
+    """Compare pairs of filters over the conditions that both have, by run or by world.
 
-    Raises:
-        ValueError: if no row matches.
+    Shapes: losses [F, C, N].
     """
-    rows = frame[frame["metric"] == metric]
-    if rows["group"].nunique() > 1:
-        rows = rows[(rows["group"] == group) & (rows["component"] == component)]
-    if rows.empty:
-        raise ValueError(
-            f"metric and group must have results, got {metric} and {group}. Choose from "
-            f"{sorted(map(str, frame['metric'].unique()))} and {sorted(map(str, frame['group'].unique()))}."
-        )
-    return tidy_rows(rows)
+    index = {label: k for k, label in enumerate(runs.filters)}
+    keys = np.empty(len(runs.conditions), dtype=object)
+    keys[:] = list(zip(runs.conditions["family"], runs.conditions["scenario"], strict=True))
+    average = _average_worlds if unit == "world" else _average_runs
+    members = []
+    for a, b in pairs:
+        first, second = average(keys, losses[index[a]], losses[index[b]])
+        members.append(((a, first), (b, second)))
+    return compare_all(members, unit)
 
 
-def tidy_rows(rows: pd.DataFrame) -> pd.DataFrame:
-    """Arrange the rows of one metric and component in the form of `to_study_runs`."""
-    models = rows.groupby("scenario")["model"].transform("nunique")
-    regime = rows["noise"].astype(str).where(models == 1, rows["noise"] + " / " + rows["model"])
-    scenario = rows["scenario"].astype(str)
-    return pd.DataFrame(
-        {
-            "filter": rows["label"].astype(str),
-            "scenario": scenario,
-            "family": rows["family"].astype(str),
-            "regime": regime,
-            "run": [f"{s:012d} {r:09d}" for s, r in zip(rows["seed"], rows["run"], strict=True)],
-            "value": rows["value"].astype(np.float64),
-            "keeps_track": rows["keeps_track"].astype(bool),
-        }
-    )
+def share_conditions(runs: StudyRuns, a: str, b: str) -> bool:
+    """Return whether two filters have runs of the same number in a condition."""
+    i, j = runs.filters.index(a), runs.filters.index(b)
+    return bool((runs.present[i] & runs.present[j]).any())
+
+
+def select_conditions(present: Flags) -> Flags:
+    """Select the conditions that all filters have, [C]; those of the filters that have most if few do.
+
+    The selection that keeps more results wins. If both keep equally many, no filter is left out. If neither has two
+    filters, nothing is selected. Shapes: present [F, C].
+    """
+    filters, conditions = np.asarray(present.any(axis=1)), np.asarray(present.any(axis=0))
+    shared = np.asarray(conditions & present[filters].all(axis=0))
+    complete = np.asarray(filters & present[:, conditions].all(axis=1))
+    keeps_filters = filters.sum() * shared.sum() if filters.sum() >= 2 else 0
+    keeps_conditions = complete.sum() * conditions.sum() if complete.sum() >= 2 else 0
+    if keeps_filters == keeps_conditions == 0:
+        return np.zeros_like(conditions)
+    return conditions if keeps_conditions > keeps_filters else shared
 
 
 def natural_sort_key(text: str) -> list[tuple[int, int, str]]:
     """Return a sorting key that puts 400 before 1600."""
     parts = re.split(r"(\d+)", text)
     return [(0, int(text), "") if text.isdigit() else (1, 0, text) for text in parts]
+
+
+def _check_unique(table: pd.DataFrame, index: np.ndarray) -> None:
+    """Check that each filter, condition and run has one row."""
+    repeated = pd.Series(index).duplicated()
+    if repeated.any():
+        row = table.iloc[int(np.argmax(repeated))]
+        names = ", ".join(f"{name}={row[name]}" for name in ("filter", *CONDITION, "run"))
+        raise ValueError(
+            f"runs must be unique per filter, scenario and regime, got {names} twice. Select one model and seed."
+        )
+
+
+def _bound_pair(first: Array, second: Array) -> tuple[Array, Array, Flags]:
+    """Return the losses of two filters [C, N] with lost runs at the largest error of both, and the common runs."""
+    common = ~(np.isnan(first) | np.isnan(second))
+    both = np.stack([first, second])
+    known = np.where(np.isfinite(both) & common, both, -np.inf).max(axis=(0, 2), initial=-np.inf)
+    largest = np.where(np.isfinite(known), known, 0.0)[:, None]
+    first, second = (np.where(np.isposinf(x), largest, x) for x in both)
+    return first, second, common
+
+
+def _average_runs(keys: np.ndarray, first: Array, second: Array) -> tuple[Array, Array]:
+    """Average the losses [C, N] of each run over the conditions that both filters have, [n].
+
+    Only runs of all these conditions count. Shapes: keys [C], world and scenario of each condition.
+    """
+    first, second, common = _bound_pair(first, second)
+    used = common.any(axis=1)
+    if not used.any():
+        return np.zeros(0), np.zeros(0)
+    everywhere = common[used].all(axis=0)
+    weights = _weigh(tuple(keys[used]))
+    return weights @ first[used][:, everywhere], weights @ second[used][:, everywhere]
+
+
+def _average_worlds(keys: np.ndarray, first: Array, second: Array) -> tuple[Array, Array]:
+    """Average the losses [C, N] of each world over its common runs and conditions, [W]."""
+    first, second, common = _bound_pair(first, second)
+    used = common.any(axis=1)
+    count = np.maximum(common[used].sum(axis=1), 1)
+    means = [np.where(common, x, 0.0)[used].sum(axis=1) / count for x in (first, second)]
+    families = np.array([key[0] for key in keys[used]])
+    rows = [np.flatnonzero(families == family) for family in dict.fromkeys(families)]
+    weights = [_weigh(tuple(keys[used][members])) for members in rows]
+    first, second = (
+        np.array([w @ mean[members] for w, members in zip(weights, rows, strict=True)])
+        for mean in means
+    )
+    return first, second

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import nctdtr, ndtr, ndtri, stdtrit
 
-from pfbench.stats.effects import MIN_RUNS, TRIM_SHARE
+from pfbench.stats.comparison import MIN_RUNS, TRIM_SHARE
 
 # --------------------------------------------------------------------------------------------------
 # Sample sizes: power of the paired signed-rank test, runs required, smallest detectable effect.

@@ -18,6 +18,7 @@ from pfbench.results.looks import MethodLook, PartName
 from pfbench.results.metrics import MetricInput
 from pfbench.results.step_times import STEP_TIME
 from pfbench.results.store import SAME_LIKELIHOODS, SAME_N
+from pfbench.stats.study_runs import LOG_SCORE
 
 # --------------------------------------------------------------------------------------------------
 # Entries of the data of a page: filters, parts, metrics and planned pairs.
@@ -57,11 +58,11 @@ class StudyNames(NamedTuple):
     baselines: Sequence[str]
 
 
-def list_metrics(table: pd.DataFrame, main: str = "rmse") -> list[str]:
+def list_metrics(values: Mapping[str, Any] | pd.DataFrame, main: str = "rmse") -> list[str]:
     """List the metrics of a board: that which decides first, then all that have values."""
-    names = [name for name in METRIC_NAMES if name in table]
+    names = [name for name in METRIC_NAMES if name in values]
     names.sort(key=lambda name: name != main)
-    return [name for name in names if name in (main, "rmse") or table[name].notna().any()]
+    return [n for n in names if n in (main, "rmse") or not np.isnan(np.asarray(values[n])).all()]
 
 
 def format_interval_level(alpha: float) -> str:
@@ -164,7 +165,6 @@ def metric_entries(table: pd.DataFrame, main: str) -> list[dict[str, Any]]:
 # metrics of the main group that a board can show, each with the component of its value
 SHOWN_METRICS: Mapping[str, str] = {"rmse": "norm", "max_error": "norm", "crps": "mean"}
 # metrics that can decide a study, but are shown only if they do
-LOG_SCORE = "log_score"  # of a filter, not of a group: a logarithm without unit
 _MAIN_ONLY: Mapping[str, str] = {"energy": "norm", LOG_SCORE: ""}
 METRIC_NAMES = {
     "rmse": "RMS error", "max_error": "largest error", "crps": "CRPS", "energy": "energy score",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
@@ -22,7 +23,6 @@ from pfbench.report.board.curves import (
 from pfbench.report.board.entries import (
     METRIC_NAMES,
     StudyNames,
-    ViewKey,
     budget_entries,
     cell_entries,
     describe_uncommitted,
@@ -34,18 +34,11 @@ from pfbench.report.board.entries import (
     name_regimes,
     regime_entries,
 )
-from pfbench.report.board.robust_word import describe_robustness
-from pfbench.report.board.study_views import (
-    build_views,
-    decide_planned,
-    planned_entries,
-    planned_words,
-)
+from pfbench.report.board.study_views import build_views, decide_planned, planned_entries
 from pfbench.report.board.sweeps import list_sweeps
-from pfbench.report.board.view import BEST, EQUAL, MISSING, NOT_KEPT, OPEN
-from pfbench.report.journal.study_pack import ALL
 from pfbench.report.methods_text import collect_methods_facts
 from pfbench.report.options import ReportOptions
+from pfbench.report.overview.tables import read_world_facts
 from pfbench.report.provenance import format_bibliography
 from pfbench.results.conditions import Condition, differing_settings, parse_label
 from pfbench.results.frame import drop_before, to_long_rows
@@ -61,8 +54,8 @@ from pfbench.results.paper_block import REFERENCES, list_named_parts
 from pfbench.results.status import count_statuses
 from pfbench.results.step_times import StepTimes
 from pfbench.results.store import JobResult, list_failures
-from pfbench.stats.decision import WORSE
 from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
+from pfbench.stats.study_runs import StudyRuns, arrange_runs
 
 # --------------------------------------------------------------------------------------------------
 # Data of the page and of the paper of a study: one dictionary, all numbers decided here.
@@ -210,14 +203,6 @@ _BASELINES = (*REFERENCES, "ukf", "ckf")  # offered first if they are in the stu
 _MOST_BASELINES, _FEW_BASELINES = 3, 2
 _MANY = 300  # filters times conditions, from which a page offers few baselines
 _OPTIONS = ("alpha", "equivalence_margin", "metric", "baseline")  # that decide
-_OUTCOMES = {  # in the order in which methods are ranked
-    BEST: "smallest error in {}",
-    EQUAL: "equal to it in {}",
-    OPEN: "not decided in {}",
-    WORSE: "worse in {}",
-    NOT_KEPT: "track not kept in {}",
-    MISSING: "not run in {}",
-}
 
 
 class StudyFacts(NamedTuple):
@@ -301,37 +286,49 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
         facts: Inputs of decisions other than the runs.
     """
     looks, worlds, options = facts.looks, facts.worlds, facts.options
-    planned = decide_planned(table, looks, options)
-    conditions = len(table[["scenario", "regime"]].drop_duplicates())
+    runs = arrange_study(table, looks, worlds)
+    conditions = len(runs.conditions)
     most = _MOST_BASELINES if len(looks) * conditions <= _MANY else _FEW_BASELINES
-    names = StudyNames(
-        looks, worlds, facts.regimes, select_baselines(looks, options.baseline)[:most]
-    )
-    views = build_views(table, names, options, planned_words(planned), facts.times)
-    warnings = (
-        _count_failures(len(facts.failures)),
-        facts.warning,
-        _describe_baseline(looks, options.baseline, next(iter(views)).baseline),
-    )
-    for key, view in views.items():
-        proposed = _describe_best_proposed(views, key, looks)
-        view["sentence"] = " ".join(filter(None, (*warnings, view["sentence"], proposed)))
+    baselines = select_baselines(looks, options.baseline)[:most]
+    names = StudyNames(looks, worlds, facts.regimes, baselines)
+    groups = table.groupby(["scenario", "regime"])[["unit", "group"]].first()
+    views = build_views(runs, groups, names, options, facts.times)
+    planned = decide_planned(runs, looks, options)
+    for view in views.values():
         view["small_print"] = " ".join(filter(None, (view["small_print"], facts.differing)))
     first = next(iter(views.values()))["rows"]
     return {
         "alpha": options.alpha,
+        "margin": options.equivalence_margin,
         "filters": [filter_entry(looks[row["filter"]]) for row in first],
         "worlds": [asdict(name) for name in worlds.values()],
         "metrics": metric_entries(table, options.metric),
-        "baselines": list(dict.fromkeys(key.baseline for key in views)),
+        "baselines": baselines,
         "views": views,
-        "planned": planned_entries(planned, table, looks, worlds, options),
-        "robustness": describe_robustness(table, looks, options),
+        "planned": planned_entries(planned, runs, looks, worlds, options),
+        "warnings": [
+            text for text in (_count_failures(len(facts.failures)), facts.warning) if text
+        ],
         "calibration": list_calibration(table),
         "runs": list_runs(table),
         "sweeps": list_sweeps(views, looks, options.metric),
         "failures": list(facts.failures),
     }
+
+
+def arrange_study(
+    table: pd.DataFrame, labels: Iterable[str], worlds: Mapping[str, PartName]
+) -> StudyRuns:
+    """Arrange the runs of a study, with the largest error that counts in each world.
+
+    It is the divergence threshold of the scenario, or that which the file of its tuning states.
+    """
+    caps = {}
+    for key, model in table.groupby("scenario", observed=True)["model"].first().items():
+        name, facts = worlds.get(str(key)), read_world_facts(str(key), str(model))
+        limit = name.limit if name else None
+        caps[str(key)] = float(limit or (facts.cap if facts else math.nan))
+    return arrange_runs(table, tuple(labels), caps)
 
 
 def _count_failures(number: int) -> str:
@@ -342,52 +339,6 @@ def _count_failures(number: int) -> str:
         else f"{number} jobs have no valid result and are"
     )
     return f"{jobs} missing from all tables." if number else ""
-
-
-def _describe_best_proposed(
-    views: Mapping[ViewKey, Mapping[str, Any]], key: ViewKey, looks: Mapping[str, MethodLook]
-) -> str:
-    """Count the verdicts of the best proposed method over the conditions of a view, each decided alone.
-
-    Empty for a view of one condition, without a proposed method, and where one has an error in all conditions.
-    """
-    proposed = [row["filter"] for row in views[key]["rows"] if looks[row["filter"]].proposed]
-    ranked = {row["filter"] for row in views[key]["rows"] if row["rank"] is not None}
-    conditions = [
-        view
-        for view_key, view in views.items()
-        if (view_key.metric, view_key.baseline) == (key.metric, key.baseline)
-        and ALL not in (view_key.world, view_key.regime)
-        and key.world in (ALL, view_key.world)
-        and key.regime in (ALL, view_key.regime)
-    ]
-    if len(conditions) < 2 or not proposed or ranked & set(proposed):
-        return ""
-    counts = {label: dict.fromkeys(_OUTCOMES, 0) for label in proposed}
-    for view in conditions:
-        for row in view["rows"]:
-            if row["filter"] in counts:
-                counts[row["filter"]][row["verdict"]] += 1
-    best = max(proposed, key=lambda label: tuple(counts[label].values()))
-    parts = [
-        text.format(n)
-        for text, n in zip(_OUTCOMES.values(), counts[best].values(), strict=True)
-        if n
-    ]
-    return (
-        f"Best proposed method in single conditions, each decided alone: [[{looks[best].name}]]. "
-        f"Of {len(conditions)} conditions: {', '.join(parts)}."
-    )
-
-
-def _describe_baseline(looks: Mapping[str, MethodLook], requested: str, baseline: str) -> str:
-    """State that another baseline is shown than the selected one; empty if it is shown."""
-    if requested in ("", baseline):
-        return ""
-    return (
-        f"[[{looks[requested].name}]] has no error to compare in all conditions: "
-        f"[[{looks[baseline].name}]] is the baseline in its place."
-    )
 
 
 def select_baselines(looks: Mapping[str, MethodLook], baseline: str = "") -> list[str]:

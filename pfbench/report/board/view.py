@@ -1,212 +1,169 @@
-"""View of a board: rows of one metric, scope and baseline. Everything shown is decided here."""
+"""View of a board: the filters of a selection of conditions against one baseline, with a sentence."""
 
 from __future__ import annotations
 
 import math
-import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
+import scipy  # scipy.stats is imported at its first use
 
-from pfbench.report.board.levels import FilterLevels, StudyArrays
 from pfbench.results.looks import MethodLook
 from pfbench.results.step_times import StepTimes, describe_costs
-from pfbench.stats.decision import IDENTICAL, WORSE
-from pfbench.stats.effects import MIN_RUNS
-from pfbench.stats.error_measures import Array
-from pfbench.stats.sentences import format_digits, percent
+from pfbench.stats.comparison import MIN_RUNS, Verdict, decide
+from pfbench.stats.effects import estimate_mean
+from pfbench.stats.error_measures import Array, Flags
+from pfbench.stats.rank_tests import holm
+from pfbench.stats.study_runs import StudyRuns, compare_filters, weigh_conditions
+from pfbench.stats.world_table import TRACK_SHARE
 
-BEST, EQUAL, OPEN, MISSING = "best", "equal", "open", "missing"
-NOT_KEPT = "not_kept"  # too few runs keep track for an error
-_SAME = 1e-6  # difference of levels of identical filters, and its standard error
-
-
-@dataclass(frozen=True)
-class ViewOptions:
-    """Options of all views.
-
-    Attributes:
-        alpha: Error of all comparisons of a view together, and of each interval.
-        margin: Relative difference of errors within which filters are equal.
-        planned: Words of planned pairs by (filter, other filter), which decide over those of all pairs.
-    """
-
-    alpha: float = 0.05
-    margin: float = 0.05
-    planned: Mapping[tuple[str, str], str] | None = None
+BASE, MISSING, LOSES_TRACK = "baseline", "missing", "loses track"
+_SAME_LEVEL = 1e-6
+_LEVEL_OF_REGIONS = 0.9
+Row = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class BoardRow:
-    """Row of a board. A value that does not exist is NaN or an empty text.
+class View(NamedTuple):
+    """Filters in the conditions of a view, whatever the baseline.
 
     Attributes:
-        filter: Label.
-        rank: Rank by level, None without a level.
-        tied: Whether the filter is not shown to be worse than the best.
-        value: Error, the exponential of the level; for a single condition only.
-        low: Lower end of its interval over runs, of level 1 - alpha.
-        high: Upper end.
-        unit: Unit of the error.
-        ratio: Error divided by that of the baseline.
-        ratio_low: Lower end of its interval.
-        ratio_high: Upper end.
-        verdict: best, equal, open, worse, not_kept or missing.
-        words: Verdict as a short text.
-        track: Share of runs that keep track.
-        lost: Number of lost runs.
-        coverage: Coverage of 90 % intervals.
-        nees: Mean NEES divided by its degrees of freedom.
-        calibration: Coverage against its level: too low, consistent or too high.
-        ms: Time per step, ms: the median of rounds, or one timing per job.
-        ms_low: Lower quartile of the rounds.
-        ms_high: Upper quartile.
-        cost: Time per step divided by that of the baseline, paired by round.
-        cost_low: Lower end of its interval.
-        cost_high: Upper end.
-    """
-
-    filter: str
-    rank: int | None
-    tied: bool
-    value: float
-    low: float
-    high: float
-    unit: str
-    ratio: float
-    ratio_low: float
-    ratio_high: float
-    verdict: str
-    words: str
-    track: float
-    lost: int
-    coverage: float
-    nees: float
-    calibration: str
-    ms: float
-    ms_low: float = math.nan
-    ms_high: float = math.nan
-    cost: float = math.nan
-    cost_low: float = math.nan
-    cost_high: float = math.nan
-
-
-def show_row(row: BoardRow, *, has_limit: bool) -> dict[str, Any]:
-    """Return the values of a row for the page."""
-    values = dict(vars(row))
-    if not has_limit:
-        values |= {"track": math.nan, "words": row.words.replace("track not kept", "runs lost")}
-    return values
-
-
-class Scope(NamedTuple):
-    """Filters in the conditions of a view, before a baseline is chosen.
-
-    Attributes:
-        filters: Labels of all filters of the study, [F].
-        levels: Levels of the error.
-        descriptions: Track, lost runs, calibration and cost of each filter.
+        runs: Runs of the conditions of the view.
+        losses: Losses of all runs, [F, C, N].
+        metric: Column of the error.
         unit: Unit of the error, empty for several conditions.
-        is_single: Whether there is one condition.
+        filters: Description of each filter, see `describe_filters`.
         times: Times of the filters in rounds, by label in each condition.
+        has_limit: Whether all scenarios state a divergence threshold.
+        alpha: Error rate of a family, and of each interval of a level.
+        margin: Log ratio within which two filters are equal.
     """
 
-    filters: tuple[str, ...]
-    levels: FilterLevels
-    descriptions: Mapping[str, Mapping[str, Any]]
+    runs: StudyRuns
+    losses: Array
+    metric: str
     unit: str
-    is_single: bool
-    times: Sequence[Mapping[str, StepTimes]] = ()
+    filters: Mapping[str, Row]
+    times: Sequence[Mapping[str, StepTimes]]
+    has_limit: bool
+    alpha: float
+    margin: float
 
 
-def build_rows(scope: Scope, baseline: str, options: ViewOptions) -> list[BoardRow]:
-    """Build the rows of a view, ordered by level. Filters without a level follow in the order of their tracks."""
-    filters, levels = scope.filters, scope.levels
-    level = levels.level
-    track = np.array([scope.descriptions[label]["track"] for label in filters])
-    order = np.lexsort((np.array(filters), -track, levels.off.sum(axis=1), level)).tolist()
-    best = order[0] if np.isfinite(level[order[0]]) else None
-    base = filters.index(baseline)
+def build_rows(view: View, baseline: str) -> list[Row]:
+    """Build the rows of a view, ordered by level; filters that lack a condition come last.
+
+    A row has filter, rank, value with its interval (of a single condition), ratio with its simultaneous interval,
+    verdict and its words, and the description of the filter. A value that does not exist is NaN.
+    """
+    runs = view.runs
+    complete = np.all(runs.present.any(axis=2), axis=1)
+    verdicts = decide_against(view, baseline, complete)
+    values = summarise_levels(view)
+    level = np.where(complete, values[0], np.nan)
+    track = np.array([view.filters[label]["track"] for label in runs.filters])
+    order = np.lexsort((np.array(runs.filters), -track, level)).tolist()
     rows = []
     for i in order:
-        verdict, words = _decide(levels, i, best, filters, options)
-        rows.append(
-            BoardRow(
-                filters[i],
-                int((level < level[i] - _SAME).sum()) + 1 if np.isfinite(level[i]) else None,
-                verdict in (EQUAL, OPEN),
-                *_level_interval(levels, i, scope.is_single, options.alpha),
-                scope.unit,
-                *_ratio(levels, i, base, options.alpha),
-                verdict,
-                words,
-                **{
-                    **scope.descriptions[filters[i]],
-                    **describe_costs(scope.times, filters[i], baseline, options.alpha),
-                },
-            )
-        )
+        label = runs.filters[i]
+        costs = describe_costs(view.times, label, baseline, view.alpha)
+        rows.append({
+            "filter": label,
+            "rank": int((level < level[i] - _SAME_LEVEL).sum()) + 1 if complete[i] else None,
+            **_show_level(view, values[:, i]), "unit": view.unit,
+            **_show_verdict(view, label, verdicts), **view.filters[label], **costs,
+        })  # fmt: skip
     return rows
 
 
-def _decide(
-    levels: FilterLevels, i: int, best: int | None, filters: tuple[str, ...], options: ViewOptions
-) -> tuple[str, str]:
-    """Return the verdict on a filter against the best, and its words."""
-    if np.isnan(levels.level[i]):
-        return MISSING, "not run in all conditions"
-    if best is None or not np.isfinite(levels.level[i]):
-        off = levels.off[i]
-        return NOT_KEPT, "track not kept" + f", {off.sum()}/{off.size}" * (off.size > 1)
-    if i == best:
-        return BEST, "smallest"
-    estimate = levels.difference(i, best)
-    if max(abs(float(estimate.value)), float(estimate.standard_error)) <= _SAME:
-        return EQUAL, IDENTICAL
-    runs = int(min(levels.runs[i], levels.runs[best]))
-    if runs < MIN_RUNS:
-        return OPEN, f"{runs} {'run' if runs == 1 else 'runs'}"
-    pairs = len(filters) * (len(filters) - 1) / 2
-    low, high = map(float, estimate.interval(options.alpha / pairs))
-    planned = (options.planned or {}).get((filters[i], filters[best]), "")
-    if low > 0 or planned == WORSE:
-        return (WORSE, f"+{percent(float(estimate.value))} %") if planned != BEST else (OPEN, "")
-    if high < math.log1p(options.margin) or planned == "equivalent":
-        return EQUAL, f"within {percent(math.log1p(options.margin))} %"
-    return OPEN, f"{_signed(low)} to {_signed(high)} %"
+def decide_against(view: View, baseline: str, complete: Flags) -> dict[str, Verdict | None]:
+    """Decide all filters of a view against a baseline, in one family; None for the baseline."""
+    labels = [name for name, is_there in zip(view.runs.filters, complete, strict=True) if is_there]
+    others = [name for name in labels if name != baseline and baseline in labels]
+    effects = compare_filters(view.runs, view.losses, [(name, baseline) for name in others])
+    decided = decide(effects, view.margin, view.alpha)
+    return {baseline: None, **dict(zip(others, decided, strict=True))}
 
 
-def _signed(log_ratio: float) -> str:
-    return f"{'-' if log_ratio < 0 else '+'}{percent(log_ratio)}"
+def summarise_levels(view: View) -> Array:
+    """Summarise the losses of each filter: mean over conditions of the medians over runs, and an interval.
+
+    Returns level and, for a single condition, the ends of the interval of its median, [3, F]. A level is infinite
+    where half of the runs are lost and no cap is known.
+    """
+    losses = view.losses
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # filters without runs
+        medians = np.nanmedian(losses, axis=2)
+    with np.errstate(invalid="ignore"):
+        level = medians @ weigh_conditions(view.runs.conditions)
+    ends = np.full((2, len(level)), np.nan)
+    if losses.shape[1] == 1:
+        for i, row in enumerate(losses[:, 0]):
+            ends[:, i] = _interval_of_median(row[~np.isnan(row)], view.alpha)
+    return np.stack([level, *ends])
 
 
-def _level_interval(
-    levels: FilterLevels, i: int, is_single: bool, alpha: float
-) -> tuple[float, float, float]:
-    """Return the error of a filter and its interval, NaN for several conditions."""
-    if not is_single or not np.isfinite(levels.level[i]):
-        return math.nan, math.nan, math.nan
-    low, high = levels.single(i).interval(alpha)
-    return float(np.exp(levels.level[i])), float(np.exp(low)), float(np.exp(high))
+def _interval_of_median(values: Array, alpha: float) -> tuple[float, float]:
+    """Return the order statistics that contain the median with probability 1 - alpha; NaN if none do."""
+    k = _count_below(len(values), alpha)
+    if k < 0:
+        return math.nan, math.nan
+    ordered = np.sort(values)
+    return float(ordered[k]), float(ordered[len(values) - 1 - k])
 
 
-def _ratio(levels: FilterLevels, i: int, base: int, alpha: float) -> tuple[float, float, float]:
-    """Return the ratio to the baseline and its interval."""
-    if not np.isfinite(levels.level[[i, base]]).all():
-        return math.nan, math.nan, math.nan
-    estimate = levels.difference(i, base)
-    with np.errstate(over="ignore"):
-        low, high = (float(np.exp(end)) for end in estimate.interval(alpha))
-        return float(np.exp(estimate.value)), low, high
+@cache
+def _count_below(n: int, alpha: float) -> int:
+    """Return the number of values below the interval of a median of n values; -1 if there is no interval."""
+    below = scipy.stats.binom.cdf(np.arange(n), n, 0.5) if n else np.ones(1)
+    return int((below <= alpha / 2).sum()) - 1
 
 
-def describe_filters(runs: StudyArrays, alpha: float = 0.05) -> dict[str, dict[str, Any]]:
-    """Describe track, lost runs, calibration and cost of each filter."""
-    lost = np.nansum(runs.values["lost"], axis=(1, 2))
+def _show_level(view: View, level: Array) -> Row:
+    """Return the error of a filter and its interval, NaN for several conditions or a level of lost runs."""
+    is_known = len(view.runs.conditions) == 1 and math.isfinite(level[0])
+    shown = np.where(np.isfinite(level), level, np.nan) if is_known else np.full(3, np.nan)
+    return dict(zip(("value", "low", "high"), map(float, np.exp(shown)), strict=True))
+
+
+def _show_verdict(view: View, label: str, verdicts: Mapping[str, Verdict | None]) -> Row:
+    """Return ratio, interval, verdict and words of a row."""
+    ends = dict.fromkeys(("ratio", "ratio_low", "ratio_high", "p"), math.nan)
+    if label not in verdicts:
+        return {**ends, "verdict": MISSING, "words": "not run in all conditions"}
+    verdict, lost = verdicts[label], view.filters[label]["lost_conditions"]
+    if verdict is None:
+        ends |= dict.fromkeys(("ratio", "ratio_low", "ratio_high"), 1.0)
+        return {**ends, "verdict": BASE, "words": _word_lost(view, label) or BASE}
+    ends = {"ratio": verdict.ratio, "ratio_low": verdict.low, "ratio_high": verdict.high, "p": verdict.p}  # fmt: skip
+    if lost and len(view.runs.conditions) == 1:
+        return {**ends, "verdict": LOSES_TRACK, "words": _word_lost(view, label)}
+    words = f"equal within {100 * math.expm1(view.margin):.3g} %" if verdict.word == "equal" else ""
+    words = ", ".join(
+        filter(None, (words or verdict.word, verdict.reason, _word_lost(view, label)))
+    )
+    return {**ends, "verdict": verdict.word, "words": words}
+
+
+def _word_lost(view: View, label: str) -> str:
+    """State that a filter loses track, with the share of runs or the conditions; empty if it is not shown."""
+    lost, count = view.filters[label]["lost_conditions"], len(view.runs.conditions)
+    what = "loses track" if view.has_limit else "loses runs"
+    if not lost:
+        return ""
+    share = f"{100 * (1 - view.filters[label]['track']):.0f} %"
+    return f"{what} in {lost}/{count}" if count > 1 else f"{what} in {share} of runs"
+
+
+def describe_filters(runs: StudyRuns, alpha: float = 0.05) -> dict[str, Row]:
+    """Describe track, lost runs, coverage and cost of each filter.
+
+    Conditions in which a filter loses track, and coverage that differs from 90 %, are shown by tests with Holm's
+    correction over all of them.
+    """
     names = ("keeps_track", "coverage_90", "nees_ratio", "ms")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # filters without runs
@@ -214,263 +171,94 @@ def describe_filters(runs: StudyArrays, alpha: float = 0.05) -> dict[str, dict[s
         track, coverage, nees = (np.nanmean(by_condition[name], axis=1) for name in names[:3])
         cost = np.exp(np.nanmean(np.log(by_condition["ms"]), axis=1))
         by_run = np.nanmean(runs.values["coverage_90"], axis=1)
+        lost = np.nansum(runs.values["lost"], axis=(1, 2))
+    lost_conditions = find_lost_conditions(runs, alpha).sum(axis=1)
+    calibration = word_calibration(by_run, alpha)
     return {
         label: {
-            "track": float(track[i]),
-            "lost": int(lost[i]),
-            "coverage": float(coverage[i]),
-            "nees": float(nees[i]),
-            "calibration": _calibration(by_run[i][~np.isnan(by_run[i])], alpha),
+            "track": float(track[i]), "lost": int(lost[i]), "lost_conditions": int(lost_conditions[i]),
+            "coverage": float(coverage[i]), "nees": float(nees[i]), "calibration": calibration[i],
             "ms": float(cost[i]),
         }
         for i, label in enumerate(runs.filters)
-    }
+    }  # fmt: skip
 
 
-def _calibration(coverage: Array, alpha: float) -> str:
-    """Return a word on the coverage [N] of 90 % regions from the interval of its mean."""
-    count = coverage.size
-    if count < MIN_RUNS:
-        return ""
-    half = -float(stdtrit(count - 1, alpha / 2)) * float(coverage.std(ddof=1)) / math.sqrt(count)
-    if coverage.mean() + half < 0.9:
-        return "too low"
-    return "too high" if coverage.mean() - half > 0.9 else "consistent"
+def find_lost_conditions(runs: StudyRuns, alpha: float) -> Flags:
+    """Find where it is shown that a filter keeps track in fewer than 80 % of runs, by exact binomial tests, [F, C]."""
+    kept, number = (runs.keeps & runs.present).sum(axis=2), runs.present.sum(axis=2)
+    p = np.where(number > 0, scipy.stats.binom.cdf(kept, number, TRACK_SHARE), 1.0)
+    return np.asarray(holm(p.ravel()).reshape(p.shape) < alpha)
+
+
+def word_calibration(coverage: Array, alpha: float) -> list[str]:
+    """Return "too low" or "too high" where the mean coverage [F, N] of 90 % regions is shown to differ; else empty."""
+    estimates = [estimate_mean(row[~np.isnan(row)] - _LEVEL_OF_REGIONS) for row in coverage]
+    tested = [np.isfinite(e.p) and e.df >= MIN_RUNS - 1 for e in estimates]
+    p = holm([float(e.p) if yes else 1.0 for e, yes in zip(estimates, tested, strict=True)])
+    return [
+        "" if value >= alpha else "too low" if e.value < 0 else "too high"
+        for e, value in zip(estimates, p, strict=True)
+    ]
 
 
 # --------------------------------------------------------------------------------------------------
-# The sentence of a view, and its small print.
-
-TrackInterval = Callable[[str, str], tuple[float, float]]  # of two labels
-
-_MOST_NAMES = 3  # in a sentence
-# words where no divergence threshold says whether a track is kept
-_LOST_WORDS = {
-    "does not keep track in": "is lost in",
-    "do not keep track in": "are lost in",
-    r"Track is kept by (.*?) in (\d+ %) and by (.*?) in (\d+ %) of runs": r"Runs that are not lost: \1 \2, \3 \4",
-}
-_LOST_SHARE = 0.2  # share of runs off track from which a filter is counted
+# The sentence of a view: at most 55 words on the opening screen.
 
 
 def describe_view(
-    rows: Sequence[BoardRow],
-    looks: Mapping[str, MethodLook],
-    baseline: str,
-    scope: str,
-    metric: str,
-    level: str = "95 %",
-    track_interval: TrackInterval | None = None,
-    *,
-    has_limit: bool = True,
+    rows: Sequence[Row], looks: Mapping[str, MethodLook], baseline: str, where: str, metric: str
 ) -> str:
-    """Describe a view: failures, the best filter, the best proposed method, ties.
+    """Describe a view: how many filters are better, equal, worse and not decided, and the best proposed method.
 
-    Returns sentences. Names of filters are enclosed in double square brackets.
+    Names of filters are enclosed in double square brackets.
     """
-    ranked = [row for row in rows if row.rank is not None]
-    failures = _describe_failures(rows, looks)
-    tracks = _describe_tracks(rows, looks, baseline, level, track_interval)
-    if not has_limit:
-        failures, tracks = map(name_lost_runs, (failures, tracks))
-    if not ranked:
-        return f"{failures} No filter has an error to compare {scope}. {tracks}".strip()
-    if len(rows) == 1:
-        row = rows[0]
-        value = "" if math.isnan(row.value) else f" of {row.value:.3g} {row.unit}".rstrip()
-        return f"{failures} {_name(row, looks)} has a {metric}{value} {scope}. It is the only filter.".strip()
-    return " ".join(
-        filter(
-            None,
-            [
-                failures,
-                _describe_best(ranked, rows, looks, baseline, (f"{metric} {scope}", level)),
-                tracks,
-                _describe_proposed(ranked, looks),
-                _describe_ties(ranked),
-            ],
+    base = f"[[{looks[baseline].name}]]"
+    others = [row for row in rows if row["verdict"] not in (BASE, MISSING)]
+    if not others:
+        value = next((row for row in rows if row["filter"] == baseline), rows[0])
+        number = (
+            ""
+            if math.isnan(value["value"])
+            else f" of {value['value']:.3g} {value['unit']}".rstrip()
         )
+        return f"{base} has a median {metric}{number} {where}; no other filter is compared with it."
+    better = sorted((r for r in others if r["verdict"] == "better"), key=lambda r: r["ratio"])
+    counts = [
+        (sum(r["verdict"] in ("equal", "identical") for r in others), "equal to it"),
+        (sum(r["verdict"] == "not decided" for r in others), "not decided"),
+        (sum(r["verdict"] == "worse" for r in others), "worse"),
+        (sum(r["verdict"] == LOSES_TRACK for r in others), "without track"),
+    ]
+    rest = ", ".join(f"{n} {'is' if n == 1 else 'are'} {text}" for n, text in counts if n)
+    head = (
+        f"Of {len(others)} {'filter' if len(others) == 1 else 'filters'}, {len(better) or 'none'}"
     )
+    head += f" {'is' if len(better) < 2 else 'are'} better than {base} {where}"
+    if better:
+        first = better[0]
+        head += f" (best: [[{looks[first['filter']].name}]], {_show_ratio(first)} of its {metric})"
+    return " ".join(filter(None, (f"{head}; {rest}." if rest else f"{head}.", _describe_proposed(others, better, looks))))  # fmt: skip
+
+
+def _show_ratio(row: Row) -> str:
+    """Format the ratio of a row with its interval."""
+    if not math.isfinite(row["ratio_high"]):
+        return f"{row['ratio']:.2f}"
+    return f"{row['ratio']:.2f} [{row['ratio_low']:.2f}, {row['ratio_high']:.2f}]"
+
+
+def _describe_proposed(
+    others: Sequence[Row], better: Sequence[Row], looks: Mapping[str, MethodLook]
+) -> str:
+    """State the proposed method of the smallest ratio, unless it is the best filter; empty without one."""
+    proposed = [row for row in others if looks[row["filter"]].proposed]
+    if not proposed or (better and looks[better[0]["filter"]].proposed):
+        return ""
+    row = min(proposed, key=lambda r: (r["verdict"] == LOSES_TRACK, r["ratio"]))
+    return f"Best proposed method: [[{looks[row['filter']].name}]], {_show_ratio(row)}, {row['verdict']}."
 
 
 def count_words(number: int, noun: str) -> str:
     """Format a count with its noun."""
     return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
-def count_failing(number: int, total: int) -> str:
-    """Format the subject and verb of a sentence on the filters that do not keep track."""
-    verb = "does" if number == 1 else "do"
-    return f"{number} of {count_words(total, 'filter')} {verb} not keep track"
-
-
-def name_lost_runs(text: str) -> str:
-    """Replace the words on tracks in a sentence on conditions without a divergence threshold."""
-    for words, lost in _LOST_WORDS.items():
-        text = re.sub(words, lost, text)
-    return text
-
-
-def _name(row: BoardRow, looks: Mapping[str, MethodLook]) -> str:
-    return f"[[{looks[row.filter].name}]]"
-
-
-def _format_ends(low: float, high: float) -> str:
-    """Format the ends of an interval with two significant digits."""
-    return f"{format_digits(low, 2)} to {format_digits(high, 2)}"
-
-
-def _join(names: Sequence[str]) -> str:
-    """List up to three names in words, and count the others."""
-    if len(names) > _MOST_NAMES:
-        others = count_words(len(names) - _MOST_NAMES + 1, "more filter")
-        names = [*names[: _MOST_NAMES - 1], others]
-    return " and ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
-
-
-def _describe_failures(rows: Sequence[BoardRow], looks: Mapping[str, MethodLook]) -> str:
-    """Count the filters that do not keep track in many runs, or were not run."""
-    off = [r for r in rows if r.verdict != MISSING and 1 - r.track > _LOST_SHARE]
-    missing = [_name(row, looks) for row in rows if row.verdict == MISSING]
-    without = sum(row.verdict == NOT_KEPT for row in rows)
-    text = ""
-    if off:
-        worst = min(off, key=lambda row: row.track)
-        share = f"{100 * (1 - worst.track):.0f} %"
-        if len(off) == 1:
-            text = f"{_name(worst, looks)} does not keep track in {share} of runs."
-        else:
-            text = (
-                f"{count_failing(len(off), len(rows))} in over a fifth of runs "
-                f"({_name(worst, looks)}: in {share})."
-            )
-    if without > len(off):
-        text += (
-            f" {count_failing(without, len(rows))} in over a fifth of the runs "
-            f"of at least one condition: {'its error is' if without == 1 else 'their errors are'} not compared."
-        )
-    if missing:
-        verb = "was" if len(missing) == 1 else "were"
-        text += f" {_join(missing)} {verb} not run in all conditions."
-    return text.strip()
-
-
-def _describe_best(
-    ranked: Sequence[BoardRow],
-    rows: Sequence[BoardRow],
-    looks: Mapping[str, MethodLook],
-    baseline: str,
-    texts: tuple[str, str],
-) -> str:
-    """State the filter of the smallest error against the baseline, with metric and level as text."""
-    where, level = texts
-    best = ranked[0]
-    base = next(row for row in rows if row.filter == baseline)
-    twins = [row for row in ranked if row.words == IDENTICAL]
-    names = _join([_name(row, looks) for row in (best, *twins)])
-    head = f"{names} {'have' if twins else 'has'} the smallest {where}"
-    head = f"Of the {len(ranked)} others, {head}" if 1 < len(ranked) < len(rows) else head
-    if twins:
-        head += " (identical results)"
-    if baseline in (best.filter, *(row.filter for row in twins)):
-        return f"{head}. {_describe_next(ranked, base, looks, level)}".rstrip()
-    if math.isnan(best.ratio):
-        state = "tracks not kept" if base.verdict == NOT_KEPT else "missing runs"
-        return f"{head}. The baseline {_name(base, looks)} has no error because of {state}."
-    size = f"{_format_size(best.ratio)} below {_name(base, looks)}"
-    if not math.isfinite(best.ratio_low) or not math.isfinite(best.ratio_high):
-        return f"{head}, {size}, without an interval from so few runs."
-    ends = [100 * (1 - end) for end in (best.ratio_high, best.ratio_low)]
-    interval = f"{level} interval {_format_ends(*ends)} %"
-    cost = _describe_cost(best, base)
-    if base.verdict == EQUAL:
-        return f"{head}, {size} ({interval}){cost}: equal to it {base.words}."
-    if base.verdict == OPEN:
-        return (
-            f"{head}, {size} ({interval}){cost}. "
-            f"Jointly with all other pairs this is not decided: {_name(base, looks)} is {base.words} above it."
-        )
-    return f"{head}: {size} ({interval}){cost}."
-
-
-def _describe_tracks(
-    rows: Sequence[BoardRow],
-    looks: Mapping[str, MethodLook],
-    baseline: str,
-    level: str,
-    track_interval: TrackInterval | None,
-) -> str:
-    """State the difference of shares of runs that keep track where no errors are compared; else empty."""
-    ranked = [row for row in rows if row.rank is not None]
-    off = sorted((row for row in rows if row.verdict == NOT_KEPT), key=lambda row: -row.track)
-    if not off or (len(ranked) > 1 and all(row.filter != baseline for row in off)):
-        return ""
-    first = ranked[0] if ranked else off[0]
-    others = off if ranked else [row for row in off if row.track < first.track]
-    if not others:
-        return ""
-    second = next((row for row in others if row.filter == baseline), others[0])
-    size = format_digits(100 * (first.track - second.track), 2)
-    text = (
-        f"Track is kept by {_name(first, looks)} in {100 * first.track:.0f} % and by {_name(second, looks)} in "
-        f"{100 * second.track:.0f} % of runs, difference {size} percentage points"
-    )
-    if track_interval is None:
-        return f"{text}."
-    ends = (100 * end for end in track_interval(first.filter, second.filter))
-    return f"{text} ({level} interval {_format_ends(*ends)})."
-
-
-def _describe_next(
-    ranked: Sequence[BoardRow], base: BoardRow, looks: Mapping[str, MethodLook], level: str
-) -> str:
-    """State distance and cost of the first filter that is worse, or of the second, where the best is the baseline."""
-    others = [row for row in ranked[1:] if row.words != IDENTICAL]
-    if not others:
-        return "No other filter has an error to compare." if len(ranked) == 1 else ""
-    row = next((row for row in others if row.verdict == WORSE), others[0])
-    subject = "The next" if row is others[0] else "The first that is worse"
-    size = f"{subject}, {_name(row, looks)}, is {_format_size(row.ratio)} above it"
-    ends = [100 * (end - 1) for end in (row.ratio_low, row.ratio_high)]
-    if not all(map(math.isfinite, ends)):
-        return f"{size}, without an interval from so few runs."
-    return f"{size} ({level} interval {_format_ends(*ends)} %){_describe_cost(row, base)}."
-
-
-def _describe_cost(row: BoardRow, base: BoardRow) -> str:
-    """Compare the time per step with that of the baseline, with its interval if it was measured in rounds."""
-    if not math.isnan(row.cost):
-        ends = f"interval {row.cost_low:.2f} to {row.cost_high:.2f}"
-        return f", at {row.cost:.2f} times its cost ({ends})"
-    if not base.ms > 0:
-        return ""
-    factor = f"{row.ms / base.ms:.2g}"
-    return ", at about the same cost" if factor == "1" else f", at about {factor} times its cost"
-
-
-def _format_size(ratio: float) -> str:
-    """Format the difference from 1 in percent."""
-    return "less than 0.01 %" if abs(ratio - 1) < 1e-4 else f"{percent(math.log(ratio))} %"
-
-
-def _describe_proposed(ranked: Sequence[BoardRow], looks: Mapping[str, MethodLook]) -> str:
-    """State the best proposed method, unless it is the best filter."""
-    proposed = [row for row in ranked if looks[row.filter].proposed]
-    if not proposed or proposed[0] is ranked[0]:
-        return ""
-    row = proposed[0]
-    state = {EQUAL: "equal to the best", OPEN: "not decided against the best"}
-    return f"Best proposed method: {_name(row, looks)}, {state.get(row.verdict, 'worse')} ({row.words})."
-
-
-def _describe_ties(ranked: Sequence[BoardRow]) -> str:
-    """Count the filters that are equal to the best, and those that are not decided against it."""
-    others = [row for row in ranked[1:] if row.words != IDENTICAL]
-    counts = [
-        (sum(row.verdict == EQUAL for row in others), "equal to the best within the margin"),
-        (sum(row.verdict == OPEN for row in others), "not decided against the best"),
-    ]
-    if len(others) == 1:
-        return "".join(f"The other filter is {state}." for n, state in counts if n)
-    parts = [f"{n} {'is' if n == 1 else 'are'} {state}" for n, state in counts if n]
-    return f"Of {count_words(len(others), 'other filter')}, {' and '.join(parts)}." if parts else ""

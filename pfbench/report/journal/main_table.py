@@ -208,11 +208,11 @@ class ErrorColumn(NamedTuple):
     entries: dict[str, tuple[str, str, str]]
 
     def best(self) -> set[str]:
-        """Return the filters whose printed number is the smallest of those not shown to be worse."""
+        """Return the filters whose printed number is the smallest."""
         numbers = {
             key: float(text)
-            for key, (text, _, verdict) in self.entries.items()
-            if verdict != "worse" and is_printed_number(text)
+            for key, (text, _, _) in self.entries.items()
+            if is_printed_number(text)
         }
         least = min(numbers.values(), default=math.nan)
         return {key for key, number in numbers.items() if number == least}
@@ -273,12 +273,18 @@ def describe_columns(
         else ""
     )
     return (
-        f"{metric}: trimmed mean over runs on the logarithmic scale{interval}{where}. Bold: smallest. "
-        r"\textsuperscript{\textdagger}: shown to be worse than the smallest, jointly for all comparisons "
-        r"of the column; the others are not told apart from it. \textsuperscript{*}: proposed methods."
+        f"{metric}: median over runs{interval}{where}. Bold: smallest. "
+        rf"\textsuperscript{{\textdagger}}: shown to be worse than {_name_baseline(pack)}, jointly for all filters "
+        r"of the column. \textsuperscript{*}: proposed methods."
         + _describe_absent(pack, cells)
         + _describe_lost(pack, cells)
     )
+
+
+def _name_baseline(pack: Pack) -> str:
+    """Return the name of the baseline in LaTeX."""
+    names = {str(look["key"]): str(look["name"]) for look in pack["filters"]}
+    return escape_latex(names[str(pack["baselines"][0])]) if pack["baselines"] else "the baseline"
 
 
 def _describe_absent(pack: Pack, cells: Sequence[tuple[str, str]]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from pfbench.files.escapes import escape_latex
@@ -35,63 +35,39 @@ _ROUNDS = "Times: medians of rounds in which the filters took turns; ratio to th
 
 
 def make_planned_table(pack: Pack) -> LatexTable | None:
-    """Build the table of the planned pairs; None without a pair that has an effect."""
-    ratios, won = list_pairs(pack, has_won=False), list_pairs(pack, has_won=True)
-    if not (ratios or won):
+    """Build the table of the pairs that were compared in advance; None without one that has a ratio."""
+    if not list_pairs(pack):
         return None
     looks = filters_by_key(pack)
-    kinds = [name for name, pairs in (("ratio", ratios), ("points", won)) if pairs]
-    extra = ["track (%)"] if won else []
-    head = ["Method and baseline", *kinds, "interval", "p", *extra, "decision"]
-    specs = ["l", *["r"] * len(kinds), "l", "r", *["l"] * len(extra), "l"]
+    head = ["Method and baseline", "ratio", "interval", "p", "verdict"]
     groups: dict[str, list[list[LatexCell]]] = {}
     for pair in pack["planned"]:
         name = f"{looks[str(pair['a'])]['name']} against"
         title = text_cell(name, span=len(head))._replace(alignment="@{}l")
         baseline = _indent(text_cell(str(looks[str(pair["b"])]["name"])))
-        cells = _pair_cells(pair, kinds, has_track=bool(won))
-        groups.setdefault(str(pair["a"]), [[title]]).append([baseline, *cells])
-    caption = _describe_pairs(len(pack["worlds"]), bool(ratios), bool(won))
+        groups.setdefault(str(pair["a"]), [[title]]).append([baseline, *_pair_cells(pair)])
+    worlds = len(pack["worlds"])
+    where = f"these {worlds} worlds" if worlds > 1 else "the runs of this world"
+    caption = (
+        rf"Pairs compared in advance: error of the method divided by that of the baseline over {where}, by Hodges "
+        r"and Lehmann. Intervals are simultaneous, with Holm's correction of \textit{p} over all pairs."
+    )
     heads = [[text_cell(text) for text in head]]
-    return LatexTable("planned", caption, list(map(Column, specs)), heads, list(groups.values()))
+    specs = list(map(Column, ["l", "r", "l", "r", "l"]))
+    return LatexTable("planned", caption, specs, heads, list(groups.values()))
 
 
-def _pair_cells(pair: Pack, kinds: Sequence[str], *, has_track: bool) -> list[LatexCell]:
-    """Return the cells of a planned pair after its name."""
-    won, word = pair.get("won"), str(pair["word"])
-    values, write = (pair, _ratio) if won is None else (won, _points)
-    effect = text_cell("--")
-    if is_number(values["estimate"]):
-        effect = _effect_cell(write(values["estimate"]), word)
-    kind = kinds[0] if won is None else "points"
-    effects = [effect if name == kind else text_cell("") for name in kinds]
-    ends = [write(values[name]) for name in ("low", "high")]
+def _pair_cells(pair: Pack) -> list[LatexCell]:
+    """Return the cells of a pair after its name."""
+    word = str(pair["word"])
+    effect = (
+        _effect_cell(_ratio(pair["estimate"]), word)
+        if is_number(pair["estimate"])
+        else text_cell("--")
+    )
+    ends = [_ratio(pair[name]) for name in ("low", "high")]
     interval = "--" if "--" in ends else f"[{', '.join(ends)}]"
-    shares = "/".join(f"{100 * share:.0f}" for share in won["track"]) if won else ""
-    return [
-        *effects, text_cell(interval), text_cell(_p_value(pair.get("p"))),
-        *[text_cell(shares)] * has_track, text_cell(word),
-    ]  # fmt: skip
-
-
-def _describe_pairs(worlds: int, has_ratio: bool, has_won: bool) -> str:
-    """Describe the effects of the planned pairs, for the caption of their table."""
-    ratio = (
-        "error of the method divided by that of the baseline, mean over "
-        rf"{'these ' + str(worlds) + ' worlds' if worlds > 1 else 'the runs of this world'} on a log scale"
-    )
-    points = (
-        "difference of the shares of runs won, in percentage points, positive if the method wins more, "
-        "with the shares of runs in which both keep track"
-    )
-    if has_ratio and has_won:
-        effects = f"{ratio}; where tracks are not kept, {points}"
-    else:
-        effects = ratio if has_ratio else f"{points}, since tracks are not kept"
-    return (
-        rf"Planned pairs: {effects}. "
-        r"Intervals are simultaneous, with Holm's correction of \textit{p} over all pairs. Decisions are for these worlds."
-    )
+    return [effect, text_cell(interval), text_cell(_p_value(pair.get("p"))), text_cell(word)]
 
 
 def make_cost_table(pack: Pack, particles: Mapping[str, str]) -> LatexTable:
@@ -161,11 +137,6 @@ def _ratio(value: Any) -> str:
     if f"{value:.2f}" == "1.00" and abs(value - 1) > _EQUAL:
         return f"{value:.3f}"
     return f"{value:.2f}" if 0.095 <= value < 9.995 else format_error_value(value, 2)
-
-
-def _points(value: Any) -> str:
-    """Format percentage points with three digits and a sign."""
-    return f"{value:+#.3g}".rstrip(".").replace("-", "−") if is_number(value) else "--"
 
 
 def _effect_cell(text: str, word: str) -> LatexCell:

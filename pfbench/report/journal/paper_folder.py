@@ -54,7 +54,7 @@ def select_figures(pack: Pack) -> dict[str, Plot]:
     plots: dict[str, tuple[Plot, bool]] = {
         "leaderboard": (plot_leaderboard, has_ratio),
         "over_time": (plot_over_time, any(key[1] == regime for key in pack["curves"])),
-        "planned": (plot_planned, any(list_pairs(pack, has_won=won) for won in (False, True))),
+        "planned": (plot_planned, bool(list_pairs(pack))),
         "cost": (plot_error_against_cost, has_cost),
         "calibration": (plot_calibration, bool(pack["calibration"].get((ALL, ALL)))),
     }
@@ -101,7 +101,7 @@ def _list_remarks(pack: Pack, tables: Iterable[str], plots: Iterable[str]) -> li
     remarks = [f"{name}.tex has the intervals" for name in tables if "supplement" in name]
     if pack["planned"] and "planned" not in plots:
         remarks.append(
-            "no planned pair has an effect, so that planned.pdf and table_planned.tex are left out"
+            "no pair compared in advance has a ratio, so that planned.pdf and table_planned.tex are left out"
         )
     return remarks
 
@@ -191,12 +191,12 @@ _PACKAGES = (
 _MINUS = re.compile(r"(?<![\w-])-(?=\d)")  # a sign, not a hyphen
 CAPTIONS = {
     "leaderboard": (
-        "{metric} relative to {baseline}, mean over worlds and noise regimes on a log scale, with {level}\\,\\% intervals. "
-        r"Filled: proposed methods. $^\dagger$: shown to be worse than the first. Triangles lie beyond the axis."
+        "{metric} relative to {baseline} over paired runs, with simultaneous {level}\\,\\% intervals. "
+        r"Filled: proposed methods. $^\dagger$: shown to be worse than {baseline}. Triangles lie beyond the axis."
     ),
     "over_time": "Median error over runs in time, {regime}. Filled and solid: proposed methods; hollow and dashed: others.",
     "planned": (
-        "Planned pairs{effects}. Diamonds: effect in these worlds with its simultaneous interval, filled if decided. {dots}"
+        "Pairs compared in advance. Diamonds: effect in these worlds with its simultaneous interval, filled if decided. {dots}"
         "Thin lines: a new world."
     ),
     "cost": (
@@ -222,10 +222,8 @@ def format_caption(name: str, pack: Pack) -> str:
     looks = {str(look["key"]): look for look in pack["filters"]}
     baseline = looks.get(str(pack["baselines"][0])) if pack["baselines"] else None
     regime = str(pack["regimes"][0]["name"]).lower()
-    has_ratio, has_won = (bool(list_pairs(pack, has_won=won)) for won in (False, True))
     words = {
-        "{effects}": ", by the share of runs won in percentage points where tracks are not kept" * has_won,
-        "{dots}": "Dots: single worlds. " * has_ratio,
+        "{dots}": "Dots: single worlds. " * bool(list_pairs(pack)),
         "{metric}": escape_latex(str(pack["metrics"][0]["name"])),
         "{level}": f"{100 * (1 - float(pack['alpha'])):g}",
         "{regime}": escape_latex(regime),

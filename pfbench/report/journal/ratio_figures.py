@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.journal.figure_style import (
     DAGGER,
     MARGIN,
@@ -67,36 +66,15 @@ def plot_leaderboard(pack: Pack, setting: FigureSetting) -> Figure:
 
 
 def plot_planned(pack: Pack, setting: FigureSetting) -> Figure:
-    """Plot the planned pairs: effect in these worlds, each world, and a new world.
-
-    Ratios of errors have a logarithmic axis. Differences of runs won have a panel with a linear axis below.
-    """
-    kinds = [(has_won, list_pairs(pack, has_won=has_won)) for has_won in (False, True)]
-    kinds = [(has_won, pairs) for has_won, pairs in kinds if pairs]
-    rows = [max(len(pairs), 2) for _, pairs in kinds]
-    figure = setting.make_figure(MARGIN * len(kinds) + 1.05 * ROW * sum(rows))
-    panels = figure.subplots(len(kinds), 1, squeeze=False, height_ratios=rows).ravel()
-    for axis, (has_won, pairs) in zip(panels, kinds, strict=True):
-        _plot_pairs(axis, pairs, filters_by_key(pack), setting, has_won=has_won)
-    return figure
-
-
-def _plot_pairs(
-    axis: Axes, pairs: Sequence[Pack], looks: Pack, setting: FigureSetting, *, has_won: bool
-) -> None:
-    """Plot pairs of one kind of effect: ratios, or percentage points of runs won."""
+    """Plot the pairs that were compared in advance: ratio of errors in these worlds, in each, and in a new world."""
+    pairs, looks = list_pairs(pack), filters_by_key(pack)
+    figure = setting.make_figure(MARGIN + 1.05 * ROW * max(len(pairs), 2))
+    axis = figure.subplots()
     effects = [pair[name] for pair in pairs for name in ("estimate", "low", "high")]
     effects += [cell["estimate"] for pair in pairs for cell in pair["cells"]]
-    values = [float(value) for value in effects if is_number(value)]
-    if has_won:
-        limits = min(-5.0, *values) * 1.08, max(5.0, *values) * 1.08
-        axis.set_xlim(limits)
-        axis.axvline(0.0, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
-        axis.set_xlabel("runs won, first minus second [points]", loc="right")  # names are wide
-    else:
-        limits = ratio_limits(values)
-        use_ratio_scale(axis, *limits)
-        axis.set_xlabel("ratio of errors, first / second", loc="right")
+    limits = ratio_limits([float(value) for value in effects if is_number(value)])
+    use_ratio_scale(axis, *limits)
+    axis.set_xlabel("ratio of errors, first / second", loc="right")  # names are wide
     label_rows(axis, [f"{looks[p['a']]['name']} / {looks[p['b']]['name']}" for p in pairs], setting)
     for y, pair in enumerate(pairs):
         new, colour = pair.get("new_world"), str(looks[pair["a"]]["colour"])
@@ -108,6 +86,7 @@ def _plot_pairs(
                 x = float(np.clip(cell["estimate"], *limits))
                 axis.plot([x], [y], ".", ms=2.5, color=_GREY, zorder=2)
         _draw_diamond(axis, y, pair, colour, limits)
+    return figure
 
 
 def plot_error_against_cost(pack: Pack, setting: FigureSetting) -> Figure:
@@ -356,24 +335,19 @@ _EQUAL_WITHIN = 1e-3  # units of the drawing
 _SVG: Any = {"svg.hashsalt": "pfbench", "svg.fonttype": "none"}  # equal bytes, text as text
 
 
-def write_headline(pack: Pack, folder: RecordedFolder) -> bool:
-    """Write the figure, or remove it if no filter has an error. A stored drawing that is equal stays.
+def render_headline(pack: Pack, stored: bytes = b"") -> bytes:
+    """Draw the error of each filter relative to the baseline as SVG; empty if no filter has a ratio.
 
-    Args:
-        pack: Data of the page.
-        folder: Folder of the report.
-
-    Returns:
-        Whether there is a figure.
+    A stored drawing that is equal but for the last digits stays. Equal data give equal bytes.
     """
     opening = next(iter(pack["views"].values()))
     if all(row["ratio"] is None for row in opening["rows"]):
-        folder.remove(HEADLINE)
-        return False
-    drawing, file = render_headline(pack), folder.path / HEADLINE
-    stored = file.read_bytes() if file.is_file() else b""
-    folder.write(HEADLINE, stored if stored and is_equal_drawing(stored, drawing) else drawing)
-    return True
+        return b""
+    setting, buffer = FigureSetting(find_page_format(width=_WIDTH)), io.BytesIO()
+    with setting.applied(), matplotlib.rc_context(_SVG):
+        plot_leaderboard(pack, setting).savefig(buffer, format="svg", metadata={"Date": None})
+    drawing = buffer.getvalue()
+    return stored if stored and is_equal_drawing(stored, drawing) else drawing
 
 
 def is_equal_drawing(first: bytes, second: bytes) -> bool:
@@ -390,11 +364,3 @@ def is_equal_drawing(first: bytes, second: bytes) -> bool:
         return False
     numbers = zip(*(_NUMBER.findall(drawing.decode()) for drawing in (first, second)), strict=True)
     return all(abs(float(a) - float(b)) < _EQUAL_WITHIN for a, b in numbers)
-
-
-def render_headline(pack: Pack) -> bytes:
-    """Draw the error of each filter relative to the baseline as SVG. Equal data give equal bytes."""
-    setting, buffer = FigureSetting(find_page_format(width=_WIDTH)), io.BytesIO()
-    with setting.applied(), matplotlib.rc_context(_SVG):
-        plot_leaderboard(pack, setting).savefig(buffer, format="svg", metadata={"Date": None})
-    return buffer.getvalue()

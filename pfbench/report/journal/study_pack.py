@@ -59,12 +59,6 @@ def is_number(value: Any) -> bool:
     return isinstance(value, int | float) and value == value and abs(value) != float("inf")
 
 
-def list_pairs(pack: Pack, *, has_won: bool) -> list[Pack]:
-    """List the planned pairs with a ratio of errors, or those with a difference of runs won.
-
-    Returns entries of the pairs, whose `estimate`, `low`, `high` and `new_world` are those of the
-    effect.
-    """
-    if not has_won:
-        return [pair for pair in pack["planned"] if is_number(pair["estimate"])]
-    return [{**pair, **pair["won"], "cells": []} for pair in pack["planned"] if pair.get("won")]
+def list_pairs(pack: Pack) -> list[Pack]:
+    """List the pairs that were compared in advance and have a ratio of errors."""
+    return [pair for pair in pack["planned"] if is_number(pair["estimate"])]

@@ -1,4 +1,4 @@
-"""Writer of the first page of a study: index.html with its figures, report.md, and the tables as CSV."""
+"""First page of a study: index.html with its figures, report.md, and the tables as CSV."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 import pandas as pd
 from markupsafe import Markup
 
-from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.overview import figures
 from pfbench.report.overview.tables import Overview, WorldRow, tell_story
 from pfbench.report.study_page.page_writer import describe_page_knobs
@@ -23,30 +22,22 @@ _HERE = Path(__file__).parent
 _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 
-def write_overview(
-    overviews: Mapping[int, Overview], pack: Mapping[str, Any], folder: RecordedFolder
-) -> Path:
-    """Write the first page of a study: index.html, report.md, heat_map.svg, matrices.svg, cells.csv and pairs.csv.
+def render_overview(overviews: Mapping[int, Overview], pack: Mapping[str, Any]) -> dict[str, str]:
+    """Render the first page of a study: index.html, report.md, figures and tables by file name.
 
     A study with several numbers of particles has the tables of each, and figures of error against number and time.
 
     Args:
         overviews: Tables of the page by number of particles, 0 for a study of one number.
         pack: Data of the page of each world.
-        folder: Folder of the report.
-
-    Returns:
-        Path of index.html.
     """
     level = list(overviews)[len(overviews) // 2]  # the middle number opens the page
     overview = overviews[level]
     pictures = draw_pictures(overviews)
-    for name, text in pictures.items():
-        if not name.endswith("_390"):
-            folder.write(f"{name}.svg", text)
+    files = {f"{name}.svg": text for name, text in pictures.items() if not name.endswith("_390")}
     for name, tables in (("cells", list_verdicts), ("pairs", list_comparisons)):
         parts = [tables(item).assign(particles=key or "") for key, item in overviews.items()]
-        folder.write(f"{name}.csv", format_csv(pd.concat(parts)))
+        files[f"{name}.csv"] = format_csv(pd.concat(parts))
     context = {
         "pack": pack,
         "overview": overview,
@@ -70,8 +61,8 @@ def write_overview(
     }
     for kind, name in (("html", "index.html"), ("md", "report.md")):
         environment = template_environment(_HERE, is_html=kind == "html")
-        folder.write(name, environment.get_template(f"page.{kind}.jinja").render(context))
-    return folder.path / "index.html"
+        files[name] = environment.get_template(f"page.{kind}.jinja").render(context)
+    return files
 
 
 def draw_pictures(overviews: Mapping[int, Overview]) -> dict[str, str]:

@@ -1,5 +1,5 @@
 // Sentence, switches and leaderboard.
-const signs = { best: "★", equal: "≈", better: "▲", open: "?", worse: "▼", not_kept: "✕", missing: "–" };
+const signs = { better: "▲", equal: "≈", identical: "≈", "not decided": "?", worse: "▼", "loses track": "✕", missing: "–" };
 const few = new Set(["rank", "filter", "ratio", "verdict", "track"]); // columns of a telephone
 const numeric = new Set(["rank", "ratio", "track", "ms"]);
 
@@ -12,7 +12,7 @@ function heads() {
     {
       key: "value",
       text: several ? "Where" : "Error",
-      small: several ? "darker: worse" : "with interval",
+      small: several ? "darker: worse" : "median",
       value: (row) => row.value,
     },
     {
@@ -22,7 +22,7 @@ function heads() {
       value: (row) => row.ratio,
     },
     { key: "bar", text: "Ratio", small: "log scale" },
-    { key: "verdict", text: "Against the best", small: "jointly", value: (row) => row.rank },
+    { key: "verdict", text: "Verdict", small: "jointly", value: (row) => row.rank },
     { key: "track", text: "Track kept", value: (row) => row.track },
     { key: "calibration", text: "Coverage", small: "90 % regions", value: (row) => row.coverage },
     { key: "ms", text: "ms/step", value: (row) => row.ms },
@@ -119,7 +119,7 @@ function details(row, span) {
     ["Family", look.family],
     [metricOf().name, valueText(row)],
     [`Ratio to ${looks[state.baseline].name}`, `${short(row.ratio, 4)} ${interval(row.ratio_low, row.ratio_high)}`],
-    ["Against the best", `${row.verdict.replace("_", " ")}: ${row.words}`],
+    [`Against ${looks[state.baseline].name}`, row.p === null ? row.words : `${row.words}; p = ${short(row.p)} for all filters together`],
     ["Track kept", percent(row.track)],
     ["Lost runs", row.lost === null ? "–" : row.lost],
     ["Coverage of 90 % regions", percent(row.coverage)],
@@ -185,12 +185,12 @@ function drawBoard() {
       const look = looks[row.filter];
       const open = state.open === row.filter;
       return (
-        `<tr data-filter="${esc(row.filter)}"><td class="number">${row.rank === null ? "–" : (row.tied ? "=" : "") + row.rank}</td>` +
+        `<tr data-filter="${esc(row.filter)}"><td class="number">${row.rank === null ? "–" : row.rank}</td>` +
         `<th scope="row"${look.proposed ? ' class="proposed"' : ""}><button type="button" class="name" data-row="${esc(row.filter)}" aria-expanded="${open}" title="${esc(look.long || look.name)}">${icon(look)}${esc(look.name)}</button></th>` +
         `<td class="desk">${several ? strip(row.filter) : esc(valueText(row))}</td>` +
         `<td class="number"><b>${short(row.ratio)}</b> <span class="interval faint">${interval(row.ratio_low, row.ratio_high)}</span></td>` +
-        `<td class="desk scale">${drawBar(row)}</td><td class="${row.verdict}">${signs[row.verdict] || ""} ${esc(row.words)}</td>` +
-        `<td class="number">${percent(row.track)}</td><td class="desk">${percent(row.coverage)}${row.calibration ? ", " : ""}<span class="${row.calibration === "consistent" ? "faint" : "open"}">${esc(row.calibration || "")}</span></td>` +
+        `<td class="desk scale">${drawBar(row)}</td><td class="${row.verdict.replace(" ", "_")}">${signs[row.verdict] || ""} ${esc(row.words)}</td>` +
+        `<td class="number">${percent(row.track)}</td><td class="desk">${percent(row.coverage)}${row.calibration ? ", " : ""}<span class="not_decided">${esc(row.calibration || "")}</span></td>` +
         `<td class="number desk"${row.cost > 0 ? ` title="ratio ${short(row.cost)} ${interval(row.cost_low, row.cost_high)}"` : ""}>${short(row.ms)}${row.ms_low > 0 ? ` <span class="interval faint">${quartiles(row)}</span>` : ""}</td></tr>${open ? details(row, columns.length) : ""}`
       );
     })

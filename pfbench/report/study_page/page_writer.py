@@ -10,7 +10,6 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.methods_text import write_methods
 from pfbench.report.study_page.encoding import encode_pack
 from pfbench.report.writers import template_environment
@@ -19,7 +18,7 @@ from pfbench.results.looks import describe_foreign_knobs, find_stored_world
 PAGE_BYTES = 1_500_000
 _HERE = Path(__file__).parent
 _SCRIPTS = ("kit", "state", "board", "cost", "pairs", "worlds", "time", "runs", "main")
-_OPTIONAL = ("paper_figures", "failures", "definitions", "filter_notes", "choices", "robustness")
+_OPTIONAL = ("paper_figures", "failures", "definitions", "filter_notes", "choices", "warnings")
 _STATIC = (
     *_OPTIONAL,
     "facts",
@@ -30,29 +29,21 @@ _STATIC = (
 )  # not read by the script
 _COLOUR = re.compile(r"#[0-9a-fA-F]{6}")
 _SECTIONS = (
-    ("planned", "planned", "Planned comparisons"), ("cells", "worlds", "Scenarios"), ("curves", "time", "Over time"),
+    ("planned", "planned", "Compared in advance"), ("cells", "worlds", "Scenarios"), ("curves", "time", "Over time"),
     ("calibration", "calibration", "Calibration"), ("runs", "runs", "Single runs"), ("sweeps", "sweeps", "Dose and response"),
     ("paper_figures", "figures", "Figures of the paper"), ("cells", "table", "Table"), ("methods", "methods", "Methods"), ("downloads", "downloads", "Downloads"),
 )  # fmt: skip
 
 
-def write_page(pack: Mapping[str, Any], folder: RecordedFolder, name: str = "index.html") -> Path:
-    """Write the page and report.md of a study. Equal packs give equal bytes.
-
-    Returns path of the page.
-    """
+def render_page(pack: Mapping[str, Any], name: str = "index.html") -> dict[str, str]:
+    """Render the page of a study and its Markdown by file name. Equal packs give equal texts."""
     pack = {**dict.fromkeys(_OPTIONAL, ()), **pack}
     pack["budgets"] = offer_budgets(pack)
     names = {look["key"]: look["name"] for look in pack["filters"]}
     context = {
-        "pack": pack,
-        "opening": describe_opening(pack),
-        "planned": describe_pairs(pack),
-        "effects": name_effects(pack),
-        "level": _format_level(pack),
+        **_describe_page(pack),
         "methods": write_methods(pack),
         "notes": [{**note, "name": names[note["filter"]]} for note in pack["filter_notes"]],
-        "choices": pack["choices"],
         "files": _group_files(pack["downloads"]),
         "sections": [
             (anchor, title)
@@ -66,31 +57,35 @@ def write_page(pack: Mapping[str, Any], folder: RecordedFolder, name: str = "ind
             )
         ),
         "colours": Markup(_format_colours(pack["filters"])),
-        "script": Markup("\n".join(_read_script(name) for name in _SCRIPTS)),
+        "script": Markup("\n".join(_read_script(script) for script in _SCRIPTS)),
         "data": "",
     }
     html = template_environment(_HERE, is_html=True).get_template("page.html.jinja")
     script_data = {key: value for key, value in pack.items() if key not in _STATIC}
     data = encode_pack(script_data, PAGE_BYTES - len(html.render(context).encode()))
-    folder.write(name, html.render({**context, "data": Markup(data)}))
-    write_markdown(pack, folder, "report.md" if name == "index.html" else f"{Path(name).stem}.md")
-    return folder.path / name
+    markdown = "report.md" if name == "index.html" else f"{Path(name).stem}.md"
+    return {
+        name: html.render({**context, "data": Markup(data)}),
+        markdown: render_markdown(pack),
+    }
 
 
-def write_markdown(
-    pack: Mapping[str, Any], folder: RecordedFolder, name: str = "report.md"
-) -> None:
-    """Write the page of a study as Markdown, one screen."""
-    context = {
-        "pack": {"headline": "", "headline_note": "", "failures": (), **pack},
-        "choices": pack.get("choices", ()),
+def render_markdown(pack: Mapping[str, Any]) -> str:
+    """Render the page of a study as Markdown, one screen."""
+    pack = {"headline": "", "failures": (), "choices": (), **pack}
+    template = template_environment(_HERE, is_html=False).get_template("report.md.jinja")
+    return template.render(_describe_page(pack))
+
+
+def _describe_page(pack: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what both forms of a page show."""
+    return {
+        "pack": pack,
         "opening": describe_opening(pack),
         "planned": describe_pairs(pack),
-        "effects": name_effects(pack),
         "level": _format_level(pack),
+        "choices": pack["choices"],
     }
-    template = template_environment(_HERE, is_html=False).get_template("report.md.jinja")
-    folder.write(name, template.render(context))
 
 
 def _format_level(pack: Mapping[str, Any]) -> str:
@@ -133,7 +128,8 @@ def _group_files(downloads: Sequence[Mapping[str, Any]]) -> list[tuple[str, list
 # Sentence, table and decisions of a page before its script runs.
 
 SIGNS = {
-    "best": "★", "equal": "≈", "better": "▲", "open": "?", "worse": "▼", "not_kept": "✕", "missing": "–",
+    "better": "▲", "equal": "≈", "identical": "≈", "not decided": "?", "worse": "▼", "loses track": "✕",
+    "missing": "–", "baseline": "",
 }  # fmt: skip
 _DASH = "–"
 _NAMED = 4  # filters with severely overconfident runs in the first lines
@@ -174,7 +170,6 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
     key, view = next(iter(pack["views"].items()))
     metric, world, regime, baseline = key
     names = {f["key"]: f for f in pack["filters"]}
-    robustness = pack.get("robustness") or ""
     parts = (
         _name(pack["metrics"], metric),
         _scope(pack["worlds"], world, "scenario"),
@@ -185,8 +180,7 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
         "sentence": format_sentence(view["sentence"]),
         "text": _remove_marks(view["sentence"]),
         "small_print": view["small_print"],
-        "robustness": format_sentence(robustness),
-        "robustness_text": _remove_marks(robustness),
+        "warnings": " ".join(pack.get("warnings", ())),
         "foreign_knobs": describe_page_knobs(pack),
         "overconfidence": describe_overconfidence(pack),
         "caption": f"{'; '.join(parts)}.",
@@ -227,8 +221,8 @@ def _remove_marks(text: str) -> str:
 def _heads(baseline: str) -> list[dict[str, str]]:
     """Return the heads of the table."""
     heads = [
-        ("#", "number", "", "ascending"), ("Filter", "", "", ""), ("Error", "desk", "with interval", ""),
-        (f"÷ {baseline}", "number", "with interval", ""), ("Against the best", "", "jointly", ""),
+        ("#", "number", "", "ascending"), ("Filter", "", "", ""), ("Error", "desk", "median", ""),
+        (f"÷ {baseline}", "number", "with interval", ""), ("Verdict", "", "jointly", ""),
         ("Track kept", "number", "", ""), ("Coverage", "desk", "90 % regions", ""),
         ("ms/step", "number desk", "", ""),
     ]  # fmt: skip
@@ -243,14 +237,14 @@ def _row(row: Mapping[str, Any], look: Mapping[str, Any]) -> dict[str, Any]:
         value = f"{format_short(row['value'])} {unit} {interval}"
     calibration = row["calibration"] or ""
     return {
-        "rank": _DASH if row["rank"] is None else f"{'=' if row['tied'] else ''}{row['rank']}",
+        "rank": _DASH if row["rank"] is None else str(row["rank"]),
         "name": look["name"],
         "proposed": look["proposed"],
         "value": value,
         "ratio": format_short(row["ratio"]),
         "interval": format_interval(row["ratio_low"], row["ratio_high"]),
-        "verdict": row["verdict"],
-        "words": f"{SIGNS[row['verdict']]} {row['words']}",
+        "verdict": row["verdict"].replace(" ", "_"),
+        "words": f"{SIGNS[row['verdict']]} {row['words']}".strip(),
         "track": format_share(row["track"]),
         "calibration": ", ".join(filter(None, (format_share(row["coverage"]), calibration))),
         "ms": f"{format_short(row['ms'])} {format_interval(row.get('ms_low'), row.get('ms_high'))}".rstrip(),
@@ -260,39 +254,18 @@ def _row(row: Mapping[str, Any], look: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def describe_pairs(pack: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return the planned comparisons as texts."""
+    """Return the pairs that were compared in advance as texts."""
     names = {f["key"]: f["name"] for f in pack["filters"]}
     return [
         {
             "pair": f"{names[pair['a']]} against {names[pair['b']]}",
-            "question": pair["question"],
-            **_describe_effect(pair),
+            "effect": format_short(pair["estimate"]),
+            "interval": format_interval(pair["low"], pair["high"]) or pair["reason"] or "",
             "word": pair["word"],
             "sentence": _remove_marks(pair["sentence"]),
         }
         for pair in pack["planned"]
     ]
-
-
-def name_effects(pack: Mapping[str, Any]) -> str:
-    """Name the effects of the planned pairs, as the head of a column: ratio, runs won, or both."""
-    has_won = [bool(pair.get("won")) for pair in pack["planned"]]
-    names = ("Ratio", *["runs won"] * any(has_won))
-    return "Runs won" if has_won and all(has_won) else " or ".join(names)
-
-
-def _describe_effect(pair: Mapping[str, Any]) -> dict[str, str]:
-    """Return effect, interval and shares of tracks kept of a planned pair."""
-    won = pair.get("won")
-    if won is None:
-        interval = format_interval(pair["low"], pair["high"]) or pair["reason"] or ""
-        return {"effect": format_short(pair["estimate"]), "interval": interval, "track": ""}
-    first, second = (format_short(100 * share) for share in won["track"])
-    return {
-        "effect": f"{format_short(won['estimate'])} points",
-        "interval": format_interval(won["low"], won["high"]),
-        "track": f"{first} and {second} %",
-    }
 
 
 def _name(items: Sequence[Mapping[str, Any]], key: str) -> str:

@@ -1,31 +1,18 @@
 // Planned comparisons as a forest, and curves over a parameter.
-const verdictStyle = (word) =>
-  /better/.test(word) ? "better" : /worse/.test(word) ? "worse" : /equal|equivalent/.test(word) ? "equal" : "open";
-
-// Ratios of errors, and points of runs won where tracks are not kept.
-const signed = (value) => `${value > 0 ? "+" : value < 0 ? "−" : ""}${short(Math.abs(value))}`;
-const ratioKind = { shown: (v) => v > 0, show: change, end: change, none: 1, less: "← smaller error", more: "larger error →" };
-const wonKind = {
-  shown: (v) => Number.isFinite(v),
-  show: (value) => `${signed(value)} points`,
-  end: signed,
-  none: 0,
-  less: "← second wins more",
-  more: "first wins more →",
-};
+const verdictStyle = (word) => ({ better: "good", worse: "bad", equal: "good", identical: "good" })[word] || "open";
 
 function drawForest(part) {
-  const ratios = data.planned.filter((pair) => pair.estimate > 0);
-  const won = data.planned.filter((pair) => pair.won).map((pair) => ({ ...pair, prediction: null, ...pair.won, cells: [] }));
-  part.innerHTML = (ratios.length ? forest(part, ratios, ratioKind) : "") + (won.length ? forest(part, won, wonKind) : "");
+  const pairs = data.planned.filter((pair) => pair.estimate > 0);
+  part.innerHTML = pairs.length ? forest(part, pairs) : "";
 }
 
-function forest(part, pairs, { shown, show, end, none, less, more }) {
+function forest(part, pairs) {
+  const shown = (v) => v > 0;
   const width = widthOf(part);
   const narrow = width < 800;
   const wordsOf = (pair) => {
-    const range = pair.low !== null && pair.high !== null ? `[${end(pair.low)}, ${end(pair.high)}]` : "";
-    return [show(pair.estimate), range, pair.word].filter(Boolean).join(" ");
+    const range = pair.low !== null && pair.high !== null ? `[${change(pair.low)}, ${change(pair.high)}]` : "";
+    return [change(pair.estimate), range, pair.word].filter(Boolean).join(" ");
   };
   const widest = Math.max(...pairs.map((pair) => textWidth(wordsOf(pair), 11.5)));
   const [left, right] = narrow ? [8, 8] : [Math.min(310, width * 0.27), Math.ceil(widest) + 16];
@@ -38,17 +25,16 @@ function forest(part, pairs, { shown, show, end, none, less, more }) {
       ...(pair.new_world ? [pair.new_world.low, pair.new_world.high] : []),
     ])
     .filter(shown);
-  const [low, high] = none
-    ? [Math.min(0.9, Math.max(1 / 30, Math.min(...ends))) / 1.05, Math.max(1.1, Math.min(30, Math.max(...ends))) * 1.05]
-    : [Math.min(-5, ...ends) * 1.05, Math.max(5, ...ends) * 1.05];
-  const x = (none ? logarithmic : linear)(low, high, left, width - right);
-  const inside = (v) => Math.min(width - right, Math.max(left, x(none ? Math.max(v, 1e-9) : v)));
+  const low = Math.min(0.9, Math.max(1 / 30, Math.min(...ends))) / 1.05;
+  const high = Math.max(1.1, Math.min(30, Math.max(...ends))) * 1.05;
+  const x = logarithmic(low, high, left, width - right);
+  const inside = (v) => Math.min(width - right, Math.max(left, x(Math.max(v, 1e-9))));
   let y = 18;
   let content = "";
   let question = null;
   for (const pair of pairs) {
     const kind = { tuned: "against tuned baselines", paper: "against the baselines of the paper" }[pair.kind];
-    const group = narrow && kind ? `A${kind.slice(1)}` : [pair.question, ...(kind ? [kind] : [])].join(", ");
+    const group = kind ? `A${kind.slice(1)}` : "Pairs";
     if (group !== question) {
       const titles = wrap(group, width, 12, true);
       content += block(0, y + 8 + 6.5 * (titles.length - 1), titles, 12, "", true);
@@ -58,10 +44,10 @@ function forest(part, pairs, { shown, show, end, none, less, more }) {
     const [a, b] = [looks[pair.a], looks[pair.b]];
     const names = `${a.name}${narrow ? " / " : " against "}${b.name}`;
     const known = pair.low !== null && pair.high !== null;
-    const range = known ? `[${end(pair.low)}, ${end(pair.high)}]` : `(${pair.reason})`;
-    const words = `${show(pair.estimate)} ${range}`;
+    const range = known ? `[${change(pair.low)}, ${change(pair.high)}]` : `(${pair.reason})`;
+    const words = `${change(pair.estimate)} ${range}`;
     const small = pair.cells.filter((cell) => shown(cell.estimate));
-    const verdict = `${show(pair.estimate)} ${pair.word}`;
+    const verdict = `${change(pair.estimate)} ${pair.word}`;
     const size = narrow ? 11.5 : 12;
     const lines = wrap(names, narrow ? width - left - textWidth(verdict, 11.5) - 10 : left - 12, size);
     const rise = narrow ? 3.5 + 12.5 * lines.length : 0;
@@ -75,7 +61,7 @@ function forest(part, pairs, { shown, show, end, none, less, more }) {
           width,
           y + 12,
           verdict,
-          ` text-anchor="end" style="font-size:11.5px;fill:var(--${{ better: "good", worse: "bad", equal: "good", open: "open" }[verdictStyle(pair.word)]})"`,
+          ` text-anchor="end" style="font-size:11.5px;fill:var(--${verdictStyle(pair.word)})"`,
         );
     else
       content +=
@@ -84,33 +70,25 @@ function forest(part, pairs, { shown, show, end, none, less, more }) {
           width - right + 12,
           middle + 4,
           wordsOf(pair),
-          ` style="font-size:11.5px;fill:var(--${{ better: "good", worse: "bad", equal: "good", open: "open" }[verdictStyle(pair.word)]})"`,
+          ` style="font-size:11.5px;fill:var(--${verdictStyle(pair.word)})"`,
         );
     content += `<g${spoken(`${group}. ${names}: ${words}, ${pair.word}. ${plain(pair.sentence)}`)}><rect x="${left}" y="${px(y + rise)}" width="${px(width - left - right)}" height="${px(height - rise - 4)}" fill="transparent"/>`;
-    if (pair.prediction?.every(shown))
-      content += line(
-        inside(pair.prediction[0]),
-        middle,
-        inside(pair.prediction[1]),
-        middle,
-        ' stroke="var(--faint)" stroke-width="1"',
-      );
     if (pair.new_world && shown(pair.new_world.low) && shown(pair.new_world.high)) content += bar(inside(pair.new_world.low), inside(pair.new_world.high), middle, 3, a, 0.45);
     content +=
       (known ? bar(inside(pair.low), inside(pair.high), middle, 6, a, 0.85) : "") + mark(a, inside(pair.estimate), middle, 6) + "</g>";
     small.forEach((cell, k) => {
       const level = middle + 10 + step * (k + 0.5);
-      const text = `${cell.name || cellName(cell)}: ${show(cell.estimate)} [${show(cell.low)}, ${show(cell.high)}]`;
+      const text = `${cell.name || cellName(cell)}: ${change(cell.estimate)} [${change(cell.low)}, ${change(cell.high)}]`;
       content += `<g${tip(text)}>${bar(inside(cell.low), inside(cell.high), level, 1.2, a, 0.7)}<circle class="c${a.index}" cx="${px(inside(cell.estimate))}" cy="${px(level)}" r="1.9" fill="var(--c)"/></g>`;
     });
     y += height;
   }
-  const ticks = (none ? logTicks : linearTicks)(low, high, narrow ? 5 : 9);
+  const ticks = logTicks(low, high, narrow ? 5 : 9);
   const frame =
     xAxis(ticks, x, 10, y) +
-    line(x(none), 10, x(none), y, ' class="rule"') +
-    label(inside(low), y + 30, less, ' class="axis"') +
-    label(width - right, y + 30, more, ' class="axis" text-anchor="end"');
+    line(x(1), 10, x(1), y, ' class="rule"') +
+    label(inside(low), y + 30, "← smaller error", ' class="axis"') +
+    label(width - right, y + 30, "larger error →", ' class="axis" text-anchor="end"');
   return svg(
     width,
     y + 36,

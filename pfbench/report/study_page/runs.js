@@ -2,7 +2,7 @@
 let dots = null; // geometry of the dots that are drawn: condition, filters, scale
 
 const runsOf = () => partOf(data.runs, state.cell);
-const runValues = (key) => decode(runsOf().values[key]);
+const runValues = (key) => runsOf().values[key];
 const runFilters = () => order().filter((look) => runsOf()?.values[look.key]);
 const byError = (key) =>
   runValues(key)
@@ -124,12 +124,12 @@ function drawTrack(look, number, cell) {
       : "No tracks are in the page. The command shows them.";
   if (!carried) return;
   const truth = part.truth && (part.truth[number] || part.truth.all);
-  if (truth && part.plane[look.key]) drawPlane(find("#plane"), look, truth, decode(part.plane[look.key][number]));
+  if (truth && part.plane[look.key]) drawPlane(find("#plane"), look, truth, part.plane[look.key][number]);
   const times = [];
   const add = (filters, head, unit, isLog, t = part.t) => {
     const lines = order()
       .filter((item) => (item === look || state.on.has(item.key)) && filters[item.key] && filters[item.key][number])
-      .map((item) => ({ look: item, values: decode(filters[item.key][number]), bold: item === look }))
+      .map((item) => ({ look: item, values: filters[item.key][number], bold: item === look }))
       .filter((item) => item.values.some((v) => v > 0 || (!isLog && v !== null)));
     if (lines.length)
       times.push({ t, lines, head, unit, isLog, height: 210, caption: `${head} of run ${number} over time` });

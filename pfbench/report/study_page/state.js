@@ -17,80 +17,17 @@ const axes = ["metric", "world", "regime", "baseline"];
 let data = null;
 let looks = {};
 let viewKeys = [];
-let places = []; // scenario and regime of the views
-const placeOf = (key) => key.slice(1, 3).join("/");
 const views = new Map(); // views that were shown, by key
 
-// The data are the length of a JSON text, the text and the bytes of all codes, in gzip and base 85 (encoding.py).
+// The data are a JSON text in gzip and base 64 (encoding.py).
 async function unpack() {
-  const stream = new Blob([fromBase85(find("#data").textContent.trim())]).stream();
-  const bytes = new Uint8Array(await new Response(stream.pipeThrough(new DecompressionStream("gzip"))).arrayBuffer());
-  const end = 4 + new DataView(bytes.buffer).getUint32(0);
-  data = JSON.parse(new TextDecoder().decode(bytes.subarray(4, end)));
-  placeCodes(data, bytes.subarray(end), 0);
+  const packed = atob(find("#data").textContent.trim());
+  const bytes = Uint8Array.from(packed, (sign) => sign.charCodeAt(0));
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  data = JSON.parse(await new Response(stream).text());
   data.filters.forEach((look, index) => (look.index = index));
   looks = Object.fromEntries(data.filters.map((look) => [look.key, look]));
-  const { keys, baselines } = data.views;
-  places = [...new Set(keys.map(placeOf))];
-  viewKeys = keys.flatMap((scope) => baselines.map((baseline) => [...scope, baseline]));
-}
-
-function fromBase85(text) {
-  const signs = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz!#$%.()*+-;,=>?@^_`{|}~";
-  const digits = new Uint8Array(128);
-  [...signs].forEach((sign, digit) => (digits[sign.charCodeAt(0)] = digit));
-  const missing = (5 - (text.length % 5)) % 5; // of the last group, and of its bytes
-  const whole = text + "~".repeat(missing);
-  const words = new DataView(new ArrayBuffer((whole.length / 5) * 4));
-  for (let k = 0; k < whole.length; k += 5) {
-    let word = 0;
-    for (let n = k; n < k + 5; n++) word = word * 85 + digits[whole.charCodeAt(n)];
-    words.setUint32((k / 5) * 4, word);
-  }
-  return words.buffer.slice(0, words.byteLength - missing);
-}
-
-// Replace the length of each code by its bytes. They lie in the order of the codes in the text.
-function placeCodes(value, bytes, start) {
-  if (value === null || typeof value !== "object") return start;
-  if (typeof value.code === "number") {
-    const end = start + value.code;
-    value.code = bytes.subarray(start, end);
-    return end;
-  }
-  return Object.values(value).reduce((place, part) => placeCodes(part, bytes, place), start);
-}
-
-// Exact numbers of four digits, or numbers from levels of equal ratio. A stored 0 is a missing value.
-function decode(code) {
-  if (!code.values) code.values = "c" in code ? decodeDecimals(code) : decodeLevels(code);
-  return code.values;
-}
-function decodeDecimals({ code, c }) {
-  const word = (k) => code[k] * 256 + code[k + c];
-  return Array.from({ length: c }, (_, k) => {
-    const exponent = word(k + 2 * c);
-    return exponent < 2 ? [null, 0][exponent] : Number(`${word(k)}e${exponent - 515}`);
-  });
-}
-function decodeLevels({ code, w, s, d, l, h }) {
-  const count = w ? code.length / 2 : code.length;
-  const range = w ? 2 ** w : 256;
-  const top = s ? range / 2 - 1 : range - 1;
-  const step = Math.log(h / l) / (top - 1);
-  const values = new Array(count);
-  let level = 0;
-  for (let k = 0; k < count; k++) {
-    const raw = w ? code[k] * 256 + code[k + count] : code[k];
-    level = d ? (level + raw) % range : raw;
-    if (level === 0) values[k] = null;
-    else if (!s) values[k] = l * Math.exp((level - 1) * step);
-    else {
-      const size = Math.abs(level - range / 2);
-      values[k] = size === 0 ? 0 : Math.sign(level - range / 2) * l * Math.exp((size - 1) * step);
-    }
-  }
-  return values;
+  viewKeys = data.views.keys;
 }
 
 // The view: the choice of the switches, kept in the address after #.
@@ -102,24 +39,14 @@ function view() {
 }
 const single = (cell) => viewOf([state.metric, cell.world, cell.regime, state.baseline]);
 
-// A view from its columns (encoding.py): of its place, of all its baselines, and its own.
+// A view from its rows, each a list of values.
 function viewOf(wish) {
   const key = viewKeys.findIndex((parts) => parts.every((part, k) => part === wish[k]));
   if (views.has(key)) return views.get(key);
   if (key < 0) return undefined;
-  const { baselines, texts, fixed, shared, separate } = data.views;
-  const [scope, base] = [Math.floor(key / baselines.length), key % baselines.length];
-  const place = places.indexOf(placeOf(viewKeys[key]));
-  const width = data.filters.length;
-  const pick = (column, part, k) => ("c" in column ? decode(column)[part * width + k] : column[part][k]);
-  const rows = data.filters.map((_, k) => {
-    const row = { filter: pick(shared.filter, scope, k) };
-    for (const [name, column] of Object.entries(fixed)) row[name] = pick(column, place, looks[row.filter].index);
-    for (const [name, column] of Object.entries(shared)) row[name] = pick(column, scope, k);
-    for (const [name, column] of Object.entries(separate)) row[name] = pick(column, key, k);
-    return row;
-  });
-  const built = { ...texts[scope][base], rows, byFilter: Object.fromEntries(rows.map((row) => [row.filter, row])) };
+  const { columns, texts, rows: stored } = data.views;
+  const rows = stored[key].map((values) => Object.fromEntries(columns.map((name, k) => [name, values[k]])));
+  const built = { ...texts[key], rows, byFilter: Object.fromEntries(rows.map((row) => [row.filter, row])) };
   views.set(key, built);
   return built;
 }

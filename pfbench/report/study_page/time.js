@@ -89,7 +89,7 @@ function drawTime(part) {
   if (!cell) return void (part.innerHTML = '<p class="note">This condition has no curves.</p>');
   const chosen = order().filter((look) => state.on.has(look.key) && cell.filters[look.key]);
   const steps = cell.t.length;
-  const quantile = (look, k) => decode(cell.filters[look.key]).slice(k * steps, (k + 1) * steps);
+  const quantile = (look, k) => cell.filters[look.key][["median", "q10", "q90"][k]];
   const lines = chosen.map((look) => ({ look, values: quantile(look, 0) }));
   const best = chosen[0];
   const band = best && { look: best, low: quantile(best, 1), high: quantile(best, 2) };

@@ -121,7 +121,6 @@ function drawTable(part) {
   const sequence = groups.flatMap(([, list]) => list).map((cell) => cells.indexOf(cell));
   for (const look of order()) {
     const bold = (row, r) =>
-      row.verdict === "best" ||
       short(row.value) === short(Math.min(...Object.values(rows[r]).map((item) => item.value ?? Infinity)));
     html += `<tr><th scope="row"${look.proposed ? ' class="proposed"' : ""}><span>${icon(look)}${esc(look.name)}</span></th>${sequence
       .map((r) => {
