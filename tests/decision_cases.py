@@ -47,8 +47,11 @@ def make_study(
                             "scenario": scenario,
                             "family": (families or {}).get(scenario, scenario),
                             "regime": f"regime_{r}",
+                            "model": "model",
+                            "seed": 1,
                             "run": range(runs),
-                            "value": loss,
+                            "rmse": loss,
+                            "lost": ~keeps,
                             "keeps_track": keeps,
                         }
                     )

@@ -85,6 +85,7 @@ def read_study(name: str) -> Study:
         if key.metric == "rmse" and "all" not in (key.world, key.regime) and row["verdict"] != "missing"
     ])  # fmt: skip
     rows = rows.drop_duplicates(["world", "regime", "filter"])
+    rows = rows.astype(dict.fromkeys(("rank", "track", "coverage", "ms"), float))
     return Study(table, rows, StudyFacts.from_pack(pack))
 
 

@@ -19,8 +19,8 @@ from paired_errors import ALPHA, LOST, compare_with_all, describe_comparison, si
 from second_seed import read_runs
 
 from pfbench.files import markdown_head, markdown_row
-from pfbench.report import read_stored_study
-from pfbench.results import holm, wilcoxon_signed_rank
+from pfbench.report import StudyFacts, arrange_study, read_stored_study
+from pfbench.results import compare_filters, compute_losses, decide, holm, wilcoxon_signed_rank
 
 LIMITS = Path(__file__).with_name("terrain_limit.json")
 REPORTS = Path(__file__).parents[2] / "reports"
@@ -211,19 +211,18 @@ def describe_joint(name: str, scenario: str) -> str:
         name: Name of the study.
         scenario: Name of the condition in the stored files.
     """
-    pack, _ = read_stored_study(REPORTS / name)
-    view = next(
-        view
-        for key, view in pack["views"].items()
-        if (key.metric, key.world, key.baseline) == ("rmse", scenario, PARTICLES)
-    )
-    rows = {row["filter"]: row for row in view["rows"]}
+    pack, table = read_stored_study(REPORTS / name)
+    runs = table[table["scenario"] == scenario]
+    labels = sorted(set(runs["filter"]))
+    arranged = arrange_study(runs, labels, StudyFacts.from_pack(pack).worlds)
+    pairs = [(label, PARTICLES) for label in labels if label != PARTICLES]
+    verdicts = decide(compare_filters(arranged, compute_losses(arranged, "rmse"), pairs))
     told = (
-        f"`{bank}` {rows[bank]['ratio']:.2f} [{rows[bank]['ratio_low']:.2f}, {rows[bank]['ratio_high']:.2f}], "
-        f"{rows[bank]['verdict']}"
-        for bank in BANKS
+        f"`{v.a}` {v.ratio:.2f} [{v.low:.2f}, {v.high:.2f}], {v.word}"
+        for v in verdicts
+        if v.a in BANKS
     )
-    return f"The report compares all filters with `{PARTICLES}` together: {'; '.join(told)}."
+    return f"All filters together against `{PARTICLES}`: {'; '.join(told)}."
 
 
 def describe_all_studies(

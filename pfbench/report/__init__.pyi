@@ -6,6 +6,7 @@ from pfbench.report.board.pack import (
     arrange_study as arrange_study,
     decide_parts as decide_parts,
 )
+from pfbench.report.board.view import find_lost_conditions as find_lost_conditions
 from pfbench.report.journal.figure_style import find_page_format as find_page_format
 from pfbench.report.journal.ratio_figures import (
     is_equal_drawing as is_equal_drawing,

@@ -15,6 +15,7 @@ from pfbench.stats.comparison import (
     Verdict as Verdict,
     compare as compare,
     decide as decide,
+    find_largest_p as find_largest_p,
 )
 from pfbench.stats.intervals import (
     crossed_mean_interval as crossed_mean_interval,

@@ -207,16 +207,17 @@ def is_testable(effect: Effect) -> bool:
     return _varies(effect.differences)
 
 
-def find_largest_p(losses: Array, baselines: Sequence[Array]) -> float:
+def find_largest_p(pairs: Sequence[tuple[Array, Array]]) -> float:
     """Return the largest one-sided p-value of both tests: whether a filter is better than all others.
 
-    The test of the union of the hypotheses needs no correction for their number. Shapes: losses [n].
+    Each pair has the losses of the filter and of one other in their common runs. The test of the union of the
+    hypotheses needs no correction for their number. Shapes: losses [n] of a pair.
     """
-    differences = [subtract_losses(losses, baseline) for baseline in baselines]
+    differences = [subtract_losses(first, second) for first, second in pairs]
     if not differences or not all(map(_varies, differences)):
         return 1.0
-    signed = wilcoxon_signed_rank_rows(np.stack(differences), "less")[1]
-    return max(float(signed.max()), *(_trimmed_p(d, "less") for d in differences))
+    signed = [float(wilcoxon_signed_rank_rows(d[None], "less")[1][0]) for d in differences]
+    return max(*signed, *(_trimmed_p(d, "less") for d in differences))
 
 
 def subtract_losses(first: Array, second: Array) -> Array:

@@ -181,8 +181,7 @@ def find_winners(
     """Find methods that are better than every baseline of a world, with Holm's correction."""
     keys = [(w, m) for w in worlds for m in methods if m in w.losses]
     largest = [
-        find_largest_p(*_losses_against(w, m, [b for b in baselines if b in w.losses]))
-        for w, m in keys
+        find_largest_p([_common(w, m, b) for b in baselines if b in w.losses]) for w, m in keys
     ]
     return [
         Winner(w.name, m, float(p), bool(p < alpha))
@@ -224,22 +223,15 @@ def count_wins(pairs: Sequence[WorldPair], worlds: Sequence[str]) -> Counter[tup
 
 def _compare(world: World, a: str, b: str) -> Effect:
     """Compare two filters of a world in their common runs."""
-    first, second = _common(world, [a, b])
+    first, second = _common(world, a, b)
     return compare((a, first), (b, second))
 
 
-def _losses_against(world: World, a: str, others: Sequence[str]) -> tuple[Array, list[Array]]:
-    """Return the losses of a filter, and those of others in the runs that all have."""
-    first, *rest = _common(world, [a, *others])
-    return first, rest
-
-
-def _common(world: World, labels: Sequence[str]) -> list[Array]:
-    """Return the losses of filters in their common runs."""
-    runs = world.losses[labels[0]].index
-    for label in labels[1:]:
-        runs = runs.intersection(world.losses[label].index)
-    return [world.losses[label].loc[runs.sort_values()].to_numpy() for label in labels]
+def _common(world: World, a: str, b: str) -> tuple[Array, Array]:
+    """Return the losses of two filters in their common runs."""
+    first, second = world.losses[a], world.losses[b]
+    runs = first.index.intersection(second.index).sort_values()
+    return first.loc[runs].to_numpy(), second.loc[runs].to_numpy()
 
 
 def _track_p(keeps_track: pd.Series) -> float:

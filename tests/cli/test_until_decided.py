@@ -11,11 +11,10 @@ import pytest
 from command_line import Said, pfbench
 
 import pfbench as package
-from pfbench.report.options import ReportOptions
+from pfbench.report.board import arrange_study, build_run_table
 from pfbench.results import store
-from pfbench.results.look_table import LookMetric, read_look_table
-from pfbench.stats.sequential_looks import LookPlan, decide_at_looks
-from pfbench.stats.study_runs import tidy_runs
+from pfbench.results.conditions import load_conditions
+from pfbench.stats.pair_states import LookSchedule, decide_at_looks
 
 STUDY = ("scenario=linear_walk", "scenario.steps=12", "particles=60", "pcrb=false", "score_steps=0")
 SWEEP = ("run", "-m", *STUDY, "filter=ekf,sir,rpf")
@@ -58,32 +57,21 @@ def test_looks_decide_as_one_study_of_all_runs(home: Path, said: Said) -> None:
     )
     assert left[columns[:-1]].equals(right[columns[:-1]])
     np.testing.assert_allclose(left["value"], right["value"], rtol=1e-9)
-    table = tidy_runs(fixed, group="state [m]")
-    options = ReportOptions().decision_options
-    for line, runs in ((first, 20), (second, 40)):
-        early = table[table.run.isin(sorted(table.run.unique())[:runs])]
-        decisions = decide_at_looks(early, PAIRS, LookPlan(runs=(20, 40)), None, options)[1::2]
-        open_pairs = [d for d in decisions if d.pair_word == "inconclusive"]
+    table = build_run_table(load_conditions("fixed", home / "results"))
+    runs = arrange_study(table, sorted(set(table["filter"])), {})
+    for line, count in ((first, 20), (second, 40)):
+        early = runs._replace(
+            present=runs.present[..., :count], keeps=runs.keeps[..., :count],
+            values={name: value[..., :count] for name, value in runs.values.items()},
+        )  # fmt: skip
+        states = decide_at_looks(early, PAIRS, LookSchedule(40))
+        open_pairs = [state for state in states if state.is_open]
         assert f"{3 - len(open_pairs)} of 3 pairs decided" in line
-        for d in open_pairs:
-            assert f"{d.a} / {d.b} (ratio {np.exp(d.low):.3g} to {np.exp(d.high):.3g})" in line
+        for state in open_pairs:
+            assert str(state) in line
 
 
-def test_the_metric_of_the_report_decides_and_is_fixed_at_the_first_look(
-    home: Path, said: Said
-) -> None:
-    keys = {file.stem for file in results(home)}
-    folder, metric = home / "results", LookMetric("max_error", start_s=3.0)
-    table = read_look_table("growing", folder, keys, lambda labels: PAIRS, metric)
-    expected, path = {}, {file.stem: file for file in results(home)}
-    for key in keys:
-        result = store.read_result(path[key])
-        error = result.data["error"][:, result.data["time"] >= 3.0, 0].astype(float)
-        first = result.meta["first_run"]
-        for run, value in enumerate(np.abs(error).max(1), start=first):
-            expected[result.meta["label"], f"{1:012d} {run:09d}"] = value
-    found = table.runs.set_index(["filter", "run"])["value"]
-    assert found.to_dict() == pytest.approx(expected)
+def test_the_metric_of_the_report_is_fixed_at_the_first_look(home: Path, said: Said) -> None:
     refused = pfbench(*GROWING, "report.metric=max_error", home=home)
     assert refused.code == 2
     assert "report.metric must be rmse, as at the first look of this study" in refused.err
@@ -163,7 +151,6 @@ def test_copies_of_runs_are_not_counted(
     [
         (("until_decided.max_runs=80",), "until_decided.max_runs must be 40, as at the first look"),
         (("particles=61",), "jobs must be "),
-        (("until_decided.mode=often",), "until_decided.mode must be looks or e_values, got often"),
         (("until_decided.max_hours=0",), "until_decided.max_hours must be positive or null, got 0"),
         (("budget=time",), "budget must be particles with runs=until-decided"),
         (("study=one", "filter=ekf"), "filter must be at least two filters"),
@@ -179,14 +166,6 @@ def test_one_job_cannot_be_decided(tmp_path: Path) -> None:
     refused = pfbench("run", *STUDY, "filter=ekf", "runs=until-decided", home=tmp_path)
     assert refused.code == 2
     assert "must be a sweep over at least two filters" in refused.err
-
-
-def test_e_values_look_every_twenty_runs(tmp_path: Path) -> None:
-    words = ("filter=ekf,sir", "until_decided.mode=e_values", "until_decided.max_runs=60")
-    printed = lines(pfbench(*GROWING, *words, home=tmp_path))
-    assert [line.partition(":")[0] for line in printed[:-1]] == [
-        f"look {k}, {20 * k} runs" for k in range(1, len(printed))
-    ]
 
 
 def test_a_study_says_before_it_runs_what_it_can_show(tmp_path: Path) -> None:

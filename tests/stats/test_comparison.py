@@ -107,9 +107,15 @@ def test_the_first_filter_beats_all_others_only_if_it_beats_each() -> None:
     rng = np.random.default_rng(5)
     best = rng.normal(size=50)
     worse = [best + rng.normal(0.5, 0.3, 50) for _ in range(3)]
-    assert find_largest_p(best, worse) < 1e-4
-    assert find_largest_p(best, [*worse, best + rng.normal(0, 0.3, 50)]) > 0.01
-    assert find_largest_p(best, []) == find_largest_p(best, [best]) == 1.0
+    pairs = [(best, other) for other in worse]
+    assert find_largest_p(pairs) < 1e-4
+    assert find_largest_p([*pairs, (best, best + rng.normal(0, 0.3, 50))]) > 0.01
+    assert find_largest_p([]) == find_largest_p([(best, best)]) == 1.0
+    fewer = (
+        best[:20],
+        worse[0][:20],
+    )  # a baseline with fewer runs does not take those of the others
+    assert find_largest_p([*pairs, fewer]) == max(find_largest_p(pairs), find_largest_p([fewer]))
 
 
 def false_words(

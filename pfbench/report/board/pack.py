@@ -348,8 +348,10 @@ def select_baselines(looks: Mapping[str, MethodLook], baseline: str = "") -> lis
             f"report.baseline must be a filter of the study, got {baseline}. "
             f"Choose from {', '.join(looks)}."
         )
-    stated = [label for look in looks.values() for label in look.baselines]
-    available = [label for label in (baseline, *_BASELINES, *stated) if label in looks]
+    names = [*_BASELINES, *(name for look in looks.values() for name in look.baselines)]
+    available = [label for label in (baseline, *names) if label in looks]
+    available += [label for name in names for label in looks if parse_label(label)[0] == name]
+    available += [label for label, look in looks.items() if not look.proposed][:1]
     return list(dict.fromkeys(available)) or list(looks)[:1]
 
 

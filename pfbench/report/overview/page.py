@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from pfbench.report.study_page.page_writer import describe_page_knobs
 from pfbench.report.writers import format_csv, template_environment
 from pfbench.results.conditions import parse_label
 from pfbench.results.paper_block import read_paper_block
+from pfbench.stats.comparison import Verdict
 
 BOARD_PAGE = "worlds.html"  # the page of each world, which is the first page of other studies
 _HERE = Path(__file__).parent
@@ -47,6 +49,8 @@ def render_overview(overviews: Mapping[int, Overview], pack: Mapping[str, Any]) 
         "headline": word_headline(overview),
         "setting": describe_setting(overview),
         "foreign_knobs": describe_page_knobs(pack) if "worlds" in pack else "",
+        "ratios": list_ratios(overview),
+        "filters": [overview.names[label] for label in (*overview.methods, *overview.conventional)],
         "stories": [tell_story(overview, m, _summary(m)) for m in overview.methods],
         "count": spell_number(len(overview.methods)),
         "pictures": {name: Markup(_data_address(text)) for name, text in pictures.items()},
@@ -133,6 +137,30 @@ def describe_setting(overview: Overview) -> str:
 def spell_number(number: int) -> str:
     """Return a small number in letters."""
     return _NUMBERS[number] if number < len(_NUMBERS) else str(number)
+
+
+def list_ratios(overview: Overview) -> list[tuple[WorldRow, list[str]]]:
+    """List the ratios of a world with their simultaneous intervals, in the order of the columns of the heat map."""
+    cells = {(cell.world, cell.filter): cell for cell in overview.cells}
+    rows = []
+    for world in overview.worlds:
+        texts = []
+        for label in (*overview.methods, *overview.conventional):
+            cell = cells.get((world.key, label))
+            text = "–" if cell is None else _format_ratio(cell.verdict)
+            share = (
+                f"; {100 * cell.track_share:.0f} % keep track" if cell and cell.loses_track else ""
+            )
+            texts.append(text + share)
+        rows.append((world, texts))
+    return rows
+
+
+def _format_ratio(verdict: Verdict) -> str:
+    """Format the ratio of a verdict with its interval."""
+    if not math.isfinite(verdict.high):
+        return f"{verdict.ratio:.2f}"
+    return f"{verdict.ratio:.2f} [{verdict.low:.2f}, {verdict.high:.2f}]"
 
 
 def list_verdicts(overview: Overview) -> pd.DataFrame:

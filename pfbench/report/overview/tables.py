@@ -50,6 +50,7 @@ class WorldRow(NamedTuple):
         unit: Unit of the error.
         runs: Number of runs.
         kalman_fits: Whether Kalman filters fit the world; None without a tuning.
+        words: What the world is, in a line.
     """
 
     key: str
@@ -59,6 +60,7 @@ class WorldRow(NamedTuple):
     unit: str
     runs: int
     kalman_fits: bool | None
+    words: str = ""
 
 
 class Overview(NamedTuple):
@@ -251,7 +253,7 @@ def _describe_world(world: World, name: PartName, looks: Mapping[str, MethodLook
     losses = world.losses[world.reference]
     return WorldRow(
         world.name, name.name, looks[world.reference].name, float(np.exp(losses.mean())), name.unit,
-        len(losses), world.kalman_fits,
+        len(losses), world.kalman_fits, name.words,
     )  # fmt: skip
 
 

@@ -21,10 +21,10 @@ RUN = ["run"]
 
 def test_copies_are_found_and_left_out() -> None:
     table = make_study({"a": 0.0, "b": 0.1}, runs=20)
-    assert find_copied_runs(table, "value", RUN) == {}
+    assert find_copied_runs(table, "rmse", RUN) == {}
     copies = table[table.run < 5].assign(run=lambda rows: rows.run + 20)
     joined = pd.concat([table, copies])
-    found = find_copied_runs(joined, "value", RUN)
+    found = find_copied_runs(joined, "rmse", RUN)
     assert found == {k + 20: k for k in range(5)}
     assert drop_runs(joined, found, RUN).equals(table)
     assert "5 runs have the errors of another run (run 20 is equal to run 0)" in describe_copies(
@@ -34,15 +34,15 @@ def test_copies_are_found_and_left_out() -> None:
 
 def test_one_filter_with_copied_data_is_enough_and_one_without_random_data_is_not() -> None:
     table = make_study({"a": 0.0, "b": 0.1}, runs=12)
-    values = table.set_index(["filter", "scenario", "regime", "run"]).value
+    values = table.set_index(["filter", "scenario", "regime", "run"]).rmse
     keys = [key for key in values.index if key[0] == "a" and key[3] == 11]
     for key in keys:
         values[key] = values[(*key[:3], 4)]
-    assert find_copied_runs(values.reset_index(), "value", RUN) == {11: 4}
+    assert find_copied_runs(values.reset_index(), "rmse", RUN) == {11: 4}
     values[keys[0]] *= 1 + 1e-12  # one digit in one condition: another run
-    assert find_copied_runs(values.reset_index(), "value", RUN) == {}
-    constant = table.assign(value=table.value.where(table["filter"] != "a", 1.0))
-    assert find_copied_runs(constant, "value", RUN) == {}
+    assert find_copied_runs(values.reset_index(), "rmse", RUN) == {}
+    constant = table.assign(rmse=table.rmse.where(table["filter"] != "a", 1.0))
+    assert find_copied_runs(constant, "rmse", RUN) == {}
 
 
 def test_size_and_power_of_the_test_of_neighbours() -> None:
@@ -63,9 +63,9 @@ def test_size_and_power_of_the_test_of_neighbours() -> None:
 
 def test_groups_of_runs_with_a_common_error_give_an_alarm() -> None:
     table = make_study({"a": 0.0, "b": 0.1}, runs=40)
-    assert describe_dependence(table, "value", RUN) == ""
+    assert describe_dependence(table, "rmse", RUN) == ""
     common = np.exp(0.6 * np.random.default_rng(2).standard_normal(10))[table.run // 4]
-    text = describe_dependence(table.assign(value=table.value * common), "value", RUN)
+    text = describe_dependence(table.assign(rmse=table.rmse * common), "rmse", RUN)
     assert "the runs are not independent" in text
     assert "2 of 2 filters" in text
 
@@ -74,7 +74,7 @@ def test_conditions_of_different_numbers_of_runs_give_no_alarm() -> None:
     study = make_study({"a": 0.0, "b": 0.1}, runs=100)
     first, *_ = study["scenario"].unique()
     easy = study["scenario"] == first
-    table = study.assign(value=study.value.where(~easy, study.value * 1e-3))
+    table = study.assign(rmse=study.rmse.where(~easy, study.rmse * 1e-3))
     table = table[~easy | (table.run < 50)]  # the later runs lack the easy scenario
     assert table["scenario"].nunique() > 1
-    assert describe_dependence(table, "value", RUN) == ""
+    assert describe_dependence(table, "rmse", RUN) == ""

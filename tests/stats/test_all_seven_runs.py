@@ -15,7 +15,7 @@ from scipy import stats
 
 from pfbench.stats.rank_tests import holm, wilcoxon_signed_rank_rows
 
-FILE = Path(__file__).parents[2] / "all_seven_runs.parquet"
+FILE = Path(__file__).parents[1] / "all_seven_runs.parquet"
 SEVEN = [
     "mcmc_rpf", "qmc_polymerised", "fm_mssrckf", "cofm_mssrckf", "cofm_amssrcpf", "dmc_reconstructed",
     "cpso_escape",

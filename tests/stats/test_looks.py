@@ -1,0 +1,148 @@
+"""A study that adds runs: levels of its looks, states of pairs, lines and record."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from decision_cases import make_study
+
+from pfbench.results.paper_block import plan_installed_pairs
+from pfbench.stats.comparison import decide
+from pfbench.stats.pair_states import (
+    LookRecord,
+    LookSchedule,
+    decide_at_looks,
+    describe_end,
+    format_look,
+    look_levels,
+)
+from pfbench.stats.study_runs import StudyRuns, arrange_runs, compare_filters, compute_losses
+from pfbench.stats.study_size import describe_study_size, detectable_effects
+
+PAIRS = [("A", "B"), ("A", "C"), ("B", "C")]
+EFFECTS = {"A": -0.4, "B": 0.0, "C": 0.0}
+
+
+def study(runs: int, seed: int = 0, effects: dict[str, float] = EFFECTS) -> StudyRuns:
+    table = make_study(effects, worlds=2, runs=runs, world_sd=0.0, run_sd=0.5, seed=seed)
+    return arrange_runs(table, tuple(effects))
+
+
+def test_schedules() -> None:
+    assert LookSchedule().runs == (20, 40, 80, 160, 320)
+    assert LookSchedule(50).runs == (20, 40, 50)
+    assert LookSchedule(20).runs == (20,)
+    assert LookSchedule(50).parts(3) == [(0, 20), (20, 20), (40, 10)]
+    for runs in (19, 9.5):
+        with pytest.raises(ValueError, match=r"until_decided.max_runs must be"):
+            LookSchedule(runs)  # type: ignore[arg-type]
+
+
+def test_the_levels_of_the_looks_spend_the_error() -> None:
+    """A random walk crosses the bounds of any look with probability alpha: a simulation without their integral."""
+    runs = (20, 40, 80)
+    levels = look_levels(runs, 0.05)
+    assert look_levels((20,), 0.05) == pytest.approx([0.05])
+    rng = np.random.default_rng(1)
+    x = np.cumsum(rng.standard_normal((40_000, 80)), axis=1)[:, [19, 39, 79]] / np.sqrt(runs)
+    limits = [math.sqrt(2) * float(_inverse_erfc(level)) for level in levels]
+    share = (np.abs(x) > limits).any(axis=1).mean()
+    assert share == pytest.approx(0.05, abs=3 * math.sqrt(0.05 * 0.95 / 40_000))
+
+
+def _inverse_erfc(level: float) -> float:
+    """Solve erfc(z) = level by bisection."""
+    low, high = 0.0, 10.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if math.erfc(middle) > level else (low, middle)
+    return low
+
+
+@pytest.mark.parametrize("runs", [20, 40, 80])
+def test_each_look_is_a_study_of_its_first_runs_at_its_level(runs: int) -> None:
+    schedule, data = LookSchedule(80), study(80)
+    levels = look_levels(schedule.runs, 0.05 / 3)
+    losses = compute_losses(data, "rmse")
+    expected: dict[int, str] = {}
+    for number, level in zip(schedule.runs, levels, strict=True):
+        if number <= runs:
+            effects = compare_filters(data, losses[..., :number], PAIRS)
+            for k, verdict in enumerate(decide(effects, alpha=3 * level)):
+                if expected.get(k, "not decided") == "not decided":
+                    expected[k] = verdict.word
+    early = data._replace(
+        present=data.present[..., :runs], keeps=data.keeps[..., :runs],
+        values={name: value[..., :runs] for name, value in data.values.items()},
+    )  # fmt: skip
+    states = decide_at_looks(early, PAIRS, schedule)
+    assert [s.verdict.word for s in states] == list(expected.values())
+    assert states[0].verdict.word == "better"
+    with pytest.raises(ValueError, match="runs must be at least 20, got 8"):
+        decide_at_looks(study(8), PAIRS, schedule)
+
+
+def test_equal_filters_are_told_apart_at_the_level_over_all_looks() -> None:
+    """200 studies of three looks: a look at 5 % each would be wrong in one study of eight (the control)."""
+    schedule, wrong, naive = LookSchedule(80), 0, 0
+    pairs = [("A", "B")]
+    for seed in range(200):
+        data = study(80, seed, {"A": 0.0, "B": 0.0})
+        wrong += decide_at_looks(data, pairs, schedule)[0].verdict.word in ("better", "worse")
+        losses = compute_losses(data, "rmse")
+        looks = [
+            decide(compare_filters(data, losses[..., :n], pairs))[0].word for n in schedule.runs
+        ]
+        naive += any(word in ("better", "worse") for word in looks)
+    limit = 0.05 + 2 * math.sqrt(0.05 * 0.95 / 200)
+    assert wrong / 200 <= limit
+    assert naive > wrong
+
+
+def test_lines_say_what_is_decided_and_what_is_open() -> None:
+    schedule = LookSchedule(40)
+    states = decide_at_looks(study(20), PAIRS, schedule)
+    line = format_look(1, schedule, states)
+    assert line.startswith("look 1, 20 runs: 2 of 3 pairs decided; new: A better than B (ratio 0.")
+    assert "open: B / C (ratio 0." in line
+    assert describe_end(1, schedule, states) == ""
+    assert "new" not in format_look(2, schedule, states, states)
+    assert describe_end(2, schedule, states) == "1 of 3 pairs are open after max_runs=40."
+    assert describe_end(1, schedule, states[:2]) == "all 2 pairs are decided after 20 runs."
+
+
+def test_the_record_keeps_its_plan(tmp_path: Path) -> None:
+    path, plan = tmp_path / "looks.json", {"until_decided.max_runs": 320, "jobs": ["a"]}
+    LookRecord(path, plan).write(["look 1"], "all decided")
+    record = LookRecord(path, plan)
+    assert (record.looks, record.state) == (["look 1"], "all decided")
+    with pytest.raises(ValueError, match=r"until_decided.max_runs must be 320, .* got 640"):
+        LookRecord(path, {**plan, "until_decided.max_runs": 640})
+    path.write_text(path.read_text().replace("look 1", "look 2"))
+    with pytest.raises(ValueError, match="got a damaged file"):
+        LookRecord(path, plan)
+
+
+def test_planned_pairs_are_those_of_the_papers() -> None:
+    assert plan_installed_pairs(["rpf", "mcmc_rpf", "sir"]) == [
+        ("mcmc_rpf", "sir"),
+        ("mcmc_rpf", "rpf"),
+    ]
+    assert plan_installed_pairs(["sir", "ekf", "ukf"]) == [
+        ("ekf", "sir"),
+        ("ekf", "ukf"),
+        ("sir", "ukf"),
+    ]
+    assert plan_installed_pairs(["sir"]) == []
+
+
+def test_the_sentence_before_a_study() -> None:
+    assert describe_study_size(5, 3, 4).startswith("5 runs can show nothing")
+    sentence = describe_study_size(50, 3, 4)
+    effects = detectable_effects(50, 3, 4)
+    assert f"at least {np.exp(effects.error_same_worlds):.3g} in these 3 worlds" in sentence
+    assert f"at least {np.exp(effects.error_new):.3g} in a new world" in sentence
+    assert "requires at least 2 worlds" in describe_study_size(50, 1, 4)

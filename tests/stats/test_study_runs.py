@@ -1,0 +1,184 @@
+"""Losses of filters in the conditions of a study: caps, lost runs, weights, units, and error rates of verdicts."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+from decision_cases import make_study
+from row_oracle import decide_family, estimate, pair_losses, subtract
+
+from pfbench.stats.comparison import decide
+from pfbench.stats.consistency_bands import assess_consistency
+from pfbench.stats.study_runs import (
+    StudyRuns,
+    arrange_runs,
+    compare_filters,
+    compute_losses,
+    select_conditions,
+    weigh_conditions,
+)
+
+EFFECTS = {"A": -0.4, "B": 0.0, "C": 0.05}
+PAIRS = [("A", "B"), ("A", "C"), ("B", "C")]
+
+
+def decide_pairs(runs: StudyRuns, metric: str = "rmse", unit: str = "run") -> list[tuple]:
+    effects = compare_filters(runs, compute_losses(runs, metric), PAIRS, unit)
+    return list(map(tuple, decide(effects)))
+
+
+def caps(table: pd.DataFrame, cap: float = 1.6) -> dict[str, float]:
+    return dict.fromkeys(table["scenario"].unique(), cap)
+
+
+@pytest.mark.parametrize("cap", [1.6, math.nan])
+def test_verdicts_are_those_of_the_independent_computation(cap: float) -> None:
+    table = make_study(EFFECTS, worlds=3, regimes=2, runs=25, lost={"B": 0.2, "C": 0.1})
+    table = table[~((table["filter"] == "A") & (table["run"] == 7) & (table.regime == "regime_1"))]
+    runs = arrange_runs(table, tuple(EFFECTS), caps(table, cap))
+    family = [subtract(pair_losses(table, pair, caps(table, cap))) for pair in PAIRS]
+    assert [len(d) for d in family] == [24, 24, 25]
+    effects = compare_filters(runs, compute_losses(runs, "rmse"), PAIRS)
+    for effect, d in zip(effects, family, strict=True):
+        np.testing.assert_allclose(effect.differences, d, atol=1e-12)
+    for verdict, wanted in zip(decide(effects), decide_family(family, math.log(1.05), 0.05), strict=True):  # fmt: skip
+        assert verdict.word == wanted["word"]
+        assert math.log(verdict.ratio) == pytest.approx(wanted["ratio"])
+        assert verdict.p == pytest.approx(wanted["p"], rel=1e-6)
+    assert estimate(family[0], 0.05) == pytest.approx(effects[0].estimate(0.05))
+
+
+def test_an_error_beyond_the_cap_and_a_lost_run_count_as_the_cap() -> None:
+    table = make_study(EFFECTS, worlds=2, regimes=1, runs=20, lost={"B": 0.2})
+    base = decide_pairs(arrange_runs(table, tuple(EFFECTS), caps(table)))
+    beyond = table["rmse"] > 1.6
+    assert beyond.any()
+    larger = table.assign(rmse=table["rmse"].where(~beyond, table["rmse"] * 1e3))
+    at_cap = table.assign(rmse=table["rmse"].where(table["keeps_track"], 1.6), keeps_track=True)
+    no_number = table.assign(rmse=table["rmse"].where(table["keeps_track"], math.nan))
+    for changed in (larger, at_cap, no_number):
+        assert decide_pairs(arrange_runs(changed, tuple(EFFECTS), caps(table))) == base
+    smaller = table.assign(rmse=table["rmse"].where(~beyond, 1.0))  # the control
+    assert decide_pairs(arrange_runs(smaller, tuple(EFFECTS), caps(table))) != base
+
+
+def test_without_a_cap_a_lost_run_counts_as_the_largest_error_of_the_pair() -> None:
+    table = make_study(EFFECTS, worlds=1, regimes=1, runs=20, lost={"B": 0.2})
+    runs = arrange_runs(table, tuple(EFFECTS))
+    losses = compute_losses(runs, "rmse")
+    lost = ~runs.keeps[1, 0]
+    assert np.isposinf(losses[1, 0, lost]).all()
+    largest = losses[:2, 0][:, ~lost].max()
+    largest = max(largest, losses[0, 0].max())
+    effect = compare_filters(runs, losses, [("B", "A")])[0]
+    np.testing.assert_allclose(effect.differences[lost], largest - losses[0, 0, lost])
+    assert np.isfinite(effect.differences).all()
+
+
+def test_another_filter_changes_no_number_of_a_pair() -> None:
+    """It changes the size of a family alone, and the effects of a pair are the same."""
+    table = make_study({**EFFECTS, "D": 3.0}, worlds=2, runs=20, lost={"D": 0.9, "B": 0.1})
+    small = table[table["filter"] != "D"]
+    for cap in (1.6, math.nan):
+        sides = [
+            arrange_runs(t, sorted(set(t["filter"])), caps(table, cap)) for t in (table, small)
+        ]
+        first, second = (
+            compare_filters(runs, compute_losses(runs, "rmse"), PAIRS) for runs in sides
+        )
+        for a, b in zip(first, second, strict=True):
+            np.testing.assert_array_equal(a.differences, b.differences)
+            assert (a.p, a.p_trimmed) == (b.p, b.p_trimmed)
+
+
+def test_worlds_scenarios_and_regimes_have_equal_weight() -> None:
+    conditions = pd.DataFrame({
+        "family": ["a", "a", "a", "b"], "scenario": ["a1", "a1", "a2", "b1"], "regime": ["x", "y", "x", "x"],
+    })  # fmt: skip
+    np.testing.assert_allclose(weigh_conditions(conditions), [1 / 8, 1 / 8, 1 / 4, 1 / 2])
+
+
+def test_runs_of_worlds_with_their_own_seeds_are_paired_by_their_number() -> None:
+    table = make_study(EFFECTS, worlds=2, regimes=1, runs=15)
+    shifted = table.assign(seed=table["seed"] + 5 * (table["scenario"] == "scenario_1"))
+    first, second = (arrange_runs(t, tuple(EFFECTS)) for t in (table, shifted))
+    assert decide_pairs(first) == decide_pairs(second)
+    two_seeds = pd.concat([table, table.assign(seed=9, rmse=table["rmse"] * 1.1)])
+    assert arrange_runs(two_seeds, tuple(EFFECTS)).present.shape == (3, 2, 30)
+    with pytest.raises(ValueError, match=r"runs must be unique .* run=0 twice"):
+        arrange_runs(pd.concat([table, table]), tuple(EFFECTS))
+
+
+def test_worlds_as_units_need_ten_of_them() -> None:
+    table = make_study(EFFECTS, worlds=12, regimes=1, runs=5, world_sd=0.02, run_sd=0.02)
+    runs = arrange_runs(table, tuple(EFFECTS))
+    words = [verdict[2] for verdict in decide_pairs(runs, unit="world")]
+    assert words[:2] == ["better", "better"]
+    few = arrange_runs(
+        table[table["family"].isin([f"scenario_{k}" for k in range(9)])], tuple(EFFECTS)
+    )
+    verdict = decide_pairs(few, unit="world")[0]
+    assert (verdict[2], verdict[-1]) == ("not decided", "9 worlds, 10 are required")
+
+
+def test_a_log_score_is_better_where_it_is_larger() -> None:
+    table = make_study(EFFECTS, worlds=1, regimes=1, runs=20)
+    runs = arrange_runs(table.assign(log_score=-np.log(table["rmse"])), tuple(EFFECTS), caps(table))
+    assert decide_pairs(runs, "log_score")[0][2] == "better"
+
+
+def test_the_selection_of_conditions_keeps_as_many_results_as_possible() -> None:
+    present = np.ones((4, 6), dtype=bool)
+    assert select_conditions(present).all()
+    present[0, 1] = False  # 4 filters in 5 conditions rather than 3 filters in 6
+    assert select_conditions(present).tolist() == [True, False, True, True, True, True]
+    present[0] = [True, False, False, False, False, False]  # 3 in 6 rather than 4 in 1
+    assert select_conditions(present).all()
+    assert not select_conditions(np.eye(2, dtype=bool)).any()
+
+
+@pytest.mark.parametrize(("lost", "cap"), [(0.0, math.nan), (0.3, math.nan), (0.3, 1.6)])
+def test_equal_filters_are_called_different_at_the_level(lost: float, cap: float) -> None:
+    """Any false word in a study of three pairs: at most 5 % of 300 studies, and two standard errors."""
+    studies, wrong, found = 300, 0, 0
+    for seed in range(studies):
+        table = make_study(
+            {"A": 0.0, "B": 0.0, "C": 0.0}, 2, 2, 20, lost=dict.fromkeys("ABC", lost), seed=seed, world_sd=0.0,
+        )  # fmt: skip
+        verdicts = decide_pairs(arrange_runs(table, ("A", "B", "C"), caps(table, cap)))
+        wrong += any(v[2] in ("better", "worse") for v in verdicts)
+        moved = table.assign(rmse=table["rmse"] * np.where(table["filter"] == "A", 1.3, 1.0))
+        found += (
+            decide_pairs(arrange_runs(moved, ("A", "B", "C"), caps(table, cap)))[0][2] == "worse"
+        )
+    assert wrong / studies <= 0.05 + 2 * math.sqrt(0.05 * 0.95 / studies)
+    assert found > 0.3 * studies  # the control: an effect of 30 % is seen
+
+
+def test_consistency_has_its_level_and_says_the_size() -> None:
+    rng = np.random.default_rng(3)
+    words = []
+    for _ in range(200):
+        table = _nees_table(rng, 1.0)
+        words.append(assess_consistency(table)["word"].ne("no deviation shown").any())
+    assert np.mean(words) <= 0.05 + 2 * math.sqrt(0.05 * 0.95 / 200)
+    row = assess_consistency(_nees_table(rng, 2.0)).set_index("filter").loc["A"]
+    assert row["word"] == "overconfident"
+    assert row["low"] < 2.0 < row["high"]
+    few = assess_consistency(_nees_table(rng, 2.0, 8)).iloc[0]
+    assert (few["word"], few["reason"]) == ("no deviation shown", "8 valid runs, 10 are required")
+
+
+def _nees_table(rng: np.random.Generator, ratio: float, runs: int = 40) -> pd.DataFrame:
+    """Mean NEES of runs over 30 steps and 2 degrees of freedom, of filter A with a ratio to its expectation."""
+    parts = []
+    for label, factor in (("A", ratio), ("B", 1.0)):
+        value = factor * rng.chisquare(60, runs) / 60
+        parts.append(pd.DataFrame({
+            "label": label, "metric": "nees_ratio", "group": "position", "scenario": "s", "family": "s", "noise": "n",
+            "model": "m", "seed": 1, "run": range(runs), "value": value,
+        }))  # fmt: skip
+    return pd.concat(parts, ignore_index=True)
