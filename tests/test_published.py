@@ -18,7 +18,7 @@ from markupsafe import escape
 
 from pfbench.claims.page import write_claims
 from pfbench.report import is_equal_drawing
-from pfbench.report.stored_study import RUNS, read_stored_study
+from pfbench.report.stored_study import RUNS_FILE, read_stored_study
 from pfbench.report.study_report import rebuild_page
 
 
@@ -94,7 +94,7 @@ LARGE = "all_seven"  # seconds
 def check_published_page(folder: Path, copy: Path) -> None:
     """Decide and write a page again, as from a fresh clone, with the runs of git only."""
     copy.mkdir()
-    (copy / RUNS).symlink_to(folder / RUNS)
+    (copy / RUNS_FILE).symlink_to(folder / RUNS_FILE)
     page = rebuild_page(copy).read_text()
     drawings = ["headline.svg"]
     pages = ["report.md"]
@@ -111,7 +111,7 @@ def check_published_page(folder: Path, copy: Path) -> None:
         stored.table, again.table
     )  # bytes differ between versions of pyarrow
     links = set(re.findall(r'href="([^#"]+)" download', page))
-    assert links == {"verdicts.csv", "decisions.csv", RUNS, "pfbench.bib", "headline.svg"}, (
+    assert links == {"verdicts.csv", "decisions.csv", RUNS_FILE, "pfbench.bib", "headline.svg"}, (
         folder.name
     )
     title = stored.pack["title"]
@@ -119,7 +119,7 @@ def check_published_page(folder: Path, copy: Path) -> None:
 
 
 def test_published_pages_are_decided_by_the_present_rules(tmp_path: Path) -> None:
-    folders = [folder for folder in list_published() if (folder / RUNS).is_file()]
+    folders = [folder for folder in list_published() if (folder / RUNS_FILE).is_file()]
     assert len(folders) > 20
     for folder in folders:
         if folder.name != LARGE:
@@ -305,7 +305,7 @@ WAITING_FOR_A_RERUN = [
 
 def test_published_jobs_are_of_committed_code() -> None:
     """A study that has been run again is taken from the list."""
-    folders = [folder for folder in list_published() if (folder / RUNS).is_file()]
+    folders = [folder for folder in list_published() if (folder / RUNS_FILE).is_file()]
     commits = {f.name: dict(read_stored_study(f).pack["provenance"])["commit"] for f in folders}
     assert {name for name in commits if "-dirty" in commits[name]} == set(WAITING_FOR_A_RERUN)
 

@@ -17,7 +17,7 @@ import pandas as pd
 
 from pfbench.files import RecordedFolder
 from pfbench.report import (
-    RUNS,
+    RUNS_FILE,
     StudyFacts,
     cell_entries,
     count_tuned,
@@ -169,7 +169,7 @@ def merge_study(study: str, folder: Path, reports: Path = REPORTS) -> list[str]:
     labels = find_new_filters(published, newer)
     runs = merge_runs(old, new, labels)
     with RecordedFolder(reports / study, is_complete=False) as target:
-        target.write(RUNS, format_runs(runs, merge_packs(published, newer, labels, runs)))
+        target.write(RUNS_FILE, format_runs(runs, merge_packs(published, newer, labels, runs)))
     rebuild_page(reports / study)
     return labels
 

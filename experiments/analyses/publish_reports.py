@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pfbench.files import RecordedFolder
-from pfbench.report import RUNS, rebuild_page
+from pfbench.report import RUNS_FILE, rebuild_page
 
 REPORTS = Path(__file__).parents[2] / "reports"
 
@@ -130,7 +130,7 @@ def main() -> None:
     for page in sorted(REPORTS.glob("*/report.md")):
         if page.parent.name in HEADLINES:
             publish_report(page.parent)
-        elif (page.parent / RUNS).is_file():
+        elif (page.parent / RUNS_FILE).is_file():
             rebuild_page(page.parent)
 
 

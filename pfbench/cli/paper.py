@@ -37,7 +37,7 @@ def write_study_paper(words: Sequence[str]) -> None:
     config = compose_study([word for word in words if word.partition("=")[0] not in values])
     from pfbench.files.recorded_folder import RecordedFolder
     from pfbench.report.journal.paper_folder import write_paper
-    from pfbench.report.stored_study import RUNS, format_runs, read_stored_study
+    from pfbench.report.stored_study import RUNS_FILE, format_runs, read_stored_study
     from pfbench.report.study_report import format_verdicts
 
     study, reports = config.values["study"], Path(config.values["reports_dir"])
@@ -48,7 +48,7 @@ def write_study_paper(words: Sequence[str]) -> None:
     with RecordedFolder(reports / study / "paper") as folder:
         remarks = write_paper(pack, page, folder)
         folder.write("verdicts.csv", format_verdicts(pack))
-        folder.write(RUNS, format_runs(table, pack))
+        folder.write(RUNS_FILE, format_runs(table, pack))
     if stored is not None:
         print(f"note: without results, the paper is made of {stored}")
     for remark in remarks:

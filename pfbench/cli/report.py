@@ -111,13 +111,13 @@ def _write_page(config: JobConfig) -> Path:
 
 def find_page_data(config: JobConfig, words: Sequence[str] = ()) -> Path | None:
     """Return the stored data of the page of a study without results, if there are any."""
-    from pfbench.report.stored_study import RUNS
+    from pfbench.report.stored_study import RUNS_FILE
 
     study, results = (
         config.values["study"],
         Path(config.values["results_dir"]) / config.values["study"],
     )
-    data = Path(config.values["reports_dir"]) / study / RUNS
+    data = Path(config.values["reports_dir"]) / study / RUNS_FILE
     if any(results.glob("*.npz")) or not data.is_file():
         return None
     if options := [word for word in words if word.lstrip("+").startswith(("report.", "report="))]:
@@ -179,10 +179,10 @@ def _write_claims(
 
 def _renew_published(study: str, folder: Path, results: Path) -> str:
     """Make the page of a published study of its stored data; return a line for the user."""
-    from pfbench.report.stored_study import RUNS
+    from pfbench.report.stored_study import RUNS_FILE
     from pfbench.report.study_report import rebuild_page
 
-    if (folder / RUNS).is_file():
+    if (folder / RUNS_FILE).is_file():
         return f"{study}: {rebuild_page(folder).resolve()}, of the stored data"
     is_script = (experiments_dir() / f"{study}.py").is_file()
     command = f"python -m pfbench.experiments.{study}" if is_script else name_run_command(study)

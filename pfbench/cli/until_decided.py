@@ -25,7 +25,7 @@ _HOUR = 3600.0
 _DECIDING_SETTINGS = ("metric", "alpha", "equivalence_margin", "start_time_s")
 
 
-class LookData(NamedTuple):
+class LookResults(NamedTuple):
     """Results of a study until a look.
 
     Attributes:
@@ -122,7 +122,7 @@ class GrowingSweep:
         folder = self.results / self.study
         return all((folder / f"{key}.npz").exists() for key in self.job_keys(number))
 
-    def read(self, number: int) -> LookData:
+    def read(self, number: int) -> LookResults:
         """Read the results until a look: one row per filter, condition and run, without copies of runs."""
         from pfbench.report.board import build_run_table
         from pfbench.results.conditions import load_conditions
@@ -134,7 +134,9 @@ class GrowingSweep:
         jobs = [job for condition in conditions for job in condition.jobs]
         seconds = sum(job.meta["seconds"]["world"] + job.meta["seconds"]["filter"] for job in jobs)
         parts = sum(len(job.parts) for job in jobs)
-        return LookData(drop_runs(table, copies, RUN), conditions, parts, float(seconds), warning)
+        return LookResults(
+            drop_runs(table, copies, RUN), conditions, parts, float(seconds), warning
+        )
 
     def run(self, run_part: Callable[[Sequence[str]], None]) -> None:
         """Run look after look until all pairs are decided or a cap is reached."""
@@ -176,7 +178,7 @@ class GrowingSweep:
         }
         return LookRecord(self.results / self.study / RECORD, request)
 
-    def _compute_look(self, number: int, run_part: Callable[[Sequence[str]], None]) -> LookData:
+    def _compute_look(self, number: int, run_part: Callable[[Sequence[str]], None]) -> LookResults:
         """Run the jobs of a look without a result, and read all runs so far."""
         start = self.jobs[0].values["first_run"]
         parts = [
@@ -196,7 +198,7 @@ class GrowingSweep:
             data = self.read(number)
         return data
 
-    def _decide(self, data: LookData) -> list[PairState]:
+    def _decide(self, data: LookResults) -> list[PairState]:
         """Decide the pairs that were fixed in advance with the runs so far."""
         from pfbench.report.board import arrange_study
         from pfbench.results.looks import study_part_names

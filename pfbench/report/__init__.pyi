@@ -19,7 +19,7 @@ from pfbench.report.papers.specs import (
     PaperFigureInput as PaperFigureInput,
 )
 from pfbench.report.stored_study import (
-    RUNS as RUNS,
+    RUNS_FILE as RUNS_FILE,
     format_runs as format_runs,
     read_stored_study as read_stored_study,
 )

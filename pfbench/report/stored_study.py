@@ -23,7 +23,7 @@ from pfbench.files.table_file import check_parquet
 from pfbench.report.board.pack import StudyFacts, decide_parts
 from pfbench.report.methods_text import MethodsFacts
 
-RUNS = "runs.parquet"
+RUNS_FILE = "runs.parquet"
 _KEY = b"pfbench"  # of the metadata of the file
 _KEYED = ("curves",)  # parts with a tuple as key
 _OMITTED = ("tracks", "downloads", "definitions")  # large, or made again with the page
@@ -46,7 +46,15 @@ def round_runs(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def format_runs(table: pd.DataFrame, pack: Mapping[str, Any]) -> bytes:
-    """Format the runs of a study with the data of its page. Equal data give equal bytes."""
+    """Format the runs of a study with the data of its page. Equal data give equal bytes.
+
+    Args:
+        table: Values of all runs.
+        pack: Data of the page.
+
+    Returns:
+        Content of the Parquet file.
+    """
     parts = {key: value for key, value in pack.items() if key not in (*_DECIDED, *_OMITTED)}
     for name in _KEYED:
         parts[name] = [[list(key), value] for key, value in pack[name].items()]
@@ -69,7 +77,7 @@ def read_stored_study(folder: Path) -> StoredStudy:
     Raises:
         ValueError: If the file is damaged, or is of another version of pfbench.
     """
-    path = folder / RUNS
+    path = folder / RUNS_FILE
     try:
         check_parquet(path)
         arrow = parquet.read_table(path)

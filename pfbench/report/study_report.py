@@ -27,7 +27,7 @@ from pfbench.report.overview.tables import (
 )
 from pfbench.report.papers import figures
 from pfbench.report.provenance import renew_bibliography
-from pfbench.report.stored_study import RUNS, format_runs, read_stored_study, round_runs
+from pfbench.report.stored_study import RUNS_FILE, format_runs, read_stored_study, round_runs
 from pfbench.report.study_page import render_page
 from pfbench.report.writers import format_csv
 from pfbench.results.conditions import (
@@ -55,7 +55,7 @@ _SUMMARISED = ("scenario", "noise", "model", "label", "group", "component", "met
 _TITLES = {
     "verdicts.csv": ("Numbers", "Verdicts of all views (CSV)"),
     "decisions.csv": ("Numbers", "Verdicts on all pairs (CSV)"),
-    RUNS: ("Numbers", "Values of all runs (Parquet)"),
+    RUNS_FILE: ("Numbers", "Values of all runs (Parquet)"),
     "metrics.csv": ("Numbers", "All metrics, summarised over runs (CSV)"),
     "consistency.csv": ("Numbers", "NEES and NIS over their expectation (CSV)"),
     STEP_TIMES: ("Numbers", "Times per step by round (JSON)"),
@@ -77,7 +77,14 @@ def write_report(
     the papers. Equal results give equal bytes. Files that an earlier report wrote are removed if this one does not
     write them and they are unchanged (manifest.json). Other files stay.
 
-    Returns path of index.html.
+    Args:
+        study: Name of the study.
+        results: Folder of all results.
+        out: Folder of all reports.
+        options: Options of the report, None for the defaults.
+
+    Returns:
+        Path of index.html.
     """
     options = options or ReportOptions()
     conditions = load_conditions(study, results, allow_mixed_versions=options.allow_mixed_versions)
@@ -141,7 +148,7 @@ def render_study(
     files: Files = {
         "verdicts.csv": format_verdicts(pack),
         "decisions.csv": format_csv(list_decisions(pack, table)),
-        RUNS: format_runs(table, pack),
+        RUNS_FILE: format_runs(table, pack),
         "pfbench.bib": pack["bibtex"],
         **({HEADLINE: headline} if headline else {}),
     }

@@ -66,8 +66,15 @@ def arrange_runs(
 ) -> StudyRuns:
     """Arrange a table with one row per filter, condition and run as arrays.
 
-    The axis of runs has the numbers of the runs, and of several seeds of a scenario one after the other. `caps` has
-    the largest error that counts by scenario.
+    The axis of runs has the numbers of the runs, and of several seeds of a scenario one after the other.
+
+    Args:
+        table: Columns filter, family, scenario, regime, seed, run, keeps_track and those of the metrics.
+        filters: Labels of the filters.
+        caps: Largest error that counts by scenario; without one a lost run counts as the largest error of a pair.
+
+    Raises:
+        ValueError: If a run is there twice.
     """
     conditions = table[CONDITION].drop_duplicates().sort_values(CONDITION).reset_index(drop=True)
     c = table.groupby(CONDITION, dropna=False, observed=True).ngroup().to_numpy()
@@ -85,8 +92,8 @@ def arrange_runs(
     numbers = table.select_dtypes(["number", "bool"]).columns
     values = {str(name): arrange(str(name)) for name in numbers}
     keeps = values["keeps_track"]
-    known = dict(caps or {})
-    limits = np.array([known.get(str(name), np.nan) for name in conditions["scenario"]])
+    stated = dict(caps or {})
+    limits = np.array([stated.get(str(name), np.nan) for name in conditions["scenario"]])
     return StudyRuns(tuple(filters), conditions, values, keeps == 1, ~np.isnan(keeps), limits)
 
 
@@ -95,6 +102,10 @@ def compute_losses(runs: StudyRuns, metric: str) -> Array:
 
     A run that does not keep track has the loss of the cap. Without a cap its loss is infinite here, and in a pair
     that of the largest error of the two filters in this condition.
+
+    Args:
+        runs: Runs of a study.
+        metric: Column of the error.
     """
     value = runs.values[metric]
     is_lost = runs.present & ~runs.keeps
@@ -106,9 +117,8 @@ def compute_losses(runs: StudyRuns, metric: str) -> Array:
     losses = np.where(is_lost, np.inf, np.where(runs.present, losses, np.nan))
     for k, cap in enumerate(runs.caps):
         if metric in CAPPED_METRICS and np.isfinite(cap):
-            known = ~np.isnan(losses[:, k])
             bounded = bound_losses(value[:, k], runs.keeps[:, k], float(cap))
-            losses[:, k] = np.where(known, bounded, np.nan)
+            losses[:, k] = np.where(np.isnan(losses[:, k]), np.nan, bounded)
     return losses
 
 
@@ -131,7 +141,11 @@ def compare_filters(
 ) -> list[Effect]:
     """Compare pairs of filters over the conditions that both have, by run or by world.
 
-    Shapes: losses [F, C, N].
+    Args:
+        runs: Runs of a study.
+        losses: Losses of `compute_losses`, [F, C, N].
+        pairs: Labels of the first and the second filter of each pair.
+        unit: What was drawn independently: a run or a world.
     """
     index = {label: k for k, label in enumerate(runs.filters)}
     keys = np.empty(len(runs.conditions), dtype=object)
@@ -187,8 +201,9 @@ def _bound_pair(first: Array, second: Array) -> tuple[Array, Array, Flags]:
     """Return the losses of two filters [C, N] with lost runs at the largest error of both, and the common runs."""
     common = ~(np.isnan(first) | np.isnan(second))
     both = np.stack([first, second])
-    known = np.where(np.isfinite(both) & common, both, -np.inf).max(axis=(0, 2), initial=-np.inf)
-    largest = np.where(np.isfinite(known), known, 0.0)[:, None]
+    finite = np.where(np.isfinite(both) & common, both, -np.inf)
+    largest = finite.max(axis=(0, 2), initial=-np.inf)
+    largest = np.where(np.isfinite(largest), largest, 0.0)[:, None]
     first, second = (np.where(np.isposinf(x), largest, x) for x in both)
     return first, second, common
 

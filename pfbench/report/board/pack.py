@@ -322,6 +322,11 @@ def arrange_study(
     """Arrange the runs of a study, with the largest error that counts in each world.
 
     It is the divergence threshold of the scenario, or that which the file of its tuning states.
+
+    Args:
+        table: Table of `build_run_table`.
+        labels: Filters.
+        worlds: Names of the scenarios by key.
     """
     caps = {}
     for key, model in table.groupby("scenario", observed=True)["model"].first().items():

@@ -19,7 +19,7 @@ from pfbench.report.board.entries import (
     round_values,
 )
 from pfbench.report.board.view import (
-    Row,
+    BoardRow,
     View,
     build_rows,
     count_words,
@@ -70,7 +70,7 @@ class Selection(NamedTuple):
     mask: Flags
     runs: StudyRuns
     groups: pd.DataFrame
-    filters: Mapping[str, Row]
+    filters: Mapping[str, BoardRow]
     where: str
     small_print: str
 
@@ -129,7 +129,7 @@ def _make_view(
     )  # fmt: skip
 
 
-def _hide_track(row: Row, has_limit: bool) -> Row:
+def _hide_track(row: BoardRow, has_limit: bool) -> BoardRow:
     """Return the values of a row for the page: no track where no divergence threshold says what it is."""
     return row if has_limit else {**row, "track": math.nan}
 

@@ -23,7 +23,7 @@ from pfbench.stats.world_table import TRACK_SHARE
 BASE, MISSING, LOSES_TRACK = "baseline", "missing", "loses track"
 _SAME_LEVEL = 1e-6
 _LEVEL_OF_REGIONS = 0.9
-Row = dict[str, Any]
+BoardRow = dict[str, Any]
 
 
 class View(NamedTuple):
@@ -45,14 +45,14 @@ class View(NamedTuple):
     losses: Array
     metric: str
     unit: str
-    filters: Mapping[str, Row]
+    filters: Mapping[str, BoardRow]
     times: Sequence[Mapping[str, StepTimes]]
     has_limit: bool
     alpha: float
     margin: float
 
 
-def build_rows(view: View, baseline: str) -> list[Row]:
+def build_rows(view: View, baseline: str) -> list[BoardRow]:
     """Build the rows of a view, ordered by level; filters that lack a condition come last.
 
     A row has filter, rank, value with its interval (of a single condition), ratio with its simultaneous interval,
@@ -122,14 +122,14 @@ def _count_below(n: int, alpha: float) -> int:
     return int((below <= alpha / 2).sum()) - 1
 
 
-def _show_level(view: View, level: Array) -> Row:
+def _show_level(view: View, level: Array) -> BoardRow:
     """Return the error of a filter and its interval, NaN for several conditions or a level of lost runs."""
     is_known = len(view.runs.conditions) == 1 and math.isfinite(level[0])
-    shown = np.where(np.isfinite(level), level, np.nan) if is_known else np.full(3, np.nan)
-    return dict(zip(("value", "low", "high"), map(float, np.exp(shown)), strict=True))
+    logs = np.where(np.isfinite(level), level, np.nan) if is_known else np.full(3, np.nan)
+    return dict(zip(("value", "low", "high"), map(float, np.exp(logs)), strict=True))
 
 
-def _show_verdict(view: View, label: str, verdicts: Mapping[str, Verdict | None]) -> Row:
+def _show_verdict(view: View, label: str, verdicts: Mapping[str, Verdict | None]) -> BoardRow:
     """Return ratio, interval, verdict and words of a row."""
     ends = dict.fromkeys(("ratio", "ratio_low", "ratio_high", "p"), math.nan)
     if label not in verdicts:
@@ -151,14 +151,14 @@ def _show_verdict(view: View, label: str, verdicts: Mapping[str, Verdict | None]
 def _word_lost(view: View, label: str) -> str:
     """State that a filter loses track, with the share of runs or the conditions; empty if it is not shown."""
     lost, count = view.filters[label]["lost_conditions"], len(view.runs.conditions)
-    what = "loses track" if view.has_limit else "loses runs"
+    verb = "loses track" if view.has_limit else "loses runs"
     if not lost:
         return ""
     share = f"{100 * (1 - view.filters[label]['track']):.0f} %"
-    return f"{what} in {lost}/{count}" if count > 1 else f"{what} in {share} of runs"
+    return f"{verb} in {lost}/{count}" if count > 1 else f"{verb} in {share} of runs"
 
 
-def describe_filters(runs: StudyRuns, alpha: float = 0.05) -> dict[str, Row]:
+def describe_filters(runs: StudyRuns, alpha: float = 0.05) -> dict[str, BoardRow]:
     """Describe track, lost runs, coverage and cost of each filter.
 
     Conditions in which a filter loses track, and coverage that differs from 90 %, are shown by tests with Holm's
@@ -185,9 +185,15 @@ def describe_filters(runs: StudyRuns, alpha: float = 0.05) -> dict[str, Row]:
 
 
 def find_lost_conditions(runs: StudyRuns, alpha: float) -> Flags:
-    """Find where it is shown that a filter keeps track in fewer than 80 % of runs, by exact binomial tests, [F, C]."""
-    kept, number = (runs.keeps & runs.present).sum(axis=2), runs.present.sum(axis=2)
-    p = np.where(number > 0, scipy.stats.binom.cdf(kept, number, TRACK_SHARE), 1.0)
+    """Find where it is shown that a filter keeps track in fewer than 80 % of runs, by exact binomial tests, [F, C].
+
+    Args:
+        runs: Runs of a study.
+        alpha: Error rate of all filters and conditions together.
+    """
+    number = runs.present.sum(axis=2)
+    successes = (runs.keeps & runs.present).sum(axis=2)
+    p = np.where(number > 0, scipy.stats.binom.cdf(successes, number, TRACK_SHARE), 1.0)
     return np.asarray(holm(p.ravel()).reshape(p.shape) < alpha)
 
 
@@ -207,7 +213,11 @@ def word_calibration(coverage: Array, alpha: float) -> list[str]:
 
 
 def describe_view(
-    rows: Sequence[Row], looks: Mapping[str, MethodLook], baseline: str, where: str, metric: str
+    rows: Sequence[BoardRow],
+    looks: Mapping[str, MethodLook],
+    baseline: str,
+    where: str,
+    metric: str,
 ) -> str:
     """Describe a view: how many filters are better, equal, worse and not decided, and the best proposed method.
 
@@ -241,7 +251,7 @@ def describe_view(
     return " ".join(filter(None, (f"{head}; {rest}." if rest else f"{head}.", _describe_proposed(others, better, looks))))  # fmt: skip
 
 
-def _show_ratio(row: Row) -> str:
+def _show_ratio(row: BoardRow) -> str:
     """Format the ratio of a row with its interval."""
     if not math.isfinite(row["ratio_high"]):
         return f"{row['ratio']:.2f}"
@@ -249,7 +259,7 @@ def _show_ratio(row: Row) -> str:
 
 
 def _describe_proposed(
-    others: Sequence[Row], better: Sequence[Row], looks: Mapping[str, MethodLook]
+    others: Sequence[BoardRow], better: Sequence[BoardRow], looks: Mapping[str, MethodLook]
 ) -> str:
     """State the proposed method of the smallest ratio, unless it is the best filter; empty without one."""
     proposed = [row for row in others if looks[row["filter"]].proposed]

@@ -339,6 +339,10 @@ def render_headline(pack: Pack, stored: bytes = b"") -> bytes:
     """Draw the error of each filter relative to the baseline as SVG; empty if no filter has a ratio.
 
     A stored drawing that is equal but for the last digits stays. Equal data give equal bytes.
+
+    Args:
+        pack: Data of the page.
+        stored: An earlier drawing.
     """
     opening = next(iter(pack["views"].values()))
     if all(row["ratio"] is None for row in opening["rows"]):
