@@ -120,7 +120,7 @@ def _describe_sample(pair: PairVerdict) -> str:
 
 
 def _describe_need(pair: PairVerdict) -> str:
-    """Describe how long a record would decide; empty where more time is no remedy."""
+    """Describe how long a record would decide; empty if unknown."""
     need = pair.seconds_needed
     return (
         f" About {format_digits(need)} s would decide a difference of the margin."

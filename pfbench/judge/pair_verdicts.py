@@ -59,7 +59,7 @@ class PairVerdict(NamedTuple):
 
     @property
     def seconds_needed(self) -> float:
-        """Time of which the interval is as wide as the margin on each side, s; infinite if no time is enough."""
+        """Length of a record whose interval is as wide as the margin on each side, s; infinite if unknown."""
         v = self.verdict
         if (
             self.unit != "block"
@@ -117,8 +117,8 @@ def cap_of(sequence: SequenceResults, options: JudgeOptions) -> float:
     """Return the error of a lost run, m: the limit, else the largest distance of the reference from its start."""
     if options.limit:
         return options.limit
-    place = sequence.reference.position
-    return max(float(np.linalg.norm(place - place[0], axis=-1).max()), _LEAST_CAP)
+    position = sequence.reference.position
+    return max(float(np.linalg.norm(position - position[0], axis=-1).max()), _LEAST_CAP)
 
 
 def _withhold(sample: _Sample, verdict: Verdict, steady: Verdict) -> Verdict:
@@ -175,15 +175,15 @@ def _of_blocks(common: list[_Common], a: str, b: str, options: JudgeOptions) -> 
         parts = [block_losses(change(_errors(c, program)), n, c.cap) for c, n in of_sequences]
         return program, np.concatenate(parts)
 
-    whole, steady = (
+    full, steady = (
         compare_blocks(losses(a, change), losses(b, change))
         for change in (np.asarray, remove_drift)
     )
-    length = sum(seconds) / len(whole.effect.differences)
-    effective = min(whole.effective, steady.effective)
+    length = sum(seconds) / len(full.effect.differences)
+    effective = min(full.effective, steady.effective)
     squares = [sum(float((_errors(c, p) ** 2).sum()) for c in common) for p in (a, b)]
     rmse_ratio = math.sqrt(squares[0] / squares[1]) if squares[1] else math.nan
-    return _Sample(whole.effect, steady.effect, effective, length, rmse_ratio, common)
+    return _Sample(full.effect, steady.effect, effective, length, rmse_ratio, common)
 
 
 def _rows(common: _Common, program: str) -> list[int]:

@@ -2,8 +2,8 @@
 
 30 blocks are enough: more would shorten an interval by less than 5 %, and shorter blocks depend on each other.
 Errors of white and slow noise look independent in short blocks. The variance of the mean of the blocks is
-therefore estimated from blocks and from pairs of blocks, each with the correlation of neighbours that is left, and
-the larger one counts. The differences of blocks are moved away from their location until independent differences
+therefore estimated from blocks and from pairs of blocks, each with the correlation of neighbours. The larger one
+counts. The differences of blocks are moved away from their location until independent differences
 would have this variance. `effective` is the number of independent blocks with the same variance of the mean.
 
 The mean error of a run and its drift are one draw of the run. No number of blocks shows how they vary, so that
