@@ -32,9 +32,9 @@ vn, ve, vd, roll, pitch, yaw, sd_pn, ..., cov_nn, ...; TUM; NMEA; KF-GINS; .npz 
   limit=M                position error above which a run diverges
   align=offset|yaw       remove a motion from positions (none)
   origin=LAT,LON,H       origin of local positions, deg, deg, m
-  block=S                mean length of the blocks of time (by rule)
+  block=S                length of the blocks of time (30 blocks)
   baseline=NAME          compare all with one program (all pairs)
-  alpha=0.05 margin=0.05 level of the tests, margin of equivalence
+  alpha=0.05 margin=0.05 level of the tests, margin of equality
   NAME.frame=enu|ned     axes of a TUM file                NAME.shift=S   time added to a clock
   NAME.columns=t:time,pn:north,...   names of columns      NAME.sd=FILE   deviations of KF-GINS
   NAME.scale=t:0.001,yaw:0.0174533   factors of columns    NAME.format=table|tum|kf_gins|nmea|result"""
@@ -53,12 +53,8 @@ def judge_trajectories(words: Sequence[str]) -> None:
     values = _split(words)
     options, sources, programs = _sort_words(values)
     from pfbench.judge.judgement import judge_programs
-    from pfbench.judge.page import (
-        describe_judgement,
-        describe_material,
-        describe_notes,
-        write_judgement,
-    )
+    from pfbench.judge.page import describe_material, describe_notes, write_judgement
+    from pfbench.judge.pair_sentences import describe_judgement
 
     reference, study = programs.pop("reference"), str(values.get("study", "judge"))
     if not re.fullmatch(r"[\w+.-]*\w[\w+.-]*", study) or len(study) > _LONGEST_NAME:

@@ -67,14 +67,14 @@ class JudgeOptions:
             2.5 steps.
         holes: "refuse" or "skip": epochs in longer gaps of the reference.
         coverage: Least share of the time that a run must cover, else it is lost.
-        limit: Position error above which a run diverges, m; 0 for none.
+        limit: Position error above which a run diverges and no error counts more, m; 0 for none.
         align: "none", "offset" or "yaw": motion that is removed from positions.
         origin: Latitude, longitude (deg) and height (m) of the local frame; empty for that of the
             reference.
-        block: Mean length of the blocks of time, s; 0 for the rule.
+        block: Length of the blocks of time, s; 0 for 30 blocks.
         baseline: Program that all others are compared with; empty for all pairs.
         alpha: Error of a family of tests.
-        margin: Relative difference of errors within which programs are equivalent.
+        margin: Relative difference of errors within which programs are equal.
     """
 
     start: float = -math.inf

@@ -17,7 +17,9 @@ from matplotlib.figure import Figure
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.judge.judge_options import JudgeOptions
-from pfbench.judge.judgement import BlockDecision, Judgement, describe_blocks
+from pfbench.judge.judgement import Judgement
+from pfbench.judge.pair_sentences import describe_judgement, describe_limits, format_ratio
+from pfbench.judge.pair_verdicts import PairVerdict, cap_of
 from pfbench.judge.reference_track import LEAST_SHARE
 from pfbench.judge.sequence_results import SequenceResults
 from pfbench.report import writers
@@ -26,16 +28,8 @@ from pfbench.results.metrics import compute_metric, data_by_scope, metric_defini
 from pfbench.results.plotting import INSTANTS, FigureSpec, stacked_axes, use_log_if_wide
 from pfbench.results.status import count_statuses
 from pfbench.results.store import JobResult
-from pfbench.stats.decision import NOT_TESTED, Decision
-from pfbench.stats.effects import MIN_RUNS
 from pfbench.stats.error_measures import Array, finite_mean
-from pfbench.stats.sentences import (
-    describe_pair,
-    describe_ranking,
-    describe_total,
-    format_count,
-    format_effect,
-)
+from pfbench.stats.sentences import format_count
 
 # --------------------------------------------------------------------------------------------------
 # Page of a judgement: report.md, index.html, decisions.json, tables and figures.
@@ -54,7 +48,7 @@ def write_judgement(
     """
     tables = {
         "accuracy": tabulate_accuracy(judgement.sequences),
-        "along_runs": blocks_table(judgement.along_runs),
+        "verdicts": tabulate_verdicts(judgement.pairs),
         "files": files_table(judgement.sequences),
     }
     context: dict[str, Any] = {
@@ -62,7 +56,7 @@ def write_judgement(
         "head": describe_material(judgement),
         "summary": list(describe_judgement(judgement)),
         "notes": list(describe_notes(judgement, options)),
-        "limits": list(_describe_limits(judgement)),
+        "limits": list(describe_limits(judgement)),
         "definitions": [d for d in metric_definitions() if d.startswith(("CRPS", "coverage"))],
         "sensors": "CRPS [m]" in tables["accuracy"],
         **tables,
@@ -82,12 +76,17 @@ def decisions_as_json(judgement: Judgement, options: JudgeOptions) -> dict[str, 
     """Return all decisions in JSON types."""
     return {
         "options": writers.to_json_types(asdict(options)),
-        "decisions": [decision.to_dict() for decision in judgement.decisions],
-        "along_runs": [result.to_dict() for result in judgement.along_runs],
-        "ranking": [
-            {"question": r.question, "top_group": list(r.top_group), "ranks": r.ranks}
-            for r in judgement.rankings
-        ],
+        "verdicts": [_to_dict(pair) for pair in judgement.pairs],
+    }
+
+
+def _to_dict(pair: PairVerdict) -> dict[str, Any]:
+    """Return a verdict in JSON types; a number that is not finite becomes text."""
+    values = {**pair._asdict(), **pair.verdict._asdict(), "sequences": list(pair.sequences)}
+    del values["verdict"]
+    return {
+        key: str(value) if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in values.items()
     }
 
 
@@ -100,59 +99,6 @@ def describe_material(judgement: Judgement) -> str:
     return (
         f"Programs: {', '.join(programs)}. Sequences: {len(judgement.sequences)}. Trajectories: {runs}. "
         f"Scored: {epochs} common epochs in {seconds:.6g} s."
-    )
-
-
-def describe_judgement(judgement: Judgement) -> Iterator[str]:
-    """Yield the sentences of all decisions."""
-    decisions = judgement.decisions
-    for question in ("a", "b") if decisions else ():
-        for track, error in _pairs_of(decisions, question):
-            if question == "b" or error.runs >= MIN_RUNS:
-                yield describe_pair(track, error)
-    if decisions:
-        yield describe_total(list(decisions))
-    if judgement.rankings:
-        first = judgement.rankings[0].top_group[0]
-        yield describe_ranking(judgement.rankings[0], judgement.rankings[1], first)
-    for result in judgement.along_runs:
-        yield describe_blocks(result)
-    if not judgement.pairs:
-        yield "One program: nothing is compared. The tables state its errors."
-
-
-def _pairs_of(
-    decisions: tuple[Decision, ...], question: str
-) -> Iterator[tuple[Decision, Decision]]:
-    of_question = [d for d in decisions if d.question == question]
-    yield from zip(of_question[::2], of_question[1::2], strict=True)
-
-
-def _describe_limits(judgement: Judgement) -> Iterator[str]:
-    """Yield the reach of the conclusions."""
-    count = len(judgement.sequences)
-    if count == 1:
-        yield (
-            "One sequence: the decisions hold for this recording. Blocks of time measure how errors vary "
-            "along it, and do not show how they vary between recordings."
-        )
-    else:
-        yield (
-            f"A sequence is one world: the decision for a new world has {count} samples, one per sequence. "
-            "Epochs and blocks are no samples for it."
-        )
-    yield (
-        "Blocks of time: neighbouring errors depend on each other, so that epochs are no samples. The "
-        "stationary bootstrap resamples blocks of random length with the stated mean. Fewer than 6 blocks "
-        "give an effect without a test."
-    )
-    yield (
-        "Position errors are estimate minus reference at the epochs of the programs. The reference is "
-        "interpolated, the estimates are not. Errors of the reference count as errors of all programs."
-    )
-    yield (
-        "RMSE: root mean square over the scored epochs. With several runs, RMSE, quantile and maximum are "
-        "means over the valid runs. Epochs in holes are scored, so more epochs than rows can be scored."
     )
 
 
@@ -203,7 +149,10 @@ def _describe_runs(sequence: SequenceResults, options: JudgeOptions) -> Iterator
         label = f"{run.program} {run.run}".strip() + f" in {sequence.name}"
         if sequence.epochs.rows[k] is None:
             share = 100 * sequence.epochs.coverage[k]
-            yield f"Lost: {label} covers {share:.3g} % of the time, {100 * options.coverage:g} % are required."
+            yield (
+                f"Lost: {label} covers {share:.3g} % of the time, {100 * options.coverage:g} % are required. "
+                f"Among runs or sequences it counts as an error of {cap_of(sequence, options):.4g} m."
+            )
         holes = sequence.epochs.holes[k]
         if holes is not None and holes.any():
             yield (
@@ -297,8 +246,8 @@ def _describe_trends(sequence: SequenceResults) -> Iterator[str]:
         if share > _TREND_SHOWN:
             yield (
                 f"Trend: {100 * share:.3g} % of the squared position error of {program} in {sequence.name} "
-                "is a constant and a drift of the run. Blocks of time cannot show how these differ "
-                "between runs, so another run can decide otherwise. Judge several runs."
+                "is a constant and a drift of the run. One record cannot tell how these differ between runs. "
+                "Judge several runs."
             )
 
 
@@ -358,25 +307,23 @@ def _mean(values: Array, lost: np.ndarray) -> float:
     return float(finite_mean(np.asarray(values, dtype=np.float64)[~lost], axis=0))
 
 
-def blocks_table(results: Sequence[BlockDecision]) -> pd.DataFrame:
-    """Return one row per decision along the runs of a sequence."""
+def tabulate_verdicts(pairs: Sequence[PairVerdict]) -> pd.DataFrame:
+    """Return one row per pair of programs."""
     rows = []
-    for result in results:
-        d = result.decision
-        effect = format_effect(d, d.estimate, d.low, d.high)
-        if d.word == NOT_TESTED:
-            effect = effect.partition(" (")[0]
+    for pair in pairs:
+        v = pair.verdict
         rows.append(
             {
-                "sequence": result.sequence,
-                "first": d.a,
-                "second": d.b,
-                "decision on first": d.word,
-                "position RMSE of first": effect,
-                "adjusted p": d.p_corrected,
-                "length [s]": result.seconds,
-                "block [s]": result.block_s,
-                "blocks": result.blocks,
+                "first": v.a,
+                "second": v.b,
+                "verdict on first": v.word,
+                "position error of first": format_ratio(v.ratio, v.low, v.high) if v.n else "-",
+                "adjusted p": v.p,
+                "sample": "sequence" if pair.unit == "world" else pair.unit,
+                "number": v.n,
+                "independent": pair.effective,
+                "block [s]": pair.block_s,
+                "reason": v.reason or "-",
             }
         )
     return pd.DataFrame(rows)

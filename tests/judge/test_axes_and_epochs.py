@@ -11,13 +11,14 @@ import pytest
 from scipy.signal import lfilter
 
 from pfbench.judge.alignment import is_in_hole
-from pfbench.judge.block_bootstrap import compare_along_run
 from pfbench.judge.checks import check_axes
 from pfbench.judge.formats import read_trajectories
 from pfbench.judge.judge_options import JudgeOptions, SourceOptions
 from pfbench.judge.judgement import judge_programs
 from pfbench.judge.reference_track import read_reference
+from pfbench.judge.time_blocks import block_losses, compare_blocks
 from pfbench.results.store import write_result
+from pfbench.stats.comparison import decide
 
 WRONG = {
     "swapped positions": ({"pn": "pe", "pe": "pn"}, [], "column pn .* times those of pe"),
@@ -100,9 +101,15 @@ def spiked(rng: np.random.Generator, steps: int, correlation: float = 100.0) -> 
 def test_a_cycle_of_measurements_hides_no_slow_correlation() -> None:
     """Equal programs: at most 5 % of 200 studies are decided, plus 3.1 standard errors."""
     rng = np.random.default_rng(4)
-    p = [compare_along_run(spiked(rng, 6000), spiked(rng, 6000)).p for _ in range(200)]
-    assert np.mean(np.isfinite(p)) > 0.5
-    assert np.mean(np.array(p) < 0.05) <= 0.05 + 3.1 * np.sqrt(0.05 * 0.95 / 200)
+    found = []
+    for _ in range(200):
+        a, b = (block_losses(np.sqrt(spiked(rng, 6000))[None, :, None], 30, 1e9) for _ in "ab")
+        found.append(compare_blocks(("a", a), ("b", b)))
+    words = [decide([blocks.effect])[0].word for blocks in found]
+    assert np.median([blocks.effective for blocks in found]) > 7
+    assert words.count("better") + words.count("worse") <= 200 * (
+        0.05 + 3.1 * np.sqrt(0.05 * 0.95 / 200)
+    )
 
 
 @pytest.mark.parametrize(("scale", "is_placed"), [(1.0, True), (1.2, False)])

@@ -130,7 +130,8 @@ def test_a_file_that_ends_early_is_lost_and_reported(tmp_path: Path) -> None:
     assert "Lost: kf" in page
     assert "line 19 has no line end" in page
     decisions = json.loads((tmp_path / "judge/decisions.json").read_text())
-    assert decisions["along_runs"][0]["blocks"] == "nan"
+    assert decisions["verdicts"][0]["n"] == 0
+    assert "kf is lost in 1 of 1 run" in decisions["verdicts"][0]["reason"]
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ def test_rmse_and_nees_of_known_errors(tmp_path: Path) -> None:
     assert row["position NEES (expected 3)"] == pytest.approx(25 / 4)
     assert row["yaw RMSE [deg]"] == pytest.approx(np.degrees(0.01))
     assert row["velocity RMSE [m/s]"] == pytest.approx(0.0, abs=1e-12)
-    assert judged.decisions == ()
+    assert judged.pairs == ()
 
 
 def test_correlated_covariance_enters_the_nees(tmp_path: Path) -> None:
@@ -56,9 +56,9 @@ def test_only_common_epochs_are_scored_and_an_early_stop_is_lost(tmp_path: Path)
     assert np.allclose(sequence.epochs.time, truth.t[::4])
     assert sequence.results["half"].data["lost"].tolist() == [True]
     judged = judge_programs(str(reference), files)
-    assert {
-        d.decision.word for d in judged.along_runs if "half" in (d.decision.a, d.decision.b)
-    } == {"not tested"}
+    halves = [p.verdict for p in judged.pairs if "half" in (p.verdict.a, p.verdict.b)]
+    assert {v.word for v in halves} == {"not decided"}
+    assert all("half is lost in 1 of 1 run" in v.reason for v in halves)
 
 
 def test_a_program_gains_nothing_by_leaving_out_its_bad_epochs(tmp_path: Path) -> None:
@@ -84,7 +84,7 @@ def test_a_program_gains_nothing_by_leaving_out_its_bad_epochs(tmp_path: Path) -
     np.testing.assert_allclose(norms["holes"][~is_kept], largest)
     np.testing.assert_allclose(norms["holes"][is_kept], norm[is_kept], rtol=1e-6)
     assert np.mean(norms["holes"] ** 2) > np.mean(norm**2)
-    assert judged.along_runs[0].decision.word != "better"
+    assert judged.pairs[0].verdict.word != "better"
 
 
 @pytest.mark.parametrize("options", [{}, {"start": 10.0, "end": 100.0}, {"every": 2.0}])
@@ -134,22 +134,32 @@ def write_study(home: Path, sequences: int, ratio: float) -> list[str]:
     return [*files, f"reports_dir={home / 'reports'}", "study=many"]
 
 
-def test_several_sequences_decide_for_a_new_one(tmp_path: Path) -> None:
-    words = write_study(tmp_path, 8, 0.6)
+@pytest.mark.parametrize(("sequences", "unit"), [(12, "world"), (4, "block")])
+def test_the_unit_is_a_sequence_where_there_are_enough(
+    tmp_path: Path, sequences: int, unit: str
+) -> None:
+    words = write_study(tmp_path, sequences, 0.6)
     said = pfbench("judge", *words, home=tmp_path)
     assert said.code == 0, said.err
-    assert "In a new world of this kind, mine is better than theirs on average" in said.out
+    assert "mine is better than theirs: the position error of mine is" in said.out
     folder = tmp_path / "reports/many"
-    stored = json.loads((folder / "decisions.json").read_text())
-    new = [
-        d for d in stored["decisions"] if d["question"] == "b" and d["metric"] == "position RMSE"
-    ]
-    assert [(d["worlds"], d["word"]) for d in new] == [(8, "better")]
-    assert len(stored["along_runs"]) == 8
-    tested = [d for d in stored["along_runs"] if d["word"] != "not tested"]
-    assert {d["family_size"] for d in tested} == {len(tested)}
+    (verdict,) = json.loads((folder / "decisions.json").read_text())["verdicts"]
+    assert (verdict["word"], verdict["unit"]) == ("better", unit)
+    if unit == "world":
+        assert (verdict["n"], verdict["effective"], verdict["block_s"]) == (12, 12.0, "nan")
+        text, reach = "; 12 sequences; adjusted p", "The sample is a sequence"
+    else:
+        assert verdict["n"] * verdict["block_s"] == pytest.approx(verdict["seconds"])
+        assert 7 <= verdict["effective"] <= verdict["n"]
+        text, reach = (
+            f" s that count as {verdict['effective']:.2g} independent ones",
+            "The sample is a block of time",
+        )
+    assert text in said.out
     for name in ("index.html", "report.md"):
-        assert "samples, one per sequence" in (folder / name).read_text()
+        page = (folder / name).read_text()
+        assert text in page
+        assert reach in page
     before = (folder / "index.html").read_bytes()
     assert pfbench("judge", *words, home=tmp_path).code == 0
     assert (folder / "index.html").read_bytes() == before
@@ -162,9 +172,27 @@ def test_equal_programs_are_not_decided_in_one_run(tmp_path: Path) -> None:
         n: str(cases.write(cases.estimate(truth, 1.0, k), tmp_path / f"{n}.csv"))
         for k, n in enumerate("ab")
     }
-    (result,) = judge_programs(str(reference), files).along_runs
-    assert result.decision.word == "inconclusive"
-    assert result.decision.low < 0 < result.decision.high
-    assert result.seconds_needed > result.seconds
-    (same,) = judge_programs(str(reference), {"a": files["a"], "copy": files["a"]}).along_runs
-    assert same.decision.word == "identical"
+    (pair,) = judge_programs(str(reference), files).pairs
+    assert (pair.verdict.word, pair.verdict.n) == ("not decided", 30)
+    assert pair.verdict.low < 1 < pair.verdict.high
+    assert pair.seconds_needed > pair.seconds
+    (same,) = judge_programs(str(reference), {"a": files["a"], "copy": files["a"]}).pairs
+    assert same.verdict.word == "identical"
+
+
+def test_all_pairs_form_one_family(tmp_path: Path) -> None:
+    truth = cases.drive(300.0)
+    reference = str(cases.write(truth, tmp_path / "truth.csv"))
+    files = {
+        n: str(cases.write(cases.estimate(truth, sd, k), tmp_path / f"{n}.csv"))
+        for k, (n, sd) in enumerate({"a": 1.0, "b": 1.05, "c": 2.0, "d": 2.1}.items())
+    }
+    pairs = judge_programs(reference, files).pairs
+    alone = judge_programs(reference, {n: files[n] for n in "ac"}).pairs[0].verdict
+    together = next(p.verdict for p in pairs if (p.verdict.a, p.verdict.b) == ("a", "c"))
+    assert len(pairs) == 6
+    assert together.ratio == alone.ratio
+    assert together.low < alone.low < alone.high < together.high
+    assert together.p > alone.p
+    baseline = judge_programs(reference, files, JudgeOptions(baseline="c")).pairs
+    assert [p.verdict.b for p in baseline] == ["c"] * 3

@@ -1,4 +1,4 @@
-"""The same runs give the same estimate and word in a report, in a judgement and at a look."""
+"""The same runs give the same verdict in a study and in a judgement."""
 
 from __future__ import annotations
 
@@ -8,15 +8,12 @@ import judge_cases as cases
 import numpy as np
 import pytest
 
-from pfbench.judge.judgement import METRIC, judge_programs
-from pfbench.report.options import ReportOptions
+from pfbench.judge.judge_options import JudgeOptions
+from pfbench.judge.judgement import judge_programs
 from pfbench.results.frame import load_frame
 from pfbench.results.store import write_result
-from pfbench.stats.decision import DecisionOptions
-from pfbench.stats.pair_states import LookSchedule, decide_pairs
-from pfbench.stats.planned_pairs import decide_planned_pairs
-from pfbench.stats.sequential_looks import LookPlan, decide_at_looks
 from pfbench.stats.study_runs import tidy_runs
+from pfbench.stats.world_table import build_world, decide_cells
 
 RUNS = 30
 NAMES = ["position_E", "position_N", "position_U"]
@@ -41,9 +38,8 @@ def write_filter(folder: Path, name: str, scale: np.ndarray, seed: int) -> Path:
     return write_result(folder / "s" / f"{name}.npz", meta, data)
 
 
-@pytest.mark.parametrize(("effect", "word"), [(-0.5, "better"), (0.0, "inconclusive"), (0.5, "worse")])  # fmt: skip
-def test_report_judgement_and_look_agree(tmp_path: Path, effect: float, word: str) -> None:
-    """The runs are skewed, so that the trimmed mean of ratios differs from the ratio of trimmed means."""
+@pytest.mark.parametrize(("effect", "word"), [(-0.5, "better"), (0.0, "not decided"), (0.5, "worse")])  # fmt: skip
+def test_a_study_and_a_judgement_agree(tmp_path: Path, effect: float, word: str) -> None:
     rng = np.random.default_rng(3)
     shared = np.exp(0.5 * rng.exponential(size=RUNS))
     a = shared * np.exp(effect + 0.4 * rng.exponential(size=RUNS) - 0.4)
@@ -51,17 +47,13 @@ def test_report_judgement_and_look_agree(tmp_path: Path, effect: float, word: st
         "a": str(write_filter(tmp_path, "a", a, 1)),
         "b": str(write_filter(tmp_path, "b", shared, 2)),
     }
-    options = ReportOptions().decision_options
     frame = load_frame("s", tmp_path)
     table = tidy_runs(frame[frame.component == "norm"])
-    report = decide_planned_pairs(table, [("a", "b")], None, options)[1]
+    rows = table.rename(columns={"value": "rmse"}).assign(lost=False, seed=1)
+    (cell,) = decide_cells([build_world(rows, "b", 1000.0)], ["a"])
     reference = cases.write(cases.drive(20.0), tmp_path / "truth.csv")
-    judged = next(d for d in judge_programs(str(reference), files).decisions if d.question == "a" and d.metric == METRIC)  # fmt: skip
-    look = decide_at_looks(table, [("a", "b")], LookPlan(runs=(RUNS,)), None, options)[1]
-    (state,) = decide_pairs(table, [("a", "b")], LookSchedule("looks", RUNS), options)
-    assert report.pair_word == word
-    assert judged.pair_word == look.pair_word == state.word == word
-    np.testing.assert_allclose([judged.estimate, look.estimate], report.estimate, atol=1e-4)
-    other = DecisionOptions(estimate="paired")
-    paired = decide_planned_pairs(table, [("a", "b")], None, other)[1]
-    assert abs(paired.estimate - report.estimate) > 1e-3  # the other estimate is another number
+    (pair,) = judge_programs(str(reference), files, JudgeOptions(limit=1000.0)).pairs
+    assert pair.unit == "run"
+    assert pair.verdict.word == cell.verdict.word == word
+    for name in ("ratio", "low", "high", "p", "n"):
+        assert getattr(pair.verdict, name) == pytest.approx(getattr(cell.verdict, name), rel=1e-4)

@@ -9,12 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from command_line import pfbench
-from scipy.signal import lfilter
 
-from pfbench.judge.block_bootstrap import compare_along_run, count_equal_blocks
 from pfbench.judge.judge_options import JudgeOptions, SourceOptions
-from pfbench.judge.judgement import Judgement, describe_blocks, judge_programs
+from pfbench.judge.judgement import Judgement, judge_programs
 from pfbench.judge.page import describe_notes, tabulate_accuracy
+from pfbench.judge.pair_sentences import describe_judgement
 from pfbench.judge.reference_track import read_reference, space_evenly
 
 POSITION = ["pn", "pe", "pd"]
@@ -70,7 +69,7 @@ def test_a_program_gains_nothing_by_repeating_its_good_epochs(tmp_path: Path) ->
     rmse = tabulate_accuracy(judged.sequences)["position RMSE [m]"][0]
     assert by_epoch < 0.85 * by_time
     assert rmse == pytest.approx(by_time, rel=0.01)
-    assert judged.along_runs[0].decision.word == "inconclusive"
+    assert judged.pairs[0].verdict.word == "not decided"
     assert "Steps: the steps of the epochs in recording differ" in notes(judged)
     (sequence,) = judged.sequences
     assert sequence.epochs.unused[0] == len(repeated) - len(mine)
@@ -89,47 +88,16 @@ def test_a_fast_stretch_has_the_weight_of_its_time(tmp_path: Path) -> None:
     judged = judge_tables(tmp_path, truth, **tables)
     rmse = tabulate_accuracy(judged.sequences)["position RMSE [m]"]
     assert rmse[0] / rmse[1] == pytest.approx(1.0, abs=0.25)
-    assert judged.along_runs[0].decision.word in ("inconclusive", "not tested")
-
-
-def markov(
-    rng: np.random.Generator, series: tuple[int, int], steps: int, time: float
-) -> np.ndarray:
-    a, warm = np.exp(-1 / time), round(10 * time)
-    white = rng.normal(size=(*series, steps + warm))
-    return lfilter([np.sqrt(1 - a * a)], [1, -a], white, axis=-1)[..., warm:]
-
-
-def test_errors_of_varying_size_give_no_false_alarms() -> None:
-    """Errors of 10 epochs with a size of 20 epochs, SD 1 of its logarithm: at most 5 % of 400 studies."""
-    rng = np.random.default_rng(7)
-    decided = tested = 0
-    for _ in range(400):
-        errors = markov(rng, (2, 3), 2000, 10.0) * np.exp(markov(rng, (2, 1), 2000, 20.0))
-        result = compare_along_run(*(errors**2).sum(axis=1))
-        assert result.equal_blocks <= result.blocks
-        decided, tested = decided + (result.p < 0.05), tested + np.isfinite(result.p)
-    assert tested > 200
-    assert decided / 400 <= 0.05 + 3.1 * np.sqrt(0.05 * 0.95 / 400)
-
-
-def test_equal_blocks_are_those_of_the_kurtosis() -> None:
-    """Normal blocks count nearly all, one block that holds all the variance counts 3."""
-    rng = np.random.default_rng(3)
-    normal = np.mean([count_equal_blocks(rng.normal(size=10000), 100.0) for _ in range(50)])
-    assert normal == pytest.approx(100, rel=0.1)
-    single = np.zeros(1000)
-    single[120:130] = 1.0
-    assert count_equal_blocks(single, 100.0) == pytest.approx(3.0)
+    assert judged.pairs[0].verdict.word == "not decided"
 
 
 @pytest.mark.parametrize(
     ("kind", "is_noted"), [("none", False), ("constant", True), ("drift", True)]
 )
 def test_a_constant_and_a_drift_are_stated(tmp_path: Path, kind: str, is_noted: bool) -> None:
-    """They are one draw of a run, so that equal programs are called different in most runs."""
+    """They are one draw of a run: equal programs are not called different, and the reason names it."""
     truth = cases.drive(300.0)
-    words = []
+    verdicts = []
     for seed in range(6):
         rng = np.random.default_rng(100 + seed)
         tables = {}
@@ -143,9 +111,13 @@ def test_a_constant_and_a_drift_are_stated(tmp_path: Path, kind: str, is_noted: 
             table[POSITION] += np.outer(growth[kind], rng.normal(size=3))
             tables[name] = table
         judged = judge_tables(tmp_path, truth, **tables)
-        words.append(judged.along_runs[0].decision.word)
+        verdicts.append(judged.pairs[0].verdict)
         assert ("Trend:" in notes(judged)) == is_noted
-    assert (words.count("better") + words.count("worse") >= 3) == is_noted
+    assert {v.word for v in verdicts} == {"not decided"}
+    named = sum("rests on the mean error and the drift of the run" in v.reason for v in verdicts)
+    assert (named >= 3) == (kind == "constant")
+    slow = sum("errors vary slowly" in v.reason for v in verdicts)
+    assert (named + slow >= 3) == is_noted
 
 
 @pytest.mark.parametrize(
@@ -206,7 +178,8 @@ def test_missing_runs_and_lost_runs_stand_on_the_console_and_on_the_page(tmp_pat
     ):
         assert text in said.out
         assert text in page
-    assert "are not compared: mine is lost in 2 of 10 runs" in said.out
+    assert "; 10 runs" in said.out
+    assert "% are required. Among runs or sequences it counts as an error of" in page
     assert "mathdefault" not in (tmp_path / "reports/judge/figures/judge_error_0.svg").read_text()
 
 
@@ -214,7 +187,7 @@ def test_runs_without_a_common_name_are_named(tmp_path: Path) -> None:
     write_runs(tmp_path)
     files = {"mine": f"{tmp_path}/mine/{{run}}.csv", "theirs": f"{tmp_path}/theirs/r00.csv"}
     judged = judge_programs(f"{tmp_path}/truth.csv", files)
-    reason = judged.along_runs[0].decision.reason
+    reason = judged.pairs[0].verdict.reason
     assert reason == "no run has the same name (mine: r00, r01, r02; theirs: without a name)"
 
 
@@ -232,16 +205,36 @@ def test_all_figures_of_programs_without_errors_are_drawn(tmp_path: Path) -> Non
     assert (said.code, said.err) == (0, "")
 
 
-def test_few_blocks_that_hold_the_difference_are_not_tested(tmp_path: Path) -> None:
-    """One burst of 5 s: 300 s have many blocks, and a longer run is not what is lacking."""
+def test_a_burst_decides_nothing_and_is_told_by_the_ratio_of_the_rmse(tmp_path: Path) -> None:
+    """One burst of 5 s holds nearly all of the squared error of a program that is as good otherwise."""
     truth = cases.drive(300.0)
     mine = cases.estimate(truth, 1.0, 1)
     burst = ((truth.t > 100) & (truth.t < 105)).to_numpy()
     mine.loc[burst, POSITION] += 60.0
     judged = judge_tables(tmp_path, truth, mine=mine, theirs=cases.estimate(truth, 1.0, 2))
-    (result,) = judged.along_runs
-    assert result.blocks > 6
-    assert result.decision.word == "not tested"
-    text = describe_blocks(result)
-    assert "hold most of the difference, which count as 3 equal blocks, 6 are required." in text
-    assert "A test requires" not in text
+    (pair,) = judged.pairs
+    assert pair.verdict.word == "not decided"
+    rmse = tabulate_accuracy(judged.sequences)["position RMSE [m]"]
+    assert pair.rmse_ratio == pytest.approx(rmse[0] / rmse[1])
+    assert pair.rmse_ratio > 5
+    (text,) = describe_judgement(judged)
+    assert "Few blocks hold most of the squared error: the ratio of the RMSE is" in text
+
+
+def test_a_lost_run_is_one_event_whatever_its_blocks(tmp_path: Path) -> None:
+    """3 runs of each: one of them lost decides nothing, and 12 runs weigh it with the cap."""
+    truth = cases.drive(120.0)
+    reference = str(cases.write(truth, tmp_path / "truth.csv"))
+    for k in range(12):
+        mine, theirs = cases.estimate(truth, 0.3, 2 * k), cases.estimate(truth, 1.0, 2 * k + 1)
+        for name, table in (("mine", mine[:100] if k == 1 else mine), ("theirs", theirs)):
+            cases.write(table, tmp_path / f"{name}/r{k:02d}.csv")
+            if k < 3:
+                cases.write(table, tmp_path / f"few/{name}{k}.csv")
+    few = {name: f"{tmp_path}/few/{name}{{run}}.csv" for name in ("mine", "theirs")}
+    (pair,) = judge_programs(reference, few).pairs
+    assert (pair.verdict.word, pair.verdict.n) == ("not decided", 0)
+    assert pair.verdict.reason == "mine is lost in 1 of 3 runs, and 10 are required to weigh that"
+    many = {name: f"{tmp_path}/{name}/{{run}}.csv" for name in ("mine", "theirs")}
+    (pair,) = judge_programs(reference, many).pairs
+    assert (pair.verdict.word, pair.unit, pair.verdict.n) == ("better", "run", 12)
