@@ -12,6 +12,7 @@ from pfbench.report.journal.ratio_figures import (
     write_headline as write_headline,
 )
 from pfbench.report.journal.table_layout import text_width as text_width
+from pfbench.report.options import ReportOptions as ReportOptions
 from pfbench.report.overview.page import write_overview as write_overview
 from pfbench.report.papers.specs import (
     PaperFigure as PaperFigure,
@@ -24,6 +25,7 @@ from pfbench.report.study_report import (
     read_page_data as read_page_data,
     rebuild_page as rebuild_page,
     write_page_data as write_page_data,
+    write_report as write_report,
 )
 from pfbench.results.looks import count_tuned as count_tuned
 from pfbench.results.plotting import (

@@ -79,7 +79,14 @@ def write_report(
     results give equal bytes. Files that an earlier report wrote are removed if this one does not write
     them and they are unchanged (manifest.json). Other files stay.
 
-    Returns path of index.html.
+    Args:
+        study: Name of the study.
+        results: Folder of all results.
+        out: Folder of all reports.
+        options: Options of the report. None for the defaults.
+
+    Returns:
+        Path of index.html.
     """
     options = options or ReportOptions()
     conditions = load_conditions(study, results, allow_mixed_versions=options.allow_mixed_versions)
