@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pfbench.cli.compose import StudyPlan
 
 SWEEP_JOBS = "PFBENCH_SWEEP_JOBS"  # environment variable: number of jobs, for the counter
-_SHORT = 10.0  # s; a shorter time left is not printed
+_SHORT = 60.0  # s; a shorter time left is not printed
 _FILE = re.compile(r"\.sweep-(\d+)-(\d+\.\d+)-(\d+)")  # process, start, jobs
 
 

@@ -41,6 +41,8 @@ Finished jobs are skipped: repeat an interrupted command to resume.
   pfbench run -m scenario=flight_300s filter=ekf,sir noise=nominal,outliers study=mine
   pfbench run -m +experiment=quickstart
   pfbench run -m +experiment=quickstart hydra/launcher=cores     on all cores
+  pfbench run --dry-run -m scenario=flight_300s filter=ekf,sir runs=100
+                             prints jobs, memory and time, and runs nothing
   pfbench run -m scenario=flight_300s filter=ekf,sir study=mine runs=until-decided
                              adds runs until each pair of filters is decided
 
@@ -57,6 +59,7 @@ _LOST_PROCESS = {
 }  # fmt: skip
 
 _FLAGS = ("-m", "--multirun")
+DRY_RUN = "--dry-run"
 
 _PRINTING_FLAGS = {"--cfg", "-c", "--info", "-i", "--hydra-help", "--version", "--resolve"}
 
@@ -66,7 +69,8 @@ def run_jobs(words: Sequence[str]) -> None:
     register_experiments()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    words = replace_config_dir(words)
+    is_dry = DRY_RUN in words
+    words = replace_config_dir([word for word in words if word != DRY_RUN])
     flags = [word for word in words if word in _FLAGS]  # first, else argparse drops later overrides
     overrides = expand_filter_sets([word for word in words if word not in flags])
     overrides = delay_keys_of_swept_groups(overrides) if flags else overrides
@@ -75,6 +79,13 @@ def run_jobs(words: Sequence[str]) -> None:
     plan = None if is_printed else plan_or_none(overrides, first)
     if plan and flags:
         plan.check_comparable()
+    if is_dry:
+        from pfbench.cli.dry_run import print_dry_run
+
+        print_dry_run(plan or plan_study(overrides, first), is_sweep=bool(flags))
+        return
+    if plan and not is_printed:
+        print_surprise(plan, overrides, is_sweep=bool(flags))
     if plan and wants_until_decided(plan):
         from pfbench.cli.until_decided import GrowingSweep, check_has_sweep
 
@@ -103,6 +114,27 @@ def _run_alone(overrides: Sequence[str], plan: StudyPlan | None) -> None:
     sys.argv = ["pfbench run", *overrides]
     with hide_hydra_line():
         make_application(run_with_plan)()
+
+
+def print_surprise(plan: StudyPlan, words: Sequence[str], *, is_sweep: bool) -> None:
+    """Say first what a command does that its words do not show: defaults alone, or one job of an experiment."""
+    if not is_sweep and plan.experiments and plan.jobs > 1:
+        note = (
+            f"{plan.jobs} jobs belong to the experiment, and without -m one of them runs. "
+            f"Run all: pfbench run -m {shlex.join(words)}"
+        )
+    elif not {word.lstrip("+").partition("=")[0] for word in words} & {
+        "scenario",
+        "filter",
+        "experiment",
+    }:
+        names = " ".join(
+            f"{key}={plan.first.choices[key]}" for key in ("scenario", "noise", "filter")
+        )
+        note = f"one job of the defaults runs: {names} runs={plan.first.values['runs']}. Choose others: pfbench list"
+    else:
+        return
+    print(f"note: {note}", file=sys.stderr, flush=True)
 
 
 def plan_or_none(overrides: Sequence[str], first: JobConfig | None = None) -> StudyPlan | None:
