@@ -6,8 +6,7 @@ import os
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,6 +28,17 @@ if TYPE_CHECKING:
         scenario as scenario,
         testing as testing,
     )
+    from pfbench.door import (
+        Part as Part,
+        Study as Study,
+        check_laws as check,
+        get_part as get,
+        list_names as names,
+        make_log as log,
+        make_own as own,
+        open_study as study,
+        run_filters as run,
+    )
 
 # torch reads this before its first tensor: blocks above 2 MB then lie at the start of a page and in large pages. Else glibc
 # before 2.38 cannot use a freed block for another of the same size: memory grew to 1.7 GB, and a step took 1.3 times as long.
@@ -40,30 +50,54 @@ except PackageNotFoundError:  # a checkout on the path that is not installed
     __version__ = "0.0.0"
 
 __all__ = [
+    "Part",
+    "Study",
     "__version__",
+    "check",
     "claims",
     "core",
     "files",
     "filter",
+    "get",
     "job",
     "judge",
     "learn",
     "load",
+    "log",
     "model",
+    "names",
     "nav",
     "noise",
+    "own",
     "ppl",
     "report",
     "results",
+    "run",
     "scenario",
+    "study",
     "testing",
 ]
 
+# short names of the door, by the names that `pfbench.door` gives them
+_DOOR = {
+    "Part": "Part",
+    "Study": "Study",
+    "check": "check_laws",
+    "get": "get_part",
+    "log": "make_log",
+    "names": "list_names",
+    "own": "make_own",
+    "run": "run_filters",
+    "study": "open_study",
+}
 
-def __getattr__(name: str) -> ModuleType:
-    """Import a folder on first use, so that `import pfbench` stays fast."""
+
+def __getattr__(name: str) -> Any:
+    """Import a folder or a name of the door on first use, so that `import pfbench` stays fast."""
     if name not in __all__:
         raise AttributeError(f"pfbench does not define {name!r}. Choose a name of pfbench.__all__.")
+    if name in _DOOR:
+        return getattr(import_module("pfbench.door"), _DOOR[name])
     return import_module(f"pfbench.{name}")
 
 

@@ -32,6 +32,7 @@ FLOORS = (
     ("report", "job", "learn", "ppl", "testing"),
     ("claims", "judge"),
     ("cli",),
+    ("door",),
     ("__main__",),
 )
 FLOOR = {folder: height for height, floor in enumerate(FLOORS) for folder in floor}

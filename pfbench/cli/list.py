@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from pathlib import Path
 
 from pfbench.cli.compose import given_keys, read_description
+from pfbench.cli.current_folder import list_own_files
 from pfbench.cli.messages import suggest_similar
-from pfbench.job.config import list_groups
+from pfbench.job.config import FILTER_SETS, list_groups
 
 HELP = """\
 pfbench list [GROUP] [key=value ...]
@@ -29,12 +31,8 @@ def list_options(words: Sequence[str]) -> None:
             print(f"{group:12} {', '.join(sorted(path.stem for path in files))}")
         print("\nNext: pfbench list GROUP")
         return
-    if words[0] not in groups:
-        similar = suggest_similar(words[0], list(groups))
-        raise ValueError(
-            f"group must be one of {', '.join(groups)}, got {words[0] or 'an empty word'}.{similar}"
-        )
-    files = sorted(groups[words[0]])
+    _check_group(words[0], list(groups))
+    files = list_files(words[0])
     if len(words) > 1:
         names = _list_fitting(words[0], words[1:])
         files = [path for path in files if path.stem in names]
@@ -42,6 +40,31 @@ def list_options(words: Sequence[str]) -> None:
         print(f"{path.stem:24} {read_description(path)}")
     if not files:
         print(f"No shipped {words[0]} fits.")
+
+
+def list_files(group: str) -> list[Path]:
+    """List the files of a group, those of the current folder included."""
+    return sorted([*list_groups()[group], *list_own_files(group)])
+
+
+def describe_choices(group: str | None) -> dict[str, str]:
+    """Return the descriptions of the files of a group by name, or the groups with their numbers of files."""
+    groups = list_groups()
+    if group is None:
+        return {name: f"{len(list_files(name))} names" for name in groups}
+    _check_group(group, list(groups))
+    sets = {name: ", ".join(names) for name, names in FILTER_SETS.items()}
+    texts = {path.stem: read_description(path) for path in list_files(group)}
+    return {**texts, **(sets if group == "filter" else {})}
+
+
+def _check_group(group: str, groups: Sequence[str]) -> None:
+    """Check the name of a group."""
+    if group not in groups:
+        similar = suggest_similar(group, groups)
+        raise ValueError(
+            f"group must be one of {', '.join(groups)}, got {group or 'an empty word'}.{similar}"
+        )
 
 
 def _list_fitting(group: str, words: Sequence[str]) -> Collection[str]:

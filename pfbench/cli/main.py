@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from importlib import import_module
 
 import pfbench
+from pfbench.cli.current_folder import add_search_path
 from pfbench.cli.messages import (
     describe_unknown,
     format_error,
@@ -33,9 +34,17 @@ COMMANDS = {
     "judge": ("judge_trajectories", "compare trajectories of other programs with a reference"),
     "tune": ("tune_filters", "tune the baselines of a study of robustness alike"),
     "train": ("train_network", "train the network of a neural_* filter or of kalman_net"),
+    "status": ("report_status", "print what is finished, failed and running, and the time left"),
+    "open": (
+        "open_report",
+        "show the report of a study in a browser, and write it if it is missing",
+    ),
+    "new": ("write_script", "write a script of your own filter, proposal, model, scenario or log"),
     "list": ("list_options", "list what a configuration can choose"),
     "check": ("check_installation", "compose all configurations and print versions"),
+    "completion": ("print_completion", "print the completion of words for a shell"),
 }
+_COMPOSING = ("run", "tune", "train", "datasheet")  # that may choose files of the current folder
 USAGE = """\
 pfbench {version}: benchmarks of particle filters in integrated navigation
 
@@ -48,6 +57,7 @@ pfbench {version}: benchmarks of particle filters in integrated navigation
 Exit codes: 0 done, 1 failed after work had started, 2 refused before it, 128 + number of a signal that ended it (130 interrupted)
 
 First study: pfbench run -m +experiment=quickstart, then pfbench report study=quickstart
+Python: import pfbench, then pfbench.run("growth", ["sir", "ekf"]); your own filter: pfbench new filter NAME
 """
 
 
@@ -108,6 +118,8 @@ def _run_command(command: str, options: Sequence[str]) -> None:
     words = [word for word in options if word != "--traceback"]
     reset_work()
     try:
+        if command in _COMPOSING:
+            words = add_search_path(words)
         flag = next((w for w in words if w.startswith("--") and w != "--multirun"), None)
         if flag and command != "run":  # which has the flags of Hydra
             raise ValueError(format_flag(words, flag, command))

@@ -64,7 +64,7 @@ def _format_hydra_error(text: str, words: Sequence[str]) -> str:
     if message := format_choice_error(text, words):
         return message
     if match := re.search(r"Could not find '(.+)/([^/']*)'", text):
-        return _format_unknown_choice(match[1], match[2], re.findall(r"^\t(\w+)$", text, re.M))
+        return format_unknown_choice(match[1], match[2], re.findall(r"^\t(\w+)$", text, re.M))
     return format_value_error(text)
 
 
@@ -110,7 +110,7 @@ def suggest_similar(name: str, options: Sequence[str]) -> str:
     return f" Similar: {', '.join(best[:3])}." if best else ""
 
 
-def _format_unknown_choice(group: str, name: str, options: Sequence[str]) -> str:
+def format_unknown_choice(group: str, name: str, options: Sequence[str]) -> str:
     """Format an error about a choice that does not exist."""
     if group != "experiment" and name.lower() in options:
         return f"{group}={name} does not exist. Names are in lower case: {group}={name.lower()}"

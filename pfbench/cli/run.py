@@ -9,12 +9,8 @@ import os
 import re
 import shlex
 import sys
-import time
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from pfbench.cli.compose import (
@@ -25,9 +21,9 @@ from pfbench.cli.compose import (
     wants_until_decided,
 )
 from pfbench.cli.messages import format_error, notes_of
+from pfbench.cli.progress import SweepCounter, SweepProgress, note_outcome
 from pfbench.cli.terminal import end_with_parent
 from pfbench.files.command_start import start_work
-from pfbench.files.reader_notes import NOTE, SWEEP_LOG, append_line
 from pfbench.job.config import JobConfig, expand_filter_sets, register_experiments
 from pfbench.job.trust import ENVIRONMENT
 from pfbench.results.paper_block import conf_dir
@@ -45,6 +41,8 @@ Finished jobs are skipped: repeat an interrupted command to resume.
   pfbench run -m scenario=flight_300s filter=ekf,sir noise=nominal,outliers study=mine
   pfbench run -m +experiment=quickstart
   pfbench run -m +experiment=quickstart hydra/launcher=cores     on all cores
+  pfbench run --dry-run -m scenario=flight_300s filter=ekf,sir runs=100
+                             prints jobs, memory and time, and runs nothing
   pfbench run -m scenario=flight_300s filter=ekf,sir study=mine runs=until-decided
                              adds runs until each pair of filters is decided
 
@@ -61,6 +59,7 @@ _LOST_PROCESS = {
 }  # fmt: skip
 
 _FLAGS = ("-m", "--multirun")
+DRY_RUN = "--dry-run"
 
 _PRINTING_FLAGS = {"--cfg", "-c", "--info", "-i", "--hydra-help", "--version", "--resolve"}
 
@@ -70,7 +69,8 @@ def run_jobs(words: Sequence[str]) -> None:
     register_experiments()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    words = replace_config_dir(words)
+    is_dry = DRY_RUN in words
+    words = replace_config_dir([word for word in words if word != DRY_RUN])
     flags = [word for word in words if word in _FLAGS]  # first, else argparse drops later overrides
     overrides = expand_filter_sets([word for word in words if word not in flags])
     overrides = delay_keys_of_swept_groups(overrides) if flags else overrides
@@ -79,6 +79,13 @@ def run_jobs(words: Sequence[str]) -> None:
     plan = None if is_printed else plan_or_none(overrides, first)
     if plan and flags:
         plan.check_comparable()
+    if is_dry:
+        from pfbench.cli.dry_run import print_dry_run
+
+        print_dry_run(plan or plan_study(overrides, first), is_sweep=bool(flags))
+        return
+    if plan and not is_printed:
+        print_surprise(plan, overrides, is_sweep=bool(flags))
     if plan and wants_until_decided(plan):
         from pfbench.cli.until_decided import GrowingSweep, check_has_sweep
 
@@ -107,6 +114,27 @@ def _run_alone(overrides: Sequence[str], plan: StudyPlan | None) -> None:
     sys.argv = ["pfbench run", *overrides]
     with hide_hydra_line():
         make_application(run_with_plan)()
+
+
+def print_surprise(plan: StudyPlan, words: Sequence[str], *, is_sweep: bool) -> None:
+    """Say first what a command does that its words do not show: defaults alone, or one job of an experiment."""
+    if not is_sweep and plan.experiments and plan.jobs > 1:
+        note = (
+            f"{plan.jobs} jobs belong to the experiment, and without -m one of them runs. "
+            f"Run all: pfbench run -m {shlex.join(words)}"
+        )
+    elif not {word.lstrip("+").partition("=")[0] for word in words} & {
+        "scenario",
+        "filter",
+        "experiment",
+    }:
+        names = " ".join(
+            f"{key}={plan.first.choices[key]}" for key in ("scenario", "noise", "filter")
+        )
+        note = f"one job of the defaults runs: {names} runs={plan.first.values['runs']}. Choose others: pfbench list"
+    else:
+        return
+    print(f"note: {note}", file=sys.stderr, flush=True)
 
 
 def plan_or_none(overrides: Sequence[str], first: JobConfig | None = None) -> StudyPlan | None:
@@ -188,20 +216,30 @@ def run_task(
     number = OmegaConf.select(
         application, "job.num", throw_on_missing=False
     )  # None outside a sweep
-    total, choices = os.environ.get(SWEEP_JOBS), application.runtime.choices
+    choices, words = application.runtime.choices, list(application.overrides.task)
     end_with_parent()
-    counter = "" if number is None else f"[{number + 1}{f'/{total}' if total else ''}] "
+    counter = "" if number is None else SweepCounter.from_environment(number)
     try:
-        outcome = job.run(checked or cfg, choices, counter, announce)
+        config = checked or job.resolve_config(
+            cfg, choices, words=[*words, *_list_place_words(application)]
+        )
+        outcome = job.run(config, choices, counter, announce)
     except Exception as error:
         note_outcome(number, "failed")
         if number is None:
             raise
         name = " / ".join(str(choices[group]) for group in ("scenario", "noise", "filter"))
-        words = list(application.overrides.task)
         raise report_failed_job(error, counter, name, words) from error
     note_outcome(number, outcome.status)
     return outcome.rmse
+
+
+def _list_place_words(application: Any) -> list[str]:
+    """List the words of a job that Hydra does not count to its task: search path and trust."""
+    packages = os.environ.get(ENVIRONMENT)
+    of_hydra = [str(word) for word in application.overrides.hydra]
+    path = [word for word in of_hydra if word.startswith("hydra.searchpath=")]
+    return [*path, *([f"trust=[{packages}]"] if packages else [])]
 
 
 def run_with_retries(sweep: Callable[[], Any]) -> None:
@@ -267,7 +305,9 @@ def hide_hydra_line() -> Iterator[None]:
         yield
 
 
-def report_failed_job(error: Exception, start: str, name: str, words: Sequence[str]) -> Exception:
+def report_failed_job(
+    error: Exception, start: object, name: str, words: Sequence[str]
+) -> Exception:
     """Print the line of a failed job of a sweep.
 
     Returns error to raise in its place, with the same message.
@@ -288,109 +328,6 @@ def summarise_failed_jobs(error: Exception, words: Sequence[str]) -> Exception:
         "all jobs of the sweep must finish, got failed jobs. Their lines above give the reasons. "
         "Correct them, and repeat the command to run them again."
     )
-
-
-# --------------------------------------------------------------------------------------------------
-# Counts of a sweep, printed at its end.
-
-SWEEP_JOBS = "PFBENCH_SWEEP_JOBS"  # environment variable: number of jobs, for the counter
-
-
-@dataclass
-class SweepProgress:
-    """Counts of a sweep, from a file to which its jobs append.
-
-    Any launcher can run the jobs. Jobs that do not get the environment, on a running cluster, are
-    counted by the results that were written meanwhile.
-
-    Attributes:
-        jobs: Number of jobs, or None if unknown.
-        study: Name of the study, or None if it cannot be determined.
-        folder: Folder of the results.
-        start_time: Start of the sweep, seconds since the epoch.
-    """
-
-    jobs: int | None = None
-    study: str | None = None
-    folder: Path = Path()
-    start_time: float = field(default_factory=time.time)
-
-    @classmethod
-    def start(cls, plan: StudyPlan | None) -> SweepProgress:
-        """Count the jobs of a sweep and set the total for the counters of its jobs."""
-        if plan is None:  # the sweep itself reports the error
-            return cls()
-        values = plan.first.values
-        os.environ[SWEEP_JOBS] = str(plan.jobs)
-        study = str(values["study"]) if plan.has_one_study else None
-        sweep = cls(plan.jobs, study, Path(values["results_dir"]) / str(values["study"]))
-        os.environ[SWEEP_LOG] = str(sweep._log)
-        return sweep
-
-    def finish(self, is_complete: bool = True, is_part: bool = False) -> None:
-        """Print the counts, and the next command if the study has results."""
-        os.environ.pop(SWEEP_JOBS, None)
-        os.environ.pop(SWEEP_LOG, None)
-        if is_complete or self._log.is_file():
-            start_work()  # in another process, for most launchers
-        if self.study is None or self.jobs is None:
-            return
-        counts = self._count_outcomes() or self._count_files(is_complete)
-        elapsed = time.time() - self.start_time
-        has_results = any(self.folder.glob("*.npz"))
-        command = (
-            f"  Next: pfbench report study={self.study}" if has_results and not is_part else ""
-        )
-        print(f"sweep: {counts} in {elapsed:.0f} s.{command}")
-
-    @property
-    def _log(self) -> Path:
-        """File of the outcomes, in the folder of the results because remote jobs see it."""
-        name = f".sweep-{os.getpid()}-{self.start_time:.6f}"
-        return self.folder.absolute() / name
-
-    def _count_outcomes(self) -> str:
-        """Count the jobs by outcome, and remove the file. Empty if there is none."""
-        try:
-            lines = self._log.read_text().splitlines()
-            self._log.unlink()
-        except OSError:
-            return ""
-        with contextlib.suppress(OSError):  # no job wrote a file, or others are there
-            self.folder.rmdir()
-        outcomes = defaultdict(set)  # a job that a retry skips has two
-        for line in lines:
-            number, _, status = line.partition(" ")
-            if number != NOTE:
-                outcomes[number].add(status)
-        finished = sum("finished" in of_job for of_job in outcomes.values())
-        failed = sum(of_job == {"failed"} for of_job in outcomes.values())
-        skipped = len(outcomes) - finished - failed
-        rest = (self.jobs or 0) - len(outcomes)
-        text = f"{finished} finished, {skipped} skipped, {failed} failed"
-        return f"{text}, {rest} not run" if rest > 0 else text
-
-    def _count_files(self, is_complete: bool) -> str:
-        """Count the jobs by the files that were written since the start."""
-        finished, failed = self._count("*.npz"), self._count("*.failed.json")
-        others = max(0, (self.jobs or 0) - finished - failed)
-        # an error without a note is of the command, which then stopped before these jobs
-        state = "skipped" if is_complete or failed else "not run"
-        return f"{finished} finished, {others} {state}, {failed} failed"
-
-    def _count(self, pattern: str) -> int:
-        """Count the files that were written since the start."""
-        times = (file.stat().st_mtime for file in self.folder.glob(pattern))
-        return sum(modified >= self.start_time - 0.05 for modified in times)
-
-
-def note_outcome(number: int | None, status: str) -> None:
-    """Append the outcome of a job to the file of its sweep, if it has one."""
-    path = os.environ.get(SWEEP_LOG)
-    if path is None or number is None:
-        return
-    with contextlib.suppress(OSError):  # of a full disk: the job reports it
-        append_line(path, f"{number} {status}")
 
 
 # --------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,11 @@ def tune_filters(words: Sequence[str]) -> None:
     others = [word for word in words if word.partition("=")[0] not in _OPTIONS]
     grids = {method: list_candidates(method, _numbers(lists["r_factors"])) for method in lists["filter"]}  # fmt: skip
     study = _compose_world(others)
+    if "scenario" not in {word.partition("=")[0] for word in others}:
+        print(
+            f"note: the world of the defaults is tuned: scenario={study.choices['scenario']}",
+            file=sys.stderr,
+        )
     name = options["name"] or _name_file(study.choices, lists["noise"], others)
     runs = study.values["runs"]
     _check_choices(name, runs)

@@ -132,10 +132,18 @@ from pfbench.filter.particle.particle_count import (
 )
 from pfbench.filter.particle.particle_filter import ParticleFilter as ParticleFilter
 from pfbench.filter.particle.regularised_resampling import (
+    EpanechnikovSmoothing as EpanechnikovSmoothing,
     GaussianSmoothing as GaussianSmoothing,
     RegularisedResampler as RegularisedResampler,
     SmoothingKernel as SmoothingKernel,
     ThompsonTaylorResampler as ThompsonTaylorResampler,
+)
+from pfbench.filter.particle.resampling import (
+    Killing as Killing,
+    Multinomial as Multinomial,
+    Residual as Residual,
+    Ssp as Ssp,
+    Stratified as Stratified,
 )
 from pfbench.filter.particle.sqmc import (
     HaltonPoints as HaltonPoints,
@@ -146,11 +154,15 @@ from pfbench.filter.particle.sqmc import (
 )
 from pfbench.filter.particle.stages import (
     AuxiliaryWeights as AuxiliaryWeights,
+    BayesWeightUpdate as BayesWeightUpdate,
     BootstrapProposal as BootstrapProposal,
     EssResampler as EssResampler,
+    FixedCount as FixedCount,
+    IidPoints as IidPoints,
     InitialProposal as InitialProposal,
     ParticleCount as ParticleCount,
     PointSet as PointSet,
+    PosteriorWeights as PosteriorWeights,
     Proposal as Proposal,
     ProposalSample as ProposalSample,
     Resampler as Resampler,

@@ -272,7 +272,7 @@ def max_runs_in_memory(plan: JobPlan, episodes: EpisodeSource) -> int:
             episodes.draw_all()
         return runs
     episode = slice_runs(episodes.sample(), slice(0, 2))
-    estimate = _estimate(plan, episode)
+    estimate = estimate_job_memory(plan, episode)
     size = memory.runs_within_limit(estimate, runs, limit)
     is_sliceable = episode.record.feedback is None  # a feedback process is that of all its runs
     if size == runs or (is_sliceable and memory.fits_drawn(estimate, runs, limit)):
@@ -296,7 +296,7 @@ def max_runs_in_memory(plan: JobPlan, episodes: EpisodeSource) -> int:
     return size
 
 
-def _estimate(plan: JobPlan, episode: Episode) -> memory.MemoryEstimate:
+def estimate_job_memory(plan: JobPlan, episode: Episode) -> memory.MemoryEstimate:
     """Estimate the bytes of a job from the episode of two runs."""
     model = plan.make_filter_model(episode)
     truth = model.assemble(episode.truth).to(model.anchor)

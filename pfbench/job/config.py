@@ -51,6 +51,7 @@ class JobConfig:
         uses_shared_particles: Whether `filter.particles` refers to the key `particles`. Only then
             may a budget replace the number.
         trusted: Packages that `_target_` may name besides pfbench.
+        words: Overrides that compose it, those of trust and search path included; empty if unknown.
 
     Raises:
         ValueError: If a group is missing or names no class, one of its numbers is not finite, or a
@@ -61,6 +62,7 @@ class JobConfig:
     choices: dict[str, str]
     uses_shared_particles: bool = False
     trusted: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         missing = [group for group in CHOICES if group not in self.choices]
@@ -99,7 +101,7 @@ def compose(overrides: Sequence[str] = ()) -> JobConfig:
         composed = compose_tree(words, trusted)
         choices = {str(k): str(v) for k, v in composed.hydra.runtime.choices.items()}
         _move_hydra_node(composed)
-        return resolve_config(composed, choices, trusted)
+        return resolve_config(composed, choices, trusted, overrides)
 
 
 def compose_tree(words: Sequence[str], trusted: Sequence[str] | None = None) -> DictConfig:
@@ -127,6 +129,7 @@ def resolve_config(
     config: JobConfig | DictConfig | Mapping[str, Any],
     choices: Mapping[str, str] | None = None,
     trusted: Sequence[str] = (),
+    words: Sequence[str] = (),
 ) -> JobConfig:
     """Resolve all interpolations of a configuration.
 
@@ -134,6 +137,7 @@ def resolve_config(
         config: Configuration of a job. One that is resolved already is returned unchanged.
         choices: Names of the chosen scenario, noise, filter and model. Default: `config.choices`.
         trusted: Packages that `_target_` may name besides pfbench and those of PFBENCH_TRUST.
+        words: Overrides that compose the configuration, for the note of a job that fails.
 
     Returns:
         The resolved configuration.
@@ -169,7 +173,7 @@ def resolve_config(
     if has_knobs:
         check_tuned_seed(values, names.get("scenario"), knobs)
         mark_foreign(values, names, knobs.get("world", {}), trusted)
-    return JobConfig(values, names, is_shared, packages)
+    return JobConfig(values, names, is_shared, packages, tuple(words))
 
 
 def _take_knobs(tree: Any, choices: Mapping[str, str], trusted: Sequence[str]) -> bool:

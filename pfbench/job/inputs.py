@@ -20,7 +20,7 @@ from pfbench.job.config import CHOICES
 from pfbench.job.trust import check_configuration, hash_user_code, trusted_packages
 from pfbench.results.inputs import list_changed
 from pfbench.results.paper_block import remove_all_blocks
-from pfbench.results.store import Inputs
+from pfbench.results.store import Inputs, remove_digests
 
 CODE_OF = "code of "  # start of the names of source files of a user's classes
 _MISSING = "missing"
@@ -33,7 +33,8 @@ def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Input
     for group in CHOICES:
         node = values.get(group)
         entries = _hash_files(_list_files(node, trusted), values.get("data", {}).get("root"))
-        entries |= {f"{CODE_OF}{name}": value for name, value in hash_user_code(node).items()}
+        code = hash_user_code(node).items()
+        entries |= {f"{CODE_OF}{remove_digests(name)}": value for name, value in code}
         if entries:
             digests[group] = entries
     return digests

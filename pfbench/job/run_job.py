@@ -63,7 +63,7 @@ class JobOutcome(NamedTuple):
 def run(
     config: JobConfig | DictConfig | Mapping[str, Any],
     choices: Mapping[str, str] | None = None,
-    counter: str = "",
+    counter: object = "",
     announce: Callable[[], None] | None = None,
 ) -> JobOutcome:
     """Run one job and write its result file, unless the file exists.
@@ -71,8 +71,8 @@ def run(
     Args:
         config: Configuration, for instance `job.compose(["scenario=flight_300s", "filter=sir"])`.
         choices: Names of scenario, noise, filter and model, if `config` does not contain them.
-        counter: Start of the log line of a job in a sweep, for instance `"[3/40] "`. Empty for a
-            job alone.
+        counter: Start of the log line of a job in a sweep, for instance `"[3/40] "`; its text is taken when
+            the line is written. Empty for a job alone.
         announce: Function that is called when the data of the job are valid, before it is computed.
 
     Returns:
@@ -148,7 +148,7 @@ def _compute_or_note(
         if is_alone and episodes is None:
             raise
         choices = {group: config.choices[group] for group in CHOICES}
-        note = store.write_failure(path, choices, error)
+        note = store.write_failure(path, choices, error, config.words)
         error.add_note(f"traceback: {note}" if note else f"previous result kept: {path}")
         raise
 

@@ -14,6 +14,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
@@ -42,6 +43,9 @@ HARMLESS = ("pyro.distributions", "torch.distributions", "torch.nn")  # parts of
 HYDRA_KEYS = ("_target_", "_args_", "_partial_", "_convert_", "_recursive_")
 NAME = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)+")
 STUDY = re.compile(r"[A-Za-z0-9_][\w.+-]{0,99}", re.ASCII)
+WRITTEN = os.path.join(
+    ".cache", "own"
+)  # in the current folder: modules of classes of a script or a notebook
 _local: set[str] = set()  # trusted packages, which may lie in the current folder
 
 
@@ -61,18 +65,33 @@ def split_trust(words: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
 
 
 class _CurrentFolder:
-    """Finder of trusted packages in the current folder, where nothing else is imported from."""
+    """Finder of trusted packages in the current folder and in `WRITTEN`, where nothing else is imported from."""
 
     @staticmethod
     def find_spec(name: str, path: object = None, target: object = None) -> ModuleSpec | None:
         """Find a top-level package that the user trusts."""
         is_trusted = path is None and name in {full.partition(".")[0] for full in _local}
-        return PathFinder.find_spec(name, [os.getcwd()]) if is_trusted else None
+        folders = [os.getcwd(), os.path.abspath(WRITTEN)]
+        return PathFinder.find_spec(name, folders) if is_trusted else None
 
 
 def trusted_packages() -> tuple[str, ...]:
     """Return the packages that the environment variable names."""
     return _parse_packages([os.environ.get(ENVIRONMENT, "")])
+
+
+@contextmanager
+def trusting(packages: Sequence[str]) -> Iterator[None]:
+    """Trust packages besides those of the environment variable while stored jobs are computed."""
+    before = os.environ.get(ENVIRONMENT)
+    os.environ[ENVIRONMENT] = ",".join(filter(None, [before or "", *packages]))
+    try:
+        trusted_packages()
+        yield
+    finally:
+        os.environ.pop(ENVIRONMENT)
+        if before is not None:
+            os.environ[ENVIRONMENT] = before
 
 
 def _parse_packages(texts: Sequence[str]) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -80,6 +80,13 @@ class StateSpaceModel(nn.Module, ABC):
     choices: tuple[str, ...] = ()
     channel_names: tuple[str, ...] = ()
     input_type: type | None = None
+    _arguments: tuple[tuple[Any, ...], dict[str, Any]] = (), {}
+
+    def __new__(cls, *args: Any, **options: Any) -> Self:
+        """Make a model that keeps the arguments of its constructor, from which the Python door describes it."""
+        model = super().__new__(cls)
+        object.__setattr__(model, "_arguments", (args, options))
+        return model
 
     @property
     def chart(self) -> Chart:

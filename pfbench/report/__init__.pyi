@@ -13,6 +13,7 @@ from pfbench.report.journal.ratio_figures import (
     render_headline as render_headline,
 )
 from pfbench.report.journal.table_layout import text_width as text_width
+from pfbench.report.options import ReportOptions as ReportOptions
 from pfbench.report.overview.page import render_overview as render_overview
 from pfbench.report.papers.specs import (
     PaperFigure as PaperFigure,

@@ -24,19 +24,19 @@ _SAME_JOB = (
     "versions",
     "inputs",
 )
-Part = tuple[Path, dict[str, Any]]
+StoredPart = tuple[Path, dict[str, Any]]
 
 
-def find_consecutive_parts(items: Sequence[Part]) -> list[list[Part]]:
+def find_consecutive_parts(items: Sequence[StoredPart]) -> list[list[StoredPart]]:
     """Group the jobs that differ in their runs alone and continue each other.
 
     Returns groups in the order of their first job, each sorted by its first run. A job that has a
     gap or an overlap with its neighbours is a group of its own.
     """
-    groups: dict[str, list[Part]] = {}
+    groups: dict[str, list[StoredPart]] = {}
     for path, meta in items:
         groups.setdefault(_part_key(meta), []).append((path, meta))
-    joined: list[list[Part]] = []
+    joined: list[list[StoredPart]] = []
     for members in groups.values():
         ordered = sorted(members, key=lambda item: int(item[1].get("first_run", 0)))
         ends = [int(meta.get("first_run", 0)) + int(meta["runs"]) for _, meta in ordered]

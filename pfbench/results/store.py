@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -109,9 +110,9 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
 
 
 def write_failure(
-    path: str | Path, choices: Mapping[str, Any], error: BaseException
+    path: str | Path, choices: Mapping[str, Any], error: BaseException, words: Sequence[str] = ()
 ) -> Path | None:
-    """Write the failure note of a job.
+    """Write the failure note of a job, with the words of the command that repeats it if they are known.
 
     Returns the note `<key>.failed.json`, or None if a result of that key exists, which is kept.
     """
@@ -124,6 +125,7 @@ def write_failure(
         "message": f"{type(error).__name__}: {error}",
         "traceback": "".join(traceback.format_exception(error)),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        **({"words": list(words)} if words else {}),
     }
     note[DIGEST] = hash_content(note)
     text = json.dumps(note, indent=1, sort_keys=True)
@@ -450,6 +452,15 @@ PLACE_SETTINGS = (
 )
 
 
+# module that the Python door writes for a class of a script or a notebook: its name ends with a digest of the source
+_WRITTEN_MODULE = re.compile(r"\b(own_\w+?)_[0-9a-f]{10}\b")
+
+
+def remove_digests(text: str) -> str:
+    """Return a text without the digests in names of written modules: the source is an input of a job, not a setting."""
+    return _WRITTEN_MODULE.sub(r"\1", text)
+
+
 def compute_config_key(config: Mapping[str, Any], ignore: tuple[str, ...] = ()) -> str:
     """Compute the key of a job: 16 hexadecimal digits of the SHA-256 of its configuration.
 
@@ -469,7 +480,7 @@ def compute_config_key(config: Mapping[str, Any], ignore: tuple[str, ...] = ()) 
         raise ValueError(
             f"configuration must be numbers, texts, lists and dicts, got {error}."
         ) from error
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return hashlib.sha256(remove_digests(text).encode()).hexdigest()[:16]
 
 
 def extend_key(key: str, inputs: Inputs) -> str:

@@ -1,0 +1,139 @@
+"""Dry run of `pfbench run`: jobs, memory and time, without a result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from pfbench.cli.compose import StudyPlan
+from pfbench.cli.messages import format_error
+from pfbench.cli.progress import format_duration
+from pfbench.job.config import JobConfig
+
+if TYPE_CHECKING:
+    from pfbench.core.record import Episode
+    from pfbench.job.plan import JobPlan
+
+_STEPS = 10  # of the trial of a filter
+
+
+class JobEstimate(NamedTuple):
+    """Estimate of a job.
+
+    Attributes:
+        state: new, or skipped because its result exists.
+        seconds: Time of the draws and the filter [s]; 0 for a skipped job.
+        bytes: Memory at the peak; 0 for a skipped job.
+    """
+
+    state: str
+    seconds: float = 0.0
+    bytes: float = 0.0
+
+
+def print_dry_run(plan: StudyPlan, *, is_sweep: bool) -> None:
+    """Print a line for each job, and the sums."""
+    configs = plan.compose_jobs() if is_sweep else [plan.first]
+    estimates: list[JobEstimate] = []
+    for number, config in enumerate(configs):
+        name = " / ".join(config.choices[key] for key in ("scenario", "noise", "filter"))
+        try:
+            estimates.append(estimate_job(config))
+        except Exception as error:
+            print(
+                f"[{number + 1}/{len(configs)}] refused   {name}   {format_error(error, config.words)}"
+            )
+            continue
+        print(f"[{number + 1}/{len(configs)}] {_format(estimates[-1])}   {name}")
+    fresh = [estimate for estimate in estimates if estimate.state == "new"]
+    seconds = sum(estimate.seconds for estimate in fresh)
+    peak = max((estimate.bytes for estimate in fresh), default=0.0)
+    print(
+        f"dry run: {len(configs)} jobs, {len(fresh)} new, {len(estimates) - len(fresh)} skipped, "
+        f"{len(configs) - len(estimates)} refused; about {format_duration(seconds)} in one process, {peak / 2**30:.2g} GiB "
+        "at the peak. Nothing was run."
+    )
+
+
+def _format(estimate: JobEstimate) -> str:
+    """Format an estimate."""
+    if estimate.state != "new":
+        return f"{estimate.state:9}"
+    return (
+        f"new       about {format_duration(estimate.seconds):>6}   {estimate.bytes / 2**30:.2g} GiB"
+    )
+
+
+def estimate_job(config: JobConfig) -> JobEstimate:
+    """Estimate a job by a trial: two runs are drawn, and all runs of the filter take a few steps of their data."""
+    from dataclasses import replace
+
+    from pfbench.job.budget import EpisodeSource, apply_budget, estimate_job_memory
+    from pfbench.job.inputs import find_inputs
+    from pfbench.job.plan import build_plan, job_key
+
+    values = config.values
+    key = job_key(values, find_inputs(values, config.trusted))
+    file = Path(values["results_dir"]) / str(values["study"]) / f"{key}.npz"
+    if file.is_file() and not values["overwrite"]:
+        return JobEstimate("skipped")
+    plan = build_plan(_without_cache(config))
+    small = replace(plan, runs=plan.runs[:2])
+    source = EpisodeSource(small)
+    episode = source.sample()
+    small, _ = apply_budget(small, source)
+    plan = replace(plan, method=small.method)
+    runs, drawn = len(plan.runs), len(episode.record.y)
+    seconds = source.seconds / drawn * runs + _time_filter(plan, episode)
+    return JobEstimate("new", seconds, estimate_job_memory(plan, episode).peak(runs))
+
+
+def _without_cache(config: JobConfig) -> JobConfig:
+    """Return a configuration that stores no episodes."""
+    from dataclasses import replace
+
+    scenario = config.values["scenario"]
+    changes = {"cache_dir": None} if "cache_dir" in scenario else {}
+    return replace(config, values={**config.values, "scenario": {**scenario, **changes}})
+
+
+def _time_filter(plan: JobPlan, episode: Episode) -> float:
+    """Measure some steps of all runs, whose data are copies of those of the episode; return the time of all steps [s]."""
+    import time
+
+    import torch
+
+    from pfbench.core.random_stream import PhiloxStream
+    from pfbench.core.record import map_inputs
+    from pfbench.filter.loop import run_filter
+    from pfbench.job.filter_pass import choose_engine
+    from pfbench.job.memory import first_steps
+    from pfbench.kernels import dispatch
+
+    model, runs = plan.make_filter_model(episode), len(plan.runs)
+    steps = episode.record.y.shape[1]
+    short = first_steps(episode.record, min(_STEPS, steps))
+    index = torch.arange(runs) % len(short.y)
+
+    def copy(a: Any) -> Any:
+        return a[index] if len(a) > 1 else a
+
+    start, spread = (None if a is None else a[index] for a in (short.start, short.spread))
+    record = short._replace(
+        y=short.y[index], u=map_inputs(copy, short.u), start=start, spread=spread
+    )
+    engine = choose_engine(plan.values["engine"], plan.method, model, runs, steps)
+    times = []
+    for _ in range(2):  # the first one also loads what the filter needs
+        draws = PhiloxStream(plan.values["seed"], plan.runs, plan.dtype)
+        begin = time.perf_counter()
+        with torch.no_grad(), dispatch.use_compiled(engine != "eager"):
+            run_filter(
+                plan.method,
+                model,
+                record,
+                draws,
+                run_batch=plan.choose_run_batch(plan.method, runs),
+            )
+        times.append(time.perf_counter() - begin)
+    return min(times) / record.y.shape[1] * steps

@@ -1,0 +1,310 @@
+"""Own parts: classes and objects of the user as files of a folder that a search path names."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib
+import inspect
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pfbench.door.own_source import write_module
+from pfbench.door.parts import Part, describe_value, place_words, plain_errors
+from pfbench.files.atomic_write import write_atomically
+from pfbench.job.config import compose, list_groups
+from pfbench.job.trust import FOLDERS, WRITTEN, split_trust
+
+# arguments of the call of each stage of a particle filter; a scheme is part of the resampler
+STAGES = {
+    "proposal": ("model", "belief", "record", "draws"),
+    "moves": ("model", "belief", "resampled", "draws"),
+    "weight_update": ("model", "log_w", "x", "log_ratio", "record"),
+    "resampler": ("model", "belief", "log_a", "n", "draws"),
+    "auxiliary_weights": ("model", "belief", "record"),
+    "initial_proposal": ("model", "record", "n", "draws"),
+    "particle_count": ("belief",),
+    "scheme": ("a", "n", "draws"),
+}
+_FAMILY = {"filter": "particle"}
+
+
+def make_own(
+    thing: Any, name: str | None = None, /, *, base: str = "sir", **arguments: Any
+) -> Part:
+    """Make a part of a class or an object of your own.
+
+    A class of a script or a notebook is stored with all that it uses and named by its source: another source is another job.
+
+    Args:
+        thing: Filter, stage of a particle filter, model, scenario or noise regime. An object, or its class.
+        name: Name in tables and figures. The name of the class by default.
+        base: Particle filter that receives a stage.
+        **arguments: Arguments of a class. For a scenario also `divergence_threshold`, the error above which a run has
+            lost the track.
+
+    Returns:
+        The part.
+
+    Raises:
+        ValueError: If the class has not the methods of any part, is defined inside of a function, or has the name of
+            a file of pfbench.
+        TypeError: If an argument cannot be written into a file.
+    """
+    with plain_errors():
+        if isinstance(thing, Part):
+            raise TypeError(
+                f"own must receive a class or an object, got the part {thing}. Pass it to run as it is."
+            )
+        group, stage = find_group(thing)
+        title = name or (thing if isinstance(thing, type) else type(thing)).__name__
+        limit = arguments.pop("divergence_threshold", None) if group == "scenario" else None
+        writer = _NodeWriter()
+        node = (
+            writer.write_class(thing, arguments)
+            if isinstance(thing, type)
+            else writer.write(thing, title)
+        )
+        if not isinstance(thing, type) and arguments:
+            raise TypeError(
+                f"{title} must be a class if arguments are given, got an object. Use own({type(thing).__name__}, "
+                f"{next(iter(arguments))}=...)."
+            )
+        if stage:
+            node = writer.put_stage(base, stage, node)
+        node |= _describe_paper(group, title, node, limit)
+        return writer.store(group, title, node)
+
+
+def find_group(thing: Any) -> tuple[str, str]:
+    """Find the group of an object or a class by its methods, and its stage of a particle filter, if it is one."""
+    from pfbench.model.base import StateSpaceModel
+
+    cls = thing if isinstance(thing, type) else type(thing)
+    if issubclass(cls, StateSpaceModel):
+        missing = sorted(getattr(cls, "__abstractmethods__", ()))
+        if missing:
+            raise ValueError(
+                f"{cls.__name__} must define {', '.join(missing)} to be a model, got a class without them. Add them."
+            )
+        return "model", ""
+    if callable(getattr(cls, "propagate", None)) or callable(getattr(cls, "observation", None)):
+        raise ValueError(
+            f"{cls.__name__} must be a subclass of pfbench.model.StateSpaceModel to be a model, which is a module of torch, "
+            f"got a subclass of {cls.__mro__[1].__name__}. Write class {cls.__name__}(StateSpaceModel)."
+        )
+    methods = {"noise": ("draw_errors",), "scenario": ("draw",), "filter": ("init", "step")}
+    for group, names in methods.items():
+        if all(callable(getattr(cls, name, None)) for name in names):
+            return group, ""
+    call = _find_call(cls)
+    names = tuple(inspect.signature(call).parameters)[1:] if call else ()
+    stage = next((kind for kind, arguments in STAGES.items() if arguments == names), "")
+    if stage:
+        return "filter", stage
+    forms = "; ".join(f"{kind} __call__(self, {', '.join(a)})" for kind, a in STAGES.items())
+    raise ValueError(
+        f"{describe_value(thing)} must have the methods of a part: filter init and step, scenario draw, noise regime draw_errors, "
+        f"or of a stage: {forms}. Got {_list_methods(cls)}. Add the method."
+    )
+
+
+def _find_call(cls: type) -> Callable[..., Any] | None:
+    """Return the method `__call__` that a class or a parent defines in Python."""
+    calls = (vars(parent).get("__call__") for parent in cls.__mro__)
+    return next((call for call in calls if inspect.isfunction(call)), None)
+
+
+def _list_methods(cls: type) -> str:
+    """List the public methods of a class for a message."""
+    names = [n for n in vars(cls) if callable(vars(cls)[n]) and not n.startswith("_")]
+    call = _find_call(cls)
+    names += [f"__call__{inspect.signature(call)}"] if call else []
+    return ", ".join(names) or "none"
+
+
+def _describe_paper(
+    group: str, title: str, node: Mapping[str, Any], limit: float | None
+) -> dict[str, Any]:
+    """Return the node `paper` of a part: its name in reports."""
+    if group == "model":
+        return {}
+    paper: dict[str, Any] = {"name": title}
+    if group == "filter":
+        family = "particle" if "particles" in node else "kalman"
+        paper |= {"long_name": title, "family": family, "proposed": True}
+    else:
+        paper["words"] = title
+    return {"paper": paper | ({} if limit is None else {"divergence_threshold": limit})}
+
+
+class _NodeWriter:
+    """Writer of objects as nodes of a configuration.
+
+    Attributes:
+        folders: Folders that the node needs.
+        packages: Packages that it needs.
+        words: Words that choose the model of a scenario.
+    """
+
+    def __init__(self) -> None:
+        self.folders: list[str] = []
+        self.packages: list[str] = []
+        self.model: Part | None = None
+
+    def write(self, value: Any, path: str) -> Any:
+        """Describe a value: an object of dataclasses, a model, a part, numbers, texts and lists of them."""
+        from pfbench.model.base import StateSpaceModel
+
+        if isinstance(value, Part):
+            return self._write_part(value)
+        if isinstance(value, StateSpaceModel):
+            return self._write_model(value)
+        if isinstance(value, type):
+            return self.write_class(value, {})
+        if dataclasses.is_dataclass(value):
+            fields = [f for f in dataclasses.fields(value) if f.init]
+            changed = {f.name: getattr(value, f.name) for f in fields if not _is_default(f, value)}
+            return self._write_fields(type(value), changed)
+        if isinstance(value, list | tuple):
+            return [self.write(item, f"{path}[{k}]") for k, item in enumerate(value)]
+        if isinstance(value, Mapping):
+            return {str(key): self.write(item, f"{path}.{key}") for key, item in value.items()}
+        if hasattr(value, "item") and getattr(value, "shape", None) == ():
+            value = value.item()
+        if value is None or isinstance(value, bool | int | float | str):
+            return value
+        if _is_without_state(value):
+            return self._write_fields(type(value), {})  # a class without arguments
+        raise TypeError(
+            f"{path} must be numbers, texts, lists or objects of dataclasses, got {describe_value(value)}. "
+            "Pass the class with its arguments: pfbench.own(Class, argument=...)."
+        )
+
+    def write_class(self, cls: type, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Describe a class with its arguments. A number of particles that is not given is that of the study."""
+        parameters = inspect.signature(cls).parameters
+        takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+        if unknown := [key for key in arguments if key not in parameters and not takes_any]:
+            raise ValueError(
+                f"{cls.__name__} must have the argument {unknown[0]}, got a class with {', '.join(parameters) or 'none'}. "
+                "Correct the name."
+            )
+        required = [
+            key for key, p in parameters.items()
+            if p.default is p.empty and p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL) and key not in arguments
+        ]  # fmt: skip
+        node = self._write_fields(cls, arguments)
+        if "particles" in required:
+            node["particles"] = "${particles}"
+            required.remove("particles")
+        if required:
+            raise ValueError(
+                f"{cls.__name__} must receive {', '.join(required)}, got no value. Use own({cls.__name__}, {required[0]}=...)."
+            )
+        return node
+
+    def _write_fields(self, cls: type, fields: Mapping[str, Any]) -> dict[str, Any]:
+        """Describe a class with the values of its arguments."""
+        values = {
+            key: self._write_model_of_scenario(value)
+            if key == "model"
+            else self.write(value, f"{cls.__name__}.{key}")
+            for key, value in fields.items()
+        }
+        return {"_target_": self.name_class(cls), **values}
+
+    def _write_model_of_scenario(self, value: Any) -> Any:
+        """Choose the model of a scenario as that of the job, so that its filters have the same one."""
+        self.model = value if isinstance(value, Part) else make_own(value)
+        self.folders += self.model.folders
+        self.packages += self.model.packages
+        return "${model}"
+
+    def _write_model(self, model: Any) -> dict[str, Any]:
+        """Describe a model by the arguments of its constructor."""
+        positional, options = model._arguments
+        bound = inspect.signature(type(model)).bind(*positional, **options)
+        return self.write_class(type(model), bound.arguments)
+
+    def _write_part(self, item: Part) -> Any:
+        """Describe a part by its composed node."""
+        config = compose([*item.words(), *place_words([item])])
+        self.packages += item.packages
+        return {key: value for key, value in config.values[item.group].items() if key != "paper"}
+
+    def name_class(self, cls: type) -> str:
+        """Name a class so that another process can import it."""
+        if cls.__module__.startswith("pfbench."):
+            for folder in FOLDERS:
+                if getattr(importlib.import_module(f"pfbench.{folder}"), cls.__name__, None) is cls:
+                    return f"pfbench.{folder}.{cls.__name__}"
+            raise ValueError(
+                f"{cls.__name__} must be a public class of pfbench, got one of {cls.__module__}. Choose a name of "
+                "pfbench.filter, pfbench.model, pfbench.noise or pfbench.scenario."
+            )
+        module = (
+            write_module(cls)
+            if cls.__module__ == "__main__" or "<locals>" in cls.__qualname__
+            else cls.__module__
+        )
+        package = module.partition(".")[0]
+        split_trust([f"trust=[{package}]"])
+        self.packages.append(package)
+        return f"{module}.{cls.__qualname__}"
+
+    def put_stage(self, base: str, stage: str, node: dict[str, Any]) -> dict[str, Any]:
+        """Return a shipped particle filter with another stage."""
+        config = compose([f"filter={base}"])
+        values = {key: value for key, value in config.values["filter"].items() if key != "paper"}
+        if "particles" not in values:
+            raise ValueError(f"base must be a particle filter, got {base}. Use base='sir'.")
+        if config.uses_shared_particles:
+            values["particles"] = "${particles}"
+        if stage == "scheme":
+            return {**values, "resampler": {**values["resampler"], "scheme": node}}
+        return {**values, stage: [node] if stage == "moves" else node}
+
+    def store(self, group: str, title: str, node: dict[str, Any]) -> Part:
+        """Write the file of a part into a folder named by its content."""
+        import yaml
+
+        name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|\W+", "_", title).strip("_").lower()
+        if name in {path.stem for path in list_groups()[group]}:
+            raise ValueError(
+                f"name must not be that of a {group} of pfbench, got {name}. Use own(..., {title + ' 2'!r})."
+            )
+        head: dict[str, Any] = {}
+        if self.model is not None:
+            head = {"defaults": ["_self_", {"override /model@_global_.model": self.model.name}]}
+        text = yaml.safe_dump({**head, **node}, sort_keys=False, allow_unicode=True)
+        digest = hashlib.sha256(f"{group}/{name}\n{text}".encode()).hexdigest()[:10]
+        folder = Path(WRITTEN) / f"{name}_{digest}"
+        path = folder / group / f"{name}.yaml"
+        if not path.is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(
+                path, lambda file: file.write(f"# {title}, of a class in Python.\n{text}".encode())
+            )
+        changes = self.model.changes if self.model is not None else ()
+        folders = dict.fromkeys([str(folder), *self.folders])
+        return Part(
+            group, name, tuple(changes), tuple(folders), tuple(dict.fromkeys(self.packages))
+        )
+
+
+def _is_without_state(value: object) -> bool:
+    """Return whether an object is only its class: a constructor without arguments, and no attributes."""
+    cls = type(value)
+    is_general = cls.__module__.partition(".")[0] in ("builtins", "numpy", "torch", "functools")
+    return not is_general and cls.__init__ is object.__init__ and not getattr(value, "__dict__", {})
+
+
+def _is_default(field: Any, holder: Any) -> bool:
+    """Return whether a field of an object has its default value."""
+    value = getattr(holder, field.name)
+    if field.default_factory is not dataclasses.MISSING:
+        return bool(field.default_factory() == value)
+    return field.default is not dataclasses.MISSING and bool(field.default == value)

@@ -1,0 +1,290 @@
+"""Source of a class of a script or a notebook as a module of its own, named by a digest of it.
+
+Another process can import the module, so that workers run the class and a result can be computed again. The module has the class,
+the functions, classes and constants of the script that it uses, and their imports, each as it is when the class is passed.
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import hashlib
+import importlib
+import re
+import symtable
+import sys
+import types
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pfbench.files.atomic_write import write_atomically
+from pfbench.job.trust import WRITTEN, split_trust
+
+_MAIN = "__main__"
+_CONSTANTS = (bool, int, float, complex, str, bytes, type(None))
+_VERBS = (
+    "run",
+    "own",
+    "study",
+    "log",
+)  # of pfbench, which a module must not call when it is imported
+_HEAD = (
+    '"""Written by pfbench from a script or a notebook. Do not change it: results name it."""\n\n'
+)
+
+
+class _Statement(NamedTuple):
+    """Top-level statement of a script that defines a name: its position, its text and its syntax."""
+
+    position: int
+    text: str
+    node: ast.stmt
+
+
+def write_module(cls: type) -> str:
+    """Write the module of a class of a script or a notebook.
+
+    Returns the name of the module. The same source gives the same module.
+    """
+    text = collect_source(cls)
+    digest = hashlib.sha256(text.encode()).hexdigest()[:10]
+    stem = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|\W+", "_", cls.__name__).strip("_").lower()
+    name = f"own_{stem}_{digest}"
+    path = Path(WRITTEN) / f"{name}.py"
+    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, lambda file: file.write(text.encode()))
+    split_trust([f"trust=[{name}]"])  # so that it is imported from its folder
+    importlib.invalidate_caches()
+    try:
+        import_module(name)
+    except Exception as error:
+        raise ValueError(
+            f"{cls.__name__} must run without the rest of its script, got {type(error).__name__}: {error}. "
+            f"Move it into a module of your own. The source that was collected is {path}."
+        ) from error
+    return name
+
+
+def collect_source(cls: type) -> str:
+    """Collect the source of a class of a script or a notebook with all that it uses."""
+    if "<locals>" in cls.__qualname__:
+        outer = cls.__qualname__.partition(".<locals>")[0]
+        raise ValueError(
+            f"{cls.__name__} must be defined at the top level, got a class inside of {outer}, whose variables no other "
+            "process has. Move it out, and pass what it needs as arguments."
+        )
+    values = vars(sys.modules[_MAIN])
+    statements = read_statements(values)
+    if cls.__name__ not in statements:
+        raise ValueError(
+            f"{cls.__name__} must be in a file or a notebook, got a class without a source. Save it in a module."
+        )
+    if values.get(cls.__name__) is not cls:
+        raise ValueError(
+            f"{cls.__name__} must be the class of that name, got one that was defined before. Make the object again."
+        )
+    return _Collector(values, statements).collect(cls.__name__)
+
+
+class _Collector:
+    """Collector of the names that a class uses.
+
+    Attributes:
+        lines: Imports and constants, by name.
+        selected: Statements of the script, by their position.
+    """
+
+    def __init__(
+        self, values: Mapping[str, Any], statements: Mapping[str, list[_Statement]]
+    ) -> None:
+        self._values, self._statements = values, statements
+        self.lines: dict[str, str] = {}
+        self.selected: dict[int, str] = {}
+
+    def collect(self, name: str) -> str:
+        """Collect a class and all that it uses. Returns the text of the module."""
+        self._add_statements(name)
+        imports = "\n".join(sorted(self.lines.values()))
+        body = "\n\n\n".join(text for _, text in sorted(self.selected.items()))
+        return f"{_HEAD}from __future__ import annotations\n\n{imports}\n\n\n{body}\n"
+
+    def _add_statements(self, name: str) -> None:
+        """Add the statements that define a name, and the names that they use."""
+        for statement in self._statements[name]:
+            if statement.position not in self.selected:
+                self.selected[statement.position] = statement.text
+                for needed in list_globals(statement.text):
+                    self._add(needed, statement.node)
+
+    def _add(self, name: str, user: ast.stmt) -> None:
+        """Add a name that a statement uses, by its present value where that can be written."""
+        if name in self.lines or name not in self._values:
+            self._check_exists(name, user)
+            return
+        value = self._values[name]
+        if isinstance(value, types.ModuleType):
+            dotted = [statement.text for statement in self._statements.get(f"import {name}", ())]
+            self.lines[name] = "\n".join([f"import {value.__name__} as {name}", *dotted])
+        elif _is_of_module(value):
+            self.lines[name] = f"from {_find_home(value)} import {value.__qualname__} as {name}"
+        elif _is_constant(value):
+            self.lines[name] = f"{name} = {value!r}"
+        elif name in self._statements:
+            for statement in self._statements[name]:
+                _check_statement(name, statement.node)
+            self._add_statements(name)
+        else:
+            raise ValueError(
+                f"{name} must be defined at the top level of the script, got a {type(value).__name__} without a "
+                "source. Pass it as an argument."
+            )
+
+    def _check_exists(self, name: str, user: ast.stmt) -> None:
+        """Check that a name is collected, a built-in one or only an annotation."""
+        if name in self.lines or hasattr(builtins, name) or name in ("__name__", "__file__"):
+            return
+        if name in _evaluated_names(user):
+            raise ValueError(
+                f"{name} must be defined before the class is passed, got a name that does not exist. Define or import it."
+            )
+
+
+def read_statements(values: Mapping[str, Any]) -> dict[str, list[_Statement]]:
+    """Read the top-level statements of the main script or the cells of a notebook, by the names that they define.
+
+    A later definition of a name replaces an earlier one. Cells count in the order in which they were executed.
+    """
+    by_name: dict[str, list[_Statement]] = {}
+    position = 0
+    for text in _list_texts(values):
+        try:
+            tree = ast.parse(text)
+        except SyntaxError:  # a cell that never ran
+            continue
+        for node in tree.body:
+            position += 1
+            for name in _list_defined(node):
+                by_name[name] = [_Statement(position, _cut_text(text, node), node)]
+            for name, line in _list_dotted_imports(node):
+                by_name.setdefault(name, []).append(_Statement(position, line, node))
+    return by_name
+
+
+def _list_texts(values: Mapping[str, Any]) -> list[str]:
+    """Return the text of the main script, or those of the cells that a notebook executed."""
+    if isinstance(values.get("In"), list):
+        return ["\n".join(map(_blank_magic, cell.splitlines())) for cell in values["In"]]
+    file = values.get("__file__")
+    is_file = isinstance(file, str) and Path(file).is_file()
+    return [Path(file).read_text(encoding="utf-8")] if is_file and file else []
+
+
+def _blank_magic(line: str) -> str:
+    """Return a line of a cell, empty for a command of the notebook."""
+    return "" if line.lstrip().startswith(("%", "!")) else line
+
+
+def _list_defined(node: ast.stmt) -> Iterator[str]:
+    """Yield the names that a top-level statement defines: a class, a function, or plain assignments."""
+    if isinstance(node, ast.ClassDef | ast.FunctionDef):
+        yield node.name
+    elif isinstance(node, ast.Assign | ast.AnnAssign):
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        items = [item for target in targets for item in ast.walk(target)]
+        yield from (item.id for item in items if isinstance(item, ast.Name))
+
+
+def _list_dotted_imports(node: ast.stmt) -> Iterator[tuple[str, str]]:
+    """Yield for `import a.b` the key `import a` and the line: the module a alone would lack b in another process."""
+    for alias in node.names if isinstance(node, ast.Import) else ():
+        if alias.asname is None and "." in alias.name:
+            yield f"import {alias.name.partition('.')[0]}", f"import {alias.name}"
+
+
+def _cut_text(text: str, node: ast.stmt) -> str:
+    """Return the text of a statement with its decorators."""
+    first = min([node.lineno, *(d.lineno for d in getattr(node, "decorator_list", []))])
+    return "\n".join(text.splitlines()[first - 1 : node.end_lineno])
+
+
+def list_globals(text: str) -> list[str]:
+    """List the global names that a statement uses, those inside of its functions included."""
+    names: dict[str, None] = {}
+    pending = [symtable.symtable(text, "own", "exec")]
+    while pending:
+        scope = pending.pop()
+        pending += scope.get_children()
+        is_top = scope.get_type() == "module"
+        for symbol in scope.get_symbols():
+            if symbol.is_referenced() and (is_top or symbol.is_global()):
+                names[symbol.get_name()] = None
+    return sorted(names)
+
+
+def _evaluated_names(node: ast.stmt) -> set[str]:
+    """Return the names in a statement outside of annotations, which a module does not evaluate."""
+
+    class Names(ast.NodeVisitor):
+        def __init__(self) -> None:
+            self.names: set[str] = set()
+
+        def visit_Name(self, node: ast.Name) -> None:
+            self.names.add(node.id)
+
+        def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
+            if node.value is not None:
+                self.visit(node.value)
+
+        def visit_arg(self, node: ast.arg) -> None:
+            pass
+
+        def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
+            for item in [*node.decorator_list, node.args, *node.body]:
+                self.visit(item)
+
+    visitor = Names()
+    visitor.visit(node)
+    return visitor.names
+
+
+def _is_of_module(value: object) -> bool:
+    """Return whether a class or function is defined in a module other than the script."""
+    module = getattr(value, "__module__", None)
+    name = getattr(value, "__qualname__", "<locals>")
+    if not isinstance(module, str) or module == _MAIN or "<" in name or "." in name:
+        return False
+    return getattr(sys.modules.get(module), name, None) is value
+
+
+def _find_home(value: Any) -> str:
+    """Return the module from which a class or function is imported: of pfbench its folder."""
+    folder = ".".join(str(value.__module__).split(".")[:2])
+    is_public = (
+        folder.startswith("pfbench.")
+        and getattr(import_module(folder), value.__qualname__, None) is value
+    )
+    return folder if is_public else str(value.__module__)
+
+
+def _is_constant(value: object) -> bool:
+    """Return whether a value is written exactly by its text."""
+    if isinstance(value, tuple | list | set | frozenset) and type(value).__module__ == "builtins":
+        return all(map(_is_constant, value))
+    if type(value) is dict:
+        return all(_is_constant(item) for pair in value.items() for item in pair)
+    is_plain = type(value) in _CONSTANTS
+    return is_plain and not (isinstance(value, float | complex) and "n" in repr(value))  # inf, nan
+
+
+def _check_statement(name: str, node: ast.stmt) -> None:
+    """Check that a statement can be repeated when a module is imported."""
+    for call in ast.walk(node):
+        if isinstance(call, ast.Attribute) and ast.unparse(call) in [
+            f"pfbench.{v}" for v in _VERBS
+        ]:
+            raise ValueError(
+                f"{name} must not be used by the class, since it is the result of {ast.unparse(call)}. Pass it as an argument."
+            )

@@ -1,0 +1,253 @@
+"""Run of filters from Python: the jobs of the command line, in this process or in several."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import logging
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from pfbench.cli.current_folder import add_search_path
+from pfbench.cli.progress import SweepCounter, SweepProgress, list_repeats, note_outcome
+from pfbench.door.own_parts import find_group, make_own
+from pfbench.door.parts import (
+    Part,
+    add_changes,
+    describe_value,
+    format_words,
+    get_part,
+    place_words,
+    plain_errors,
+)
+from pfbench.door.study import Study, open_study
+from pfbench.door.worker import COUNTER, JobReply, WorkerPool, run_config
+from pfbench.job.config import CHOICES, FILTER_SETS, JobConfig, compose
+from pfbench.results.conditions import JobFile
+
+log = logging.getLogger("pfbench")
+
+
+def run_filters(
+    scenario: Any,
+    filters: Any,
+    *,
+    noise: Any = "nominal",
+    model: Any = None,
+    study: str = "notebook",
+    workers: int = 1,
+    progress: bool = True,
+    **settings: Any,
+) -> Study:
+    """Run filters in scenarios, as `pfbench run -m` does: finished jobs are skipped.
+
+    Args:
+        scenario: Name, part or class of your own, or a list of them. A model is simulated for 100 steps.
+        filters: Names, named sets, parts, or filters and stages of your own; one or a list.
+        noise: Noise regime, or a list of them.
+        model: Model of the filters. That of the scenario by default.
+        study: Name of the study.
+        workers: Number of processes.
+        progress: Whether each job prints a line.
+        **settings: Settings of the job by key, such as `runs=100`, `seed=2` or `particles=1000`. Two underscores stand
+            for a point. 50 runs by default.
+
+    Returns:
+        The study, which also holds results of earlier runs.
+
+    Raises:
+        ValueError: If a name, a value or a class is not valid. Nothing was run.
+        RuntimeError: If no job finished.
+    """
+    if type(workers) is not int or workers < 1:
+        raise ValueError(
+            f"workers must be a whole number of at least 1, got {workers!r}. Set workers=2."
+        )
+    parts = [
+        _list_parts(group, value)
+        for group, value in (("scenario", scenario), ("noise", noise), ("filter", filters))
+    ]
+    models = [None] if model is None else _list_parts("model", model)
+    words = format_words({"runs": 50, **settings, "study": study})
+    jobs = [_list_words(choice, words) for choice in product(*parts, models)]
+    with preserved_process():
+        configs = [_compose_job(list(job)) for job in dict.fromkeys(map(tuple, jobs))]
+        _run_jobs(configs, workers, progress)
+    values = configs[0].values
+    packages = dict.fromkeys(name for config in configs for name in config.trusted)
+    return open_study(
+        values["study"], values["results_dir"], values["reports_dir"], trust=tuple(packages)
+    )
+
+
+def _list_parts(group: str, value: Any) -> list[Part]:
+    """Return the parts of a group that a name, a part, an object or a list of them stands for."""
+    items = list(value) if isinstance(value, list | tuple | set) else [value]
+    if not items:
+        raise ValueError(
+            f"{group} must be at least one, got an empty list. List the names: pfbench.names({group!r})."
+        )
+    names = [name for item in items for name in _expand(group, item)]
+    return [_make_part(group, item) for item in names]
+
+
+def _expand(group: str, item: Any) -> Sequence[Any]:
+    """Return the members of a named set of filters, or the item itself."""
+    is_set = group == "filter" and isinstance(item, str) and item in FILTER_SETS
+    return FILTER_SETS[item] if is_set else (item,)
+
+
+def _make_part(group: str, item: Any) -> Part:
+    """Return the part of one item."""
+    if isinstance(item, str):
+        return get_part(group, item)
+    if item is None or isinstance(item, bool | int | float | dict):
+        raise TypeError(
+            f"{group} must be a name, a part or a class, got {describe_value(item)}. List the names: pfbench.names({group!r})."
+        )
+    if isinstance(item, Part):
+        kind = item.group
+    else:
+        with plain_errors():
+            kind = find_group(item)[0]
+    if group == "scenario" and kind == "model":
+        return simulate_model(item)
+    if kind != group:
+        raise ValueError(
+            f"{group} must be a {group}, got the {kind} {item if isinstance(item, Part) else describe_value(item)}. Pass it as {kind}=..."
+        )
+    return item if isinstance(item, Part) else make_own(item)
+
+
+def simulate_model(item: Any, **arguments: Any) -> Part:
+    """Make the scenario that simulates a model; 100 steps unless they are given."""
+    from pfbench.scenario import ModelSimulation
+
+    if isinstance(item, Part):
+        title = item.name
+    else:
+        title = (item if isinstance(item, type) else type(item)).__name__
+    if isinstance(item, Part) and not item.folders:
+        return add_changes(get_part("scenario", item.name), item.changes)
+    return make_own(ModelSimulation, title, model=item, **{"steps": 100, **arguments})
+
+
+def _list_words(choice: Sequence[Part | None], words: Sequence[str]) -> list[str]:
+    """Return the words of one job."""
+    parts = [item for item in choice if item is not None]
+    order = {"scenario": 0, "noise": 1, "model": 2, "filter": 3}
+    parts = sorted(parts, key=lambda item: order[item.group])
+    return [*(word for item in parts for word in item.words()), *words, *place_words(parts)]
+
+
+def _compose_job(words: list[str]) -> JobConfig:
+    """Compose and check the configuration of a job. Raises ValueError with the sentence of the command line."""
+    with plain_errors(words):
+        config = compose(add_search_path(words))
+        _check_settings(config)
+    return config
+
+
+def _check_settings(config: JobConfig) -> None:
+    """Check the settings of a job before the first one runs."""
+    from pfbench.job.plan import check_settings
+
+    check_settings(config.values)
+
+
+def continue_jobs(study: Study, runs: int, workers: int, progress: bool) -> None:
+    """Run more runs of all jobs of a study, after the last one that each has."""
+    configs = [
+        _continue_job(job, runs, study.trust)
+        for condition in study.conditions()
+        for job in condition.jobs
+    ]
+    with preserved_process():
+        for config in configs:
+            _check_settings(config)
+        _run_jobs(configs, workers, progress)
+
+
+def _continue_job(job: JobFile, runs: int, trusted: Sequence[str]) -> JobConfig:
+    """Return the configuration of the next runs of a stored job."""
+    meta = job.meta
+    values = copy.deepcopy(meta["config"])
+    values |= {"runs": runs, "first_run": int(meta["first_run"]) + int(meta["runs"])}
+    values |= {"overwrite": False}
+    missing = [name for name in meta.get("trusted", ()) if name not in trusted]
+    if missing:
+        raise ValueError(
+            f"trust must name the packages whose classes the study uses, {', '.join(missing)}, got none of them. "
+            f"If you still trust them, open it by pfbench.study({meta['study']!r}, trust={tuple(missing)})."
+        )
+    choices = {group: str(meta["choices"][group]) for group in CHOICES}
+    is_shared = bool(meta.get("budget_allocation"))
+    return JobConfig(values, choices, is_shared, tuple(trusted))
+
+
+def _run_jobs(configs: Sequence[JobConfig], workers: int, progress: bool) -> None:
+    """Run jobs and print a line of each, the counts, and the words that repeat failed jobs."""
+    values, total = configs[0].values, len(configs)
+    folder = Path(values["results_dir"]) / str(values["study"])
+    sweep = SweepProgress(total, str(values["study"]), folder)
+    failed: list[str] = []
+    with _printed_lines() if progress else contextlib.nullcontext():
+        try:
+            for number, reply in _replies(configs, workers):
+                counter = str(SweepCounter(number, str(total), str(sweep.file)))
+                for line in reply.lines:
+                    log.info("%s", line.replace(COUNTER, counter))
+                note_outcome(number, reply.status, sweep.file)
+                failed += [reply.message] if reply.status == "failed" else []
+        finally:
+            log.info("run: %s in %.0f s", sweep.count(), time.time() - sweep.start_time)
+            for line in list_repeats(folder, sweep.start_time):
+                log.info("%s", line)
+    if len(failed) == total:
+        raise RuntimeError(failed[0])
+
+
+def _replies(configs: Sequence[JobConfig], workers: int) -> Iterator[tuple[int, JobReply]]:
+    """Yield the numbers and the replies of jobs as they end."""
+    if workers > 1 and len(configs) > 1:
+        with WorkerPool(min(workers, len(configs))) as pool:
+            yield from pool.run(configs)
+        return
+    for number, config in enumerate(configs):
+        yield number, run_config(config)
+
+
+@contextlib.contextmanager
+def _printed_lines() -> Iterator[None]:
+    """Print the lines of jobs while they run."""
+    handler = logging.StreamHandler(sys.stdout)
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    level, log.level = log.level, logging.INFO
+    handlers = list(log.handlers)
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.handlers[:] = handlers
+        log.setLevel(level)
+
+
+@contextlib.contextmanager
+def preserved_process() -> Iterator[None]:
+    """Restore the threads of torch and the environment after jobs, which set both."""
+    import torch
+
+    threads, environment = torch.get_num_threads(), dict(os.environ)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        for name in set(os.environ) - set(environment):
+            del os.environ[name]
+        os.environ.update(environment)

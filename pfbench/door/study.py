@@ -1,0 +1,283 @@
+"""A study in Python: its tables, decisions, figures and pages, read from the files of the command line."""
+
+from __future__ import annotations
+
+import webbrowser
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pfbench.cli.progress import StudyState, format_repeat, read_state
+from pfbench.door.parts import format_html_table, plain_errors
+from pfbench.job.trust import trusting
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+
+    from pfbench.door.comparisons import Comparison, Summary
+    from pfbench.results.conditions import Condition
+
+
+@dataclass(frozen=True)
+class Study:
+    """Results of a study. All is read when it is asked for, so that results of later runs count.
+
+    Attributes:
+        name: Name.
+        results: Folder of all results.
+        reports: Folder of all reports.
+        trust: Packages that define classes of the user, for `replay` and `more`.
+    """
+
+    name: str
+    results: str = "results"
+    reports: str = "reports"
+    trust: tuple[str, ...] = ()
+
+    def table(self, metric: str | None = None) -> pd.DataFrame:
+        """Load the results as one table.
+
+        Args:
+            metric: Metric whose rows are selected. None for all.
+
+        Returns:
+            A row per job, run, component and metric, as `pfbench.load` returns.
+        """
+        from pfbench.results.frame import load_frame
+
+        with plain_errors():
+            frame = load_frame(self.name, self.results)
+        names = sorted(frame["metric"].unique())
+        if metric is not None and metric not in names:
+            raise ValueError(
+                f"metric must be one of {', '.join(names)}, got {metric!r}. Leave it out for all."
+            )
+        return frame if metric is None else frame[frame["metric"] == metric].reset_index(drop=True)
+
+    def errors(self, group: str | None = None) -> pd.DataFrame:
+        """Return the root mean square error over time, a row per run and a column per filter.
+
+        Args:
+            group: Group of the state. The main group by default.
+
+        Returns:
+            Errors in the unit of the group. Rows of several conditions have their names in the index.
+        """
+        frame = self.table("rmse")
+        mains = self._main_groups()
+        names = sorted(set(frame["group"]))
+        if group is not None and group not in names:
+            raise ValueError(
+                f"group must be one of {', '.join(names)}, got {group!r}. Leave it out for the main group."
+            )
+        keys = zip(frame["scenario"], frame["noise"], frame["model"], strict=True)
+        selected = [group or mains[key] for key in keys]
+        rows = frame[(frame["group"] == selected) & (frame["component"] == "norm")]
+        index = [n for n in ("scenario", "noise", "model") if rows[n].nunique() > 1]
+        return rows.pivot_table("value", [*index, "run"], "label", observed=True)
+
+    def summary(self, **options: Any) -> Summary:
+        """Summarise the study as the first view of its report.
+
+        Args:
+            **options: Options of a report, such as `baseline="ekf"`.
+
+        Returns:
+            Sentence and leaderboard, as text and in a notebook as a table.
+        """
+        from pfbench.door.comparisons import summarise_study
+
+        with plain_errors():
+            return summarise_study(self.name, self.conditions(), options)
+
+    def compare(self, a: str, b: str) -> Comparison:
+        """Compare two filters in the runs that both have, as all pages do.
+
+        Args:
+            a: Label of the first filter.
+            b: Label of the second filter.
+
+        Returns:
+            A verdict for each condition, corrected for their number.
+        """
+        from pfbench.door.comparisons import compare_filters
+
+        with plain_errors():
+            return compare_filters(self.conditions(), a, b)
+
+    def plot(self, kind: str = "cost", ax: Axes | None = None, **choice: Any) -> Axes:
+        """Draw a figure in the looks of the report.
+
+        Args:
+            kind: cost (error against time per step), time (error over time), calibration (coverage of 90 % intervals),
+                or run (error of one run over time).
+            ax: Axes to draw into. New ones by default.
+            **choice: For a study of several conditions `scenario`, `noise` and `model`; for `run` also `run` and `filter`.
+
+        Returns:
+            The axes.
+        """
+        from pfbench.door.figures import draw_study
+
+        with plain_errors():
+            return draw_study(self, kind, ax, choice)
+
+    def replay(self, label: str, run: int, **choice: str) -> pd.DataFrame:
+        """Compute one stored run again with all its traces.
+
+        Args:
+            label: Label of the filter.
+            run: Number of the run.
+            **choice: scenario, noise and model, where the filter has results in several conditions.
+
+        Returns:
+            A row per step: time, error, standard deviation, NEES and traces such as the effective sample size.
+        """
+        from pfbench.door.running import preserved_process
+        from pfbench.job.config import compose
+        from pfbench.job.replay import recompute_run, tabulate_traces
+        from pfbench.job.run_selection import find_run
+
+        with plain_errors(), preserved_process(), trusting(self.trust):
+            stored = find_run(self.name, self.results, run, label, choice)
+            places = compose([]).values
+            names = ("data", "results_dir", "reports_dir", "episode_cache_dir")
+            changes = {name: places[name] for name in names}
+            return tabulate_traces(recompute_run(stored, changes))
+
+    def report(self, open: bool = False, **options: Any) -> Path:  # noqa: A002
+        """Write the report.
+
+        Args:
+            open: Whether a browser shows it.
+            **options: Options of a report, such as `figure_formats=("svg",)`.
+
+        Returns:
+            Path of index.html.
+        """
+        from pfbench.report import write_report
+        from pfbench.report.options import ReportOptions
+
+        with plain_errors():
+            path = write_report(self.name, self.results, self.reports, ReportOptions(**options))
+        if open:
+            webbrowser.open(path.resolve().as_uri())
+        return path
+
+    def paper(self, journal: str = "ieee", **settings: Any) -> list[Path]:
+        """Write figures, tables and text for a journal, as `pfbench paper` does.
+
+        Args:
+            journal: Name of the page format.
+            **settings: Words of `pfbench paper`.
+
+        Returns:
+            The files.
+        """
+        from pfbench.cli.paper import write_study_paper
+        from pfbench.door.parts import format_words
+
+        folder = Path(self.reports) / self.name / "paper"
+        words = format_words(
+            {
+                "study": self.name,
+                "journal": journal,
+                "results_dir": self.results,
+                "reports_dir": self.reports,
+                **settings,
+            }
+        )
+        with plain_errors(words):
+            write_study_paper(words)
+        return sorted(path for path in folder.rglob("*") if path.is_file())
+
+    def status(self) -> StudyState:
+        """Return what is finished, failed and running, and the time left."""
+        return read_state(Path(self.results) / self.name)
+
+    def failed(self) -> list[dict[str, str]]:
+        """List the failed jobs, each with its choices, its message and the command that repeats it."""
+        return [
+            {**note["choices"], "message": note["message"], "repeat": format_repeat(note)}
+            for note in self.status().failures
+        ]
+
+    def more(self, runs: int, workers: int = 1, progress: bool = True) -> Study:
+        """Add runs to all jobs. Their numbers continue those of the study.
+
+        Args:
+            runs: Number of runs to add.
+            workers: Number of processes.
+            progress: Whether each job prints a line.
+
+        Returns:
+            The study.
+        """
+        from pfbench.door.running import continue_jobs
+
+        with plain_errors():
+            continue_jobs(self, runs, workers, progress)
+        return self
+
+    def to_xarray(self) -> Any:
+        """Return errors, variances and traces as a data set of xarray.
+
+        Returns:
+            Variables with the axes condition, filter, run, time and state; attributes with unit, seed, version and key.
+        """
+        from pfbench.door.figures import make_dataset
+
+        with plain_errors():
+            return make_dataset(self.conditions())
+
+    def conditions(self) -> list[Condition]:
+        """Return the conditions of the study, whose filters have the same data."""
+        from pfbench.results.conditions import load_conditions
+
+        with plain_errors():
+            return load_conditions(self.name, self.results)
+
+    def _main_groups(self) -> Mapping[tuple[str, str, str], str]:
+        """Return the main group by scenario, noise and model."""
+        from pfbench.results.frame import list_main_groups
+
+        return list_main_groups(self.conditions())
+
+    def _repr_html_(self) -> str:
+        failures = self.failed()
+        rows = [(note["filter"], note["scenario"], note["message"]) for note in failures]
+        table = format_html_table(("failed filter", "scenario", "message"), rows) if rows else ""
+        has_results = any((Path(self.results) / self.name).glob("*.npz"))
+        return (self.summary()._repr_html_() if has_results else "") + table
+
+
+def open_study(
+    name: str, results: str = "results", reports: str = "reports", *, trust: tuple[str, ...] = ()
+) -> Study:
+    """Open a study that Python or the command line has run.
+
+    Args:
+        name: Name of the study.
+        results: Folder of all results.
+        reports: Folder of all reports.
+        trust: Packages that define classes of the user, for `replay` and `more`.
+
+    Returns:
+        The study.
+
+    Raises:
+        ValueError: If it has neither results nor failed jobs.
+    """
+    from pfbench.cli.report import check_has_results
+
+    if not isinstance(name, str):
+        raise TypeError(
+            f"study must be the name of a study, got {name!r}. List them: pfbench status"
+        )
+    study = Study(name, str(results), str(reports), tuple(trust))
+    if not study.status().failures:
+        with plain_errors():
+            check_has_results(name, Path(results))
+    return study

@@ -1,0 +1,422 @@
+"""The Python door: the jobs of the command line, own classes of a notebook, and a study that is read from the same files."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from command_line import pfbench as command
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from notebook_cells import MODEL, PROPOSAL, Notebook
+
+import pfbench
+from pfbench.cli.compose import plan_study
+from pfbench.job import IGNORED_IN_KEY, job_key
+from pfbench.report.overview.tables import read_world_facts
+from pfbench.results import main_component_group, store
+from pfbench.stats.comparison import EQUALITY_MARGIN, bound_losses, compare, decide
+
+SMALL = {"runs": 4, "particles": 40}
+WALK = pfbench.get("scenario", "linear_walk", steps=6)
+WALK_WORDS = ("scenario=linear_walk", "scenario.steps=6", "runs=4", "particles=40")
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty current folder, in which all results lie."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PFBENCH_TRUST", raising=False)
+    monkeypatch.setenv("PFBENCH_RESULTS", str(tmp_path / "results"))
+    monkeypatch.setenv("PFBENCH_EPISODES", str(tmp_path / "worlds"))
+    return tmp_path
+
+
+@pytest.fixture
+def notebook(home: Path, monkeypatch: pytest.MonkeyPatch) -> Notebook:
+    return Notebook(monkeypatch)
+
+
+def stored(study: str) -> dict[str, store.JobResult]:
+    """Results of a study by label."""
+    results = map(store.read_result, Path("results", study).glob("*.npz"))
+    return {result.meta["label"]: result for result in results}
+
+
+def keys(study: str) -> set[str]:
+    return {path.stem for path in Path("results", study).glob("*.npz")}
+
+
+# the same jobs as the command line
+
+
+def test_results_of_the_command_line_are_skipped_and_the_other_way_round(
+    home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = command("run", "-m", *WALK_WORDS, "filter=sir,ekf", "study=s", home=home)
+    assert said.code == 0, said.err
+    before = keys("s")
+    study = pfbench.run(WALK, ["sir", "ekf", "rpf"], study="s", **SMALL)
+    printed = capsys.readouterr().out
+    assert printed.count("skipped   linear_walk") == 2
+    assert "run: 1 finished, 2 skipped, 0 failed" in printed
+    assert before < keys("s")
+    again = command("run", "-m", *WALK_WORDS, "filter=sir,ekf,rpf", "study=s", home=home)
+    assert again.out.count("skipped   linear_walk") == 3
+    assert sorted(study.errors().columns) == ["ekf", "rpf", "sir"]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "filters", "settings", "words"),
+    [
+        ("flight_500s", "tuned_baselines", {}, ["filter=tuned_baselines"]),
+        ("passive_1_printed", ["sir", "mcmc_rpf"], {"seed": 2}, ["filter=sir,mcmc_rpf", "seed=2"]),
+        (
+            pfbench.get("scenario", "terrain", initial_sd=50.0),
+            [pfbench.get("filter", "sir", resampler__ess_threshold=1.0)],
+            {"budget": "time"},
+            ["scenario.initial_sd=50.0", "filter=sir", "filter.resampler.ess_threshold=1.0", "budget=time"],
+        ),
+    ],
+)  # fmt: skip
+def test_keys_are_those_of_the_command_line(
+    home: Path, monkeypatch: pytest.MonkeyPatch, scenario, filters, settings, words
+) -> None:
+    """For named sets, changed parts and settings; the jobs themselves are not run."""
+    composed = []
+
+    def keep(configs, workers, progress) -> None:
+        composed.extend(configs)
+
+    monkeypatch.setattr("pfbench.door.running._run_jobs", keep)
+    monkeypatch.setattr("pfbench.door.running.open_study", lambda *a, **b: None)
+    pfbench.run(scenario, filters, noise=["nominal", "outliers"], study="k", **settings)
+    name = scenario if isinstance(scenario, str) else scenario.name
+    from pfbench.job.config import expand_filter_sets
+
+    full = [f"scenario={name}", "noise=nominal,outliers", "runs=50", "study=k", *words]
+    expected = plan_study(expand_filter_sets(full)).compose_jobs()
+    assert {job_key(c.values, {}) for c in composed} == {job_key(c.values, {}) for c in expected}
+    assert len(composed) == len(expected) == len({job_key(c.values, {}) for c in composed})
+    assert "results_dir" in IGNORED_IN_KEY
+
+
+# own classes
+
+
+def test_a_proposal_of_a_notebook_runs_in_workers_and_is_computed_again(notebook: Notebook) -> None:
+    notebook.run("%matplotlib inline\nSCALE = 3.0")
+    notebook.run(PROPOSAL)
+    study = pfbench.run(WALK, ["sir", notebook["Defensive"]()], study="own", workers=2, **SMALL)
+    result = stored("own")["defensive"]
+    target = result.meta["config"]["filter"]["proposal"]["_target_"]
+    assert re.fullmatch(r"own_defensive_[0-9a-f]{10}\.Defensive", target)
+    assert result.meta["inputs"]["filter"].keys() == {"code of own_defensive"}
+    assert result.meta["config"]["filter"]["particles"] == SMALL["particles"]  # that of the study
+    assert not np.array_equal(result.data["error"], stored("own")["sir"].data["error"])
+    traces = study.replay("defensive", 2)
+    assert np.array_equal(traces["error position [m]" if "error position [m]" in traces else traces.columns[1]].to_numpy(), result.data["error"][2, :, 0])  # fmt: skip
+    said = command("replay", "study=own", "filter=defensive", "run=2", home=Path.cwd())
+    assert f"add trust=[{target.partition('.')[0]}]" in said.err
+    place = [f"hydra.searchpath=[own://{next(Path('.cache/own').glob('defensive_*'))}]", f"trust=[{target.partition('.')[0]}]"]  # fmt: skip
+    again = command("run", *WALK_WORDS, "filter=defensive", "study=own", *place, home=Path.cwd())
+    assert "skipped   linear_walk" in again.out, again.err
+
+
+def test_a_changed_class_or_helper_is_a_new_job_and_replaces_the_old_one(
+    notebook: Notebook,
+) -> None:
+    notebook.run("SCALE = 3.0")
+    notebook.run(PROPOSAL)
+    pfbench.run(WALK, ["ekf", notebook["Defensive"]()], study="own", progress=False, **SMALL)
+    first = keys("own")
+    for change in ("SCALE = 2.0", "def log_normal(w):\n    return -0.5 * (w * w).sum(-1)"):
+        notebook.run(change)
+        before = keys("own")
+        study = pfbench.run(WALK, ["ekf", notebook["Defensive"]()], study="own", progress=False, **SMALL)  # fmt: skip
+        assert len(keys("own") - before) == 1
+    assert len(first) == 2
+    assert list(study.errors().columns) == ["defensive", "ekf"]  # the newest code alone
+    assert {path.stem[:8] for path in Path("results/own").glob("*.npz")} == {k[:8] for k in first}
+
+
+def test_a_model_of_a_notebook_is_simulated_with_its_arguments(notebook: Notebook) -> None:
+    notebook.run(MODEL)
+    world = pfbench.run(notebook["Room"](0.2, measurement_sd=0.7), ["ukf"], study="room", **SMALL)
+    config = stored("room")["ukf"].meta["config"]
+    arguments = {key: config["model"][key] for key in ("cooling_rate", "measurement_sd")}
+    assert arguments == {"cooling_rate": 0.2, "measurement_sd": 0.7}
+    assert config["scenario"]["model"] == {"_target_": config["model"]["_target_"], **arguments}
+    assert stored("room")["ukf"].data["error"].shape[:2] == (4, 100)
+    assert world.errors()["ukf"].between(0, 5).all()
+    assert pfbench.check(notebook["Room"]).passed
+
+
+def test_names_of_own_parts(notebook: Notebook) -> None:
+    notebook.run("SCALE = 3.0")
+    notebook.run(PROPOSAL)
+    mine = pfbench.own(notebook["Defensive"](0.4), "Wide PF", base="rpf")
+    assert (mine.group, mine.name) == ("filter", "wide_pf")
+    study = pfbench.run(WALK, [mine, "rpf"], study="named", progress=False, **SMALL)
+    node = stored("named")["wide_pf"].meta["config"]["filter"]
+    assert node["proposal"]["share"] == 0.4
+    assert node["resampler"]["_target_"] == "pfbench.filter.RegularisedResampler"
+    assert "Wide PF" in str(study.summary())
+
+
+CLOSURE = """
+def make(scale):
+    class Scaled:
+        is_exact = True
+
+        def __call__(self, a, n, draws):
+            return scale * a
+
+    return Scaled
+"""
+BAD_CELLS = {
+    CLOSURE: ("make(2.0)()", "Scaled must be defined at the top level, got a class inside of make"),
+    "class Empty:\n    pass": ("Empty", "must have the methods of a part: filter init and step"),
+    "class Call:\n    def __call__(self, x, y):\n        return x": ("Call()", "Got __call__(self, x, y)"),
+    "class Plain:\n    def propagate(self, x, u, w):\n        return x": (
+        "Plain", "Plain must be a subclass of pfbench.model.StateSpaceModel to be a model, which is a module of torch"
+    ),
+    "from pfbench.model import StateSpaceModel\nclass Half(StateSpaceModel):\n    def propagate(self, x, u, w):\n        return x": (
+        "Half", "Half must define initial, observation to be a model"
+    ),
+    "class Lost:\n    is_exact = True\n    def __call__(self, belief):\n        return MISSING(belief)": (
+        "Lost()", "MISSING must be defined before the class is passed"
+    ),
+    "import pfbench\nimport numpy\nBIG = numpy.zeros(3)\ndel numpy\nfrom dataclasses import dataclass\n@dataclass(frozen=True)\n"
+    "class Array:\n    values: object\n    def __call__(self, belief):\n        return belief": (
+        "Array(BIG)", "Array.values must be numbers, texts, lists or objects of dataclasses, got ndarray"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("cell", BAD_CELLS, ids=lambda cell: cell.strip().splitlines()[-1][:20])
+def test_classes_that_no_other_process_can_use_are_refused_in_a_sentence(
+    notebook: Notebook, cell: str
+) -> None:
+    expression, sentence = BAD_CELLS[cell]
+    notebook.run(cell)
+    with pytest.raises((ValueError, TypeError), match=re.escape(sentence)):
+        pfbench.run(WALK, [eval(expression, vars(notebook.main))], **SMALL)
+    assert not Path("results").exists()
+
+
+def test_an_object_of_an_earlier_definition_is_refused(notebook: Notebook) -> None:
+    notebook.run("SCALE = 3.0")
+    notebook.run(PROPOSAL)
+    old = notebook["Defensive"]()
+    notebook.run(PROPOSAL)
+    with pytest.raises(
+        ValueError, match=r"got one that was defined before\. Make the object again"
+    ):
+        pfbench.own(old)
+
+
+# bad input: the sentences of the command line
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda: pfbench.get("filter", "sirr"), "filter=sirr does not exist. Similar: sir"),
+        (lambda: pfbench.get("filters", "sir"), "group must be one of scenario, noise, filter, model"),
+        (lambda: pfbench.names("filtre"), "group must be one of "),
+        (lambda: pfbench.run("terrian", "sir"), "scenario=terrian does not exist. Similar: terrain"),
+        (lambda: pfbench.run(WALK, []), "filter must be at least one, got an empty list"),
+        (lambda: pfbench.run(WALK, 3), "filter must be a name, a part or a class, got 3"),
+        (lambda: pfbench.run(WALK, WALK), "filter must be a filter, got the scenario scenario=linear_walk"),
+        (lambda: pfbench.run(WALK, "sir", workers=0), "workers must be a whole number of at least 1, got 0"),
+        (lambda: pfbench.run(WALK, "sir", workers=True), "workers must be a whole number of at least 1, got True"),
+        (lambda: pfbench.run(WALK, "sir", runs=0), "runs must be a whole number of at least 1, got 0"),
+        (lambda: pfbench.run(WALK, "sir", partcles=3), "partcles=3: key partcles does not exist. Similar: particles"),
+        (lambda: pfbench.run(WALK, "sir", study="a/b"), "study must be a name of letters"),
+        (lambda: pfbench.run(WALK, "sir", particles=object()), "particles must be a number, a text, a list or a dictionary"),
+        (lambda: pfbench.study("nothing"), "study must be a study with results, got nothing"),
+        (lambda: pfbench.study(3), "study must be the name of a study, got 3"),
+        (lambda: pfbench.own(WALK), "own must receive a class or an object, got the part scenario=linear_walk"),
+        (lambda: pfbench.own("sir"), "'sir' must have the methods of a part"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_a_sentence(home: Path, call, sentence: str) -> None:
+    with pytest.raises((ValueError, TypeError)) as caught:
+        call()
+    assert sentence in str(caught.value)
+    assert re.search(r"\bmust\b|does not exist", str(caught.value))
+    assert not Path("results").exists()
+
+
+def test_unknown_keys_have_the_sentence_of_the_command_line(home: Path) -> None:
+    with pytest.raises(ValueError, match="key partcles") as caught:
+        pfbench.run(WALK, "sir", partcles=3, study="s")
+    said = command("run", *WALK_WORDS, "filter=sir", "partcles=3", "study=s", home=home)
+    assert str(caught.value) in said.err
+
+
+def test_a_failed_job_is_listed_with_the_words_that_repeat_it(
+    home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bad = pfbench.get("filter", "sir", particles=0)
+    study = pfbench.run(WALK, ["ekf", bad], study="f", **SMALL)
+    (note,) = study.failed()
+    assert "must be at least 2, got 0" in note["message"]
+    printed = capsys.readouterr().out
+    assert note["repeat"] in printed
+    assert "1 finished, 0 skipped, 1 failed" in printed
+    words = note["repeat"].split()[2:]
+    assert "filter.particles=0" in words
+    said = command(*words[:0], "run", *words, home=home)
+    assert "must be at least 2, got 0" in said.err + said.out
+    with pytest.raises(RuntimeError, match="must be at least 2, got 0"):
+        pfbench.run(WALK, [bad], study="g", progress=False, **SMALL)
+
+
+# a study
+
+
+def test_a_run_leaves_no_global_state(home: Path) -> None:
+    torch.set_num_threads(2)
+    logger = logging.getLogger("pfbench")
+    before = (
+        torch.get_num_threads(), dict(os.environ), list(sys.argv), list(logger.handlers), logger.level,
+        GlobalHydra.instance().hydra, HydraConfig.instance().cfg,
+    )  # fmt: skip
+    try:
+        pfbench.run(WALK, "sir", study="s", **SMALL)
+        after = (
+            torch.get_num_threads(), dict(os.environ), list(sys.argv), list(logger.handlers), logger.level,
+            GlobalHydra.instance().hydra, HydraConfig.instance().cfg,
+        )  # fmt: skip
+    finally:
+        torch.set_num_threads(1)
+    assert before == after
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> pfbench.Study:
+    """A study of two noise regimes and three filters, read only."""
+    folder = tmp_path_factory.mktemp("study")
+    return pfbench.run(
+        pfbench.get("scenario", "linear_walk", steps=20), ["ekf", "sir", "rpf"], noise=["nominal", "outliers"],
+        study="s", runs=12, particles=60, progress=False, results_dir=str(folder / "results"), reports_dir=str(folder / "reports"),
+    )  # fmt: skip
+
+
+def test_errors_are_those_of_the_files(study: pfbench.Study) -> None:
+    errors = study.errors()
+    assert errors.index.names == ["noise", "run"]
+    for condition in study.conditions():
+        for job in condition.jobs:
+            group = main_component_group(job.meta["state"])
+            error = job.load().data["error"][..., group.places] * group.scale
+            rmse = np.sqrt((error**2).sum(-1).mean(-1))
+            np.testing.assert_allclose(errors.loc[condition.noise][job.label], rmse, rtol=1e-6)
+    assert set(study.table("rmse")["metric"]) == {"rmse"}
+    with pytest.raises(ValueError, match="metric must be one of"):
+        study.table("rsme")
+    with pytest.raises(ValueError, match="group must be one of"):
+        study.errors("wing")
+
+
+def test_a_comparison_is_the_one_of_the_package(study: pfbench.Study) -> None:
+    comparison = study.compare("sir", "ekf")
+    rows = study.table("rmse")
+    group = main_component_group(study.conditions()[0].jobs[0].meta["state"]).group
+    rows = rows[(rows["group"] == group) & (rows["component"] == "norm")]
+    cap = read_world_facts("linear_walk", "linear_walk").cap  # of the tuning of this world
+    effects = []
+    for noise in ("nominal", "outliers"):
+        pair = []
+        for name in ("sir", "ekf"):
+            of_filter = rows[(rows["noise"] == noise) & (rows["label"] == name)].sort_values("run")
+            values, keeps = of_filter["value"].to_numpy(), of_filter["keeps_track"].to_numpy()
+            pair.append((name, bound_losses(values, keeps.astype(bool), cap)))
+        effects.append(compare(*pair))
+    expected = decide(effects, EQUALITY_MARGIN)
+    for verdict, reference in zip(comparison.verdicts.values(), expected, strict=True):
+        assert (verdict.word, verdict.n) == (reference.word, reference.n)
+        np.testing.assert_allclose(verdict[3:7], reference[3:7], rtol=1e-5)
+    assert "sir" in repr(comparison)
+    assert len(comparison.table()) == 2
+    with pytest.raises(ValueError, match="must have one condition, got 2"):
+        _ = comparison.word
+    with pytest.raises(ValueError, match="filter must be a filter of the study, got 'sirr'"):
+        study.compare("sirr", "ekf")
+
+
+def test_summary_page_and_html(study: pfbench.Study) -> None:
+    summary = study.summary()
+    page = study.report(figure_formats=("svg",)).with_name("report.md").read_text()
+    assert summary.sentence in page
+    for row in summary.rows:
+        assert row[1] in page
+    html = study._repr_html_()
+    assert html.count("<tr>") == 4
+    assert summary.rows[0][1] in html
+    assert list(summary.table()["filter"]) == [row[1] for row in summary.rows]
+    assert study.status().finished == 6
+    assert repr(study.status()) == "s: 6 finished, 0 failed"
+
+
+@pytest.mark.parametrize("kind", ["cost", "time", "calibration", "run"])
+def test_figures_show_each_filter_once(study: pfbench.Study, kind: str) -> None:
+    ax = study.plot(kind, noise="outliers", run=3)
+    labels = {text.get_text().strip() for text in (*ax.texts, *ax.get_yticklabels())}
+    labels |= {text.get_text() for text in (ax.get_legend().get_texts() if ax.get_legend() else ())}
+    assert {"EKF", "SIR", "RPF"} <= labels
+    with pytest.raises(ValueError, match="must select one condition of the study, got 2"):
+        study.plot(kind)
+    with pytest.raises(ValueError, match="kind must be one of cost, time, calibration, run"):
+        study.plot("pie")
+
+
+def test_more_runs_are_those_of_one_longer_study(home: Path) -> None:
+    part = pfbench.run(WALK, ["sir", "ekf"], study="a", progress=False, **SMALL)
+    part.more(3, progress=False)
+    full = pfbench.run(WALK, ["sir", "ekf"], study="b", progress=False, runs=7, particles=40)
+    pd.testing.assert_frame_equal(part.errors(), full.errors())
+
+
+def test_arrays_for_xarray(study: pfbench.Study) -> None:
+    pytest.importorskip("xarray")
+    data = study.to_xarray()
+    assert data["error"].dims == ("condition", "filter", "run", "time", "state")
+    job = study.conditions()[1].jobs[0]
+    condition = study.conditions()[1].name
+    selected = data["error"].sel(condition=condition, filter=job.label).to_numpy()
+    assert np.array_equal(selected, job.load().data["error"])
+    assert data.attrs["seed"] == 1
+
+
+def test_names_list_what_the_command_line_lists(
+    home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = pfbench.names("filter")
+    said = command("list", "filter", home=home)
+    lines = dict(line.split(maxsplit=1) for line in said.out.splitlines())
+    assert {name: names[name] for name in lines} == lines
+    assert names["tuned_baselines"].startswith("ekf_scaled_tuned")
+    assert "<td" in names._repr_html_()
+
+
+def test_the_door_is_light() -> None:
+    code = (
+        "import sys, pfbench\n"
+        "def loaded(names): return [name for name in names if name in sys.modules]\n"
+        "print(loaded(('torch', 'pandas', 'numpy', 'hydra')))\n"
+        "pfbench.names('filter'), pfbench.get('filter', 'sir', particles=3)\n"
+        "print(loaded(('torch', 'pyro', 'hydra', 'matplotlib')))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["[]", "[]"]
