@@ -28,7 +28,10 @@ NAMES = [name for name in TEXTS if not name.startswith(NEEDS_TRAINING)]
 
 NEEDS_ATTITUDE = ("invariant_ekf", "rbpf_heading")  # refuse a model without one
 
-ON_ANY_MODEL = [name for name in NAMES if name not in NEEDS_ATTITUDE]
+# literal forms whose equations are lost in print: they refuse any model
+UNPRINTED = ("fm_mssrckf_literal", "cofm_mssrckf_literal", "cofm_amssrcpf_literal")
+
+ON_ANY_MODEL = [name for name in NAMES if name not in (*NEEDS_ATTITUDE, *UNPRINTED)]
 
 
 @cache
@@ -41,13 +44,20 @@ def method_of(name: str) -> Any:
         return job.instantiate(compose(f"filter/{name}", words)["filter"])
 
 
-DENSE = ("mcmc_bridge", "mcmc_rpf_printed", "mcmc_tail")
+DENSE = ("mcmc_bridge", "mcmc_rpf_printed", "mcmc_rpf_literal", "mcmc_tail")
 
 BRANCHING = ("gpb1", "imm", "gaussian_sum", "rbpf_discrete", "ekf_bank", "ekf_bank_dense")
 
-EACH = ("cofm_amssrcpf_each", "cpf_each", "fmcpf_each")  # a guide filter for each particle
+EACH = (
+    "cofm_amssrcpf_each",
+    "cofm_amssrcpf_each_printed",
+    "cpf_each",
+    "fmcpf_each",
+)  # a guide filter for each particle
 
-REMEMBERING = ("cofm_amssrcpf", "cofm_amssrcpf_printed", "cpf", "fmcpf", *EACH)
+REMEMBERING = (
+    *("cofm_amssrcpf", "cofm_amssrcpf_printed", "cpf", "fmcpf", "dmc_reconstructed_literal", *EACH),
+)
 
 # no step determines the state; that of Benes is known at the start
 WITHOUT_FIXES = ("Benes", "StochasticVolatility", "TerrainAided")
@@ -56,6 +66,8 @@ WITHOUT_FIXES = ("Benes", "StochasticVolatility", "TerrainAided")
 def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
     """Return the pattern of the error of a filter that refuses a model or a record; else empty."""
     x, first = model.origin.expand(2, 1, -1), model.prepare(record).at_step(0)
+    if name in UNPRINTED:
+        return "must have equations to run"
     if name in DENSE and model.transition(x, first.u) is None:
         return "density of x_t given x_t-1"
     if name.startswith("gauss_hermite") and _needs_many_points(name, model, first.u):

@@ -21,7 +21,7 @@ from config_cases import (
     composed,
     world,
 )
-from filter_cases import NEEDS_ATTITUDE, method_of
+from filter_cases import NEEDS_ATTITUDE, UNPRINTED, method_of
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf, open_dict
@@ -171,7 +171,9 @@ def test_every_scenario_runs_with_the_default_filter(scenario: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:ParticleGuideProposal")
-@pytest.mark.parametrize("method", [m for m in GROUPS["filter"] if m not in NEEDS_ATTITUDE])
+@pytest.mark.parametrize(
+    "method", [m for m in GROUPS["filter"] if m not in (*NEEDS_ATTITUDE, *UNPRINTED)]
+)
 def test_every_filter_runs(method: str) -> None:
     """Gaussian filters that leave noise and gain alone are the Kalman filter on a linear model, whatever their rule.
 

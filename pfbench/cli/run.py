@@ -24,7 +24,7 @@ from pfbench.cli.messages import format_error, notes_of
 from pfbench.cli.progress import SweepCounter, SweepProgress, note_outcome
 from pfbench.cli.terminal import end_with_parent
 from pfbench.files.command_start import start_work
-from pfbench.job.config import JobConfig, expand_filter_sets, register_experiments
+from pfbench.job.config import CHOICES, JobConfig, expand_filter_sets, register_experiments
 from pfbench.job.trust import ENVIRONMENT
 from pfbench.results.paper_block import conf_dir
 
@@ -192,6 +192,8 @@ def delay_keys_of_swept_groups(words: Sequence[str]) -> list[str]:
     """
     pairs = [word.partition("=") for word in words]
     groups = {key for key, _, value in pairs if "," in value and "." not in key}
+    if any(key.startswith("reading/") and re.search(r",|glob", value) for key, _, value in pairs):
+        groups |= {*CHOICES}  # a reading chooses the world
     return [
         f"{key}=choice({value})"
         if key.split(".")[0] in groups and "." in key and re.fullmatch(r"[\w.+-]+", value)

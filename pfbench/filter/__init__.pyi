@@ -1,11 +1,8 @@
 """Public names of `pfbench.filter` and the modules that define them.
 
-A file of conf/filter whose name ends in `_printed` keeps what a paper states, with its errors. What the
-papers leave open is completed, see the table in docs/methods/README.md: the resampling scheme of
-`sir_printed` and `rpf_printed`, the acceptance ratio of `mcmc_rpf_printed`, the cells of
-`qmc_polymerised_printed`, the adaptive factor of `fm_mssrckf_printed`, the noise matrices of
-`cofm_mssrckf_printed`, proposal and entropy of `cofm_amssrcpf_printed`, the numbers of
-`dmc_reconstructed_printed`, and fitness and coefficients of `cpso_escape_printed`.
+A file of conf/filter whose name ends in `_literal` repairs nothing of a paper, and refuses to run where equations
+are lost in print (`UnprintedFilter`). One that ends in `_printed` is that form with the list `paper.completions`:
+each value that the paper does not state, and each printed symbol that is read otherwise, with a reason.
 """
 
 from pfbench.filter.belief import (
@@ -110,6 +107,7 @@ from pfbench.filter.moves.metropolis import (
 )
 from pfbench.filter.moves.path_kernels import (
     LastStateKernel as LastStateKernel,
+    LikelihoodRatioKernel as LikelihoodRatioKernel,
     NoiseFlowGibbsKernel as NoiseFlowGibbsKernel,
     NoiseFlowKernel as NoiseFlowKernel,
     NoiseFlowStatKernel as NoiseFlowStatKernel,
@@ -184,6 +182,7 @@ from pfbench.filter.particle.weights import (
 from pfbench.filter.proposed.dmc_controller import (
     DmcController as DmcController,
     DmcResponse as DmcResponse,
+    OneStepResponse as OneStepResponse,
     StaticResponse as StaticResponse,
 )
 from pfbench.filter.proposed.polymerised import (
@@ -217,6 +216,7 @@ from pfbench.filter.proposed.swarm_coordinates import (
     LikelihoodFitness as LikelihoodFitness,
     ObservedComponents as ObservedComponents,
     PosteriorFitness as PosteriorFitness,
+    PrintedFitness as PrintedFitness,
     SwarmCoordinates as SwarmCoordinates,
 )
 from pfbench.filter.proposed.swarm_motion import (
@@ -234,6 +234,7 @@ from pfbench.filter.proposed.swarm_weighting import (
     PrintedWeighting as PrintedWeighting,
     SwarmWeighting as SwarmWeighting,
 )
+from pfbench.filter.proposed.unprinted import UnprintedFilter as UnprintedFilter
 from pfbench.filter.robust.hypotheses import NoiseHypotheses as NoiseHypotheses
 from pfbench.filter.robust.multiple_models import (
     GaussianSumFilter as GaussianSumFilter,

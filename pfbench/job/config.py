@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pfbench.files import limits
+from pfbench.job.readings import apply_readings, name_readings
 from pfbench.job.trust import (
     UntrustedConfigError,
     check_configuration,
@@ -121,7 +122,7 @@ def compose_tree(words: Sequence[str], trusted: Sequence[str] | None = None) -> 
         version.setbase("1.3")
         loader = SharedLoader(create_config_search_path(str(conf_dir())), trusted)
         return Hydra("app", loader).compose_config(
-            "config", list(words), RunMode.RUN, from_shell=False
+            "config", name_readings(words), RunMode.RUN, from_shell=False
         )
 
 
@@ -155,7 +156,12 @@ def resolve_config(
     is_shared = "particles" in tree["filter"] and OmegaConf.is_interpolation(
         tree["filter"], "particles"
     )
-    names = {str(group): str(name) for group, name in (choices or {}).items()}
+    names = {
+        str(group): str(name)
+        for group, name in (choices or {}).items()
+        if name not in (None, "None")
+    }
+    apply_readings(tree, names)
     _, packages = split_trust([f"trust=[{','.join(trusted)}]"])
     has_knobs = _take_knobs(tree, names, trusted)
     try:
@@ -413,7 +419,7 @@ def expand_filter_names(names: str) -> str:
 
 
 def expand_filter_sets(words: Sequence[str]) -> list[str]:
-    """Replace named sets in the overrides of a sweep.
+    """Replace named sets in the overrides of a sweep, and numbers of papers by the groups of their readings.
 
     Returns the words, `filter=tuned_baselines` as the list of its filters.
     """
@@ -421,5 +427,5 @@ def expand_filter_sets(words: Sequence[str]) -> list[str]:
         f"filter={expand_filter_names(word.removeprefix('filter='))}"
         if re.match(r"filter=[\w,]+$", word) and set(word[7:].split(",")) & set(FILTER_SETS)
         else word
-        for word in words
+        for word in name_readings(words)
     ]

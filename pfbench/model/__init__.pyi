@@ -7,6 +7,7 @@ from pfbench.core.density import (
 from pfbench.model.azimuth import (
     Discretisation as Discretisation,
     ErrorEquations as ErrorEquations,
+    EulerDiscretisation as EulerDiscretisation,
     ExactErrorEquations as ExactErrorEquations,
     PrintedErrorEquations as PrintedErrorEquations,
     SinsGpsAzimuth as SinsGpsAzimuth,

@@ -28,16 +28,21 @@ PAPER = "paper"
 
 FAMILIES = ("kalman", "particle", "gaussian", "guided", "swarm", "learned")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">", "p", "h")  # of matplotlib
+# form of a method: to the letter of its paper, as printed with named completions, repaired, or another
+FORMS = ("literal", "printed", "repaired", "variant")
 _COLOUR = re.compile(r"#[0-9a-f]{6}")
+# entries of `cites`, keys that the paper states, and of `completions`, keys that it does not state or that are read
+# otherwise than `printed`: each with keys of the filter and a text
+_ENTRIES = {"cites": ({"keys", "place"}, set()), "completions": ({"keys", "why"}, {"printed"})}
 
 # keys of the node by part, each with its requirement
-_TEXTS = ("name", "long_name", "summary", "words", "unit", "cite", "family", "tuning")
+_TEXTS = ("name", "long_name", "summary", "words", "unit", "cite", "family", "tuning", "form_of")
 _KEYS = {
     "scenario": ("name", "words", "unit", "family", "divergence_threshold"),
     "noise": ("name", "words", "family"),
     "filter": (
-        "name", "long_name", "summary", "family", "proposed", "colour", "marker", "cite", "baselines",
-        "tuning",
+        "name", "long_name", "summary", "family", "proposed", "form", "form_of", "colour", "marker", "cite",
+        "baselines", "tuning", "cites", "completions",
     ),
 }  # fmt: skip
 
@@ -110,6 +115,12 @@ def _requirement(group: str, key: str, value: Any) -> str:
         return f"one of {' '.join(MARKERS)}"
     if key == "colour" and not _is_colour_pair(value):
         return "two colours such as '#0b4f8a', for white and for dark ground"
+    if key == "form" and value not in FORMS:
+        return f"one of {', '.join(FORMS)}"
+    if key in _ENTRIES and not _is_list_of_entries(value, *_ENTRIES[key]):
+        required, optional = _ENTRIES[key]
+        names = ", ".join(sorted(required)) + "".join(f", perhaps {name}" for name in optional)
+        return f"a list of entries with {names}: keys a list of names, all others texts"
     if key == "baselines" and not _is_list_of_names(value):
         return "a list of filters"
     return ""
@@ -118,6 +129,18 @@ def _requirement(group: str, key: str, value: Any) -> str:
 def _is_colour_pair(value: Any) -> bool:
     """Return whether a value is a list of two colours."""
     return _is_list_of_names(value) and len(value) == 2 and all(map(_COLOUR.fullmatch, value))
+
+
+def _is_list_of_entries(value: Any, required: set[str], optional: set[str]) -> bool:
+    """Return whether a value is a list of dictionaries with lists of keys and texts."""
+    return isinstance(value, list | tuple) and all(
+        isinstance(entry, Mapping)
+        and required <= set(entry) <= required | optional
+        and bool(entry["keys"])
+        and _is_list_of_names(entry["keys"])
+        and all(isinstance(entry[name], str) for name in entry if name != "keys")
+        for entry in value
+    )
 
 
 def _is_list_of_names(value: Any) -> bool:

@@ -52,20 +52,29 @@ BASED = (
     "dmc_optimal",
     "fmcpf",
     "fmcpf_each",
+    *("rpf_half", "rpf_epanechnikov", "mcmc_rpf_literal", "qmc_polymerised_literal", "sir_literal"),
+    *(
+        "dmc_reconstructed_literal",
+        "cpso_escape_literal",
+        "pso_pf_literal",
+        "thompson_taylor_literal",
+    ),
 )  # on another of these
 PARTICLES = [
     name for name in NAMES if "pfbench.filter.ParticleFilter" in TEXTS[name] or name in BASED
 ]
 FIXED_NUMBER = ("sqmc", "guided_start")  # refuse a number that changes, or have points for one
+EXACT_EACH = tuple(name for name in EACH if not name.endswith("_printed"))
+MOVED = ("mcmc_tail", "mcmc_bridge", "mcmc_rpf_printed", "mcmc_rpf_literal")
 EXACT = (
-    *("sir", "sir_printed", "apf", "sqmc", "rbpf"), *("ckf_pf", "ekf_pf", "ukf_pf"), *("mcmc_tail", "mcmc_bridge", "mcmc_rpf_printed"),
-    *("dmc_density", "dmc_noise", "dmc_optimal"), "guided_start", "interval_pf", *EACH,
+    *("sir", "sir_printed", "sir_literal", "apf", "sqmc", "rbpf"), *("ckf_pf", "ekf_pf", "ukf_pf"), *MOVED,
+    *("dmc_density", "dmc_noise", "dmc_optimal"), "guided_start", "interval_pf", *EXACT_EACH,
 )  # fmt: skip
 
 
 REFUSING = {
     "bounded errors": ("rbpf",),
-    "bounded noise": ("rbpf", "dmc_density", "mcmc_tail", "mcmc_bridge", "mcmc_rpf_printed", *EACH),
+    "bounded noise": ("rbpf", "dmc_density", *MOVED, *EXACT_EACH),
     "two modes": ("rbpf",),
 }
 UNBOUNDED = ("cofm_amssrcpf", "cofm_amssrcpf_printed", "cpf", "fmcpf", *EACH)

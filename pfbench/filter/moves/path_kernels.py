@@ -454,3 +454,37 @@ class PathBlockKernel(McmcKernel):
             for name, a in new_window.items()
         }
         return belief._replace(x=child, window=window | ends), log_alpha
+
+
+@dataclass(frozen=True)
+class LikelihoodRatioKernel(McmcKernel):
+    """Move x_t and accept by its likelihood alone, without the transition density.
+
+    log beta = log p(y_t | x') - log p(y_t | x). A reading of the missing eqs. 13 to 15 of [Yan et al.
+    2016]: the kernel is symmetric, "the proposed distribution ratio is reduced". It runs on any
+    model, but the move forgets p(x_t | x_t-1). The target is not invariant: what is not measured
+    spreads as under regularisation.
+
+    Attributes:
+        random_walk: Step of x_t.
+    """
+
+    random_walk: RandomWalk = field(default_factory=RandomWalk)
+    is_exact = False
+    required_history = StateHistory(1)
+
+    @override
+    def propose(
+        self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
+    ) -> tuple[ParticleBelief, Tensor]:
+        if not belief.past:
+            return belief, torch.full_like(belief.log_w, -torch.inf)
+        record, window = belief.past[-1], belief.window
+        child = model.chart.add(belief.x, self.random_walk(model, belief, belief.x, draws))
+        log_like = model.log_likelihood(record.y, child, record.u)
+        new = {"states": child.unsqueeze(2), "log_like": log_like.unsqueeze(2)}
+        ends = {
+            name: concatenate_histories([window[name][:, :, :-1], a]) for name, a in new.items()
+        }
+        log_alpha = log_like - window["log_like"][:, :, -1]
+        return belief._replace(x=child, window=window | ends), log_alpha

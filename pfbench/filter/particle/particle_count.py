@@ -66,6 +66,8 @@ class EssStepCount(ParticleCount):
         increment: Increment. 0 keeps the number at `limits.initial`.
         ess_threshold: Ratio of ESS to N.
         limits: Limits, which the source does not state [ours].
+        before_weights: ESS before the new weights, as printed. The particles are copies of equal
+            weight there, so ESS is N, and the number falls to its minimum.
 
     Raises:
         ValueError: If the step is negative or the threshold is outside [0, 1].
@@ -74,6 +76,7 @@ class EssStepCount(ParticleCount):
     increment: int = 10
     ess_threshold: float = 0.5
     limits: CountLimits = field(default_factory=lambda: CountLimits(100, 200, 150))
+    before_weights: bool = False
     is_exact = True
 
     def __post_init__(self) -> None:
@@ -93,8 +96,9 @@ class EssStepCount(ParticleCount):
         n = _active_count(belief)
         if self.increment == 0:
             return torch.full_like(n, self.limits.initial)
+        effective = n if self.before_weights else ess(belief.log_w).unsqueeze(1)
         number = torch.where(
-            ess(belief.log_w).unsqueeze(1) < self.ess_threshold * n,
+            effective < self.ess_threshold * n,
             n + self.increment,
             n - self.increment,
         )

@@ -56,13 +56,30 @@ class SmoothingKernel(Protocol):
 class GaussianSmoothing(SmoothingKernel):
     """K = N(0, I), h = (4/(d+2))^(1/(d+4)) N^(-1/(d+4)).
 
+    Attributes:
+        offset: Number added to d in the base. 2 as derived, -2 as printed in [Yan et al. 2016,
+            eq. 9], where the base is infinite for two dimensions and negative for one.
+        dimension: d that a paper states in place of the number of coordinates, None for these.
+
+    Raises:
+        ValueError: On use, if d + offset is not positive.
+
     References:
         Silverman 1986. Musso, Oudjane, Le Gland 2001.
     """
 
+    offset: int = 2
+    dimension: int | None = None
+
     @override
     def bandwidth(self, d: int, n: Tensor) -> Tensor:
-        return (4.0 / (d + 2)) ** (1.0 / (d + 4)) * n ** (-1.0 / (d + 4))
+        d = d if self.dimension is None else self.dimension
+        if not d + self.offset > 0:
+            raise ValueError(
+                f"kernel.offset must exceed -{d} with {d} dimensions, got {self.offset}: there is no "
+                "bandwidth. Use 2, as derived."
+            )
+        return (4.0 / (d + self.offset)) ** (1.0 / (d + 4)) * n ** (-1.0 / (d + 4))
 
     @override
     def variance(self, d: int) -> float:

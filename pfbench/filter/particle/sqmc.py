@@ -73,6 +73,8 @@ class HaltonPoints(ShiftedPoints):
         permute_digits: Permute the digits of each base by a fixed permutation [Owen 2017; ours].
             Without it neighbouring axes of large base are correlated: 0.27 for some of 21 axes with
             400 points, 0.05 by chance. With six axes the effect is negligible.
+        shifted: Shift each draw. False gives one set, the same in each draw and run, whose error
+            does not average out.
 
     Raises:
         ValueError: If the number is negative.
@@ -83,7 +85,13 @@ class HaltonPoints(ShiftedPoints):
 
     skip: int = 20
     permute_digits: bool = True
-    is_exact = True
+    shifted: bool = True
+
+    @property
+    @override
+    def is_exact(self) -> bool:
+        """True if each point is uniform."""
+        return self.shifted
 
     def __post_init__(self) -> None:
         if self.skip < 0:
@@ -95,6 +103,7 @@ class HaltonPoints(ShiftedPoints):
     @override
     def shift_points(self, axes: range, n: int, shift: Tensor) -> Tensor:
         base = halton_points(self.skip, n, axes, self.permute_digits).to(shift.device)
+        shift = shift if self.shifted else torch.zeros_like(shift)
         return ((base.unsqueeze(1) + shift) % 1.0).clamp(_EDGE, 1.0 - _EDGE)
 
 

@@ -286,6 +286,9 @@ def _identity_minus(a: Tensor) -> Tensor:
 # process noise (`ReconstructedNoiseProposal`).
 
 
+_SHIFT = "reconstruction.shift"  # in the memory of particles: B dU of the step before, [R, N, d]
+
+
 @dataclass(frozen=True)
 class ReconstructedProposal(Proposal):
     """Particles of `base`, shifted by a DMC controller.
@@ -294,16 +297,19 @@ class ReconstructedProposal(Proposal):
         base: Proposal of the particles.
         controller: Controller that determines the shift.
         weight_correction: Correction of the weights. Uncorrected is as printed.
+        repeats_shift: Add the shift of the step before to the prediction too, the "+ B U" of step V
+            as printed. The shift then counts twice.
     """
 
     base: Proposal = field(default_factory=BootstrapProposal)
     controller: DmcController = field(default_factory=DmcController)
     weight_correction: WeightCorrection = field(default_factory=MarginalRatioCorrection)
+    repeats_shift: bool = False
 
     @property
     @override
     def is_exact(self) -> bool:
-        return is_every_part_exact(
+        return not self.repeats_shift and is_every_part_exact(
             **{"proposal.base": self.base, "proposal.correction": self.weight_correction}
         )
 
@@ -317,7 +323,14 @@ class ReconstructedProposal(Proposal):
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
         sample = self.base(model, belief, record, draws)
-        return self.weight_correction(model, belief, record, sample, self.controller, draws)
+        if not self.repeats_shift:
+            return self.weight_correction(model, belief, record, sample, self.controller, draws)
+        chart, shift = model.chart, belief.memory.get(_SHIFT)
+        if shift is not None:
+            sample = sample._replace(x=chart.add(sample.x, shift))
+        shifted = self.weight_correction(model, belief, record, sample, self.controller, draws)
+        new_shift = {_SHIFT: chart.subtract(shifted.x, sample.x).nan_to_num()}
+        return shifted._replace(memory=shifted.memory | new_shift)
 
 
 @dataclass(frozen=True)

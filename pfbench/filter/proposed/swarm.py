@@ -41,6 +41,7 @@ from pfbench.filter.proposed.swarm_motion import (
     SwarmStart,
     SwarmState,
     VelocityUpdate,
+    follow_logistic,
     iterate_logistic,
     logistic_map,
     match_memory_layout,
@@ -187,6 +188,9 @@ class SwarmProposal(Proposal):
         iterations: Maximum number of iterations.
         swarm_start: Particles of the first step.
         weighting: Weights of the final swarm.
+        lags_velocity: Move by the velocity of the iteration before, as eqs. 30 and 41 print.
+        single_sequence: One chaotic sequence per run, whose k-th value belongs to all coordinates of
+            particle k, as eqs. 31 and 39 print. The start is then a line through the box.
 
     Raises:
         ValueError: If iterations is below 1, or limits by the initial particles are combined with
@@ -204,6 +208,8 @@ class SwarmProposal(Proposal):
     iterations: int = 5
     swarm_start: SwarmStart = field(default_factory=PriorStart)
     weighting: SwarmWeighting = field(default_factory=MixtureWeighting)
+    lags_velocity: bool = False
+    single_sequence: bool = False
 
     def __post_init__(self) -> None:
         if self.iterations < 1:
@@ -275,7 +281,7 @@ class SwarmProposal(Proposal):
         penalty = self.fitness(frame)
 
         def fitness(q: Tensor) -> Tensor:
-            value = model.log_likelihood(record.y, frame.to_states(q), record.u) + penalty(q)
+            value = self.fitness.fit_measurement(model, frame.to_states(q), record) + penalty(q)
             return torch.where(active_mask & ~torch.isnan(value), value, -torch.inf)
 
         swarm = initial = self._initialise_swarm(frame, fitness(frame.q), memory)
@@ -315,12 +321,13 @@ class SwarmProposal(Proposal):
     ) -> SwarmState:
         """Move to x + v or, if its fitness is higher, x + v + Dx, and update the records."""
         v = self.limits.clamp_velocity(v, scale)
-        q = self.limits.clamp_position(swarm.q + v, spread)
+        move = swarm.v if self.lags_velocity else v
+        q = self.limits.clamp_position(swarm.q + move, spread)
         value, chaos = fitness(q), swarm.chaos
         if self.perturbation and spare is not None:
             chaos = logistic_map(chaos, spare)
             step = self.perturbation(chaos, scale)
-            perturbed = self.limits.clamp_position(swarm.q + v + step, spread)
+            perturbed = self.limits.clamp_position(swarm.q + move + step, spread)
             perturbed_value = fitness(perturbed)
             q = torch.where((perturbed_value > value).unsqueeze(-1), perturbed, q)
             value = torch.maximum(perturbed_value, value)
@@ -349,8 +356,11 @@ class SwarmProposal(Proposal):
         """Return parents [R, N, D] and memory, which the first step initialises."""
         if "swarm.scale" in belief.memory:
             return belief.x, belief.memory
-        chart = model.chart
-        z = iterate_logistic(draws.uniform("swarm.chaos", belief.x.shape[1], chart.dimension))
+        chart, slots = model.chart, belief.x.shape[1]
+        if self.single_sequence:
+            z = follow_logistic(draws.uniform("swarm.chaos", 1, 1), slots, chart.dimension)
+        else:
+            z = iterate_logistic(draws.uniform("swarm.chaos", slots, chart.dimension))
         w = normalise_log_weights(belief.log_w)
         c = chart.subtract(belief.x, chart.mean(belief.x, w).unsqueeze(1))
         memory = belief.memory | {

@@ -11,6 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor
+from pfbench.core.record import Record
 from pfbench.filter.linearisation import derivative
 from pfbench.filter.whitening import compute_half_square, fill_missing, whiten
 from pfbench.model.base import StateSpaceModel
@@ -111,10 +112,20 @@ class ObservedComponents(SwarmCoordinates):
 
 
 class Fitness(Protocol):
-    """Fitness of swarm positions, as a term that is added to the log likelihood."""
+    """Fitness of swarm positions: that of the measurement, plus a term."""
 
     def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
         """Return the fitness term [R, N] as a function of coordinates q [R, N, k]."""
+
+    def fit_measurement(self, model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
+        """Return the fitness of the measurement, its log likelihood [R, N].
+
+        Args:
+            model: State-space model of the step.
+            x: States, [R, N, D].
+            record: Record of the step.
+        """
+        return model.log_likelihood(record.y, x, record.u)
 
 
 @dataclass(frozen=True)
@@ -127,6 +138,21 @@ class LikelihoodFitness(Fitness):
     @override
     def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
         return lambda q: q.new_zeros(q.shape[:-1])
+
+
+@dataclass(frozen=True)
+class PrintedFitness(LikelihoodFitness):
+    """ln Y = -sum_i (y_i - y_hat_i) / (2 R_i), eq. 37 as printed, over the components of y.
+
+    The paper writes one residual and one R. The sum over components is [ours]. It is linear in the
+    state where y_hat is, so it has no maximum, and only the limit of the velocity holds the swarm.
+    """
+
+    @override
+    def fit_measurement(self, model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
+        y: Any = model.observation(x, record.u)
+        terms = model.residual(record.y.unsqueeze(1), y.mean) / (2.0 * y.variance)
+        return -torch.where(torch.isnan(terms), 0.0, terms).sum(-1)
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from pfbench.filter.proposed.swarm_coordinates import (
     LikelihoodFitness,
     ObservedComponents,
     PosteriorFitness,
+    PrintedFitness,
     SwarmFrame,
     observed_components,
 )
@@ -689,22 +690,14 @@ def test_the_printed_swarm_returns_the_measurement() -> None:
 
 
 def test_the_fitness_as_printed_has_no_maximum() -> None:
-    """exp(-(z - z_pred) / 2 R) rewards a prediction beyond the measurement without bound; no filter of ours seeks it."""
-
-    @dataclasses.dataclass(frozen=True)
-    class AsPrinted:
-        """Cancels the likelihood of the only state, z = q + mean, and puts the printed exponent in its place."""
-
-        def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
-            return lambda q: -0.5 * (0.0 - q[..., 0]) + 0.5 * q[..., 0].square()
-
+    """exp(-(z - z_pred) / 2 R) rewards a prediction beyond the measurement without bound; only the literal form seeks it."""
     model = LinearGaussian([[1.0]], [[1.0]], [[1.0]], [1.0], [0.0], [1.0])
     x = draws(1).normal("x", 50, 1)
     frame = AllComponents()(
         model, x - x.mean(1, keepdim=True), torch.full((1, 50), 0.02, dtype=torch.float64), ()
     )
     found = []
-    for fitness in (AsPrinted(), LikelihoodFitness()):
+    for fitness in (PrintedFitness(), LikelihoodFitness()):
         swarm = SwarmProposal(
             ESCAPE, None, fitness, AllComponents(), SwarmLimits(max_distance_sd=None), None, 60
         )

@@ -1,0 +1,99 @@
+"""The 88 claims of the papers as data: ids, kinds, factors with readings, proofs, and where a decision turns."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import yaml
+from checkout import ROOT
+from config_cases import GROUPS
+
+from pfbench.claims.claim_list import (
+    KINDS,
+    compute_size_share,
+    find_tipping_bound,
+    read_printed_claims,
+)
+from pfbench.claims.claim_records import read_claims
+from pfbench.claims.proofs import read_proofs
+
+CLAIMS = read_printed_claims()
+READINGS = ROOT / "conf" / "reading"
+
+
+def list_factors(paper: str) -> set[str]:
+    files = sorted((READINGS / f"paper_{paper}").glob("*.yaml"))
+    return {yaml.safe_load(file.read_text())["reading"][paper]["factor"] for file in files} - {
+        "none"
+    }
+
+
+def test_there_are_88_claims_and_those_of_the_first_ledger_are_among_them() -> None:
+    assert len(CLAIMS) == 88
+    counts = Counter(claim.paper for claim in CLAIMS)
+    assert counts == {"000": 10, "001": 12, "002": 40, "003": 11, "004": 15}
+    old = {claim.id for claim in read_claims()}
+    assert len(old) == 71
+    assert old < {claim.id for claim in CLAIMS}
+
+
+def test_each_claim_names_what_exists() -> None:
+    proofs = {proof.id: proof for proof in read_proofs()}
+    for claim in CLAIMS:
+        assert claim.a in {*GROUPS["filter"], "each"}, claim.id
+        assert len(claim.words) > 12, claim.id
+        assert claim.place, claim.id
+        assert set(claim.factors) <= list_factors(claim.paper), claim.id
+        assert not claim.proof or claim.id in proofs[claim.proof].claims, claim.id
+        assert (claim.kind == "number") <= bool(claim.printed or claim.mark.startswith("lost")), (
+            claim.id
+        )
+    named = {claim for proof in proofs.values() for claim in proof.claims}
+    assert named <= {claim.id for claim in CLAIMS}
+    assert {claim.id for claim in CLAIMS if claim.proof} == named
+
+
+def test_each_factor_of_a_paper_touches_a_claim() -> None:
+    for paper in ("000", "001", "002", "003", "004"):
+        touched = {factor for claim in CLAIMS if claim.paper == paper for factor in claim.factors}
+        assert list_factors(paper) <= touched
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("kind: best", r"kind must be one of better, much better, same, number"),
+        ("colour: red", r"must have other keys, got or missing \['colour'\]"),
+        ("mark: 'odd: x'", r"mark must begin with circular, vacuous, lost"),
+        ("id: C000-2", r"id must be unique, got C000-2"),
+    ],
+)
+def test_a_wrong_claim_is_told(change: str, message: str, tmp_path: Path) -> None:
+    row = {
+        "id": "C000-1",
+        "words": "a",
+        "place": "b",
+        "kind": "better",
+        "figure": "c",
+        "a": "sir",
+        "factors": [],
+    }
+    rows = [row | yaml.safe_load(change), row | {"id": "C000-2"}]
+    file = tmp_path / "claims.yaml"
+    file.write_text(yaml.safe_dump(rows))
+    with pytest.raises(ValueError, match=message):
+        read_printed_claims(file)
+
+
+def test_where_a_decision_turns() -> None:
+    assert find_tipping_bound("better", 0.85, 0.93) == 0.93
+    assert find_tipping_bound("same", 0.8, 1.1) == pytest.approx(1.25)
+    assert find_tipping_bound("same", 0.95, 1.2) == pytest.approx(1.2)
+    assert compute_size_share(0.45, 0.45) == 1.0
+    assert compute_size_share(0.9, 0.81) == pytest.approx(0.5)
+    assert compute_size_share(1.0, 0.45) == 0.0
+    assert all(0 < false <= true for true, false in KINDS.values())
+    assert math.isclose(KINDS["much better"][0], 0.8)
