@@ -7,8 +7,7 @@ from collections.abc import Iterator
 
 from pfbench.judge.judgement import Judgement
 from pfbench.judge.pair_verdicts import PairVerdict
-from pfbench.stats.comparison import EQUAL_WORD, NO_DECISION, SAME_RUNS
-from pfbench.stats.effects import MIN_RUNS
+from pfbench.stats.comparison import EQUAL_WORD, MIN_RUNS, NO_DECISION, SAME_RUNS
 from pfbench.stats.sentences import format_count, format_digits
 
 _TENFOLD = 10.0

@@ -20,6 +20,7 @@ from pfbench.judge.time_blocks import (
 from pfbench.results.status import keeps_track
 from pfbench.stats.comparison import (
     EQUALITY_MARGIN,
+    MIN_RUNS,
     NO_DECISION,
     SAME_RUNS,
     Effect,
@@ -29,7 +30,6 @@ from pfbench.stats.comparison import (
     compare,
     decide,
 )
-from pfbench.stats.effects import MIN_RUNS
 from pfbench.stats.error_measures import Array, Flags, rmse_per_run
 from pfbench.stats.sentences import format_count, format_digits
 

@@ -52,4 +52,4 @@ class UnprintedFilter(Filter):
         self, model: StateSpaceModel, belief: Any, record: Record, draws: RandomStream
     ) -> NoReturn:
         """Refuse to continue."""
-        return self.init(model, len(record.y), draws)
+        self.init(model, len(record.y), draws)
