@@ -11,13 +11,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import synthetic_results as synthetic
+from pfbench.stats.decision import Decision
 
 from pfbench.report import study_report
 from pfbench.report.options import ReportOptions
 from pfbench.report.study_report import decide_study
 from pfbench.results import frame, store
 from pfbench.results.paper_block import plan_installed_pairs
-from pfbench.stats.decision import Decision
 
 EFFECTS = {"sir": 0.4, "rpf": 0.2, "mcmc_rpf": 0.0}
 PAIRS = [("mcmc_rpf", "sir"), ("mcmc_rpf", "rpf")]

@@ -11,11 +11,11 @@ import numpy as np
 import pandas as pd
 import pytest
 import synthetic_results as synthetic
+from pfbench.stats.filter_sets import order_filters
+from pfbench.stats.planned_pairs import decide_planned_pairs
 
 from pfbench.report import study_report
 from pfbench.results import frame, store
-from pfbench.stats.filter_sets import order_filters
-from pfbench.stats.planned_pairs import decide_planned_pairs
 from pfbench.stats.study_runs import tidy_runs
 
 NOISES = ("nominal", "surge", "heavy", "outage", "jam")
