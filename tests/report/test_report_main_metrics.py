@@ -9,9 +9,12 @@ import pandas as pd
 import pytest
 import synthetic_results as synthetic
 
+from pfbench.report.board.entries import build_run_table
 from pfbench.report.options import ReportOptions
 from pfbench.report.study_report import write_report
 from pfbench.results import store
+from pfbench.results.conditions import load_conditions
+from pfbench.results.frame import load_frame
 from pfbench.stats.main_metrics import MAIN_METRICS
 
 
@@ -36,6 +39,23 @@ def median_ratio(results: Path, metric: str) -> float:
         logs[result.meta["label"]] = np.log(values)
     d = logs["ukf"] - logs["ekf"]
     return float(np.exp(np.median(np.add.outer(d, d)[np.triu_indices(len(d))] / 2)))
+
+
+def test_values_are_those_of_the_stored_arrays(results: Path) -> None:
+    """Of the runs that decide, and of the table of all metrics."""
+    runs = build_run_table(load_conditions("demo", results)).set_index(["filter", "run"])
+    table = load_frame("demo", results).query("metric == 'nees_ratio' and group == 'position'")
+    ratios = table.set_index(["label", "run"])["value"]
+    for path in sorted((results / "demo").glob("*.npz")):
+        result = store.read_result(path)
+        data, lost, label = result.data, result.data["lost"], result.meta["label"]
+        norm = np.linalg.norm(data["error"][..., 6:9].astype(float), axis=-1)
+        nees = data["nees"][..., 2].astype(float).mean(1) / 3
+        for values, expected in (
+            (runs.loc[label, "rmse"], np.sqrt((norm**2).mean(1))), (runs.loc[label, "max_error"], norm.max(1)),
+            (runs.loc[label, "nees_ratio"], nees), (ratios.loc[label], nees),
+        ):  # fmt: skip
+            np.testing.assert_allclose(values[~lost], expected[~lost], rtol=1e-6)
 
 
 @pytest.mark.parametrize("metric", ["rmse", "max_error", "log_score"])
