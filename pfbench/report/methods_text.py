@@ -163,11 +163,10 @@ def write_methods(pack: Pack) -> list[str]:
     """
     facts = MethodsFacts.from_entries(pack["methods"])
     names = {str(look["key"]): str(look["name"]) for look in pack["filters"]}
-    won = sum(bool(pair.get("won")) for pair in pack["planned"])
     done = [
         *_describe_design(facts),
         *_describe_particles(facts, names),
-        *_describe_decisions(facts, len(pack["planned"]), won),
+        *_describe_decisions(facts, len(pack["planned"])),
         *_describe_times(facts),
         *_describe_software(facts),
     ]
@@ -249,28 +248,23 @@ def _describe_equal_particles(numbers: Sequence[Sequence[int]]) -> str:
     return f"{text}: particle filters have {kind} numbers of particles."
 
 
-def _describe_decisions(facts: MethodsFacts, pairs: int, won: int) -> list[str]:
-    """Describe metric, intervals, tests and lost runs."""
+def _describe_decisions(facts: MethodsFacts, pairs: int) -> list[str]:
+    """Describe metric, lost runs, intervals, tests and families."""
     level = f"{100 * (1 - facts.alpha):g} %"
-    tests = (
-        f"{_count(pairs, 'planned pair')} {'is' if pairs == 1 else 'are'} decided from {_describe_units(pairs, won)}, paired by run, "
-        "with runs as units and Holm's correction over all pairs, separately for track and error; "
+    family = (
+        f"The {_count(pairs, 'planned pair')} {'is' if pairs == 1 else 'are'} one family, and so are the filters of a table."
         if pairs
-        else "No pair was planned; "
+        else "No pair was planned; the filters of a table are one family."
     )
     return [
-        f"The metric is the {facts.metric} over the time of a run; a run that is lost or diverges counts as the largest.",
-        f"Values are 20 % trimmed means over runs on the logarithmic scale, averaged over conditions; ratios to a baseline are paired by run, with {level} intervals.",
-        f"{tests}intervals are simultaneous ({level}), and filters within {100 * facts.margin:g} % are called equivalent.",
+        f"The metric is the {facts.metric} over the time of a run; a run that is lost or diverges counts as the limit of its world, "
+        "or as the largest error of the pair where the world states none.",
+        "Ratios are those of Hodges and Lehmann over paired runs, from logarithms that are averaged over the conditions, "
+        f"with simultaneous intervals ({level}).",
+        "Better and worse: Wilcoxon's signed-rank test and the t test of the 20 % trimmed mean both reject after Holm's "
+        f"correction and agree in sign. Equal: the interval lies within {100 * facts.margin:g} %.",
+        family,
     ]
-
-
-def _describe_units(pairs: int, won: int) -> str:
-    """Describe the differences that decide the planned pairs, some of them by the shares of runs won."""
-    means, shares = "these trimmed means", "the shares of runs won, since tracks are not kept"
-    if won in (0, pairs):
-        return f"the differences of {shares if won else means}"
-    return f"the differences of {means}, or for {won} of them of {shares}"
 
 
 def _describe_times(facts: MethodsFacts) -> list[str]:

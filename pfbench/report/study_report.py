@@ -40,7 +40,7 @@ from pfbench.results.metrics import METRICS
 from pfbench.results.paper_block import name_run_command
 from pfbench.results.plotting import line_styles
 from pfbench.results.step_times import STEP_TIMES
-from pfbench.stats.comparison import decide
+from pfbench.stats.comparison import Verdict, decide
 from pfbench.stats.consistency_bands import assess_consistency
 from pfbench.stats.study_runs import (
     compare_filters,
@@ -98,6 +98,7 @@ def write_report(
     files |= {
         "metrics.csv": format_csv(summarise_metrics(data.metrics)),
         "consistency.csv": format_csv(assess_consistency(data.metrics, options.alpha)),
+        RUNS_FILE: format_runs(table, pack),
     }
     times = conditions[0].jobs[0].path.parent / STEP_TIMES
     if times.is_file():
@@ -107,7 +108,7 @@ def write_report(
 
 
 def rebuild_page(folder: Path) -> Path:
-    """Write the page of a study again, from the file of its runs.
+    """Write the page of a study again, from the file of its runs, which stays as it is.
 
     Args:
         folder: Folder of the report.
@@ -134,7 +135,7 @@ def rebuild_page(folder: Path) -> Path:
 def render_study(
     pack: dict[str, Any], table: pd.DataFrame, folder: Path, others: Mapping[str, str | bytes]
 ) -> Files:
-    """Render all files of a study that follow from its runs: page, tables, runs, references and figures.
+    """Render all files of a study that follow from its runs: page, tables, references and figures.
 
     Args:
         pack: Data of the page.
@@ -148,7 +149,6 @@ def render_study(
     files: Files = {
         "verdicts.csv": format_verdicts(pack),
         "decisions.csv": format_csv(list_decisions(pack, table)),
-        RUNS_FILE: format_runs(table, pack),
         "pfbench.bib": pack["bibtex"],
         **({HEADLINE: headline} if headline else {}),
     }
@@ -185,7 +185,7 @@ def list_decisions(pack: Mapping[str, Any], table: pd.DataFrame) -> pd.DataFrame
     pairs = [pair for pair in combinations(labels, 2) if share_conditions(runs, *pair)]
     losses, margin = compute_losses(runs, facts.options.metric), math.log1p(pack["margin"])
     verdicts = decide(compare_filters(runs, losses, pairs), margin, pack["alpha"])
-    return pd.DataFrame([verdict._asdict() for verdict in verdicts])
+    return pd.DataFrame(verdicts, columns=list(Verdict._fields))
 
 
 def format_verdicts(pack: Mapping[str, Any]) -> str:
@@ -199,9 +199,10 @@ def format_verdicts(pack: Mapping[str, Any]) -> str:
 
 
 def list_downloads(files: Mapping[str, str | bytes]) -> list[dict[str, Any]]:
-    """List files as downloads of the page."""
-    entries = []
-    for name, content in files.items():
+    """List files as downloads of the page, whatever the order in which they were made."""
+    entries, order = [], {name: k for k, name in enumerate(_TITLES)}
+    for name in sorted(files, key=lambda name: (order.get(name, len(order)), name)):
+        content = files[name]
         path = Path(name)
         figure = f"{path.stem.removeprefix('paper_').replace('_', ' ')} ({path.suffix[1:].upper()})"
         group, title = _TITLES.get(name, ("Figures", figure))

@@ -245,7 +245,8 @@ def _decide_one(
         return Verdict(*names, SAME_RUNS, 1.0, 1.0, 1.0, math.nan, n, f"all {effect.unit}s agree")
     location, low, high = effect.estimate(level)
     if not is_testable(effect):
-        reason = f"{n} {effect.unit}s, {MIN_RUNS} are required" if n < MIN_RUNS else "no variation"
+        units = f"{n} {effect.unit}{'' if n == 1 else 's'}"
+        reason = f"{units}, {MIN_RUNS} are required" if n < MIN_RUNS else "no variation"
         return Verdict(*names, NO_DECISION, math.exp(location), 0.0, math.inf, math.nan, n, reason)
     is_signed, is_trimmed = p[0] < alpha, p[1] < alpha
     if is_signed:  # the interval that belongs to Holm's test may end at 0

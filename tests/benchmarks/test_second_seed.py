@@ -12,8 +12,7 @@ import pandas as pd
 import pytest
 from checkout import ROOT
 
-from pfbench.files import RecordedFolder
-from pfbench.report import read_page_data, write_page_data
+from pfbench.report import RUNS_FILE, format_runs, read_stored_study
 
 sys.path.insert(0, str(ROOT / "experiments" / "analyses"))  # scripts, not a package
 import merge_study
@@ -27,11 +26,10 @@ BEST = ("gate", "best")
 @pytest.mark.parametrize(
     ("first", "second", "outcome"),
     [
-        ((BEST, ("ekf", "worse")), (BEST, ("ekf", "open")), second_seed.SAME),
-        ((BEST, ("ekf", "open")), (("ekf", "best"), ("gate", "equal")), second_seed.OPEN),
-        ((BEST, ("ekf", "open")), (("ekf", "best"), ("gate", "worse")), second_seed.CHANGED),
-        ((BEST, ("ekf", "worse")), (("ekf", "best"), ("gate", "open")), second_seed.CHANGED),
-        ((BEST, ("ekf", "not_kept")), (("ekf", "best"), ("gate", "open")), second_seed.CHANGED),
+        ((BEST, ("ekf", "worse")), (BEST, ("ekf", "not decided")), second_seed.SAME),
+        ((BEST, ("ekf", "not decided")), (("ekf", "best"), ("gate", "equal")), second_seed.OPEN),
+        ((BEST, ("ekf", "not decided")), (("ekf", "best"), ("gate", "worse")), second_seed.CHANGED),
+        ((BEST, ("ekf", "worse")), (("ekf", "best"), ("gate", "not decided")), second_seed.CHANGED),
     ],
 )
 def test_the_best_filter_changes_only_by_a_verdict(first: Any, second: Any, outcome: str) -> None:
@@ -41,7 +39,7 @@ def test_the_best_filter_changes_only_by_a_verdict(first: Any, second: Any, outc
 def test_the_rank_correlation_is_that_of_the_orders() -> None:
     """One swap of neighbours among n filters leaves all pairs but one: 1 - 2 / (n (n - 1) / 2)."""
     names = ["a", "b", "c", "d"]
-    ranking = [(name, "open") for name in names]
+    ranking = [(name, "not decided") for name in names]
     swapped = [ranking[k] for k in (0, 2, 1, 3)]
     assert second_seed.compare_rankings(ranking, ranking).agreement == pytest.approx(1.0)
     assert second_seed.compare_rankings(ranking, ranking[::-1]).agreement == pytest.approx(-1.0)
@@ -49,58 +47,52 @@ def test_the_rank_correlation_is_that_of_the_orders() -> None:
 
 
 @pytest.mark.parametrize("study", ["robust_quad", "robust_canyon"])
-def test_rankings_are_those_of_the_report(study: str) -> None:
+def test_rankings_follow_the_order_of_the_report(study: str) -> None:
+    """The best filter has rank 1 on the page, and ranks do not fall along the ranking."""
     stored = robustness.read_study(study)
     rankings = second_seed.rank_filters(stored.runs, stored.facts)
     for (world, regime), ranking in rankings.items():
-        rows = [row for row in stored.list_rows(world) if row["regime"] == regime]
-        assert ranking == [(row["filter"], row["verdict"]) for row in rows]
+        ranks = {
+            row["filter"]: row["rank"] for row in stored.list_rows(world) if row["regime"] == regime
+        }
+        order = [ranks[label] for label, _ in ranking if label in ranks]
+        assert order == sorted(order)
+        assert (order[0], ranking[0][1]) == (1, "best")
+        assert {word for _, word in ranking[1:]} <= {
+            "equal",
+            "worse",
+            "not decided",
+            "identical",
+            "better",
+        }
     assert len(rankings) == len(stored.runs[["scenario", "regime"]].drop_duplicates())
 
 
-def test_filters_that_lose_the_track_are_the_last_of_a_table() -> None:
-    study, world = robustness.read_study("robust_quad"), "recorded_quad_flights"
-    verdicts: dict[str, set[str]] = {}
-    for row in study.list_rows(world):
-        verdicts.setdefault(row["filter"], set()).add(row["verdict"])
-    lost = {label for label, words in verdicts.items() if words == {"not_kept"}}
-    table = robustness._world_table(study, world).splitlines()
-    order = [line.split("`")[1] for line in table if line.startswith("| `")]
-    assert lost
-    assert set(order[-len(lost) :]) == lost
-
-
 def test_verdicts_that_differ_are_counted() -> None:
-    runs = pd.DataFrame({
-        "scenario": "w", "regime": ["nominal", "outliers"] * 3, "filter": ["a", "a", "b", "b", "c", "c"],
-    })  # fmt: skip
-    sets = iter([("a", "b"), ("b", "c")])
-    text = second_seed.compare_robust(
-        {"study": (runs, runs)}, lambda *_: next(sets), ("nominal", "outliers"), ("d",)
+    runs = pd.DataFrame(
+        {"scenario": "w", "regime": "outliers", "filter": ["a", "b", "c", "control"]}
     )
+    sets = iter([("a", "b"), ("b", "c")])
+    text = second_seed.compare_better({"study": (runs, runs)}, lambda *_: next(sets), "outliers")
     assert "| `w` | `b` | `a` | `c` |" in text
     assert (
-        "Of 3 pairs of a filter and a world, without the controls, 1 are robust with both" in text
+        "Of 3 pairs of a filter and a world, 1 are better than the control with both seeds" in text
     )
     assert "2 with one of them and 0 with none." in text
-    sets = iter([("a", "b"), ("b", "c")])
-    text = second_seed.compare_robust(
-        {"study": (runs, runs)}, lambda *_: next(sets), ("nominal", "outliers"), ("b",)
-    )
-    assert "| `w` | – | `a` | `c` |" in text  # the control is not compared with itself
-    assert "Of 2 pairs" in text
+    text = second_seed.compare_better({"study": (runs, runs)}, lambda *_: next(sets), "nominal")
+    assert "Of 0 pairs" in text  # no world has this regime
 
 
 def test_a_study_without_a_new_report_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(second_seed, "RUNS", tmp_path / "runs.parquet")
+    monkeypatch.setattr(second_seed, "RUNS_FILE", tmp_path / "runs.parquet")
     for study, values in (("a", [1.0]), ("b", [2.0]), ("b", [3.0])):
         folder = tmp_path / f"{study}{values[0]}" / study
         folder.mkdir(parents=True)
         pd.DataFrame({"rmse": values}).to_parquet(folder / "runs.parquet")
         second_seed.store_runs(folder.parent, ("a", "b"))
-    stored = pd.read_parquet(second_seed.RUNS)
+    stored = pd.read_parquet(second_seed.RUNS_FILE)
     assert dict(zip(stored["study"], stored["rmse"], strict=True)) == {"a": 1.0, "b": 3.0}
 
 
@@ -138,23 +130,19 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
     """A published study, and a newer report of two of its filters, one with another tuning and other errors."""
     for name in ("published", "newer"):
         (tmp_path / name / "robust_canyon").mkdir(parents=True)
-        for file in ("report.md", "page.json.gz", "runs.parquet", "verdicts.csv", "headline.svg"):
-            shutil.copy(
-                ROOT / "reports" / "robust_canyon" / file, tmp_path / name / "robust_canyon"
-            )
+        shutil.copy(
+            ROOT / "reports" / "robust_canyon" / RUNS_FILE, tmp_path / name / "robust_canyon"
+        )
     folder = tmp_path / "newer" / "robust_canyon"
-    runs = pd.read_parquet(folder / "runs.parquet")
+    pack, runs = read_stored_study(folder)
     runs = runs[runs["filter"].isin(["ekf", "gate_tuned"])]
     runs.loc[runs["filter"] == "gate_tuned", "rmse"] *= 0.5
     runs["ms"] *= 9.0  # on a busy machine
-    runs.to_parquet(folder / "runs.parquet", index=False)
-    pack = read_page_data(folder)
     pack["facts"]["looks"] = [
         {**look, "tuning": "recorded_berlin (new)" if look["key"] == "gate_tuned" else look["tuning"]}
         for look in pack["facts"]["looks"] if look["key"] in ("ekf", "gate_tuned")
     ]  # fmt: skip
-    with RecordedFolder(folder, is_complete=False) as target:
-        write_page_data(pack, target)
+    (folder / RUNS_FILE).write_bytes(format_runs(runs, pack))
     return tmp_path / "published", tmp_path / "newer"
 
 
@@ -172,7 +160,7 @@ def test_newer_jobs_replace_a_filter_and_the_page_is_decided_again(
     assert len(pairs) == len(before) == len(after)
     np.testing.assert_allclose(ratio, expected)
     np.testing.assert_array_equal(pairs["ms_x"], pairs["ms_y"])
-    pack = read_page_data(published / "robust_canyon")
+    pack = read_stored_study(published / "robust_canyon").pack
     assert next(iter(pack["views"].values()))["rows"][0]["filter"] == "gate_tuned"
     assert pack["methods"]["tuned"]["recorded_berlin (new)"] == 1
     page = (published / "robust_canyon" / "report.md").read_text()
@@ -181,15 +169,20 @@ def test_newer_jobs_replace_a_filter_and_the_page_is_decided_again(
 
 def test_other_data_are_refused(folders: tuple[Path, Path]) -> None:
     published, newer = folders
-    path = newer / "robust_canyon" / "runs.parquet"
-    runs = pd.read_parquet(path)
+    path = newer / "robust_canyon" / RUNS_FILE
+    pack, runs = read_stored_study(path.parent)
+
+    def write(table: pd.DataFrame) -> None:
+        looks = [look for look in pack["facts"]["looks"] if look["key"] in set(table["filter"])]
+        path.write_bytes(format_runs(table, {**pack, "facts": {**pack["facts"], "looks": looks}}))
+
     is_control = runs["filter"] == "ekf"
-    runs.assign(rmse=np.where(is_control, 1.01, 1.0) * runs["rmse"]).to_parquet(path)
+    write(runs.assign(rmse=np.where(is_control, 1.01, 1.0) * runs["rmse"]))
     with pytest.raises(ValueError, match=r"errors of ekf must be those of the published study"):
         merge_study.merge_study("robust_canyon", newer, published)
-    runs[~is_control].to_parquet(path)
+    write(runs[~is_control])
     with pytest.raises(ValueError, match=r"must have a filter of the published study on the same"):
         merge_study.merge_study("robust_canyon", newer, published)
-    runs[is_control | (runs["run"] < 40)].to_parquet(path)
+    write(runs[is_control | (runs["run"] < 40)])
     with pytest.raises(ValueError, match=r"all runs of gate_tuned .* got 10 missing"):
         merge_study.merge_study("robust_canyon", newer, published)

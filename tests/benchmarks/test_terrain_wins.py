@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from checkout import ROOT
 from scipy import stats
+
+from pfbench.report.board.entries import ViewKey
 
 sys.path.insert(0, str(ROOT / "experiments" / "analyses"))  # scripts, not a package
 import paired_errors
@@ -54,21 +55,16 @@ def test_a_win_is_a_decision_of_paired_runs() -> None:
     assert errors.shape == (RUNS, 4)
 
 
-def test_the_answer_names_the_doses_and_the_joint_verdicts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(terrain_wins, "REPORTS", tmp_path)
+def test_the_answer_names_the_doses_and_the_joint_verdicts(monkeypatch: pytest.MonkeyPatch) -> None:
     seeds = {"terrain_rough": make_runs({20.0: (2.0, 1.5, 1.4), 500.0: (1.5, 1.0, 0.5)})}
     monkeypatch.setattr(terrain_wins, "read_runs", lambda name: seeds.get(name, pd.DataFrame()))
-    row = {"metric": "rmse", "world": "terrain[initial_sd=20.0]", "baseline": "rpf"}
-    verdicts = [
-        {**row, "filter": "gpf", "verdict": "best", "words": "smallest"},
-        {**row, "filter": "ekf_bank", "verdict": "worse", "words": "+88 %"},
-        {**row, "filter": "ekf_bank_dense", "verdict": "open", "words": "'-4.0 to +73 %"},
-        {**row, "metric": "crps", "filter": "ekf_bank", "verdict": "open", "words": "no"},
-    ]
-    (tmp_path / "terrain_rough").mkdir()
-    pd.DataFrame(verdicts).to_csv(tmp_path / "terrain_rough" / "verdicts.csv", index=False)
+    key = ViewKey("rmse", "terrain[initial_sd=20.0]", "all", "rpf")
+    rows = [
+        {"filter": "ekf_bank", "ratio": 1.5, "ratio_low": 1.4, "ratio_high": 1.6, "verdict": "worse"},
+        {"filter": "ekf_bank_dense", "ratio": 1.4, "ratio_low": 0.96, "ratio_high": 1.73, "verdict": "not decided"},
+    ]  # fmt: skip
+    views = {key._replace(metric="crps"): {"rows": []}, key: {"rows": rows}}
+    monkeypatch.setattr(terrain_wins, "read_stored_study", lambda folder: ({"views": views}, None))
     start = make_runs({50.0: (1.0, 1.0, 1.0), 400.0: (2.0, 1.0, 0.8)})
     rough = make_runs({20.0: (2.0, 1.5, 1.4), 500.0: (1.5, 1.0, 1.0)})
     text = terrain_wins.describe_answer({"terrain_start": start, "terrain_rough": rough}, FAMILIES)
@@ -79,7 +75,8 @@ def test_the_answer_names_the_doses_and_the_joint_verdicts(
         in text
     )
     assert (
-        "that of `gpf`: `ekf_bank` is worse (+88 %), `ekf_bank_dense` is not decided (-4.0" in text
+        "together: `ekf_bank` 1.50 [1.40, 1.60], worse; `ekf_bank_dense` 1.40 [0.96, 1.73], not decided."
+        in text
     )
     assert (
         "With a second seed and 40 runs, which decide this one statement, it is shown to be" in text

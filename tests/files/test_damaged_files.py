@@ -139,7 +139,7 @@ def test_a_report_leaves_a_damaged_job_out_and_says_so(tmp_path: Path) -> None:
     )
     assert pfbench(*words, home=tmp_path).code == 0
     page = (tmp_path / "reports" / "adhoc" / "report.md").read_text()
-    assert "1 job has no valid result and is missing from all tables" in page.splitlines()[2]
+    assert "1 job has no valid result and is missing from all tables" in page.splitlines()[4]
     assert "npz was damaged. Run the job again" in page
     assert file.stem in page
     assert not file.exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import gzip
 import io
 import os
@@ -19,7 +20,7 @@ from pyarrow import parquet
 from pfbench.files import limits
 from pfbench.files.table_file import read_table_file
 from pfbench.filter.learned.checkpoint import read_checkpoint
-from pfbench.report.study_report import PAGE_DATA, read_page_data
+from pfbench.report import RUNS_FILE, read_stored_study
 from pfbench.results.store import read_metadata, read_result
 from pfbench.scenario.simulated import _read
 
@@ -33,6 +34,12 @@ def write_zip(path: Path) -> None:
 def write_gzip(path: Path) -> None:
     part = gzip.compress(bytes(2**20))
     path.write_bytes(part * 500)  # members, which a reader joins
+
+
+def write_metadata(path: Path) -> None:
+    bomb = base64.b64encode(gzip.compress(bytes(2**20)) * 250)
+    table = pa.table({"filter": ["a"]}).replace_schema_metadata({b"pfbench": bomb})
+    parquet.write_table(table, path)
 
 
 def write_columns(path: Path) -> None:
@@ -51,7 +58,8 @@ CASES: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]] =
     "metadata of a result": ("a.npz", write_zip, read_metadata),
     "a checkpoint": ("a.pt", write_zip, read_checkpoint),
     "an episode": ("a.npz", write_zip, _read),
-    "a page": (PAGE_DATA, write_gzip, lambda path: read_page_data(path.parent)),
+    "a gzip file": ("a.gz", write_gzip, limits.read_gzip),
+    "metadata of a study": (RUNS_FILE, write_metadata, lambda path: read_stored_study(path.parent)),
     "a table of columns": ("a.csv", write_columns, read_table_file),
     "a table of rows": ("a.parquet", write_rows, read_table_file),
     "a pipe": ("a.csv", os.mkfifo, read_table_file),

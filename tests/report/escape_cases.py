@@ -18,8 +18,8 @@ _FILES = (
     "metrics.csv",
     "headline.svg",
     "runs.parquet",
-    "decisions.json",
-    "consistency.json",
+    "decisions.csv",
+    "consistency.csv",
     "pfbench.bib",
 )
 _LATEX = re.compile(r"(?<!\\)(\\evil|<img|\|<|&lt)")

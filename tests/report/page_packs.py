@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import itertools
+import json
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from pfbench.report.study_page import render_page
 
 FAMILIES = ("kalman", "particle", "gaussian", "guided", "swarm")
 COLOURS = {
@@ -17,6 +23,7 @@ COLOURS = {
     "swarm": ("#a01266", "#f07ac0"),
 }
 MARKERS = "os^Dv<>Pp*"
+LIMIT = 50.0  # of the worlds, error of a filter that loses track
 METRICS = (("rmse", "RMS error", "m"), ("final", "Last quarter", "m"), ("crps", "CRPS", "m"))
 
 
@@ -64,7 +71,7 @@ def build_pack(
     for i in missing:
         errors[i] = np.nan
     keys = [str(filters - i) if numbered else f"f{i}" for i in range(filters)]
-    built = _Numbers(keys, errors, set(lost), set(missing), rng)
+    built = _Numbers(keys, errors, set(lost), rng)
     cells = list(itertools.product(range(worlds), range(regimes)))
     tracks = (
         {_cell(c): built.tracks(c, min(carried, runs), plane) for c in cells} if carried else {}
@@ -74,10 +81,13 @@ def build_pack(
         "title": "Invented study",
         "generated": {"commit": "0" * 7, "date": "2026-01-31", "version": "0.0"},
         "alpha": 0.05,
+        "margin": 0.05,
+        "warnings": [],
+        "failures": [],
         "filters": [{**_look(i, names or {}), "key": key} for i, key in enumerate(keys)],
         "worlds": [
             {"key": f"w{i}", "name": f"World {i}", "words": f"Words of world {i}.", "unit": "m",
-             "limit": 50.0, "family": f"w{i}"} for i in range(worlds)
+             "limit": LIMIT, "family": f"w{i}"} for i in range(worlds)
         ],
         "regimes": [
             {"key": f"r{i}", "name": ("Nominal", "Outliers", "Heavy tails", "Outage")[i % 4],
@@ -130,10 +140,8 @@ def build_pack(
 class _Numbers:
     """Invented numbers of all parts of a pack."""
 
-    def __init__(
-        self, keys: list[str], errors: Any, lost: set[int], missing: set[Any], rng: Any
-    ) -> None:
-        self.keys, self.errors, self.lost, self.missing, self.rng = keys, errors, lost, missing, rng
+    def __init__(self, keys: list[str], errors: Any, lost: set[int], rng: Any) -> None:
+        self.keys, self.errors, self.lost, self.rng = keys, errors, lost, rng
         self.are_equal = len(errors) > 1 and np.array_equal(errors[0], errors[1], equal_nan=True)
         self.baselines = 3 if errors[..., 0].size <= 300 else 2
         self.cost = np.exp(rng.normal(1, 1, len(keys)))
@@ -158,65 +166,89 @@ class _Numbers:
             picked = picked[:, w : w + 1]
         if r != "all":
             picked = picked[:, :, r : r + 1]
-        single = picked.shape[1] * picked.shape[2] == 1
-        with np.errstate(all="ignore"):
-            log = np.log(picked)
-            means = np.array([np.nan if np.isnan(v).all() else np.nanmean(v) for v in log])
-        sd = 0.3 / np.sqrt(picked.shape[3])
+        count, runs = picked.shape[1] * picked.shape[2], picked.shape[3]
+        log = np.log(picked)
+        log[sorted(self.lost)] = np.log(LIMIT)
+        means = log.mean(axis=(1, 2, 3))  # NaN for a filter that lacks a condition
+        sd = 0.3 / np.sqrt(runs)
         order = sorted(range(len(self.keys)), key=lambda i: (np.isnan(means[i]), means[i], i))
-        best = means[order[0]]
-        rows = [self.row(i, k, means, best, means[b], sd, single) for k, i in enumerate(order)]
-        names = [f"[[Filter {order[0]}]]", f"{100 * (np.exp(best - means[b]) - 1):.3g} %"]
+        rows = [self.row(i, k, means, b, sd, count, runs) for k, i in enumerate(order)]
+        better = [row for row in rows if row["verdict"] == "better"]
+        best = (
+            f" (best: [[Filter {order[0]}]], {better[0]['ratio']:.2f} of its error)"
+            if better
+            else ""
+        )
         return {
-            "sentence": f"{names[0]} has the smallest error: {names[1]} against Filter {b} "
-            "(95 % interval 18 to 33 %), at 1.2 times its cost. Best proposed method: [[Filter 0]].",
+            "sentence": f"Of {len(rows) - 1} filters, {len(better)} are better than [[Filter {b}]]{best}. "
+            "Best proposed method: [[Filter 0]].",
             "small_print": f"{len(self.keys)} filters; intervals 95 %, jointly; one seed.",
             "rows": rows,
         }
 
     def row(
-        self, i: int, k: int, means: Any, best: float, base: float, sd: float, single: bool
+        self, i: int, k: int, means: Any, b: int, sd: float, count: int, runs: int
     ) -> dict[str, Any]:
-        gap = means[i] - best
-        if np.isnan(gap):
-            word = "not_kept" if i in self.lost else "missing"
-        else:
-            word = "best" if k == 0 else "open" if gap < 4 * sd else "worse"
+        gap, single = means[i] - means[b], count == 1
+        is_lost, is_missing = i in self.lost, bool(np.isnan(means[i]))
+        word, words = self.decide(i, b, gap, sd, runs)
+        if is_lost:
+            share = "100 % of runs" if single else f"{count}/{count}"
+            word = "loses track" if single and i != b else word
+            words = ", ".join(
+                (*([words] if word != "loses track" else []), f"loses track in {share}")
+            )
         spread = np.exp(np.array([0, -2, 2]) * sd)
         value = np.exp(means[i]) * spread if single else [np.nan] * 3
-        ratio = np.exp(means[i] - base) * spread
+        ratio = np.exp(gap) * (spread if i != b else np.ones(3))
+        if runs < 10 and i != b:
+            ratio[1:] = 0.0, np.inf
+        coverage = None if is_lost or is_missing else self.coverage[i]
         return {
-            "filter": self.keys[i], "rank": None if np.isnan(gap) else k + 1, "tied": word == "open",
+            "filter": self.keys[i], "rank": None if is_missing else k + 1,
             "value": _short(value[0]), "low": _short(value[1]), "high": _short(value[2]),
             "unit": "m" if single else None,
             "ratio": _short(ratio[0]), "ratio_low": _short(ratio[1]), "ratio_high": _short(ratio[2]),
-            "verdict": word,
-            "words": {"best": "best", "open": f"{100 * (gap - 2 * sd):+.0f} to {100 * (gap + 2 * sd):+.0f} %",
-                      "worse": f"{100 * np.expm1(gap):+.0f} %", "not_kept": "track not kept"}.get(word, "not run"),
-            "track": _short(0.0 if i in self.lost else 1 - 0.03 * i), "lost": 20 if i in self.lost else 0,
-            "coverage": None if word in ("not_kept", "missing") else _short(self.coverage[i]),
-            "nees": _short(1 / self.coverage[i]),
-            "calibration": None if word in ("not_kept", "missing") else
-            "too low" if self.coverage[i] < 0.85 else "consistent",
-            "ms": _short(self.cost[i]),
+            "p": None if i == b or is_missing else 0.01, "verdict": word, "words": words,
+            "track": _short(0.0 if is_lost else 1 - 0.03 * i), "lost": 20 if is_lost else 0,
+            "lost_conditions": count if is_lost else 0,
+            "coverage": coverage and _short(coverage), "nees": _short(1 / self.coverage[i]),
+            "calibration": "too low" if coverage and coverage < 0.85 else None, "ms": _short(self.cost[i]),
         }  # fmt: skip
+
+    def decide(self, i: int, b: int, gap: float, sd: float, runs: int) -> tuple[str, str]:
+        if i == b:
+            return "baseline", "baseline"
+        if np.isnan(gap):
+            return "missing", "not run in all conditions"
+        if self.are_equal:
+            return "identical", "identical, all runs agree"
+        if runs < 10:
+            return "not decided", f"not decided, {runs} runs, 10 are required"
+        if abs(gap) < sd / 2:
+            return "equal", "equal within 5 %"
+        word = "not decided" if abs(gap) < 2 * sd else "better" if gap < 0 else "worse"
+        return word, word
 
     def planned(self, worlds: int, regimes: int) -> list[dict[str, Any]]:
         pairs = [(i, i + 1) for i in range(0, len(self.keys) - 1, 3)]
         found = []
-        for a, b in pairs:
+        for k, (a, b) in enumerate(pairs):
             gaps = np.log(self.errors[a] / self.errors[b]).mean(-1).mean(-1)
             if np.isnan(gaps).any():
                 continue
-            mean, sd = gaps.mean(), 0.3 / np.sqrt(self.errors.shape[-1])
+            runs = self.errors.shape[-1]
+            mean, sd = gaps.mean(), 0.3 / np.sqrt(runs)
+            word, words = self.decide(a, b, mean, sd, runs)
+            has_interval = runs >= 10 or self.are_equal
             found.append({
-                "a": self.keys[a], "b": self.keys[b], "question": "Error in these worlds", "kind": "paper",
-                "sentence": f"In these worlds Filter {a} against Filter {b}.",
-                "estimate": _short(np.exp(mean)), "low": _short(np.exp(mean - 2 * sd)),
-                "high": _short(np.exp(mean + 2 * sd)), "p": 0.01, "reason": "", "word": "better" if mean < -2 * sd else "open",
-                "new_world": None if worlds < 2 else {"estimate": _short(np.exp(mean)),
-                    "low": _short(np.exp(mean - 0.5)), "high": _short(np.exp(mean + 0.5)), "word": "open"},
-                "prediction": None if worlds < 3 else [_short(np.exp(mean - 1)), _short(np.exp(mean + 1))],
+                "a": self.keys[a], "b": self.keys[b], "kind": ("paper", "tuned", "")[k % 3], "word": word,
+                "sentence": f"[[Filter {a}]] against [[Filter {b}]]: {words}.",
+                "estimate": _short(np.exp(mean)), "low": _short(np.exp(mean - 2 * sd)) if has_interval else None,
+                "high": _short(np.exp(mean + 2 * sd)) if has_interval else None,
+                "p": 0.01, "reason": words.partition(", ")[2] or None,
+                "new_world": None if worlds < 2 else {"estimate": _short(np.exp(mean)), "worlds": worlds,
+                    "low": _short(np.exp(mean - 0.5)), "high": _short(np.exp(mean + 0.5)), "word": "not decided"},
                 "cells": [{"world": f"w{w}", "regime": "all", "name": f"World {w}", "estimate": _short(np.exp(g)),
                            "low": _short(np.exp(g - sd)), "high": _short(np.exp(g + sd))}
                           for w, g in enumerate(gaps)],
@@ -288,6 +320,19 @@ class _Numbers:
             built["truth"] = {"all": truth.round(1).tolist()}
             built["plane"] = {k: {j: e.tolist() for j, e in r.items()} for k, r in offset.items()}
         return built
+
+
+def write(pack: dict[str, Any], folder: Path) -> Path:
+    """Write the page of a pack to a folder; return the path of index.html."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in render_page(pack).items():
+        (folder / name).write_text(text, encoding="utf-8")
+    return folder / "index.html"
+
+
+def unpack(text: str) -> dict[str, Any]:
+    """Return the data of a page: JSON in gzip and base 64."""
+    return dict(json.loads(gzip.decompress(base64.b64decode(text))))
 
 
 def _short(value: float) -> float | None:

@@ -118,10 +118,7 @@ def test_the_level_of_a_report_is_that_of_its_option(results: Path, alpha: float
     pack = build_pack("demo", load_conditions("demo", results), ReportOptions(alpha=alpha))
     level = f"{100 * (1 - alpha):g} %"
     for view in pack["views"].values():
-        assert f"ratio: {level} each" in view["small_print"]
-        assert f"together at {level}" in view["small_print"]
-        if "interval" in view["sentence"]:
-            assert f"{level} interval" in view["sentence"]
+        assert f"with simultaneous {level} intervals" in view["small_print"]
     assert level in write_methods(pack)[0]
 
 
@@ -144,18 +141,22 @@ def test_one_baseline_measures_all_filters(results: Path) -> None:
     assert missing["time"] == "The study has no jobs with budget=time."
 
 
-def test_a_baseline_without_an_error_is_replaced_in_words(tmp_path: Path) -> None:
-    absent = synthetic.Method("apf", 1.2, 0.9, 200, 3.0, tuple(range(12)))
-    synthetic.study(tmp_path / "demo", runs=12, steps=10, methods=(*synthetic.METHODS, absent))
-    conditions = load_conditions("demo", tmp_path)
-    words = (
-        "[[APF]] has no error to compare in all conditions: [[EKF]] is the baseline in its place."
+def test_the_baseline_of_a_page_does_not_depend_on_its_results(tmp_path: Path) -> None:
+    """It is that of the labels, also if it is the worst filter or lost all runs."""
+    others = synthetic.METHODS[1:]
+    first = synthetic.METHODS[0]
+    doomed = (
+        first._replace(size=0.01),
+        first._replace(size=500.0),
+        first._replace(lost=tuple(range(12))),
     )
-    for baseline, is_said in (("apf", True), ("ukf", False)):
-        pack = build_pack("demo", conditions, ReportOptions(baseline=baseline))
-        assert [words in view["sentence"] for view in pack["views"].values()] == [is_said] * len(
-            pack["views"]
-        )
+    for k, ekf in enumerate(doomed):
+        synthetic.study(tmp_path / f"study_{k}", runs=12, steps=10, methods=(ekf, *others))
+        conditions = load_conditions(f"study_{k}", tmp_path)
+        pack = build_pack(f"study_{k}", conditions, ReportOptions())
+        assert pack["baselines"] == ["ekf", "sir", "ukf"]
+        assert {key.baseline for key in pack["views"]} == {"ekf", "sir", "ukf"}
+        assert next(iter(pack["views"])).baseline == "ekf"
 
 
 def test_a_page_says_that_jobs_are_of_uncommitted_code() -> None:

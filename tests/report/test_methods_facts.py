@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
-import json
 import shutil
 from dataclasses import fields
 from pathlib import Path
@@ -14,14 +12,13 @@ import synthetic_results as synthetic
 from command_line import pfbench
 from page_packs import build_pack
 
-from pfbench.report import read_page_data
+from pfbench.report import RUNS_FILE, format_runs, read_stored_study
 from pfbench.report.journal.paper_folder import format_methods
 from pfbench.report.methods_text import MethodsFacts, collect_methods_facts, write_methods
 from pfbench.report.study_report import rebuild_page, write_report
 from pfbench.results.conditions import Condition, load_conditions
 
 FACTS = [field.name for field in fields(MethodsFacts)]
-WON = {"estimate": -51.7, "low": -63.8, "high": -0.288, "track": [0.966, 0.9791]}
 # another value of each fact, and words that the paragraph then has
 CHANGED: dict[str, tuple[Any, str]] = {
     "filters": (1, "compares 1 filter with pfbench"),
@@ -34,8 +31,8 @@ CHANGED: dict[str, tuple[Any, str]] = {
     "particles": ({"f0": [100], "f1": [100], "f2": [200]}, "exceptions: 200 (Filter 2)."),
     "budgets": (["particles", "time"], "chosen for equal cost (time)."),
     "metric": ("CRPS", "The metric is the CRPS over the time of a run"),
-    "alpha": (0.01, "intervals are simultaneous (99 %)"),
-    "margin": (0.1, "filters within 10 % are called equivalent"),
+    "alpha": (0.01, "simultaneous intervals (99 %)"),
+    "margin": (0.1, "Equal: the interval lies within 10 %."),
     "rounds": (7, "Times per step are medians of 7 or more rounds"),
     "software": (
         {"pfbench": ["1.2"], "commit": [], "python": ["3.14"], "torch": ["2.9"], "numpy": ["2.4"],
@@ -93,13 +90,12 @@ def test_a_missing_fact_is_named(name: str, pack: dict[str, Any]) -> None:
 
 def test_a_stored_page_without_facts_is_refused(home: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(home / "reports" / "demo", tmp_path / "reports" / "demo"))
-    file = folder / "page.json.gz"
-    stored = json.loads(gzip.decompress(file.read_bytes()))
+    file = folder / RUNS_FILE
     page = (folder / "index.html").read_bytes()
-    del stored["methods"]["seeds"]
-    for facts, missing in ((stored["methods"], "seeds"), (None, ", ".join(FACTS))):
-        stored["methods"] = facts
-        file.write_bytes(gzip.compress(json.dumps(stored).encode()))
+    stored = read_stored_study(folder)
+    facts = {key: value for key, value in stored.pack["methods"].items() if key != "seeds"}
+    for methods, missing in ((facts, "seeds"), (None, ", ".join(FACTS))):
+        file.write_bytes(format_runs(stored.table, {**stored.pack, "methods": methods}))
         for words in (("report",), ("paper", "journal=ieee")):
             said = pfbench(*words, "study=demo", f"reports_dir={folder.parent}", home=tmp_path)
             assert said.code == 2
@@ -112,7 +108,8 @@ def test_a_stored_page_without_facts_is_refused(home: Path, tmp_path: Path) -> N
 def test_all_readers_write_the_same_paragraph(home: Path, tmp_path: Path) -> None:
     """A fresh report, a page of stored data, and papers with and without results."""
     folder = Path(shutil.copytree(home / "reports" / "demo", tmp_path / "reports" / "demo"))
-    texts = write_methods(read_page_data(folder))
+    stored = read_stored_study(folder).pack
+    texts = write_methods(stored)
     for page in (folder / "index.html", rebuild_page(folder)):
         shown = page.read_text().replace("&#39;", "'")
         assert all(f"<p>{text}</p>" in shown for text in texts)
@@ -121,8 +118,6 @@ def test_all_readers_write_the_same_paragraph(home: Path, tmp_path: Path) -> Non
         assert (said := pfbench("paper", *words, home=place)).code == 0, said.err
         written = (place / "reports" / "demo" / "paper" / "methods.tex").read_text()
         assert written == format_methods(texts)
-    stored = json.loads(gzip.decompress((folder / "page.json.gz").read_bytes()))
-    assert "methods_paragraph" not in stored
     restored = MethodsFacts.from_entries(stored["methods"])
     assert restored == collect_methods_facts(load_conditions("demo", home / "results"))
 
@@ -130,16 +125,26 @@ def test_all_readers_write_the_same_paragraph(home: Path, tmp_path: Path) -> Non
 def test_pairs_and_names_are_those_that_the_page_decides_again(pack: dict[str, Any]) -> None:
     pack["methods"]["particles"] = {"f0": [100], "f1": [200]}
     pack["filters"][1]["name"] = "New name"
-    pack["planned"] = [{"won": WON}, {}]
+    pack["planned"] = [{}, {}]
     text = text_of(pack)
     assert "Particle filters used 100 (Filter 0) and 200 (New name) particles." in text
-    assert "2 planned pairs are decided from the differences of these trimmed means, or for 1 of them of the shares of runs won" in text  # fmt: skip
-    pack["planned"] = [{"won": WON}]
-    assert "1 planned pair is decided from the differences of the shares of runs won, since" in (
-        text_of(pack)
-    )
+    assert "The 2 planned pairs are one family, and so are the filters of a table." in text
+    pack["planned"] = [{}]
+    assert "The 1 planned pair is one family" in text_of(pack)
     pack["planned"] = []
-    assert "No pair was planned; intervals are simultaneous" in text_of(pack)
+    assert "No pair was planned; the filters of a table are one family." in text_of(pack)
+
+
+def test_the_paragraph_has_the_words_of_the_tests_that_decide(pack: dict[str, Any]) -> None:
+    text = text_of(pack)
+    for words in (
+        "Hodges and Lehmann",
+        "Wilcoxon's signed-rank test",
+        "trimmed mean",
+        "Holm's correction",
+    ):
+        assert words in text
+    assert "counts as the limit of its world, or as the largest error of the pair" in text
 
 
 @pytest.mark.parametrize(("numbers", "text", "kind"), [

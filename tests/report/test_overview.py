@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import subprocess
@@ -16,10 +17,9 @@ import pytest
 from checkout import ROOT
 from scipy import stats
 
-from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import study_report
 from pfbench.report.overview import figures
-from pfbench.report.overview.page import list_verdicts, word_headline, write_overview
+from pfbench.report.overview.page import list_verdicts, render_overview, word_headline
 from pfbench.report.overview.tables import (
     Overview,
     build_overview,
@@ -293,7 +293,6 @@ def test_a_study_without_references_keeps_its_first_page(
     monkeypatch.setattr(study_report.StudyFacts, "from_pack", lambda pack: facts)
     assert study_report.find_overviews({}, table) is not None
     assert study_report.find_overviews({}, table.assign(model="other")) is None
-    assert study_report.find_overviews({}, None) is None
 
 
 def test_ink_has_contrast_on_every_ground() -> None:
@@ -331,20 +330,20 @@ def test_undecided_cells_have_no_colour_and_lost_tracks_are_grey(overview: Overv
             assert drawn[key].value == pytest.approx(math.log(cell.verdict.ratio))
 
 
-def test_the_page_has_its_figures_tables_and_stories(overview: Overview, tmp_path: Path) -> None:
+def test_the_page_has_its_figures_tables_and_stories(overview: Overview) -> None:
     pack = {
         "study": "s",
         "title": "A title",
         "generated": {"version": "0", "commit": "abc", "date": ""},
     }
-    with RecordedFolder(tmp_path / "study") as folder:
-        page = write_overview({0: overview}, pack, folder).read_text()
-    assert {f.name for f in (tmp_path / "study").iterdir()} >= {
+    files = render_overview({0: overview}, pack)
+    page = files["index.html"]
+    assert set(files) >= {
         "index.html", "report.md", "cells.csv", "pairs.csv", "heat_map.svg", "matrices_column.svg",
     }  # fmt: skip
     assert page.count("data:image/svg+xml;base64,") == 4
     assert "http://" not in page.replace("http://www.w3.org", "")
-    text = (tmp_path / "study" / "report.md").read_text()
+    text = files["report.md"]
     for method in overview.methods:
         assert overview.names[method] in page
         assert overview.names[method] in text
@@ -395,17 +394,15 @@ def test_labels_without_their_number_of_particles() -> None:
     ]
 
 
-def test_the_page_of_several_numbers_shows_them(
-    levels: dict[int, Overview], tmp_path: Path
-) -> None:
+def test_the_page_of_several_numbers_shows_them(levels: dict[int, Overview]) -> None:
     pack = {"study": "s", "title": "T", "generated": {"version": "0", "commit": "abc", "date": ""}}
-    with RecordedFolder(tmp_path / "study") as folder:
-        page = write_overview(levels, pack, folder).read_text()
+    files = render_overview(levels, pack)
+    page = files["index.html"]
     assert "How many particles are enough?" in page
     assert "<summary>100 particles</summary>" in page
-    table = pd.read_csv(tmp_path / "study" / "cells.csv")
+    table = pd.read_csv(io.StringIO(files["cells.csv"]))
     assert set(table["particles"]) == {100, 1000}
-    assert (tmp_path / "study" / "error_by_time.svg").stat().st_size < 60_000
+    assert len(files["error_by_time.svg"]) < 60_000
 
 
 def test_which_studies_have_the_page(table: pd.DataFrame, looks: dict[str, MethodLook]) -> None:

@@ -11,9 +11,7 @@ import page_packs
 import pytest
 from checkout import ROOT
 
-from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report import study_report
-from pfbench.report.study_page import write_page
+from pfbench.report import RUNS_FILE, study_report
 
 playwright = pytest.importorskip(
     "playwright.sync_api", reason="playwright is not installed: pip install 'pfbench[browser]'"
@@ -34,7 +32,6 @@ PUBLISHED = (
     "paper_002",
     "paper_004",
 )
-STORED = ("page.json.gz", "runs.parquet", "verdicts.csv")
 LONG = {
     0: "COFM-AMSSRCPF (printed) [1000]",
     1: "CPSO-Escape (stopped) [IntervalStart]",
@@ -118,15 +115,10 @@ def list_wide(browser: Any, file: Path) -> dict[int, list[str]]:
 
 
 @pytest.mark.parametrize("study", PUBLISHED)
-def test_labels_of_a_published_page_are_whole(
-    study: str, tmp_path: Path, chromium: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # the stored decisions are those that are decided again (test_published)
-    monkeypatch.setattr(study_report, "decide_again", lambda pack, runs: pack)
+def test_labels_of_a_published_page_are_whole(study: str, tmp_path: Path, chromium: Any) -> None:
     folder = tmp_path / study
     folder.mkdir()
-    for name in STORED:
-        shutil.copy(ROOT / "reports" / study / name, folder)
+    shutil.copy(ROOT / "reports" / study / RUNS_FILE, folder)
     page = study_report.rebuild_page(folder)
     board = folder / "worlds.html"  # of a study with a first page
     file = board if board.exists() else page
@@ -139,8 +131,7 @@ def test_labels_of_a_published_page_are_whole(
 def long_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Page whose filters have long names."""
     folder = tmp_path_factory.mktemp("long")
-    with RecordedFolder(folder) as target:
-        return write_page(page_packs.build_pack(9, 3, 2, 8, names=LONG), target)
+    return page_packs.write(page_packs.build_pack(9, 3, 2, 8, names=LONG), folder)
 
 
 def test_long_names_are_whole(long_page: Path, chromium: Any) -> None:

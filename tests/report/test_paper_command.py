@@ -54,7 +54,7 @@ def test_without_results_it_uses_the_stored_data_of_the_report(
     capsys.readouterr()
     write_study_paper([*words, f"results_dir={tmp_path}/none"])
     assert {path.name: path.read_bytes() for path in paper.iterdir()} == expected
-    data = tmp_path / "demo" / "page.json.gz"
+    data = tmp_path / "demo" / "runs.parquet"
     assert f"note: without results, the paper is made of {data}" in capsys.readouterr().out
     with pytest.raises(
         ValueError, match=r"options of the report need results, got report\.alpha=0\.1"

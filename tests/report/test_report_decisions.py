@@ -1,8 +1,7 @@
-"""Decisions of a report: planned pairs, their words, and what happens without enough data."""
+"""Verdicts of a report from results: all pairs, worlds, thresholds, and what happens without enough data."""
 
 from __future__ import annotations
 
-import json
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -12,58 +11,12 @@ import pandas as pd
 import pytest
 import synthetic_results as synthetic
 
-from pfbench.report import study_report
-from pfbench.report.options import ReportOptions
-from pfbench.report.study_report import decide_study
-from pfbench.results import frame, store
+from pfbench.report import read_stored_study, study_report
+from pfbench.results import store
 from pfbench.results.paper_block import plan_installed_pairs
-from pfbench.stats.decision import Decision
+from pfbench.stats.study_runs import arrange_runs, compare_filters, compute_losses
 
-EFFECTS = {"sir": 0.4, "rpf": 0.2, "mcmc_rpf": 0.0}
 PAIRS = [("mcmc_rpf", "sir"), ("mcmc_rpf", "rpf")]
-
-
-def rows(
-    effects: dict[str, float] | None = None,
-    worlds: tuple[str, ...] = ("flight",),
-    regimes: tuple[str, ...] = ("nominal",),
-    runs: int = 20,
-) -> pd.DataFrame:
-    """Errors of filters by their log effects; the noise of a filter depends on its name alone."""
-    parts = []
-    for (world, noise), (label, effect) in product(
-        product(worlds, regimes), (effects or EFFECTS).items()
-    ):
-        rng = np.random.default_rng([*world.encode(), *noise.encode(), *label.encode()])
-        parts.append(pd.DataFrame({
-            "scenario": world, "family": world, "noise": noise, "model": "m", "label": label, "seed": 1,
-            "run": np.arange(runs), "lost": False, "keeps_track": True, "group": "position",
-            "component": "norm", "unit": "m", "metric": "rmse",
-            "value": np.exp(effect + 0.1 * rng.standard_normal(runs)),
-        }))  # fmt: skip
-    return pd.concat(parts, ignore_index=True)
-
-
-def decide(table: pd.DataFrame) -> list[Decision]:
-    return decide_study(table, "position", ReportOptions())
-
-
-def planned(decisions: list[Decision], question: str, metric: str) -> list[Decision]:
-    return [
-        d
-        for d in decisions
-        if d.family.startswith("planned") and (d.question, d.metric) == (question, metric)
-    ]
-
-
-def ordered(decisions: list[Decision]) -> set[str]:
-    """Filters of the pairs that only the order of all filters has."""
-    others = [d for d in decisions if not d.family.startswith("planned")]
-    return {label for d in others for label in (d.a, d.b)}
-
-
-def main_rows(table: pd.DataFrame) -> pd.DataFrame:
-    return table[(table.group == "position") & (table.component == "norm")]
 
 
 def write_scenario(
@@ -79,8 +32,12 @@ def write_scenario(
     store.write_result(path, meta, arrays)
 
 
+def report(folder: Path, study: str) -> Path:
+    return study_report.write_report(study, folder, folder / "reports").parent
+
+
 def test_planned_pairs_of_a_study() -> None:
-    assert plan_installed_pairs(sorted(EFFECTS)) == PAIRS
+    assert plan_installed_pairs(["mcmc_rpf", "rpf", "sir"]) == PAIRS
     assert plan_installed_pairs(["ckf", "ukf"]) == [("ckf", "ukf")]
     many = [f"filter_{k}" for k in range(6)]
     assert plan_installed_pairs([*many, "ekf", "sir"]) == [
@@ -90,64 +47,41 @@ def test_planned_pairs_of_a_study() -> None:
     assert plan_installed_pairs(many) == []
 
 
-@pytest.mark.parametrize("worlds", [("flight",), ("drive", "flight", "walk")])
-def test_planned_pairs_of_one_and_many_conditions_are_decided(worlds: tuple[str, ...]) -> None:
-    regimes = ("nominal", "outliers") if len(worlds) > 1 else ("nominal",)
-    decisions = decide(rows(worlds=worlds, regimes=regimes))
-    for question, metric in product("ab", ("keeps track", "position error")):
-        part = planned(decisions, question, metric)
-        assert [(d.a, d.b) for d in part] == PAIRS
-        assert {d.worlds for d in part} == {len(worlds)}
-    assert [d.pair_word for d in planned(decisions, "a", "position error")] == ["better"] * 2
-    for d in planned(decisions, "b", "position error"):
-        assert (d.pair_word == "not tested") == (len(worlds) == 1)
-
-
-def test_another_filter_changes_neither_p_nor_interval_of_a_pair() -> None:
-    worlds = ("drive", "flight", "walk")
-    more = {"gpf": 0.0, "qmc_polymerised": -3.0, **EFFECTS}
-    few, many = (decide(rows(effects, worlds)) for effects in (EFFECTS, more))
-    other = {(d.question, d.a, d.b, d.metric, d.family): d for d in many}
-    records = [d for d in few if d.family.startswith("planned")]
-    assert len(records) == 8
-    for d in records:
-        same = other[d.question, d.a, d.b, d.metric, d.family]
-        for name in ("p", "plain_low", "plain_high", "estimate"):
-            assert getattr(same, name) == pytest.approx(getattr(d, name), rel=0, nan_ok=True)
-    assert {d.family_size for d in records if d.question == "a"} == {2}
-    assert min(d.family_size for d in many if d.question == "a" and d.a == "mcmc_rpf") > 2
-
-
-def test_a_filter_that_gives_up_in_its_worst_runs_is_not_better() -> None:
+def test_a_filter_that_gives_up_in_its_worst_runs_is_not_better(tmp_path: Path) -> None:
     """Without the runs that it lost, the filter would be called better."""
-    table = rows({"rpf": 0.0, "sir": 0.0}, runs=60)
-    value = table.set_index(["label", "run"])["value"]
-    ratio = value["rpf"] / value["sir"]
-    worst = ratio.index[ratio >= ratio.quantile(0.8)]
-    gives_up = (table.label == "rpf") & table.run.isin(worst)
-    assert gives_up.sum() == 12
-    left_out = decide(table[~table.run.isin(worst)])
-    assert planned(left_out, "a", "position error")[0].pair_word == "better"
-    lost = table.assign(
-        value=table.value.where(~gives_up, np.inf), lost=gives_up, keeps_track=~gives_up
-    )
-    decisions = decide(lost)
-    assert "better" not in {d.pair_word for d in decisions}
-    assert "better" not in {d.word for d in decisions if d.a == "rpf"}
-    assert planned(decisions, "a", "keeps track")[0].share_a == pytest.approx(0.8)
+    rng = np.random.default_rng(2)
+    log = rng.normal(0, 0.3, (2, 60))
+    worst = np.argsort(log[0] - log[1])[-12:]
+    table = pd.DataFrame({
+        "filter": np.repeat(["rpf", "sir"], 60), "scenario": "s", "family": "s", "regime": "r", "seed": 1,
+        "run": np.tile(np.arange(60), 2), "rmse": np.exp(log.ravel()), "keeps_track": True,
+    })  # fmt: skip
+    off = table["filter"].eq("rpf") & table["run"].isin(worst)
+    words = []
+    for data, cap in (
+        (table[~table["run"].isin(worst)], np.nan), (table.assign(keeps_track=~off), np.nan), (table.assign(keeps_track=~off), 9.0),
+    ):  # fmt: skip
+        runs = arrange_runs(data, ("rpf", "sir"), {"s": cap})
+        (effect,) = compare_filters(runs, compute_losses(runs, "rmse"), [("rpf", "sir")])
+        words.append(effect.p < 0.05 and effect.location < 0)
+    assert words == [True, False, False]
 
 
-def test_track_is_kept_below_the_divergence_threshold_of_the_scenario(tmp_path: Path) -> None:
-    for name, size in (("ekf", 1.0), ("sir", 1000.0)):
-        for scenario, paper in (("free", {}), ("bounded", {"divergence_threshold": 500.0})):
+def test_a_limit_of_the_scenario_bounds_the_errors(tmp_path: Path) -> None:
+    """With the limit all runs of the bad filter are at it; without one they have their errors."""
+    ratio = {}
+    for scenario, paper in (("free", {}), ("bounded", {"divergence_threshold": 500.0})):
+        for name, size in (("ekf", 1.0), ("sir", 1000.0)):
             write_scenario(tmp_path / scenario, name, size, scenario, paper)
-    tracks = {}
-    for scenario in ("free", "bounded"):
-        decisions = decide(main_rows(frame.load_frame(scenario, tmp_path)))
-        (tracks[scenario],) = planned(decisions, "a", "keeps track")
-    assert (tracks["free"].share_a, tracks["free"].share_b) == (1, 1)
-    bounded = tracks["bounded"]
-    assert (bounded.share_a, bounded.share_b, bounded.word) == (1, 0, "better")
+        rows = pd.read_csv(report(tmp_path, scenario) / "verdicts.csv")
+        row = rows.query("filter == 'sir' and baseline == 'ekf' and metric == 'rmse'").iloc[0]
+        ratio[scenario] = row["ratio"]
+        level = rows.query("filter == 'ekf' and baseline == 'ekf' and metric == 'rmse'")[
+            "value"
+        ].iloc[0]
+        assert row["verdict"] == ("worse" if scenario == "free" else "loses track")
+    assert ratio["free"] > 300
+    assert ratio["bounded"] == pytest.approx(500 / level, rel=0.3)
 
 
 @pytest.mark.parametrize(("family", "worlds"), [({"family": "orbit"}, 1), ({}, 2)])
@@ -156,27 +90,22 @@ def test_scenarios_of_one_family_are_one_world(
 ) -> None:
     for scenario, name in product(("short", "long"), ("ekf", "sir")):
         write_scenario(tmp_path / "demo", name, 1.0, scenario, family)
-    decisions = decide(main_rows(frame.load_frame("demo", tmp_path)))
-    assert {d.worlds for d in decisions} == {worlds}
-    (new,) = planned(decisions, "b", "position error")
-    assert (new.pair_word == "not tested") == (worlds == 1)
+    folder = report(tmp_path, "demo")
+    text = "2 scenarios of 1 world" if worlds == 1 else "2 scenarios,"
+    assert text in next(iter(read_stored_study(folder).pack["views"].values()))["small_print"]
 
 
-def test_without_some_conditions_pairs_are_decided_and_complete_filters_are_ordered() -> None:
-    table = rows({**EFFECTS, "qmc_gpf": 0.1}, worlds=("drive", "flight"))
-    partial = table[(table.label != "sir") | (table.scenario != "drive")]
-    decisions = decide(partial)
-    errors = planned(decisions, "a", "position error")
-    worlds = {(d.a, d.b): d.worlds for d in errors}
-    assert (worlds["mcmc_rpf", "sir"], worlds["mcmc_rpf", "rpf"]) == (1, 2)
-    # sir lacks a condition, so that it has no place in the order
-    assert ordered(decisions) == {"mcmc_rpf", "rpf", "qmc_gpf"}
-    assert ordered(decide(table)) == {"mcmc_rpf", "rpf", "qmc_gpf", "sir"}
-
-
-def test_the_order_of_rows_does_not_change_a_decision() -> None:
-    table = rows(worlds=("drive", "flight"), regimes=("nominal", "outliers"))
-    assert repr(decide(table)) == repr(decide(table.sample(frac=1, random_state=3)))
+def test_pairs_are_decided_where_both_filters_have_runs(tmp_path: Path) -> None:
+    """A filter that lacks a condition changes no other pair."""
+    words = []
+    for study, missing in (("whole", ()), ("part", ("short",))):
+        for scenario, (k, name) in product(("short", "long"), enumerate(("ekf", "sir", "ukf"))):
+            if name != "ukf" or scenario not in missing:
+                write_scenario(tmp_path / study, name, 1.0 + 0.2 * k, scenario, {})
+        words.append(pd.read_csv(report(tmp_path, study) / "decisions.csv").set_index(["a", "b"]))
+    assert words[0].loc[("ekf", "sir")].equals(words[1].loc[("ekf", "sir")])
+    assert words[0].loc[("ekf", "ukf"), "ratio"] != words[1].loc[("ekf", "ukf"), "ratio"]
+    assert set(words[1]["n"]) == {12}
 
 
 @pytest.mark.parametrize("case", ["one run", "all lost", "identical"])
@@ -192,14 +121,10 @@ def test_a_page_without_enough_data_states_why(case: str, tmp_path: Path) -> Non
         if case == "identical":
             first = first or arrays
             store.write_result(path, meta, first)
-    made = study_report.write_report("demo", tmp_path, tmp_path / "reports")
-    records = json.loads((made.parent / "decisions.json").read_text())
-    words = {r["word"] for r in records}
-    assert not words & {"better", "worse"}
-    text = (made.parent / "report.md").read_text()
-    sentence = {
-        "one run": "| not tested |",
-        "all lost": "No filter has an error to compare",
-        "identical": "identical",
-    }[case]
-    assert sentence in made.read_text() + text
+    folder = report(tmp_path, "demo")
+    words = set(pd.read_csv(folder / "decisions.csv")["word"])
+    text = (folder / "report.md").read_text()
+    assert words == {"not decided" if case == "one run" else "identical"}
+    shown = {"one run": "not decided, 1 run, 10 are required", "all lost": "loses runs in 100 % of runs", "identical": "identical, all runs agree"}  # fmt: skip
+    assert shown[case] in text
+    assert "nan" not in text.replace("provenance", "")

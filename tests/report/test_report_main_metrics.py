@@ -1,28 +1,21 @@
-"""Metrics that decide: their values from stored arrays, their rules, and the choice of the main one."""
+"""The metric that decides a study, its choice, and the bands of consistency of a report."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import synthetic_results as synthetic
-from scipy import stats
 
-from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report.board.entries import build_run_table
 from pfbench.report.options import ReportOptions
-from pfbench.report.study_report import write_study_files
+from pfbench.report.study_report import write_report
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
 from pfbench.results.frame import load_frame
-from pfbench.stats.main_metrics import (
-    MAIN_METRICS,
-    RULES,
-    select_main_metrics,
-    tidy_main,
-    tidy_secondary,
-)
+from pfbench.stats.main_metrics import MAIN_METRICS
 
 
 @pytest.fixture(scope="module")
@@ -33,70 +26,64 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def median_ratio(results: Path, metric: str) -> float:
+    """Ratio of UKF to EKF by Hodges and Lehmann, from the stored arrays."""
+    logs = {}
+    for path in sorted((results / "demo").glob("*.npz")):
+        result = store.read_result(path)
+        error = result.data["error"][..., 6:9].astype(float)
+        largest, mean = np.linalg.norm(error, axis=-1).max(1), (error**2).sum(-1).mean(1)
+        values = largest if metric == "max_error" else np.sqrt(mean)
+        if metric == "log_score":
+            values = np.exp(-result.data["log_evidence"] / result.meta["steps"])
+        logs[result.meta["label"]] = np.log(values)
+    d = logs["ukf"] - logs["ekf"]
+    return float(np.exp(np.median(np.add.outer(d, d)[np.triu_indices(len(d))] / 2)))
+
+
 def test_values_are_those_of_the_stored_arrays(results: Path) -> None:
-    table = load_frame("demo", results, convergence_threshold={"position": 4.0})
-    key = table.groupby(["scenario", "noise", "model"]).size().index[0]
-    rows = select_main_metrics(table, {key: "position"}, "main")
-    assert set(rows["group"]) == {"main"}
+    """Of the runs that decide, and of the table of all metrics."""
+    runs = build_run_table(load_conditions("demo", results)).set_index(["filter", "run"])
+    table = load_frame("demo", results).query("metric == 'nees_ratio' and group == 'position'")
+    ratios = table.set_index(["label", "run"])["value"]
     for path in sorted((results / "demo").glob("*.npz")):
         result = store.read_result(path)
         data, lost, label = result.data, result.data["lost"], result.meta["label"]
-        values = rows[rows["label"] == label].set_index("metric")["value"]
-        log_score = np.where(lost, np.nan, data["log_evidence"] / result.meta["steps"])
-        assert values["log_score"].to_numpy() == pytest.approx(log_score, nan_ok=True)
-        nees = data["nees"][..., 2].astype(float).mean(1)
-        limit = stats.chi2.ppf(0.999, 3)
-        flags = np.where(lost, np.nan, nees > limit)
-        assert values["overconfident"].to_numpy() == pytest.approx(flags, nan_ok=True)
-        ratio = np.where(lost, np.nan, nees / 3)
-        assert values["nees_ratio"].to_numpy() == pytest.approx(ratio, nan_ok=True)
         norm = np.linalg.norm(data["error"][..., 6:9].astype(float), axis=-1)
-        for run, share in enumerate(values["time_to_converge"]):
-            above = np.nonzero(norm[run] > 4.0)[0]
-            first = 0 if not len(above) else above[-1] + 1
-            late = lost[run] or first == norm.shape[1]
-            assert share == pytest.approx(1.0 if late else data["time"][first] / data["time"][-1])
+        nees = data["nees"][..., 2].astype(float).mean(1) / 3
+        for values, expected in (
+            (runs.loc[label, "rmse"], np.sqrt((norm**2).mean(1))), (runs.loc[label, "max_error"], norm.max(1)),
+            (runs.loc[label, "nees_ratio"], nees), (ratios.loc[label], nees),
+        ):  # fmt: skip
+            np.testing.assert_allclose(values[~lost], expected[~lost], rtol=1e-6)
 
 
-def test_each_metric_has_a_rule_and_a_table(results: Path) -> None:
-    table = load_frame("demo", results, convergence_threshold={"position": 4.0})
-    key = table.groupby(["scenario", "noise", "model"]).size().index[0]
-    rows = select_main_metrics(table, {key: "position"}, "main")
-    tables = tidy_secondary(rows, "main")
-    assert set(tables) == set(RULES)
-    assert len(tables["rmse"]) == len(tables["log_score"]) == 4 * 20  # lost runs stay, at the end
-    assert len(tables["overconfident"]) == 4 * 20 - 1  # one lost run
-    assert set(MAIN_METRICS) < set(RULES)
-    without = rows[(rows["metric"] != "crps") | (rows["label"] != "sir")]
-    with pytest.raises(
-        ValueError, match=r"report\.metric must be a metric of all results, got crps"
-    ):
-        tidy_main(without, "crps", "main")
+@pytest.mark.parametrize("metric", ["rmse", "max_error", "log_score"])
+def test_the_metric_of_the_option_decides(metric: str, results: Path, tmp_path: Path) -> None:
+    options = ReportOptions(metric=metric, figure_formats=("svg",))
+    folder = write_report("demo", results, tmp_path, options).parent
+    rows = pd.read_csv(folder / "verdicts.csv")
+    assert rows["metric"].iloc[0] == metric
+    row = rows.query("filter == 'ukf' and baseline == 'ekf'").iloc[0]
+    assert row["ratio"] == pytest.approx(median_ratio(results, metric), rel=1e-3)
+    pairs = pd.read_csv(folder / "decisions.csv").set_index(["a", "b"])
+    assert pairs.loc[("ekf", "ukf"), "ratio"] == pytest.approx(1 / row["ratio"], rel=1e-3)
+
+
+def test_bands_of_a_report(results: Path, tmp_path: Path) -> None:
+    """A filter that reports 0.7 of its errors has a NEES of 1 / 0.49 over its expectation."""
+    folder = write_report("demo", results, tmp_path, ReportOptions(figure_formats=("svg",))).parent
+    bands = pd.read_csv(folder / "consistency.csv")
+    assert set(bands["quantity"]) == {"NEES"}
+    assert set(bands["group"]) == {"attitude", "velocity", "position"}
+    ekf = bands[bands["filter"] == "ekf"]
+    assert set(ekf["word"]) == {"overconfident"}
+    assert ((ekf["low"] <= 1 / 0.49) & (ekf["high"] >= 1 / 0.49)).all()
+    assert set(bands.loc[bands["filter"] == "cofm_amssrcpf", "word"]) == {"no deviation shown"}
+    assert set(bands.loc[bands["filter"] == "sir", "lost"]) == {1}
+
+
+def test_other_metrics_are_refused() -> None:
+    assert "rmse" in MAIN_METRICS
     with pytest.raises(ValueError, match=r"report\.metric must be one of rmse, crps"):
         ReportOptions(metric="nees")
-
-
-@pytest.mark.parametrize("metric", ["rmse", "crps"])
-def test_the_main_metric_is_in_the_first_family_and_the_others_in_the_second(
-    metric: str, results: Path, tmp_path: Path
-) -> None:
-    options = ReportOptions(metric=metric, convergence_threshold={"position": 4.0})
-    table = load_frame("demo", results, convergence_threshold=options.convergence_threshold)
-    with RecordedFolder(tmp_path) as folder:
-        downloads = write_study_files(table, load_conditions("demo", results), options, folder)
-    assert [d["href"] for d in downloads] == ["decisions.json", "consistency.json", "metrics.csv"]
-    assert all((tmp_path / d["href"]).stat().st_size == d["bytes"] for d in downloads)
-    records = json.loads((tmp_path / "decisions.json").read_text())
-    assert len({tuple(map(str, record.values())) for record in records}) == len(records)
-    first = {r["metric"] for r in records if "track and error" in r["family"]}
-    assert first == {"keeps track", f"position {RULES[metric].name}"}
-    second = {r["metric"] for r in records if "secondary" in r["family"]}
-    others = {"attitude error", "velocity error"}  # RMSE of the groups that are not the main one
-    assert second == {RULES[name].name for name in RULES if name != metric} | others
-    tested = [r for r in records if "secondary" in r["family"] and r["question"] == "a"]
-    assert len(tested) == 6 * len(second)  # all pairs of four filters are planned
-    assert len({r["family_size"] for r in tested}) == 1  # one family
-    bands = json.loads((tmp_path / "consistency.json").read_text())
-    assert {b["quantity"] for b in bands} == {"NEES"}
-    assert {b["group"] for b in bands} == {"attitude", "velocity", "position"}
-    assert {b["label"] for b in bands if b["word"] == "overconfident"} >= {"ekf"}

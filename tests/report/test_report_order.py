@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
+import math
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,10 +12,11 @@ import pytest
 import synthetic_results as synthetic
 
 from pfbench.report import study_report
-from pfbench.results import frame, store
-from pfbench.stats.filter_sets import order_filters
-from pfbench.stats.planned_pairs import decide_planned_pairs
-from pfbench.stats.study_runs import tidy_runs
+from pfbench.report.board import build_pack, read_study
+from pfbench.report.options import ReportOptions
+from pfbench.report.study_report import list_decisions
+from pfbench.results import store
+from pfbench.results.conditions import load_conditions
 
 NOISES = ("nominal", "surge", "heavy", "outage", "jam")
 METHODS = synthetic.METHODS[1:]
@@ -39,55 +39,58 @@ def study(folder: Path, turn: int = 0) -> Path:
     return folder
 
 
+Stored = tuple[dict[str, object], pd.DataFrame]
+
+
 @pytest.fixture(scope="module")
-def table(tmp_path_factory: pytest.TempPathFactory) -> pd.DataFrame:
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Stored:
+    """Pack and runs of a study."""
     folder = study(tmp_path_factory.mktemp("results") / "demo")
-    full = frame.load_frame("demo", folder.parent)
-    return full[(full.metric == "rmse") & (full.component == "norm")]
+    conditions, options = load_conditions("demo", folder.parent), ReportOptions()
+    data = read_study(conditions, options)
+    return build_pack("demo", conditions, options, data), data.table
 
 
-def between(table: pd.DataFrame) -> dict[Any, tuple[Any, ...]]:
-    """Numbers and words of each planned pair, and the order of the filters."""
-    tidy = tidy_runs(table)
-    pairs = {
-        (d.question, d.a, d.b, d.metric): (d.word, d.pair_word, d.estimate, d.low, d.high, d.p)
-        for d in decide_planned_pairs(tidy, [("cofm_amssrcpf", "ukf"), ("sir", "ukf")])
-    }
-    orders = {
-        order.question: (order.top_group, *order.ranks.items()) for order in order_filters(tidy)
-    }
-    return {**pairs, **orders}
+def decide(stored: Stored, table: pd.DataFrame) -> pd.DataFrame:
+    return list_decisions(stored[0], table).set_index(["a", "b"])
 
 
-def alike(first: dict[Any, tuple[Any, ...]], second: dict[Any, tuple[Any, ...]]) -> bool:
-    """The same words, and the same numbers but for the order in which they were summed."""
+def test_all_pairs_are_decided_in_one_family(stored: Stored) -> None:
+    """Holm over all pairs: the corrected p-values are those of scipy, and words and intervals agree with them."""
+    from scipy import stats
 
-    def same(a: Any, b: Any) -> bool:
-        if isinstance(a, tuple):
-            return len(a) == len(b) and all(map(same, a, b))
-        return (
-            a == b
-            if isinstance(a, str)
-            else bool(np.isclose(a, b, rtol=1e-9, atol=0, equal_nan=True))
-        )
+    table = stored[1]
+    found = decide(stored, table)
+    assert len(found) == 3
+    wide = table.assign(log=np.log(table["rmse"])).pivot_table("log", ["regime", "run"], "filter")
+    p = {}
+    for a, b in found.index:
+        if "sir" in (a, b):
+            continue  # it lost a run
+        p[a, b] = stats.wilcoxon((wide[a] - wide[b]).unstack("regime").mean(axis=1)).pvalue
+    ((pair, alone),) = p.items()
+    assert found.loc[pair, "p"] in (pytest.approx(k * alone) for k in (1, 2, 3))
+    for row in found.itertuples():
+        assert (row.p < 0.05) == (row.high <= 1 or row.low >= 1)
+        assert row.n == 16
 
-    return first.keys() == second.keys() and all(same(first[key], second[key]) for key in first)
+
+def test_the_order_of_rows_changes_no_verdict(stored: Stored) -> None:
+    table = stored[1]
+    mixed = decide(stored, table.sample(frac=1, random_state=1))
+    pd.testing.assert_frame_equal(mixed, decide(stored, table), check_exact=False, rtol=1e-9)
 
 
-def test_the_order_of_rows_changes_no_verdict(table: pd.DataFrame) -> None:
-    mixed = table.sample(frac=1, random_state=1)
-    assert alike(between(table), between(mixed))
-
-
-def test_the_numbers_of_the_runs_change_no_verdict(table: pd.DataFrame) -> None:
+def test_the_numbers_of_the_runs_change_no_verdict(stored: Stored) -> None:
     """The same runs made in another order: each has another number, the same for all filters."""
-    number = np.random.default_rng(4).permutation(16)
-    renamed = table.assign(run=number[table.run.to_numpy()])
-    assert alike(between(table), between(renamed))
-    apart = table.assign(
-        run=np.where(table.label == "ukf", number[table.run.to_numpy()], table.run)
-    )
-    assert not alike(between(table), between(apart))  # they are paired by it
+    table, number = stored[1], np.random.default_rng(4).permutation(16)
+    renamed = table.assign(run=number[table["run"].to_numpy()])
+    first = decide(stored, table)
+    pd.testing.assert_frame_equal(decide(stored, renamed), first, check_exact=False, rtol=1e-9)
+    of_one = np.where(table["filter"] == "ukf", number[table["run"].to_numpy()], table["run"])
+    apart = decide(stored, table.assign(run=of_one))  # they are paired by it
+    widths = [math.log(t.loc[("cofm_amssrcpf", "ukf"), "high"] / t.loc[("cofm_amssrcpf", "ukf"), "low"]) for t in (first, apart)]  # fmt: skip
+    assert widths[1] > 1.2 * widths[0]
 
 
 @pytest.mark.slow
@@ -96,8 +99,8 @@ def test_order_of_files_and_workers_change_no_verdict(tmp_path: Path) -> None:
     for turn in (0, 7):
         folder = study(tmp_path / f"results{turn}" / "demo", turn)
         made = study_report.write_report("demo", folder.parent, tmp_path / f"reports{turn}")
-        names = ("decisions.json", "consistency.json", "metrics.csv", "verdicts.csv")
+        names = ("decisions.csv", "consistency.csv", "metrics.csv", "verdicts.csv")
         said.append([(made.parent / name).read_text() for name in names])
         assert ("worker 3" in made.read_text()) is bool(turn)
     assert said[0] == said[1]
-    assert len(json.loads(said[0][0])) > 15
+    assert len(said[0][0].splitlines()) == 4  # all pairs of three filters

@@ -1,6 +1,5 @@
 """The report: whole, the same for the same results, and honest about what is missing."""
 
-import json
 import re
 import shutil
 import tomllib
@@ -16,6 +15,7 @@ from pfbench.report import study_report, writers
 from pfbench.report.board.curves import make_curves
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
+from pfbench.stats.comparison import Verdict
 
 QUICK = study_report.ReportOptions(figure_formats=("svg",))
 
@@ -47,12 +47,11 @@ def report(results, tmp_path_factory):
 
 def test_every_file_is_there_and_offered_by_the_page(report):
     files = {path.relative_to(report).as_posix() for path in report.rglob("*") if path.is_file()}
-    numbers = {"verdicts.csv", "runs.parquet", "metrics.csv", "decisions.json", "consistency.json"}
+    numbers = {"verdicts.csv", "runs.parquet", "metrics.csv", "decisions.csv", "consistency.csv"}
     assert files == {
         "index.html",
         "report.md",
         "manifest.json",
-        "page.json.gz",
         "pfbench.bib",
         "headline.svg",
         *numbers,
@@ -180,19 +179,20 @@ def test_a_toy_without_map_particles_or_rival(tmp_path):
     store.write_result(path, {**meta, "state": state}, toy)
     made = study_report.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     assert "kalman" in made.read_text()
-    assert json.loads((made.parent / "decisions.json").read_text()) == []
+    assert (made.parent / "decisions.csv").read_text() == f"{','.join(Verdict._fields)}\n"
 
 
-def test_a_filter_that_lost_every_run_is_worse_and_has_no_number(tmp_path):
+def test_a_filter_that_lost_every_run_has_the_largest_errors_and_no_number(tmp_path):
     folder = tmp_path / "demo"
     synthetic.write(folder, synthetic.METHODS[0], runs=12, steps=20)
     doomed = synthetic.Method("doomed", 1.0, lost=tuple(range(12)))
     synthetic.write(folder, doomed, runs=12, steps=20)
     made = study_report.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
-    records = json.loads((made.parent / "decisions.json").read_text())
-    track = [r for r in records if r["metric"] == "keeps track" and r["question"] == "a"]
-    assert [(r["a"], r["b"], r["word"]) for r in track] == [("doomed", "ekf", "worse")]
-    assert "is lost in 100 % of runs" in (made.parent / "report.md").read_text()
+    rows = pd.read_csv(made.parent / "verdicts.csv").query("baseline == 'ekf' and metric == 'rmse'")
+    doomed = rows[rows["filter"] == "doomed"]
+    assert set(doomed["words"]) == {"loses runs in 100 % of runs"}
+    assert (doomed["ratio"] >= 1).all()  # each of its runs has the largest error of the pair
+    assert doomed["value"].isna().all()
     row = pd.read_csv(made.parent / "metrics.csv").query(
         "filter == 'doomed' and metric == 'rmse' and component == 'norm' and group == 'position'"
     )

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
 import re
 import runpy
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +17,19 @@ import pytest
 import synthetic_results as synthetic
 from checkout import ROOT
 from command_line import pfbench
+from pyarrow import parquet
 
-from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report import read_page_data, write_page_data
-from pfbench.report.board.pack import StudyFacts
+from pfbench.report import (
+    RUNS_FILE,
+    StudyFacts,
+    decide_parts,
+    format_runs,
+    read_stored_study,
+    rebuild_page,
+    render_page,
+    write_report,
+)
 from pfbench.report.options import ReportOptions
-from pfbench.report.study_report import decide_again, rebuild_page, write_report
 from pfbench.results.looks import PartName, find_looks
 from pfbench.results.step_times import StepTimes
 
@@ -34,10 +44,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_study_is_published_from_the_data_of_its_page(study: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(study, tmp_path / "demo"))
-    publish_study = runpy.run_path(str(ROOT / "experiments/analyses/publish_reports.py"))[
-        "publish_study"
-    ]
-    publish_study(folder)
+    rebuild_page(folder)
     first = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     text = (folder / "report.md").read_text()
     assert "](headline.svg)" in text
@@ -49,7 +56,7 @@ def test_a_study_is_published_from_the_data_of_its_page(study: Path, tmp_path: P
     assert len(rows) == 4
     for ratio in rows["ratio"]:
         assert f">{ratio:.2f}<" in drawing
-    publish_study(folder)
+    rebuild_page(folder)
     assert first == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
@@ -62,62 +69,55 @@ def test_a_page_offers_its_figures_and_each_kind_of_file_once(study: Path, tmp_p
     assert heads == ["Numbers", "LaTeX", "Figures"]
     assert "pfbench paper study=demo journal=ieee" in page
     copy = Path(shutil.copytree(study, tmp_path / "demo"))
-    assert 'href="headline.svg" download' in rebuild_page(copy).read_text()
     (copy / "headline.svg").unlink()
-    assert "headline.svg" not in rebuild_page(copy).read_text()
-
-
-def test_a_published_figure_names_the_filters_that_it_does_not_show(
-    study: Path, tmp_path: Path
-) -> None:
-    folder = Path(shutil.copytree(study, tmp_path / "demo"))
-    publish_study = runpy.run_path(str(ROOT / "experiments/analyses/publish_reports.py"))[
-        "publish_study"
-    ]
-    publish_study(folder)
-    assert "Not shown" not in (folder / "report.md").read_text()
-    pack = read_page_data(folder)
-    rows = next(iter(pack["views"].values()))["rows"]
-    for row, words in zip(rows[-2:], ("track not kept", "not run in all conditions"), strict=True):
-        row.update(ratio=None, ratio_low=None, ratio_high=None, words=words)
-    with RecordedFolder(folder, is_complete=False) as target:
-        write_page_data(pack, target)
-    publish_study(folder)
-    names = {look["key"]: look["name"] for look in pack["filters"]}
-    first, second = (names[row["filter"]] for row in rows[-2:])
-    note = f"Not shown, track not kept: {first}. Not shown, not run in all conditions: {second}."
-    assert f"](headline.svg)\n\n{note}\n\n" in (folder / "report.md").read_text()
-    drawing = (folder / "headline.svg").read_text()
-    assert f">{first}<" not in drawing
-    assert f">{second}<" not in drawing
+    assert 'href="headline.svg" download' in rebuild_page(copy).read_text()
+    assert (copy / "headline.svg").read_bytes() == (study / "headline.svg").read_bytes()
 
 
 def test_a_page_is_made_again_without_results(study: Path, tmp_path: Path) -> None:
-    """As from a fresh clone: git stores some files only."""
+    """As from a fresh clone: git stores report.md, its figure and the runs."""
     folder = tmp_path / "reports" / "demo"
     folder.mkdir(parents=True)
-    for name in ("report.md", "runs.parquet", "verdicts.csv", "page.json.gz"):
+    for name in ("report.md", RUNS_FILE):
         shutil.copy(study / name, folder)
     text = (folder / "report.md").read_bytes()
     printed = pfbench("report", "study=demo", f"reports_dir={tmp_path}/reports", home=tmp_path)
     assert printed.code == 0, printed.err
     assert "without results" in printed.out
     assert (folder / "report.md").read_bytes() == text
+    for name in ("verdicts.csv", "decisions.csv", "headline.svg"):
+        assert (folder / name).read_bytes() == (study / name).read_bytes()
     links = re.findall(r'href="([^#"]+)" download', (folder / "index.html").read_text())
-    assert links == ["verdicts.csv", "runs.parquet"]
-    (folder / "page.json.gz").write_bytes((study / "page.json.gz").read_bytes()[:-9])
+    assert sorted(links) == [
+        "decisions.csv",
+        "headline.svg",
+        "pfbench.bib",
+        RUNS_FILE,
+        "verdicts.csv",
+    ]
+    (folder / RUNS_FILE).write_bytes((study / RUNS_FILE).read_bytes()[:-9])
     damaged = pfbench("report", "study=demo", f"reports_dir={tmp_path}/reports", home=tmp_path)
     assert damaged.code == 2
-    assert "page.json.gz must be the data of a page" in damaged.err
+    assert f"{RUNS_FILE} must be " in damaged.err
+
+
+def test_the_runs_alone_give_the_same_files_twice(study: Path, tmp_path: Path) -> None:
+    folder, made = tmp_path / "demo", []
+    folder.mkdir()
+    shutil.copy(study / RUNS_FILE, folder)
+    for _ in range(2):  # the second time beside the files of the first
+        rebuild_page(folder)
+        made.append({path.name: path.read_bytes() for path in folder.iterdir()})
+    assert made[0] == made[1]
+    assert set(made[0]) > {"index.html", "report.md", "verdicts.csv", "decisions.csv"}
+    assert made[0][RUNS_FILE] == (study / RUNS_FILE).read_bytes()
 
 
 def test_a_table_of_the_readme_is_the_opening_view(
-    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    study: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     numbers = runpy.run_path(str(ROOT / "experiments/analyses/readme_numbers.py"))
-    monkeypatch.setitem(numbers["board_table"].__globals__, "TOP", tmp_path)
-    (tmp_path / "reports" / "demo").mkdir(parents=True)
-    shutil.copy(study / "verdicts.csv", tmp_path / "reports" / "demo")
+    monkeypatch.setitem(numbers["board_table"].__globals__, "TOP", study.parents[1])
     lines = numbers["board_table"]("demo").split("\n")
     rows = pd.read_csv(study / "verdicts.csv").iloc[:4]
     # the world of this study states no divergence threshold, so that there is no share of tracks
@@ -135,14 +135,17 @@ def test_a_table_of_the_readme_is_the_opening_view(
 
 def test_a_stored_page_is_decided_again_from_its_runs(study: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(study, tmp_path / "demo"))
-    files = ("report.md", "verdicts.csv", "page.json.gz", "index.html")
-    first = {name: (folder / name).read_bytes() for name in files[:3]}
+    names = [
+        path.name for path in folder.iterdir() if path.suffix in (".md", ".csv", ".parquet", ".svg")
+    ]
+    first = {name: (folder / name).read_bytes() for name in names}
     rebuild_page(folder)
     assert first == {name: (folder / name).read_bytes() for name in first}
-    runs, rows = pd.read_parquet(folder / "runs.parquet"), pd.read_csv(folder / "verdicts.csv")
+    rows = pd.read_csv(folder / "verdicts.csv")
     best = rows["filter"].iloc[0]
+    pack, runs = read_stored_study(folder)
     runs.loc[runs["filter"] == best, "rmse"] *= 50.0
-    runs.to_parquet(folder / "runs.parquet")
+    (folder / RUNS_FILE).write_bytes(format_runs(runs, pack))
     rebuild_page(folder)
     changed = pd.read_csv(folder / "verdicts.csv").query("metric == 'rmse'")
     assert changed["filter"].iloc[0] != best
@@ -151,15 +154,66 @@ def test_a_stored_page_is_decided_again_from_its_runs(study: Path, tmp_path: Pat
         for table in (rows, changed)
     ]
     assert ratios[1] == pytest.approx(50.0 * ratios[0], rel=1e-3)
-    runs[runs["filter"] != best].to_parquet(folder / "runs.parquet")
+
+
+def rewrite(path: Path, change: Callable[[dict[bytes, bytes]], dict[bytes, bytes]]) -> None:
+    """Write a file of runs again with other metadata."""
+    arrow = parquet.read_table(path)
+    parquet.write_table(arrow.replace_schema_metadata(change(dict(arrow.schema.metadata))), path)
+
+
+def pack_text(text: str) -> bytes:
+    return base64.b64encode(gzip.compress(text.encode()))
+
+
+def drop_facts(old: dict[bytes, bytes]) -> dict[bytes, bytes]:
+    """A pack of another version, without the facts of its decisions."""
+    pack = json.loads(gzip.decompress(base64.b64decode(old[KEY])))
+    return {**old, KEY: pack_text(json.dumps({k: v for k, v in pack.items() if k != "facts"}))}
+
+
+KEY = b"pfbench"
+DAMAGES: dict[str, Callable[[dict[bytes, bytes]], dict[bytes, bytes]]] = {
+    "no metadata": lambda old: {k: v for k, v in old.items() if k != KEY},
+    "no base 64": lambda old: {**old, KEY: b"\xff\x00 no text"},
+    "half": lambda old: {**old, KEY: old[KEY][: len(old[KEY]) // 8 * 4]},
+    "no gzip": lambda old: {**old, KEY: base64.b64encode(b"plain")},
+    "no JSON": lambda old: {**old, KEY: pack_text("{")},
+    "no dictionary": lambda old: {**old, KEY: pack_text("[1, 2]")},
+    "another version": drop_facts,
+    "a bomb": lambda old: {**old, KEY: base64.b64encode(gzip.compress(bytes(2**20)) * 300)},
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damaged_runs_are_refused_in_words(name: str, study: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(study, tmp_path / "demo"))
+    page = (folder / "index.html").read_bytes()
+    rewrite(folder / RUNS_FILE, dict)  # the control: the same metadata
+    read_stored_study(folder)
+    rewrite(folder / RUNS_FILE, DAMAGES[name])
     with pytest.raises(
-        ValueError, match=rf"must have runs of all filters of the page, got none of {best}"
+        ValueError, match=rf"{RUNS_FILE} must (be|inflate to) .*got .*\. [A-Z].* again\.$"
     ):
+        rebuild_page(folder)
+    assert (folder / "index.html").read_bytes() == page
+
+
+def test_runs_that_lack_a_filter_of_the_page_are_refused(study: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(study, tmp_path / "demo"))
+    pack, runs = read_stored_study(folder)
+    (folder / RUNS_FILE).write_bytes(format_runs(runs[runs["filter"] != "sir"], pack))
+    with pytest.raises(
+        ValueError, match=r"must have runs of all filters of the page, got none of sir"
+    ):
+        rebuild_page(folder)
+    (folder / RUNS_FILE).unlink()
+    with pytest.raises(ValueError, match=rf"{RUNS_FILE} must be the runs of a study"):
         rebuild_page(folder)
 
 
 def test_facts_of_a_page_are_restored(study: Path) -> None:
-    pack = read_page_data(study)
+    pack = read_stored_study(study).pack
     times = StepTimes(np.array([1e-3, 2e-3, 4e-3]), "group")
     regime = PartName("nominal", "Nominal", "nominal noise")
     options = ReportOptions(alpha=0.01, equivalence_margin=0.1, metric="crps", baseline="sir")
@@ -178,12 +232,19 @@ def test_facts_of_a_page_are_restored(study: Path) -> None:
     assert own.looks["own_filter"].name == facts.looks["ekf"].name
 
 
-def test_warnings_stand_first_in_each_view_that_is_decided_again(study: Path) -> None:
-    pack = read_page_data(study)
-    pack["failures"] = [{}, {}]
+def test_warnings_stand_below_the_sentence_of_each_view(study: Path, tmp_path: Path) -> None:
+    pack, runs = read_stored_study(study)
+    pack["failures"] = [
+        {"key": "k", "choices": dict.fromkeys(("scenario", "noise", "filter"), "x"), "message": "m"}
+    ] * 2
     pack["facts"] |= {"warning": "Runs are copies.", "differing": "Jobs differ."}
-    pack["facts"]["options"]["baseline"] = pack["baselines"][0]
-    for view in decide_again(pack, study / "runs.parquet")["views"].values():
-        start = "2 jobs have no valid result and are missing from all tables. Runs are copies. "
-        assert view["sentence"].startswith(start)
+    decided = decide_parts(runs, StudyFacts.from_pack(pack))
+    assert decided["warnings"] == [
+        "2 jobs have no valid result and are missing from all tables.",
+        "Runs are copies.",
+    ]
+    for view in decided["views"].values():
+        assert view["sentence"].startswith("Of 3 filters, ")
         assert view["small_print"].endswith(" Jobs differ.")
+    page = render_page({**pack, **decided, "downloads": []})["index.html"]
+    assert "missing from all tables. Runs are copies." in page

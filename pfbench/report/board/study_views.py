@@ -234,7 +234,7 @@ def _small_print(runs: StudyRuns, options: ReportOptions, names: StudyNames) -> 
     return (
         f"{sample}. Ratios are those of Hodges and Lehmann over paired runs, with simultaneous "
         f"{format_interval_level(options.alpha)} intervals. Better and worse: Wilcoxon's test and the trimmed mean agree. "
-        f"A lost run counts as an error at the limit of the world. {' '.join(filter(None, texts))}"
+        f"A lost run counts as the limit of the world, or without one as the largest error of the pair. {' '.join(filter(None, texts))}"
     ).rstrip()
 
 

@@ -23,6 +23,7 @@ from pfbench.stats.world_table import TRACK_SHARE
 BASE, MISSING, LOSES_TRACK = "baseline", "missing", "loses track"
 _SAME_LEVEL = 1e-6
 _LEVEL_OF_REGIONS = 0.9
+_MOST_WORDS = 55  # of the sentence of a view
 BoardRow = dict[str, Any]
 
 
@@ -137,7 +138,11 @@ def _show_verdict(view: View, label: str, verdicts: Mapping[str, Verdict | None]
     verdict, lost = verdicts[label], view.filters[label]["lost_conditions"]
     if verdict is None:
         ends |= dict.fromkeys(("ratio", "ratio_low", "ratio_high"), 1.0)
-        return {**ends, "verdict": BASE, "words": _word_lost(view, label) or BASE}
+        return {
+            **ends,
+            "verdict": BASE,
+            "words": ", ".join(filter(None, (BASE, _word_lost(view, label)))),
+        }
     ends = {"ratio": verdict.ratio, "ratio_low": verdict.low, "ratio_high": verdict.high, "p": verdict.p}  # fmt: skip
     if lost and len(view.runs.conditions) == 1:
         return {**ends, "verdict": LOSES_TRACK, "words": _word_lost(view, label)}
@@ -248,7 +253,9 @@ def describe_view(
     if better:
         first = better[0]
         head += f" (best: [[{looks[first['filter']].name}]], {_show_ratio(first)} of its {metric})"
-    return " ".join(filter(None, (f"{head}; {rest}." if rest else f"{head}.", _describe_proposed(others, better, looks))))  # fmt: skip
+    head = f"{head}; {rest}." if rest else f"{head}."
+    texts = [f"{head} {text}".rstrip() for text in _describe_proposed(others, better, looks)]
+    return next((text for text in texts if len(text.split()) <= _MOST_WORDS), head)
 
 
 def _show_ratio(row: BoardRow) -> str:
@@ -260,13 +267,16 @@ def _show_ratio(row: BoardRow) -> str:
 
 def _describe_proposed(
     others: Sequence[BoardRow], better: Sequence[BoardRow], looks: Mapping[str, MethodLook]
-) -> str:
-    """State the proposed method of the smallest ratio, unless it is the best filter; empty without one."""
+) -> list[str]:
+    """State the proposed method of the smallest ratio, with its interval and without; empty if it is the best filter."""
     proposed = [row for row in others if looks[row["filter"]].proposed]
     if not proposed or (better and looks[better[0]["filter"]].proposed):
-        return ""
+        return [""]
     row = min(proposed, key=lambda r: (r["verdict"] == LOSES_TRACK, r["ratio"]))
-    return f"Best proposed method: [[{looks[row['filter']].name}]], {_show_ratio(row)}, {row['verdict']}."
+    head = f"Best proposed method: [[{looks[row['filter']].name}]]"
+    return [
+        f"{head}, {ratio}, {row['verdict']}." for ratio in (_show_ratio(row), f"{row['ratio']:.2f}")
+    ]
 
 
 def count_words(number: int, noun: str) -> str:

@@ -2,7 +2,10 @@
 const verdictStyle = (word) => ({ better: "good", worse: "bad", equal: "good", identical: "good" })[word] || "open";
 
 function drawForest(part) {
-  const pairs = data.planned.filter((pair) => pair.estimate > 0);
+  const kinds = ["paper", "tuned", ""];
+  const pairs = data.planned
+    .filter((pair) => pair.estimate > 0)
+    .sort((a, b) => kinds.indexOf(a.kind) - kinds.indexOf(b.kind));
   part.innerHTML = pairs.length ? forest(part, pairs) : "";
 }
 
@@ -44,7 +47,7 @@ function forest(part, pairs) {
     const [a, b] = [looks[pair.a], looks[pair.b]];
     const names = `${a.name}${narrow ? " / " : " against "}${b.name}`;
     const known = pair.low !== null && pair.high !== null;
-    const range = known ? `[${change(pair.low)}, ${change(pair.high)}]` : `(${pair.reason})`;
+    const range = known ? `[${change(pair.low)}, ${change(pair.high)}]` : pair.reason ? `(${pair.reason})` : "";
     const words = `${change(pair.estimate)} ${range}`;
     const small = pair.cells.filter((cell) => shown(cell.estimate));
     const verdict = `${change(pair.estimate)} ${pair.word}`;
