@@ -135,7 +135,7 @@ def test_stored_knobs_are_the_choice_among_the_stored_candidates(name: str) -> N
 
 
 # files of an earlier `pfbench tune`, until they are written again
-WITHOUT_FIT = ("flight_300s", "recorded_berlin")
+WITHOUT_FIT = ("recorded_berlin",)
 
 
 @pytest.mark.parametrize("name", TUNED)
