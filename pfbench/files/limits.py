@@ -7,6 +7,7 @@ import io
 import stat
 import zipfile
 import zlib
+from collections import Counter
 from pathlib import Path
 
 # of a configuration file
@@ -23,6 +24,11 @@ LOADED_FILES = (
     300  # by the defaults lists of one configuration with a search path, repetitions counted
 )
 SWEPT_JOBS = 100_000  # of the sweep in a file
+# of texts that are read line by line: NMEA, TUM, KF-GINS, RINEX and CSV
+TEXT_BYTES = 512 * 2**20
+TEXT_LINES = 5_000_000
+LINE_BYTES = 100_000
+_PIECE = 2**20  # bytes that are checked at once
 # of tables and compressed files
 TABLE_BYTES = 4 * 2**30
 TABLE_COLUMNS = 1_000
@@ -56,6 +62,30 @@ def check_columns(path: Path, count: int) -> None:
             f"{path.name} must have at most {TABLE_COLUMNS} columns, got {count}. "
             "Keep the columns that the reader names."
         )
+
+
+def read_text(path: Path) -> bytes:
+    """Read a text, whose size, number of lines and longest line are checked piece by piece."""
+    check_is_file(path, TEXT_BYTES)
+    pieces, ends, length = [], Counter[bytes](), 0
+    with path.open("rb") as file:
+        while piece := file.read(_PIECE):
+            pieces.append(piece)
+            first, *others = map(len, piece.replace(b"\r", b"\n").split(b"\n"))
+            longest = max(length + first, *others, 0)
+            if longest > LINE_BYTES:
+                raise LimitError(
+                    f"{path.name} must have lines of at most {LINE_BYTES} bytes, got a longer one. "
+                    "Write each row into a line of its own."
+                )
+            length = others[-1] if others else length + first
+            ends.update({end: piece.count(end) for end in (b"\n", b"\r")})
+            if max(ends.values()) > TEXT_LINES:
+                raise LimitError(
+                    f"{path.name} must have at most {TEXT_LINES} lines, got more. Split the file, or write a "
+                    "table as Parquet."
+                )
+    return b"".join(pieces)
 
 
 def check_inflated(path: Path, size: int) -> None:

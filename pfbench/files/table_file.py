@@ -155,7 +155,7 @@ def is_number_text(text: str) -> bool:
 
 def _whole_lines(file: Path) -> tuple[list[str], tuple[str, ...]]:
     """Return the complete lines, and a note if the last one is not complete."""
-    content = file.read_bytes()
+    content = limits.read_text(file)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -188,6 +188,11 @@ def _whole_lines(file: Path) -> tuple[list[str], tuple[str, ...]]:
     if not last:
         return lines, ()
     return lines, (describe_cut(file, len(lines) + 1),)
+
+
+def split_lines(text: str) -> list[str]:
+    """Split a text at line ends of any system; the last line is the one without an end."""
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
 def describe_cut(file: Path, line: int) -> str:

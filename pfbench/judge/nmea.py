@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pfbench.files.limits import read_text
+from pfbench.files.table_file import split_lines
 from pfbench.judge.judge_options import SourceOptions
 from pfbench.judge.trajectory_table import GEODETIC, POSITION_SD, TrajectoryTable
 
@@ -31,8 +33,13 @@ _Epoch = dict[str, float]
 class _Sentence(NamedTuple):
     line: int
     kind: str  # as GGA
-    fields: list[str]
+    body: str
     checksum: str  # "valid", "wrong" or "none"
+
+    @property
+    def fields(self) -> list[str]:
+        """Fields of the sentence; a log has millions, so that they are not kept."""
+        return self.body.split(",")
 
 
 def read_nmea_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
@@ -158,7 +165,7 @@ def _fill_separation(epochs: list[_Epoch], notes: list[str]) -> np.ndarray:
 def _read_sentences(file: Path, counts: Counter[str]) -> list[_Sentence]:
     """Return the sentences that are read; others and other lines are counted."""
     sentences = []
-    *lines, last = file.read_text(encoding="ascii", errors="replace").split("\n")
+    *lines, last = split_lines(read_text(file).decode("ascii", "replace"))
     for number, line in enumerate(map(str.strip, (*lines, last)), 1):
         if _WITHOUT_SIGN.search(line):
             raise ValueError(
@@ -173,7 +180,7 @@ def _read_sentences(file: Path, counts: Counter[str]) -> list[_Sentence]:
             kind = match["kind"] if match["kind"] in _READERS else ""
             if match["sign"] == "!":  # of other systems, as AIS
                 kind, checksum = "", "none"
-            sentences.append(_Sentence(number, kind, match["body"].split(","), checksum))
+            sentences.append(_Sentence(number, kind, match["body"], checksum))
     while sentences and sentences[-1].line > len(lines) and sentences[-1].checksum != "valid":
         counts["damaged sentences in the last line, which has no end"] += 1
         sentences.pop()
@@ -192,7 +199,7 @@ def _check_checksums(file: Path, sentences: list[_Sentence]) -> list[str]:
     none = [sentence for sentence in read if sentence.checksum == "none"]
     bad = wrong or (none if len(none) < len(read) else [])
     if bad:
-        body = ",".join(bad[0].fields)
+        body = bad[0].body
         remedy = (
             "Remove these lines." if wrong else "Remove these lines, or all checksums with their *."
         )
@@ -209,7 +216,7 @@ def _check_checksums(file: Path, sentences: list[_Sentence]) -> list[str]:
 def _field_error(file: Path, sentence: _Sentence) -> ValueError:
     return ValueError(
         f"{file.name}: line {sentence.line} must have the fields of NMEA 0183, got "
-        f"{','.join(sentence.fields)[:80]!r}. Repair or remove this line."
+        f"{sentence.body[:80]!r}. Repair or remove this line."
     )
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import difflib
 import re
+from array import array
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from pfbench.files.table_file import describe_cut, is_number_text, read_table_file
+from pfbench.files.limits import check_columns, read_text
+from pfbench.files.table_file import describe_cut, is_number_text, read_table_file, split_lines
 from pfbench.judge.judge_options import SourceOptions
 from pfbench.judge.trajectory_table import (
     ALL_COLUMNS,
@@ -37,8 +39,8 @@ _WEEK = 604800.0  # s
 _TO_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # from East, North, Up
 _TO_FRD = np.diag([1.0, -1.0, -1.0])  # a body with forward, left, up
 _COMMENTS, _BOM = ("#", "%"), "\ufeff"
-_LONGEST_HEAD = 100_000  # characters of a line, or lines before the first row
-_UNIT = re.compile(r"[\[(][^\])]*[\])]")  # as in time [s]
+_HEAD_BYTES = 2**20  # with all comments before the first row
+_UNIT = re.compile(r"[\[(][^\[(\])]*[\])]")  # as in time [s]
 _QUATERNION = re.compile(r"(?:.*\W)?(?:q|quat|quaternion|orientation|rot|rotation)\w*?_?([wxyz])")
 
 
@@ -128,16 +130,22 @@ def read_head(file: Path, rows: int = 20) -> tuple[list[str], list[list[str]]]:
     """Read names of columns and the first rows of a text; a line of names can be a comment."""
     heads: list[list[str]] = []
     fields: list[list[str]] = []
-    with file.open(encoding="utf-8-sig", errors="replace") as lines:
-        for line in map(str.strip, lines):
-            if line.startswith(_COMMENTS) or (not fields and _has_no_number(line)):
-                heads.append(split_line(_UNIT.sub("", line.lstrip("#% "))))
-            elif line:
-                fields.append(split_line(line))
-            if len(fields) == rows or len(line) + len(heads) > _LONGEST_HEAD:
-                break
+    for line in map(str.strip, _read_first_lines(file)):
+        if line.startswith(_COMMENTS) or (not fields and _has_no_number(line)):
+            heads.append(split_line(_UNIT.sub("", line.lstrip("#% "))))
+        elif line:
+            fields.append(split_line(line))
+        if len(fields) == rows:
+            break
     width = len(fields[0]) if fields else 0
+    check_columns(file, width)
     return next((names for names in reversed(heads) if len(names) == width), []), fields
+
+
+def _read_first_lines(file: Path) -> list[str]:
+    """Return the lines at the start of a text. The last one can be cut."""
+    with file.open("rb") as stream:
+        return split_lines(stream.read(_HEAD_BYTES).decode("utf-8-sig", "replace"))
 
 
 def to_numbers(rows: Sequence[Sequence[str]]) -> Array:
@@ -172,12 +180,11 @@ def _read_numbers(
     Comments start with # or %, and names can precede the first row. A last line without an end may
     lack digits, so it is dropped with a note.
     """
-    rows: list[list[float]] = []
-    lines: list[int] = []
+    rows, lines = array("d"), array("q")  # a list of numbers needs four times the memory
     notes: list[str] = []
     width = width or len(names)
-    content = file.read_text(encoding="utf-8", errors="replace").removeprefix(_BOM)
-    *complete, last = content.split("\n")
+    content = read_text(file).decode("utf-8", "replace").removeprefix(_BOM)
+    *complete, last = split_lines(content)
     for number, line in enumerate(complete, 1):
         text, fields = line.strip(), split_line(line)
         if not text or text.startswith(_COMMENTS):
@@ -194,10 +201,10 @@ def _read_numbers(
                 f"{file.name}: line {number} must have {width} numbers ({' '.join(names[:11])}), "
                 f"got {line[:80]!r}. Repair or remove this line."
             )
-        rows.append(row)
+        rows.extend(row)
         lines.append(number)
     notes += [describe_cut(file, len(complete) + 1)] if last.strip() else []
-    numbers = np.array(rows, dtype=np.float64).reshape(len(rows), len(places) or width)
+    numbers = np.array(rows).reshape(len(lines), len(places) or width)
     return numbers, np.array(lines), tuple(notes)
 
 

@@ -16,6 +16,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from pfbench.files.limits import read_text
 from pfbench.files.table_file import read_table_file
 from pfbench.nav import earth
 from pfbench.nav.orbits import GPS_OMEGA, OrbitalElements, eccentric_anomaly
@@ -244,7 +245,7 @@ def _describe_kind(lines: Sequence[str]) -> str:
 
 def _lines(file: Path) -> list[str]:
     # names and comments contain other letters, which are read but not used
-    text = file.read_bytes().removeprefix(b"\xef\xbb\xbf").decode("latin-1")
+    text = read_text(file).removeprefix(b"\xef\xbb\xbf").decode("latin-1")
     return [line.rstrip() for line in text.split("\n")]
 
 

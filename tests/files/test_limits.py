@@ -20,6 +20,9 @@ from pyarrow import parquet
 from pfbench.files import limits
 from pfbench.files.table_file import read_table_file
 from pfbench.filter.learned.checkpoint import read_checkpoint
+from pfbench.judge.formats import read_trajectories
+from pfbench.judge.judge_options import SourceOptions
+from pfbench.nav.ephemeris import read_rinex
 from pfbench.report import RUNS_FILE, read_stored_study
 from pfbench.results.store import read_metadata, read_result
 from pfbench.scenario.simulated import _read
@@ -53,6 +56,53 @@ def write_rows(path: Path) -> None:
     parquet.write_table(pa.table({"t": column}), path, compression="zstd")
 
 
+def write_one_line(path: Path) -> None:
+    """A text of 400 MB without a line end, which takes no space on the disk."""
+    path.write_bytes(START[path.suffix])
+    os.truncate(path, 400 * 2**20)
+
+
+def write_gigabytes(path: Path) -> None:
+    path.write_bytes(START[path.suffix])
+    os.truncate(path, 5 * 2**30)
+
+
+def write_empty_lines(path: Path) -> None:
+    path.write_bytes(START[path.suffix] + b"\n" * (limits.TEXT_LINES + 1))
+
+
+def write_old_line_ends(path: Path) -> None:
+    path.write_bytes(START[path.suffix] + b"\r" * (limits.TEXT_LINES + 1))
+
+
+def write_pose_columns(path: Path) -> None:
+    path.write_text("1 " * 30_000 + "\n")
+
+
+def write_brackets(path: Path) -> None:
+    """Comments in which each bracket may begin a unit."""
+    path.write_text(("#" + "[" * 90_000 + "\n") * 11)
+
+
+START = {
+    ".csv": b"t,pn,pe,pd\n",
+    ".nmea": b"$GPGGA,\n",
+    ".tum": b"0 0 0 0 0 0 0 1\n",
+    ".20n": b"     2.11           N: GPS NAV DATA                         RINEX VERSION / TYPE\n",
+}
+READERS: dict[str, Callable[[Path], object]] = {
+    ".csv": read_table_file,
+    ".nmea": lambda path: read_trajectories(path, SourceOptions()),
+    ".tum": lambda path: read_trajectories(path, SourceOptions(frame="ned")),
+    ".20n": read_rinex,
+}
+TEXTS: dict[str, Callable[[Path], None]] = {
+    "one line": write_one_line,
+    "gigabytes": write_gigabytes,
+    "empty lines": write_empty_lines,
+    "old line ends": write_old_line_ends,
+}
+
 CASES: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]] = {
     "a result": ("a.npz", write_zip, read_result),
     "metadata of a result": ("a.npz", write_zip, read_metadata),
@@ -63,6 +113,13 @@ CASES: dict[str, tuple[str, Callable[[Path], None], Callable[[Path], object]]] =
     "a table of columns": ("a.csv", write_columns, read_table_file),
     "a table of rows": ("a.parquet", write_rows, read_table_file),
     "a pipe": ("a.csv", os.mkfifo, read_table_file),
+    "poses of columns": ("a.tum", write_pose_columns, READERS[".tum"]),
+    "units in a comment": ("a.txt", write_brackets, READERS[".tum"]),
+    **{
+        f"{name}: {kind}": (f"a{kind}", write, read)
+        for kind, read in READERS.items()
+        for name, write in TEXTS.items()
+    },
 }
 
 
@@ -96,3 +153,24 @@ def test_files_within_the_limits_are_read(tmp_path: Path) -> None:
     np.savez_compressed(stream, zeros=np.zeros(2**20))  # a ratio of a thousand, and 8 MB
     path.write_bytes(stream.getvalue())
     limits.check_zip(path)
+
+
+def test_a_text_at_the_limits_is_read_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lines and bytes are counted alike wherever the pieces end."""
+    path = tmp_path / "a.txt"
+    for end in (b"\n", b"\r", b"\r\n"):
+        content = end.join([b"a" * 7, b"b" * 10, b"", b"c"]) + end
+        path.write_bytes(content)
+        for piece in range(1, len(content) + 1):
+            for name, most in (("_PIECE", piece), ("LINE_BYTES", 10), ("TEXT_LINES", 4)):
+                monkeypatch.setattr(limits, name, most)
+            assert limits.read_text(path) == content
+            monkeypatch.setattr(limits, "LINE_BYTES", 9)
+            with pytest.raises(limits.LimitError, match="at most 9 bytes, got a longer one"):
+                limits.read_text(path)
+            monkeypatch.setattr(limits, "LINE_BYTES", 10)
+            monkeypatch.setattr(limits, "TEXT_LINES", 3)
+            with pytest.raises(limits.LimitError, match="at most 3 lines"):
+                limits.read_text(path)

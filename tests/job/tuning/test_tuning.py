@@ -134,18 +134,11 @@ def test_stored_knobs_are_the_choice_among_the_stored_candidates(name: str) -> N
         assert "tuned" not in config  # else the key of every job would change with the record
 
 
-# files of an earlier `pfbench tune`, until they are written again
-WITHOUT_FIT = ("flight_300s", "recorded_berlin")
-
-
 @pytest.mark.parametrize("name", TUNED)
 def test_a_file_states_the_best_filter_of_its_world_and_whether_kalman_filters_fit(
     name: str,
 ) -> None:
     content = read_tuned(name)
-    assert ("fit" in content) == (name not in WITHOUT_FIT)
-    if name in WITHOUT_FIT:
-        return
     fit = content["fit"]
     errors = {}
     for method in TUNED_METHODS:
