@@ -38,7 +38,7 @@ RANGES: dict[str, tuple[list[Any], list[Any], str]] = {
     "(0, inf)": ([5e-324], [0, math.inf], "positive and finite, got"),
     "(2, inf]": ([2.1, math.inf], [2], "above 2, got"),
     "whole [2, inf) Use 3.": ([2, 10**9], [1, 2.0, True, None, "2"], r"a whole number of at least 2, got .* Use 3\."),
-    "null or whole [1, inf)": ([None, 1], [0, 1.0], "a whole number of at least 1, got"),
+    "null or whole [1, inf)": ([None, 1], [0, 1.0, True], "a whole number of at least 1, got"),
     "null or [1e-6, 1e6]": ([None, 1e-6, 1e6], [1e-7, 2e6], r"in \[1e-6, 1e6\], got"),
 }  # fmt: skip
 
