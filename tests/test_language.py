@@ -225,16 +225,22 @@ def long_docstring_sentences(tree: ast.AST) -> Iterator[str]:
         yield from (f"{line}: {sentence}" for sentence in long_sentences(text))
 
 
+def literal(text: ast.expr) -> str:
+    """Return the text of a literal; a value in it becomes {}."""
+    if isinstance(text, ast.JoinedStr):
+        return "".join(map(literal, text.values))
+    return text.value if isinstance(text, ast.Constant) and isinstance(text.value, str) else "{}"
+
+
 def messages(tree: ast.AST) -> Iterator[tuple[int, str]]:
     """Yield the literal texts of raised errors; a value in a text becomes {}."""
     for node in nodes_of(tree):
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "require":
+            key, must, got, *remedy = (literal(argument) for argument in node.args[1:])
+            yield node.lineno, f"{key} must {must}, got {got}. {''.join(remedy)}"
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args:
-            text = node.exc.args[0]
-            if isinstance(text, ast.Constant) and isinstance(text.value, str):
-                yield node.lineno, text.value
-            elif isinstance(text, ast.JoinedStr):
-                parts = (p.value if isinstance(p, ast.Constant) else "{}" for p in text.values)
-                yield node.lineno, "".join(map(str, parts))
+            text = literal(node.exc.args[0])
+            yield from [(node.lineno, text)] if text != "{}" else ()
 
 
 def messages_without_requirement(tree: ast.AST) -> Iterator[str]:

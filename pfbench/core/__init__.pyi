@@ -7,6 +7,11 @@ from pfbench.core.chart import (
     LieGroupBlock as LieGroupBlock,
     QuaternionBlock as QuaternionBlock,
 )
+from pfbench.core.parameter_checks import (
+    require as require,
+    require_range as require_range,
+    require_ranges as require_ranges,
+)
 from pfbench.core.random_stream import PhiloxStream as PhiloxStream, RandomStream as RandomStream
 from pfbench.core.record import (
     Episode as Episode,

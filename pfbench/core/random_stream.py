@@ -15,9 +15,10 @@ from typing import Any, Protocol, TypeAlias
 
 import torch
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensor
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import check_run_numbers
+from pfbench.core.parameter_checks import RUN_NUMBERS
 from pfbench.kernels import cuda, dispatch
 from pfbench.kernels.dispatch import compilable
 
@@ -249,3 +250,17 @@ def select_runs(draws: RandomStream, rows: Tensor) -> RandomStream:
         lambda d, p, n, w: d.uniform(p, n, w)[rows],
         lambda d, p, n, w: d.normal(p, n, w)[rows],
     )
+
+
+def check_run_numbers(runs: Tensor) -> None:
+    """Check the range of run numbers on the CPU. On another device the host would wait for them.
+
+    Shapes: runs [R].
+    """
+    if runs.device.type != "cpu" or isinstance(runs, FakeTensor):
+        return
+    wrong = runs[(runs < 0) | (runs >= RUN_NUMBERS)].tolist()
+    if wrong:
+        raise ValueError(
+            f"runs must be from 0 to 2**32 - 1, got {wrong[0]}. Use another seed for more runs."
+        )

@@ -10,6 +10,7 @@ from torch.distributions import Independent
 from torch.distributions.constraints import Constraint, is_dependent
 
 from pfbench.core.density import check_event_dimension
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state
@@ -50,8 +51,7 @@ def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) ->
             f"{str(y.dtype).removeprefix('torch.')} {list(y.shape)}. Convert it, for instance by "
             "y.double()."
         )
-    if y.shape[1] == 0:
-        raise ValueError("record.y must have at least one time step, got 0. Add measurements.")
+    require(y.shape[1] != 0, "record.y", "have at least one time step", "0", "Add measurements.")
     if bool(torch.isinf(y).any()):
         raise ValueError("record.y must be finite, got infinity. Mark a missing component as NaN.")
     runs, steps, _ = y.shape
@@ -146,13 +146,13 @@ def _check_likelihood(model: StateSpaceModel, record: Record, x: Tensor) -> None
     with torch.no_grad(), uncounted_observation(model):
         log_likelihood = model.log_likelihood(record.y, x, record.u)
     is_undefined = torch.isnan(log_likelihood) | torch.isposinf(log_likelihood)
-    if bool(is_undefined.all()):
-        raise ValueError(
-            f"{type(model).__name__}.log_likelihood must be a number or -inf, got NaN or infinity for "
-            "all states that were tried at the first step. Check mean and spread of the measurement "
-            "for NaN, and its noise: a component without noise, or two that are copies of each "
-            "other, are without a density."
-        )
+    require(
+        not bool(is_undefined.all()),
+        f"{type(model).__name__}.log_likelihood",
+        "be a number or -inf",
+        "NaN or infinity for all states that were tried at the first step",
+        "Check mean and spread of the measurement for NaN, and its noise: a component without noise, or two that are copies of each other, are without a density.",
+    )
 
 
 def _check_support(model: StateSpaceModel, record: Record, first: Any, x: Tensor) -> None:

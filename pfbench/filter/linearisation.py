@@ -12,6 +12,7 @@ from torch.distributions import Distribution, Independent, MultivariateNormal, N
 
 from pfbench.core.density import has_finite_moments
 from pfbench.core.linear_algebra import jacobian, shared_distribution_covariance, squared_length
+from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record
 from pfbench.filter.belief import (
     compute_spread,
@@ -269,13 +270,13 @@ def check_noise_gain(model: StateSpaceModel, x: Tensor, u: Any) -> None:
             f"{name} must have shape [{x.shape[0]} or 1, {shape[0]}, {shape[1]}] of runs, state and "
             f"noise, got {list(gain.shape)}."
         )
-    if not is_noise_gain(model, x, u, probe_noise(model, x), gain):
-        raise ValueError(
-            f"{name} must be the L of propagate(x, u, mean + w) = propagate(x, u, mean) (+) L w, got "
-            "another matrix. Correct it, or return None if the noise is not additive. A class that "
-            "overrides propagate must override noise_gain, too. pfbench.testing.check_jacobians "
-            "shows the size of the error."
-        )
+    require(
+        is_noise_gain(model, x, u, probe_noise(model, x), gain),
+        name,
+        "be the L of propagate(x, u, mean + w) = propagate(x, u, mean) (+) L w",
+        "another matrix",
+        "Correct it, or return None if the noise is not additive. A class that overrides propagate must override noise_gain, too. pfbench.testing.check_jacobians shows the size of the error.",
+    )
 
 
 def around_first(

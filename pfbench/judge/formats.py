@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pfbench.core.parameter_checks import require
 from pfbench.judge.judge_options import SourceOptions
 from pfbench.judge.nmea import read_nmea_trajectory
 from pfbench.judge.text_formats import (
@@ -110,8 +111,7 @@ def list_trajectory_files(pattern: str) -> list[TrajectoryFile]:
     """
     path = Path(pattern)
     if "{" not in pattern:
-        if not path.is_file():
-            raise ValueError(f"{pattern} must be a file, got none. Check the path.")
+        require(path.is_file(), pattern, "be a file", "none", "Check the path.")
         return [TrajectoryFile(path, ONE, "")]
     fixed = path
     while "{" in str(fixed):

@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
 
+from pfbench.core.parameter_checks import require, require_range, require_ranges
 from pfbench.judge.trajectory_table import ALL_COLUMNS
 
 FRAMES = ("", "ned", "enu")
@@ -39,19 +39,14 @@ class SourceOptions:
     sd: str = ""
 
     def __post_init__(self) -> None:
-        _require(
-            "NAME.shift",
-            abs(self.shift) <= _LARGEST_TIME,
-            f"at most {_LARGEST_TIME:g} s",
-            self.shift,
-        )
-        _require("NAME.frame", self.frame in FRAMES, "ned or enu", self.frame)
-        _require("NAME.format", self.format in FORMATS, ", ".join(FORMATS[1:]), self.format)
+        require_range("NAME.shift", self.shift, f"[-{_LARGEST_TIME:g}, {_LARGEST_TIME:g}]")
+        require(self.frame in FRAMES, "NAME.frame", "be ned or enu", self.frame)
+        formats = f"be {', '.join(FORMATS[1:])}"
+        require(self.format in FORMATS, "NAME.format", formats, self.format)
         for name, factor in self.scale.items():
-            _require(
-                "NAME.scale", math.isfinite(factor) and factor != 0, "finite and not 0", factor
-            )
-            _require("NAME.scale", name in ALL_COLUMNS, f"of {', '.join(ALL_COLUMNS)}", name)
+            is_factor = math.isfinite(factor) and factor != 0
+            require(is_factor, "NAME.scale", "be finite and not 0", factor)
+            require(name in ALL_COLUMNS, "NAME.scale", f"be of {', '.join(ALL_COLUMNS)}", name)
 
 
 @dataclass(frozen=True)
@@ -93,20 +88,15 @@ class JudgeOptions:
     margin: float = 0.05
 
     def __post_init__(self) -> None:
-        for name in ("every", "largest_gap", "limit", "block"):
-            _require(name, getattr(self, name) >= 0, "at least 0", getattr(self, name))
-        _require("tolerance", 0 < self.tolerance < math.inf, "positive", self.tolerance)
-        _require("margin", 1e-6 <= self.margin <= 1e6, "from 1e-6 to 1e6", self.margin)
-        _require("alpha", 1e-9 <= self.alpha < 1, "from 1e-9 to below 1", self.alpha)
-        _require("coverage", 0 < self.coverage <= 1, "above 0 and at most 1", self.coverage)
-        _require("from", self.start < self.end, "before to", f"{self.start} and {self.end}")
-        _require("holes", self.holes in HOLES, " or ".join(HOLES), self.holes)
-        _require("align", self.align in ALIGNMENTS, " or ".join(ALIGNMENTS), self.align)
-        _require(
-            "origin", len(self.origin) in (0, 3), "lat_deg,lon_deg,h_m", list(self.origin) or "none"
-        )
+        least = ("every", "largest_gap", "limit", "block")
+        rules = {**dict.fromkeys(least, "[0, inf]"), "tolerance": "(0, inf)", "coverage": "(0, 1]"}
+        require_ranges("", self, **rules, margin="[1e-6, 1e6]", alpha="[1e-9, 1)")
+        require(self.start < self.end, "from", "be before to", f"{self.start} and {self.end}")
+        require(self.holes in HOLES, "holes", f"be {' or '.join(HOLES)}", self.holes)
+        require(self.align in ALIGNMENTS, "align", f"be {' or '.join(ALIGNMENTS)}", self.align)
+        require(len(self.origin) in (0, 3), "origin", "be lat_deg,lon_deg,h_m", list(self.origin))
         for value, limit in zip(self.origin, _ORIGIN_LIMITS, strict=False):
-            _require("origin", abs(value) <= limit, f"within {limit:g}", value)
+            require_range("origin", value, f"[-{limit:g}, {limit:g}]")
 
 
 @contextmanager
@@ -116,8 +106,3 @@ def name_program(program: str) -> Iterator[None]:
         yield
     except ValueError as error:
         raise ValueError(str(error).replace("NAME.", f"{program}.")) from error
-
-
-def _require(name: str, is_valid: bool, requirement: str, value: Any) -> None:
-    if not is_valid:
-        raise ValueError(f"{name} must be {requirement}, got {value}. Change {name}=...")

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.limits import check_columns, read_text
 from pfbench.files.table_file import describe_cut, is_number_text, read_table_file, split_lines
 from pfbench.judge.judge_options import SourceOptions
@@ -112,8 +113,7 @@ def read_kf_gins_trajectory(
     )
     if sd is not None:
         names = ("t", *(f"column {k}" for k in range(2, KF_GINS_SD + 1)))
-        if not sd.is_file():
-            raise ValueError(f"sd must be a file, got {sd} for {file.name}. Check the path.")
+        require(sd.is_file(), "sd", "be a file", f"{sd} for {file.name}", "Check the path.")
         deviations, _, _ = _read_numbers(sd, names)
         if deviations.shape[0] != len(time) or (np.abs(deviations[:, 0] - second) > 1e-4).any():
             raise ValueError(

@@ -17,6 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import PhiloxStream, RandomStream, relabel
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter, GaussianBelief, ParticleBelief, StepInfo
@@ -356,23 +357,16 @@ class Training:
     checkpoint_path: str | None = None
 
     def __post_init__(self) -> None:
-        minima = {"particles": 2, "training_runs": 1, "validation_runs": 1, "seed": 0, "epochs": 1}
-        minima |= {"batch_size": 1, "patience_epochs": 1, "max_steps": 1, "gradient_steps": 1}
-        for name, minimum in minima.items():
-            value = getattr(self, name)
-            if value is None and name in ("max_steps", "gradient_steps"):
-                continue
-            if type(value) is not int or value < minimum:
-                raise ValueError(
-                    f"train.{name} must be an integer of at least {minimum}, got {value}. "
-                    f"Set train.{name}={minimum} or more."
-                )
-        for name in ("learning_rate", "max_grad_norm"):
-            value = getattr(self, name)
-            if not value > 0.0:
-                raise ValueError(
-                    f"train.{name} must be positive, got {value}. Set train.{name}=0.001."
-                )
+        counts = ("training_runs", "validation_runs", "epochs", "batch_size", "patience_epochs")
+        require_ranges(
+            "train",
+            self,
+            particles="whole [2, inf)",
+            seed="whole [0, inf)",
+            **dict.fromkeys(counts, "whole [1, inf)"),
+            **dict.fromkeys(("max_steps", "gradient_steps"), "null or whole [1, inf)"),
+            **dict.fromkeys(("learning_rate", "max_grad_norm"), "(0, inf] Use 0.001."),
+        )
 
 
 @dataclass

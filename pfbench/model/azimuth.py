@@ -13,6 +13,7 @@ from typing_extensions import override
 
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, wrap_angle
 from pfbench.core.density import independent_normal
+from pfbench.core.parameter_checks import require_range
 from pfbench.core.record import Record
 from pfbench.model.ins_gnss import BIASES, NAVIGATION, InsErrorModel, name_ins_components
 from pfbench.nav import attitude, earth, error_dynamics
@@ -95,11 +96,11 @@ class SinsGpsAzimuth(InsErrorModel):
         super().__init__()
         self.channel_names = LOOSE_CHANNELS[: len(receiver.sd)]
         self.check_receiver(receiver)
-        if not process_noise_factor > 0.0:
-            raise ValueError(
-                f"model.process_noise_factor must be positive, got {process_noise_factor}. "
-                "Use 1.0 for the sensors' nominal noise."
-            )
+        require_range(
+            "model.process_noise_factor",
+            process_noise_factor,
+            "(0, inf] Use 1.0 for the sensors' nominal noise.",
+        )
         self.names, self.units, self.groups = name_ins_components(
             NAVIGATION + (BIASES if biases else ())
         )

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from pfbench.core.chart import wrap_angle
 from pfbench.core.density import independent_normal, normal_batch
-from pfbench.core.parameter_checks import check_positive
+from pfbench.core.parameter_checks import check_positive, require, require_range
 from pfbench.model.base import StateSpaceModel
 
 SPEED_OF_LIGHT = 299792458.0  # m/s
@@ -90,14 +90,8 @@ class PassiveLocation(StateSpaceModel):
             "initial_sd": (initial_sd, 4),
         }
         for name, (values, length) in lengths.items():
-            if len(values) != length:
-                raise ValueError(
-                    f"model.{name} must be {length} numbers, got {list(values)}. Correct the list."
-                )
-        if not 0.0 <= acceleration_sd < float("inf"):
-            raise ValueError(
-                f"model.acceleration_sd must be 0 or more, got {acceleration_sd}. Give m/s^2."
-            )
+            require(len(values) == length, f"model.{name}", f"be {length} numbers", list(values))
+        require_range("model.acceleration_sd", acceleration_sd, "[0, inf) Give m/s^2.")
         t = float(check_positive("model.interval", interval))
         eye = torch.eye(2, dtype=torch.float64)
         self.register_buffer(

@@ -12,7 +12,7 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core.density import independent_normal, normal_batch
-from pfbench.core.parameter_checks import check_positive, check_whole_number
+from pfbench.core.parameter_checks import check_positive, require_ranges
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.model.base import StateSpaceModel
 
@@ -175,14 +175,16 @@ class RandomTerrain:
     seed: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("height_sd", "shortest_m", "longest_m", "hurst_exponent"):
-            check_positive(f"scenario.terrain.{name}", getattr(self, name))
-        if not self.shortest_m < self.longest_m:
-            raise ValueError(
-                f"scenario.terrain.longest_m must be above shortest_m = {self.shortest_m}, got "
-                f"{self.longest_m}. Increase longest_m."
-            )
-        check_whole_number("scenario.terrain.waves", self.waves, 8, "Use 48.")
+        longest = f"({self.shortest_m}, inf) Increase longest_m, above shortest_m."
+        require_ranges(
+            "scenario.terrain",
+            self,
+            height_sd="(0, inf)",
+            shortest_m="(0, inf)",
+            longest_m=longest,
+            hurst_exponent="(0, inf)",
+            waves="whole [8, inf) Use 48.",
+        )
 
     def draw_waves(self) -> TerrainWaves:
         """Draw the waves of the terrain."""

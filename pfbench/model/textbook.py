@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock
 from pfbench.core.density import independent_normal, normal_batch
-from pfbench.core.parameter_checks import as_float64, check_positive
+from pfbench.core.parameter_checks import as_float64, check_positive, require_range
 from pfbench.core.record import Record, name_channels
 from pfbench.model.base import StateSpaceModel
 
@@ -135,11 +135,7 @@ class StochasticVolatility(StateSpaceModel):
 
     def __init__(self, mu: float = -1.0, rho: float = 0.95, sigma: float = 0.3) -> None:
         super().__init__()
-        if not -1.0 < rho < 1.0:
-            raise ValueError(
-                f"model.rho must be between -1 and 1, exclusive, got {rho}. "
-                "Choose a stationary log volatility."
-            )
+        require_range("model.rho", rho, "(-1, 1) Choose a stationary log volatility.")
         self.register_buffer("sigma", check_positive("model.sigma", [sigma]))
         self.register_buffer("mu", as_float64([mu]))
         self.register_buffer("rho", as_float64([rho]))

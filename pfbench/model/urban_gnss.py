@@ -21,7 +21,12 @@ from typing_extensions import override
 
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, wrap_angle
 from pfbench.core.density import independent_normal, normal_batch
-from pfbench.core.parameter_checks import check_positive, check_three_positive, check_tuning
+from pfbench.core.parameter_checks import (
+    check_positive,
+    check_three_positive,
+    check_tuning,
+    require_ranges,
+)
 from pfbench.core.record import EACH_SATELLITE
 from pfbench.model.base import StateSpaceModel
 
@@ -120,11 +125,7 @@ class LosNlosRangeError(PseudorangeError):
     slope: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.share < 1.0:
-            raise ValueError(
-                "model.range_error.share must be between 0 and 1, exclusive, "
-                f"got {self.share}. Set a probability."
-            )
+        require_ranges("model.range_error", self, share="(0, 1)")
         check_positive("model.range_error.sd", self.sd)
         check_positive("model.range_error.tail", self.tail)
         if not math.isfinite(self.slope):

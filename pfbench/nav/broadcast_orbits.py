@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.files.reader_notes import announce_notes
 from pfbench.nav.ephemeris import (
     CLOCK,
@@ -54,8 +55,7 @@ class BroadcastConstellation(Constellation):
 
     def __post_init__(self) -> None:
         _ = self.epoch
-        if not self.validity > 0.0:
-            raise ValueError(f"validity must be positive, got {self.validity}. Give seconds.")
+        require_ranges("", self, validity="(0, inf]")
 
     def input_files(self) -> list[Path]:
         """List the file of the ephemerides."""

@@ -16,6 +16,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.limits import read_text
 from pfbench.files.table_file import read_table_file
 from pfbench.nav import earth
@@ -32,8 +33,7 @@ def read_ephemeris(root: str | None, path: str) -> RinexFile:
     if root is None:
         raise ValueError(f"data.root is not set. Ephemerides are not part of the package. {remedy}")
     file = Path(root) / path
-    if not file.is_file():
-        raise ValueError(f"data.root must contain {path}, got {root} without {file}. {remedy}")
+    require(file.is_file(), "data.root", f"contain {path}", f"{root} without {file}", remedy)
     if file.suffix == ".parquet":
         return RinexFile(check_numbers(read_table_file(file).rows, path), ())
     content = read_rinex(file)

@@ -14,6 +14,7 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 
 DEG_H = math.radians(1.0) / 3600  # rad/s
@@ -63,21 +64,11 @@ class ImuErrors:
     accelerometer_misalignment: Matrix = _ZERO
 
     def __post_init__(self) -> None:
-        for name in (f.name for f in fields(self) if f.type == "float"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(
-                    f"{name} must be 0 or more, got {getattr(self, name)}. Signs are random."
-                )
-        for kind, sigma in (
-            ("gyro", self.gyro_markov_deg_h),
-            ("accelerometer", self.accelerometer_markov_ug),
-        ):
-            time = getattr(self, f"{kind}_markov_time_s")
-            if sigma > 0 and not time > 0:
-                raise ValueError(
-                    f"{kind}_markov_time_s must be positive, got {time}. "
-                    "Give the correlation time of the Markov part in seconds."
-                )
+        rules = {f.name: "[0, inf] Signs are random." for f in fields(self) if f.type == "float"}
+        time = "(0, inf] Give the correlation time of the Markov part in seconds."
+        rules |= {"gyro_markov_time_s": time} if self.gyro_markov_deg_h > 0 else {}
+        rules |= {"accelerometer_markov_time_s": time} if self.accelerometer_markov_ug > 0 else {}
+        require_ranges("", self, **rules)
 
     @property
     def gyro_bias(self) -> float:

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.nav.trajectory import (
     NODES,
     MotionProfile,
@@ -52,8 +53,7 @@ class ManoeuvreSegment:
     smooth: bool = False
 
     def __post_init__(self) -> None:
-        if not self.duration_s > 0:
-            raise ValueError(f"duration_s must be positive, got {self.duration_s}. Give seconds.")
+        require_ranges("", self, duration_s="(0, inf]")
 
 
 Manoeuvre: TypeAlias = tuple[ManoeuvreSegment, ...]

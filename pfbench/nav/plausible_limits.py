@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
+from pfbench.core.parameter_checks import require_ranges
+
 
 class Quantity(NamedTuple):
     """Range of a physical quantity and of its change between two rows.
@@ -162,13 +164,9 @@ class PlausibleLimits:
     drop_fixes: bool = False
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.name != "drop_fixes" and not 0.0 < value < math.inf:
-                raise ValueError(
-                    f"scenario.limits.{field.name} must be a positive finite number, got {value}. "
-                    "Set the largest value that the platform can reach."
-                )
+        rule = "(0, inf) Set the largest value that the platform can reach."
+        numbers = (field.name for field in fields(self) if field.name != "drop_fixes")
+        require_ranges("scenario.limits", self, **dict.fromkeys(numbers, rule))
 
     def select(self, name: str) -> Quantity:
         """Return a quantity with the limits of the platform.

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import EACH_SATELLITE, MeasurementChannels
 from pfbench.nav.aiding import AidingData, AidingSensor, FlightSolution
@@ -50,11 +51,7 @@ class ReceiverClock:
     drift_walk: float = 0.03
 
     def __post_init__(self) -> None:
-        for name in (item.name for item in fields(self)):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(
-                    f"receiver.clock.{name} must be positive, got {getattr(self, name)}. Change it."
-                )
+        require_ranges("receiver.clock", self, **{item.name: "(0, inf]" for item in fields(self)})
 
     def noise_gain(self, duration: Tensor) -> Tensor:
         """Compute the noise root of (bias, drift) over durations [...] s: [..., 2, 2].
@@ -165,16 +162,13 @@ class RangingReceiver(AidingSensor):
     input_type = RangingInputs
 
     def __post_init__(self) -> None:
-        for name, size in (("pseudorange_sd", self.pseudorange_sd), ("rate_sd", self.rate_sd)):
-            if not size > 0.0:
-                raise ValueError(
-                    f"receiver.{name} must be positive, got {size}. Set a standard deviation."
-                )
-        if not -90.0 <= self.mask_deg <= 90.0:
-            raise ValueError(
-                f"receiver.mask_deg must be between -90 and 90 degrees, got {self.mask_deg}. "
-                "Set the smallest elevation."
-            )
+        require_ranges(
+            "receiver",
+            self,
+            pseudorange_sd="(0, inf]",
+            rate_sd="(0, inf]",
+            mask_deg="[-90, 90] Set the smallest elevation.",
+        )
         names = self.satellites
         if names is not None and (not names or len(set(names)) < len(names)):
             raise ValueError(

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from pfbench.core.parameter_checks import require
 from pfbench.nav import attitude, earth
 
 # --------------------------------------------------------------------------------------------------
@@ -131,8 +132,7 @@ def _check_samples(n: int, n_dv: int, per_interval: int, per_step: int) -> None:
             f"dtheta and dv must have the same number of samples, got {n} and {n_dv}. "
             "Give one of each per sample."
         )
-    if per_step not in (1, 2):
-        raise ValueError(f"samples_per_step must be 1 or 2, got {per_step}. Choose one.")
+    require(per_step in (1, 2), "samples_per_step", "be 1 or 2", per_step)
     if per_interval < 1 or per_interval % per_step:
         raise ValueError(
             f"samples_per_interval must be a positive multiple of samples_per_step={per_step}, "

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.nav import attitude, earth
 
 G_TURN = 9.80665  # gravity of a coordinated turn [m/s^2], constant, independent of position
@@ -49,11 +50,7 @@ class TrajectoryStart:
     heading_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        if not -89.0 <= self.lat_deg <= 89.0:
-            raise ValueError(
-                f"lat_deg must be within +-89, got {self.lat_deg}. "
-                "East and North are undefined near a pole."
-            )
+        require_ranges("", self, lat_deg="[-89, 89] East and North are undefined near a pole.")
 
 
 class TrajectoryData(NamedTuple):
@@ -283,11 +280,8 @@ class MotionSpline(TrajectorySource):
     velocity_sd: float = 0.05
 
     def __post_init__(self) -> None:
-        for name in ("knot_interval_s", "use_full_log", "position_sd", "velocity_sd"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(
-                    f"trajectory.{name} must be positive, got {getattr(self, name)}. Change it."
-                )
+        names = ("knot_interval_s", "use_full_log", "position_sd", "velocity_sd")
+        require_ranges("trajectory", self, **dict.fromkeys(names, "(0, inf]"))
         time = self.recorded.time
         step = time.diff()
         if len(time) < 2 or not bool((step > 0.0).all()):

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, Laplace, Normal, StudentT, constraints
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
 
@@ -165,10 +166,9 @@ class StudentTNoise(_UnitProcess):
     dof: int = 4
 
     def __post_init__(self) -> None:
-        if self.dof < 3:
-            raise ValueError(
-                f"noise.dof must be at least 3, got {self.dof}. The variance of smaller values is large or infinite."
-            )
+        require_ranges(
+            "noise", self, dof="[3, inf] The variance of smaller values is large or infinite."
+        )
 
     @override
     def draw_errors(
@@ -221,16 +221,12 @@ class _ContaminatedNoise(_UnitProcess):
     joint: bool
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.probability <= 1.0:
-            raise ValueError(
-                f"noise.probability must be between 0 and 1, got {self.probability}. "
-                "Set a probability."
-            )
-        if not self.sd_factor >= 1.0:
-            raise ValueError(
-                f"noise.sd_factor must be at least 1, got {self.sd_factor}. "
-                "Give a factor on the nominal standard deviation."
-            )
+        require_ranges(
+            "noise",
+            self,
+            probability="[0, 1]",
+            sd_factor="[1, inf] Give a factor on the nominal standard deviation.",
+        )
 
     @property
     def _large_errors(self) -> Family:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
 from pfbench.noise.base import (
@@ -43,16 +44,12 @@ class GaussMarkovNoise(LayeredRegime):
     base_regime: NoiseRegime = field(default_factory=NominalNoise)
 
     def __post_init__(self) -> None:
-        if not self.sd_ratio >= 0.0:
-            raise ValueError(
-                f"noise.sd_ratio must be 0 or more, got {self.sd_ratio}. "
-                "Give a size in nominal standard deviations."
-            )
-        if not self.correlation_time_s > 0.0:
-            raise ValueError(
-                f"noise.correlation_time_s must be positive, got {self.correlation_time_s}. "
-                "Give seconds."
-            )
+        require_ranges(
+            "noise",
+            self,
+            sd_ratio="[0, inf] Give a size in nominal standard deviations.",
+            correlation_time_s="(0, inf]",
+        )
 
     @override
     def draw_errors(
@@ -101,20 +98,14 @@ class NonLineOfSightNoise(LayeredRegime):
     base_regime: NoiseRegime = field(default_factory=NominalNoise)
 
     def __post_init__(self) -> None:
-        endless = self.mean_dwell_s is not None and self.probability == 1.0
-        if not 0.0 <= self.probability <= 1.0 or endless:
-            raise ValueError(
-                "noise.probability must be between 0 and 1, and below 1 if noise.mean_dwell_s is set, "
-                f"got {self.probability}. Set a probability."
-            )
-        for key, value in (
-            ("mean_delay_sd", self.mean_delay_sd),
-            ("mean_dwell_s", self.mean_dwell_s),
-        ):
-            if value is not None and not 0.0 < value < math.inf:
-                raise ValueError(
-                    f"noise.{key} must be positive and finite, got {value}. Change it."
-                )
+        end = "]" if self.mean_dwell_s is None else ") It is below 1 if noise.mean_dwell_s is set."
+        require_ranges(
+            "noise",
+            self,
+            probability=f"[0, 1{end}",
+            mean_delay_sd="(0, inf)",
+            mean_dwell_s="null or (0, inf)",
+        )
 
     @override
     def draw_errors(

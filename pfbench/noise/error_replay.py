@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
 from pfbench.files.table_file import check_parquet
@@ -58,11 +59,7 @@ class ErrorReplay(NoiseRegime):
     absolute_metres: bool = False
 
     def __post_init__(self) -> None:
-        if not self.block_length_s >= 1.0:
-            raise ValueError(
-                "noise.block_length_s must be at least 1 s, the interval of the record, "
-                f"got {self.block_length_s}. Give longer blocks."
-            )
+        require_ranges("noise", self, block_length_s="[1, inf] 1 s is the interval of the record.")
 
     def input_files(self) -> list[Path]:
         """List the file of the record."""

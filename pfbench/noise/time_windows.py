@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_range, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
 from pfbench.noise.base import ErrorDistribution, LayeredRegime, NoiseRegime, NominalNoise
@@ -37,11 +38,11 @@ def check_windows(windows: Windows, span: float | None) -> None:
                 "starts before the previous window ends. Sort or join the windows."
             )
         last = stop
-    if span is not None and not 0.0 < span < math.inf:
-        raise ValueError(
-            f"noise.reference_duration_s must be positive, got {span}. "
-            "Give the duration in seconds for which the windows are written, or null."
-        )
+    require_range(
+        "noise.reference_duration_s",
+        span,
+        "null or (0, inf) Give the duration in seconds for which the windows are written, or null.",
+    )
 
 
 def window_index(windows: Windows, time: Tensor, span: float | None = None) -> Tensor:
@@ -226,11 +227,7 @@ class MeasurementOutage(LayeredRegime):
 
     def __post_init__(self) -> None:
         check_windows(self.windows_s, self.reference_duration_s)
-        if self.visible_sources < 0:
-            raise ValueError(
-                f"noise.visible_sources must be 0 or more, got {self.visible_sources}. "
-                "Give the number of visible sources."
-            )
+        require_ranges("noise", self, visible_sources="[0, inf]")
 
     @override
     def draw_errors(

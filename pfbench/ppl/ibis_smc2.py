@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from pfbench.core.parameter_checks import require_range
 from pfbench.core.random_stream import PhiloxStream, RandomStream, relabel
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
@@ -26,7 +27,6 @@ from pfbench.ppl.parameterised_model import (
     Values,
     check_counts,
     check_kinds,
-    check_number,
 )
 
 
@@ -93,7 +93,7 @@ def smc2(
     check_kinds("smc2", {"unknown": (unknown, ParameterisedModel), "record": (record, Record)})
     check_kinds("smc2", {"method": (method, Filter)})
     check_counts("smc2", {"particles": (particles, 2), "moves": (moves, 0), "seed": (seed, 0)})
-    check_number("smc2", "threshold", threshold, 0.0, 1.0, "[]")
+    require_range("smc2.threshold", threshold, "[0, 1]")
     with torch.no_grad():
         sampler = _ParameterSampler(unknown, method, record, particles, seed)
         return sampler.run(moves, threshold)

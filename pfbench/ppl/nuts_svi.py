@@ -5,7 +5,6 @@ Pyro's samplers use torch's global random state. It is seeded and restored here 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -17,6 +16,7 @@ from pyro.optim import ClippedAdam
 from torch import Tensor
 from torch.distributions import biject_to
 
+from pfbench.core.parameter_checks import require_range
 from pfbench.core.record import Record
 from pfbench.ppl.parameter_posterior import ParameterPosterior
 from pfbench.ppl.parameterised_model import (
@@ -24,7 +24,6 @@ from pfbench.ppl.parameterised_model import (
     Values,
     check_counts,
     check_kinds,
-    check_number,
 )
 
 Program = Callable[[Record], Values]
@@ -124,7 +123,7 @@ def svi(
     check_kinds("svi", kinds)
     counts = {"steps": (steps, 1), "draws": (draws, 1), "seed": (seed, 0)}
     check_counts("svi", {**counts, "particles": (particles, 1)})
-    check_number("svi", "rate", rate, 0.0, math.inf, "()")
+    require_range("svi.rate", rate, "(0, inf)")
     with torch.random.fork_rng(), pyro.get_param_store().scope():
         torch.manual_seed(seed)
         optimiser = ClippedAdam({"lr": rate, "lrd": 0.1 ** (1.0 / steps)})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -12,6 +11,7 @@ from pyro.distributions.torch_distribution import TorchDistributionMixin
 from torch import Tensor
 from torch.distributions import Distribution, Independent, biject_to
 
+from pfbench.core.parameter_checks import require_range
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.simulate import draw_values
 from pfbench.model.base import StateSpaceModel
@@ -168,11 +168,7 @@ def _as_event(distribution: Prior) -> Distribution:
 def check_counts(algorithm: str, counts: Mapping[str, tuple[Any, int]]) -> None:
     """Check whole numbers."""
     for name, (value, least) in counts.items():
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise ValueError(
-                f"{algorithm}.{name} must be a whole number of at least {least}, got {value!r}. "
-                f"Change {name}."
-            )
+        require_range(f"{algorithm}.{name}", value, f"whole [{least}, inf)")
 
 
 def check_kinds(algorithm: str, values: Mapping[str, tuple[Any, Any]]) -> None:
@@ -185,17 +181,3 @@ def check_kinds(algorithm: str, values: Mapping[str, tuple[Any, Any]]) -> None:
                 f"{algorithm}.{name} must be a {kind.__name__}, got {class_name}. "
                 f"Pass an instance of {kind.__name__}."
             )
-
-
-def check_number(
-    algorithm: str, name: str, value: Any, low: float, high: float, bounds: str
-) -> None:
-    """Check a real number."""
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    is_inside = is_number and math.isfinite(value) and low <= value <= high
-    if is_inside and (value > low or bounds[0] == "[") and (value < high or bounds[1] == "]"):
-        return
-    raise ValueError(
-        f"{algorithm}.{name} must be a number in {bounds[0]}{low:g}, {high:g}{bounds[1]}, got "
-        f"{value!r}. Change {name}."
-    )

@@ -12,6 +12,7 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
+from pfbench.core.parameter_checks import require_range
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
@@ -22,7 +23,6 @@ from pfbench.ppl.parameterised_model import (
     Prior,
     check_counts,
     check_kinds,
-    check_number,
 )
 
 _Proposal: TypeAlias = Callable[[Tensor, RandomStream], tuple[Tensor, Tensor]]
@@ -58,7 +58,7 @@ class PmmhSettings:
 
     def __post_init__(self) -> None:
         check_counts("pmmh", {"thin": (self.thin, 1), "leaps": (self.leaps, 0)})
-        check_number("pmmh", "rho", self.rho, 0.0, 1.0, "[)")
+        require_range("pmmh.rho", self.rho, "[0, 1)")
 
 
 def pmmh(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from torch import Tensor
 
+from pfbench.core.parameter_checks import require_range
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Episode, MeasurementChannels
 from pfbench.model.base import StateSpaceModel
@@ -39,14 +40,12 @@ class Scenario(Protocol):
 
 def check_duration(name: str, value: float) -> None:
     """Check that a time is positive."""
-    if not value > 0.0:
-        raise ValueError(f"{name} must be positive, got {value}. Set a time in seconds.")
+    require_range(name, value, "(0, inf]")
 
 
 def check_added_sd(name: str, sd: float) -> None:
     """Check the standard deviation of errors that are added to recorded measurements."""
-    if not sd >= 0.0:
-        raise ValueError(f"{name} must be at least 0, got {sd}. Use 0 for no added errors.")
+    require_range(name, sd, "[0, inf] Use 0 for no added errors.")
 
 
 # --------------------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.chart import wrap_angle
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.model.passive_location import (
@@ -227,10 +228,7 @@ class PassiveLocationScenario(Scenario):
                 "scenario.aircraft_velocity must have a horizontal component, "
                 f"got {list(self.aircraft_velocity)}. Set an East or North velocity."
             )
-        if self.steps < 1:
-            raise ValueError(
-                f"scenario.steps must be at least 1, got {self.steps}. Increase scenario.steps."
-            )
+        require_ranges("scenario", self, steps="[1, inf]")
 
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:

@@ -19,6 +19,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.core.simulate import (
@@ -70,15 +71,7 @@ class ModelSimulation(Scenario):
         return self.model.channel_names
 
     def __post_init__(self) -> None:
-        if not isinstance(self.steps, int) or self.steps < 1:
-            raise ValueError(
-                f"scenario.steps must be a whole number of at least 1, got {self.steps}. "
-                "Change scenario.steps."
-            )
-        if not self.interval_s > 0.0:
-            raise ValueError(
-                f"scenario.interval_s must be positive, got {self.interval_s}. Give it in seconds."
-            )
+        require_ranges("scenario", self, steps="whole [1, inf)", interval_s="(0, inf]")
 
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from pfbench.core.parameter_checks import check_whole_number
+from pfbench.core.parameter_checks import require_range
 from pfbench.files.table_file import Array
 from pfbench.filter.input_check import check_is_filter
 from pfbench.model.base import StateSpaceModel
@@ -127,7 +127,7 @@ def check_is_model(tester: str, model: object) -> None:
 def check_count(tester: str, least: int = 1, **counts: object) -> None:
     """Check numbers of runs, particles or paths."""
     for name, value in counts.items():
-        check_whole_number(f"{tester}: {name}", value, least, "Choose a larger one.")
+        require_range(f"{tester}: {name}", value, f"whole [{least}, inf) Choose a larger one.")
 
 
 def compute_twice(

@@ -65,10 +65,16 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("-m", "filter=ekf,sir", "filter.particles=20"),
         ("filter.particles=20: not all jobs of this sweep have the key", "separate sweep"),
     ),
-    "no particles": (("filter.particles=0",), ("filter.particles must be at least 2, got 0",)),
+    "no particles": (
+        ("filter.particles=0",),
+        ("filter.particles must be a whole number of at least 2, got 0",),
+    ),
     "particles in words": (
         ("filter.particles=many",),
-        ("filter.particles must be a whole number, got 'many'", "Write it without a point"),
+        (
+            "filter.particles must be a whole number of at least 2, got 'many'",
+            "Write it without a point",
+        ),
     ),
     "negative deviation": (
         ("model.measurement_sd=-1",),

@@ -53,8 +53,8 @@ MISTAKES: dict[tuple[str, ...], str] = {
     ("list", ""): "got an empty word",
     ("check", "more"): "check must be without words, got more",
     ("judge", "reference=/etc", "mine=/etc"): "/etc must be a file, got none",
-    ("judge", "reference=a.csv", "mine=b.csv", "tolerance=inf"): "tolerance must be positive, got inf",
-    ("judge", "reference=a.csv", "mine=b.csv", "margin=1e-300"): "margin must be from 1e-6 to 1e6",
+    ("judge", "reference=a.csv", "mine=b.csv", "tolerance=inf"): "tolerance must be positive and finite, got inf",
+    ("judge", "reference=a.csv", "mine=b.csv", "margin=1e-300"): "margin must be in [1e-6, 1e6]",
     ("judge", "reference=a.csv", "mine=b.csv", "study=claims"): "study must not be claims or datasheets",
     ("train", "filter=nobody"): "filter=nobody does not exist",
 }  # fmt: skip

@@ -435,9 +435,9 @@ REFUSED = {
     "without a decimal point: runs=1000000000.",
     "seed=99999999999": "seed must be from 0 to 2**32 - 1, got 99999999999. Set seed=1.",
     "seed=-1": "seed must be a whole number of at least 0, got -1. Set seed=1.",
-    "filter.particles=0": "filter.particles must be at least 2, got 0. Choose more particles.",
-    "particles=0": "filter.particles must be at least 2, got 0. Choose more particles.",
-    "particles=many": "filter.particles must be a whole number, got 'many'. Write it without",
+    "filter.particles=0": "filter.particles must be a whole number of at least 2, got 0. Write it without",
+    "particles=0": "filter.particles must be a whole number of at least 2, got 0. Write it without",
+    "particles=many": "filter.particles must be a whole number of at least 2, got 'many'. Write it without",
     "scenario.steps=0": "scenario.steps must be a whole number of at least 1, got 0. Change",
 }
 
@@ -485,7 +485,7 @@ def test_a_sweep_goes_on_after_a_bad_cell_and_says_so(tmp_path: Path) -> None:
     )
     assert said.code == 1
     for number, particles in ((1, 0), (3, 1)):  # once each, on the line of the job
-        message = f"filter.particles must be at least 2, got {particles}. Choose more particles."
+        message = f"filter.particles must be a whole number of at least 2, got {particles}. Write it without a point or exponent."
         assert f"[{number}/4] failed    linear_walk / nominal / sir   {message}   trace" in said.out
         assert (said.out + said.err).count(message) == 1
     assert "Error executing job" not in said.err
@@ -497,7 +497,10 @@ def test_a_sweep_goes_on_after_a_bad_cell_and_says_so(tmp_path: Path) -> None:
     messages = [json.loads(note.read_text())["message"] for note in notes]
     assert len(notes) == 2
     assert all(
-        any(f"filter.particles must be at least 2, got {n}" in message for message in messages)
+        any(
+            f"filter.particles must be a whole number of at least 2, got {n}" in message
+            for message in messages
+        )
         for n in (0, 1)
     )
     assert all(str(note) in said.out for note in notes)  # every one is named, not only the first

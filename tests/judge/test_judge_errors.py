@@ -111,7 +111,7 @@ def test_a_hole_of_the_reference(home: Path) -> None:
     [
         (("hole=3",), "hole must be a program with a file, got hole=3. Similar: holes"),
         (("from=abc",), "from must be a number, got abc"),
-        (("coverage=2",), "coverage must be above 0 and at most 1, got 2.0"),
+        (("coverage=2",), "coverage must be in (0, 1], got 2.0"),
         (("baseline=other",), "baseline must be a program, got other"),
         (("mine.speed=3",), "mine.speed must be an option of a program, got speed"),
         (("other.shift=3",), "other must be a program with a file"),
@@ -147,8 +147,8 @@ def test_a_frame_of_a_tum_file_is_required(home: Path) -> None:
         ("block=1e9", "block must be at most half of the scored time"),
         ("every=1e9", "Set a smaller every"),
         ("mine.sd=sd.txt", "sd must belong to a text file of KF-GINS, got sd.txt for mine.csv"),
-        ("margin=0", "error judge: margin must be from 1e-6 to 1e6"),
-        ("alpha=1", "error judge: alpha must be from 1e-9 to below 1"),
+        ("margin=0", "error judge: margin must be in [1e-6, 1e6]"),
+        ("alpha=1", "error judge: alpha must be in [1e-9, 1)"),
     ],
 )
 def test_an_option_that_cannot_be_is_refused(home: Path, word: str, message: str) -> None:

@@ -73,8 +73,8 @@ def test_a_first_line_without_names_is_named(home: Path, first: str, problem: st
     ("word", "message"),
     [
         ("mine.frame=enu", "frame must belong to a TUM file, got mine.csv"),
-        ("mine.shift=1e300", "shift must be at most 1e+10 s, got 1e+300"),
-        ("origin=200,11,0", "origin must be within 90, got 200.0"),
+        ("mine.shift=1e300", "shift must be in [-1e+10, 1e+10], got 1e+300"),
+        ("origin=200,11,0", "origin must be in [-90, 90], got 200.0"),
         (f"study={'x' * 300}", "study must be letters, digits, _, -, + or ., at most 100"),
         ("my program=mine.csv", "got 'my program'. Rename the program: my_program=mine.csv"),
     ],

@@ -268,7 +268,10 @@ def test_it_starts_about_its_origin_where_no_record_says_otherwise() -> None:
             {"measurement_sd": (1e-3, 1e-3, 1e-4, 0.0, 1.0)},
             r"model\.measurement_sd must be .*positive",
         ),
-        ({"acceleration_sd": -0.1}, r"model\.acceleration_sd must be 0 or more, got -0\.1"),
+        (
+            {"acceleration_sd": -0.1},
+            r"model\.acceleration_sd must be at least 0 and finite, got -0\.1",
+        ),
         ({"interval": 0.0}, r"model\.interval must be .*positive numbers, got 0\.0"),
         ({"initial_sd": (1.0,)}, r"model\.initial_sd must be 4 numbers, got \[1\.0\]"),
     ],

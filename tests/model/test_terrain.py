@@ -176,8 +176,8 @@ def test_without_slope_the_point_mass_filter_keeps_the_initial_distribution() ->
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"height_sd": 0.0}, "scenario.terrain.height_sd must be finite positive"),
-        ({"longest_m": 200.0}, "longest_m must be above shortest_m = 300.0, got 200.0"),
+        ({"height_sd": 0.0}, "scenario.terrain.height_sd must be positive and finite"),
+        ({"longest_m": 200.0}, r"longest_m must be above 300\.0 and finite, got 200\.0"),
         ({"waves": 4}, "scenario.terrain.waves must be a whole number of at least 8, got 4"),
     ],
 )

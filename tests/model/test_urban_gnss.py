@@ -325,7 +325,7 @@ def test_the_law_broadcasts_expands_and_sums_over_satellites() -> None:
     [
         (
             lambda: LosNlosRangeError(1.0, 3.0, 40.0),
-            r"range_error\.share must be between 0 and 1.*got 1\.0",
+            r"range_error\.share must be in \(0, 1\), got 1\.0",
         ),
         (lambda: LosNlosRangeError(0.5, 0.0, 40.0), r"range_error\.sd must be .*got 0\.0"),
         (lambda: LosNlosRangeError(0.5, 3.0, -1.0), r"range_error\.tail must be .*got -1\.0"),

@@ -30,10 +30,10 @@ def test_units():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"gyro_bias_deg_h": -1.0}, r"gyro_bias_deg_h must be 0 or more, got -1\.0"),
+        ({"gyro_bias_deg_h": -1.0}, r"gyro_bias_deg_h must be at least 0, got -1\.0"),
         (
             {"accelerometer_random_walk_ug_sqrt_hz": math.nan},
-            "accelerometer_random_walk_ug_sqrt_hz must be 0 or more, got nan",
+            "accelerometer_random_walk_ug_sqrt_hz must be at least 0, got nan",
         ),
         (
             {"gyro_markov_deg_h": 1.0},

@@ -472,7 +472,7 @@ def test_pmmh_says_what_it_cannot_do() -> None:
         pmmh(LEVELS, EKF, record, 1, 1, settings=PmmhSettings(leaps=-1))
     with pytest.raises(ValueError, match=r"a distribution for each of \['a', 'b'\], got \['a'\]"):
         pmmh(LEVELS, EKF, record, 1, 1, settings=PmmhSettings(start={"a": LogNormal(0.0, 1.0)}))
-    with pytest.raises(ValueError, match=r"rho must be a number in \[0, 1\), got 1"):
+    with pytest.raises(ValueError, match=r"rho must be in \[0, 1\), got 1"):
         pmmh(LEVELS, EKF, record, 1, 1, settings=PmmhSettings(rho=1.0))
     with pytest.raises(ValueError, match=r"draws must .* got 0"):
         pmmh(LEVELS, EKF, record, 0, 1)
@@ -485,7 +485,7 @@ def test_online_learning_says_what_it_cannot_do() -> None:
     impossible = Record(torch.tensor([[[0.5], [1e200]]], dtype=torch.float64))
     with pytest.raises(ValueError, match="one particle at step 1, got none"):
         smc2(LEVELS, ParticleFilter(5), impossible, 4)
-    with pytest.raises(ValueError, match=r"threshold must be a number in \[0, 1\], got 2"):
+    with pytest.raises(ValueError, match=r"threshold must be in \[0, 1\], got 2"):
         smc2(LEVELS, EKF, impossible, 4, threshold=2.0)
     with pytest.raises(ValueError, match=r"particles must .* got 1"):
         smc2(LEVELS, EKF, impossible, 1)

@@ -54,9 +54,12 @@ def test_wrong_arguments_of_svi_smc2_and_simulation_are_named() -> None:
     )
     method = ParticleFilter(10)
     for change, message in (
-        ({"steps": 0}, r"svi\.steps must be a whole number of at least 1, got 0\. Change steps"),
+        (
+            {"steps": 0},
+            r"svi\.steps must be a whole number of at least 1, got 0\. Change svi\.steps",
+        ),
         ({"draws": 0}, r"svi\.draws must be"),
-        ({"rate": math.nan}, r"svi\.rate must be a number in \(0, inf\), got nan"),
+        ({"rate": math.nan}, r"svi\.rate must be positive and finite, got nan"),
         ({"guide": None}, r"svi\.guide must be a Callable, got NoneType"),
     ):
         words: dict[str, Any] = {"guide": print, "steps": 1, "draws": 1}

@@ -17,6 +17,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor, shared_distribution_covariance
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, StepInfo, summarise
@@ -133,16 +134,12 @@ class EnsembleKalmanFilter:
     is_exact = False  # exact in the limit on linear-Gaussian models only
 
     def __post_init__(self) -> None:
-        if self.particles < 2:
-            raise ValueError(
-                f"filter.particles must be at least 2, got {self.particles}. "
-                "A sample covariance requires 2 members."
-            )
-        if not 0.0 < self.inflation < math.inf:
-            raise ValueError(
-                f"filter.inflation must be positive and finite, got {self.inflation}. "
-                "Use 1 for no inflation."
-            )
+        require_ranges(
+            "filter",
+            self,
+            particles="[2, inf] A sample covariance requires 2 members.",
+            inflation="(0, inf) Use 1 for no inflation.",
+        )
 
     def init(
         self,

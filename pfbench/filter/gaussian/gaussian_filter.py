@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pfbench.core.chart import Chart
 from pfbench.core.linear_algebra import distribution_covariance, factor
-from pfbench.core.parameter_checks import check_whole_number
+from pfbench.core.parameter_checks import require_range
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief, StepInfo
@@ -297,7 +297,7 @@ def check_adaptations(
     iterations: int,
 ) -> None:
     """Check that adaptations do not judge one innovation twice."""
-    check_whole_number("filter.iterations", iterations, 1, "Use 1 for a single update.")
+    require_range("filter.iterations", iterations, "whole [1, inf) Use 1 for a single update.")
     if iterations > 1 and (noise_adaptations or gain_adaptations):
         raise ValueError(
             "filter.iterations must be 1 with noise_adaptations or gain_adaptations, got "

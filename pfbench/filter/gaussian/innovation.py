@@ -351,12 +351,6 @@ def diagonal_axes(a: Tensor) -> Tensor:
     return a.diagonal(dim1=-2, dim2=-1)
 
 
-def check_weight(name: str, value: float) -> None:
-    """Check that a value lies in (0, 1]."""
-    if not 0.0 < value <= 1.0:
-        raise ValueError(f"{name} must be in (0, 1], got {value}. Set a number in this range.")
-
-
 # --------------------------------------------------------------------------------------------------
 # Protocol for the use of an observation distribution that is not normal in a Gaussian filter.
 

@@ -21,6 +21,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import jacobian
+from pfbench.core.parameter_checks import require_range, require_ranges
 from pfbench.kernels import dispatch
 from pfbench.kernels.dispatch import compilable
 
@@ -116,10 +117,7 @@ class SigmaPointLinearisation(LinearisationRule):
     largest_angle: float | None = 2.0
 
     def __post_init__(self) -> None:
-        if self.largest_angle is not None and not self.largest_angle > 0.0:
-            raise ValueError(
-                f"linearisation.largest_angle must be positive, got {self.largest_angle}. Use 2."
-            )
+        require_ranges("linearisation", self, largest_angle="null or (0, inf] Use 2.")
 
     @override
     def __call__(
@@ -170,23 +168,14 @@ class UnscentedPoints:
     kappa: float = 0.0
 
     def __post_init__(self) -> None:
-        if not self.alpha > 0.0:
-            raise ValueError(
-                f"linearisation.points.alpha must be positive, got {self.alpha}. Set a spread."
-            )
-        if not self.beta >= 0.0:  # the covariance of a curved function could be indefinite
-            raise ValueError(
-                f"linearisation.points.beta must be at least 0, got {self.beta}. Use 2 for normal states."
-            )
+        # with beta < 0 the covariance of a curved function could be indefinite
+        beta = "[0, inf] Use 2 for normal states."
+        require_ranges("linearisation.points", self, alpha="(0, inf]", beta=beta)
 
     def __call__(self, d: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return points [P, d], mean weights [P] and covariance weights [P]."""
         squared_radius = self.alpha**2 * (d + self.kappa)
-        if not squared_radius > 0.0:
-            raise ValueError(
-                f"filter.linearisation.points.kappa must be greater than -d = {-d}, got {self.kappa}. "
-                "Increase it."
-            )
+        require_range("filter.linearisation.points.kappa", self.kappa, f"({-d}, inf] More than -d.")
         offsets = math.sqrt(squared_radius) * torch.eye(d, dtype=torch.float64)
         xi = torch.cat([torch.zeros(1, d, dtype=torch.float64), offsets, -offsets])
         w = torch.full((2 * d + 1,), 0.5 / squared_radius, dtype=torch.float64)
@@ -237,11 +226,7 @@ class GaussHermitePoints:
     order: int = 3
 
     def __post_init__(self) -> None:
-        if type(self.order) is not int or self.order < 2:
-            raise ValueError(
-                f"linearisation.points.order must be a whole number of at least 2, got {self.order}. "
-                "Use 3."
-            )
+        require_ranges("linearisation.points", self, order="whole [2, inf) Use 3.")
 
     def __call__(self, d: int) -> tuple[Tensor, Tensor, Tensor]:
         """Return points [P, d], mean weights [P] and covariance weights [P]."""

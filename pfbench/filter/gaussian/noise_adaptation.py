@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import (
     GainAdaptation,
@@ -17,7 +18,6 @@ from pfbench.filter.gaussian.innovation import (
     NoiseAdaptation,
     PrincipalAxes,
     axes_by_group,
-    check_weight,
     compute_group_root,
     diagonal_axes,
     measurement_precision,
@@ -52,11 +52,7 @@ class FadingMemory(NoiseAdaptation):
     has_evidence = True
 
     def __post_init__(self) -> None:
-        if not self.fading_factor >= 1.0:
-            raise ValueError(
-                f"FadingMemory.fading_factor must be at least 1, got {self.fading_factor}. "
-                "Use 1 for no fading."
-            )
+        require_ranges("FadingMemory", self, fading_factor="[1, inf] Use 1 for no fading.")
 
     @override
     def predict_scale(
@@ -111,19 +107,16 @@ class ConstrainedNoiseAdaptation(NoiseAdaptation):
     groups: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
-        check_weight("ConstrainedNoiseAdaptation.forgetting_factor", self.forgetting_factor)
-        check_weight("ConstrainedNoiseAdaptation.decay", self.decay)
-        for name in ("max_r_factor", "max_q_factor"):
-            if not getattr(self, name) >= 1.0:
-                raise ValueError(
-                    f"ConstrainedNoiseAdaptation.{name} must be at least 1, got {getattr(self, name)}. "
-                    "Use 1 for no adaptation."
-                )
-        if not (self.deadband >= 0.0 and self.gate_sigmas >= 0.0):
-            raise ValueError(
-                "ConstrainedNoiseAdaptation.deadband and gate_sigmas must be at least 0, got "
-                f"deadband={self.deadband}, gate_sigmas={self.gate_sigmas}. Set 0 or more."
-            )
+        require_ranges(
+            "ConstrainedNoiseAdaptation",
+            self,
+            forgetting_factor="(0, 1]",
+            decay="(0, 1]",
+            max_r_factor="[1, inf] Use 1 for no adaptation.",
+            max_q_factor="[1, inf] Use 1 for no adaptation.",
+            deadband="[0, inf]",
+            gate_sigmas="[0, inf]",
+        )
 
     @override
     def predict_scale(
@@ -227,12 +220,12 @@ class ScalarNoiseAdaptation(NoiseAdaptation):
     max_r_factor: float = 100.0
 
     def __post_init__(self) -> None:
-        check_weight("ScalarNoiseAdaptation.forgetting_factor", self.forgetting_factor)
-        if not self.max_r_factor >= 1.0:
-            raise ValueError(
-                "ScalarNoiseAdaptation.max_r_factor must be at least 1, "
-                f"got {self.max_r_factor}. Use 1 for no adaptation."
-            )
+        require_ranges(
+            "ScalarNoiseAdaptation",
+            self,
+            forgetting_factor="(0, 1]",
+            max_r_factor="[1, inf] Use 1 for no adaptation.",
+        )
 
     @override
     def predict_scale(
@@ -281,7 +274,7 @@ class MatrixNoiseAdaptation(NoiseAdaptation):
     has_evidence = True  # R and Q of a step follow from the steps before it
 
     def __post_init__(self) -> None:
-        check_weight("MatrixNoiseAdaptation.forgetting_factor", self.forgetting_factor)
+        require_ranges("MatrixNoiseAdaptation", self, forgetting_factor="(0, 1]")
 
     @override
     def predict_scale(
@@ -361,12 +354,12 @@ class AdaptiveFactorGain(GainAdaptation):
     weight_by_noise: bool = True
 
     def __post_init__(self) -> None:
-        check_weight("AdaptiveFactorGain.min_factor", self.min_factor)
-        if not self.threshold > 0.0:
-            raise ValueError(
-                f"AdaptiveFactorGain.threshold must be positive, got {self.threshold}. "
-                "Use .inf for no factor."
-            )
+        require_ranges(
+            "AdaptiveFactorGain",
+            self,
+            min_factor="(0, 1]",
+            threshold="(0, inf] Use .inf for no factor.",
+        )
 
     @override
     def __call__(self, innovation: Innovation, factor: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from typing_extensions import override
 
 from pfbench.core.density import StandardNormal, dense_normal, independent_normal
 from pfbench.core.linear_algebra import factor
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief, ParticleBelief, weighted_mean_cov
@@ -97,11 +98,8 @@ class SharedGuideProposal(Proposal):
         options = {"weight_model": ("adapted", "nominal"), "guide_state": ("gauss", "moments")}
         for key, (first, second) in options.items():
             value = getattr(self, key)
-            if value not in (first, second):
-                raise ValueError(
-                    f"proposal.{key} must be {first} or {second}, got {value}. Choose one."
-                )
-        check_covariance_factor(self.covariance_factor)
+            require(value in (first, second), f"proposal.{key}", f"be {first} or {second}", value)
+        require_ranges("proposal", self, covariance_factor=FACTOR_RULE)
         check_normal_guide(self.guide_filter)
 
     @override
@@ -245,7 +243,7 @@ class ParticleGuideProposal(Proposal):
     is_exact = True
 
     def __post_init__(self) -> None:
-        check_covariance_factor(self.covariance_factor)
+        require_ranges("proposal", self, covariance_factor=FACTOR_RULE)
         check_normal_guide(self.guide_filter)
 
     @override
@@ -407,12 +405,8 @@ def standardise_noise(distribution: Distribution) -> bool:
     return isinstance(unwrap_independent(distribution), StandardNormal)
 
 
-def check_covariance_factor(widen: float) -> None:
-    """Check that the covariance factor is positive."""
-    if not widen > 0.0:
-        raise ValueError(
-            f"proposal.covariance_factor must be positive, got {widen}. Use 1 for no change."
-        )
+FACTOR_RULE = "(0, inf] Use 1 for no change."
+"""Rule of the factor on a guide's covariance."""
 
 
 def check_normal_guide(guide_filter: object) -> None:

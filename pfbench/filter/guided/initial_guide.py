@@ -11,12 +11,12 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor
-from pfbench.core.parameter_checks import check_whole_number
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_values
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.guided.guides import check_covariance_factor
+from pfbench.filter.guided.guides import FACTOR_RULE
 from pfbench.filter.particle.stages import InitialProposal
 from pfbench.filter.smoothing.gaussian_smoother import smooth_initial_state
 from pfbench.filter.whitening import LOG_2PI
@@ -58,13 +58,14 @@ class GuidedInitialProposal(InitialProposal):
     has_bounded_weights = True
 
     def __post_init__(self) -> None:
-        check_covariance_factor(self.covariance_factor)
-        check_whole_number("initial_proposal.steps", self.steps, 1, "Use 1 for causal estimates.")
-        check_whole_number("initial_proposal.passes", self.passes, 0, "Use 3.")
-        if not 0.0 < self.prior_fraction < 1.0:
-            raise ValueError(
-                f"initial_proposal.prior_fraction must be in (0, 1), got {self.prior_fraction}. Use 0.2."
-            )
+        require_ranges(
+            "initial_proposal",
+            self,
+            covariance_factor=FACTOR_RULE,
+            steps="whole [1, inf) Use 1 for causal estimates.",
+            passes="whole [0, inf) Use 3.",
+            prior_fraction="(0, 1) Use 0.2.",
+        )
         if not isinstance(self.guide_filter, GaussianFilter) or not self.guide_filter.plain:
             raise ValueError(
                 "initial_proposal.guide_filter must be a Gaussian filter without adaptations, got "

@@ -20,11 +20,11 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import distribution_covariance, factor, jacobian
-from pfbench.core.parameter_checks import check_whole_number
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record, map_inputs
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
-from pfbench.filter.guided.guides import check_covariance_factor, standardise_noise
+from pfbench.filter.guided.guides import FACTOR_RULE, standardise_noise
 from pfbench.filter.linearisation import (
     check_moments,
     find_propagation_jacobian,
@@ -76,12 +76,13 @@ class GuidedIntervalProposal(Proposal):
         return self.prior_fraction > 0.0
 
     def __post_init__(self) -> None:
-        check_whole_number("proposal.steps", self.steps, 1, "Use 1000 for the whole interval.")
-        check_covariance_factor(self.covariance_factor)
-        if not 0.0 <= self.prior_fraction < 1.0:
-            raise ValueError(
-                f"proposal.prior_fraction must be in [0, 1), got {self.prior_fraction}. Use 0.1."
-            )
+        require_ranges(
+            "proposal",
+            self,
+            steps="whole [1, inf) Use 1000 for the whole interval.",
+            covariance_factor=FACTOR_RULE,
+            prior_fraction="[0, 1) Use 0.1.",
+        )
 
     @override
     def __call__(

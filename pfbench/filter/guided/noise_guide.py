@@ -12,12 +12,13 @@ from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import distribution_covariance, factor
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import AffineApproximation, DifferenceSpace
-from pfbench.filter.guided.guides import check_covariance_factor, check_normal_guide
+from pfbench.filter.guided.guides import FACTOR_RULE, check_normal_guide
 from pfbench.filter.linearisation import (
     around_first,
     mask_covariance,
@@ -25,7 +26,6 @@ from pfbench.filter.linearisation import (
     unwrap_independent,
 )
 from pfbench.filter.particle.proposals import (
-    check_fraction,
     choose_defensive_particles,
     draw_standardised_noise,
     log_noise_density,
@@ -114,18 +114,22 @@ class GuidedNoiseProposal(Proposal):
         return self.defensive_fraction > 0.0
 
     def __post_init__(self) -> None:
-        check_fraction("proposal.defensive_fraction", self.defensive_fraction, below_one=True)
-        check_covariance_factor(self.covariance_factor)
+        require_ranges(
+            "proposal",
+            self,
+            defensive_fraction="[0, 1) Use BootstrapProposal for 1.",
+            covariance_factor=FACTOR_RULE,
+        )
         check_normal_guide(self.guide_filter)
-        if (
-            self.guide_filter.noise_adaptations
-            or self.guide_filter.gain_adaptations
-            or self.guide_filter.iterations > 1
-        ):
-            raise ValueError(
-                "proposal.guide_filter must have a linearisation only, got adaptations, gains or "
-                "iterations. Remove adaptations, gains and iterations."
-            )
+        require(
+            not self.guide_filter.noise_adaptations
+            and not self.guide_filter.gain_adaptations
+            and self.guide_filter.iterations <= 1,
+            "proposal.guide_filter",
+            "have a linearisation only",
+            "adaptations, gains or iterations",
+            "Remove adaptations, gains and iterations.",
+        )
 
     @override
     def __call__(

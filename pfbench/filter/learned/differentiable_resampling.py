@@ -25,6 +25,7 @@ from torch.distributions import (
 )
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights, select_by_run
 from pfbench.filter.exactness import is_every_part_exact
@@ -96,11 +97,7 @@ class SoftResampler(Resampler):
         return is_every_part_exact(**{"resampler.inner": self.resampler})
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.alpha <= 1.0:
-            raise ValueError(
-                f"resampler.alpha must be in (0, 1], got {self.alpha}. "
-                "Use 1 for resampling by the weights."
-            )
+        require_ranges("resampler", self, alpha="(0, 1] Use 1 for resampling by the weights.")
 
     @override
     def __call__(
@@ -148,16 +145,13 @@ class OptimalTransportResampler(Resampler):
     is_exact = False
 
     def __post_init__(self) -> None:
-        if not self.epsilon > 0.0 or self.iterations < 1:
-            raise ValueError(
-                "resampler.epsilon must be positive and iterations at least 1, "
-                f"got {self.epsilon} and {self.iterations}. Raise them."
-            )
-        if not 0.0 <= self.threshold <= 1.0:
-            raise ValueError(
-                f"resampler.threshold must be from 0 (never) to 1 (always), got {self.threshold}. "
-                "Choose a ratio of ESS to N."
-            )
+        require_ranges(
+            "resampler",
+            self,
+            epsilon="(0, inf]",
+            iterations="[1, inf]",
+            threshold="[0, 1] Use 0 for never, 1 for always.",
+        )
 
     @override
     def __call__(

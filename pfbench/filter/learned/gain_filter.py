@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_range
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief, StepInfo
@@ -216,8 +217,7 @@ class LearnedGain(nn.Module):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        if hidden < 1:
-            raise ValueError(f"gain.hidden must be at least 1, got {hidden}. The default is 32.")
+        require_range("gain.hidden", hidden, "[1, inf] The default is 32.")
         if normalisation not in NORMALISATIONS:
             raise ValueError(
                 f"gain.normalisation must be one of {', '.join(NORMALISATIONS)}, got "

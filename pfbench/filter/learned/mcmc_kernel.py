@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution, Normal
 
+from pfbench.core.parameter_checks import require_range
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.learned.differentiable_resampling import sample_from
@@ -62,11 +63,8 @@ class LearnedRandomWalk(nn.Module):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        if lag < 1 or not scale > 0.0:
-            raise ValueError(
-                "kernel.lag must be at least 1 and kernel.scale positive, got "
-                f"lag={lag}, scale={scale}. The default scale is 2.38."
-            )
+        require_range("kernel.lag", lag, "[1, inf]")
+        require_range("kernel.scale", scale, "(0, inf] The default is 2.38.")
         self.make, self.lag, self.scale = network, lag, scale
         self.learnable = CheckpointSpec(self.checkpoint_key, checkpoint, seed)
         self.network: nn.Module | None = None

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state, draw_values, simulate_steps
@@ -199,10 +200,9 @@ def find_learned_parts(method: TrainableFilter) -> dict[str, LearnedPart]:
         for stage in stages
         if isinstance(stage, LearnedProposal | LearnedRandomWalk | LearnedGain)
     }
-    if not parts:
-        raise ValueError(
-            "filter must have a network to train, got none. Choose one such as filter=neural_sir."
-        )
+    require(
+        parts, "filter", "have a network to train", "none", "Choose one such as filter=neural_sir."
+    )
     return parts
 
 

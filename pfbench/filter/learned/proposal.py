@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.distributions import Distribution
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_range
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
@@ -24,7 +25,6 @@ from pfbench.filter.learned.differentiable_resampling import sample_from
 from pfbench.filter.learned.features import Feature, FeatureStack, make_feature_context
 from pfbench.filter.learned.networks import CheckpointSpec, build_networks
 from pfbench.filter.particle.proposals import (
-    check_fraction,
     choose_defensive_particles,
     draw_standardised_noise,
     log_noise_density,
@@ -95,12 +95,8 @@ class LearnedProposal(nn.Module):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        check_fraction("proposal.defensive_fraction", defensive_fraction)
-        if defensive_fraction == 1.0 or memory < 0:
-            raise ValueError(
-                "proposal.defensive_fraction must be below 1 and proposal.memory at least 0, got "
-                f"defensive_fraction={defensive_fraction}, memory={memory}. Use 0 for neither."
-            )
+        require_range("proposal.defensive_fraction", defensive_fraction, "[0, 1) Use 0 for none.")
+        require_range("proposal.memory", memory, "[0, inf] Use 0 for none.")
         self.make, self.guide_filter = network, guide_filter
         self.defensive_fraction, self.hidden = defensive_fraction, memory
         self.features_of = FeatureStack() if features is None else FeatureStack(features)

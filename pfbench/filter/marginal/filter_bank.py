@@ -11,7 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor
-from pfbench.core.parameter_checks import check_whole_number
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record, map_inputs
 from pfbench.filter.belief import GaussianBelief, ParticleBelief, StepInfo
@@ -72,11 +72,7 @@ class FilterBank(HypothesisFilter):
     overlap: float = 0.6
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.overlap < 1.0:
-            raise ValueError(
-                f"filter.overlap must be above 0 and below 1, got {self.overlap}. Use 0.6."
-            )
-        check_whole_number("filter.branches", self.branches, 1, "Use 81.")
+        require_ranges("filter", self, overlap="(0, 1) Use 0.6.", branches="whole [1, inf) Use 81.")
 
     @override
     def init(
@@ -216,11 +212,12 @@ class GaussianSplitFilter:
     is_exact = False  # each particle linearises within the limit
 
     def __post_init__(self) -> None:
-        check_whole_number("filter.particles", self.particles, 2, "Use 32.")
-        if not 0.0 < self.largest_sd < math.inf:
-            raise ValueError(
-                f"filter.largest_sd must be positive, got {self.largest_sd}. Use 0.35 for angles."
-            )
+        require_ranges(
+            "filter",
+            self,
+            particles="whole [2, inf) Use 32.",
+            largest_sd="(0, inf) Use 0.35 for angles.",
+        )
         inner = self.filter.filter if isinstance(self.filter, InvariantFilter) else self.filter
         if not isinstance(inner, GaussianFilter) or not inner.plain:
             raise ValueError(

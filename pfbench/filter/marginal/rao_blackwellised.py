@@ -24,6 +24,7 @@ from torch.distributions import Distribution, MultivariateNormal
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, StepInfo, normalise_log_weights
@@ -130,10 +131,7 @@ class RaoBlackwellisedFilter:
     resampler: Resampler = field(default_factory=lambda: EssResampler(Systematic()))
 
     def __post_init__(self) -> None:
-        if self.particles < 2:
-            raise ValueError(
-                f"filter.particles must be at least 2, got {self.particles}. Set 2 or more."
-            )
+        require_ranges("filter", self, particles="[2, inf]")
 
     @property
     def is_exact(self) -> bool:

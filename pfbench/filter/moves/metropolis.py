@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream, relabel, select_runs
 from pfbench.core.record import Record, map_inputs
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
@@ -294,11 +295,7 @@ class MetropolisHastings(Move):
     mcmc_steps: int = 1
 
     def __post_init__(self) -> None:
-        if self.mcmc_steps < 0:
-            raise ValueError(
-                f"move.mcmc_steps must be 0 or more, got {self.mcmc_steps}. "
-                "Choose the number of MCMC steps."
-            )
+        require_ranges("move", self, mcmc_steps="[0, inf]")
 
     @property
     @override

@@ -10,6 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import distribution_covariance, factor
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights, weighted_mean_cov
@@ -166,11 +167,9 @@ class RandomWalk:
     is_exact = True  # symmetric: its density ratio is 1
 
     def __post_init__(self) -> None:
-        if not self.scale > 0.0:
-            raise ValueError(
-                f"kernel.random_walk.scale must be positive, got {self.scale}. "
-                "Set a factor on the optimal bandwidth."
-            )
+        require_ranges(
+            "kernel.random_walk", self, scale="(0, inf] Set a factor on the optimal bandwidth."
+        )
 
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, x: Tensor, draws: RandomStream
@@ -228,15 +227,7 @@ class NoiseFlowKernel(McmcKernel):
     is_exact = False
 
     def __post_init__(self) -> None:
-        if self.lag < 1:
-            raise ValueError(
-                f"kernel.lag must be at least 1, got {self.lag}. Set the number of steps."
-            )
-        if not 0.0 <= self.noise_refresh < 1.0:
-            raise ValueError(
-                f"kernel.noise_refresh must be in [0, 1), got {self.noise_refresh}. "
-                "Use 0 for no refresh."
-            )
+        require_ranges("kernel", self, lag="[1, inf]", noise_refresh="[0, 1) Use 0 for no refresh.")
 
     @property
     @override
@@ -405,11 +396,7 @@ class PathBlockKernel(McmcKernel):
     random_walk: RandomWalk = field(default_factory=RandomWalk)
 
     def __post_init__(self) -> None:
-        if self.block_length < 0:
-            raise ValueError(
-                f"kernel.block_length must be at least 0, got {self.block_length}. "
-                "Use 0 to re-draw no state."
-            )
+        require_ranges("kernel", self, block_length="[0, inf] Use 0 to re-draw no state.")
 
     @property
     @override

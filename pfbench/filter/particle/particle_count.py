@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.filter.belief import ParticleBelief, ess
 from pfbench.filter.particle.stages import (
     ParticleCount,
@@ -80,12 +81,7 @@ class EssStepCount(ParticleCount):
     is_exact = True
 
     def __post_init__(self) -> None:
-        if self.increment < 0 or not 0.0 <= self.ess_threshold <= 1.0:
-            raise ValueError(
-                "particle_count.increment must be 0 or more and ess_threshold from 0 to 1, got "
-                f"increment={self.increment}, ess_threshold={self.ess_threshold}. "
-                "Choose both in range."
-            )
+        require_ranges("particle_count", self, increment="[0, inf]", ess_threshold="[0, 1]")
 
     @override
     def initial_count(self, slots: int) -> int:
@@ -124,11 +120,7 @@ class EssTargetCount(ParticleCount):
     is_exact = True
 
     def __post_init__(self) -> None:
-        if not self.target > 0.0:
-            raise ValueError(
-                f"particle_count.target must be positive, got {self.target}. "
-                "Choose an effective sample size."
-            )
+        require_ranges("particle_count", self, target="(0, inf] Choose an effective sample size.")
 
     @override
     def initial_count(self, slots: int) -> int:

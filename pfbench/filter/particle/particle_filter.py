@@ -15,6 +15,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import distribution_covariance
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream, relabel
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state
@@ -94,15 +95,8 @@ class ParticleFilter(Filter):
     initial_proposal: InitialProposal | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.particles, int):
-            raise ValueError(
-                f"filter.particles must be a whole number, got {self.particles!r}. Write it without a "
-                "point or exponent."
-            )
-        if self.particles < 2:
-            raise ValueError(
-                f"filter.particles must be at least 2, got {self.particles}. Choose more particles."
-            )
+        rule = "whole [2, inf) Write it without a point or exponent."
+        require_ranges("filter", self, particles=rule)
         _ = self.is_exact  # warns of each stage that does not state it
         if self.initial_proposal is not None:
             _check_initial_proposal(self.moves, self.particle_count)

@@ -103,14 +103,6 @@ def choose_defensive_particles(
     return DefensiveSelection((rank < target) | ~active_mask, target / count)
 
 
-def check_fraction(name: str, value: float, below_one: bool = False) -> None:
-    """Check that a value is a fraction."""
-    if below_one and value == 1.0:
-        raise ValueError(f"{name} must be below 1, got {value}. Use BootstrapProposal for 1.")
-    if not 0.0 <= value <= 1.0:
-        raise ValueError(f"{name} must be from 0 to 1, got {value}. Choose a fraction.")
-
-
 class AffineMap(NamedTuple):
     """Affine map e -> matrix e + offset.
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
 from pfbench.filter.particle.stages import EssResampler, Resampler
@@ -147,11 +148,9 @@ class RegularisedResampler(Resampler):
     is_exact = False
 
     def __post_init__(self) -> None:
-        if not self.scale > 0.0:
-            raise ValueError(
-                f"resampler.scale must be positive, got {self.scale}. "
-                "Choose a factor on the optimal bandwidth."
-            )
+        require_ranges(
+            "resampler", self, scale="(0, inf] Choose a factor on the optimal bandwidth."
+        )
 
     @override
     def __call__(
@@ -216,11 +215,7 @@ class ThompsonTaylorResampler(Resampler):
     is_exact = False
 
     def __post_init__(self) -> None:
-        if self.neighbours < 2:
-            raise ValueError(
-                f"resampler.neighbours must be at least 2, got {self.neighbours}. "
-                "Count the particle itself as one."
-            )
+        require_ranges("resampler", self, neighbours="[2, inf] Count the particle itself as one.")
 
     @override
     def __call__(

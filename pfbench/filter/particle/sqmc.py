@@ -19,6 +19,7 @@ from torch.quasirandom import SobolEngine
 from typing_extensions import override
 
 from pfbench.core.chart import Chart
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import DerivedStream, PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, gather_ancestors, weighted_mean_cov
@@ -94,11 +95,7 @@ class HaltonPoints(ShiftedPoints):
         return self.shifted
 
     def __post_init__(self) -> None:
-        if self.skip < 0:
-            raise ValueError(
-                f"points.skip must be 0 or more, got {self.skip}. "
-                "Choose the number of points to omit."
-            )
+        require_ranges("points", self, skip="[0, inf]")
 
     @override
     def shift_points(self, axes: range, n: int, shift: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.density import StandardNormal
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_values
@@ -201,11 +202,8 @@ class EssResampler(Resampler):
     ess_threshold: float = 0.5
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.ess_threshold <= 1.0:
-            raise ValueError(
-                "resampler.ess_threshold must be from 0 (never) to 1 (at every step), got "
-                f"{self.ess_threshold}. Choose a ratio of ESS to N."
-            )
+        rule = "[0, 1] Use 0 to resample never, 1 at every step."
+        require_ranges("resampler", self, ess_threshold=rule)
 
     @property
     @override

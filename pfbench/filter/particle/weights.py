@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, is_resolved
 from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
-from pfbench.filter.particle.proposals import check_fraction
 from pfbench.filter.particle.stages import (
     AuxiliaryWeights,
     BayesWeightUpdate,
@@ -59,12 +59,12 @@ class LookAheadWeights(AuxiliaryWeights):
         return self.defensive_fraction > 0.0
 
     def __post_init__(self) -> None:
-        check_fraction("auxiliary_weights.defensive_fraction", self.defensive_fraction)
-        if not 0.0 < self.likelihood_power <= 1.0:
-            raise ValueError(
-                "auxiliary_weights.likelihood_power must be in (0, 1], got "
-                f"{self.likelihood_power}. Use 1 for the published filter."
-            )
+        require_ranges(
+            "auxiliary_weights",
+            self,
+            defensive_fraction="[0, 1]",
+            likelihood_power="(0, 1] Use 1 for the published filter.",
+        )
 
     @override
     def __call__(self, model: StateSpaceModel, belief: ParticleBelief, record: Record) -> Tensor:
@@ -115,7 +115,7 @@ class PowerTempering(Tempering):
     has_bounded_weights = True  # tempering flattens
 
     def __post_init__(self) -> None:
-        _check_strength(self.strength, torch.inf)
+        require_ranges("tempering", self, strength="[0, inf] Use 0 for unchanged weights.")
 
     @override
     def __call__(self, log_w: Tensor) -> Tensor:
@@ -137,7 +137,7 @@ class AdditiveTempering(Tempering):
     has_bounded_weights = True  # tempering flattens
 
     def __post_init__(self) -> None:
-        _check_strength(self.strength, torch.inf)
+        require_ranges("tempering", self, strength="[0, inf] Use 0 for unchanged weights.")
 
     @override
     def __call__(self, log_w: Tensor) -> Tensor:
@@ -164,7 +164,7 @@ class UniformTempering(Tempering):
         return self.strength < 1.0
 
     def __post_init__(self) -> None:
-        _check_strength(self.strength, 1.0)
+        require_ranges("tempering", self, strength="[0, 1] Use 0 for unchanged weights.")
 
     @override
     def __call__(self, log_w: Tensor) -> Tensor:
@@ -230,15 +230,6 @@ class TemperedPosterior(WeightUpdate):
         return value if tempered is log_w else torch.where(valid, tempered + total, value)
 
 
-def _check_strength(strength: float, maximum: float) -> None:
-    """Raise a ValueError if the strength is outside [0, maximum]."""
-    if not 0.0 <= strength <= maximum:
-        raise ValueError(
-            f"tempering.strength must be from 0 to {maximum:g}, got {strength}. "
-            "Use 0 for unchanged weights."
-        )
-
-
 @dataclass(frozen=True)
 class FlooredWeightUpdate(WeightUpdate):
     """Weights as plain numbers plus a floor, as in much code, for comparison [ours].
@@ -258,11 +249,11 @@ class FlooredWeightUpdate(WeightUpdate):
     is_exact = False
 
     def __post_init__(self) -> None:
-        if not self.weight_floor > 0.0:
-            raise ValueError(
-                f"weight_update.weight_floor must be positive, got {self.weight_floor}. "
-                "Choose a small number, or BayesWeightUpdate, which needs none."
-            )
+        require_ranges(
+            "weight_update",
+            self,
+            weight_floor="(0, inf] Choose a small number, or BayesWeightUpdate, which needs none.",
+        )
 
     @override
     def __call__(

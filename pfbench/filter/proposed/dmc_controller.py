@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
@@ -112,10 +113,9 @@ class DmcController:
             ("error_weight", self.error_weight),
             ("control_weight", self.control_weight),
         ):
-            if not bool((torch.as_tensor(value) > 0).all()):
-                raise ValueError(
-                    f"controller.{name} must be positive, got {value}. Set positive weights."
-                )
+            require(
+                bool((torch.as_tensor(value) > 0).all()), f"controller.{name}", "be positive", value
+            )
 
     def compute_gain(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, h: Tensor
@@ -142,10 +142,9 @@ class DmcController:
 def state_indices(model: StateSpaceModel, key: str, names: Sequence[str]) -> list[int]:
     """Return the indices of states by name."""
     unknown = [name for name in names if name not in model.names]
-    if unknown:
-        raise ValueError(
-            f"{key} must be among the states {list(model.names)}, got {unknown}. Correct the names."
-        )
+    require(
+        not unknown, key, f"be among the states {list(model.names)}", unknown, "Correct the names."
+    )
     return [model.names.index(name) for name in names]
 
 

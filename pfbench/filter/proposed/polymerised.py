@@ -21,6 +21,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights, select_by_run
 from pfbench.filter.particle.gaussian_particle_filter import refuse_history
@@ -104,11 +105,7 @@ class AxisAlignedCells(CellPartition):
     cells_per_axis: int = 8
 
     def __post_init__(self) -> None:
-        if self.cells_per_axis < 1:
-            raise ValueError(
-                "resampler.partition.cells_per_axis must be at least 1, got "
-                f"{self.cells_per_axis}. Set 1 or more."
-            )
+        require_ranges("resampler.partition", self, cells_per_axis="[1, inf]")
 
     @property
     @override
@@ -227,11 +224,9 @@ class ScaledCentrePlacement(ParticlePlacement):
     points: PointSet = field(default_factory=HaltonPoints)
 
     def __post_init__(self) -> None:
-        if not -1.0 <= self.min_scale < 1.0:
-            raise ValueError(
-                f"resampler.placement.min_scale must be in [-1, 1), got {self.min_scale}. "
-                "Use 0 (as printed) or -1 (centred)."
-            )
+        require_ranges(
+            "resampler.placement", self, min_scale="[-1, 1) Use 0 (as printed) or -1 (centred)."
+        )
 
     @override
     def __call__(
@@ -356,11 +351,8 @@ class PolymerisedResampler(Resampler):
     is_exact = False
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.ess_threshold <= 1.0:
-            raise ValueError(
-                f"resampler.ess_threshold must be from 0 to 1, got {self.ess_threshold}. "
-                "Use 0 to resample never, 1 at every step."
-            )
+        rule = "[0, 1] Use 0 to resample never, 1 at every step."
+        require_ranges("resampler", self, ess_threshold=rule)
         if self.axes is not None and (
             not self.axes or len(set(self.axes)) < len(self.axes) or min(self.axes) < 0
         ):

@@ -11,6 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
@@ -25,7 +26,7 @@ from pfbench.filter.linearisation import (
     mean_noise,
     measurement_jacobian,
 )
-from pfbench.filter.particle.proposals import AffineMap, check_fraction
+from pfbench.filter.particle.proposals import AffineMap
 from pfbench.filter.particle.stages import BootstrapProposal, Proposal, ProposalSample
 from pfbench.filter.proposed.dmc_controller import (
     DmcController,
@@ -156,7 +157,7 @@ class TransitionRatioCorrection(WeightCorrection):
         return self.defensive_fraction > 0.0
 
     def __post_init__(self) -> None:
-        check_fraction("weight_correction.defensive_fraction", self.defensive_fraction)
+        require_ranges("weight_correction", self, defensive_fraction="[0, 1]")
 
     @override
     def __call__(
@@ -227,7 +228,7 @@ class MarginalRatioCorrection(WeightCorrection):
         return self.defensive_fraction > 0.0
 
     def __post_init__(self) -> None:
-        check_fraction("weight_correction.defensive_fraction", self.defensive_fraction)
+        require_ranges("weight_correction", self, defensive_fraction="[0, 1]")
 
     @override
     def __call__(
@@ -365,7 +366,7 @@ class ReconstructedNoiseProposal(Proposal):
     linearise_per_particle: bool = True
 
     def __post_init__(self) -> None:
-        check_fraction("proposal.defensive_fraction", self.defensive_fraction)
+        require_ranges("proposal", self, defensive_fraction="[0, 1]")
 
     @property
     @override

@@ -17,6 +17,7 @@ from scipy.special import chdtri
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
@@ -79,14 +80,12 @@ class SwarmLimits:
     max_distance_sd: float | None = 3.0
 
     def __post_init__(self) -> None:
-        if not self.max_velocity_sd > 0.0 or (
-            self.max_distance_sd is not None and not self.max_distance_sd > 0.0
-        ):
-            raise ValueError(
-                "proposal.limits must be positive, got "
-                f"max_velocity_sd={self.max_velocity_sd}, max_distance_sd={self.max_distance_sd}. "
-                "Use max_distance_sd=null for no limit of position."
-            )
+        require_ranges(
+            "proposal.limits",
+            self,
+            max_velocity_sd="(0, inf]",
+            max_distance_sd="null or (0, inf] Use null for no limit of position.",
+        )
 
     def clamp_velocity(self, v: Tensor, scale: Tensor) -> Tensor:
         """Clamp velocities to their limits.
@@ -135,11 +134,7 @@ class ChiSquareStopping:
     quantile: float = 0.5
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.quantile < 1.0:
-            raise ValueError(
-                f"proposal.stopping.quantile must be in (0, 1), got {self.quantile}. "
-                "Use 0.5 for the median."
-            )
+        require_ranges("proposal.stopping", self, quantile="(0, 1) Use 0.5 for the median.")
 
     def __call__(self, model: StateSpaceModel, best: Tensor, record: Record) -> Tensor:
         """Compute the mask of the runs that stop.
@@ -212,10 +207,7 @@ class SwarmProposal(Proposal):
     single_sequence: bool = False
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise ValueError(
-                f"proposal.iterations must be at least 1, got {self.iterations}. Set 1 or more."
-            )
+        require_ranges("proposal", self, iterations="[1, inf]")
         if self.limits.scale_by_prior and self.coordinates.whiten:
             raise ValueError(
                 "proposal.limits.scale_by_prior must be false in whitened coordinates, got true. "

@@ -11,6 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.record import Record
 from pfbench.filter.linearisation import derivative
 from pfbench.filter.whitening import compute_half_square, fill_missing, whiten
@@ -171,11 +172,9 @@ class PosteriorFitness(Fitness):
     covariance_shrinkage: float = 0.05
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.covariance_shrinkage <= 1.0:
-            raise ValueError(
-                "proposal.fitness.covariance_shrinkage must be from 0 to 1, got "
-                f"{self.covariance_shrinkage}. Use 0 for no shrinkage."
-            )
+        require_ranges(
+            "proposal.fitness", self, covariance_shrinkage="[0, 1] Use 0 for no shrinkage."
+        )
 
     @override
     def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:

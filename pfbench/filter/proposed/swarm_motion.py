@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import DerivedStream, RandomStream
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
 from pfbench.filter.particle.stages import PointSet
@@ -121,17 +122,14 @@ class InertiaVelocity(VelocityUpdate):
                 "proposal.velocity.printed_iterations must be at least 1, got "
                 f"{self.printed_iterations}. Use null for the meaning of eq. 35."
             )
-        if not 0.0 <= self.inertia_weight < 1.0:
-            raise ValueError(
-                f"proposal.velocity.inertia_weight must be in [0, 1), got {self.inertia_weight}. "
-                "Reduce it."
-            )
-        for name in ("cognitive_coefficient", "social_coefficient", "escape_coefficient"):
-            if getattr(self, name) < 0.0:
-                raise ValueError(
-                    f"proposal.velocity.{name} must be at least 0, got {getattr(self, name)}. "
-                    "Set 0 or more."
-                )
+        require_ranges(
+            "proposal.velocity",
+            self,
+            inertia_weight="[0, 1)",
+            cognitive_coefficient="[0, inf]",
+            social_coefficient="[0, inf]",
+            escape_coefficient="[0, inf]",
+        )
 
     def compute_escape_factor(self, phase: float) -> float:
         """Return c3 = c4 for a phase from 0 to 1."""
@@ -308,11 +306,11 @@ class ChaoticPerturbation:
     beta: float = 0.05
 
     def __post_init__(self) -> None:
-        if not self.beta > 0.0:
-            raise ValueError(
-                f"proposal.perturbation.beta must be positive, got {self.beta}. "
-                "Use perturbation=null for no perturbation."
-            )
+        require_ranges(
+            "proposal.perturbation",
+            self,
+            beta="(0, inf] Use perturbation=null for no perturbation.",
+        )
 
     def __call__(self, z: Tensor, scale: Tensor) -> Tensor:
         """Compute a perturbation.

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.particle.proposals import choose_defensive_particles
 from pfbench.filter.particle.regularised_resampling import GaussianSmoothing
@@ -123,11 +124,11 @@ class MixtureWeighting(SwarmWeighting):
     defensive_fraction: float = 0.5
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.defensive_fraction <= 1.0:
-            raise ValueError(
-                "proposal.weighting.defensive_fraction must be in (0, 1], got "
-                f"{self.defensive_fraction}. Use 1 for the bootstrap proposal."
-            )
+        require_ranges(
+            "proposal.weighting",
+            self,
+            defensive_fraction="(0, 1] Use 1 for the bootstrap proposal.",
+        )
 
     @property
     @override

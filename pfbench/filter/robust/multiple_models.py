@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.robust.hypotheses import OFFSET, Branches, HypothesisFilter, branch_memory
@@ -93,10 +94,7 @@ class GaussianSumFilter(HypothesisFilter):
     branches: int = 8
 
     def __post_init__(self) -> None:
-        if type(self.branches) is not int or self.branches < 1:
-            raise ValueError(
-                f"filter.branches must be a whole number of at least 1, got {self.branches}. Use 8."
-            )
+        require_ranges("filter", self, branches="whole [1, inf) Use 8.")
 
     @override
     def _start(self, log_law: Tensor) -> tuple[Tensor, Tensor]:

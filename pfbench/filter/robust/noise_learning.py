@@ -10,11 +10,19 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor
-from pfbench.core.parameter_checks import check_whole_number
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import Innovation, diagonal_axes
 from pfbench.filter.gaussian.kalman_update import kalman_gain_update
 from pfbench.filter.robust.robust_update import RobustUpdate, updated_residual
+
+_FORGETTING = "(0, 1) Use 0.98."
+_BOUNDS = {"min_factor": "(0, 1] Use 0.5.", "max_factor": "[1, inf] Use 100."}
+_VARIATIONAL = {
+    "forgetting_factor": _FORGETTING,
+    "prior_count": "(0, inf) Use 10.",
+    "iterations": "whole [1, inf) Use 4.",
+}
 
 # --------------------------------------------------------------------------------------------------
 # Adaptive measurement noise: the variance of each component is learned from the measurements.
@@ -48,12 +56,8 @@ class SageHusaAdaptation(RobustUpdate):
     max_factor: float = 100.0
 
     def __post_init__(self) -> None:
-        check_forgetting("SageHusaAdaptation", self.forgetting_factor)
-        if not 0.0 < self.max_gain <= 1.0:
-            raise ValueError(
-                f"SageHusaAdaptation.max_gain must be in (0, 1], got {self.max_gain}. Use 0.05."
-            )
-        check_factor_bounds("SageHusaAdaptation", self.min_factor, self.max_factor)
+        rules = {"forgetting_factor": _FORGETTING, "max_gain": "(0, 1] Use 0.05."}
+        require_ranges("SageHusaAdaptation", self, **rules, **_BOUNDS)
 
     @override
     def noise_adapt(
@@ -95,13 +99,7 @@ class VariationalNoiseAdaptation(RobustUpdate):
     iterations: int = 4
 
     def __post_init__(self) -> None:
-        check_forgetting("VariationalNoiseAdaptation", self.forgetting_factor)
-        if not 0.0 < self.prior_count < math.inf:
-            raise ValueError(
-                "VariationalNoiseAdaptation.prior_count must be positive and finite, got "
-                f"{self.prior_count}. Use 10."
-            )
-        check_whole_number("VariationalNoiseAdaptation.iterations", self.iterations, 1, "Use 4.")
+        require_ranges(type(self).__name__, self, **_VARIATIONAL)
 
     @override
     def noise_adapt(
@@ -135,25 +133,8 @@ def scale_variances(noise: Tensor, factor: Tensor) -> Tensor:
     return noise * root.unsqueeze(-1) * root.unsqueeze(-2)
 
 
-def check_factor_bounds(name: str, lowest: float, largest: float) -> None:
-    """Check the bounds of a factor on the model's variance."""
-    if not 0.0 < lowest <= 1.0 <= largest:
-        raise ValueError(
-            f"{name}.min_factor must be in (0, 1] and max_factor at least 1, got "
-            f"min_factor={lowest}, max_factor={largest}. Use 0.5 and 100."
-        )
-
-
-def check_forgetting(name: str, value: float) -> None:
-    """Check that a forgetting factor lies in (0, 1)."""
-    if not 0.0 < value < 1.0:
-        raise ValueError(f"{name}.forgetting_factor must be in (0, 1), got {value}. Use 0.98.")
-
-
 # --------------------------------------------------------------------------------------------------
 # Variational Bayes for the whole measurement noise covariance and the predicted covariance.
-
-_NAME = "VariationalCovarianceAdaptation"
 
 
 @dataclass(frozen=True)
@@ -188,16 +169,8 @@ class VariationalCovarianceAdaptation(RobustUpdate):
     iterations: int = 4
 
     def __post_init__(self) -> None:
-        check_forgetting(_NAME, self.forgetting_factor)
-        if not 0.0 < self.prior_count < math.inf:
-            raise ValueError(
-                f"{_NAME}.prior_count must be positive and finite, got {self.prior_count}. Use 10."
-            )
-        if not self.prediction_count > 0.0:
-            raise ValueError(
-                f"{_NAME}.prediction_count must be positive, got {self.prediction_count}. Use 5."
-            )
-        check_whole_number(f"{_NAME}.iterations", self.iterations, 1, "Use 4.")
+        rules = {**_VARIATIONAL, "prediction_count": "(0, inf] Use 5."}
+        require_ranges(type(self).__name__, self, **rules)
 
     @override
     def noise_adapt(
@@ -291,12 +264,7 @@ class WindowedNoiseAdaptation(RobustUpdate):
     max_factor: float = 100.0
 
     def __post_init__(self) -> None:
-        if type(self.window) is not int or self.window < 2:
-            raise ValueError(
-                "WindowedNoiseAdaptation.window must be a whole number of at least 2, got "
-                f"{self.window}. Use 20."
-            )
-        check_factor_bounds("WindowedNoiseAdaptation", self.min_factor, self.max_factor)
+        require_ranges("WindowedNoiseAdaptation", self, window="whole [2, inf) Use 20.", **_BOUNDS)
 
     @override
     def noise_adapt(

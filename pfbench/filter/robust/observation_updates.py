@@ -21,7 +21,7 @@ from torch.distributions import (
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import distribution_covariance
-from pfbench.core.parameter_checks import check_whole_number
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.gaussian.kalman_update import (
     MeasurementUpdate,
@@ -53,7 +53,7 @@ class StudentObservationUpdate(MeasurementUpdate):
     has_evidence = False
 
     def __post_init__(self) -> None:
-        check_whole_number("StudentObservationUpdate.iterations", self.iterations, 1, "Use 4.")
+        require_ranges("StudentObservationUpdate", self, iterations="whole [1, inf) Use 4.")
 
     @override
     def observe(self, model: StateSpaceModel, distribution: Any) -> tuple[Tensor, Tensor]:

@@ -217,19 +217,10 @@ def count_downweighted(groups: GroupDistances, weight: Tensor) -> dict[str, Tens
     return {"downweighted": groups.count_groups(weight < DOWNWEIGHTED)}
 
 
-def check_efficiency(name: str, efficiency: float) -> None:
-    """Check that an efficiency is between 0 and 1."""
-    if not 0.0 < efficiency < 1.0:
-        raise ValueError(f"{name}.efficiency must be in (0, 1), got {efficiency}. Use 0.95.")
-
-
-def check_threshold(name: str, threshold: float | None) -> None:
-    """Check that a threshold is positive."""
-    if threshold is not None and not threshold > 0.0:
-        raise ValueError(
-            f"{name}.threshold must be positive, got {threshold}. Use null for the threshold of "
-            "95 % efficiency."
-        )
+THRESHOLD_RULES = {
+    "threshold": "null or (0, inf] Use null for the threshold of 95 % efficiency.",
+    "efficiency": "(0, 1) Use 0.95.",
+}
 
 
 # --------------------------------------------------------------------------------------------------

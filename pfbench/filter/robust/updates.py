@@ -11,21 +11,20 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import check_whole_number
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import Innovation, NoiseAdaptation
 from pfbench.filter.gaussian.kalman_update import kalman_gain_update
 from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
 from pfbench.filter.gaussian.noise_adaptation import scale_columns
 from pfbench.filter.robust.robust_update import (
+    THRESHOLD_RULES,
     ComponentGrouping,
     GroupDistances,
     InnovationWeight,
     ResidualLoss,
     WeightFunction,
     cauchy_weight,
-    check_efficiency,
-    check_threshold,
     count_downweighted,
     finite_weight,
     huber_log_density,
@@ -65,11 +64,9 @@ class MEstimationUpdate(ResidualLoss):
     groups: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
-        name = type(self).__name__
-        check_threshold(name, self.threshold)
         ComponentGrouping(self.grouping, self.groups)
-        check_efficiency(name, self.efficiency)
-        check_whole_number(f"{name}.iterations", self.iterations, 1, "Use 4.")
+        name = type(self).__name__
+        require_ranges(name, self, **THRESHOLD_RULES, iterations="whole [1, inf) Use 4.")
 
     @property
     @abstractmethod
@@ -198,9 +195,8 @@ class StudentUpdate(ResidualLoss):
 
     def __post_init__(self) -> None:
         ComponentGrouping(self.grouping, self.groups)
-        if not self.dof > 0.0:
-            raise ValueError(f"StudentUpdate.dof must be positive, got {self.dof}. Use 4 to 8.")
-        check_whole_number("StudentUpdate.iterations", self.iterations, 1, "Use 4.")
+        iterations = "whole [1, inf) Use 4."
+        require_ranges("StudentUpdate", self, dof="(0, inf] Use 4 to 8.", iterations=iterations)
 
     @override
     def noise_adapt(
@@ -258,13 +254,9 @@ class WeightedLikelihoodUpdate(InnovationWeight):
     def __post_init__(self) -> None:
         name = "WeightedLikelihoodUpdate"
         ComponentGrouping(self.grouping, self.groups)
-        check_threshold(name, self.threshold)
-        if self.distance not in ("mahalanobis", "plain"):
-            raise ValueError(
-                f"{name}.distance must be mahalanobis or plain, got {self.distance}. Use "
-                "mahalanobis."
-            )
-        check_efficiency(name, self.efficiency)
+        require_ranges(name, self, **THRESHOLD_RULES)
+        is_known = self.distance in ("mahalanobis", "plain")
+        require(is_known, f"{name}.distance", "be mahalanobis or plain", self.distance)
         if self.distance == "plain" and self.threshold is None:
             raise ValueError(
                 f"{name}.threshold must be a number in the unit of the measurement with "
@@ -330,12 +322,12 @@ class InnovationGate(InnovationWeight):
 
     def __post_init__(self) -> None:
         ComponentGrouping(self.grouping, self.groups)
-        if not 0.0 < self.probability <= 1.0:
-            raise ValueError(
-                f"InnovationGate.probability must be in (0, 1], got {self.probability}. Use 0.999, "
-                "or 1 for no gate."
-            )
-        check_whole_number("InnovationGate.patience", self.patience, 0, "Use 0 for no limit.")
+        require_ranges(
+            "InnovationGate",
+            self,
+            probability="(0, 1] Use 0.999, or 1 for no gate.",
+            patience="whole [0, inf) Use 0 for no limit.",
+        )
 
     @override
     def noise_adapt(
@@ -388,12 +380,12 @@ class ScaledNoise(NoiseAdaptation):
     has_evidence = True
 
     def __post_init__(self) -> None:
-        for name in ("r_factor", "q_factor"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(
-                    f"ScaledNoise.{name} must be positive, got {getattr(self, name)}. Use 1 for "
-                    "the model's noise."
-                )
+        require_ranges(
+            "ScaledNoise",
+            self,
+            r_factor="(0, inf] Use 1 for the model's noise.",
+            q_factor="(0, inf] Use 1 for the model's noise.",
+        )
 
     @override
     def predict_scale(

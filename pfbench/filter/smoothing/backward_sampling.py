@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_range, require_ranges
 from pfbench.core.random_stream import BatchRandomStream, RandomStream, relabel
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter, ParticleBelief, StepInfo
@@ -57,8 +58,7 @@ def sample_trajectories(
     References:
         S. Godsill, A. Doucet and M. West (2004), Monte Carlo smoothing for nonlinear time series.
     """
-    if paths < 1:
-        raise ValueError(f"trajectories: paths must be at least 1, got {paths}. Increase it.")
+    require_range("trajectories: paths", paths, "[1, inf]")
     check_no_feedback(record)
     sampler = sampler or ExactBackwardSampler()
     inputs = prepare_record(model, record)
@@ -306,10 +306,7 @@ class MetropolisBackwardSampler(BackwardSampler):
     needs_parents = True
 
     def __post_init__(self) -> None:
-        if self.mcmc_steps < 1:
-            raise ValueError(
-                f"sampler.mcmc_steps must be at least 1, got {self.mcmc_steps}. Increase it."
-            )
+        require_ranges("sampler", self, mcmc_steps="[1, inf]")
 
     @override
     def __call__(self, step: BackwardStep, draws: RandomStream) -> Tensor:

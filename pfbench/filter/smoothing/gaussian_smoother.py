@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from pfbench.core.linear_algebra import factor
+from pfbench.core.parameter_checks import require_range
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record, iterate_steps
 from pfbench.filter.belief import GaussianBelief, StepInfo
@@ -186,10 +187,7 @@ def smooth_iteratively(
         B. Bell (1994), The iterated Kalman smoother as a Gauss-Newton method. A. Garcia-Fernandez,
         L. Svensson and S. Sarkka (2017), Iterated posterior linearization smoother.
     """
-    if passes < 1:
-        raise ValueError(
-            f"smooth_iteratively: passes must be at least 1, got {passes}. Increase it."
-        )
+    require_range("smooth_iteratively: passes", passes, "[1, inf]")
     first = smooth(method, model, record)
     inputs = prepare_record(model, record)
     runs = len(record.y)

@@ -13,6 +13,7 @@ from torch.distributions import Independent, MultivariateNormal, Normal
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import distribution_covariance, factor, jacobian
+from pfbench.core.parameter_checks import require_range, require_ranges
 from pfbench.core.random_stream import RandomStream, relabel
 from pfbench.core.record import Record, iterate_steps
 from pfbench.filter.loop import prepare_record
@@ -201,8 +202,7 @@ def fit_path_laplace(space: NoiseSpace, passes: int = 6) -> PathLaplace:
     Raises:
         ValueError: If passes is below 1.
     """
-    if passes < 1:
-        raise ValueError(f"passes must be at least 1, got {passes}. Increase it.")
+    require_range("passes", passes, "[1, inf]")
     zero = space.start(
         torch.zeros(space.runs, 1, space.model.chart.dimension).to(space.model.anchor)
     )
@@ -255,8 +255,7 @@ class CrankNicolsonKernel(PathKernel):
     rho: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.rho < 1.0:
-            raise ValueError(f"kernel.rho must be from 0 to below 1, got {self.rho}. Change it.")
+        require_ranges("kernel", self, rho="[0, 1)")
 
     @override
     def __call__(
@@ -320,8 +319,7 @@ def sample_smoothed_paths(
             record has feedback.
     """
     for name, value in (("paths", paths), ("mcmc_steps", mcmc_steps)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}. Increase it.")
+        require_range(name, value, "[1, inf]")
     space = NoiseSpace(model, record)
     laplace = fit_path_laplace(space)
     kernel = kernel or CrankNicolsonKernel(laplace)
@@ -363,10 +361,7 @@ class ConditionalSmcKernel(PathKernel):
     sample_ancestors: bool = True
 
     def __post_init__(self) -> None:
-        if self.particles < 2:
-            raise ValueError(
-                f"kernel.particles must be at least 2, got {self.particles}. Increase it."
-            )
+        require_ranges("kernel", self, particles="[2, inf]")
 
     @override
     def __call__(

@@ -634,7 +634,7 @@ def test_unscented_parameters_without_points_are_refused() -> None:
         UnscentedPoints(beta=-1.0)
     with pytest.raises(ValueError, match=r"alpha must be positive, got 0\.0"):
         UnscentedPoints(0.0)
-    with pytest.raises(ValueError, match=r"kappa must be greater than -d = -2, got -2\.0"):
+    with pytest.raises(ValueError, match=r"kappa must be above -2, got -2\.0\. More than -d"):
         UnscentedPoints(1.0, 2.0, -2.0)(2)
 
 

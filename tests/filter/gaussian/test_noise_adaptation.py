@@ -979,7 +979,7 @@ REFUSED = {
     "max_q_factor must be at least 1, got 0.0": lambda: ConstrainedNoiseAdaptation(
         max_q_factor=0.0
     ),
-    "deadband=-1": lambda: ConstrainedNoiseAdaptation(deadband=-1.0),
+    r"deadband must be at least 0, got -1": lambda: ConstrainedNoiseAdaptation(deadband=-1.0),
     "ScalarNoiseAdaptation.max_r_factor must be at least 1, got 0.1": lambda: ScalarNoiseAdaptation(
         max_r_factor=0.1
     ),

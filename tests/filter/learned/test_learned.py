@@ -682,15 +682,18 @@ def test_worlds_that_were_learned_from_are_not_for_judging(kept: Any) -> None:
     [
         (
             lambda: LearnedProposal(DiagonalNormalHead, defensive_fraction=1.0),
-            "defensive_fraction=1.0",
+            r"defensive_fraction must be in \[0, 1\), got 1\.0",
         ),
         (
             lambda: LearnedProposal(DiagonalNormalHead, defensive_fraction=-0.1),
-            "proposal.defensive_fraction must be from 0 to 1, got -0.1",
+            r"proposal\.defensive_fraction must be in \[0, 1\), got -0\.1",
         ),
-        (lambda: LearnedProposal(DiagonalNormalHead, memory=-1), "memory=-1"),
-        (lambda: LearnedRandomWalk(DiagonalNormalHead, lag=0), "lag=0"),
-        (lambda: LearnedRandomWalk(DiagonalNormalHead, scale=0.0), "scale=0.0"),
+        (
+            lambda: LearnedProposal(DiagonalNormalHead, memory=-1),
+            "memory must be at least 0, got -1",
+        ),
+        (lambda: LearnedRandomWalk(DiagonalNormalHead, lag=0), "lag must be at least 1, got 0"),
+        (lambda: LearnedRandomWalk(DiagonalNormalHead, scale=0.0), "scale must be positive, got 0"),
     ],
 )
 def test_learned_stages_refuse_values_of_no_use(make: Callable[[], Any], word: str) -> None:

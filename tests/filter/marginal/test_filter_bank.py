@@ -158,5 +158,5 @@ def test_a_bank_that_is_not_possible_is_refused() -> None:
 
 @pytest.mark.parametrize("overlap", [0.0, 1.0, math.nan])
 def test_the_overlap_is_a_fraction(overlap: float) -> None:
-    with pytest.raises(ValueError, match=r"filter\.overlap must be above 0 and below 1.* Use 0\.6"):
+    with pytest.raises(ValueError, match=r"filter\.overlap must be in \(0, 1\), got .* Use 0\.6"):
         FilterBank(overlap=overlap)

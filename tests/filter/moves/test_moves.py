@@ -1116,7 +1116,10 @@ def test_what_moves_cannot_do_without() -> None:
 @pytest.mark.parametrize(
     ("make", "word"),
     [
-        (lambda: MetropolisHastings(LastStateKernel(), -1), "mcmc_steps must be 0 or more, got -1"),
+        (
+            lambda: MetropolisHastings(LastStateKernel(), -1),
+            "mcmc_steps must be at least 0, got -1",
+        ),
         (lambda: RandomWalk(0.0), "scale must be positive, got 0.0"),
         (lambda: RandomWalk(math.nan), "scale must be positive, got nan"),
         (lambda: NoiseFlowKernel(0), "lag must be at least 1, got 0"),

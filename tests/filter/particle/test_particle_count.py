@@ -257,8 +257,8 @@ def test_the_number_changes_from_step_to_step_without_a_nan(preference: Auxiliar
     ("make", "key"),
     [
         (lambda: CountLimits(200, 300, 100), "minimum=200"),
-        (lambda: EssStepCount(-1), "particle_count.increment must be 0 or more.*got increment=-1"),
-        (lambda: EssStepCount(ess_threshold=1.5), "ess_threshold=1.5"),
+        (lambda: EssStepCount(-1), "particle_count.increment must be at least 0, got -1"),
+        (lambda: EssStepCount(ess_threshold=1.5), r"ess_threshold must be in \[0, 1\], got 1\.5"),
         (lambda: EssTargetCount(0.0), "particle_count.target must be positive, got 0.0"),
         (
             lambda: ParticleFilter(50, particle_count=EssStepCount()).init(

@@ -418,7 +418,9 @@ def test_moves_come_after_the_refresh_and_before_the_proposal() -> None:
 
 @pytest.mark.parametrize("particles", [1, 0, -5])
 def test_too_few_particles_are_refused(particles: int) -> None:
-    with pytest.raises(ValueError, match=f"particles must be at least 2, got {particles}"):
+    with pytest.raises(
+        ValueError, match=f"particles must be a whole number of at least 2, got {particles}"
+    ):
         ParticleFilter(particles)
 
 

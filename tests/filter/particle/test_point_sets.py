@@ -203,5 +203,5 @@ def test_shifts_at_the_edge_stay_inside() -> None:
 
 
 def test_a_negative_number_of_points_to_skip_is_refused() -> None:
-    with pytest.raises(ValueError, match="skip must be 0 or more, got -1"):
+    with pytest.raises(ValueError, match="skip must be at least 0, got -1"):
         HaltonPoints(-1)

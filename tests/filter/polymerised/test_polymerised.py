@@ -821,7 +821,7 @@ CLOUD, ONE = one_cloud(1)
     [
         (
             lambda: PolymerisedResampler(ess_threshold=1.2),
-            "ess_threshold must be from 0 to 1, got 1.2",
+            r"ess_threshold must be in \[0, 1\], got 1\.2",
         ),
         (lambda: PolymerisedResampler(axes=[0, 0]), r"axes must be .*, got \[0, 0\]"),
         (lambda: PolymerisedResampler(axes=[]), r"axes must be .*, got \[\]"),

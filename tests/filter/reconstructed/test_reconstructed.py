@@ -747,10 +747,10 @@ def test_what_cannot_be_is_told() -> None:
         lambda: TransitionRatioCorrection(defensive_fraction=-0.1),
         lambda: ReconstructedNoiseProposal(defensive_fraction=math.nan),
     ):
-        with pytest.raises(ValueError, match=r"defensive_fraction must be from 0 to 1"):
+        with pytest.raises(ValueError, match=r"defensive_fraction must be in \[0, 1\]"):
             wrong()
     for words in ({"error_weight": 0.0}, {"control_weight": [1.0, -2.0]}):
-        with pytest.raises(ValueError, match="positive weights"):
+        with pytest.raises(ValueError, match="must be positive, got"):
             DmcController(**words)  # type: ignore[arg-type]
     corrections: dict[str, tuple[DmcController, WeightCorrection]] = {
         "must have 1 or 1 numbers, got 3": (

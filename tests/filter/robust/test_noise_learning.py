@@ -200,12 +200,12 @@ BAD: dict[str, Any] = {
     r"SageHusaAdaptation.max_gain must be in \(0, 1\], got 0": lambda: SageHusaAdaptation(
         max_gain=0.0
     ),
-    r"SageHusaAdaptation.min_factor must be .*min_factor=2": lambda: SageHusaAdaptation(
+    r"SageHusaAdaptation.min_factor must be in \(0, 1\], got 2": lambda: SageHusaAdaptation(
         min_factor=2.0
     ),
     r"WindowedNoiseAdaptation.window must be .*got 1": lambda: WindowedNoiseAdaptation(1),
-    r"WindowedNoiseAdaptation.min_factor must be .*max_factor=0.9": lambda: WindowedNoiseAdaptation(
-        max_factor=0.9
+    r"WindowedNoiseAdaptation.max_factor must be at least 1, got 0.9": lambda: (
+        WindowedNoiseAdaptation(max_factor=0.9)
     ),
     r"VariationalCovarianceAdaptation.prior_count must be .*got 0": lambda: (
         VariationalCovarianceAdaptation(prior_count=0.0)

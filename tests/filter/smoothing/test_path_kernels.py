@@ -180,7 +180,7 @@ def test_settings_outside_their_range_say_why() -> None:
     draws = PhiloxStream(1, torch.arange(1))
     with pytest.raises(ValueError, match="paths must be at least 1"):
         sample_smoothed_paths(SINGULAR, RECORD, draws, 0)
-    with pytest.raises(ValueError, match="rho must be from 0 to below 1"):
+    with pytest.raises(ValueError, match=r"rho must be in \[0, 1\), got 1"):
         CrankNicolsonKernel(LAPLACE, 1.0)
     with pytest.raises(ValueError, match="particles must be at least 2"):
         ConditionalSmcKernel(1)

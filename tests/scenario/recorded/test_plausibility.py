@@ -135,7 +135,9 @@ def test_a_key_widens_a_limit_and_cannot_switch_it_off(tmp_path: Path) -> None:
     log["gnss"].loc[40, "pe"] += 1500.0
     read = read_log(write(tmp_path, log), limits=PlausibleLimits(fix_error_m=2000.0))
     assert np.isfinite(read.fixes.position).all()
-    with pytest.raises(ValueError, match=r"scenario\.limits\.speed_m_s must be a positive finite"):
+    with pytest.raises(
+        ValueError, match=r"scenario\.limits\.speed_m_s must be positive and finite"
+    ):
         PlausibleLimits(speed_m_s=math.inf)
 
 
