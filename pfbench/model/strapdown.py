@@ -45,9 +45,10 @@ def _block_diagonal(a: Tensor, b: Tensor) -> Tensor:
 
     Shapes: a [B or 1, n, p], b [B or 1, m, q].
     """
-    right = a.new_zeros(a.shape[0], a.shape[1], b.shape[2])
-    left = b.new_zeros(b.shape[0], b.shape[1], a.shape[2])
-    return torch.cat([torch.cat(row, -1) for row in ([a, right], [left, b])], -2)
+    upper_right = a.new_zeros(a.shape[0], a.shape[1], b.shape[2])
+    lower_left = b.new_zeros(b.shape[0], b.shape[1], a.shape[2])
+    rows = ([a, upper_right], [lower_left, b])
+    return torch.cat([torch.cat(row, -1) for row in rows], -2)
 
 
 class _StrapdownModel(StateSpaceModel):
