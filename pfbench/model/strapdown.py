@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import NamedTuple
 
 import torch
@@ -13,7 +14,7 @@ from typing_extensions import override
 from pfbench.core import chart as quaternion
 from pfbench.core.chart import Chart, EuclideanBlock, LieGroupBlock, QuaternionBlock
 from pfbench.core.density import independent_normal, normal_batch
-from pfbench.core.parameter_checks import check_positive, check_tuning
+from pfbench.core.parameter_checks import check_positive, check_tuning, require
 from pfbench.core.record import EACH_SATELLITE, Record, name_channels
 from pfbench.model.base import StateSpaceModel, check_truth_sizes
 from pfbench.model.ins_gnss import name_components
@@ -29,12 +30,77 @@ from pfbench.nav.strapdown import PreintegratedImu, rotate
 # is then one inexpensive map for all particles at any IMU rate.
 
 _SIZES = (4, 3, 3, 3, 3)  # quaternion, velocity, position, gyro bias, accelerometer bias
-_CHART = Chart((QuaternionBlock(), EuclideanBlock(12)))
 _AXES = ("East", "North", "Up")
 FIX_CHANNELS = (*name_channels("position", _AXES, "m"), *name_channels("velocity", _AXES, "m/s"))
 
 
-class StrapdownTotal(StateSpaceModel):
+@cache
+def _chart(attitude: QuaternionBlock | LieGroupBlock, further: int) -> Chart:
+    """Return the chart of an attitude and further components."""
+    return Chart((attitude, EuclideanBlock(further)))
+
+
+def _block_diagonal(a: Tensor, b: Tensor) -> Tensor:
+    """Return a matrix with two blocks, [B, n + m, p + q].
+
+    Shapes: a [B or 1, n, p], b [B or 1, m, q].
+    """
+    upper_right = a.new_zeros(a.shape[0], a.shape[1], b.shape[2])
+    lower_left = b.new_zeros(b.shape[0], b.shape[1], a.shape[2])
+    rows = ([a, upper_right], [lower_left, b])
+    return torch.cat([torch.cat(row, -1) for row in rows], -2)
+
+
+class _StrapdownModel(StateSpaceModel):
+    """Preintegrated inertial increments, and a start of each run from the recorded scenario."""
+
+    input_type: type = PreintegratedImu
+    p0: Tensor
+    r: Tensor
+    further = 0  # states after attitude, velocity, position and the sensor biases
+    measured = remedy = ""  # what the scenario must measure, if their number is fixed
+
+    @property
+    @override
+    def chart(self) -> Chart:
+        return _chart(QuaternionBlock(), 12 + self.further)
+
+    def group_chart(self, side: str) -> Chart:
+        """Return an invariant chart: attitude, velocity and position are an element of SE_2(3).
+
+        The noise gain holds in the left chart as well, to first order in the attitude noise of a step.
+        The reason is that the density of the accelerometer is the same in all axes.
+
+        Args:
+            side: `left` or `right`, see LieGroupBlock.
+        """
+        return _chart(LieGroupBlock(side=side), 6 + self.further)
+
+    @property
+    @override
+    def anchor(self) -> Tensor:
+        return self.p0
+
+    @property
+    @override
+    def origin(self) -> Tensor:
+        return torch.cat([self.p0.new_ones(1), self.p0.new_zeros(15 + self.further)])
+
+    @override
+    def prepare(self, record: Record) -> Record:
+        record = super().prepare(record)
+        if self.measured:
+            size, got = len(self.r), record.y.shape[-1]
+            must = f"measure the {size} components of {self.measured}"
+            require(got == size, "the scenario", must, got, self.remedy)
+        return record
+
+    @override
+    def initial(self, runs: int) -> Distribution:
+        return normal_batch(runs, self.p0)
+
+
+class StrapdownTotal(_StrapdownModel):
     """Motion of a vehicle with the biases of its IMU.
 
     State [16]: quaternion body to level, velocity and position (East, North, Up), gyro and
@@ -59,11 +125,12 @@ class StrapdownTotal(StateSpaceModel):
         ValueError: If a density or standard deviation is not positive.
     """
 
-    input_type = PreintegratedImu
     density: Tensor
-    r: Tensor
-    p0: Tensor
     noise_dim = 12
+    measured = "tuning.position_sd and velocity_sd"
+    remedy = (
+        "Set tuning.velocity_sd and receiver.velocity_sd both to three numbers, or both to null."
+    )
     choices = (
         "flat Earth about the start with constant normal gravity; "
         "the gyro bias absorbs the Earth's rate (0.004 deg/s)",
@@ -93,47 +160,6 @@ class StrapdownTotal(StateSpaceModel):
             "accelerometer_bias": (("right", "forward", "up"), "m/s^2"),
         }
         self.names, self.units, self.groups = name_components(axes)
-
-    @property
-    @override
-    def chart(self) -> Chart:
-        return _CHART
-
-    def group_chart(self, side: str) -> Chart:
-        """Return an invariant chart: attitude, velocity and position are an element of SE_2(3).
-
-        The noise gain holds in the left chart as well, to first order in the attitude noise of a step.
-        The reason is that the density of the accelerometer is the same in all axes.
-
-        Args:
-            side: `left` or `right`, see LieGroupBlock.
-        """
-        return Chart((LieGroupBlock(side=side), EuclideanBlock(6)))
-
-    @property
-    @override
-    def anchor(self) -> Tensor:
-        return self.p0
-
-    @property
-    @override
-    def origin(self) -> Tensor:
-        return torch.cat([self.p0.new_ones(1), self.p0.new_zeros(15)])
-
-    @override
-    def prepare(self, record: Record) -> Record:
-        record = super().prepare(record)
-        if record.y.shape[-1] != len(self.r):
-            raise ValueError(
-                f"the scenario must measure the {len(self.r)} components of tuning.position_sd "
-                f"and velocity_sd, got {record.y.shape[-1]}. Set tuning.velocity_sd and "
-                "receiver.velocity_sd both to three numbers, or both to null."
-            )
-        return record
-
-    @override
-    def initial(self, runs: int) -> Distribution:
-        return normal_batch(runs, self.p0)
 
     @override
     def propagate(self, x: Tensor, u: PreintegratedImu, w: Tensor) -> Tensor:
@@ -197,10 +223,9 @@ INSTRUMENT_CHANNELS = (
     *name_channels("magnetic field in body axes", ("right", "forward", "up"), "gauss"),
 )
 _DRIVEN = StrapdownTotal.noise_dim
-_CHART_AIDED = Chart((QuaternionBlock(), EuclideanBlock(_MOTION - 4 + _BIASES)))
 
 
-class StrapdownAided(StateSpaceModel):
+class StrapdownAided(_StrapdownModel):
     """StrapdownTotal with barometer and magnetometer biases.
 
     State [20]: the state of StrapdownTotal, then the barometer bias m and the magnetometer bias,
@@ -221,12 +246,15 @@ class StrapdownAided(StateSpaceModel):
             numbers or is zero.
     """
 
-    input_type = PreintegratedImu
-    p0: Tensor
-    r: Tensor
+    measured = "StrapdownAided (a fix, a height, a field)"
+    remedy = (
+        "Choose scenario=recorded_fixed_wing_aided, and set velocity_sd of tuning.motion and of the "
+        "receiver both to three numbers or both to null."
+    )
     magnetic_field_gauss: Tensor
     walk: Tensor
     noise_dim = _DRIVEN + _BIASES
+    further = _BIASES
 
     def __init__(self, tuning: AidedTuning) -> None:
         super().__init__()
@@ -258,44 +286,6 @@ class StrapdownAided(StateSpaceModel):
             "as white noise plus a random-walk bias",
         )
 
-    @property
-    @override
-    def chart(self) -> Chart:
-        return _CHART_AIDED
-
-    def group_chart(self, side: str) -> Chart:
-        """Return an invariant chart, that of StrapdownTotal with further Euclidean components.
-
-        Args:
-            side: `left` or `right`, see LieGroupBlock.
-        """
-        return Chart((LieGroupBlock(side=side), EuclideanBlock(6 + _BIASES)))
-
-    @property
-    @override
-    def anchor(self) -> Tensor:
-        return self.p0
-
-    @property
-    @override
-    def origin(self) -> Tensor:
-        return torch.cat([self.motion.origin, self.p0.new_zeros(_BIASES)])
-
-    @override
-    def prepare(self, record: Record) -> Record:
-        record = super().prepare(record)
-        if record.y.shape[-1] != len(self.r):
-            raise ValueError(
-                f"the scenario must measure the {len(self.r)} components of StrapdownAided (a fix, a height, "
-                f"a field), got {record.y.shape[-1]}. Choose scenario=recorded_fixed_wing_aided, and set "
-                "velocity_sd of tuning.motion and of the receiver both to three numbers or both to null."
-            )
-        return record
-
-    @override
-    def initial(self, runs: int) -> Distribution:
-        return normal_batch(runs, self.p0)
-
     @override
     def propagate(self, x: Tensor, u: PreintegratedImu, w: Tensor) -> Tensor:
         motion = self.motion.propagate(x[..., :_MOTION], u, w[..., :_DRIVEN])
@@ -306,10 +296,7 @@ class StrapdownAided(StateSpaceModel):
     def noise_gain(self, u: PreintegratedImu) -> Tensor:
         motion = self.motion.noise_gain(u)
         walk = torch.diag_embed(torch.sqrt(u.duration)[:, None] * self.walk)
-        upper_right = motion.new_zeros(motion.shape[0], motion.shape[1], _BIASES)
-        lower_left = motion.new_zeros(motion.shape[0], _BIASES, motion.shape[2])
-        rows = [[motion, upper_right], [lower_left, walk]]
-        return torch.cat([torch.cat(row, -1) for row in rows], -2)
+        return _block_diagonal(motion, walk)
 
     @override
     def observation(self, x: Tensor, u: PreintegratedImu) -> Distribution:
@@ -346,7 +333,6 @@ def _field(values: Sequence[float]) -> Sequence[float]:
 
 _MOTION_TIGHT, _CLOCK = 16, 3
 _DRIVEN_TIGHT = StrapdownTotal.noise_dim
-_CHART_TIGHT = Chart((QuaternionBlock(), EuclideanBlock(_MOTION_TIGHT - 4 + _CLOCK)))
 
 
 class TightMemsInputs(NamedTuple):
@@ -384,7 +370,7 @@ class TightMemsInputs(NamedTuple):
         return PreintegratedImu(*self[: len(PreintegratedImu._fields)])
 
 
-class StrapdownTight(StateSpaceModel):
+class StrapdownTight(_StrapdownModel):
     """StrapdownTotal with a receiver clock, measured by pseudoranges and range rates.
 
     State [19]: the state of StrapdownTotal, then bias m and drift m/s of the receiver clock, and
@@ -407,9 +393,9 @@ class StrapdownTight(StateSpaceModel):
         f"range rate {EACH_SATELLITE} minus that from the local origin [m/s]",
     )
     input_type = TightMemsInputs
-    p0: Tensor
     other_walk: Tensor
     noise_dim = _DRIVEN_TIGHT + _CLOCK
+    further = _CLOCK
 
     def __init__(self, tuning: TightTuning) -> None:
         super().__init__()
@@ -431,33 +417,6 @@ class StrapdownTight(StateSpaceModel):
             "so their standard deviations are inflated",
         )
 
-    @property
-    @override
-    def chart(self) -> Chart:
-        return _CHART_TIGHT
-
-    def group_chart(self, side: str) -> Chart:
-        """Return an invariant chart, that of StrapdownTotal with further Euclidean components.
-
-        Args:
-            side: `left` or `right`, see LieGroupBlock.
-        """
-        return Chart((LieGroupBlock(side=side), EuclideanBlock(6 + _CLOCK)))
-
-    @property
-    @override
-    def anchor(self) -> Tensor:
-        return self.p0
-
-    @property
-    @override
-    def origin(self) -> Tensor:
-        return torch.cat([self.motion.origin, self.p0.new_zeros(_CLOCK)])
-
-    @override
-    def initial(self, runs: int) -> Distribution:
-        return normal_batch(runs, self.p0)
-
     @override
     def propagate(self, x: Tensor, u: TightMemsInputs, w: Tensor) -> Tensor:
         motion, bias, drift, inter_system = x.split([_MOTION_TIGHT, 1, 1, 1], -1)
@@ -470,17 +429,12 @@ class StrapdownTight(StateSpaceModel):
     @override
     def noise_gain(self, u: TightMemsInputs) -> Tensor:
         motion, clock = self.motion.noise_gain(u.increments), self._clock_gain(u.duration)
-        upper_right = motion.new_zeros(motion.shape[0], motion.shape[1], _CLOCK)
-        lower_left = motion.new_zeros(motion.shape[0], _CLOCK, motion.shape[2])
-        rows = [[motion, upper_right], [lower_left, clock]]
-        return torch.cat([torch.cat(row, -1) for row in rows], -2)
+        return _block_diagonal(motion, clock)
 
     def _clock_gain(self, duration: Tensor) -> Tensor:
         """Return the noise gain of bias, drift and inter-system bias [R or 1, 3, 3]."""
         walk = (self.other_walk * torch.sqrt(duration))[:, None, None]
-        side = torch.zeros_like(walk).expand(-1, 2, 1)
-        rows = [[self.clock.noise_gain(duration), side], [side.mT, walk]]
-        return torch.cat([torch.cat(row, -1) for row in rows], -2)
+        return _block_diagonal(self.clock.noise_gain(duration), walk)
 
     @override
     def observation(self, x: Tensor, u: TightMemsInputs) -> Distribution:

@@ -14,6 +14,7 @@ from pfbench.core import chart as quaternion
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
 from pfbench.core.density import independent_normal
 from pfbench.core.linear_algebra import affine_map, factor
+from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record, map_inputs
 from pfbench.model.ins_gnss import (
     BIASES,
@@ -63,18 +64,27 @@ def compute_initial_sd(imu: ImuErrors, clock: ReceiverClock, initial: AlignmentE
     return torch.cat([initial.sd, torch.tensor(sizes, dtype=torch.float64)])
 
 
-def check_satellites(record: Record, components: int) -> RangingInputs:
-    """Check that the measurements are of the satellites of a tightly coupled model.
+class _TightModel(InsErrorModel):
+    """States, sensors and measurements of the tightly coupled models."""
 
-    Returns inputs.
-    """
-    if record.y.shape[-1] != components:
-        raise ValueError(
-            f"the scenario must measure the {components} components of model.receiver, "
-            f"got {record.y.shape[-1]}. Give both the same satellites."
-        )
-    u: RangingInputs = record.u
-    return u
+    channel_names, input_type = RangingReceiver.channel_names, RangingReceiver.input_type
+    r: Tensor
+    names, units, groups = NAMES, UNITS, TIGHT_GROUPS
+
+    def __init__(self, imu: ImuErrors, receiver: RangingReceiver, initial: AlignmentErrors) -> None:
+        super().__init__()
+        self.check_receiver(receiver)
+        self.imu, self.clock = imu, receiver.clock
+        self.register_buffer("p0", compute_initial_sd(imu, receiver.clock, initial))
+        self.register_buffer("r", receiver.sd)
+
+    def ranging_inputs(self, record: Record) -> RangingInputs:
+        """Return the inputs of a record whose measurements are those of the receiver."""
+        u: RangingInputs = super().prepare(record).u
+        size, got = len(self.r), record.y.shape[-1]
+        must = f"measure the {size} components of model.receiver"
+        require(got == size, "the scenario", must, got, "Give both the same satellites.")
+        return u
 
 
 # --------------------------------------------------------------------------------------------------
@@ -107,7 +117,7 @@ class TightStep(NamedTuple):
     closing: Tensor
 
 
-class SinsGnssTight(InsErrorModel):
+class SinsGnssTight(_TightModel):
     """Errors of an INS (INS minus truth) and a receiver clock, measured by ranges.
 
     The 17 states are attitude phi (E, N, U), velocity (E, N, U), position in metres (N, E, U),
@@ -133,10 +143,6 @@ class SinsGnssTight(InsErrorModel):
             sensor has a Markov part.
     """
 
-    channel_names, input_type = RangingReceiver.channel_names, RangingReceiver.input_type
-    r: Tensor
-    names, units, groups = NAMES, UNITS, TIGHT_GROUPS
-
     def __init__(
         self,
         imu: ImuErrors,
@@ -144,11 +150,8 @@ class SinsGnssTight(InsErrorModel):
         initial: AlignmentErrors,
         inflation: ProcessNoiseInflation | None = None,
     ) -> None:
-        super().__init__()
-        self.check_receiver(receiver)
-        self.imu, self.clock, self.inflation = imu, receiver.clock, inflation
-        self.register_buffer("p0", compute_initial_sd(imu, receiver.clock, initial))
-        self.register_buffer("r", receiver.sd)
+        super().__init__(imu, receiver, initial)
+        self.inflation = inflation
         self.noise_dim = 17 if inflation else 11
         self.choices = (
             (f"process noise is inflated for every filter: {inflation}",) if inflation else ()
@@ -158,7 +161,7 @@ class SinsGnssTight(InsErrorModel):
     def prepare(self, record: Record) -> Record:
         if isinstance(record.u, TightStep):
             return record
-        u = check_satellites(super().prepare(record), len(self.r))
+        u = self.ranging_inputs(record)
         steps = u.duration.shape[-1]
         blocks = [
             self.discretise(map_inputs(lambda a, i=i: a[:, i : i + _EPOCHS], u))
@@ -293,7 +296,7 @@ class NonlinearTightStep(NamedTuple):
     closing: Tensor
 
 
-class SinsGnssTightNl(InsErrorModel):
+class SinsGnssTightNl(_TightModel):
     """`SinsGnssTight` without linearisation, for INS errors of any size.
 
     An example is an INS with an approximate initial heading, wrong by 45 degrees. State [18]:
@@ -325,18 +328,8 @@ class SinsGnssTightNl(InsErrorModel):
             sensor has a Markov part.
     """
 
-    channel_names, input_type = RangingReceiver.channel_names, RangingReceiver.input_type
-    r: Tensor
-    names, units, groups = NAMES, UNITS, TIGHT_GROUPS
     noise_dim = 11
     choices = ("an interval's specific force enters as one impulse, not in steps of 0.1 s",)
-
-    def __init__(self, imu: ImuErrors, receiver: RangingReceiver, initial: AlignmentErrors) -> None:
-        super().__init__()
-        self.check_receiver(receiver)
-        self.imu, self.clock = imu, receiver.clock
-        self.register_buffer("p0", compute_initial_sd(imu, receiver.clock, initial))
-        self.register_buffer("r", receiver.sd)
 
     @property
     @override
@@ -352,7 +345,7 @@ class SinsGnssTightNl(InsErrorModel):
     def prepare(self, record: Record) -> Record:
         if isinstance(record.u, NonlinearTightStep):
             return record
-        u = check_satellites(super().prepare(record), len(self.r))
+        u = self.ranging_inputs(record)
         dcm = error_dynamics.mid_interval(u.intervals).dcm
         interval = (dcm, u.pos, u.pos_start, u.pos_end, u.vel, u.w_in, u.f, u.duration)
         return record._replace(u=NonlinearTightStep(*interval, *u.sight))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -168,9 +169,7 @@ class VariationalCovarianceAdaptation(RobustUpdate):
     prediction_count: float = 5.0
     iterations: int = 4
 
-    def __post_init__(self) -> None:
-        rules = {**_VARIATIONAL, "prediction_count": "(0, inf] Use 5."}
-        require_ranges(type(self).__name__, self, **rules)
+    rules: ClassVar = {**_VARIATIONAL, "prediction_count": "(0, inf] Use 5."}
 
     @override
     def noise_adapt(

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.special import gammainc, gammaincc, gammaln
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require_ranges
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import (
     Innovation,
@@ -146,8 +147,13 @@ class RobustUpdate(NoiseAdaptation):
     """
 
     has_evidence = False
-    grouping: str
-    groups: Sequence[int] | None
+    grouping: str = "component"
+    groups: Sequence[int] | None = None
+    rules: ClassVar[Mapping[str, str]] = {}  # ranges of the fields
+
+    def __post_init__(self) -> None:
+        _ = self.component_grouping  # refuses what is none
+        require_ranges(type(self).__name__, self, **self.rules)
 
     @property
     def component_grouping(self) -> ComponentGrouping:
@@ -164,19 +170,42 @@ class RobustUpdate(NoiseAdaptation):
 class ResidualLoss(RobustUpdate, ABC):
     """Base of the updates that follow from a loss of the residual, a function of its distance.
 
+    The measurement is reweighted by the residual after the update, a fixed number of times.
+
     Attributes:
+        iterations: Number of reweightings, equal for all runs.
         is_density: True if exp(-loss) is a density of the measurement given the state.
+        adds_spread: True if the distance includes the covariance of the predicted measurement.
     """
 
+    iterations: int
     is_density: bool = False
+    adds_spread: bool = False
 
     @abstractmethod
-    def residual_weight(self, squared: Tensor, size: Tensor) -> Tensor:
-        """Compute the weight of groups."""
+    def weight_of(self, size: Tensor) -> Callable[[Tensor], Tensor]:
+        """Return the weight as a function of squared distances, for groups of a size [R, k]."""
 
     @abstractmethod
     def log_density(self, squared: Tensor, size: Tensor) -> Tensor:
         """Compute minus the loss of groups in whitened coordinates, with its constant."""
+
+    def residual_weight(self, squared: Tensor, size: Tensor) -> Tensor:
+        """Compute the weight of groups."""
+        return self.weight_of(size)(squared)
+
+    @override
+    def noise_adapt(
+        self, innovation: Innovation, belief: GaussianBelief
+    ) -> tuple[Innovation, dict[str, Tensor]]:
+        groups = self.component_grouping.apply(innovation, innovation.noise)
+        weight, w = self.weight_of(groups.size), torch.ones_like(innovation.r)
+        for _ in range(self.iterations):
+            residual, covariance = updated_residual(innovation.reweight(w, groups.group_mask))
+            squared = groups.squared_distance(residual)
+            squared = squared + groups.trace(covariance) if self.adds_spread else squared
+            w = finite_weight(weight(squared))
+        return innovation.reweight(w, groups.group_mask), count_downweighted(groups, w)
 
 
 class InnovationWeight(RobustUpdate, ABC):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -19,11 +20,9 @@ from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
 from pfbench.filter.gaussian.noise_adaptation import scale_columns
 from pfbench.filter.robust.robust_update import (
     THRESHOLD_RULES,
-    ComponentGrouping,
     GroupDistances,
     InnovationWeight,
     ResidualLoss,
-    WeightFunction,
     cauchy_weight,
     count_downweighted,
     finite_weight,
@@ -32,10 +31,11 @@ from pfbench.filter.robust.robust_update import (
     quantile_table,
     student_log_density,
     threshold_table,
-    updated_residual,
     welsch_log_loss,
     welsch_weight,
 )
+
+_ITERATIONS = {"iterations": "whole [1, inf) Use 4."}
 
 # --------------------------------------------------------------------------------------------------
 # M-estimation of the whitened state by iterated reweighting: Huber and maximum correntropy.
@@ -63,15 +63,12 @@ class MEstimationUpdate(ResidualLoss):
     grouping: str = "component"
     groups: Sequence[int] | None = None
 
-    def __post_init__(self) -> None:
-        ComponentGrouping(self.grouping, self.groups)
-        name = type(self).__name__
-        require_ranges(name, self, **THRESHOLD_RULES, iterations="whole [1, inf) Use 4.")
+    rules = THRESHOLD_RULES | _ITERATIONS
 
-    @property
+    @staticmethod
     @abstractmethod
-    def weight(self) -> WeightFunction:
-        """Weight as a function of squared distances and thresholds."""
+    def weight(squared: Tensor, threshold: Tensor) -> Tensor:
+        """Compute the weights of squared distances."""
 
     def table(self, size: Tensor) -> Tensor:
         """Return the threshold of each group.
@@ -81,20 +78,9 @@ class MEstimationUpdate(ResidualLoss):
         return threshold_table(self.weight, self.threshold, self.efficiency, size)
 
     @override
-    def residual_weight(self, squared: Tensor, size: Tensor) -> Tensor:
-        return self.weight(squared, self.table(size))
-
-    @override
-    def noise_adapt(
-        self, innovation: Innovation, belief: GaussianBelief
-    ) -> tuple[Innovation, dict[str, Tensor]]:
-        groups = self.component_grouping.apply(innovation, innovation.noise)
-        threshold = self.table(groups.size)
-        w = torch.ones_like(innovation.r)
-        for _ in range(self.iterations):
-            residual, _ = updated_residual(innovation.reweight(w, groups.group_mask))
-            w = finite_weight(self.weight(groups.squared_distance(residual), threshold))
-        return innovation.reweight(w, groups.group_mask), count_downweighted(groups, w)
+    def weight_of(self, size: Tensor) -> Callable[[Tensor], Tensor]:
+        threshold = self.table(size)
+        return lambda squared: self.weight(squared, threshold)
 
 
 @dataclass(frozen=True)
@@ -102,11 +88,7 @@ class HuberUpdate(MEstimationUpdate):
     """Huber's weight min(1, c / d): bounded influence [Huber 1964; Gandhi and Mili 2010]."""
 
     is_density = True
-
-    @property
-    @override
-    def weight(self) -> WeightFunction:
-        return huber_weight
+    weight = staticmethod(huber_weight)
 
     @override
     def log_density(self, squared: Tensor, size: Tensor) -> Tensor:
@@ -126,11 +108,7 @@ class CorrentropyUpdate(MEstimationUpdate):
     """
 
     weight_prior: bool = False
-
-    @property
-    @override
-    def weight(self) -> WeightFunction:
-        return welsch_weight
+    weight = staticmethod(welsch_weight)
 
     @override
     def log_density(self, squared: Tensor, size: Tensor) -> Tensor:
@@ -143,15 +121,14 @@ class CorrentropyUpdate(MEstimationUpdate):
         if not self.weight_prior:
             return super().noise_adapt(innovation, belief)
         groups = self.component_grouping.apply(innovation, innovation.noise)
-        threshold = self.table(groups.size)
-        prior_threshold = self.table(torch.ones_like(innovation.m[:, 0]))
         w, scale = torch.ones_like(innovation.r), torch.ones_like(innovation.m[:, 0])
+        weight, weight_of_prior = self.weight_of(groups.size), self.weight_of(scale)
         for _ in range(self.iterations):
             weighted = _scale_prior(innovation.reweight(w, groups.group_mask), scale)
             shift, *_ = kalman_gain_update(weighted)
             residual = innovation.r - (weighted.m @ shift.unsqueeze(-1)).squeeze(-1)
-            w = finite_weight(self.weight(groups.squared_distance(residual), threshold))
-            prior_weight = finite_weight(self.weight((scale * shift).square(), prior_threshold))
+            w = finite_weight(weight(groups.squared_distance(residual)))
+            prior_weight = finite_weight(weight_of_prior((scale * shift).square()))
             scale = prior_weight.clamp(min=1e-4).rsqrt()
         return _scale_prior(innovation.reweight(w, groups.group_mask), scale), count_downweighted(
             groups, w
@@ -192,29 +169,14 @@ class StudentUpdate(ResidualLoss):
     grouping: str = "component"
     groups: Sequence[int] | None = None
     is_density = True
-
-    def __post_init__(self) -> None:
-        ComponentGrouping(self.grouping, self.groups)
-        iterations = "whole [1, inf) Use 4."
-        require_ranges("StudentUpdate", self, dof="(0, inf] Use 4 to 8.", iterations=iterations)
+    adds_spread = True
+    rules: ClassVar = {"dof": "(0, inf] Use 4 to 8.", **_ITERATIONS}
 
     @override
-    def noise_adapt(
-        self, innovation: Innovation, belief: GaussianBelief
-    ) -> tuple[Innovation, dict[str, Tensor]]:
-        groups = self.component_grouping.apply(innovation, innovation.noise)
-        w = torch.ones_like(innovation.r)
-        for _ in range(self.iterations if math.isfinite(self.dof) else 0):
-            residual, covariance = updated_residual(innovation.reweight(w, groups.group_mask))
-            gamma = groups.squared_distance(residual) + groups.trace(covariance)
-            w = finite_weight(self.residual_weight(gamma, groups.size))
-        return innovation.reweight(w, groups.group_mask), count_downweighted(groups, w)
-
-    @override
-    def residual_weight(self, squared: Tensor, size: Tensor) -> Tensor:
+    def weight_of(self, size: Tensor) -> Callable[[Tensor], Tensor]:
         if math.isinf(self.dof):
-            return torch.ones_like(squared)
-        return (self.dof + size) / (self.dof + squared)
+            return torch.ones_like
+        return lambda squared: (self.dof + size) / (self.dof + squared)
 
     @override
     def log_density(self, squared: Tensor, size: Tensor) -> Tensor:
@@ -251,10 +213,11 @@ class WeightedLikelihoodUpdate(InnovationWeight):
     grouping: str = "all"
     groups: Sequence[int] | None = None
 
+    rules = THRESHOLD_RULES
+
     def __post_init__(self) -> None:
-        name = "WeightedLikelihoodUpdate"
-        ComponentGrouping(self.grouping, self.groups)
-        require_ranges(name, self, **THRESHOLD_RULES)
+        super().__post_init__()
+        name = type(self).__name__
         is_known = self.distance in ("mahalanobis", "plain")
         require(is_known, f"{name}.distance", "be mahalanobis or plain", self.distance)
         if self.distance == "plain" and self.threshold is None:
@@ -320,14 +283,10 @@ class InnovationGate(InnovationWeight):
     grouping: str = "sensor"
     groups: Sequence[int] | None = None
 
-    def __post_init__(self) -> None:
-        ComponentGrouping(self.grouping, self.groups)
-        require_ranges(
-            "InnovationGate",
-            self,
-            probability="(0, 1] Use 0.999, or 1 for no gate.",
-            patience="whole [0, inf) Use 0 for no limit.",
-        )
+    rules: ClassVar = {
+        "probability": "(0, 1] Use 0.999, or 1 for no gate.",
+        "patience": "whole [0, inf) Use 0 for no limit.",
+    }
 
     @override
     def noise_adapt(

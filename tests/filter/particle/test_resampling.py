@@ -22,6 +22,7 @@ from pfbench.filter.belief import (
     exponentiate,
     weighted_mean_cov,
 )
+from pfbench.filter.particle import resampling
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
 from pfbench.filter.particle.resampling import Killing, Multinomial, Residual, Ssp, Stratified
 from pfbench.filter.particle.stages import EssResampler, ResamplingScheme, Systematic
@@ -30,14 +31,16 @@ from pfbench.testing import check_resampling
 
 SCHEMES: list[ResamplingScheme] = [
     Systematic(),
-    Stratified(),
-    Multinomial(),
-    Residual(),
-    Ssp(),
-    Killing(),
+    *(
+        scheme()
+        for scheme in vars(resampling).values()
+        if isinstance(scheme, type) and scheme.__module__ == resampling.__name__
+    ),
 ]
 every_scheme = pytest.mark.parametrize("scheme", SCHEMES, ids=lambda s: type(s).__name__)
-resizing = pytest.mark.parametrize("scheme", SCHEMES[:5], ids=lambda s: type(s).__name__)
+resizing = pytest.mark.parametrize(
+    "scheme", [s for s in SCHEMES if not isinstance(s, Killing)], ids=lambda s: type(s).__name__
+)
 MODEL = linear_walk(1.0, 0.3, 1.0)
 
 
