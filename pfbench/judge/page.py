@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.judge.judge_options import JudgeOptions
 from pfbench.judge.judgement import Judgement
-from pfbench.judge.pair_sentences import describe_judgement, describe_limits, format_ratio
+from pfbench.judge.pair_sentences import describe_judgement, describe_limits, format_size
 from pfbench.judge.pair_verdicts import PairVerdict, cap_of
 from pfbench.judge.reference_track import LEAST_SHARE
 from pfbench.judge.sequence_results import SequenceResults
@@ -317,7 +317,7 @@ def tabulate_verdicts(pairs: Sequence[PairVerdict]) -> pd.DataFrame:
                 "first": v.a,
                 "second": v.b,
                 "verdict on first": v.word,
-                "position error of first": format_ratio(v.ratio, v.low, v.high) if v.n else "-",
+                "position error of first": format_size(v.ratio, v.low, v.high) if v.n else "-",
                 "adjusted p": v.p,
                 "sample": "sequence" if pair.unit == "world" else pair.unit,
                 "number": v.n,

@@ -61,7 +61,7 @@ def describe_limits(judgement: Judgement) -> Iterator[str]:
     )
 
 
-def format_ratio(ratio: float, low: float, high: float) -> str:
+def format_size(ratio: float, low: float, high: float) -> str:
     """Format a ratio of errors and its interval as "26 % smaller (18 to 33 %)"."""
     if max(ratio, high) > _TENFOLD or ratio < 1 / _TENFOLD:
         return f"{format_digits(ratio)} times as large ({format_digits(low)} to {_format_end(high)} times)"
@@ -84,7 +84,7 @@ def _describe_pair(pair: PairVerdict) -> str:
     if v.n == 0:
         return f"{head}{v.a} and {v.b} are not compared: {v.reason}."
     effect = (
-        f"the position error of {v.a} is {_insert_name(format_ratio(v.ratio, v.low, v.high), v.b)}"
+        f"the position error of {v.a} is {_insert_name(format_size(v.ratio, v.low, v.high), v.b)}"
     )
     sample = f"{effect}; {_describe_sample(pair)}"
     if v.word == NO_DECISION:

@@ -94,7 +94,7 @@ def test_blocks_hold_the_epochs_of_a_sequence_in_order() -> None:
 
 @pytest.mark.parametrize(
     "row",
-    [Row("white plus 25 % slow, 20 %"), Row("correlation time 10 %", 1, 0.1), Row("outages at other times", 3), Row("heavy tails", 10, 0.4)],
+    [Row("white plus 25 % slow, 20 %"), Row("correlation time 10 %", 1, 0.1), Row("outages at other times", 3), Row("heavy tails", 10, 0.4), Row("correlation time 5 %", 10)],
 )  # fmt: skip
 def test_many_studies_at_once_have_the_words_of_the_product(row: Row) -> None:
     signs = {"better": -1, "worse": 1}
