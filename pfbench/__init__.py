@@ -6,8 +6,7 @@ import os
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,6 +28,7 @@ if TYPE_CHECKING:
         scenario as scenario,
         testing as testing,
     )
+    from pfbench.scenario import inspect_log as inspect_log
 
 # torch reads this before its first tensor: blocks above 2 MB then lie at the start of a page and in large pages. Else glibc
 # before 2.38 cannot use a freed block for another of the same size: memory grew to 1.7 GB, and a step took 1.3 times as long.
@@ -45,6 +45,7 @@ __all__ = [
     "core",
     "files",
     "filter",
+    "inspect_log",
     "job",
     "judge",
     "learn",
@@ -60,10 +61,12 @@ __all__ = [
 ]
 
 
-def __getattr__(name: str) -> ModuleType:
+def __getattr__(name: str) -> Any:
     """Import a folder on first use, so that `import pfbench` stays fast."""
     if name not in __all__:
         raise AttributeError(f"pfbench does not define {name!r}. Choose a name of pfbench.__all__.")
+    if name == "inspect_log":
+        return import_module("pfbench.scenario").inspect_log
     return import_module(f"pfbench.{name}")
 
 
