@@ -39,6 +39,7 @@ if TYPE_CHECKING:
         open_study as study,
         run_filters as run,
     )
+    from pfbench.scenario import inspect_log as inspect_log
 
 # torch reads this before its first tensor: blocks above 2 MB then lie at the start of a page and in large pages. Else glibc
 # before 2.38 cannot use a freed block for another of the same size: memory grew to 1.7 GB, and a step took 1.3 times as long.
@@ -59,6 +60,7 @@ __all__ = [
     "files",
     "filter",
     "get",
+    "inspect_log",
     "job",
     "judge",
     "learn",
@@ -98,6 +100,8 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"pfbench does not define {name!r}. Choose a name of pfbench.__all__.")
     if name in _DOOR:
         return getattr(import_module("pfbench.door"), _DOOR[name])
+    if name == "inspect_log":
+        return import_module("pfbench.scenario").inspect_log
     return import_module(f"pfbench.{name}")
 
 

@@ -17,7 +17,9 @@ from checkout import ROOT
 import pfbench
 
 SHORT = ["Part", "Study", "check", "get", "log", "names", "own", "run", "study"]  # of pfbench.door
-FOLDERS = [name for name in pfbench.__all__ if name not in ("__version__", "load", *SHORT)]
+FOLDERS = [
+    name for name in pfbench.__all__ if name not in ("__version__", "inspect_log", "load", *SHORT)
+]
 DOTTED = re.compile(r"(?<![\w/.])pfbench(?:\.[A-Za-z_]\w*)+")
 COMMAND = re.compile(r"-m pfbench[\w.]*")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
@@ -121,7 +123,7 @@ def test_type_checkers_know_every_public_name(file: str) -> None:
     exported = sorted(alias.name for alias in names if alias.asname == alias.name)
     assert len(set(exported)) == len(exported)
     if file == "__init__.py":
-        assert exported == sorted([*FOLDERS, "Part", "Study"])
+        assert exported == sorted([*FOLDERS, "Part", "Study", "inspect_log"])
         aliases = {alias.asname: alias.name for alias in names if alias.asname != alias.name}
         assert {k: v for k, v in aliases.items() if k} == {
             name: getattr(pfbench, name).__name__ for name in SHORT if name[0].islower()

@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from typing import Any
 
 import pfbench
 from pfbench.cli.current_folder import add_search_path
@@ -31,6 +32,8 @@ COMMANDS = {
     "claims": ("report_claims", "write the page of the papers' claims and verdicts"),
     "datasheet": ("report_scenario", "write the datasheet of a scenario"),
     "replay": ("replay_run", "compute one stored run again, with all its traces"),
+    "import": ("import_log", "write the tables of an own log from files of other programs"),
+    "inspect": ("inspect_folder", "name the faults of an own log, and the settings that mend them"),
     "judge": ("judge_trajectories", "compare trajectories of other programs with a reference"),
     "tune": ("tune_filters", "tune the baselines of a study of robustness alike"),
     "train": ("train_network", "train the network of a neural_* filter or of kalman_net"),
@@ -54,7 +57,7 @@ pfbench {version}: benchmarks of particle filters in integrated navigation
   pfbench --version          version
   --traceback                print the traceback of an error (or set PFBENCH_TRACEBACK=1)
 
-Exit codes: 0 done, 1 failed after work had started, 2 refused before it, 128 + number of a signal that ended it (130 interrupted)
+Exit codes: 0 done, 1 failed after work had started, 2 refused before it, 3 warnings of inspect, 128 + number of a signal that ended it (130 interrupted)
 
 First study: pfbench run -m +experiment=quickstart, then pfbench report study=quickstart
 Python: import pfbench, then pfbench.run("growth", ["sir", "ekf"]); your own filter: pfbench new filter NAME
@@ -107,9 +110,14 @@ def _dispatch(words: Sequence[str]) -> None:
         print(f"error: command '{command}' does not exist.{similar}\n\n{_usage()}", file=sys.stderr)
         raise SystemExit(2)
     if {"-h", "--help"} & set(options):
-        print(import_module(f"pfbench.cli.{command}").HELP)
+        print(_open_module(command).HELP)
         return
     _run_command(command, options)
+
+
+def _open_module(command: str) -> Any:
+    """Import the module of a command; `import` is a word of Python and no name of a module."""
+    return import_module(f"pfbench.cli.{'own_files' if command == 'import' else command}")
 
 
 def _run_command(command: str, options: Sequence[str]) -> None:
@@ -127,7 +135,7 @@ def _run_command(command: str, options: Sequence[str]) -> None:
         os.environ[ENVIRONMENT] = ",".join(
             packages
         )  # for all parts, and the processes of a launcher
-        getattr(import_module(f"pfbench.cli.{command}"), COMMANDS[command][0])(words)
+        getattr(_open_module(command), COMMANDS[command][0])(words)
     except Exception as error:
         if shows_traceback:
             raise

@@ -1,6 +1,8 @@
 """Public names of `pfbench.scenario` and the modules that define them."""
 
 from pfbench.scenario.base import RecordingRegime as RecordingRegime, Scenario as Scenario
+from pfbench.scenario.diagnosis.finding import Finding as Finding, LogDiagnosis as LogDiagnosis
+from pfbench.scenario.diagnosis.inspection import inspect_log as inspect_log
 from pfbench.scenario.flights import (
     SimulatedFlight as SimulatedFlight,
     TerrainFlight as TerrainFlight,
@@ -10,6 +12,7 @@ from pfbench.scenario.passive_location import (
     PassiveLocationScenario as PassiveLocationScenario,
     QuadratureEmitterPrior as QuadratureEmitterPrior,
 )
+from pfbench.scenario.recorded.corrections import LogCorrections as LogCorrections
 from pfbench.scenario.recorded.drive import (
     BaroMagSensors as BaroMagSensors,
     FixHoldout as FixHoldout,
@@ -36,4 +39,5 @@ from pfbench.scenario.recorded.urban_error_fit import (
     estimate_normal as estimate_normal,
     range_residuals as range_residuals,
 )
+from pfbench.scenario.recorded.user_log import UserLog as UserLog
 from pfbench.scenario.simulated import ModelSimulation as ModelSimulation

@@ -25,6 +25,7 @@ from pfbench.scenario.recorded.log_reader import read_log
 from pfbench.scenario.recorded.log_tables import (
     Array,
     LogFiles,
+    NavigationLog,
     check_changes,
     find_dataset,
     list_tables,
@@ -107,15 +108,8 @@ class RecordedDrive(Scenario):
     def read(self) -> ResampledLog:
         """Read the log and resample it to filter steps."""
         folder = find_dataset(self.root, self.folder)
-        log = read_log(
-            folder,
-            self.files,
-            origin=self.origin,
-            limits=self.limits,
-            fix_codes=self.fix_codes,
-        )
         leg = resample_log(
-            log,
+            self._read_log(folder),
             self.receiver.fix_interval_s,
             self.filter_step_s,
             self.receiver.velocity_sd is not None,
@@ -124,6 +118,16 @@ class RecordedDrive(Scenario):
         )
         announce_notes(folder, leg.notes)
         return leg
+
+    def _read_log(self, folder: Path) -> NavigationLog:
+        """Read the log in a folder."""
+        return read_log(
+            folder,
+            self.files,
+            origin=self.origin,
+            limits=self.limits,
+            fix_codes=self.fix_codes,
+        )
 
     def over(self, leg: ResampledLog, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
         """Draw the errors of some runs over a resampled log.

@@ -50,6 +50,7 @@ def select_usable(table: LogTable, codes: FixCodes) -> tuple[NDArray[np.bool_], 
 
     Returns mask of used fixes, [n], and a note with the number of fixes of each code.
     """
+    check_fix_codes(codes)
     if "fix" not in table.rows:
         return np.ones(len(table.rows), bool), ()
     values = parse_numbers(table, ("fix",))[:, 0]

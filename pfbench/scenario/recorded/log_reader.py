@@ -17,19 +17,21 @@ A table can contain several flights and sensors. The columns `path` and `imu` id
 from __future__ import annotations
 
 import contextlib
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pfbench.files.reader_notes import announce_notes
-from pfbench.nav import attitude, earth
 from pfbench.nav.plausible_limits import PlausibleLimits
+from pfbench.scenario.diagnosis.checks import run_checks
+from pfbench.scenario.diagnosis.finding import REFUSE
+from pfbench.scenario.diagnosis.raw_log import RawLog, take_log
 from pfbench.scenario.recorded.clock_offsets import find_fix_offset, find_imu_offset
-from pfbench.scenario.recorded.fix_codes import FixCodes, check_fix_codes, select_usable
+from pfbench.scenario.recorded.corrections import LogCorrections
+from pfbench.scenario.recorded.fix_codes import FixCodes, select_usable
+from pfbench.scenario.recorded.imu_gaps import GAP_SAMPLES, LONGEST_BRIDGE, bridge_gaps
 from pfbench.scenario.recorded.log_agreement import (
     compare_fixes,
     compare_inertial,
@@ -37,10 +39,16 @@ from pfbench.scenario.recorded.log_agreement import (
     compare_times,
 )
 from pfbench.scenario.recorded.log_checks import (
-    STANDARD_GRAVITY,
     check_force,
     check_overlap,
     check_rotation,
+)
+from pfbench.scenario.recorded.log_frames import (
+    DEGREE,
+    find_origin,
+    gravity_at,
+    quaternion_of_angles,
+    read_positions,
 )
 from pfbench.scenario.recorded.log_tables import (
     Array,
@@ -59,10 +67,9 @@ from pfbench.scenario.recorded.log_tables import (
     swap_frd_rfu,
 )
 
-_DEGREE = math.pi / 180.0
-_GEODETIC, _LOCAL = ("lat_deg", "lon_deg", "h_m"), ("pn", "pe", "pd")
+_CLOCKS = ("imu clock: ", "gnss clock: ")
+_OF_FIXES = ("lever arm", "fix shift")  # a reference that also gives the fixes has none
 _VELOCITY, _DERIVED = ("vn", "ve", "vd"), ("vn_d", "ve_d", "vd_d")
-_MAX_GAP = 0.1  # s; longest interval between samples
 
 
 def read_log(
@@ -73,6 +80,7 @@ def read_log(
     origin: Sequence[float] | None = None,
     limits: PlausibleLimits | None = None,
     fix_codes: FixCodes = None,
+    corrections: LogCorrections | None = None,
 ) -> NavigationLog:
     """Read and check the log in a folder.
 
@@ -86,12 +94,13 @@ def read_log(
         limits: Limits of the platform. None for the default limits.
         fix_codes: Meaning of the column `fix` of the fixes: the program that wrote it (nmea, rtklib,
             ublox), the codes of the fixes to use, or None for 1 (use) and 0.
+        corrections: Corrections that are applied before the checks. None for none.
 
     Returns:
         The log in right-forward-up and East-North-Up axes.
 
     Raises:
-        ValueError: If a check fails. The message names file, column, row, value and remedy.
+        ValueError: If a check or the diagnosis refuses the log. The message names file, column, row, value and remedy.
     """
     names, limits = files or LogFiles(), limits or PlausibleLimits()
     select = {"path": path, "imu": imu}
@@ -99,34 +108,68 @@ def read_log(
         read_table(Path(folder), name, select, limits)
         for name in (names.imu, names.gnss, names.reference)
     )
+    mending = corrections or LogCorrections()
+    (inertial, gnss, truth), mended = mending.correct_tables(inertial, gnss, truth)
     sensors, notes = _samples(inertial)
-    centre = _origin(origin, gnss, truth)
-    check_fix_codes(fix_codes)
+    centre = find_origin(origin, gnss, truth)
     usable, usable_notes = select_usable(gnss, fix_codes)
     fixes, reference = _fixes(gnss, centre, usable), _motion(truth, centre)
-    check_overlap(inertial.name, sensors.time, gnss.name, fixes.time)
-    check_overlap(inertial.name, sensors.time, truth.name, reference.time)
-    check_force(sensors, reference, inertial.name)
-    imu_offset = find_imu_offset(sensors, reference)
-    late = imu_offset.describe(inertial.name, truth.name) if imu_offset else ""
-    check_rotation(
-        sensors,
-        reference,
-        (inertial.name, truth.name),
-        lambda: _other_attitudes(truth, reference),
-        late,
-    )
-    gravity, gravity_notes = _gravity(centre)
+    fixes, mended_fixes = mending.correct_fixes(fixes, reference, gnss.name)
+    for name, time in ((gnss.name, fixes.time), (truth.name, reference.time)):
+        check_overlap(inertial.name, sensors.time, name, time)
+    late = _check_motion((inertial, sensors), (truth, reference))
+    gravity, gravity_notes = gravity_at(centre)
     notes += (*gravity_notes, *compare_reference(truth, reference))
     with _explain(late):
         notes += compare_inertial(truth, sensors, reference, gravity)
     fixes, fix_notes = _compare_fixes(gnss, fixes, (truth, reference), limits)
-    tables = ((inertial.name, sensors.time), (gnss.name, fixes.time), (truth.name, reference.time))
     dropped = dict.fromkeys(note for table in (inertial, gnss, truth) for note in table.notes)
-    offsets = (late,) if late else ()
-    notes = (*dropped, *offsets, *usable_notes, *notes, *fix_notes, *compare_times(tables))
+    diagnosed = _diagnose(
+        take_log((inertial, gnss, truth), sensors, fixes, reference, gravity),
+        gnss.name != truth.name,
+    )
+    notes = (*dropped, *mended, *mended_fixes, late, *usable_notes, *notes, *fix_notes)
+    spans = ((inertial.name, sensors.time), (gnss.name, fixes.time), (truth.name, reference.time))
+    notes = (*_leave_out_offsets(notes, diagnosed), *diagnosed, *compare_times(spans))
     announce_notes(folder, notes)
     return NavigationLog(sensors, fixes, reference, gravity, notes)
+
+
+def _diagnose(log: RawLog, has_own_fixes: bool) -> tuple[str, ...]:
+    """Return the findings of the quick checks as notes; raise those that refuse the log."""
+    findings, _, _ = run_checks(log)
+    refused = [finding for finding in findings if finding.level == REFUSE]
+    if refused:
+        raise ValueError(
+            f"the log must agree in itself, got: {refused[0].text} See all findings: pfbench inspect"
+        )
+    return tuple(
+        f"{finding.check}: {finding.text}"
+        for finding in findings
+        if has_own_fixes or finding.check not in _OF_FIXES
+    )
+
+
+def _leave_out_offsets(notes: Iterable[str], diagnosed: Iterable[str]) -> Iterator[str]:
+    """Yield the notes without empty ones and without offsets of clocks that the diagnosis names."""
+    clocks = [note.split(": ")[1] for note in diagnosed if note.startswith(_CLOCKS)]
+    yield from (n for n in notes if n and not any(n.startswith(f"{t}: t is") for t in clocks))
+
+
+def _check_motion(inertial: tuple[LogTable, ImuLog], truth: tuple[LogTable, ReferenceLog]) -> str:
+    """Check force and turns of the IMU against the reference; return a note on its clock, or ''."""
+    (table, sensors), (reference_table, reference) = inertial, truth
+    check_force(sensors, reference, table.name)
+    offset = find_imu_offset(sensors, reference)
+    late = offset.describe(table.name, reference_table.name) if offset else ""
+    check_rotation(
+        sensors,
+        reference,
+        (table.name, reference_table.name),
+        lambda: _other_attitudes(reference_table, reference),
+        late,
+    )
+    return late
 
 
 def _compare_fixes(
@@ -143,15 +186,6 @@ def _compare_fixes(
     with _explain(late):
         fixes, notes = compare_fixes(table, fixes, reference, limits)
     return fixes, ((late, *notes) if late else notes)
-
-
-def _gravity(centre: tuple[float, ...] | None) -> tuple[float, tuple[str, ...]]:
-    """Return the gravity at the origin, m/s^2, and a note if the origin is not known."""
-    if centre is None:
-        text = f"gravity {STANDARD_GRAVITY} m/s^2: the log does not contain its location"
-        return STANDARD_GRAVITY, (text,)
-    latitude, height = torch.tensor([centre[0] * _DEGREE, centre[2]], dtype=torch.float64)
-    return float(earth.gravity(latitude, height)), ()
 
 
 @contextlib.contextmanager
@@ -174,7 +208,15 @@ def _samples(table: LogTable) -> tuple[ImuLog, tuple[str, ...]]:
         parse_numbers(table, ("wx", "wy", "wz")),
     )
     check_changes(table, ("fx", "fy", "fz", "wx", "wy", "wz"), time, np.hstack([force, rate]))
-    return ImuLog(time, swap_frd_rfu(force), swap_frd_rfu(rate)), notes
+    imu, (start, longest, count) = bridge_gaps(
+        ImuLog(time, swap_frd_rfu(force), swap_frd_rfu(rate))
+    )
+    if count:
+        notes += (
+            f"{table.name}: {count} intervals are longer than {GAP_SAMPLES:g} samples, the longest with {longest:.3f} s "
+            f"after t = {start:.3f}. They were filled with a line and noise of the samples before",
+        )
+    return imu, notes
 
 
 def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
@@ -197,17 +239,11 @@ def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
     check_seconds(table, time, longest=0.5)
     step = np.diff(time)
     i = int(step.argmax())
-    if step[i] > max(_MAX_GAP, 3 * typical):
+    if step[i] > max(LONGEST_BRIDGE, GAP_SAMPLES * typical):
         raise ValueError(
             f"{table.name} must not have gaps, got a gap of {step[i]:.3f} s after {table.row(i)} "
             f"(t = {time[i]}), with samples every {typical:.4f} s. "
-            f"{_longest_part(table, time, step > max(_MAX_GAP, 3 * typical))}"
-        )
-    slow = np.flatnonzero(step > 3 * typical)
-    if slow.size:
-        notes += (
-            f"{table.name}: {slow.size} intervals are longer than 3 samples, the longest with "
-            f"{step[i]:.3f} s after {table.row(i)}. Samples were interpolated",
+            f"{_longest_part(table, time, step > max(LONGEST_BRIDGE, GAP_SAMPLES * typical))}"
         )
     return time, notes
 
@@ -223,52 +259,8 @@ def _longest_part(table: LogTable, time: Array, is_gap: NDArray[np.bool_]) -> st
     )
 
 
-def _origin(
-    origin: Sequence[float] | None, gnss: LogTable, truth: LogTable
-) -> tuple[float, ...] | None:
-    """Return lat_deg, lon_deg, h_m of the local frame, or None for local positions only."""
-    keys = [f"origin_{name}" for name in _GEODETIC]
-    stated = [
-        [float(table.stated[key]) for key in keys]
-        for table in (truth, gnss)
-        if all(key in table.stated for key in keys)
-    ]
-    if origin is not None or stated:
-        centre = stated[0] if origin is None else list(map(float, origin))
-        if len(centre) != 3 or not abs(centre[0]) <= 90.0:
-            raise ValueError(
-                f"scenario.origin must be lat_deg (-90 to 90), lon_deg, h_m, got {centre}. "
-                "Set the point pn = pe = pd = 0."
-            )
-        return tuple(centre)
-    for table in (gnss, truth):
-        if not table.has(_LOCAL) and not table.has(_GEODETIC):
-            parse_numbers(table, _LOCAL)  # raises with the names of the missing columns
-    local = [table.has(_LOCAL) for table in (gnss, truth)]
-    if all(local):
-        return None
-    if not any(local):
-        return tuple(parse_numbers(truth, _GEODETIC)[0].tolist())
-    raise ValueError(
-        f"{gnss.name} and {truth.name} must both have pn, pe, pd or both lat_deg, lon_deg, h_m, "
-        "got one with each and no file with the origin pn = pe = pd = 0. "
-        "Set scenario.origin=[lat_deg, lon_deg, h_m]."
-    )
-
-
-def _positions(table: LogTable, origin: tuple[float, ...] | None) -> Array:
-    """Read positions in East, North, Up from the origin, m, [n, 3]."""
-    if table.has(_LOCAL) or not table.has(_GEODETIC):
-        return swap_frd_rfu(parse_numbers(table, _LOCAL))
-    pos = parse_numbers(table, _GEODETIC)
-    scale = np.array([_DEGREE, _DEGREE, 1.0])
-    return earth.local_enu(
-        torch.from_numpy(pos * scale), torch.from_numpy(np.array(origin) * scale)
-    ).numpy()
-
-
 def _fixes(table: LogTable, origin: tuple[float, ...] | None, usable: NDArray[np.bool_]) -> GnssLog:
-    time, position = read_times(table, longest=100.0), _positions(table, origin)
+    time, position = read_times(table, longest=100.0), read_positions(table, origin)
     recorded = table.has(_VELOCITY)
     columns = _VELOCITY if recorded else _DERIVED
     velocity = np.full_like(position, np.nan)
@@ -281,7 +273,7 @@ def _fixes(table: LogTable, origin: tuple[float, ...] | None, usable: NDArray[np
 def _motion(table: LogTable, origin: tuple[float, ...] | None) -> ReferenceLog:
     time = read_times(table, longest=100.0)
     derived = "vn" not in table.rows and "vn_d" in table.rows
-    q = _quaternion(*parse_numbers(table, ("roll", "pitch", "yaw")).T)
+    q = quaternion_of_angles(*parse_numbers(table, ("roll", "pitch", "yaw")).T)
     columns = _DERIVED if derived else _VELOCITY
     velocity = swap_frd_rfu(parse_numbers(table, columns))
     check_changes(table, columns, time, swap_frd_rfu(velocity))
@@ -289,28 +281,23 @@ def _motion(table: LogTable, origin: tuple[float, ...] | None) -> ReferenceLog:
         time,
         q,
         velocity,
-        _positions(table, origin),
+        read_positions(table, origin),
     )
-
-
-def _quaternion(roll: Array, pitch: Array, yaw: Array) -> Array:
-    euler = torch.from_numpy(np.stack([pitch, roll, -yaw], axis=-1))
-    return attitude.quaternion_from_dcm(attitude.dcm_from_euler(euler)).numpy()
 
 
 def _other_attitudes(table: LogTable, reference: ReferenceLog) -> dict[str, ReferenceLog]:
     """Return the reference as other units and signs of its attitude would give it."""
     roll, pitch, yaw = parse_numbers(table, ("roll", "pitch", "yaw")).T
     angles = {
-        f"yaw is in degrees: multiply it by {_DEGREE:.10f}.": (roll, pitch, _DEGREE * yaw),
-        f"roll, pitch, yaw are in degrees: multiply them by {_DEGREE:.10f}.": (
-            _DEGREE * roll,
-            _DEGREE * pitch,
-            _DEGREE * yaw,
+        f"yaw is in degrees: multiply it by {DEGREE:.10f}.": (roll, pitch, DEGREE * yaw),
+        f"roll, pitch, yaw are in degrees: multiply them by {DEGREE:.10f}.": (
+            DEGREE * roll,
+            DEGREE * pitch,
+            DEGREE * yaw,
         ),
         "yaw is counted anticlockwise: negate it.": (roll, pitch, -yaw),
     }
     return {
-        f"{table.name}: {text}": reference._replace(attitude=_quaternion(*values))
+        f"{table.name}: {text}": reference._replace(attitude=quaternion_of_angles(*values))
         for text, values in angles.items()
     }

@@ -1,0 +1,68 @@
+"""Orders and signs of axes: 48 of a body, 16 of a level frame, and nine conventions of the attitude."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from pfbench.files.table_file import Array
+
+_BODY, _LEVEL = ("x", "y", "z"), ("n", "e", "d")
+
+
+def _list_orders() -> tuple[Array, ...]:
+    """List the signed permutations, those near the identity first."""
+    matrices = [
+        np.array([[sign[i] * (j == order[i]) for j in range(3)] for i in range(3)], float)
+        for order in itertools.permutations(range(3))
+        for sign in itertools.product((1, -1), repeat=3)
+    ]
+    return tuple(sorted(matrices, key=lambda m: (-np.trace(m), np.abs(m - np.eye(3)).sum())))
+
+
+BODY_ORDERS = _list_orders()
+LEVEL_ORDERS = tuple(m for m in BODY_ORDERS if abs(m[2, 2]) == 1.0)
+
+
+def name_axes(matrix: Array, is_level: bool = False) -> list[str]:
+    """Name the recorded axes that a signed permutation takes, such as [x, -y, -z]."""
+    letters = _LEVEL if is_level else _BODY
+    index = np.abs(matrix).argmax(1)
+    return [
+        f"{'-' if row[i] < 0.0 else ''}{letters[i]}" for row, i in zip(matrix, index, strict=True)
+    ]
+
+
+def parse_axes(names: Sequence[str], is_level: bool = False) -> Array | None:
+    """Return the signed permutation that takes the named axes; None if they are not three different axes."""
+    letters = _LEVEL if is_level else _BODY
+    matrix = np.zeros((3, 3))
+    if len(names) != 3:
+        return None
+    for i, name in enumerate(names):
+        letter = str(name).removeprefix("-")
+        if letter not in letters:
+            return None
+        matrix[i, letters.index(letter)] = -1.0 if str(name).startswith("-") else 1.0
+    return matrix if (np.abs(matrix).sum(0) == 1.0).all() else None
+
+
+# name of the setting: what is wrong, and the angles (roll, pitch, yaw) that are right
+CONVENTIONS: dict[str, tuple[str, Callable[[Array, Array, Array], tuple[Array, Array, Array]]]] = {
+    "yaw_from_east": ("yaw is counted from East, anticlockwise", lambda r, p, y: (r, p, np.pi / 2 - y)),
+    "yaw_anticlockwise": ("yaw is counted anticlockwise", lambda r, p, y: (r, p, -y)),
+    "yaw_plus_90": ("yaw is 90 deg too large", lambda r, p, y: (r, p, y - np.pi / 2)),
+    "yaw_minus_90": ("yaw is 90 deg too small", lambda r, p, y: (r, p, y + np.pi / 2)),
+    "yaw_plus_180": ("yaw is turned by 180 deg", lambda r, p, y: (r, p, y + np.pi)),
+    "roll_pitch_exchanged": ("roll and pitch are exchanged", lambda r, p, y: (p, r, y)),
+    "pitch_negated": ("pitch has the other sign", lambda r, p, y: (r, -p, y)),
+    "roll_negated": ("roll has the other sign", lambda r, p, y: (-r, p, y)),
+}  # fmt: skip
+
+
+def convert_angles(name: str, angles: Array) -> Array:
+    """Return angles, rad, [k, 3], that were recorded in another convention."""
+    roll, pitch, yaw = angles.T
+    return np.stack(CONVENTIONS[name][1](roll, pitch, yaw), -1)

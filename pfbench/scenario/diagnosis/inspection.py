@@ -1,0 +1,211 @@
+"""Inspection of a folder: all checks, the noise of the sensors, and settings that mend what was named."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from pfbench.nav import earth
+from pfbench.nav.plausible_limits import PlausibleLimits
+from pfbench.scenario.diagnosis.checks import run_checks
+from pfbench.scenario.diagnosis.finding import REFUSE, Finding, LogDiagnosis, merge_settings
+from pfbench.scenario.diagnosis.raw_log import RawImu, RawLog, take_log, take_rows
+from pfbench.scenario.diagnosis.sensor_grade import measure_noise
+from pfbench.scenario.recorded.corrections import LogCorrections
+from pfbench.scenario.recorded.fix_codes import FixCodes, select_usable
+from pfbench.scenario.recorded.log_frames import (
+    DEGREE,
+    GEODETIC_COLUMNS,
+    LOCAL_COLUMNS,
+    find_origin,
+    gravity_at,
+    quaternion_of_angles,
+)
+from pfbench.scenario.recorded.log_reader import read_log
+from pfbench.scenario.recorded.log_tables import (
+    Array,
+    GnssLog,
+    ImuLog,
+    LogFiles,
+    LogTable,
+    ReferenceLog,
+    convert_column,
+    read_table,
+    swap_frd_rfu,
+)
+
+_FORCE, _RATE, _ANGLES = ("fx", "fy", "fz"), ("wx", "wy", "wz"), ("roll", "pitch", "yaw")
+_ROUNDS = 3  # of checks with the settings found so far
+READING = "reading"  # check of what the reader refuses itself
+
+
+@dataclass(frozen=True)
+class LogSource:
+    """Place of a log, and how it is read.
+
+    Attributes:
+        folder: Folder of the three tables.
+        files: Names of the tables.
+        path: Number of the flight, for tables with a column `path`.
+        imu: Number of the sensor, for tables with a column `imu`.
+        origin: lat_deg, lon_deg, h_m of pn = pe = pd = 0.
+        limits: Limits of the platform.
+        fix_codes: Meaning of the column `fix`, see `read_log`.
+        corrections: Corrections before the checks.
+    """
+
+    folder: Path
+    files: LogFiles = field(default_factory=LogFiles)
+    path: int | None = None
+    imu: int | None = None
+    origin: Sequence[float] | None = None
+    limits: PlausibleLimits | None = None
+    fix_codes: FixCodes = None
+    corrections: LogCorrections = field(default_factory=LogCorrections)
+
+    def read(self) -> RawLog:
+        """Read the tables with the corrections, without a check of their contents."""
+        names, select = self.files, {"path": self.path, "imu": self.imu}
+        inertial, gnss, truth = (
+            read_table(self.folder, name, select, self.limits)
+            for name in (names.imu, names.gnss, names.reference)
+        )
+        tables, _ = self.corrections.correct_tables(inertial, gnss, truth)
+        return take_tables(tables, self)
+
+    def check_reading(self) -> str:
+        """Read the log as a run does; return the message if it is refused."""
+        try:
+            read_log(
+                self.folder, self.files, self.path, self.imu, self.origin, self.limits, self.fix_codes,
+                self.corrections,
+            )  # fmt: skip
+        except ValueError as error:
+            return str(error)
+        return ""
+
+    def with_settings(self, settings: Mapping[str, Any]) -> LogSource:
+        """Return the source with settings of a finding."""
+        return replace(
+            self,
+            fix_codes=settings.get("fix_codes", self.fix_codes),
+            corrections=replace(self.corrections, **settings.get("corrections", {})),
+        )
+
+
+def inspect_log(
+    folder: str | Path,
+    files: LogFiles | None = None,
+    limits: PlausibleLimits | None = None,
+    **options: Any,
+) -> LogDiagnosis:
+    """Inspect a log and name its faults.
+
+    Args:
+        folder: Folder of the three tables.
+        files: Names of the tables.
+        limits: Limits of the platform. None for the default limits.
+        **options: Other attributes of a source: path, imu, origin, fix_codes, corrections.
+
+    Returns:
+        Findings with evidence and remedy, facts, and the settings that mend the log.
+
+    Raises:
+        ValueError: If a table cannot be read at all.
+    """
+    source = LogSource(Path(folder), files or LogFiles(), limits=limits, **options)
+    findings, facts = _inspect(source)
+    settings = merge_settings(finding.settings for finding in findings)
+    checks = [finding.check for finding in findings if not finding.settings]
+    for _ in range(_ROUNDS if settings else 0):
+        remaining, _ = _inspect(source.with_settings(settings))
+        checks = [finding.check for finding in remaining]
+        more = merge_settings([settings, *(finding.settings for finding in remaining)])
+        if more == settings:
+            break
+        settings = more
+    return LogDiagnosis(tuple(findings), facts, settings, tuple(checks))
+
+
+def _inspect(source: LogSource) -> tuple[list[Finding], dict[str, Any]]:
+    """Run all checks, and read the log as a run does."""
+    log = source.read()
+    findings, facts, mended = run_checks(log)
+    measure_noise(mended, facts)
+    if not any(finding.level == REFUSE for finding in findings):
+        message = source.check_reading()
+        if message:
+            findings.append(Finding(READING, REFUSE, 1.0, 0.0, "refusals", message.rstrip(".")))
+    return findings, facts
+
+
+def take_tables(tables: tuple[LogTable, LogTable, LogTable], source: LogSource) -> RawLog:
+    """Convert corrected tables without checks of their contents.
+
+    Args:
+        tables: Tables of IMU, fixes and reference.
+        source: How the log is read.
+
+    Returns:
+        The log.
+    """
+    inertial, gnss, truth = tables
+    centre = find_origin(source.origin, gnss, truth)
+    gravity, _ = gravity_at(centre)
+    imu = ImuLog(_time(inertial), _vectors(inertial, _FORCE), _vectors(inertial, _RATE))
+    position = _positions(gnss, centre)
+    fixes = GnssLog(_time(gnss), position, np.full_like(position, np.nan))
+    angles = _columns(truth, _ANGLES)
+    velocity = _vectors(truth, ("vn", "ve", "vd") if "vn" in truth.rows else ("vn_d", "ve_d", "vd_d"))  # fmt: skip
+    track = _positions(truth, centre)
+    keep = np.isfinite(np.hstack([angles, velocity, track, _time(truth)[:, None]])).all(1)
+    reference = ReferenceLog(
+        _time(truth)[keep], quaternion_of_angles(*angles[keep].T), velocity[keep], track[keep]
+    )
+    codes = None
+    if "fix" in gnss.rows and source.fix_codes is None:
+        codes = convert_column(gnss, "fix")
+    elif "fix" in gnss.rows:
+        usable, _ = select_usable(gnss, source.fix_codes)
+        position[~usable] = np.nan
+    if len(reference.time) > 1:
+        fixes, _ = source.corrections.correct_fixes(fixes, reference, gnss.name)
+    log = take_log(tables, imu, fixes, reference, gravity)
+    return log._replace(
+        reference=log.reference._replace(angles=angles[keep], rows=np.flatnonzero(keep)),
+        codes=codes,
+        imu=RawImu(*take_rows(log.imu, np.isfinite(imu.time))),
+    )
+
+
+def _time(table: LogTable) -> Array:
+    return _columns(table, ("t",))[:, 0]
+
+
+def _columns(table: LogTable, columns: Sequence[str]) -> Array:
+    """Convert columns to numbers, [n, k], NaN where there is none."""
+    missing = [column for column in columns if column not in table.rows]
+    if missing:
+        raise ValueError(
+            f"{table.name} must have a column {', '.join(missing)}, got "
+            f"{', '.join(map(str, table.rows.columns))}. Rename the columns, or map them with pfbench import."
+        )
+    return np.stack([convert_column(table, column) for column in columns], -1)
+
+
+def _vectors(table: LogTable, columns: Sequence[str]) -> Array:
+    return swap_frd_rfu(_columns(table, columns))
+
+
+def _positions(table: LogTable, centre: tuple[float, ...] | None) -> Array:
+    """Convert positions to East, North, Up, m, [n, 3]."""
+    if table.has(LOCAL_COLUMNS) or not table.has(GEODETIC_COLUMNS):
+        return _vectors(table, LOCAL_COLUMNS)
+    scale = np.array([DEGREE, DEGREE, 1.0])
+    at = torch.from_numpy(_columns(table, GEODETIC_COLUMNS) * scale)
+    return earth.local_enu(at, torch.from_numpy(np.array(centre) * scale)).numpy()
