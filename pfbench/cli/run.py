@@ -87,19 +87,23 @@ def run_jobs(words: Sequence[str]) -> None:
     if plan and not is_printed:
         print_surprise(plan, overrides, is_sweep=bool(flags))
     if plan and wants_until_decided(plan):
-        from pfbench.cli.until_decided import GrowingSweep, check_has_sweep
-
-        check_has_sweep(flags)
-        sweep = GrowingSweep.from_plan(plan)
-        others = [word for word in overrides if not re.match(r"(runs|first_run)=", word)]
-        application = make_application(run_task)
-        sweep.run(lambda more: run_sweep(application, [*flags, *others, *more], plan, is_part=True))
-        return
-    if flags:
+        _run_until_decided(flags, overrides, plan)
+    elif flags:
         print_study_size(plan)
         run_sweep(make_application(run_task), [*flags, *overrides], plan)
-        return
-    _run_alone(overrides, plan)
+    else:
+        _run_alone(overrides, plan)
+
+
+def _run_until_decided(flags: Sequence[str], overrides: Sequence[str], plan: StudyPlan) -> None:
+    """Run a sweep that adds runs until its pairs are decided."""
+    from pfbench.cli.until_decided import GrowingSweep, check_has_sweep
+
+    check_has_sweep(flags)
+    sweep = GrowingSweep.from_plan(plan)
+    others = [word for word in overrides if not re.match(r"(runs|first_run)=", word)]
+    application = make_application(run_task)
+    sweep.run(lambda more: run_sweep(application, [*flags, *others, *more], plan, is_part=True))
 
 
 def _run_alone(overrides: Sequence[str], plan: StudyPlan | None) -> None:

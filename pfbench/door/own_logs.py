@@ -142,7 +142,7 @@ def _convert(
 
 
 def _find_name(column: str, columns: Mapping[str, str]) -> str:
-    """Return the column of the format that a column stands for; empty for none."""
+    """Return the name in the format of a column; empty for none."""
     if column in columns:
         return columns[column]
     if column in columns.values():  # another column takes its place
@@ -174,7 +174,7 @@ def _write_text(text: str, file: IO[bytes]) -> None:
 
 
 def _check(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Read the log as a job would, so that its errors are told at once."""
+    """Read the log as a job would, so that its errors appear at once."""
     from pfbench.scenario import read_log
 
     options = {key: settings[key] for key in ("origin", "fix_codes") if key in settings}

@@ -56,7 +56,7 @@ def make_own(
     with plain_errors():
         if isinstance(thing, Part):
             raise TypeError(
-                f"own must receive a class or an object, got the part {thing}. Pass it to run as it is."
+                f"own must receive a class or an object, got the part {thing}. Pass it to run unchanged."
             )
         group, stage = find_group(thing)
         title = name or (thing if isinstance(thing, type) else type(thing)).__name__

@@ -1,7 +1,7 @@
 """Source of a class of a script or a notebook as a module of its own, named by a digest of it.
 
 Another process can import the module, so that workers run the class and a result can be computed again. The module has the class,
-the functions, classes and constants of the script that it uses, and their imports, each as it is when the class is passed.
+the functions, classes and constants of the script that it uses, and their imports, with the values at that time.
 """
 
 from __future__ import annotations

@@ -130,7 +130,8 @@ def get_part(group: str, name: str, /, **changes: Any) -> Part:
         )
     names = [path.stem for path in list_files(group)]
     if name not in names:
-        raise ValueError(f"{format_unknown_choice(group, name, names)}")
+        message = format_unknown_choice(group, name, names)
+        raise ValueError(message)
     return Part(group, name, tuple(f"{group}.{word}" for word in format_words(changes)))
 
 

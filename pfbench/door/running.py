@@ -86,7 +86,7 @@ def run_filters(
 
 
 def _list_parts(group: str, value: Any) -> list[Part]:
-    """Return the parts of a group that a name, a part, an object or a list of them stands for."""
+    """Return the parts of a group that a name, a part, an object or a list of them means."""
     items = list(value) if isinstance(value, list | tuple | set) else [value]
     if not items:
         raise ValueError(
