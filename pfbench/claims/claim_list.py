@@ -63,7 +63,17 @@ class PrintedClaim:
 
 
 def read_printed_claims(path: Path = FILE) -> list[PrintedClaim]:
-    """Read the claims, in the order of the file."""
+    """Read and check the 88 claims.
+
+    Args:
+        path: Data file.
+
+    Returns:
+        The claims, in the order of the file.
+
+    Raises:
+        ValueError: If a claim is wrong. The message names it, the fault and the options.
+    """
     claims = [_parse(path, row) for row in yaml.safe_load(path.read_text(encoding="utf-8"))]
     ids = [claim.id for claim in claims]
     if twice := sorted({name for name in ids if ids.count(name) > 1}):

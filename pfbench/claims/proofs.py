@@ -33,7 +33,17 @@ class Proof:
 
 
 def read_proofs(path: Path = FILE) -> list[Proof]:
-    """Read the proofs, in the order of the file."""
+    """Read the proofs.
+
+    Args:
+        path: Data file.
+
+    Returns:
+        The proofs, in the order of the file.
+
+    Raises:
+        ValueError: If an entry has other keys.
+    """
     names = {item.name for item in fields(Proof)}
     rows = yaml.safe_load(path.read_text(encoding="utf-8"))
     for row in rows:
