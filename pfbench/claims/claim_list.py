@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-FILE = Path(__file__).with_name("claims_2.yaml")
+_DATA = Path(__file__).with_name("claims_2.yaml")
 
 # ratio of a to b below which a claim of a kind is true, and above which it is false. "same" is symmetric in logs. The
 # direction of a number is "better", its size is within a factor of two of the printed one in logs
@@ -20,7 +20,7 @@ KINDS = {
     "same": (1.1, 1.1),
     "number": (1.0, 0.99),
 }
-MARKS = ("circular", "vacuous", "lost")
+_MARKS = ("circular", "vacuous", "lost")
 _REQUIRED = {"id", "words", "place", "kind", "figure", "a", "factors"}
 
 
@@ -62,7 +62,7 @@ class PrintedClaim:
         return self.id.removeprefix("C")[:3]
 
 
-def read_printed_claims(path: Path = FILE) -> list[PrintedClaim]:
+def read_printed_claims(path: Path = _DATA) -> list[PrintedClaim]:
     """Read and check the 88 claims.
 
     Args:
@@ -93,9 +93,9 @@ def _parse(path: Path, row: Mapping[str, Any]) -> PrintedClaim:
         raise ValueError(
             f"{path.name}: {name}.kind must be one of {', '.join(KINDS)}, got {row['kind']!r}. Choose one."
         )
-    if row.get("mark", MARKS[0]).split(":")[0] not in MARKS:
+    if row.get("mark", _MARKS[0]).split(":")[0] not in _MARKS:
         raise ValueError(
-            f"{path.name}: {name}.mark must begin with {', '.join(MARKS)}, got {row['mark']!r}. Choose one."
+            f"{path.name}: {name}.mark must begin with {', '.join(_MARKS)}, got {row['mark']!r}. Choose one."
         )
     return PrintedClaim(**row)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import yaml
 
-FILE = Path(__file__).with_name("proofs.yaml")
+_DATA = Path(__file__).with_name("proofs.yaml")
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Proof:
     test: str
 
 
-def read_proofs(path: Path = FILE) -> list[Proof]:
+def read_proofs(path: Path = _DATA) -> list[Proof]:
     """Read the proofs.
 
     Args:
