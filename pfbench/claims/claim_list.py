@@ -21,7 +21,7 @@ KINDS = {
     "number": (1.0, 0.99),
 }
 _MARKS = ("circular", "vacuous", "lost")
-_REQUIRED = {"id", "words", "place", "kind", "figure", "a", "factors"}
+_REQUIRED = {"id", "words", "section", "kind", "figure", "a", "factors"}
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class PrintedClaim:
     Attributes:
         id: Identifier, as "C000-1".
         words: Sentence of the paper, word for word.
-        place: Section, table or figure.
+        section: Section, table or figure.
         kind: One of `KINDS`.
         figure: What is measured.
         a: Method or filter of which it speaks.
@@ -45,7 +45,7 @@ class PrintedClaim:
 
     id: str
     words: str
-    place: str
+    section: str
     kind: str
     figure: str
     a: str
