@@ -34,9 +34,9 @@ class PrintedClaim:
         section: Section, table or figure.
         kind: One of `KINDS`.
         figure: What is measured.
-        a: Method or filter of which it speaks.
+        a: Method or filter that the claim describes.
         factors: Factors of the readings that can touch it.
-        b: What it is compared with: filters, or words for another setting of a.
+        b: Filters that a is compared with, or words for another setting of a.
         window: Part of the record, empty for all of it.
         printed: Printed numbers, empty without any.
         proof: Proof that decides it, alone or in one scope, empty for none.
