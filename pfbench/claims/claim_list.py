@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-FILE = Path(__file__).with_name("claims_2.yaml")
+_DATA = Path(__file__).with_name("claims_2.yaml")
 
 # ratio of a to b below which a claim of a kind is true, and above which it is false. "same" is symmetric in logs. The
 # direction of a number is "better", its size is within a factor of two of the printed one in logs
@@ -20,8 +20,8 @@ KINDS = {
     "same": (1.1, 1.1),
     "number": (1.0, 0.99),
 }
-MARKS = ("circular", "vacuous", "lost")
-_REQUIRED = {"id", "words", "place", "kind", "figure", "a", "factors"}
+_MARKS = ("circular", "vacuous", "lost")
+_REQUIRED = {"id", "words", "section", "kind", "figure", "a", "factors"}
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,12 @@ class PrintedClaim:
     Attributes:
         id: Identifier, as "C000-1".
         words: Sentence of the paper, word for word.
-        place: Section, table or figure.
+        section: Section, table or figure.
         kind: One of `KINDS`.
         figure: What is measured.
-        a: Method or filter of which it speaks.
+        a: Method or filter that the claim describes.
         factors: Factors of the readings that can touch it.
-        b: What it is compared with: filters, or words for another setting of a.
+        b: Filters that a is compared with, or words for another setting of a.
         window: Part of the record, empty for all of it.
         printed: Printed numbers, empty without any.
         proof: Proof that decides it, alone or in one scope, empty for none.
@@ -45,7 +45,7 @@ class PrintedClaim:
 
     id: str
     words: str
-    place: str
+    section: str
     kind: str
     figure: str
     a: str
@@ -62,8 +62,18 @@ class PrintedClaim:
         return self.id.removeprefix("C")[:3]
 
 
-def read_printed_claims(path: Path = FILE) -> list[PrintedClaim]:
-    """Read the claims, in the order of the file."""
+def read_printed_claims(path: Path = _DATA) -> list[PrintedClaim]:
+    """Read and check the 88 claims.
+
+    Args:
+        path: Data file.
+
+    Returns:
+        The claims, in the order of the file.
+
+    Raises:
+        ValueError: If a claim is wrong. The message names it, the fault and the options.
+    """
     claims = [_parse(path, row) for row in yaml.safe_load(path.read_text(encoding="utf-8"))]
     ids = [claim.id for claim in claims]
     if twice := sorted({name for name in ids if ids.count(name) > 1}):
@@ -83,9 +93,9 @@ def _parse(path: Path, row: Mapping[str, Any]) -> PrintedClaim:
         raise ValueError(
             f"{path.name}: {name}.kind must be one of {', '.join(KINDS)}, got {row['kind']!r}. Choose one."
         )
-    if row.get("mark", MARKS[0]).split(":")[0] not in MARKS:
+    if row.get("mark", _MARKS[0]).split(":")[0] not in _MARKS:
         raise ValueError(
-            f"{path.name}: {name}.mark must begin with {', '.join(MARKS)}, got {row['mark']!r}. Choose one."
+            f"{path.name}: {name}.mark must begin with {', '.join(_MARKS)}, got {row['mark']!r}. Choose one."
         )
     return PrintedClaim(**row)
 

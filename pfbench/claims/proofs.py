@@ -8,7 +8,7 @@ from pathlib import Path
 
 import yaml
 
-FILE = Path(__file__).with_name("proofs.yaml")
+_DATA = Path(__file__).with_name("proofs.yaml")
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,18 @@ class Proof:
     test: str
 
 
-def read_proofs(path: Path = FILE) -> list[Proof]:
-    """Read the proofs, in the order of the file."""
+def read_proofs(path: Path = _DATA) -> list[Proof]:
+    """Read the proofs.
+
+    Args:
+        path: Data file.
+
+    Returns:
+        The proofs, in the order of the file.
+
+    Raises:
+        ValueError: If an entry has other keys.
+    """
     names = {item.name for item in fields(Proof)}
     rows = yaml.safe_load(path.read_text(encoding="utf-8"))
     for row in rows:

@@ -29,7 +29,7 @@ PAPER = "paper"
 FAMILIES = ("kalman", "particle", "gaussian", "guided", "swarm", "learned")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">", "p", "h")  # of matplotlib
 # form of a method: to the letter of its paper, as printed with named completions, repaired, or another
-FORMS = ("literal", "printed", "repaired", "variant")
+METHOD_FORMS = ("literal", "printed", "repaired", "variant")
 _COLOUR = re.compile(r"#[0-9a-f]{6}")
 # entries of `cites`, keys that the paper states, and of `completions`, keys that it does not state or that are read
 # otherwise than `printed`: each with keys of the filter and a text
@@ -115,8 +115,8 @@ def _requirement(group: str, key: str, value: Any) -> str:
         return f"one of {' '.join(MARKERS)}"
     if key == "colour" and not _is_colour_pair(value):
         return "two colours such as '#0b4f8a', for white and for dark ground"
-    if key == "form" and value not in FORMS:
-        return f"one of {', '.join(FORMS)}"
+    if key == "form" and value not in METHOD_FORMS:
+        return f"one of {', '.join(METHOD_FORMS)}"
     if key in _ENTRIES and not _is_list_of_entries(value, *_ENTRIES[key]):
         required, optional = _ENTRIES[key]
         names = ", ".join(sorted(required)) + "".join(f", perhaps {name}" for name in optional)

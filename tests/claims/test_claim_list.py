@@ -45,7 +45,7 @@ def test_each_claim_names_what_exists() -> None:
     for claim in CLAIMS:
         assert claim.a in {*GROUPS["filter"], "each"}, claim.id
         assert len(claim.words) > 12, claim.id
-        assert claim.place, claim.id
+        assert claim.section, claim.id
         assert set(claim.factors) <= list_factors(claim.paper), claim.id
         assert not claim.proof or claim.id in proofs[claim.proof].claims, claim.id
         assert (claim.kind == "number") <= bool(claim.printed or claim.mark.startswith("lost")), (
@@ -75,7 +75,7 @@ def test_a_wrong_claim_is_told(change: str, message: str, tmp_path: Path) -> Non
     row = {
         "id": "C000-1",
         "words": "a",
-        "place": "b",
+        "section": "b",
         "kind": "better",
         "figure": "c",
         "a": "sir",

@@ -77,8 +77,8 @@ class GaussianSmoothing(SmoothingKernel):
         d = d if self.dimension is None else self.dimension
         if not d + self.offset > 0:
             raise ValueError(
-                f"kernel.offset must exceed -{d} with {d} dimensions, got {self.offset}: there is no "
-                "bandwidth. Use 2, as derived."
+                f"kernel.offset must exceed -{d} with {d} dimensions, got {self.offset}: the bandwidth "
+                "does not exist. Use 2, as derived."
             )
         return (4.0 / (d + self.offset)) ** (1.0 / (d + 4)) * n ** (-1.0 / (d + 4))
 

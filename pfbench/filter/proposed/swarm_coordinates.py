@@ -146,7 +146,7 @@ class PrintedFitness(LikelihoodFitness):
     """ln Y = -sum_i (y_i - y_hat_i) / (2 R_i), eq. 37 as printed, over the components of y.
 
     The paper writes one residual and one R. The sum over components is [ours]. It is linear in the
-    state where y_hat is, so it has no maximum, and only the limit of the velocity holds the swarm.
+    state where y_hat is, so it is unbounded. The limit of the velocity alone holds the swarm.
     """
 
     @override

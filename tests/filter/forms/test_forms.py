@@ -42,7 +42,7 @@ from pfbench.filter.proposed.swarm_motion import InertiaVelocity, IntervalStart,
 from pfbench.filter.proposed.swarm_weighting import PrintedWeighting
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.results.paper_block import (
-    FORMS,
+    METHOD_FORMS,
     check_paper_blocks,
     read_paper_block,
     remove_all_blocks,
@@ -110,7 +110,7 @@ def test_the_seven_methods_are_counted_once() -> None:
     proposed = [name for name, block in BLOCKS.items() if block["proposed"]]
     assert sorted(name for name in proposed if "form_of" not in BLOCKS[name]) == sorted(SEVEN)
     assert {method_of_form(name) for name in proposed} == set(SEVEN)
-    assert all(BLOCKS[name].get("form") in FORMS for name in proposed)
+    assert all(BLOCKS[name].get("form") in METHOD_FORMS for name in proposed)
     assert all(method_of_form(name) in BLOCKS for name in BLOCKS)
 
 
