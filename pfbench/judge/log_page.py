@@ -122,7 +122,7 @@ def _describe(number: int, finding: Any, folder: RecordedFolder, formats: Sequen
     if finding.picture is not None:
         caption = f"{finding.check}: {finding.evidence}."
         figure = FigureSpec(f"{number:02d}_{format_slug(finding.check)}", caption, partial(_draw, finding.picture))  # fmt: skip
-        drawing = writers.render_figure(figure, "finding", folder, formats)
+        (drawing,) = writers.write_figures([figure], "finding", folder, formats)
     return {
         "check": finding.check,
         "level": finding.level,
