@@ -86,13 +86,13 @@ def test_verdicts_that_differ_are_counted() -> None:
 def test_a_study_without_a_new_report_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(second_seed, "RUNS_FILE", tmp_path / "runs.parquet")
+    monkeypatch.setattr(second_seed, "RUNS", tmp_path / "runs.parquet")
     for study, values in (("a", [1.0]), ("b", [2.0]), ("b", [3.0])):
         folder = tmp_path / f"{study}{values[0]}" / study
         folder.mkdir(parents=True)
         pd.DataFrame({"rmse": values}).to_parquet(folder / "runs.parquet")
         second_seed.store_runs(folder.parent, ("a", "b"))
-    stored = pd.read_parquet(second_seed.RUNS_FILE)
+    stored = pd.read_parquet(second_seed.RUNS)
     assert dict(zip(stored["study"], stored["rmse"], strict=True)) == {"a": 1.0, "b": 3.0}
 
 
