@@ -73,7 +73,7 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("filter.particles=many",),
         (
             "filter.particles must be a whole number of at least 2, got 'many'",
-            "Write it without a point",
+            "Use 2 or more, without a point",
         ),
     ),
     "negative deviation": (
@@ -176,7 +176,7 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "study of claims": (("study=claims",), ("study must not be datasheets or claims, got claims",)),
     "regime": (
         ("noise=outliers", "noise.probability=2"),
-        ("noise.probability must be between 0 and 1, got 2",),
+        ("noise.probability must be in [0, 1], got 2",),
     ),
     "no such class": (
         ("noise._target_=pfbench.noise.base.Louder",),

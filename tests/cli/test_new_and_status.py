@@ -93,7 +93,7 @@ def test_a_dry_run_counts_jobs_and_stores_nothing(
         "run", "--dry-run", "-m", *WALK, "study=s", "filter=sir", "filter.particles=0,9", home=tmp_path
     )  # fmt: skip
     assert "1 refused" in refused.out
-    assert "filter.particles must be at least 2" in refused.out
+    assert "filter.particles must be a whole number of at least 2" in refused.out
 
 
 def test_the_estimate_grows_with_the_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,7 +120,10 @@ def test_the_state_of_a_study_lists_failed_jobs_with_the_words_that_repeat_them(
     for text in (sweep.out, said.out):
         (repeat,) = re.findall(r"repeat: pfbench (run .*)", text)
         assert {"filter.particles=0", "study=s", *WALK} <= set(repeat.split())
-    assert "filter.particles must be at least 2" in pfbench(*repeat.split(), home=tmp_path).err
+    assert (
+        "filter.particles must be a whole number of at least 2"
+        in pfbench(*repeat.split(), home=tmp_path).err
+    )
     assert pfbench("status", home=tmp_path).out == "s: 1 finished, 1 failed\n"
     empty = pfbench("status", f"results_dir={tmp_path / 'none'}", home=tmp_path)
     assert "No study has results" in empty.out

@@ -134,7 +134,10 @@ def test_several_processes_give_the_bits_of_one_and_a_bad_cell_fails_alone(tmp_p
     launcher = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
     said = process(*words, *launcher, home=several, cwd=several)
     assert said.code == 1
-    assert "failed    linear_walk / nominal / sir   filter.particles must be at least 2" in said.out
+    assert (
+        "failed    linear_walk / nominal / sir   filter.particles must be a whole number of at least 2"
+        in said.out
+    )
     assert len(list((several / "results" / "adhoc").glob("*.failed.json"))) == 1
     assert pfbench(*words, home=alone).code == 1
     ours, theirs = (

@@ -270,15 +270,15 @@ def test_a_failed_job_is_listed_with_the_words_that_repeat_it(
     bad = pfbench.get("filter", "sir", particles=0)
     study = pfbench.run(WALK, ["ekf", bad], study="f", **SMALL)
     (note,) = study.failed()
-    assert "must be at least 2, got 0" in note["message"]
+    assert "must be a whole number of at least 2, got 0" in note["message"]
     printed = capsys.readouterr().out
     assert note["repeat"] in printed
     assert "1 finished, 0 skipped, 1 failed" in printed
     words = note["repeat"].split()[2:]
     assert "filter.particles=0" in words
     said = command(*words[:0], "run", *words, home=home)
-    assert "must be at least 2, got 0" in said.err + said.out
-    with pytest.raises(RuntimeError, match="must be at least 2, got 0"):
+    assert "must be a whole number of at least 2, got 0" in said.err + said.out
+    with pytest.raises(RuntimeError, match="must be a whole number of at least 2, got 0"):
         pfbench.run(WALK, [bad], study="g", progress=False, **SMALL)
 
 

@@ -435,9 +435,9 @@ REFUSED = {
     "without a decimal point: runs=1000000000.",
     "seed=99999999999": "seed must be from 0 to 2**32 - 1, got 99999999999. Set seed=1.",
     "seed=-1": "seed must be a whole number of at least 0, got -1. Set seed=1.",
-    "filter.particles=0": "filter.particles must be a whole number of at least 2, got 0. Write it without",
-    "particles=0": "filter.particles must be a whole number of at least 2, got 0. Write it without",
-    "particles=many": "filter.particles must be a whole number of at least 2, got 'many'. Write it without",
+    "filter.particles=0": "filter.particles must be a whole number of at least 2, got 0. Use 2 or more, without a point or exponent.",
+    "particles=0": "filter.particles must be a whole number of at least 2, got 0. Use 2 or more, without a point or exponent.",
+    "particles=many": "filter.particles must be a whole number of at least 2, got 'many'. Use 2 or more",
     "scenario.steps=0": "scenario.steps must be a whole number of at least 1, got 0. Change",
 }
 
@@ -484,10 +484,10 @@ def test_a_sweep_goes_on_after_a_bad_cell_and_says_so(tmp_path: Path) -> None:
         "run", "-m", *WALK, "filter=sir", "runs=2", "filter.particles=0,50,1,60", home=tmp_path
     )
     assert said.code == 1
-    for number, particles in ((1, 0), (3, 1)):  # once each, on the line of the job
-        message = f"filter.particles must be a whole number of at least 2, got {particles}. Write it without a point or exponent."
+    for number, particles in ((1, 0), (3, 1)):  # on the line of the job, and at the end
+        message = f"filter.particles must be a whole number of at least 2, got {particles}. Use 2 or more, without a point or exponent."
         assert f"[{number}/4] failed    linear_walk / nominal / sir   {message}   trace" in said.out
-        assert (said.out + said.err).count(message) == 1
+        assert (said.out + said.err).count(message) == 2  # and with the words that repeat it
     assert "Error executing job" not in said.err
     assert "error run: all jobs of the sweep must finish, got failed jobs." in said.err
     assert "sweep: 2 finished, 0 skipped, 2 failed" in said.out

@@ -95,7 +95,7 @@ class ParticleFilter(Filter):
     initial_proposal: InitialProposal | None = None
 
     def __post_init__(self) -> None:
-        rule = "whole [2, inf) Write it without a point or exponent."
+        rule = "whole [2, inf) Use 2 or more, without a point or exponent."
         require_ranges("filter", self, particles=rule)
         _ = self.is_exact  # warns of each stage that does not state it
         if self.initial_proposal is not None:
