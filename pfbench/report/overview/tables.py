@@ -17,7 +17,7 @@ import yaml
 from pfbench.files import limits
 from pfbench.results.conditions import parse_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
-from pfbench.results.paper_block import conf_dir
+from pfbench.results.paper_block import conf_dir, read_paper_block
 from pfbench.stats.world_table import (
     MeanRanks,
     Winner,
@@ -137,8 +137,14 @@ def _read_tuning(path: Path, changed: int) -> Mapping[str, Any]:
 
 def has_overview(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> bool:
     """Return whether a study has several proposed methods in several worlds."""
-    methods = {parse_label(label)[0] for label in looks if looks[label].proposed}
+    methods = {parse_label(label)[0] for label in looks if is_method(looks[label])}
     return len(methods) >= FEWEST_METHODS and table["scenario"].nunique() >= FEWEST_WORLDS
+
+
+def is_method(look: MethodLook) -> bool:
+    """Return whether a filter is a proposed method, and not another form of one, such as that as printed."""
+    block = read_paper_block("filter", parse_label(look.key)[0])
+    return look.proposed and not block.get("form_of")
 
 
 def build_overview(
@@ -149,7 +155,7 @@ def build_overview(
     Returns tables of one study. A world without a stated reference, or without runs of it, is left out with the
     reason.
     """
-    methods = order_methods([label for label in looks if looks[label].proposed], looks)
+    methods = order_methods([label for label in looks if is_method(looks[label])], looks)
     by_name = {parse_label(label)[0]: label for label in looks}
     conventional = tuple(
         by_name[name] for name in CONVENTIONAL if name in by_name and name not in methods
@@ -165,7 +171,7 @@ def build_overview(
         rows.append(_describe_world(world, parts[str(key)], looks))
     order = sorted(range(len(worlds)), key=lambda k: worlds[k].kalman_fits is False)
     worlds, rows = [worlds[k] for k in order], [rows[k] for k in order]
-    baselines = [label for label in looks if label not in methods]
+    baselines = [label for label, look in looks.items() if not look.proposed]
     return Overview(
         tuple(rows), methods, conventional, {label: look.name for label, look in looks.items()},
         decide_cells(worlds, [*methods, *conventional]), compare_methods(worlds, methods),
@@ -204,7 +210,7 @@ def build_overviews(
 
 def list_levels(looks: Mapping[str, MethodLook]) -> list[int]:
     """List the numbers of particles of a study in which several proposed methods have several; else none."""
-    levels = Counter(_level(label) for label, look in looks.items() if look.proposed)
+    levels = Counter(_level(label) for label, look in looks.items() if is_method(look))
     several = sorted(n for n, count in levels.items() if n is not None and count >= FEWEST_METHODS)
     return several if len(several) > 1 else []
 
