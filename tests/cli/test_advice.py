@@ -184,7 +184,9 @@ def test_text_in_place_of_a_number_is_refused_by_its_setting() -> None:
     with pytest.raises(Exception, match="dof must be positive, got 'four'") as caught:
         job.build_plan(config)
     message = messages.format_error(caught.value, ["filter=student", word])
-    assert message.startswith("filter.noise_adaptations.0.dof must be positive, got 'four'. Use 4 to 8.")
+    assert message.startswith(
+        "filter.noise_adaptations.0.dof must be positive, got 'four'. Use 4 to 8."
+    )
 
 
 @pytest.mark.parametrize(

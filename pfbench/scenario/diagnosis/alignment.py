@@ -136,12 +136,16 @@ def _has_turns(search: TurnSearch, turns: Array) -> bool:
 def _find_unit(
     log: RawLog, search: TurnSearch, nodes: NDArray[np.intp]
 ) -> tuple[str, float, float]:
-    """Return the columns in degrees, '' for none, with the offset and the score of their turns."""
+    """Return the columns in degrees, '' for none, with the offset and the score of their turns.
+
+    A yaw within a turn is in radians: a short log without turns can agree with any unit.
+    """
     results = []
+    is_within_a_turn = float(np.abs(log.reference.angles[:, 2]).max()) <= 2.0 * np.pi
     for unit, factor in _UNITS.items():
         offset, score = search.find(turns_between(dcm_of(log.reference.angles * factor), nodes))
         results.append((unit, offset, score))
-        if not unit and score > _CERTAIN:
+        if not unit and (score > _CERTAIN or is_within_a_turn):
             break
     best = max(results, key=lambda result: result[2])
     return best if best[2] > results[0][2] + _GAIN else results[0]

@@ -141,7 +141,7 @@ def _diagnose(log: RawLog, has_own_fixes: bool) -> tuple[str, ...]:
     refused = [finding for finding in findings if finding.level == REFUSE]
     if refused:
         raise ValueError(
-            f"the log must agree in itself, got: {refused[0].text} See all findings: pfbench inspect"
+            f"the log must agree in itself, got: {refused[0].text} See all findings with pfbench inspect."
         )
     return tuple(
         f"{finding.check}: {finding.text}"
