@@ -6,14 +6,14 @@ import pytest
 from checkout import ROOT, list_published
 
 # use_your_data.md and write_a_scenario.md also run shell commands: their own tests run all blocks
-# glossary.md contains tables only; tests/door/test_python_page.py runs python.md as a script
+# glossary.md and results.md have tables only; tests/door/test_python_page.py runs README.md and python.md as scripts
 ALL_PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 METHODS = (
     page
     for page in sorted((ROOT / "docs" / "methods").glob("*.md"))
     if "```python" in page.read_text()
 )
-NOT_RUN = {"glossary.md", "use_your_data.md", "python.md"}
+NOT_RUN = {"README.md", "glossary.md", "results.md", "use_your_data.md", "python.md"}
 PAGES = [*(page for page in ALL_PAGES if page.name not in NOT_RUN), *METHODS]
 LINKING_PAGES = (
     ROOT / "README.md",

@@ -43,7 +43,7 @@ ONLY = {  # (importing folder, imported folder): the modules that it may name
 }
 NEVER = {("filter", "noise"), ("scenario", "results"), ("scenario", "filter"), ("nav", "kernels")}
 AT_THE_SAME_FLOOR = {("learn", "job")}
-FOREIGN = {"hydra": {"cli", "job"}, "omegaconf": {"cli", "job"}}
+FOREIGN = {"hydra": {"cli", "door", "job"}, "omegaconf": {"cli", "job"}}
 NO_ENGINE = ("torch", "pyro", "hydra")  # stored files are enough for these folders
 STORED = {"stats", "results", "report", "claims", "judge"}
 LONGEST_FUNCTION = 25

@@ -137,7 +137,7 @@ def _format(verdict: Verdict) -> str:
     )
 
 
-def compare_filters(conditions: Sequence[Condition], a: str, b: str) -> Comparison:
+def compare_in_conditions(conditions: Sequence[Condition], a: str, b: str) -> Comparison:
     """Compare two filters in all conditions that have both."""
     names = [condition.name for condition in conditions]
     labels = sorted({job.label for condition in conditions for job in condition.jobs})

@@ -102,10 +102,10 @@ class Study:
         Returns:
             A verdict for each condition, corrected for their number.
         """
-        from pfbench.door.comparisons import compare_filters
+        from pfbench.door.comparisons import compare_in_conditions
 
         with plain_errors():
-            return compare_filters(self.conditions(), a, b)
+            return compare_in_conditions(self.conditions(), a, b)
 
     def plot(self, kind: str = "cost", ax: Axes | None = None, **choice: Any) -> Axes:
         """Draw a figure in the looks of the report.

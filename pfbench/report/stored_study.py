@@ -1,4 +1,4 @@
-"""A study in one file: the values of all runs, and with them all that its page needs beside the decisions.
+"""A study in one file: the values of all runs, and all other data of its page but the decisions.
 
 Git stores this file of a published study, so that its page and every decision are made again in a fresh clone by the
 rules and words of the program.

@@ -72,7 +72,7 @@ def write_report(
 ) -> Path:
     """Write the report of a study to `<out>/<study>/`.
 
-    The folder contains the page (index.html, report.md) with its numbers (verdicts.csv, decisions.csv, metrics.csv,
+    The folder has the page (index.html, report.md), its numbers (verdicts.csv, decisions.csv, metrics.csv,
     consistency.csv), the runs with all that a page needs (runs.parquet), pfbench.bib, headline.svg, and the figures of
     the papers. Equal results give equal bytes. Files that an earlier report wrote are removed if this one does not
     write them and they are unchanged (manifest.json). Other files stay.
@@ -108,7 +108,7 @@ def write_report(
 
 
 def rebuild_page(folder: Path) -> Path:
-    """Write the page of a study again, from the file of its runs, which stays as it is.
+    """Write the page of a study again, from the file of its runs, which does not change.
 
     Args:
         folder: Folder of the report.

@@ -47,7 +47,7 @@ TRIM_SHARE = 0.2  # removed at each end; the middle 60 % of the units remain
 # the tolerance, EKF and UKF of a linear model would differ by how they round.
 LOG_TOLERANCE = 1e-6
 _ROUNDING = 1e-12  # relative spread of equal values
-_FEW_DIFFERENCES = 200  # of which all means of two are formed
+_FEW_DIFFERENCES = 200  # up to which the means of all pairs are formed
 _HALVINGS = 52  # of the range of the differences: the precision of a double
 
 

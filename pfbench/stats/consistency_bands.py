@@ -28,7 +28,7 @@ def assess_consistency(table: pd.DataFrame, alpha: float = ALPHA) -> pd.DataFram
     """Compare mean NEES and NIS of each filter and group with their expectation.
 
     Returns a row per filter, quantity and group: ratio with its simultaneous interval, corrected p-value, runs, lost
-    runs, word and reason. The size stands in the ratio, so that "overconfident" is never alone.
+    runs, word and reason. The ratio has the size, so that "overconfident" is never alone.
     """
     rows: list[dict[str, Any]] = []
     estimates: list[EffectEstimate] = []

@@ -1,4 +1,4 @@
-"""Estimate with a Student distribution, and log ratios of losses of which some are infinite."""
+"""Estimate with a Student distribution, and log ratios of losses that can be infinite."""
 
 from __future__ import annotations
 

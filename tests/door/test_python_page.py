@@ -1,4 +1,4 @@
-"""The page docs/python.md runs as one script in an empty folder: its classes are those of a script, as a reader's are."""
+"""README.md and docs/python.md run as scripts in empty folders: their classes are those of a script, as a reader's are."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from checkout import ROOT
 from command_line import environment
 
 
-@pytest.mark.slow
-def test_the_examples_of_the_page_run_as_a_script(tmp_path: Path) -> None:
-    page = (ROOT / "docs" / "python.md").read_text()
-    blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+def run_page(page: Path, tmp_path: Path) -> str:
+    """Run all Python of a page as one script; return what it prints."""
+    blocks = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
     script = tmp_path / "page.py"
     script.write_text("\n\n".join(blocks))
     env = os.environ | environment(tmp_path) | {"PYTHONPATH": str(ROOT)}
@@ -24,8 +23,24 @@ def test_the_examples_of_the_page_run_as_a_script(tmp_path: Path) -> None:
         [sys.executable, "page.py"], cwd=tmp_path, env=env, capture_output=True, text=True, check=False
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "FAILS" not in done.stdout
-    assert done.stdout.count(", 0 failed in") == 4  # studies of the page
+    return done.stdout
+
+
+def test_the_readme_runs_as_a_script_and_prints_its_leaderboard(tmp_path: Path) -> None:
+    printed = run_page(ROOT / "README.md", tmp_path)
+    assert printed.count(", 0 failed in") == 2
+    sentence = (
+        "Of 3 filters, 3 are better than EKF in Growth model with nominal noise (best: RPF, 0.35"
+    )
+    assert sentence in printed
+    assert sentence in (ROOT / "README.md").read_text()
+
+
+@pytest.mark.slow
+def test_the_examples_of_the_page_run_as_a_script(tmp_path: Path) -> None:
+    printed = run_page(ROOT / "docs" / "python.md", tmp_path)
+    assert "FAILS" not in printed
+    assert printed.count(", 0 failed in") == 4  # studies of the page
     assert {path.name for path in (tmp_path / "results").iterdir()} == {
         "first",
         "settings",

@@ -10,9 +10,9 @@ import pytest
 
 from pfbench.judge.judge_options import JudgeOptions
 from pfbench.judge.judgement import judge_programs
-from pfbench.results.frame import load_frame
+from pfbench.report.board import build_run_table
+from pfbench.results.conditions import load_conditions
 from pfbench.results.store import write_result
-from pfbench.stats.study_runs import tidy_runs
 from pfbench.stats.world_table import build_world, decide_cells
 
 RUNS = 30
@@ -47,9 +47,7 @@ def test_a_study_and_a_judgement_agree(tmp_path: Path, effect: float, word: str)
         "a": str(write_filter(tmp_path, "a", a, 1)),
         "b": str(write_filter(tmp_path, "b", shared, 2)),
     }
-    frame = load_frame("s", tmp_path)
-    table = tidy_runs(frame[frame.component == "norm"])
-    rows = table.rename(columns={"value": "rmse"}).assign(lost=False, seed=1)
+    rows = build_run_table(load_conditions("s", tmp_path))
     (cell,) = decide_cells([build_world(rows, "b", 1000.0)], ["a"])
     reference = cases.write(cases.drive(20.0), tmp_path / "truth.csv")
     (pair,) = judge_programs(str(reference), files, JudgeOptions(limit=1000.0)).pairs

@@ -21,7 +21,7 @@ from pfbench.report.board.study_views import (
     planned_entries,
     round_ratio,
 )
-from pfbench.report.board.view import Row, View, build_rows, describe_filters, describe_view
+from pfbench.report.board.view import BoardRow, View, build_rows, describe_filters, describe_view
 from pfbench.report.options import ReportOptions
 from pfbench.report.study_page.page_writer import describe_pairs
 from pfbench.results.looks import PartName, find_looks
@@ -63,7 +63,7 @@ def make_view(data: pd.DataFrame, cap: float = math.nan, alpha: float = 0.05) ->
     return View(runs, losses, "rmse", "m", described, times, cap > 0, alpha, MARGIN)
 
 
-def board(data: pd.DataFrame, baseline: str = "sir", cap: float = math.nan) -> dict[str, Row]:
+def board(data: pd.DataFrame, baseline: str = "sir", cap: float = math.nan) -> dict[str, BoardRow]:
     return {row["filter"]: row for row in build_rows(make_view(data, cap), baseline)}
 
 

@@ -130,7 +130,7 @@ def _make_view(
 
 
 def _hide_track(row: BoardRow, has_limit: bool) -> BoardRow:
-    """Return the values of a row for the page: no track where no divergence threshold says what it is."""
+    """Return the values of a row for the page: no track without a divergence threshold."""
     return row if has_limit else {**row, "track": math.nan}
 
 

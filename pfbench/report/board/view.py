@@ -118,7 +118,7 @@ def _interval_of_median(values: Array, alpha: float) -> tuple[float, float]:
 
 @cache
 def _count_below(n: int, alpha: float) -> int:
-    """Return the number of values below the interval of a median of n values; -1 if there is no interval."""
+    """Return the number of values below the interval of a median of n values; -1 without an interval."""
     below = scipy.stats.binom.cdf(np.arange(n), n, 0.5) if n else np.ones(1)
     return int((below <= alpha / 2).sum()) - 1
 

@@ -338,7 +338,7 @@ _SVG: Any = {"svg.hashsalt": "pfbench", "svg.fonttype": "none"}  # equal bytes, 
 def render_headline(pack: Pack, stored: bytes = b"") -> bytes:
     """Draw the error of each filter relative to the baseline as SVG; empty if no filter has a ratio.
 
-    A stored drawing that is equal but for the last digits stays. Equal data give equal bytes.
+    A stored drawing that differs in the last digits alone stays. Equal data give equal bytes.
 
     Args:
         pack: Data of the page.

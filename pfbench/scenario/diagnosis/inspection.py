@@ -41,7 +41,7 @@ from pfbench.scenario.recorded.log_tables import (
 
 _FORCE, _RATE, _ANGLES = ("fx", "fy", "fz"), ("wx", "wy", "wz"), ("roll", "pitch", "yaw")
 _ROUNDS = 3  # of checks with the settings found so far
-READING = "reading"  # check of what the reader refuses itself
+READER_CHECK = "reading"  # check of what the reader refuses itself
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,9 @@ def _inspect(source: LogSource) -> tuple[list[Finding], dict[str, Any]]:
     if not any(finding.level == REFUSE for finding in findings):
         message = source.check_reading()
         if message:
-            findings.append(Finding(READING, REFUSE, 1.0, 0.0, "refusals", message.rstrip(".")))
+            findings.append(
+                Finding(READER_CHECK, REFUSE, 1.0, 0.0, "refusals", message.rstrip("."))
+            )
     return findings, facts
 
 
