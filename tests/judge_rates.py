@@ -30,7 +30,7 @@ from pfbench.judge.time_blocks import (
 )
 from pfbench.results.store import JobResult
 from pfbench.stats.comparison import EQUALITY_MARGIN
-from pfbench.stats.effects import MIN_RUNS, trimmed_effects
+from pfbench.stats.comparison import MIN_RUNS
 from pfbench.stats.rank_tests import rank_sum_cdf, wilcoxon_signed_rank_rows
 
 STEPS = 600
@@ -243,12 +243,14 @@ def _words(d: np.ndarray, ratio: np.ndarray, margin: float = EQUALITY_MARGIN) ->
     means = np.sort((d[:, i] + d[:, j]) / 2, axis=1)
     low, high = means[:, k - 1], means[:, -k]
     p = wilcoxon_signed_rank_rows(d)[1]
-    trimmed = trimmed_effects(d)
-    h = trimmed.middle
-    t = trimmed.location / np.sqrt(h / (h - 1) * (trimmed.parts**2).sum(-1))
+    cut = int(0.2 * n + 1e-9)
+    h, ordered = n - 2 * cut, np.sort(d, axis=1)
+    trimmed = ordered[:, cut : n - cut].mean(axis=1)
+    winsorised = np.clip(d, ordered[:, [cut]], ordered[:, [n - cut - 1]])
+    t = trimmed / np.sqrt(n * winsorised.var(axis=1) / (h * (h - 1)))
     equal = (np.minimum(low, np.where(p < 0.05, low, 0)) > -margin) & (np.maximum(high, np.where(p < 0.05, high, 0)) < margin)  # fmt: skip
     agree = (p < 0.05) & (2 * stdtr(h - 1, -np.abs(t)) < 0.05)
-    sign = np.where(agree & ~equal & (trimmed.location * location[:, 0] > 0), np.sign(location[:, 0]), 0)  # fmt: skip
+    sign = np.where(agree & ~equal & (trimmed * location[:, 0] > 0), np.sign(location[:, 0]), 0)  # fmt: skip
     return Words(sign, equal, n / ratio)
 
 

@@ -391,7 +391,7 @@ def contents() -> str:
         f"{count('scenario')} scenarios, simulated and recorded, {count('model')} models and {count('noise')} noise regimes; own ones are one class.",
         "All Monte Carlo runs of a job are one tensor axis; each random number is a function of seed, run, step and use.",
         "Better, equal, worse or not decided: each word has a simulated error rate, and a lost run deletes no filter.",
-        "A result knows its inputs: a changed file, class or setting is a new job, and sweeps resume.",
+        "A result depends on all its inputs: a changed file, class or setting is a new job, and sweeps resume.",
         "Baselines are tuned in the world in which they are compared, on another seed.",
         "Proposals that learn, NUTS, SVI, PMMH and SMC² on the same models, which are modules of torch.",
     )).rstrip()  # fmt: skip
