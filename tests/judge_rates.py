@@ -29,8 +29,7 @@ from pfbench.judge.time_blocks import (
     variance_ratio,
 )
 from pfbench.results.store import JobResult
-from pfbench.stats.comparison import EQUALITY_MARGIN
-from pfbench.stats.comparison import MIN_RUNS
+from pfbench.stats.comparison import EQUALITY_MARGIN, MIN_RUNS
 from pfbench.stats.rank_tests import rank_sum_cdf, wilcoxon_signed_rank_rows
 
 STEPS = 600

@@ -24,7 +24,7 @@ _HEADS = (
     "#",
     "filter",
     "ratio",
-    "against the best",
+    "verdict",
     "track kept",
     "coverage of 90 % regions",
     "ms/step",

@@ -76,6 +76,8 @@ def build_rows(view: View, baseline: str) -> list[BoardRow]:
             **_show_level(view, values[:, i]), "unit": view.unit,
             **_show_verdict(view, label, verdicts), **view.filters[label], **costs,
         })  # fmt: skip
+        if complete[i] and label not in verdicts:
+            rows[-1]["words"] = "the baseline was not run in all conditions"
     return rows
 
 
