@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pfbench.job.config import TUNED_METHODS, JobConfig, compose
-from pfbench.job.tuned_knobs import AUTO, NOMINAL
+from pfbench.job.tuned_knobs import AUTO, NOMINAL, SEED_SHIFT
 
 HELP = """\
 pfbench tune scenario=NAME [model=NAME] [filter=NAME,NAME] [key=value ...]
@@ -23,7 +23,8 @@ of these filters, ekf and ukf (`best`), and whether Kalman filters fit the world
   pfbench tune scenario=benes folder=conf
   pfbench run -m 'hydra.searchpath=[file://conf]' scenario=benes filter=tuned_baselines
 
-  filter=...         filters to tune, default ekf_scaled,gate,huber,student
+  filter=...         filters to tune, default ekf_scaled,gate,huber,student; others, such as rpf, are added
+                     to a file of the same world
   runs=20 seed=1     runs of a candidate, and seed of the study
   noise=...          noise regimes, default nominal,outliers,student. noise=nominal for a study of
                      nominal noise alone, whose choice is tuned=nominal
@@ -32,7 +33,7 @@ of these filters, ekf and ukf (`best`), and whether Kalman filters fit the world
   fit_particles=10000     their particles
   report.start_time_s=0   time before which errors do not count, as in the report of the study
   name=...           name of the file, default SCENARIO, SCENARIO_with_MODEL, and _nominal behind it;
-                     a file of this name is replaced
+                     a file of this name is replaced if ekf_scaled is tuned
   folder=conf        folder of the file, default that of hydra.searchpath if there is one"""
 
 _OPTIONS = {
@@ -40,6 +41,7 @@ _OPTIONS = {
     "r_factors": "1,2,4,8", "fit_runs": "", "fit_particles": "10000",
 }  # fmt: skip
 _DEFAULTS = {"runs": "runs=20", "fit_runs": "fit_runs=RUNS", "fit_particles": "fit_particles=10000"}
+CONTROL = "ekf_scaled"  # without which no filter is the best of a world
 _FEWEST_RUNS = 2  # a median of one run is that run
 _TAKEN = (AUTO, NOMINAL)  # choices that look for a file
 _OWN = ("seed", "runs", "study", "results_dir", "report.start_time_s")  # not settings of the world
@@ -47,7 +49,7 @@ _OWN = ("seed", "runs", "study", "results_dir", "report.start_time_s")  # not se
 
 def tune_filters(words: Sequence[str]) -> None:
     """Tune filters, and write their knobs with the best filter of the world."""
-    from pfbench.job.tuning import SEED_SHIFT, check_seed, list_candidates
+    from pfbench.job.tuning import check_seed, list_candidates
 
     options = _OPTIONS | {k: v for k, _, v in (w.partition("=") for w in words) if k in _OPTIONS}
     lists = {key: _split_list(key, options[key]) for key in ("filter", "noise", "r_factors")}
@@ -93,9 +95,13 @@ def _search(
     name: str,
 ) -> Path:
     """Search the knobs of all filters, judge the world, and write the file."""
-    from pfbench.job.tuned_files import measure_fit, write_tuned_file
+    from pfbench.job.tuned_files import add_to_tuned_file, measure_fit, write_tuned_file
     from pfbench.job.tuning import CandidateSearch
 
+    present = folder / "tuned" / f"{name}.yaml"
+    adds = CONTROL not in grids and present.is_file()
+    if adds:
+        _check_same_world(present, world)
     fixed = [f"seed={world['seed']}", f"runs={world['runs']}", "pcrb=false", "score_steps=0"]
     fixed += ["budget=particles", "engine=kernels"]  # whatever an experiment sets
     search = CandidateSearch([*settings, *fixed], world["regimes"], print, world["start_time_s"])
@@ -111,9 +117,25 @@ def _search(
     for result in results:
         values = ", ".join(f"{key}={value:g}" for key, value in result.choice.values.items())
         print(f"{result.method}: {values}")
+    if adds:
+        add_to_tuned_file(results, present, unsupported)
+        return present
     fit = measure_fit(search, results, *fit_size)
     print(f"best: {fit.best}\nkalman_fits: {str(fit.kalman_fits).lower()}")
     return write_tuned_file(results, folder, name, world, fit, unsupported)
+
+
+def _check_same_world(path: Path, world: Mapping[str, Any]) -> None:
+    """Check that a file to which filters are added is of the same world, with the same runs."""
+    import yaml
+
+    stated = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("world", {})
+    for key in world:
+        if stated.get(key) != world[key]:
+            raise ValueError(
+                f"{key} must be {stated.get(key)!r} as in {path}, to which filters are added, got {world[key]!r}. "
+                f"Add filter={','.join(TUNED_METHODS)} to tune all anew, or name=NAME for another file."
+            )
 
 
 def _name_file(choices: Mapping[str, str], regimes: Sequence[str], words: Sequence[str]) -> str:

@@ -173,6 +173,7 @@ from pfbench.filter.particle.weights import (
     AdditiveTempering as AdditiveTempering,
     FlooredWeightUpdate as FlooredWeightUpdate,
     LookAheadWeights as LookAheadWeights,
+    PowerLikelihoodUpdate as PowerLikelihoodUpdate,
     PowerTempering as PowerTempering,
     TemperedPosterior as TemperedPosterior,
     TemperedWeights as TemperedWeights,

@@ -44,17 +44,39 @@ def write_tuned_file(
         *(f"  {key}: {json.dumps(value)}" for key, value in world.items()),
         *(_list_fit(fit) if fit else ()),
     ]
-    for method, reason in (unsupported or {}).items():
-        lines += [f"{method}:", f"  unsupported: {json.dumps(reason)}"]
-    for result in results:
-        lines += [f"{result.method}:"]
-        lines += [f"  {key}: {json.dumps(value)}" for key, value in result.choice.values.items()]
-        lines += [f"  note: {json.dumps(_NO_EFFECT)}"] if _has_no_effect(result) else []
-        lines += [f"  seconds: {result.seconds:.1f}", "  candidates: |"]
-        lines += [f"    {' '.join(row)}" for row in _list_rows(result)]
     path = folder / "tuned" / f"{name}.yaml"
-    write_atomically(path, lambda file: file.write(("\n".join(lines) + "\n").encode()))
+    _write_lines(path, [*lines, *_list_methods(results, unsupported or {})])
     return path
+
+
+def add_to_tuned_file(
+    results: Sequence[TuningResult], path: Path, unsupported: Mapping[str, str]
+) -> None:
+    """Add filters to the file of a tuning of the same world, or replace them; the rest of the file stays."""
+    done = {*unsupported, *(result.method for result in results)}
+    parts = re.split(r"^(?=\w+:)", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    kept = "".join(part for part in parts if part.split(":")[0] not in done)
+    _write_lines(path, [*kept.splitlines(), *_list_methods(results, unsupported)])
+
+
+def _write_lines(path: Path, lines: Sequence[str]) -> None:
+    """Write a file of a tuning."""
+    write_atomically(path, lambda file: file.write(("\n".join(lines) + "\n").encode()))
+
+
+def _list_methods(results: Sequence[TuningResult], unsupported: Mapping[str, str]) -> Iterator[str]:
+    """Yield the lines of all filters: those that cannot run here first."""
+    for method, reason in unsupported.items():
+        yield from (f"{method}:", f"  unsupported: {json.dumps(reason)}")
+    for result in results:
+        yield f"{result.method}:"
+        yield from (f"  {key}: {json.dumps(value)}" for key, value in result.choice.values.items())
+        if _has_no_effect(result):
+            yield f"  note: {json.dumps(_NO_EFFECT)}"
+        if result.particles is not None:
+            yield f"  particles: {result.particles}"
+        yield from (f"  seconds: {result.seconds:.1f}", "  candidates: |")
+        yield from (f"    {' '.join(row)}" for row in _list_rows(result))
 
 
 def _list_fit(fit: WorldFit) -> Iterator[str]:
@@ -218,7 +240,7 @@ def measure_fit(
     """Find the best conventional filter, and compare SIR and RPF with it in the first noise regime."""
     regime = search.regimes[0]
     first = [f"runs={runs}", f"particles={particles}"]
-    tuned = {f"{result.method}_{SUFFIX}": result.choice for result in results}
+    tuned = {f"{r.method}_{SUFFIX}": r.choice for r in results if r.particles is None}
     errors = {name: _errors_of(search, name) for name in _UNTUNED}
     errors = {name: e for name, e in errors.items() if e}
     errors |= {name: choice.errors for name, choice in tuned.items()}

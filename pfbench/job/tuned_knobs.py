@@ -13,6 +13,7 @@ from pfbench.results.paper_block import PAPER, add_world, conf_dir, name_world
 
 TUNED = "tuned"  # group of the knobs that `pfbench tune` chose, which no job stores
 AUTO, NOMINAL = "auto", "nominal"  # choices that look up the world of the job
+SEED_SHIFT = 1000  # seed of a tuning minus seed of the study
 _WORLD = ("scenario", "model")  # groups that a tuning and its jobs have in common
 # names, places of data, and the part of a recording: a tuning takes another part than the scored one
 _NOT_A_SETTING = (PAPER, "root", "cache_dir", "start_s", "end_s")
@@ -34,7 +35,7 @@ def select_knobs(tree: Any, choices: Mapping[str, str], trusted: Sequence[str]) 
         reason = (knobs.get(lacking[0]) or {}).get("unsupported")
         raise ValueError(
             f"filter={choices['filter']} must have knobs of {choices['scenario']}, got none, since {reason} "
-            "Choose another filter." if reason else _refuse(choices, trusted)
+            "Choose another filter." if reason else _refuse(choices, trusted, lacking, knobs.get("world"))
         )  # fmt: skip
     with flag_override(tree, ["struct", "readonly"], [False, False]):
         tree[TUNED] = knobs
@@ -64,22 +65,45 @@ def _is_of(world: Mapping[str, Any], choices: Mapping[str, str]) -> bool:
     return all(world.get(group) == choices.get(group) for group in _WORLD)
 
 
-def _refuse(choices: Mapping[str, str], trusted: Sequence[str]) -> str:
-    """Word the refusal of a job without knobs, with the command that makes them."""
+def _refuse(
+    choices: Mapping[str, str],
+    trusted: Sequence[str],
+    lacking: Sequence[str],
+    world: Mapping[str, Any] | None,
+) -> str:
+    """Word the refusal of a job without knobs, with the command that makes them.
+
+    A world with a file that lacks some filters is tuned for these with the runs of the file.
+    """
+    from pfbench.job.config import TUNED_METHODS  # which imports this module
+
     scenario, model, choice = (choices.get(key, "") for key in ("scenario", "model", TUNED))
     folders, words = _read_command()
     words = [
         word
         for word in words
-        if re.match(r"\+{0,2}((scenario|model|experiment)[.=]|data\.root=)", word)
+        if re.match(r"\+{0,2}(scenario\.|model\.|experiment=|data\.root=)", word)
     ]
-    words = [word for word in words if not re.match(r"\+*(scenario|model)=", word)]
+    is_found = folders or Path("conf").resolve() == conf_dir()
+    again = "" if is_found else ", and add 'hydra.searchpath=[file://conf]' to the words of the run"
+    if world:
+        words = [
+            *world.get("settings", ()),
+            *(word for word in words if word.startswith("data.root=")),
+        ]
+        words += [f"runs={world['runs']}", f"seed={world['seed'] - SEED_SHIFT}"]
+        words += [f"noise={','.join(world['regimes'])}", f"filter={','.join(lacking)}"]
+        words += [f"report.start_time_s={world['start_time_s']:g}"] if world["start_time_s"] else []
+        if not is_found:  # a file of this name is pfbench's own
+            words += [f"name=my_{scenario}"]
+            again += f" with tuned=my_{scenario}"
+    else:
+        others = sorted({*lacking} - {*TUNED_METHODS})
+        words += [f"filter={','.join((*TUNED_METHODS, *others))}"] if others else []
+        words += ["noise=nominal"] if choice == NOMINAL else []
     words += [f"trust=[{','.join(trusted)}]"] if trusted else []
-    words += ["noise=nominal"] if choice == NOMINAL else []
     words += [f"hydra.searchpath=[{','.join(folders)}]"] if folders else []
     command = shlex.join(["pfbench", "tune", f"scenario={scenario}", f"model={model}", *words])
-    is_found = folders or Path("conf").resolve() == conf_dir()
-    again = "" if is_found else " and add 'hydra.searchpath=[file://conf]' to the words of the run"
     return (
         f"{TUNED}={choice or AUTO} must find the knobs of filter={choices.get('filter')} for scenario={scenario} "
         f"with model={model}, got none. Choose {TUNED}=WORLD (pfbench list {TUNED}), which the names of the "

@@ -37,7 +37,6 @@ from pfbench.stats.error_measures import Array, Flags, mean_per_run, rmse_per_ru
 # --------------------------------------------------------------------------------------------------
 # Search of the knobs of a filter: all candidates, several noise regimes, seeds that no study scores.
 
-SEED_SHIFT = 1000  # seed of a tuning minus seed of the study
 _RUNS_AT_ONCE = 400  # of all candidates and regimes in one pass, which bounds its memory
 TIE = 0.01  # relative difference of two scores that calibration decides
 OBJECTIVE = (
@@ -85,6 +84,7 @@ class TuningResult:
         untuned: The filter as its file states it, without a factor on R.
         candidates: All candidates.
         seconds: Computing time of all candidates.
+        particles: Number of particles; None for other filters.
     """
 
     method: str
@@ -92,6 +92,7 @@ class TuningResult:
     untuned: Candidate
     candidates: tuple[Candidate, ...]
     seconds: float
+    particles: int | None = None
 
 
 def choose_candidate(candidates: Sequence[Candidate]) -> Candidate:
@@ -134,6 +135,7 @@ class CandidateSearch:
         candidates, self.seconds = [], 0.0
         config = self.compose(method, self.regimes[0])
         at_once = max(1, _RUNS_AT_ONCE // max(len(batch.runs) for batch in self.batches))
+        at_once = 1 if method == "rpf" else at_once  # only Gaussian filters share a pass
         for first in range(0, len(grid), at_once):
             some = grid[first : first + at_once]
             self.progress(f"{method}, candidates {first + 1} to {first + len(some)} of {len(grid)}")
@@ -141,7 +143,8 @@ class CandidateSearch:
             candidates += [self._rate(*pair) for pair in zip(some, scores, strict=True)]
         choice, seconds = choose_candidate(candidates), self.seconds
         untuned = self._rate({}, *self._score([config]))
-        return TuningResult(method, choice, untuned, tuple(candidates), seconds)
+        particles = config.values["filter"].get("particles")
+        return TuningResult(method, choice, untuned, tuple(candidates), seconds, particles)
 
     def _rate(self, values: dict[str, float], scores: Mapping[str, RegimeScore]) -> Candidate:
         """Rate a candidate by its scores in all regimes."""
@@ -200,8 +203,7 @@ def with_candidate(config: JobConfig, values: Mapping[str, float]) -> JobConfig:
     if not values:
         return config
     changed = copy.deepcopy(config.values)
-    node = changed["filter"]
-    node["noise_adaptations"] = apply_candidate(node["noise_adaptations"], values)
+    changed["filter"] |= apply_candidate(changed["filter"], values)
     return JobConfig(changed, config.choices, config.uses_shared_particles, config.trusted)
 
 
@@ -424,7 +426,7 @@ def _select(parts: Any, places: Tensor) -> Any:
 # Knobs of the filters that are tuned alike: the factor on R, and one knob of the method.
 
 R_FACTORS = (1.0, 2.0, 4.0, 8.0)
-_SCALED = "pfbench.filter.ScaledNoise"
+_SCALED, _POWER = "pfbench.filter.ScaledNoise", "pfbench.filter.PowerLikelihoodUpdate"
 
 
 @dataclass(frozen=True)
@@ -432,7 +434,7 @@ class Knob:
     """Knob of a method.
 
     Attributes:
-        name: Key of the robust update, or `q_factor` of the scaled noise.
+        name: Key of the robust update, `q_factor` of the scaled noise, or `scale` of the bandwidth.
         values: Values to try.
     """
 
@@ -450,6 +452,7 @@ KNOBS: Mapping[str, Knob] = {
     "wolf": Knob("threshold", (2.0, 3.0, 4.0, 6.0)),
     "sage_husa": Knob("forgetting_factor", (0.95, 0.98, 0.99, 0.998)),
     "vb_r": Knob("forgetting_factor", (0.95, 0.98, 0.99, 0.998)),
+    "rpf": Knob("scale", (0.25, 0.5, 1.0, 2.0)),
 }
 
 
@@ -467,16 +470,23 @@ def list_candidates(method: str, r_factors: Sequence[float] = R_FACTORS) -> list
     return [{"r_factor": r, knob.name: v} for r, v in product(r_factors, knob.values)]
 
 
-def apply_candidate(adaptations: list[dict[str, Any]], values: Mapping[str, float]) -> list[Any]:
-    """Set the knobs in the noise adaptations of a filter.
+def apply_candidate(node: Mapping[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
+    """Set the knobs in the settings of a filter.
 
-    Returns the nodes, with the scaled noise first.
+    Returns the settings that change: the noise adaptations, with the scaled noise first, or bandwidth and
+    weights of a particle filter.
     """
+    if "scale" in values:
+        return {
+            "resampler": {**node["resampler"], "scale": values["scale"]},
+            "weight_update": {"_target_": _POWER, "r_factor": values["r_factor"]},
+        }
     scaled = {"_target_": _SCALED, "r_factor": values["r_factor"], "q_factor": 1.0}
     if "q_factor" in values:
-        return [scaled | {"q_factor": values["q_factor"]}]
+        return {"noise_adaptations": [scaled | {"q_factor": values["q_factor"]}]}
     (name,) = (key for key in values if key != "r_factor")
-    return [scaled, {**adaptations[-1], name: values[name]}]
+    update = {**node["noise_adaptations"][-1], name: values[name]}
+    return {"noise_adaptations": [scaled, update]}
 
 
 # --------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief, is_resolved
+from pfbench.filter.belief import ParticleBelief, add_log_weights, is_resolved
 from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
 from pfbench.filter.particle.stages import (
     AuxiliaryWeights,
@@ -228,6 +228,45 @@ class TemperedPosterior(WeightUpdate):
         log_w = torch.where(valid, value - total, 0.0)
         tempered = self.tempering(log_w)
         return value if tempered is log_w else torch.where(valid, tempered + total, value)
+
+
+@dataclass(frozen=True)
+class PowerLikelihoodUpdate(WeightUpdate):
+    """Bayes' rule with the likelihood to the power 1 / r_factor.
+
+    For normal errors this is their likelihood with `r_factor` times the covariance, up to a constant.
+
+    Attributes:
+        r_factor: Factor on the measurement noise covariance.
+
+    Raises:
+        ValueError: If the factor is not positive.
+    """
+
+    r_factor: float = 1.0
+
+    def __post_init__(self) -> None:
+        require_ranges(
+            "PowerLikelihoodUpdate", self, r_factor="(0, inf) Use 1 for the model's noise."
+        )
+
+    @property
+    @override
+    def is_exact(self) -> bool:
+        """True without tempering."""
+        return self.r_factor == 1.0
+
+    @property
+    def has_evidence(self) -> bool:
+        """True if the weights are densities of y given x."""
+        return self.is_exact
+
+    @override
+    def __call__(
+        self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, record: Record
+    ) -> Tensor:
+        log_likelihood = model.log_likelihood(record.y, x, record.u).expand_as(log_w).to(log_w)
+        return add_log_weights(log_likelihood / self.r_factor, log_w, log_ratio)
 
 
 @dataclass(frozen=True)

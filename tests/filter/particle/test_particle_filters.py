@@ -27,6 +27,7 @@ from pfbench.filter.belief import (
     ess,
     normalise_log_weights,
 )
+from pfbench.filter.exactness import has_evidence
 from pfbench.filter.loop import run_filter
 from pfbench.filter.moves.metropolis import MetropolisHastings
 from pfbench.filter.moves.path_kernels import NoiseFlowKernel
@@ -46,7 +47,11 @@ from pfbench.filter.particle.stages import (
     ResamplingScheme,
     Systematic,
 )
-from pfbench.filter.particle.weights import FlooredWeightUpdate, LookAheadWeights
+from pfbench.filter.particle.weights import (
+    FlooredWeightUpdate,
+    LookAheadWeights,
+    PowerLikelihoodUpdate,
+)
 from pfbench.kernels import dispatch
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
@@ -570,6 +575,26 @@ def test_floored_weights_are_bayes_s_until_they_are_too_small_for_a_number() -> 
     assert float(far[1].mean[..., 0].min()) > float(far[0].mean[..., 0].max()) + 2.0
     with pytest.raises(ValueError, match=r"weight_update\.weight_floor must be positive, got 0"):
         FlooredWeightUpdate(0.0)
+
+
+def test_a_likelihood_to_a_power_is_that_of_larger_normal_errors() -> None:
+    """The oracle is the filter of a model whose covariance of the errors is multiplied: equal weights."""
+    y = torch.randn(
+        1, 30, 1, generator=torch.Generator().manual_seed(3), dtype=torch.float64
+    ).cumsum(1)
+    power, plain = (
+        filter_record(
+            ParticleFilter(300, weight_update=update), linear_walk(1.0, 0.5, sd), y, runs=3
+        )
+        for update, sd in ((PowerLikelihoodUpdate(4.0), 1.0), (BayesWeightUpdate(), 2.0))
+    )
+    torch.testing.assert_close(power.mean, plain.mean, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(power.trace["ess"], plain.trace["ess"], rtol=1e-9, atol=1e-9)
+    assert PowerLikelihoodUpdate(1.0).is_exact
+    assert not PowerLikelihoodUpdate(4.0).is_exact
+    assert not has_evidence(ParticleFilter(9, weight_update=PowerLikelihoodUpdate(4.0)))
+    with pytest.raises(ValueError, match=r"r_factor must be positive.*got 0"):
+        PowerLikelihoodUpdate(0.0)
 
 
 # angles, precision, start

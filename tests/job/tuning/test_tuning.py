@@ -74,9 +74,14 @@ def test_the_smallest_error_wins_and_calibration_decides_within_one_percent() ->
 
 @pytest.mark.parametrize("method", KNOBS)
 def test_the_knobs_reach_the_filter(method: str) -> None:
-    nodes = job.compose([f"filter={method}"]).values["filter"]["noise_adaptations"]
+    node = job.compose([f"filter={method}"]).values["filter"]
     values = list_candidates(method)[-1]
-    built = [job.instantiate(node) for node in apply_candidate(nodes, values)]
+    changed = apply_candidate(node, values)
+    if method == "rpf":
+        assert job.instantiate(changed["weight_update"]).r_factor == values["r_factor"] == 8.0
+        assert job.instantiate(changed["resampler"]).scale == values["scale"] == 2.0
+        return
+    built = [job.instantiate(node) for node in changed["noise_adaptations"]]
     knob = KNOBS[method].name
     assert built[0].r_factor == values["r_factor"] == 8.0
     assert getattr(built[-1], knob) == values[knob]
@@ -119,7 +124,8 @@ def test_stored_knobs_are_the_choice_among_the_stored_candidates(name: str) -> N
     content = read_tuned(name)
     methods = [method for method in TUNED_METHODS if "unsupported" not in content[method]]
     assert "ekf_scaled" in methods  # the control
-    for method in methods:
+    has_particles = "scale" in content.get("rpf", {})
+    for method in [*methods, *["rpf"] * has_particles]:
         candidates, untuned = read_candidates(content[method])
         choice = choose_candidate(candidates)
         assert choice.values == {key: content[method][key] for key in choice.values}
@@ -127,7 +133,11 @@ def test_stored_knobs_are_the_choice_among_the_stored_candidates(name: str) -> N
         assert untuned.values == {}
         assert set(untuned.errors) == set(content["world"]["regimes"])
         words = [f"tuned={name}", f"filter={method}_tuned"]
-        stated = stated_knobs(words)
+        if method == "rpf":
+            node = job.compose(words).values["filter"]
+            stated = {**node["resampler"], **node["weight_update"]}
+        else:
+            stated = stated_knobs(words)
         assert {key: stated[key] for key in choice.values} == choice.values
         config = job.compose(words).values
         assert config["filter"]["paper"]["tuning"] == content["data"]
@@ -285,6 +295,38 @@ def test_a_search_finds_that_errors_are_larger_than_the_model_says(
     assert [c.errors["outliers"] for c in candidates] == pytest.approx(errors, rel=1e-5)
     assert untuned.errors["outliers"] == pytest.approx(errors[1], rel=1e-5)
     assert "ekf_scaled: r_factor=4, q_factor=1" in capsys.readouterr().out
+
+
+def test_a_filter_is_added_to_the_file_of_its_world(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second search replaces its own part; errors of another world or other runs are never mixed."""
+    monkeypatch.setattr(
+        tuning, "KNOBS", {"ekf_scaled": Knob("q_factor", (1.0,)), "rpf": Knob("scale", (0.5, 1.0))}
+    )
+    monkeypatch.chdir(tmp_path)
+    world = [
+        "scenario=linear_walk",
+        "scenario.steps=30",
+        "noise=nominal",
+        "name=walk",
+        "folder=lab",
+    ]
+    world += ["r_factors=1,4", "fit_runs=2", "fit_particles=50"]
+    tune_filters([*world, "runs=4", "filter=ekf_scaled"])
+    path = tmp_path / "lab/tuned/walk.yaml"
+    first = path.read_text()
+    for _ in range(2):
+        tune_filters([*world, "runs=4", "filter=rpf"])
+        assert path.read_text().startswith(first)
+    node = yaml.safe_load(path.read_text())["rpf"]
+    candidates, _ = read_candidates(node)
+    assert node["particles"] == 500
+    assert choose_candidate(candidates).values == {key: node[key] for key in ("r_factor", "scale")}
+    assert len(candidates) == 4
+    assert len({c.log_ratio for c in candidates}) == 4  # each knob changes the filter
+    with pytest.raises(ValueError, match=r"runs must be 4 as in .*walk\.yaml.*got 6"):
+        tune_filters([*world, "runs=6", "filter=rpf"])
 
 
 @pytest.mark.parametrize(
