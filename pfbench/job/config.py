@@ -176,6 +176,8 @@ def resolve_config(
             raise
         raise explained from error
     knobs = values.pop(TUNED, {})  # the filter has them
+    for table in [key for key in values if key.endswith(_TABLE)]:
+        del values[table]
     if has_knobs:
         check_tuned_seed(values, names.get("scenario"), knobs)
         mark_foreign(values, names, knobs.get("world", {}), trusted)
@@ -404,6 +406,7 @@ def is_simulated_from(scenario: Any, name: str) -> bool:
 # --------------------------------------------------------------------------------------------------
 # Named sets of filters, which a sweep may name in place of a list.
 
+_TABLE = "_in"  # end of the names of tables from which an experiment takes `runs` or `seed`; no settings of a job
 SUFFIX = "tuned"  # end of the names of the tuned filters
 TUNED_METHODS = ("ekf_scaled", "gate", "huber", "student")
 FILTER_SETS = {"tuned_baselines": tuple(f"{method}_{SUFFIX}" for method in TUNED_METHODS)}

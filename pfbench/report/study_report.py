@@ -22,6 +22,7 @@ from pfbench.report.overview.page import BOARD_PAGE, render_overview
 from pfbench.report.overview.tables import (
     FEWEST_WORLDS,
     Overview,
+    TabKey,
     build_overviews,
     has_overview,
 )
@@ -159,7 +160,7 @@ def render_study(
     return files | render_page(pack, BOARD_PAGE) | render_overview(overviews, pack)
 
 
-def find_overviews(pack: Mapping[str, Any], table: pd.DataFrame) -> dict[int, Overview] | None:
+def find_overviews(pack: Mapping[str, Any], table: pd.DataFrame) -> dict[TabKey, Overview] | None:
     """Decide the first page of a study with several proposed methods in several worlds.
 
     Args:
@@ -167,7 +168,7 @@ def find_overviews(pack: Mapping[str, Any], table: pd.DataFrame) -> dict[int, Ov
         table: Runs of the study.
 
     Returns:
-        Tables of the page by number of particles; None for other studies.
+        Tables of the page by number of particles, at equal time and as printed; None for other studies.
     """
     facts = StudyFacts.from_pack(pack)
     if not has_overview(table, facts.looks):

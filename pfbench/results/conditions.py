@@ -261,6 +261,8 @@ def make_distinct_label(meta: Mapping[str, Any], twins: Sequence[Mapping[str, An
         return str(meta["label"])
     flat = [flatten_settings(twin["config"]) for twin in twins]
     names = [name for name in list_differing(flat) if not name.startswith(_WORDS)]
+    if "filter.particles" in names and "particles" in names:  # from which it is taken
+        names.remove("particles")
     of_filter = [name for name in names if name.startswith("filter.")]
     if len({tuple(repr(config.get(name)) for name in of_filter) for config in flat}) == len(flat):
         names = of_filter

@@ -21,7 +21,10 @@ from pfbench.report import study_report
 from pfbench.report.overview import figures
 from pfbench.report.overview.page import list_verdicts, render_overview, word_headline
 from pfbench.report.overview.tables import (
+    EQUAL_TIME,
+    PRINTED,
     Overview,
+    TabKey,
     build_overview,
     build_overviews,
     central_rows,
@@ -34,6 +37,7 @@ from pfbench.report.overview.tables import (
 from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.stats.world_table import (
     SHARED_SEEDS,
+    Winner,
     World,
     build_world,
     compare_methods,
@@ -352,7 +356,7 @@ def test_the_page_has_its_figures_tables_and_stories(overview: Overview) -> None
 
 
 @pytest.fixture(scope="module")
-def levels(table: pd.DataFrame, parts: dict[str, PartName]) -> dict[int, Overview]:
+def levels(table: pd.DataFrame, parts: dict[str, PartName]) -> dict[TabKey, Overview]:
     """The same runs as of 100 particles, and with half of the error of particle filters as of 1000."""
     particle = ["mcmc_rpf", "qmc_polymerised", "cpso_escape", "dmc_reconstructed", "sir", "rpf"]
     swept = table[table["filter"].isin(particle)]
@@ -365,7 +369,7 @@ def levels(table: pd.DataFrame, parts: dict[str, PartName]) -> dict[int, Overvie
 
 
 def test_each_number_of_particles_has_its_tables(
-    overview: Overview, levels: dict[int, Overview]
+    overview: Overview, levels: dict[TabKey, Overview]
 ) -> None:
     assert list(levels) == [100, 1000]
     plain = {(c.world, c.filter): c.verdict.ratio for c in overview.cells}
@@ -376,15 +380,16 @@ def test_each_number_of_particles_has_its_tables(
     half = {(c.world, c.filter): c.verdict.ratio for c in levels[1000].cells}
     assert half["azimuth", "mcmc_rpf"] == pytest.approx(plain["azimuth", "mcmc_rpf"] / 2, rel=0.1)
     assert half["azimuth", "fm_mssrckf"] == plain["azimuth", "fm_mssrckf"]
-    points = figures.dose_points(levels, overview.worlds[0], "mcmc_rpf", "particles")
+    doses = {key: levels[key] for key in (100, 1000)}
+    points = figures.dose_points(doses, overview.worlds[0], "mcmc_rpf", "particles")
     assert [point.x for point in points] == [100.0, 1000.0]
-    times = figures.dose_points(levels, overview.worlds[0], "mcmc_rpf", "time")
+    times = figures.dose_points(doses, overview.worlds[0], "mcmc_rpf", "time")
     assert times[1].x == pytest.approx(9 * times[0].x)
 
 
 def test_labels_without_their_number_of_particles() -> None:
     assert name_without_level("sir[particles=100]") == "sir"
-    assert name_without_level("sir[particles=100,budget=time]") == "sir[budget=time]"
+    assert name_without_level("sir[particles=100,budget=time,scale=2]") == "sir[scale=2]"
     assert name_without_level("ekf") == "ekf"
     labels = ["mcmc_rpf", "qmc_polymerised", "cpso_escape"]
     assert list_levels(find_looks([f"{name}[particles=50]" for name in labels])) == []
@@ -394,15 +399,89 @@ def test_labels_without_their_number_of_particles() -> None:
     ]
 
 
-def test_the_page_of_several_numbers_shows_them(levels: dict[int, Overview]) -> None:
+def test_the_page_of_several_numbers_shows_them(levels: dict[TabKey, Overview]) -> None:
     pack = {"study": "s", "title": "T", "generated": {"version": "0", "commit": "abc", "date": ""}}
     files = render_overview(levels, pack)
     page = files["index.html"]
     assert "How many particles are enough?" in page
     assert "<summary>100 particles</summary>" in page
     table = pd.read_csv(io.StringIO(files["cells.csv"]))
-    assert set(table["particles"]) == {100, 1000}
+    assert set(table["table"]) == {100, 1000}
     assert len(files["error_by_time.svg"]) < 60_000
+
+
+@pytest.fixture(scope="module")
+def tabs(table: pd.DataFrame, parts: dict[str, PartName]) -> dict[TabKey, Overview]:
+    """Two numbers of particles; at equal time with twice the errors of the larger one; three forms as printed."""
+    particle = ["mcmc_rpf", "qmc_polymerised", "cpso_escape", "dmc_reconstructed", "sir", "rpf"]
+    swept = table[table["filter"].isin(particle)]
+    names = {"few": "[budget=particles,particles=100]", "many": "[budget=particles,particles=1000]"}
+    kinds = [
+        swept.assign(filter=swept["filter"] + names["few"], particles=100),
+        swept.assign(filter=swept["filter"] + names["many"], particles=1000),
+        swept.assign(
+            filter=swept["filter"] + "[budget=time,particles=1000]",
+            particles=700,
+            rmse=2 * swept["rmse"],
+        ),
+    ]
+    printed = swept[swept["filter"].isin(particle[1:4]) & (swept["scenario"] != "azimuth")]
+    kinds.append(printed.assign(filter=printed["filter"] + "_printed", particles=100))
+    both = pd.concat([table[~table["filter"].isin(particle)].assign(particles=pd.NA), *kinds])
+    return build_overviews(both, find_looks(sorted(both["filter"].unique())), parts)
+
+
+def test_filters_at_equal_time_and_as_printed_have_tables_of_their_own(
+    overview: Overview, tabs: dict[TabKey, Overview]
+) -> None:
+    """In each table all filters have one setting, so that none is compared with another setting of itself."""
+    assert list(tabs) == [100, 1000, EQUAL_TIME, PRINTED]
+    plain = {(c.world, c.filter): c.verdict.ratio for c in overview.cells}
+    for key in (100, 1000):
+        assert {(c.world, c.filter): c.verdict.ratio for c in tabs[key].cells} == plain
+    timed = {(c.world, c.filter): c.verdict.ratio for c in tabs[EQUAL_TIME].cells}
+    assert timed["azimuth", "fm_mssrckf"] == plain["azimuth", "fm_mssrckf"]
+    assert timed["azimuth", "mcmc_rpf"] == pytest.approx(2 * plain["azimuth", "mcmc_rpf"], rel=0.1)
+    printed = tabs[PRINTED]
+    assert set(printed.methods) == {
+        f"{k}_printed" for k in ("qmc_polymerised", "cpso_escape", "dmc_reconstructed")
+    }
+    assert {w.key for w in printed.worlds} == {
+        "passive_1",
+        "sar_flight_short",
+    }  # where they have runs
+    ratios = {(c.world, c.filter): c.verdict.ratio for c in printed.cells}
+    assert ratios["passive_1", "cpso_escape_printed"] == plain["passive_1", "cpso_escape"]
+    assert ratios["passive_1", "sir"] == plain["passive_1", "sir"]
+
+
+def test_the_first_sentence_says_what_holds_at_equal_time(tabs: dict[TabKey, Overview]) -> None:
+    first, timed = tabs[1000], tabs[EQUAL_TIME]
+    winner = Winner("azimuth", "mcmc_rpf", 0.01, True)
+    with_star, without = first._replace(winners=[winner]), first._replace(winners=[])
+    timed_star, timed_none = timed._replace(winners=[winner]), timed._replace(winners=[])
+    said = [word_headline(a, b) for a in (with_star, without) for b in (timed_star, timed_none)]
+    name = first.names["mcmc_rpf"]
+    assert (
+        f"with as many particles: {name} (azimuth). Also at equal time: {name} (azimuth)."
+        in said[0]
+    )
+    assert f"with as many particles: {name} (azimuth). At equal time none is." in said[1]
+    assert (
+        said[2].startswith("None of the seven is shown")
+        and f"At equal time: {name} (azimuth)." in said[2]
+    )
+    assert "in any of 3 worlds, nor at equal time." in said[3]
+    assert all(len(text.split()) <= 55 for text in said)
+
+
+def test_the_page_shows_all_tables(tabs: dict[TabKey, Overview]) -> None:
+    pack = {"study": "s", "title": "T", "generated": {"version": "0", "commit": "abc", "date": ""}}
+    files = render_overview(tabs, pack)
+    assert "<summary>The methods as printed</summary>" in files["index.html"]
+    cells = pd.read_csv(io.StringIO(files["cells.csv"]))
+    assert set(cells["table"]) == {"100", "1000", EQUAL_TIME, PRINTED}
+    assert {"heat_map_equal_time.svg", "matrices_as_printed.svg"} <= set(files)
 
 
 def test_which_studies_have_the_page(table: pd.DataFrame, looks: dict[str, MethodLook]) -> None:

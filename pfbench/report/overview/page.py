@@ -12,7 +12,14 @@ import pandas as pd
 from markupsafe import Markup
 
 from pfbench.report.overview import figures
-from pfbench.report.overview.tables import Overview, WorldRow, tell_story
+from pfbench.report.overview.tables import (
+    EQUAL_TIME,
+    PRINTED,
+    Overview,
+    TabKey,
+    WorldRow,
+    tell_story,
+)
 from pfbench.report.study_page.page_writer import describe_page_knobs
 from pfbench.report.writers import format_csv, template_environment
 from pfbench.results.conditions import parse_label
@@ -24,29 +31,35 @@ _HERE = Path(__file__).parent
 _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 
-def render_overview(overviews: Mapping[int, Overview], pack: Mapping[str, Any]) -> dict[str, str]:
+def render_overview(
+    overviews: Mapping[TabKey, Overview], pack: Mapping[str, Any]
+) -> dict[str, str]:
     """Render the first page of a study: index.html, report.md, figures and tables by file name.
 
     A study with several numbers of particles has the tables of each, and figures of error against number and time.
 
     Args:
-        overviews: Tables of the page by number of particles, 0 for a study of one number.
+        overviews: Tables of the page by number of particles, 0 for a study of one number, and at equal time
+            and as printed.
         pack: Data of the page of each world.
     """
-    level = list(overviews)[len(overviews) // 2]  # the middle number opens the page
+    level = choose_level(overviews)
     overview = overviews[level]
     pictures = draw_pictures(overviews)
     files = {f"{name}.svg": text for name, text in pictures.items() if not name.endswith("_390")}
     for name, tables in (("cells", list_verdicts), ("pairs", list_comparisons)):
-        parts = [tables(item).assign(particles=key or "") for key, item in overviews.items()]
+        parts = [tables(item).assign(table=key or "") for key, item in overviews.items()]
         files[f"{name}.csv"] = format_csv(pd.concat(parts))
     context = {
         "pack": pack,
         "overview": overview,
         "levels": [key for key in overviews if key],
         "level": level,
-        "others": [(key, f"_{key}") for key in overviews if key != level],
-        "headline": word_headline(overview),
+        "has_doses": len(_select_levels(overviews)) > 1,
+        "others": [
+            (_name_tab(key, item), _suffix(key)) for key, item in overviews.items() if key != level
+        ],
+        "headline": word_headline(overview, overviews.get(EQUAL_TIME)),
         "setting": describe_setting(overview),
         "foreign_knobs": describe_page_knobs(pack) if "worlds" in pack else "",
         "ratios": list_ratios(overview),
@@ -69,22 +82,45 @@ def render_overview(overviews: Mapping[int, Overview], pack: Mapping[str, Any]) 
     return files
 
 
-def draw_pictures(overviews: Mapping[int, Overview]) -> dict[str, str]:
+def choose_level(overviews: Mapping[TabKey, Overview]) -> TabKey:
+    """Return the number of particles that opens the page: the middle one."""
+    levels = list(_select_levels(overviews))
+    return levels[len(levels) // 2]
+
+
+def _select_levels(overviews: Mapping[TabKey, Overview]) -> dict[int, Overview]:
+    """Select the tables that belong to a number of particles."""
+    return {key: overview for key, overview in overviews.items() if isinstance(key, int)}
+
+
+def _name_tab(key: TabKey, overview: Overview) -> str:
+    """Name tables below the first ones."""
+    if key == EQUAL_TIME:
+        return "All particle filters with the time of a step of SIR with 1000 particles"
+    return "The methods as printed" if key == PRINTED else f"{key} particles"
+
+
+def _suffix(key: TabKey) -> str:
+    """Return the end of the names of the figures of tables."""
+    return f"_{key}".replace(" ", "_")
+
+
+def draw_pictures(overviews: Mapping[TabKey, Overview]) -> dict[str, str]:
     """Draw all figures of the page as SVG: those of the middle number of particles without a suffix of it."""
-    level = list(overviews)[len(overviews) // 2]
+    first, levels = choose_level(overviews), _select_levels(overviews)
     pictures = {}
     for key, overview in overviews.items():
-        suffix = "" if key == level else f"_{key}"
+        suffix = "" if key == first else _suffix(key)
         for size in figures.HEAT_FORMATS:
             pictures[f"heat_map{suffix}{size.name}"] = figures.draw_heat_map(overview, size)
         for size in figures.MATRIX_FORMATS:
             pictures[f"matrices{suffix}{size.name}"] = figures.draw_matrices(overview, size)
-    if len(overviews) > 1:
-        worlds = select_dose_worlds(overviews[level])
+    if len(levels) > 1:
+        worlds = select_dose_worlds(overviews[first])
         for axis in ("particles", "time"):
             for size in figures.DOSE_FORMATS:
                 pictures[f"error_by_{axis}{size.name}"] = figures.draw_doses(
-                    overviews, worlds, axis, size
+                    levels, worlds, axis, size
                 )
     return {name: figures.to_svg(figure) for name, figure in pictures.items()}
 
@@ -99,17 +135,20 @@ def select_dose_worlds(overview: Overview, most: int = 2) -> list[WorldRow]:
     return order[:most]
 
 
-def word_headline(overview: Overview) -> str:
+def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> str:
     """Word the two sentences that open the page, at most 55 words."""
-    worlds = {world.key: world.name for world in overview.worlds}
-    winners = [winner for winner in overview.winners if winner.wins]
+    count, number = spell_number(len(overview.methods)), len(overview.worlds)
+    winners, better = _name_winners(overview), "better than every conventional filter"
+    timed = _name_winners(at_equal_time) if at_equal_time else ""
     if winners:
-        wins = [f"{overview.names[w.filter]} ({worlds[w.world]})" for w in winners[:3]]
-        more = f" and {len(winners) - 3} more" if len(winners) > 3 else ""
-        first = f"Better than every conventional filter with as many particles: {', '.join(wins)}{more}."
+        first = f"{better.capitalize()} with as many particles: {winners}."
     else:
-        methods = spell_number(len(overview.methods))
-        first = f"None of the {methods} is shown to be better than every conventional filter in any of {len(worlds)} worlds."
+        first = f"None of the {count} is shown to be {better} in any of {number} worlds"
+        first += ", nor at equal time." if at_equal_time and not timed else "."
+    if timed:
+        first += f" {'Also at' if winners else 'At'} equal time: {timed}."
+    elif winners and at_equal_time:
+        first += " At equal time none is."
     cells = [cell for cell in overview.cells if cell.filter in overview.methods]
     words = ["lost" if cell.loses_track else cell.verdict.word for cell in cells]
     counts = [
@@ -122,6 +161,15 @@ def word_headline(overview: Overview) -> str:
     return (
         f"{first} Against the best Kalman filter of each world they are {', '.join(counts)}.{lost}"
     )
+
+
+def _name_winners(overview: Overview, most: int = 2) -> str:
+    """Name the methods that are better than every conventional filter of a world; empty without one."""
+    worlds = {world.key: world.name for world in overview.worlds}
+    winners = [winner for winner in overview.winners if winner.wins]
+    wins = [f"{overview.names[w.filter]} ({worlds[w.world]})" for w in winners[:most]]
+    more = f" and {len(winners) - most} more" if len(winners) > most else ""
+    return f"{', '.join(wins)}{more}"
 
 
 def describe_setting(overview: Overview) -> str:

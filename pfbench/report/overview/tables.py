@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -18,6 +18,7 @@ from pfbench.files import limits
 from pfbench.results.conditions import parse_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.results.paper_block import conf_dir, read_paper_block
+from pfbench.results.store import SAME_TIME
 from pfbench.stats.world_table import (
     MeanRanks,
     Winner,
@@ -34,6 +35,8 @@ from pfbench.stats.world_table import (
 FEWEST_METHODS, FEWEST_WORLDS = 3, 2  # from which a study has this page
 CENTRAL = "nominal"  # regime of the page, if a world has several
 CONVENTIONAL = ("sir", "rpf", "ekf_bank", "gpf")  # that stand next to the methods
+TabKey = int | str  # a number of particles, 0 for a study of one number, or one of the two below
+EQUAL_TIME, PRINTED = "equal time", "as printed"
 _TUNING_BYTES = 1_000_000
 _WORDS = ("better", "worse", "equal", "identical", "not decided")
 _FAMILIES = ("particle", "guided", "swarm", "gaussian", "learned", "kalman", "")
@@ -143,19 +146,31 @@ def has_overview(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> bool:
 
 def is_method(look: MethodLook) -> bool:
     """Return whether a filter is a proposed method, and not another form of one, such as that as printed."""
-    block = read_paper_block("filter", parse_label(look.key)[0])
-    return look.proposed and not block.get("form_of")
+    return look.proposed and not _read_form(look).get("form_of")
+
+
+def is_printed(look: MethodLook) -> bool:
+    """Return whether a filter is a proposed method as printed, with the completions that it names."""
+    return look.proposed and _read_form(look).get("form") == "printed"
+
+
+def _read_form(look: MethodLook) -> Mapping[str, Any]:
+    """Return the statements of the file of a filter on its form."""
+    return read_paper_block("filter", parse_label(look.key)[0])
 
 
 def build_overview(
-    table: pd.DataFrame, looks: Mapping[str, MethodLook], parts: Mapping[str, PartName]
+    table: pd.DataFrame,
+    looks: Mapping[str, MethodLook],
+    parts: Mapping[str, PartName],
+    is_shown: Callable[[MethodLook], bool] = is_method,
 ) -> Overview:
     """Decide all that the first page shows.
 
     Returns tables of one study. A world without a stated reference, or without runs of it, is left out with the
     reason.
     """
-    methods = order_methods([label for label in looks if is_method(looks[label])], looks)
+    methods = order_methods([label for label in looks if is_shown(looks[label])], looks)
     by_name = {parse_label(label)[0]: label for label in looks}
     conventional = tuple(
         by_name[name] for name in CONVENTIONAL if name in by_name and name not in methods
@@ -182,43 +197,68 @@ def build_overview(
 
 def build_overviews(
     table: pd.DataFrame, looks: Mapping[str, MethodLook], parts: Mapping[str, PartName]
-) -> dict[int, Overview]:
+) -> dict[TabKey, Overview]:
     """Decide the tables of each number of particles, with the key 0 for a study of one number.
 
-    A filter without a number of particles is in all of them.
+    A filter without a number of particles is in all of them. Filters at equal time, and methods as printed,
+    have tables of their own. A table has the worlds in which it has other runs than the others.
     """
-    levels = list_levels(looks)
-    if not levels:
-        return {0: build_overview(table, looks, parts)}
+    levels: list[TabKey] = [*list_levels(looks)]
+    timed = [label for label in looks if _has_equal_time(label)]
+    printed = [label for label, look in looks.items() if is_printed(look)]
     overviews = {}
-    for level in levels:
-        names = {
-            label: name_without_level(label) for label in looks if _level(label) in (None, level)
-        }
-        rows = table[table["filter"].isin(list(names))]
-        rows = rows.assign(filter=rows["filter"].map(names))
-        present = [name for name in dict.fromkeys(names.values()) if name in set(rows["filter"])]
-        plain = find_looks(present)
-        kinds = {names[label]: looks[label] for label in names}
-        overviews[level] = build_overview(
-            rows,
-            {k: plain[k] if plain[k].family else replace(kinds[k], key=k) for k in present},
-            parts,
-        )
+    for key in levels or [0]:
+        own = [label for label in looks if label not in timed and _level(label) in (None, key)]
+        overviews[key] = _build_tab(table, looks, parts, own if levels else list(looks))
+    if sum(is_method(looks[label]) for label in timed) >= FEWEST_METHODS:
+        fixed = [label for label in looks if _level(label) is None]
+        overviews[EQUAL_TIME] = _build_tab(table, looks, parts, [*timed, *fixed])
+    if len(printed) >= FEWEST_METHODS:
+        number = table.loc[table["filter"].isin(printed), "particles"].dropna().median()
+        same = [label for label in looks if label not in timed and _level(label) in (None, number)]
+        others = [label for label in same if not is_method(looks[label])]
+        overviews[PRINTED] = _build_tab(table, looks, parts, others, is_printed)
     return overviews
+
+
+def _build_tab(
+    table: pd.DataFrame,
+    looks: Mapping[str, MethodLook],
+    parts: Mapping[str, PartName],
+    labels: Sequence[str],
+    is_shown: Callable[[MethodLook], bool] = is_method,
+) -> Overview:
+    """Decide the tables of some filters, named without their numbers of particles."""
+    names = {label: name_without_level(label) for label in labels}
+    rows = table[table["filter"].isin(labels)]
+    own = [
+        label for label in labels if name_without_level(label) != label or is_shown is is_printed
+    ]
+    own = [label for label in own if is_shown(looks[label])]
+    if own:
+        rows = rows[rows["scenario"].isin(rows.loc[rows["filter"].isin(own), "scenario"].unique())]
+    rows = rows.assign(filter=rows["filter"].map(names))
+    present = [name for name in dict.fromkeys(names.values()) if name in set(rows["filter"])]
+    plain = find_looks(present)
+    kinds = {names[label]: looks[label] for label in labels}
+    shown = {k: plain[k] if plain[k].family else replace(kinds[k], key=k) for k in present}
+    return build_overview(rows, shown, parts, is_shown)
 
 
 def list_levels(looks: Mapping[str, MethodLook]) -> list[int]:
     """List the numbers of particles of a study in which several proposed methods have several; else none."""
-    levels = Counter(_level(label) for label, look in looks.items() if is_method(look))
+    labels = [label for label, look in looks.items() if is_method(look)]
+    levels = Counter(_level(label) for label in labels if not _has_equal_time(label))
     several = sorted(n for n, count in levels.items() if n is not None and count >= FEWEST_METHODS)
     return several if len(several) > 1 else []
 
 
 def name_without_level(label: str) -> str:
-    """Return a label without its number of particles."""
+    """Return a label without its number of particles and the budget that determines it."""
     name, settings = parse_label(label)
-    others = [f"{key}={value}" for key, value in settings.items() if key != "particles"]
+    others = [
+        f"{key}={value}" for key, value in settings.items() if key not in ("particles", "budget")
+    ]
     return f"{name}[{','.join(others)}]" if others else name
 
 
@@ -226,6 +266,11 @@ def _level(label: str) -> int | None:
     """Return the number of particles in a label; None without one."""
     number = parse_label(label)[1].get("particles", "")
     return int(number) if number.isdigit() else None
+
+
+def _has_equal_time(label: str) -> bool:
+    """Return whether the number of particles of a job follows from a time."""
+    return parse_label(label)[1].get("budget") == SAME_TIME
 
 
 def order_methods(labels: Sequence[str], looks: Mapping[str, MethodLook]) -> tuple[str, ...]:

@@ -579,9 +579,8 @@ def test_floored_weights_are_bayes_s_until_they_are_too_small_for_a_number() -> 
 
 def test_a_likelihood_to_a_power_is_that_of_larger_normal_errors() -> None:
     """The oracle is the filter of a model whose covariance of the errors is multiplied: equal weights."""
-    y = torch.randn(
-        1, 30, 1, generator=torch.Generator().manual_seed(3), dtype=torch.float64
-    ).cumsum(1)
+    steps = torch.randn(30, 1, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    y = steps.cumsum(0)
     power, plain = (
         filter_record(
             ParticleFilter(300, weight_update=update), linear_walk(1.0, 0.5, sd), y, runs=3
