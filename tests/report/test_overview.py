@@ -467,10 +467,8 @@ def test_the_first_sentence_says_what_holds_at_equal_time(tabs: dict[TabKey, Ove
         in said[0]
     )
     assert f"with as many particles: {name} (azimuth). At equal time none is." in said[1]
-    assert (
-        said[2].startswith("None of the seven is shown")
-        and f"At equal time: {name} (azimuth)." in said[2]
-    )
+    assert said[2].startswith("None of the seven is shown")
+    assert f"At equal time: {name} (azimuth)." in said[2]
     assert "in any of 3 worlds, nor at equal time." in said[3]
     assert all(len(text.split()) <= 55 for text in said)
 
