@@ -26,18 +26,24 @@ def check_fit(model: Any, scenario: Any, tree: Mapping[str, Any], trusted: Seque
 
 
 def explain_error(
-    error: Exception, tree: Mapping[str, Any], trusted: Sequence[str], scenario: str = ""
+    error: Exception,
+    tree: Mapping[str, Any],
+    trusted: Sequence[str],
+    scenario: str = "",
+    model: str = "",
 ) -> Exception:
     """Explain an error of a shipped model that has another scenario than it is made for.
 
     Returns a refusal with the shipped models that fit. The error itself if there is none, or if the
-    class of the model fits this scenario, so that one of its values is wrong.
+    model, or another with its class where its name is unknown, fits this scenario: then one of its values is wrong.
     """
     target, fitting = (
         str(tree["model"].get("_target_")),
         list_fitting_models(tree, trusted, scenario),
     )
-    if not fitting or target in fitting.values() or not target.startswith("pfbench."):
+    is_shipped = model in {path.stem for path in list_groups()["model"]}
+    fits = model in fitting if is_shipped else target in fitting.values()
+    if not fitting or fits or not target.startswith("pfbench."):
         return error
     cause = error.__cause__ if type(error).__name__ == "InstantiationException" else error
     text = " ".join(f"{cause}".split())
@@ -158,11 +164,11 @@ def instantiate(node: Any, trusted: Sequence[str] = ()) -> Any:
 
 
 def instantiate_parts(
-    values: Mapping[str, Any], names: Sequence[str], trusted: Sequence[str] = ()
+    values: Mapping[str, Any], names: Sequence[str], trusted: Sequence[str] = (), model: str = ""
 ) -> tuple[Any, ...]:
     """Build several parts of a configuration, and check that model and scenario fit.
 
-    Returns the objects.
+    Returns the objects. The name of the model's file, if it is known, decides whether the model or its values are wrong.
     """
     from omegaconf import OmegaConf
 
@@ -174,7 +180,7 @@ def instantiate_parts(
         except Exception as error:
             if name != "model" or isinstance(error, UntrustedConfigError):
                 raise
-            explained = explain_error(error, values, trusted)
+            explained = explain_error(error, values, trusted, model=model)
             if explained is error:
                 raise
             raise explained from error

@@ -144,7 +144,7 @@ def build_plan(config: JobConfig) -> JobPlan:
     apply_global_settings(values)
     # The model first: a scenario may contain it, and an error then names the key of the model.
     model, scenario, noise, method = instantiate_parts(
-        values, ("model", "scenario", "noise", "filter"), config.trusted
+        values, ("model", "scenario", "noise", "filter"), config.trusted, config.choices["model"]
     )
     runs = torch.arange(values["first_run"], values["first_run"] + values["runs"])
     return JobPlan(config, model, scenario, RecordingRegime(noise), method, runs)

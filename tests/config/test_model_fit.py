@@ -152,6 +152,10 @@ REFUSED = {
         ["scenario=recorded_car_drive", "scenario.tuning.velocity_sd=[1,1,1]", "scenario.receiver.velocity_sd=null"],
         r"reads 'velocity East \[m/s\]' as channel 4, and RecordedDrive measures 'nothing' there\. No shipped model",
     ),
+    "sensors of another model of the class": (
+        ["scenario=flight_300s", "model=ins_gnss18"],
+        r"model\.imu must have positive initial standard deviations.*Models that fit: .*ins_gnss, ",
+    ),
 }  # fmt: skip
 
 
@@ -164,8 +168,8 @@ def test_what_does_not_fit_is_refused_with_the_models_that_do(name: str) -> None
 
 def test_a_wrong_value_of_a_model_that_fits_keeps_its_own_message() -> None:
     with pytest.raises(InstantiationException) as error:  # not a refusal of the pair
-        job.build_plan(job.compose(["scenario=flight_300s", "model=ins_gnss18"]))
-    assert "model.imu must have positive initial standard deviations" in str(error.value.__cause__)
+        job.build_plan(job.compose(["scenario=growth", "model.process_sd=-1"]))
+    assert "must" in str(error.value.__cause__)
 
 
 def test_a_datasheet_is_refused_as_a_job_is(tmp_path: Path) -> None:
