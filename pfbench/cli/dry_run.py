@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,6 +13,7 @@ from pfbench.job.config import JobConfig
 
 if TYPE_CHECKING:
     from pfbench.core.record import Episode
+    from pfbench.job.budget import EpisodeSource
     from pfbench.job.plan import JobPlan
 
 _STEPS = 10  # of the trial of a filter
@@ -35,10 +37,11 @@ def print_dry_run(plan: StudyPlan, *, is_sweep: bool) -> None:
     """Print a line for each job, and the sums."""
     configs = plan.compose_jobs() if is_sweep else [plan.first]
     estimates: list[JobEstimate] = []
+    worlds = DrawnWorlds()
     for number, config in enumerate(configs):
         name = " / ".join(config.choices[key] for key in ("scenario", "noise", "filter"))
         try:
-            estimates.append(estimate_job(config))
+            estimates.append(estimate_job(config, worlds))
         except Exception as error:
             print(
                 f"[{number + 1}/{len(configs)}] refused   {name}   {format_error(error, config.words)}"
@@ -64,11 +67,37 @@ def _format(estimate: JobEstimate) -> str:
     )
 
 
-def estimate_job(config: JobConfig) -> JobEstimate:
-    """Estimate a job by a trial: two runs are count, and all runs of the filter take a few steps of their data."""
+class DrawnWorlds:
+    """Draws of a few runs of each world, which all filters share as in a sweep."""
+
+    def __init__(self) -> None:
+        self._sources: dict[str, EpisodeSource] = {}
+
+    def draw(self, plan: JobPlan) -> tuple[EpisodeSource, float]:
+        """Draw two runs. Returns them, and the time of a draw of all runs [s]; 0 for a world that was drawn.
+
+        The time is that of what all runs share, such as a trajectory, and a part for each run.
+        """
+        from dataclasses import replace
+
+        from pfbench.job.budget import EpisodeSource
+
+        names = ("scenario", "noise", "model", "seed", "first_run", "runs", "oracle_noise", "dtype")
+        key = json.dumps([plan.values[name] for name in names], sort_keys=True)
+        if key in self._sources:
+            return self._sources[key], 0.0
+        few, more = (EpisodeSource(replace(plan, runs=plan.runs[:n])) for n in (2, 8))
+        self._sources[key] = few
+        a, b = (len(source.sample().record.y) for source in (few, more))
+        per_run = max(0.0, more.seconds - few.seconds) / max(1, b - a)
+        return few, few.seconds + per_run * max(0, len(plan.runs) - a)
+
+
+def estimate_job(config: JobConfig, worlds: DrawnWorlds) -> JobEstimate:
+    """Estimate a job by a trial: all runs of the filter take a few steps of the data of two runs."""
     from dataclasses import replace
 
-    from pfbench.job.budget import EpisodeSource, apply_budget, estimate_job_memory
+    from pfbench.job.budget import apply_budget, estimate_job_memory
     from pfbench.job.inputs import find_inputs
     from pfbench.job.plan import build_plan, job_key
 
@@ -78,14 +107,12 @@ def estimate_job(config: JobConfig) -> JobEstimate:
     if file.is_file() and not values["overwrite"]:
         return JobEstimate("skipped")
     plan = build_plan(_without_cache(config))
-    small = replace(plan, runs=plan.runs[:2])
-    source = EpisodeSource(small)
+    source, seconds = worlds.draw(plan)
     episode = source.sample()
-    small, _ = apply_budget(small, source)
+    small, _ = apply_budget(replace(plan, runs=plan.runs[:2]), source)
     plan = replace(plan, method=small.method)
-    runs, count = len(plan.runs), len(episode.record.y)
-    seconds = source.seconds / count * runs + _time_filter(plan, episode)
-    return JobEstimate("new", seconds, estimate_job_memory(plan, episode).peak(runs))
+    seconds += _time_filter(plan, episode)
+    return JobEstimate("new", seconds, estimate_job_memory(plan, episode).peak(len(plan.runs)))
 
 
 def _without_cache(config: JobConfig) -> JobConfig:

@@ -97,14 +97,20 @@ def test_a_dry_run_counts_jobs_and_stores_nothing(
 
 
 def test_the_estimate_grows_with_the_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pfbench.cli.dry_run import estimate_job
-    from pfbench.job import compose
+    from pfbench.cli.dry_run import DrawnWorlds, estimate_job
+    from pfbench.job import build_plan, compose
 
     monkeypatch.chdir(tmp_path)
+    words = ["scenario=growth", "filter=sir", "particles=2000"]
     small, large = (
-        estimate_job(compose(["scenario=growth", "filter=sir", f"runs={runs}", "particles=2000"]))
-        for runs in (2, 400)
+        estimate_job(compose([*words, f"runs={runs}"]), DrawnWorlds()) for runs in (2, 400)
     )
+    worlds = DrawnWorlds()
+    first, again, other = (
+        worlds.draw(build_plan(compose([*words[:2], f"seed={seed}"])))[1] for seed in (1, 1, 2)
+    )
+    assert again == 0.0  # filters share the draw of a world
+    assert min(first, other) > 0.0
     assert large.seconds > 3 * small.seconds  # 200 times the runs, and a constant part
     assert large.bytes > small.bytes
 
