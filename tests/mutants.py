@@ -74,7 +74,7 @@ def run_tests(tests: list[str], root: Path) -> int:
         "-p",
         "no:cacheprovider",
         "-m",
-        "not slow",
+        "not nightly",  # what `make test` runs
         *tests,
     ]
     try:
