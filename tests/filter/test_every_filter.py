@@ -13,6 +13,7 @@ import pytest
 import torch
 from config_cases import CONF, GROUPS, RECORDED, composed, truncated, world
 from filter_cases import EACH, NAMES, ON_ANY_MODEL, SLOTS, TEXTS, method_of, refusal
+from model_cases import tracker
 from particle_cases import HARD
 from recorded_data import DATA
 from torch import Tensor
@@ -161,14 +162,6 @@ def test_every_filter_runs_on_every_world_or_says_why_not(
 
 
 # empty slots, changing numbers, missing measurements
-
-
-def tracker() -> LinearGaussian:
-    """Two states, each driven, two sensors."""
-    h = [[1.0, 0.0], [0.3, 1.0]]
-    return LinearGaussian(
-        [[1.0, 0.5], [0.0, 0.9]], [[0.6, 0.0], [0.2, 0.5]], h, [1.0, 0.8], [0.3, -0.2], [1.5, 1.0]
-    )
 
 
 Y = torch.tensor(

@@ -11,11 +11,12 @@ import oracles
 import pytest
 import torch
 from checkout import TESTS
+from model_cases import Unrolled
 from pyro.distributions import GaussianHMM, MultivariateNormal
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
-from pfbench.core.chart import Chart, EuclideanBlock, wrap_angle
+from pfbench.core.chart import wrap_angle
 from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.linear_algebra import factor
 from pfbench.core.random_stream import PhiloxStream
@@ -712,14 +713,6 @@ def test_jacobians_are_the_analytic_ones() -> None:
 
 
 # angles
-
-
-class Unrolled(Pendulum):
-    """The pendulum on the real line."""
-
-    @property
-    def chart(self) -> Chart:
-        return Chart((EuclideanBlock(2),))
 
 
 @every_rule

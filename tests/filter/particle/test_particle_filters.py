@@ -12,13 +12,14 @@ import oracles
 import pytest
 import torch
 from checkout import TESTS
+from model_cases import Fragile, Unrolled, measurements
 from particle_cases import CASES, WALK, WALK_Y, Drifting, Spiky, belief, benes_case, singular_case
 from pyro.distributions import Uniform
 from scipy import stats
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
-from pfbench.core.chart import Chart, EuclideanBlock, wrap_angle
+from pfbench.core.chart import wrap_angle
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import (
@@ -458,14 +459,6 @@ every_toy = pytest.mark.parametrize(
 )
 
 
-def measurements(model: StateSpaceModel, runs: int = 4, steps: int = 8) -> Tensor:
-    dy = model.observation(torch.ones(1, 1, model.chart.size, dtype=torch.float64), ()).event_shape[
-        0
-    ]
-    mean = model.initial(1).mean[0, :dy] if dy == 3 else 0.0
-    return mean + PhiloxStream(8, torch.arange(runs)).normal("y", steps, dy)
-
-
 @every_filter
 @every_toy
 def test_the_future_is_not_used(method: ParticleFilter, model: StateSpaceModel) -> None:
@@ -502,15 +495,6 @@ def test_an_impossible_measurement_loses_its_run_alone(method: ParticleFilter) -
     assert torch.equal(estimate.mean[1, :3], healthy.mean[1, :3])
     for r in (0, 2, 3):
         assert torch.allclose(estimate.mean[r], healthy.mean[r], rtol=1e-12, atol=1e-14)
-
-
-class Fragile(LinearGaussian):
-    """A walk whose mechanisation fails far out: some particles become NaN, others infinite."""
-
-    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
-        moved = super().propagate(x, u, w)
-        moved = torch.where(x[..., :1] > 2.5, torch.nan, moved)
-        return torch.where(x[..., :1] < -2.5, torch.inf, moved)
 
 
 @every_filter
@@ -573,14 +557,6 @@ def test_floored_weights_are_bayes_s_until_they_are_too_small_for_a_number() -> 
 
 
 # angles, precision, start
-
-
-class Unrolled(Pendulum):
-    """The pendulum on the real line."""
-
-    @property
-    def chart(self) -> Chart:
-        return Chart((EuclideanBlock(2),))
 
 
 def test_angles_that_cross_the_cut_change_nothing() -> None:
