@@ -55,12 +55,14 @@ def test_each_planted_fault_has_a_test_by_day(request: pytest.FixtureRequest) ->
         pytest.skip("some tests of files alone are collected")
     files = {nodeid.partition("::")[0] for nodeid, _ in nightly.COLLECTED}
     for name, fault in mutants.read_faults().items():
-        paths, _, words = " ".join(fault["tests"]).partition(" -k ")
-        if files >= set(paths.split()):
+        text, _, words = " ".join(fault["tests"]).partition(" -k ")
+        paths = text.split()
+        assert all((TESTS.parent / path).is_file() for path in paths), f"{name}: {text}"
+        if files >= set(paths):
             tests = [
                 waits
                 for nodeid, waits in nightly.COLLECTED
-                if nodeid.startswith(tuple(f"{path}::" for path in paths.split()))
+                if nodeid.startswith(tuple(f"{path}::" for path in paths))
                 and (not words or nightly.is_selected(nodeid, words))
             ]
             assert tests, f"{name}: no test has the words {words}"

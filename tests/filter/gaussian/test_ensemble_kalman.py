@@ -388,14 +388,3 @@ def test_the_belief_is_a_cloud_of_equal_weights(analysis: EnsembleUpdate) -> Non
         belief, _ = method.step(WALK, belief, Record(WALK_Y[t].expand(3, -1)), draws.at_step(t + 1))
         assert isinstance(belief, ParticleBelief)
         assert torch.equal(belief.log_w, torch.full((3, 25), -math.log(25.0), dtype=torch.float64))
-
-
-@pytest.mark.parametrize(
-    "words",
-    [{"particles": 1}, {"inflation": 0.0}, {"inflation": -1.0}, {"inflation": math.nan}],
-    ids=str,
-)
-def test_ensembles_of_no_use_are_refused(words: dict[str, Any]) -> None:
-    (name, value), *_ = words.items()
-    with pytest.raises(ValueError, match=rf"filter\.{name} must be .*, got {value}"):
-        EnsembleKalmanFilter(**{"particles": 10, **words})

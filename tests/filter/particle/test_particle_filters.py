@@ -417,14 +417,6 @@ def test_moves_come_after_the_refresh_and_before_the_proposal() -> None:
     assert dataclasses.replace(plain, moves=(Shift(is_exact=True),)).is_exact
 
 
-@pytest.mark.parametrize("particles", [1, 0, -5])
-def test_too_few_particles_are_refused(particles: int) -> None:
-    with pytest.raises(
-        ValueError, match=f"particles must be a whole number of at least 2, got {particles}"
-    ):
-        ParticleFilter(particles)
-
-
 def test_a_prediction_that_is_no_number_excludes_its_parent_alone() -> None:
     """As one that the measurement excludes; the other parents of the run keep their look-ahead."""
     before, seen = belief(WALK), Record(torch.full((3, 1), 0.3, dtype=torch.float64))
@@ -433,12 +425,6 @@ def test_a_prediction_that_is_no_number_excludes_its_parent_alone() -> None:
     log_a, expected = (LookAheadWeights()(WALK, before._replace(x=x), seen) for x in (failed, far))
     assert torch.equal(log_a, expected)
     assert not torch.allclose(log_a, before.log_w)
-
-
-@pytest.mark.parametrize("power", [0.0, 1.5, math.nan])
-def test_a_power_of_no_use_is_refused(power: float) -> None:
-    with pytest.raises(ValueError, match="likelihood_power"):
-        LookAheadWeights(power)
 
 
 # one run, its neighbours, its past and its future
