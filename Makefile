@@ -25,7 +25,7 @@ report: $(VENV)/.installed      ## all reports, from results/ or stored runs
 test: $(VENV)/.installed        ## fast and slow tests, without those of the night
 	$(BIN)/python -m pytest -n 2 -m "not nightly"
 
-test-nightly: $(VENV)/.installed   ## the tests of tests/nightly.txt: half an hour
+test-nightly: $(VENV)/.installed   ## the tests of tests/nightly.txt: three quarters of an hour
 	$(BIN)/python -m pytest -n 2 -m nightly
 
 test-fast: $(VENV)/.installed
@@ -34,7 +34,7 @@ test-fast: $(VENV)/.installed
 test-slow: $(VENV)/.installed
 	$(BIN)/python -m pytest -n 2 -m "slow and not nightly"
 
-mutants: $(VENV)/.installed     ## plant each fault of tests/mutants.toml and check that a test fails
+mutants: $(VENV)/.installed     ## plant each fault of tests/mutants.toml and check that a test of `make test` fails
 	$(BIN)/python tests/mutants.py
 
 studies: $(VENV)/.installed     ## run all published studies, cheapest first: about four hours on one idle core; repeat to continue

@@ -6,8 +6,8 @@ each time, and processes that a test starts compose as users do.
 
 from __future__ import annotations
 
-import copy
 import os
+import pickle
 import re
 from typing import Any
 from unittest import mock
@@ -28,7 +28,7 @@ with mock.patch.object(yaml, "SafeLoader", getattr(yaml, "CSafeLoader", yaml.Saf
     _Loader = _utils.get_yaml_loader()  # a subclass, here of the parser in C, which is faster
 compose_by_hydra = ConfigLoaderImpl._load_configuration_impl
 _store = ConfigStore.store
-_composed: dict[Any, Any] = {}
+_composed: dict[Any, bytes] = {}  # pickled: loading takes a quarter of the time of a deep copy
 
 
 def install() -> None:
@@ -61,8 +61,9 @@ def compose_once(
     key = (config_name, *words, str(sorted(options.items())), version.getbase(), os.getcwd())
     if key not in _composed:
         with mock.patch.object(_utils, "get_yaml_loader", return_value=_Loader):
-            _composed[key] = compose_by_hydra(self, config_name, words, **more)
-    copied = copy.deepcopy(_composed[key])
+            composed = compose_by_hydra(self, config_name, words, **more)
+        _composed[key] = pickle.dumps(composed, pickle.HIGHEST_PROTOCOL)
+    copied = pickle.loads(_composed[key])
     if "hydra" in copied:
         copied.hydra.job.name = JobRuntime().get("name")
     if modes:

@@ -1,18 +1,25 @@
-"""The list of nightly tests names tests that exist, and leaves the rest to each day."""
+"""The list of nightly tests names tests that exist, leaves the rest to each day, and with it a test of each planted fault."""
 
 import ast
+from functools import cache
 from typing import Any
 
+import mutants
 import nightly
 import pytest
 from checkout import TESTS
 
 
+@cache
+def functions_of(path: str) -> set[str]:
+    tree = ast.parse((TESTS.parent / path).read_text())
+    return {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+
+
 def test_each_line_names_a_test() -> None:
     for name in nightly.read_list():
         path, _, function = name.partition("::")
-        tree = ast.parse((TESTS.parent / path).read_text())
-        assert function in {n.name for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)}, name
+        assert function in functions_of(path), name
 
 
 class Item:
@@ -25,12 +32,46 @@ class Item:
         self.marks.append(mark.name)
 
 
-def test_every_kth_case_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        nightly, "read_list", lambda: {"tests/a.py::grid": 3, "tests/a.py::long": 0}
-    )
-    cases: list[Any] = [Item(f"tests/a.py::grid[{k}]") for k in range(7)]
-    others: list[Any] = [Item("tests/a.py::long"), Item("tests/a.py::short")]
+def test_every_kth_case_and_named_cases_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    listed = {
+        "tests/a.py::grid": nightly.Share(3, ("-5",)),
+        "tests/a.py::long": nightly.Share(0),
+        "tests/a.py::one": nightly.Share(0, ("small",)),
+    }
+    monkeypatch.setattr(nightly, "read_list", lambda: listed)
+    monkeypatch.setattr(nightly, "COLLECTED", [])
+    cases: list[Any] = [Item(f"tests/a.py::grid[k-{k}]") for k in range(7)]
+    names = ("long", "one[small]", "one[large]", "short")
+    others: list[Any] = [Item(f"tests/a.py::{name}") for name in names]
     nightly.mark([*cases, *others])
-    assert [item.nodeid[-2] for item in cases if not item.marks] == ["0", "3", "6"]
-    assert [item.marks for item in others] == [["nightly"], []]
+    assert [item.nodeid[-2] for item in cases if not item.marks] == ["0", "3", "5", "6"]
+    assert [item.marks for item in others] == [["nightly"], [], ["nightly"], []]
+    assert [waits for _, waits in nightly.COLLECTED[-4:]] == [True, False, True, False]
+
+
+def test_each_planted_fault_has_a_test_by_day(request: pytest.FixtureRequest) -> None:
+    """Of those that its words select; `make mutants` then runs these alone. Checked for the files of this process."""
+    if any("::" in word for word in request.config.args):
+        pytest.skip("some tests of files alone are collected")
+    files = {nodeid.partition("::")[0] for nodeid, _ in nightly.COLLECTED}
+    for name, fault in mutants.read_faults().items():
+        text, _, words = " ".join(fault["tests"]).partition(" -k ")
+        paths = text.split()
+        assert all((TESTS.parent / path).is_file() for path in paths), f"{name}: {text}"
+        if files >= set(paths):
+            tests = [
+                waits
+                for nodeid, waits in nightly.COLLECTED
+                if nodeid.startswith(tuple(f"{path}::" for path in paths))
+                and (not words or nightly.is_selected(nodeid, words))
+            ]
+            assert tests, f"{name}: no test has the words {words}"
+            assert not all(tests), f"{name}: all its tests wait for the night"
+
+
+def test_words_select_as_pytest_does() -> None:
+    test = "tests/a/test_of_it.py::test_of_that[Case-2]"
+    for words in ("that", "case-2 and not other", "(other or of_it) and test_of", "not (other)"):
+        assert nightly.is_selected(test, words), words
+    for words in ("tests/a", "not that", "other or (that and no_case)"):
+        assert not nightly.is_selected(test, words), words

@@ -79,17 +79,22 @@ class AllocationCounter(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
         self._alive: dict[int, tuple[StorageWeakRef, int]] = {}
+        self._size = 0  # of all of them, among which are some that are freed
         self.peak = 0
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run the operation and count its results."""
+        """Run the operation and count its results; freed ones are looked for where they would make a new peak."""
         out = func(*args, **(kwargs or {}))
-        self._alive = {k: entry for k, entry in self._alive.items() if not entry[0].expired()}
         for leaf in tree_leaves(out):
             if isinstance(leaf, Tensor):
                 storage = leaf.untyped_storage()
+                _, before = self._alive.get(storage._cdata, (None, 0))
                 self._alive[storage._cdata] = StorageWeakRef(storage), storage.nbytes()
-        self.peak = max(self.peak, sum(size for _, size in self._alive.values()))
+                self._size += storage.nbytes() - before
+        if self._size > self.peak:
+            self._alive = {k: entry for k, entry in self._alive.items() if not entry[0].expired()}
+            self._size = sum(size for _, size in self._alive.values())
+            self.peak = max(self.peak, self._size)
         return out
 
 

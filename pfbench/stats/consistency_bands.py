@@ -51,10 +51,11 @@ def assess_consistency(table: pd.DataFrame, alpha: float = ALPHA) -> pd.DataFram
 
 def average_runs(values: pd.DataFrame) -> tuple[Array, int]:
     """Average the ratio of each run over the conditions, of the runs that are valid in all of them; count the lost."""
-    wide = values.pivot_table("value", CONDITION, ["seed", "run"], dropna=False)
-    wide = wide.dropna(how="all").clip(upper=_LARGEST)
+    by_condition = values.groupby([*CONDITION, "seed", "run"], dropna=False, observed=True)["value"]
+    wide = by_condition.mean().unstack(["seed", "run"]).dropna(how="all")
+    ratios = np.minimum(wide.to_numpy(dtype=np.float64), _LARGEST)
+    complete = ratios[:, ~np.isnan(ratios).any(axis=0)]
     conditions = wide.index.to_frame(index=False)
-    complete = wide.loc[:, wide.notna().all(axis=0)].to_numpy()
     return weigh_conditions(conditions) @ complete, int(values["value"].isna().sum())
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import re
+import runpy
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,23 +33,51 @@ GOAL = {"filter": 30, "proposal": 32, "model": 35, "scenario": 40, "log": 40}
 @pytest.mark.parametrize("kind", SCRIPTS)
 def test_a_new_script_runs_at_once_from_an_empty_folder(tmp_path: Path, kind: str) -> None:
     """One file, no switch: the script writes a report with a row for its own part."""
-    env = os.environ | environment(tmp_path) | {"PYTHONPATH": str(ROOT)}
-    start = [sys.executable, "-m", "pfbench", "new", kind, "my_idea"]
-    subprocess.run(start, cwd=tmp_path, env=env, check=True, capture_output=True)
-    script = tmp_path / "my_idea.py"
-    lines = [line for line in script.read_text().splitlines() if line.strip()]
-    assert len(lines) <= GOAL[kind]
-    short = re.sub("runs=(50|10)", "runs=6", script.read_text())
-    script.write_text(short.replace("check(MyIdea())", "check(MyIdea(), runs=50)"))
-    done = subprocess.run(
-        [sys.executable, "my_idea.py"], cwd=tmp_path, env=env, capture_output=True, text=True, check=False
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert "FAILS" not in done.stdout
-    assert "0 failed" in done.stdout
-    page = (tmp_path / "reports" / "my_idea" / "report.md").read_text()
+    said, page = run_new_script(tmp_path, kind, run_in_a_process)
+    assert "FAILS" not in said
+    assert "0 failed" in said
     assert ("MyIdea" in page) or kind == "log"
     assert len(list((tmp_path / "results" / "my_idea").glob("*.npz"))) >= 3
+
+
+@pytest.mark.parametrize("kind", SCRIPTS)
+def test_a_new_script_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """In this process, where its start costs nothing."""
+    monkeypatch.chdir(tmp_path)
+    for name, value in environment(tmp_path).items():
+        monkeypatch.setenv(name, value)
+    said, page = run_new_script(tmp_path, kind, run_here)
+    assert "FAILS" not in said
+    assert "0 failed" in said
+    assert ("MyIdea" in page) or kind == "log"
+
+
+def run_new_script(folder: Path, kind: str, run: Callable[[Path], str]) -> tuple[str, str]:
+    """Write a script, shorten its study, run it, and return what it prints and its report."""
+    with contextlib.chdir(folder):
+        assert pfbench("new", kind, "my_idea", home=folder).code == 0
+    script = folder / "my_idea.py"
+    lines = [line for line in script.read_text().splitlines() if line.strip()]
+    assert len(lines) <= GOAL[kind]
+    short = re.sub("runs=(50|10)", "runs=3", script.read_text())
+    script.write_text(short.replace("check(MyIdea())", "check(MyIdea(), runs=50)"))
+    return run(script), (folder / "reports" / "my_idea" / "report.md").read_text()
+
+
+def run_in_a_process(script: Path) -> str:
+    env = os.environ | environment(script.parent) | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, script.name], cwd=script.parent, env=env, capture_output=True, text=True, check=False
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def run_here(script: Path) -> str:
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        runpy.run_path(str(script), run_name="__main__")
+    return said.getvalue()
 
 
 @pytest.mark.parametrize(
@@ -101,9 +133,9 @@ def test_the_estimate_grows_with_the_runs(tmp_path: Path, monkeypatch: pytest.Mo
     from pfbench.job import build_plan, compose
 
     monkeypatch.chdir(tmp_path)
-    words = ["scenario=growth", "filter=sir", "particles=2000"]
+    words = ["scenario=growth", "filter=sir", "particles=1000"]
     small, large = (
-        estimate_job(compose([*words, f"runs={runs}"]), DrawnWorlds()) for runs in (2, 400)
+        estimate_job(compose([*words, f"runs={runs}"]), DrawnWorlds()) for runs in (2, 200)
     )
     worlds = DrawnWorlds()
     first, again, other = (
@@ -111,7 +143,7 @@ def test_the_estimate_grows_with_the_runs(tmp_path: Path, monkeypatch: pytest.Mo
     )
     assert again == 0.0  # filters share the draw of a world
     assert min(first, other) > 0.0
-    assert large.seconds > 3 * small.seconds  # 200 times the runs, and a constant part
+    assert large.seconds > 3 * small.seconds  # 100 times the runs, and a constant part
     assert large.bytes > small.bytes
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from config_cases import composed, truncated, world
 from filter_cases import NAMES, ON_ANY_MODEL, TEXTS, method_of, refusal
+from model_cases import tracker
 from torch import Tensor
 
 from pfbench import job
@@ -22,7 +23,6 @@ from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.proposed.swarm import SwarmProposal
 from pfbench.kernels import dispatch
-from pfbench.model.linear_gaussian import LinearGaussian
 
 pytestmark = pytest.mark.filterwarnings("ignore:ParticleGuideProposal")  # it says that it is dear
 
@@ -38,14 +38,6 @@ Y = torch.tensor(
 compiler = pytest.mark.skipif(
     not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="no C++ compiler"
 )
-
-
-def tracker() -> LinearGaussian:
-    """Two states, each driven, two sensors."""
-    h = [[1.0, 0.0], [0.3, 1.0]]
-    return LinearGaussian(
-        [[1.0, 0.5], [0.0, 0.9]], [[0.6, 0.0], [0.2, 0.5]], h, [1.0, 0.8], [0.3, -0.2], [1.5, 1.0]
-    )
 
 
 def run(method: Any, compiled: bool, batch: int | None = None) -> FilterResult:

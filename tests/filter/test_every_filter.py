@@ -13,6 +13,7 @@ import pytest
 import torch
 from config_cases import CONF, GROUPS, RECORDED, composed, truncated, world
 from filter_cases import EACH, NAMES, ON_ANY_MODEL, SLOTS, TEXTS, method_of, refusal
+from model_cases import tracker
 from particle_cases import HARD
 from recorded_data import DATA
 from torch import Tensor
@@ -136,11 +137,12 @@ def test_the_worlds_have_every_default_model() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("part", range(6))
 @pytest.mark.parametrize("scenario", WORLDS)
 def test_every_filter_runs_on_every_world_or_says_why_not(
-    scenario: str, monkeypatch: pytest.MonkeyPatch
+    scenario: str, part: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A model of an INS takes two steps, the first and one after it, since each takes 10 to 50 ms."""
+    """A sixth of the filters. A model of an INS takes two steps, the first and one after it, since each takes 10 to 50 ms."""
     if scenario in RECORDED and DATA is None:
         pytest.skip("PFBENCH_DATA does not name the folder of the recorded data sets")
     model, episode = job.instantiate(composed(f"scenario={scenario}").model), world(scenario)
@@ -148,7 +150,7 @@ def test_every_filter_runs_on_every_world_or_says_why_not(
     # checked once, not at the start of each filter: a fifth of the time
     check_model(model, prepare_record(model, record))
     monkeypatch.setattr(loop, "check_model", lambda *_: None)
-    for name in NAMES:
+    for name in NAMES[part::6]:
         why = refusal(name, model, record)
         if not why:
             some_steps(name, model, record)
@@ -160,14 +162,6 @@ def test_every_filter_runs_on_every_world_or_says_why_not(
 
 
 # empty slots, changing numbers, missing measurements
-
-
-def tracker() -> LinearGaussian:
-    """Two states, each driven, two sensors."""
-    h = [[1.0, 0.0], [0.3, 1.0]]
-    return LinearGaussian(
-        [[1.0, 0.5], [0.0, 0.9]], [[0.6, 0.0], [0.2, 0.5]], h, [1.0, 0.8], [0.3, -0.2], [1.5, 1.0]
-    )
 
 
 Y = torch.tensor(

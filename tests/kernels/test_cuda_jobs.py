@@ -14,6 +14,7 @@ import torch
 from command_line import pfbench
 from config_cases import composed, truncated, world
 from filter_cases import NAMES, method_of, refusal
+from model_cases import tracker
 from torch import Tensor
 
 from pfbench import job
@@ -125,13 +126,6 @@ def test_a_filter_does_there_what_it_does_here(name: str, scenario: str) -> None
     assert apart(model().chart, here, there) < max(OFF, 3.0 * apart(model().chart, here, shaken))
 
 
-def walk() -> LinearGaussian:
-    h = [[1.0, 0.0], [0.3, 1.0]]
-    return LinearGaussian(
-        [[1.0, 0.5], [0.0, 0.9]], [[0.6, 0.0], [0.2, 0.5]], h, [1.0, 0.8], [0.3, -0.2], [1.5, 1.0]
-    )
-
-
 class Failing(LinearGaussian):
     """Particles that run beyond 4 become no number."""
 
@@ -144,7 +138,7 @@ class Failing(LinearGaussian):
 @pytest.mark.parametrize("threshold", [0.5, 1.0])
 def test_engines_agree(particles: int, threshold: float) -> None:
     """In the first steps number by number; later particles fall to other slots, and estimates differ as two of one law."""
-    plain = walk()
+    plain = tracker()
     model = Failing(plain.f, plain.g, plain.h, plain.r, plain.m0, plain.l0)
     record = ModelSimulation(plain, 12).draw(NominalNoise(), torch.arange(5), 1).record
     record.y[1, 4] = record.y[3, 7:9] = math.nan

@@ -47,7 +47,7 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.stages import BootstrapProposal, EssResampler, Proposal, Systematic
 from pfbench.learn.trainer import Progress, Training, TrainingState
 from pfbench.learn.training_data import TrainingData, draw_training_data
-from pfbench.learn.training_job import train
+from pfbench.learn.training_job import train, write_losses
 from pfbench.model.linear_gaussian import local_level
 from pfbench.noise.base import NoiseRegime, NominalNoise
 from pfbench.results import store
@@ -575,3 +575,16 @@ def test_mistakes_are_told_in_words(words: tuple[str, ...], said: str, tmp_path:
     answer = pfbench(words[0], *CHEAP, *words[1:], f"results_dir={tmp_path}", home=tmp_path)
     assert answer.code == (1 if "traceback:" in answer.err else 2)  # a job failed, or was refused
     assert re.search(said, answer.err), answer.err
+
+
+# the table of losses of a training
+
+
+def test_a_table_of_the_user_is_kept_and_an_old_log_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "data.csv"
+    path.write_text("mine\n")
+    for loss in (2.0, 1.0):
+        write_losses(path, [{"epoch": 1, "loss": loss}])
+    assert (tmp_path / "data.csv.kept").read_text() == "mine\n"
+    assert path.read_bytes() == b"epoch,loss\r\n1,1.0\r\n"
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["data.csv", "data.csv.kept"]

@@ -137,8 +137,8 @@ def repeat(record: Record, runs: int) -> Record:
 
 
 def test_a_particle_filter_has_the_mean_of_the_point_mass_filter() -> None:
-    """60 filters with 2000 particles on the record of one run, four standard errors at each of 12 steps."""
-    episode, runs = draw(1), 60
+    """30 filters with 2000 particles on the record of one run, four standard errors at each of 12 steps."""
+    episode, runs = draw(1), 30
     record = repeat(episode.record, runs)
     expected = torch.from_numpy(exact_mean(episode))
     spread = float((expected - episode.truth["position"][0]).norm(dim=-1)[:10].mean())

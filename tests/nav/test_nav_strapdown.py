@@ -315,23 +315,3 @@ def test_intervals_say_what_happened():
     )
     before = torch.cat([flight.vel[None, :1], u.vel_end[:, :-1]], 1)
     assert (u.vel_end - before - u.f - free).abs().max() < 1e-4
-
-
-@pytest.mark.parametrize(
-    ("n", "interval", "step", "message"),
-    [
-        (100, 5, 2, "samples_per_interval must .*, got 5. Choose an even number"),
-        (100, 30, 2, "must be a multiple of samples_per_interval=30, got 100. Give 90 or 120"),
-        (100, 10, 3, "samples_per_step must be 1 or 2, got 3"),
-    ],
-)
-def test_samples_that_do_not_divide_are_refused(n, interval, step, message):
-    flight = generate_manoeuvres([cruise(1)], TrajectoryStart(0, 0, 0), rate=n)
-    with pytest.raises(ValueError, match=message):
-        navigate(true_start(flight), flight.dtheta[None], flight.dv[None], 0.01, interval, step)
-
-
-def test_unequal_numbers_of_increments_are_refused():
-    flight = generate_manoeuvres([cruise(1)], TrajectoryStart(0, 0, 0), rate=10)
-    with pytest.raises(ValueError, match="the same number of samples, got 10 and 8"):
-        navigate(true_start(flight), flight.dtheta[None], flight.dv[None, :8], 0.1, 2)

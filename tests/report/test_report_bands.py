@@ -30,7 +30,7 @@ def table(sizes: dict[str, float], seed: int, runs: int = RUNS) -> pd.DataFrame:
 
 def test_consistent_filters_are_rarely_called_otherwise() -> None:
     """The level holds for all filters together, although the worlds of a run are not independent."""
-    studies, wrong = 150, 0
+    studies, wrong = 100, 0
     for seed in range(studies):
         bands = assess_consistency(table(dict.fromkeys("abcd", 1.0), seed))
         words = bands["word"] != "no deviation shown"
@@ -43,13 +43,13 @@ def test_a_word_comes_with_the_size_of_the_deviation() -> None:
     """Intervals of all filters together contain the sizes in nearly all studies."""
     sizes = {"a": 1.5, "b": 0.6, "c": 400.0, "d": 1.0}
     inside = 0
-    for seed in range(60):
+    for seed in range(30):
         bands = assess_consistency(table(sizes, seed)).set_index("filter")
         assert bands.loc[["a", "b", "c"], "word"].tolist() == ["overconfident", "underconfident", "overconfident"]  # fmt: skip
         true = pd.Series(sizes)
         assert np.abs(np.log(bands["ratio"] / true)).max() < 0.2
         inside += bool(((bands["low"] <= true) & (true <= bands["high"])).all())
-    assert inside / 60 >= 0.95 - 2.5 * math.sqrt(0.05 * 0.95 / 60)
+    assert inside / 30 >= 0.95 - 2.5 * math.sqrt(0.05 * 0.95 / 30)
 
 
 def test_lost_runs_are_left_out_and_counted_and_few_runs_decide_nothing() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from pfbench.results import crossed_mean_interval
 from pfbench.stats.comparison import (
     EQUAL_WORD,
     EQUALITY_MARGIN,
@@ -169,3 +170,27 @@ def test_signed_ranks_of_all_pairs_are_antisymmetric() -> None:
         assert (one.p, one.p_trimmed) == pytest.approx((other.p, other.p_trimmed))
         value, low, high = other.estimate(0.1)
         assert one.estimate(0.1) == pytest.approx((-value, -high, -low))
+
+
+# interval of a mean over two crossed samples, against scipy and by its coverage
+
+
+def test_one_row_has_the_interval_of_student() -> None:
+    values = np.random.default_rng(1).normal(2.0, 3.0, (1, 12))
+    mean, half = crossed_mean_interval(values, 0.9)
+    low, high = stats.t.interval(0.9, 11, values.mean(), stats.sem(values[0]))
+    assert (mean - half, mean + half) == pytest.approx((low, high))
+    assert crossed_mean_interval(np.full((3, 4), 2.0)) == (2.0, 0.0)
+
+
+def test_the_interval_covers_the_mean_of_both_populations() -> None:
+    """Rows alone, as in an interval over columns that forgets the rows, cover far too rarely."""
+    rng, studies, rows, columns = np.random.default_rng(2), 2000, 4, 30
+    inside, forgets = 0, 0
+    for _ in range(studies):
+        values = rng.normal(0, 1, (rows, 1)) + rng.normal(0, 1, (1, columns)) + rng.normal(0, 0.3, (rows, columns))  # fmt: skip
+        mean, half = crossed_mean_interval(values)
+        inside += abs(mean) < half
+        forgets += abs(mean) < crossed_mean_interval(values.mean(0, keepdims=True))[1]
+    assert inside / studies == pytest.approx(0.95, abs=4 * (0.95 * 0.05 / studies) ** 0.5 + 0.01)
+    assert forgets / studies < 0.8

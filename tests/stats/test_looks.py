@@ -88,9 +88,11 @@ def test_each_look_is_a_study_of_its_first_runs_at_its_level(runs: int) -> None:
 def test_equal_filters_are_told_apart_at_the_level_over_all_looks() -> None:
     """200 studies of three looks: a look at 5 % each would be wrong in one study of eight (the control)."""
     schedule, wrong, naive = LookSchedule(80), 0, 0
-    pairs = [("A", "B")]
-    for seed in range(200):
-        data = study(80, seed, {"A": 0.0, "B": 0.0})
+    pairs, rng = [("A", "B")], np.random.default_rng(0)
+    arranged = study(80, 0, {"A": 0.0, "B": 0.0})
+    for _ in range(200):
+        errors = np.exp(0.5 * rng.standard_normal(arranged.keeps.shape))
+        data = arranged._replace(values={"rmse": errors})
         wrong += decide_at_looks(data, pairs, schedule)[0].verdict.word in ("better", "worse")
         losses = compute_losses(data, "rmse")
         looks = [

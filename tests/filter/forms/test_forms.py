@@ -15,6 +15,7 @@ import torch
 from checkout import ROOT
 from config_cases import GROUPS, composed
 from filter_cases import UNPRINTED, method_of
+from model_cases import tracker
 from omegaconf import OmegaConf
 from torch import Tensor
 
@@ -209,14 +210,6 @@ def test_equation_9_of_000_as_printed_has_no_bandwidth_for_two_states() -> None:
         with pytest.raises(ValueError, match=r"kernel.offset must exceed .* Use 2"):
             printed.bandwidth(d, n)
     assert float(printed.bandwidth(3, n)) == pytest.approx(4 ** (1 / 7) * 500 ** (-1 / 7))
-
-
-def tracker() -> LinearGaussian:
-    """Two states, each driven, two sensors."""
-    h = [[1.0, 0.0], [0.3, 1.0]]
-    return LinearGaussian(
-        [[1.0, 0.5], [0.0, 0.9]], [[0.6, 0.0], [0.2, 0.5]], h, [1.0, 0.8], [0.3, -0.2], [1.5, 1.0]
-    )
 
 
 def half_seen() -> LinearGaussian:

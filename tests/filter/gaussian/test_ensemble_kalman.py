@@ -10,11 +10,12 @@ import numpy as np
 import oracles
 import pytest
 import torch
+from model_cases import Fragile, Unrolled, measurements
 from pyro.distributions import MultivariateNormal
 from torch import Tensor
 from torch.distributions import Distribution
 
-from pfbench.core.chart import Chart, EuclideanBlock, wrap_angle
+from pfbench.core.chart import wrap_angle
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
@@ -315,14 +316,6 @@ every_toy = pytest.mark.parametrize(
 )
 
 
-def measurements(model: StateSpaceModel, runs: int = 4, steps: int = 8) -> Tensor:
-    dy = model.observation(torch.ones(1, 1, model.chart.size, dtype=torch.float64), ()).event_shape[
-        0
-    ]
-    mean = model.initial(1).mean[0, :dy] if dy == 3 else 0.0
-    return mean + PhiloxStream(8, torch.arange(runs)).normal("y", steps, dy)
-
-
 @every_analysis
 @every_toy
 def test_neither_future_nor_neighbours_are_felt(
@@ -357,15 +350,6 @@ def test_an_impossible_measurement_loses_its_run_alone(analysis: EnsembleUpdate)
         assert torch.allclose(estimate.mean[r], healthy.mean[r], rtol=1e-12, atol=1e-14)
 
 
-class Fragile(LinearGaussian):
-    """A walk whose mechanisation fails far out: some members become NaN, others infinite."""
-
-    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
-        moved = super().propagate(x, u, w)
-        moved = torch.where(x[..., :1] > 2.5, torch.nan, moved)
-        return torch.where(x[..., :1] < -2.5, torch.inf, moved)
-
-
 @every_analysis
 def test_a_member_that_is_not_finite_goes_on_from_where_it_was(analysis: EnsembleUpdate) -> None:
     model = Fragile(*(getattr(WALK, k) for k in PARTS))
@@ -374,14 +358,6 @@ def test_a_member_that_is_not_finite_goes_on_from_where_it_was(analysis: Ensembl
     )
     assert not bool(estimate.lost.any())
     assert bool(torch.isfinite(estimate.mean).all())
-
-
-class Unrolled(Pendulum):
-    """The pendulum on the real line."""
-
-    @property
-    def chart(self) -> Chart:
-        return Chart((EuclideanBlock(2),))
 
 
 @every_analysis
@@ -412,14 +388,3 @@ def test_the_belief_is_a_cloud_of_equal_weights(analysis: EnsembleUpdate) -> Non
         belief, _ = method.step(WALK, belief, Record(WALK_Y[t].expand(3, -1)), draws.at_step(t + 1))
         assert isinstance(belief, ParticleBelief)
         assert torch.equal(belief.log_w, torch.full((3, 25), -math.log(25.0), dtype=torch.float64))
-
-
-@pytest.mark.parametrize(
-    "words",
-    [{"particles": 1}, {"inflation": 0.0}, {"inflation": -1.0}, {"inflation": math.nan}],
-    ids=str,
-)
-def test_ensembles_of_no_use_are_refused(words: dict[str, Any]) -> None:
-    (name, value), *_ = words.items()
-    with pytest.raises(ValueError, match=rf"filter\.{name} must be .*, got {value}"):
-        EnsembleKalmanFilter(**{"particles": 10, **words})

@@ -11,11 +11,12 @@ import oracles
 import pytest
 import torch
 from checkout import TESTS
+from model_cases import Unrolled
 from pyro.distributions import GaussianHMM, MultivariateNormal
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
-from pfbench.core.chart import Chart, EuclideanBlock, wrap_angle
+from pfbench.core.chart import wrap_angle
 from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.linear_algebra import factor
 from pfbench.core.random_stream import PhiloxStream
@@ -629,15 +630,6 @@ def test_the_unscented_kappa_of_three_less_d_matches_the_kurtosis(d: int) -> Non
     assert torch.allclose((w[:, None] * xi**4).sum(0), torch.full((d,), 3.0, dtype=torch.float64))
 
 
-def test_unscented_parameters_without_points_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"beta must be at least 0, got -1\.0\. Use 2"):
-        UnscentedPoints(beta=-1.0)
-    with pytest.raises(ValueError, match=r"alpha must be positive, got 0\.0"):
-        UnscentedPoints(0.0)
-    with pytest.raises(ValueError, match=r"kappa must be above -2, got -2\.0\. More than -d"):
-        UnscentedPoints(1.0, 2.0, -2.0)(2)
-
-
 @pytest.mark.parametrize("scheme", SCHEMES[:2], ids=str)
 def test_the_mean_of_a_cubic_is_exact(scheme: Any) -> None:
     def cubic(x: Tensor) -> tuple[Tensor, Tensor]:
@@ -712,14 +704,6 @@ def test_jacobians_are_the_analytic_ones() -> None:
 
 
 # angles
-
-
-class Unrolled(Pendulum):
-    """The pendulum on the real line."""
-
-    @property
-    def chart(self) -> Chart:
-        return Chart((EuclideanBlock(2),))
 
 
 @every_rule

@@ -106,11 +106,6 @@ def test_only_angles_count() -> None:
     assert "got" in refusal(CubaturePoints(), CHART, covariance(90.0) * (torch.arange(15) > 5))
 
 
-def test_a_limit_of_zero_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"linearisation.largest_angle must be positive, got 0"):
-        SigmaPointLinearisation(CubaturePoints(), largest_angle=0.0)
-
-
 @pytest.mark.parametrize("name", ["ckf", "ukf", "ekf", "imm", "ckf_pf"])
 def test_filters_of_sigma_points_refuse_at_their_start(name: str) -> None:
     model = job.instantiate(composed("scenario=anshun_nl").model)

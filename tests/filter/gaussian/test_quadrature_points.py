@@ -84,12 +84,3 @@ def test_level_two_is_the_unscented_transform(d: int) -> None:
         return rows[np.lexsort(rows.T)]
 
     np.testing.assert_allclose(ordered(ours), ordered(theirs), atol=1e-9)
-
-
-def test_rules_outside_of_their_range_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"points\.order must be .* at least 2, got 1"):
-        GaussHermitePoints(1)
-    with pytest.raises(ValueError, match=r"at most 20000 points, got 3\^15 .*filter=sparse_grid"):
-        GaussHermitePoints(3)(15)
-    with pytest.raises(ValueError, match=r"points\.level must be 2 or 3, got 4"):
-        SparseGridPoints(4)

@@ -778,14 +778,6 @@ def test_matching_needs_more_particles_than_states() -> None:
         )
 
 
-@pytest.mark.parametrize(
-    "options", [{"weight_model": "both"}, {"guide_state": "none"}, {"covariance_factor": 0.0}]
-)
-def test_bad_arguments_are_named(options: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=f"proposal.{next(iter(options))} must be "):
-        SharedGuideProposal(EKF, **options)
-
-
 def test_moments_of_empty_slots_are_nothing() -> None:
     """Slots without a particle have no part in the matched draws, nor in the estimate, nor in the evidence."""
     stage = SharedGuideProposal(EKF, match_moments=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -675,30 +674,6 @@ def test_worlds_that_were_learned_from_are_not_for_judging(kept: Any) -> None:
         )
         is None
     )
-
-
-@pytest.mark.parametrize(
-    ("make", "word"),
-    [
-        (
-            lambda: LearnedProposal(DiagonalNormalHead, defensive_fraction=1.0),
-            r"defensive_fraction must be in \[0, 1\), got 1\.0",
-        ),
-        (
-            lambda: LearnedProposal(DiagonalNormalHead, defensive_fraction=-0.1),
-            r"proposal\.defensive_fraction must be in \[0, 1\), got -0\.1",
-        ),
-        (
-            lambda: LearnedProposal(DiagonalNormalHead, memory=-1),
-            "memory must be at least 0, got -1",
-        ),
-        (lambda: LearnedRandomWalk(DiagonalNormalHead, lag=0), "lag must be at least 1, got 0"),
-        (lambda: LearnedRandomWalk(DiagonalNormalHead, scale=0.0), "scale must be positive, got 0"),
-    ],
-)
-def test_learned_stages_refuse_values_of_no_use(make: Callable[[], Any], word: str) -> None:
-    with pytest.raises(ValueError, match=word):
-        make()
 
 
 def test_the_stages_of_a_recipe_may_be_replaced() -> None:

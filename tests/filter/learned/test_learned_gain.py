@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from model_cases import tracker
 from torch import Tensor, nn
 from torch.distributions import Cauchy, Distribution, Independent
 
@@ -37,14 +38,6 @@ from pfbench.scenario.simulated import ModelSimulation
 LEVEL = local_level(0.5, 1.0, 0.0, 1.0)
 HEAD = partial(SkipMlp, hidden=(16,))
 NORMALISATIONS = ("length", "asinh")
-
-
-def tracker() -> LinearGaussian:
-    """Two states, each driven, two sensors."""
-    h = [[1.0, 0.0], [0.3, 1.0]]
-    return LinearGaussian(
-        [[1.0, 0.5], [0.0, 0.9]], [[0.6, 0.0], [0.2, 0.5]], h, [1.0, 0.8], [0.3, -0.2], [1.5, 1.0]
-    )
 
 
 def shaken(inputs: int, outputs: int) -> nn.Module:

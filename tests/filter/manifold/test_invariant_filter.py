@@ -150,14 +150,3 @@ def test_a_model_without_a_group_is_refused_at_the_start(message: str) -> None:
         run_filter(LEFT, model, Record(torch.zeros(1, 2, 1)), PhiloxStream(1, torch.arange(1)))
     with pytest.raises(ValueError, match=r"which has none\. Choose filter=ekf, or a scenario"):
         ChartModel(model, "left")
-
-
-def test_other_arguments_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"filter\.chart must be left or right, got up"):
-        InvariantFilter(EKF, "up")
-    with pytest.raises(ValueError, match=r"filter.filter must be GaussianFilter or ParticleFilter"):
-        InvariantFilter(LEFT)  # type: ignore[arg-type]
-    with pytest.raises(
-        ValueError, match=r"got ukf\. Select it by name as filter@filter\.filter=ukf"
-    ):
-        InvariantFilter("ukf")  # type: ignore[arg-type]

@@ -149,14 +149,6 @@ def test_a_bank_of_one_filter_is_that_filter() -> None:
     torch.testing.assert_close(bank.log_evidence, single.log_evidence)
 
 
-def test_a_bank_that_is_not_possible_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"filter\.branches must be a whole number of at least 1"):
-        FilterBank(branches=0)
+def test_a_group_that_the_model_lacks_is_refused() -> None:
     with pytest.raises(ValueError, match=r"filter\.group must be of .*, got wheel\. Choose"):
         run(FilterBank(group="wheel"))
-
-
-@pytest.mark.parametrize("overlap", [0.0, 1.0, math.nan])
-def test_the_overlap_is_a_fraction(overlap: float) -> None:
-    with pytest.raises(ValueError, match=r"filter\.overlap must be in \(0, 1\), got .* Use 0\.6"):
-        FilterBank(overlap=overlap)

@@ -11,12 +11,13 @@ import oracles
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from model_cases import Unrolled, measurements
 from pyro.distributions import Laplace, MultivariateNormal
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
 from pfbench import job
-from pfbench.core.chart import Chart, EuclideanBlock, wrap_angle
+from pfbench.core.chart import Chart, wrap_angle
 from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record, map_inputs
@@ -653,14 +654,6 @@ def test_a_quaternion_may_be_sampled_and_so_may_all_but_it() -> None:
         assert torch.allclose(ours.mean[..., :4].norm(dim=-1), torch.ones(1, dtype=torch.float64))
 
 
-class Unrolled(Pendulum):
-    """The pendulum on the real line."""
-
-    @property
-    def chart(self) -> Chart:
-        return Chart((EuclideanBlock(2),))
-
-
 @pytest.mark.parametrize("sampled", [None, ["rate"]], ids=str)
 def test_angles_that_cross_the_cut_change_nothing(sampled: list[str] | None) -> None:
     y = (
@@ -692,14 +685,6 @@ CASES: dict[str, tuple[StateSpaceModel, list[str] | None]] = {
     "lorenz": (Lorenz63(), ["x"]),
     "growth, all sampled": (UnivariateGrowth(), ["state"]),
 }
-
-
-def measurements(model: StateSpaceModel, runs: int = 4, steps: int = 8) -> Tensor:
-    dy = model.observation(torch.ones(1, 1, model.chart.size, dtype=torch.float64), ()).event_shape[
-        0
-    ]
-    mean = model.initial(1).mean[0, :dy] if dy == 3 else 0.0
-    return mean + PhiloxStream(8, torch.arange(runs)).normal("y", steps, dy)
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -1113,28 +1113,6 @@ def test_what_moves_cannot_do_without() -> None:
         filter_record(moving(MIXED), wide, WALK_Y)
 
 
-@pytest.mark.parametrize(
-    ("make", "word"),
-    [
-        (
-            lambda: MetropolisHastings(LastStateKernel(), -1),
-            "mcmc_steps must be at least 0, got -1",
-        ),
-        (lambda: RandomWalk(0.0), "scale must be positive, got 0.0"),
-        (lambda: RandomWalk(math.nan), "scale must be positive, got nan"),
-        (lambda: NoiseFlowKernel(0), "lag must be at least 1, got 0"),
-        (
-            lambda: NoiseFlowKernel(3, noise_refresh=1.0),
-            r"noise_refresh must be in \[0, 1\), got 1.0",
-        ),
-        (lambda: PathBlockKernel(-1, PriorSegment()), "block_length must be at least 0, got -1"),
-    ],
-)
-def test_values_of_no_use_are_refused(make: Callable[[], Any], word: str) -> None:
-    with pytest.raises(ValueError, match=word):
-        make()
-
-
 def test_keepers_join() -> None:
     deep = moving(
         MetropolisHastings(LastStateKernel()),

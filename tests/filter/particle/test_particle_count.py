@@ -160,20 +160,6 @@ def test_flattened_weights_keep_their_sum_and_the_lost_runs() -> None:
     assert (log_w[2] == -torch.inf).all()
 
 
-@pytest.mark.parametrize(
-    ("form", "strength"),
-    [
-        (PowerTempering, -0.1),
-        (AdditiveTempering, -1.0),
-        (UniformTempering, 1.1),
-        (UniformTempering, math.nan),
-    ],
-)
-def test_a_strength_out_of_range_is_named(form: type, strength: float) -> None:
-    with pytest.raises(ValueError, match=r"tempering\.strength must be"):
-        form(strength)
-
-
 # sizes
 
 
@@ -251,32 +237,6 @@ def test_the_number_changes_from_step_to_step_without_a_nan(preference: Auxiliar
         assert ((belief.log_w > -torch.inf) == (torch.arange(40) < wanted[:, None])).all()
         seen |= set(wanted.tolist())
     assert len(seen) > 3
-
-
-@pytest.mark.parametrize(
-    ("make", "key"),
-    [
-        (lambda: CountLimits(200, 300, 100), "minimum=200"),
-        (lambda: EssStepCount(-1), "particle_count.increment must be at least 0, got -1"),
-        (lambda: EssStepCount(ess_threshold=1.5), r"ess_threshold must be in \[0, 1\], got 1\.5"),
-        (lambda: EssTargetCount(0.0), "particle_count.target must be positive, got 0.0"),
-        (
-            lambda: ParticleFilter(50, particle_count=EssStepCount()).init(
-                WALK, 2, PhiloxStream(1, torch.arange(2))
-            ),
-            "particle_count.limits.maximum must be at most .*got 200",
-        ),
-        (
-            lambda: ParticleFilter(50, particle_count=EssTargetCount()).init(
-                WALK, 2, PhiloxStream(1, torch.arange(2))
-            ),
-            "particle_count.limits.maximum must be at most .*got 1000",
-        ),
-    ],
-)
-def test_bad_arguments_are_named(make: Any, key: str) -> None:
-    with pytest.raises(ValueError, match=key):
-        make()
 
 
 @dataclass(frozen=True)

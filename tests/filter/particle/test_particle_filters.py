@@ -12,13 +12,14 @@ import oracles
 import pytest
 import torch
 from checkout import TESTS
+from model_cases import Fragile, Unrolled, measurements
 from particle_cases import CASES, WALK, WALK_Y, Drifting, Spiky, belief, benes_case, singular_case
 from pyro.distributions import Uniform
 from scipy import stats
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
-from pfbench.core.chart import Chart, EuclideanBlock, wrap_angle
+from pfbench.core.chart import wrap_angle
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import (
@@ -421,14 +422,6 @@ def test_moves_come_after_the_refresh_and_before_the_proposal() -> None:
     assert dataclasses.replace(plain, moves=(Shift(is_exact=True),)).is_exact
 
 
-@pytest.mark.parametrize("particles", [1, 0, -5])
-def test_too_few_particles_are_refused(particles: int) -> None:
-    with pytest.raises(
-        ValueError, match=f"particles must be a whole number of at least 2, got {particles}"
-    ):
-        ParticleFilter(particles)
-
-
 def test_a_prediction_that_is_no_number_excludes_its_parent_alone() -> None:
     """As one that the measurement excludes; the other parents of the run keep their look-ahead."""
     before, seen = belief(WALK), Record(torch.full((3, 1), 0.3, dtype=torch.float64))
@@ -437,12 +430,6 @@ def test_a_prediction_that_is_no_number_excludes_its_parent_alone() -> None:
     log_a, expected = (LookAheadWeights()(WALK, before._replace(x=x), seen) for x in (failed, far))
     assert torch.equal(log_a, expected)
     assert not torch.allclose(log_a, before.log_w)
-
-
-@pytest.mark.parametrize("power", [0.0, 1.5, math.nan])
-def test_a_power_of_no_use_is_refused(power: float) -> None:
-    with pytest.raises(ValueError, match="likelihood_power"):
-        LookAheadWeights(power)
 
 
 # one run, its neighbours, its past and its future
@@ -461,14 +448,6 @@ every_toy = pytest.mark.parametrize(
     [WALK, UnivariateGrowth(), StochasticVolatility(), Benes(), Pendulum(), Lorenz63()],
     ids=lambda m: type(m).__name__,
 )
-
-
-def measurements(model: StateSpaceModel, runs: int = 4, steps: int = 8) -> Tensor:
-    dy = model.observation(torch.ones(1, 1, model.chart.size, dtype=torch.float64), ()).event_shape[
-        0
-    ]
-    mean = model.initial(1).mean[0, :dy] if dy == 3 else 0.0
-    return mean + PhiloxStream(8, torch.arange(runs)).normal("y", steps, dy)
 
 
 @every_filter
@@ -507,15 +486,6 @@ def test_an_impossible_measurement_loses_its_run_alone(method: ParticleFilter) -
     assert torch.equal(estimate.mean[1, :3], healthy.mean[1, :3])
     for r in (0, 2, 3):
         assert torch.allclose(estimate.mean[r], healthy.mean[r], rtol=1e-12, atol=1e-14)
-
-
-class Fragile(LinearGaussian):
-    """A walk whose mechanisation fails far out: some particles become NaN, others infinite."""
-
-    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
-        moved = super().propagate(x, u, w)
-        moved = torch.where(x[..., :1] > 2.5, torch.nan, moved)
-        return torch.where(x[..., :1] < -2.5, torch.inf, moved)
 
 
 @every_filter
@@ -597,14 +567,6 @@ def test_a_likelihood_to_a_power_is_that_of_larger_normal_errors() -> None:
 
 
 # angles, precision, start
-
-
-class Unrolled(Pendulum):
-    """The pendulum on the real line."""
-
-    @property
-    def chart(self) -> Chart:
-        return Chart((EuclideanBlock(2),))
 
 
 def test_angles_that_cross_the_cut_change_nothing() -> None:

@@ -200,8 +200,3 @@ def test_shifts_at_the_edge_stay_inside() -> None:
         for points in (HaltonPoints(0), SobolPoints()):
             u = points.shift_points(range(0, 2), 64, shift)
             assert bool(((u > 0.0) & (u < 1.0)).all())
-
-
-def test_a_negative_number_of_points_to_skip_is_refused() -> None:
-    with pytest.raises(ValueError, match="skip must be at least 0, got -1"):
-        HaltonPoints(-1)

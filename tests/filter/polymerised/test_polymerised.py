@@ -817,34 +817,13 @@ CLOUD, ONE = one_cloud(1)
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    ("resampler", "window", "message"),
     [
-        (
-            lambda: PolymerisedResampler(ess_threshold=1.2),
-            r"ess_threshold must be in \[0, 1\], got 1\.2",
-        ),
-        (lambda: PolymerisedResampler(axes=[0, 0]), r"axes must be .*, got \[0, 0\]"),
-        (lambda: PolymerisedResampler(axes=[]), r"axes must be .*, got \[\]"),
-        (lambda: WhitenedCells(0.0), "cell_size=0.0"),
-        (lambda: WhitenedCells(7.0), "cell_size=7.0"),
-        (lambda: AxisAlignedCells(0), "cells_per_axis must be at least 1, got 0"),
-        (lambda: ScaledCentrePlacement(1.0), r"min_scale must be in \[-1, 1\), got 1.0"),
-        (lambda: ScaledCentrePlacement(-1.5), r"min_scale must be in \[-1, 1\), got -1.5"),
-        (
-            lambda: ThompsonTaylorResampler(EssResampler(Systematic()), 1),
-            "neighbours must be at least 2, got 1",
-        ),
-        (
-            lambda: refreshed(ThompsonTaylorResampler(EssResampler(Systematic()), 401), CLOUD, ONE),
-            "neighbours must be at most .*got 401",
-        ),
-        (
-            lambda: refreshed(PolymerisedResampler(), CLOUD._replace(window={"w": CLOUD.x}), ONE),
-            "copy particles that store w",
-        ),
+        (ThompsonTaylorResampler(EssResampler(Systematic()), 401), {}, "neighbours must be at most .*got 401"),
+        (PolymerisedResampler(), {"w": CLOUD.x}, "copy particles that store w"),
     ],
-    ids=lambda v: v if isinstance(v, str) else "",
-)
-def test_what_makes_no_sense_is_refused(wrong: Any, message: str) -> None:
+    ids=["neighbours", "past"],
+)  # fmt: skip
+def test_clouds_that_do_not_fit_are_refused(resampler: Any, window: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        wrong()
+        refreshed(resampler, CLOUD._replace(window=window), ONE)

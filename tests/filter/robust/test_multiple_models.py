@@ -237,20 +237,3 @@ def test_the_nis_is_of_the_predicted_mixture() -> None:
     nis, count = info.nis()
     assert float(nis[0]) == pytest.approx(Y[0] ** 2 / s, rel=1e-10)
     assert int(count[0]) == 1
-
-
-def test_impossible_hypotheses_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"process_factors must be at least two positive"):
-        NoiseHypotheses(process_factors=(1.0,))
-    with pytest.raises(ValueError, match=r"measurement_factors must be at least two positive"):
-        NoiseHypotheses(measurement_factors=(1.0, 0.0))
-    with pytest.raises(ValueError, match=r"measurement_factors must be as many"):
-        NoiseHypotheses(measurement_factors=(1.0, 2.0, 3.0))
-    wrong = ([[0.9, 0.2], [0.5, 0.5]], [[1.1, -0.1], [0.5, 0.5]], [[1.0, 0.0]], [0.9, 0.1], 0.5)
-    for rows in wrong:
-        with pytest.raises(ValueError, match=r"transition must be 2 rows of 2 probabilities"):
-            NoiseHypotheses(transition=rows)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="one stationary distribution"):
-        NoiseHypotheses(transition=[[1.0, 0.0], [0.0, 1.0]])
-    with pytest.raises(ValueError, match="branches must be a whole number"):
-        GaussianSumFilter(branches=0)
