@@ -14,8 +14,7 @@ import sys
 
 import numpy as np
 
-from pfbench.claims.claim_list import KINDS
-from pfbench.claims.words import CONFIRMED, REFUTED, Comparison, Decision, Dot, decide_paper
+from pfbench.claims import KINDS, ClaimDecision, ClaimSample, ReadingDot, decide_paper
 
 LEVEL = 0.025  # of each error
 KINDS_IN_TURN = ("better", "much better")
@@ -23,23 +22,23 @@ KINDS_IN_TURN = ("better", "much better")
 
 def make_comparison(
     g: np.random.Generator, ratio: float, kind: str, n: int = 60, lost: float = 0.0
-) -> Comparison:
+) -> ClaimSample:
     """Draw runs of two filters with a median ratio, heavy tails, and a share of runs that either one loses."""
     b = np.exp(0.3 * g.standard_normal(n))
     a = b * np.exp(math.log(ratio) + 0.4 * g.standard_t(3, n))
     is_lost = g.random((2, n)) < lost
-    return Comparison(kind, a, b, is_lost[0], is_lost[1], np.arange(n) < n // 3)
+    return ClaimSample(kind, a, b, is_lost[0], is_lost[1], np.arange(n) < n // 3)
 
 
 def decide_edge(
     g: np.random.Generator, edge: int, claims: int = 5, readings: int = 1, lost: float = 0.0
-) -> dict[str, Decision]:
+) -> dict[str, ClaimDecision]:
     """Decide a ledger whose claims are at the edge of true (0) or of false (1) in all readings."""
     ledger = {}
     for k in range(claims):
         kind = KINDS_IN_TURN[k % len(KINDS_IN_TURN)]
         dots = {
-            f"reading {r}": Dot(
+            f"reading {r}": ReadingDot(
                 "none" if r == 0 else f"factor {r}",
                 [make_comparison(g, KINDS[kind][edge], kind, lost=lost)],
             )
@@ -53,7 +52,7 @@ def measure_rates(ledgers: int, seed: int, **settings: float) -> tuple[float, fl
     """Measure the share of ledgers with a false "confirmed", and of those with a false "refuted"."""
     g = np.random.default_rng(seed)
     counts = [0, 0]
-    for edge, word in enumerate((CONFIRMED, REFUTED)):
+    for edge, word in enumerate(("confirmed", "refuted")):
         for _ in range(ledgers):
             decisions = decide_edge(g, edge, **settings)  # type: ignore[arg-type]
             counts[edge] += any(decision.word == word for decision in decisions.values())

@@ -1,7 +1,7 @@
 """The five words on a claim over its readings, from `compare` and `decide` alone.
 
 A kind of claim is a region of the log ratio of a to b. A test of a border is the comparison of a with b times the
-border. A claim is true in a reading if all of its comparisons are, with the largest of their p-values, and false if
+border. A claim is true in a reading if all of its comparisons are, with the largest of their p-values. It is false if
 some comparison is, with the smallest p-value times their number. It is confirmed if it is true in all readings, with
 the largest p-value over them, and Holm's correction over the claims of a paper. The rules for refuted are the same.
 "It depends" needs a reading of both outcomes after Holm's correction over claims times readings.
@@ -10,7 +10,7 @@ the largest p-value over them, and Holm's correction over the claims of a paper.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -44,7 +44,7 @@ SIZE_BOUND = 2.0  # a printed ratio holds within this factor of its logarithm
 _MOST_LOST = 0.5  # share of runs that both filters lose, above which a reading cannot run
 
 
-class Comparison(NamedTuple):
+class ClaimSample(NamedTuple):
     """Values of two filters, or of a filter and a bound, in the same runs of a reading.
 
     Attributes:
@@ -65,14 +65,14 @@ class Comparison(NamedTuple):
     early: Flags
     printed: float = math.nan
 
-    def select(self, mask: Flags) -> Comparison:
+    def select(self, mask: Flags) -> ClaimSample:
         """Select runs, [n]."""
         return self._replace(**{
             name: getattr(self, name)[mask] for name in ("a", "b", "lost_a", "lost_b", "early")
         })  # fmt: skip
 
 
-class Dot(NamedTuple):
+class ReadingDot(NamedTuple):
     """A claim in a reading.
 
     Attributes:
@@ -83,11 +83,11 @@ class Dot(NamedTuple):
     """
 
     factor: str
-    comparisons: Sequence[Comparison] = ()
+    comparisons: Sequence[ClaimSample] = ()
     state: str = ""
 
 
-class Decision(NamedTuple):
+class ClaimDecision(NamedTuple):
     """Word on a claim.
 
     Attributes:
@@ -128,7 +128,7 @@ _NOTHING = Effect("claim", "border", "run", np.zeros(0), 1.0, 1.0)
 def find_borders(kind: str, printed: float = math.nan) -> tuple[_Region, _Region]:
     """Find the borders of a kind in the log ratio.
 
-    Returns low and high of the region that is true, and of the region outside of which a claim is false.
+    Returns low and high of the region that is true, and of the region that is not false.
     """
     if kind == "size":
         ends = sorted(math.log(printed) * factor for factor in (SIZE_BOUND, 1 / SIZE_BOUND))
@@ -140,7 +140,7 @@ def find_borders(kind: str, printed: float = math.nan) -> tuple[_Region, _Region
     return (-math.inf, math.log(true)), (-math.inf, math.log(false))
 
 
-def decide_paper(claims: Mapping[str, Mapping[str, Dot]]) -> dict[str, Decision]:
+def decide_paper(claims: Mapping[str, Mapping[str, ReadingDot]]) -> dict[str, ClaimDecision]:
     """Decide the claims of a paper, in one column.
 
     Args:
@@ -159,9 +159,11 @@ def decide_paper(claims: Mapping[str, Mapping[str, Dot]]) -> dict[str, Decision]
 _Look = tuple[dict[str, set[str]], dict[str, dict[str, set[str]]]]
 
 
-def _decide_look(claims: Mapping[str, Mapping[str, Dot]], is_early: bool, alpha: float) -> _Look:
+def _decide_look(
+    claims: Mapping[str, Mapping[str, ReadingDot]], is_early: bool, alpha: float
+) -> _Look:
     """Decide all claims and all readings at a look; returns the outcomes shown by claim, and by claim and reading."""
-    shown: dict[str, set[str]] = {name: set() for name in claims}
+    decided: dict[str, set[str]] = {name: set() for name in claims}
     dots_shown: dict[str, dict[str, set[str]]] = {
         name: {reading: set() for reading in dots} for name, dots in claims.items()
     }
@@ -172,22 +174,22 @@ def _decide_look(claims: Mapping[str, Mapping[str, Dot]], is_early: bool, alpha:
             for reading, dot in readings.items()
             if is_counted(dot)
         }
-        whole = {name: _hold_everywhere([e for (n, _), e in dots.items() if n == name]) for name in claims}  # fmt: skip
-        for name in _select_decided(whole, alpha):
-            shown[name].add(outcome)
+        everywhere = {name: _hold_everywhere([e for (n, _), e in dots.items() if n == name]) for name in claims}  # fmt: skip
+        for name in _select_decided(everywhere, alpha):
+            decided[name].add(outcome)
         for name, reading in _select_decided(dots, alpha):
             dots_shown[name][reading].add(outcome)
-    return shown, dots_shown
+    return decided, dots_shown
 
 
-def is_counted(dot: Dot) -> bool:
+def is_counted(dot: ReadingDot) -> bool:
     """Return whether a reading counts for the word: it can run, says something, and is not fitted to the claim."""
     if dot.state in (CANNOT_RUN, VACUOUS, NOT_COUNTED):
         return False
     return not dot.comparisons or bool(_select_informative(dot))
 
 
-def _select_informative(dot: Dot) -> list[Comparison]:
+def _select_informative(dot: ReadingDot) -> list[ClaimSample]:
     """Select the comparisons that say something: not lost on both sides, and not equal by construction."""
     return [
         c for c in dot.comparisons
@@ -195,13 +197,13 @@ def _select_informative(dot: Dot) -> list[Comparison]:
     ]  # fmt: skip
 
 
-def _is_equal(c: Comparison) -> bool:
+def _is_equal(c: ClaimSample) -> bool:
     """Return whether a and b are equal in all runs, as of two filters that are one algebraically."""
     d = compare_to_border(c, 0.0).differences
     return len(d) >= MIN_RUNS and not d.any() and not (c.lost_a | c.lost_b).any()
 
 
-def compare_to_border(c: Comparison, border: float) -> Effect:
+def compare_to_border(c: ClaimSample, border: float) -> Effect:
     """Compare the losses of a with those of b times a border of the ratio, by the comparison of all pages."""
     values = np.stack([c.a, c.b])[:, None]
     is_lost = np.stack([c.lost_a, c.lost_b])[:, None]
@@ -212,7 +214,7 @@ def compare_to_border(c: Comparison, border: float) -> Effect:
     return compare_filters(runs, losses, [("a", "b")])[0]
 
 
-def _weigh(dot: Dot, outcome: str, is_early: bool) -> _Evidence:
+def _weigh(dot: ReadingDot, outcome: str, is_early: bool) -> _Evidence:
     """Weigh the evidence of a reading for an outcome."""
     if dot.state or not dot.comparisons:
         return _Evidence(_NOTHING, is_certain=dot.state == outcome, is_excluded=dot.state == (FALSE if outcome == TRUE else TRUE))  # fmt: skip
@@ -227,7 +229,7 @@ def _weigh(dot: Dot, outcome: str, is_early: bool) -> _Evidence:
     return _hold_everywhere(tests) if outcome == TRUE else _hold_somewhere(tests)
 
 
-def _orient(c: Comparison, border: float, sign: float) -> _Evidence:
+def _orient(c: ClaimSample, border: float, sign: float) -> _Evidence:
     """Compare with a border such that "better" is the side of the sign; p is 1 on the other side."""
     effect = compare_to_border(c, border)
     d = -sign * effect.differences if sign > 0 else effect.differences
@@ -242,9 +244,9 @@ def _orient(c: Comparison, border: float, sign: float) -> _Evidence:
 
 def _hold_everywhere(parts: Sequence[_Evidence]) -> _Evidence:
     """Combine evidence for an outcome that all parts must have: the largest p-values."""
-    if not parts or any(part.is_excluded for part in parts):
+    if not parts or any(item.is_excluded for item in parts):
         return _Evidence(_NOTHING, is_excluded=bool(parts))
-    tested = [part.effect for part in parts if not part.is_certain]
+    tested = [item.effect for item in parts if not item.is_certain]
     if not tested:
         return parts[0]
     weakest = max(tested, key=lambda e: max(e.p, e.p_trimmed))
@@ -254,19 +256,19 @@ def _hold_everywhere(parts: Sequence[_Evidence]) -> _Evidence:
 
 def _hold_somewhere(parts: Sequence[_Evidence]) -> _Evidence:
     """Combine evidence for an outcome that one part may have: the smallest p-values times the number of parts."""
-    if any(part.is_certain for part in parts):
-        return next(part for part in parts if part.is_certain)
-    if not parts or all(part.is_excluded for part in parts):
+    if any(item.is_certain for item in parts):
+        return next(item for item in parts if item.is_certain)
+    if not parts or all(item.is_excluded for item in parts):
         return _Evidence(_NOTHING, is_excluded=bool(parts))
-    strongest = min((part.effect for part in parts), key=lambda e: max(e.p, e.p_trimmed))
+    strongest = min((item.effect for item in parts), key=lambda e: max(e.p, e.p_trimmed))
     p, p_trimmed = (min(1.0, len(parts) * p) for p in (strongest.p, strongest.p_trimmed))
     return _Evidence(strongest._replace(p=p, p_trimmed=p_trimmed))
 
 
 def _select_decided(evidence: Mapping[_Key, _Evidence], alpha: float) -> list[_Key]:
     """Select what is shown: certain, or decided by the verdicts of one family."""
-    tested = {key: part for key, part in evidence.items() if not part.is_certain}
-    verdicts = decide([part.effect for part in tested.values()], margin=0.0, alpha=alpha)
+    tested = {key: item for key, item in evidence.items() if not item.is_certain}
+    verdicts = decide([item.effect for item in tested.values()], margin=0.0, alpha=alpha)
     better = {
         key for key, verdict in zip(tested, verdicts, strict=True) if verdict.word == BETTER_THAN
     }
@@ -274,42 +276,42 @@ def _select_decided(evidence: Mapping[_Key, _Evidence], alpha: float) -> list[_K
 
 
 def _conclude(
-    dots: Mapping[str, Dot], looks: Sequence[tuple[set[str], Mapping[str, set[str]]]]
-) -> Decision:
+    dots: Mapping[str, ReadingDot], looks: Sequence[tuple[set[str], Mapping[str, set[str]]]]
+) -> ClaimDecision:
     """Conclude on a claim from both looks."""
-    shown = set().union(*(look[0] for look in looks))
+    decided = set().union(*(look[0] for look in looks))
     outcomes = {
         reading: _name_outcome(dot, set().union(*(look[1][reading] for look in looks)))
         for reading, dot in dots.items()
     }
     counted = [reading for reading, dot in dots.items() if is_counted(dot)]
-    if len(shown) == 1:  # what holds in all readings holds in each of them
-        outcomes |= dict.fromkeys(counted, next(iter(shown)))
-    central = _describe_central(next(iter(dots.values()), Dot("none")))
+    if len(decided) == 1:  # what holds in all readings holds in each of them
+        outcomes |= dict.fromkeys(counted, next(iter(decided)))
+    central = _describe_central(next(iter(dots.values()), ReadingDot("none")))
     if not counted:
-        return Decision(UNTESTABLE, (), outcomes, *central)
-    if len(shown) == 1:
-        return Decision(CONFIRMED if shown == {TRUE} else REFUTED, (), outcomes, *central)
+        return ClaimDecision(UNTESTABLE, (), outcomes, *central)
+    if len(decided) == 1:
+        return ClaimDecision(CONFIRMED if decided == {TRUE} else REFUTED, (), outcomes, *central)
     if {TRUE, FALSE} <= set(outcomes.values()):
-        return Decision(DEPENDS, _find_factors(dots, outcomes), outcomes, *central)
-    return Decision(OPEN, (), outcomes, *central)
+        return ClaimDecision(DEPENDS, _find_factors(dots, outcomes), outcomes, *central)
+    return ClaimDecision(OPEN, (), outcomes, *central)
 
 
-def _name_outcome(dot: Dot, shown: set[str]) -> str:
+def _name_outcome(dot: ReadingDot, decided: set[str]) -> str:
     """Name the outcome of a reading; open if both looks differ."""
     if not is_counted(dot):
         return dot.state or (CANNOT_RUN if _is_lost(dot) else VACUOUS)
-    if len(shown) == 1:
-        return next(iter(shown))
+    if len(decided) == 1:
+        return next(iter(decided))
     return UNDECIDED if dot.comparisons else NOT_RUN
 
 
-def _is_lost(dot: Dot) -> bool:
+def _is_lost(dot: ReadingDot) -> bool:
     """Return whether both filters lose most runs of a comparison."""
     return any((c.lost_a & c.lost_b).mean() > _MOST_LOST for c in dot.comparisons)
 
 
-def _find_factors(dots: Mapping[str, Dot], outcomes: Mapping[str, str]) -> tuple[str, ...]:
+def _find_factors(dots: Mapping[str, ReadingDot], outcomes: Mapping[str, str]) -> tuple[str, ...]:
     """Find the factors whose levels turn the outcome of the central reading; of all decided levels if it is open."""
     central = next(iter(outcomes.values()))
     turned = {TRUE: (FALSE,), FALSE: (TRUE,)}.get(central, (TRUE, FALSE))
@@ -317,13 +319,13 @@ def _find_factors(dots: Mapping[str, Dot], outcomes: Mapping[str, str]) -> tuple
     return tuple(dict.fromkeys(name for name in names if name != "none"))
 
 
-def _describe_central(dot: Dot) -> tuple[float, float, float, int, float]:
+def _describe_central(dot: ReadingDot) -> tuple[float, float, float, int, float]:
     """Describe the comparison of a reading that is closest to turn the claim: ratio, interval, runs and order."""
     options = [_describe(c) for c in dot.comparisons if len(c.a)]
     return max(options, key=lambda row: row[0])[1] if options else (math.nan,) * 3 + (0, math.nan)
 
 
-def _describe(c: Comparison) -> tuple[float, tuple[float, float, float, int, float]]:
+def _describe(c: ClaimSample) -> tuple[float, tuple[float, float, float, int, float]]:
     """Return how close a comparison is to its border, and ratio, interval, runs and share of runs with a smaller."""
     effect = compare_to_border(c, 0.0)
     location, low, high = effect.estimate(ALPHA)
@@ -331,9 +333,3 @@ def _describe(c: Comparison) -> tuple[float, tuple[float, float, float, int, flo
     nearness = max(location - true_high, true_low - location)
     order = float((effect.differences < 0).mean())
     return nearness, (math.exp(location), math.exp(low), math.exp(high), len(effect.differences), order)  # fmt: skip
-
-
-def count_words(decisions: Iterable[Decision]) -> dict[str, int]:
-    """Count decisions by word."""
-    words = [decision.word for decision in decisions]
-    return {word: words.count(word) for word in WORDS}
