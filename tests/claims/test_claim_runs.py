@@ -241,8 +241,8 @@ def test_cells_are_verified_by_a_seed_at_least_three_a_paper() -> None:
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a cell of paper 001 have twelve runs."""
     settings = {k: {**v, "runs": {"screen": 12, "centre": 14, "mover": 2}} for k, v in read_paper_settings().items()}  # fmt: skip
-    monkeypatch.setattr(claim_lines, "read_settings", lambda: settings)
-    monkeypatch.setattr(claim_runs, "read_settings", lambda: settings)
+    monkeypatch.setattr(claim_lines, "read_paper_settings", lambda: settings)
+    monkeypatch.setattr(claim_runs, "read_paper_settings", lambda: settings)
 
 
 @pytest.mark.slow
