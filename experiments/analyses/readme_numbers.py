@@ -21,7 +21,6 @@ from typing import Any
 
 import yaml
 
-from pfbench.claims import read_claims
 from pfbench.files import markdown_bullets
 from pfbench.report import read_stored_study
 
@@ -152,11 +151,16 @@ def board_table(study: str) -> str:
     return f"{table}{describe_knobs(study)}"
 
 
+def read_old_claims() -> list[dict[str, Any]]:
+    """Read the claims of version 1 of the ledger."""
+    return json.loads((TOP / "reports/claims/verdicts.json").read_text())  # type: ignore[no-any-return]
+
+
 def claims() -> str:
     """Verdicts by paper, counted in verdicts.json. Circular and vacuous claims are undecided."""
-    marked = {claim.id for claim in read_claims() if claim.mark[0]}
     titles = [row["paper"] for row in read_table("reports/claims/report.md")][:-1]
-    records = json.loads((TOP / "reports/claims/verdicts.json").read_text())
+    records = read_old_claims()
+    marked = {record["id"] for record in records if record["reason"] in ("circular", "vacuous")}
     papers = sorted({record["paper"] for record in records})
     verdicts = (
         "reproduced",
@@ -384,10 +388,11 @@ def contents() -> str:
     def count(group: str) -> int:
         return len(list((TOP / "conf" / group).glob("*.yaml")))
 
-    papers = len({claim.paper for claim in read_claims()})
+    ledger = read_old_claims()
+    papers = len({claim["paper"] for claim in ledger})
     return "\n".join(markdown_bullets(
         f"{count('filter')} filters and forms of filters: Kalman, particle, guided, swarm, robust, adaptive, smoothing and learned ones.",
-        f"Seven methods of {papers} papers, literal, as printed and as repaired, with {len(read_claims())} claims decided.",
+        f"Seven methods of {papers} papers, literal, as printed and as repaired, with {len(ledger)} claims decided.",
         f"{count('scenario')} scenarios, simulated and recorded, {count('model')} models and {count('noise')} noise regimes; own ones are one class.",
         "All Monte Carlo runs of a job are one tensor axis; each random number is a function of seed, run, step and use.",
         "Better, equal, worse or not decided: each word has a simulated error rate, and a lost run deletes no filter.",

@@ -12,7 +12,6 @@ from typing import Any
 
 import pytest
 
-from pfbench import job
 from pfbench.claims import page as claims_page
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -58,16 +57,13 @@ addEventListener("load", () => {
 </script>
 """
 CLAIMS = """(facts) => {
-  const shown = () => [...document.querySelectorAll("tr[data-verdict]")].filter((row) => !row.hidden);
-  const find = document.getElementById("find"), which = document.getElementById("which");
-  facts.all = shown().length;
-  find.value = "002-1";
-  find.dispatchEvent(new Event("input"));
-  facts.words = shown().map((row) => row.id);
-  find.value = "";
-  which.value = "reproduced";
-  which.dispatchEvent(new Event("change"));
-  facts.verdicts = shown().map((row) => row.dataset.verdict);
+  facts.squares = document.querySelectorAll(".board a.square").length;
+  const block = document.getElementById("003-C10");
+  facts.folded = [...document.querySelectorAll("details")].filter((one) => one.open).length;
+  location.hash = "#003-C10";
+  dispatchEvent(new HashChangeEvent("hashchange"));
+  facts.unfolded = block.open && block.parentElement.open;
+  facts.wide = document.documentElement.scrollWidth > innerWidth;
 }"""
 
 
@@ -122,12 +118,13 @@ def facts(made: Path, action: str, dark: bool, width: int = 1280) -> dict[str, A
     return json.loads(html.unescape(said[1]))
 
 
-def test_the_ledger_opens_and_its_filters_filter(tmp_path: Path) -> None:
-    places = tmp_path / "none", tmp_path / "reports", 0.05, job.conf_dir(), job.experiments_dir()
-    made = claims_page.write_claims(*places, formats=("png",))
-    found = facts(made, CLAIMS, dark=False)
+@pytest.mark.parametrize("width", [390, 1440])
+def test_the_page_of_claims_is_a_picture_whose_squares_unfold(tmp_path: Path, width: int) -> None:
+    made = claims_page.write_claims(tmp_path / "none", tmp_path / "reports")
+    found = facts(made, CLAIMS, dark=width == 390, width=width)
     assert found["noted"] == found["resources"] == []
     assert found["anchors"] == 0
-    assert found["all"] == 71
-    assert found["words"] == [f"002-{k}" for k in range(10, 20)]
-    assert found["verdicts"] == ["reproduced"] * 2  # what tests of the package show; nothing ran
+    assert found["squares"] == 88
+    assert found["folded"] == 0
+    assert found["unfolded"]
+    assert not found["wide"]

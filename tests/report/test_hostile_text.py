@@ -12,8 +12,7 @@ import synthetic_results as synthetic
 from escape_cases import HOSTILE, faults_of_folder, find_faults
 from hostile_report import disguise, write_hostile_report
 
-from pfbench import job
-from pfbench.claims import claim_records, page as claims_page
+from pfbench.claims import claim_lines, page as claims_page
 from pfbench.report import datasheet
 from pfbench.results import store
 
@@ -54,10 +53,11 @@ def test_datasheet(tmp_path: Path) -> None:
 
 
 def test_claims(tmp_path: Path) -> None:
-    claims = claim_records.read_claims(job.conf_dir(), job.experiments_dir())[:12]
-    texts = dict.fromkeys(("claim", "source", "printed", "note"), HOSTILE)
-    hostile = [replace(claim, **texts) for claim in claims]
-    with mock.patch.object(claims_page, "read_claims", return_value=hostile):
-        made = claims_page.write_claims(tmp_path, tmp_path / "reports", formats=("svg",)).parent
+    texts = dict.fromkeys(("words", "section", "printed", "figure", "mark"), HOSTILE)
+    hostile = [
+        plan._replace(claim=replace(plan.claim, **texts)) for plan in claim_lines.read_plans()
+    ]
+    with mock.patch.object(claims_page, "read_plans", return_value=hostile):
+        made = claims_page.write_claims(tmp_path, tmp_path / "reports").parent
     assert faults_of_folder(made) == {}
     assert "onerror" in (made / "report.md").read_text()

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from command_line import pfbench
 
-from pfbench.claims import claim_records, page as claims_page
+from pfbench.claims import page as claims_page
 from pfbench.report import study_report
 
 
@@ -66,19 +66,18 @@ def test_what_has_results_is_made_again_and_what_has_none_stays(
     assert {options.alpha for options in made.values()} == {0.01}
     assert "paper_001: the published report is unchanged" in said.out
     assert "pfbench run -m +experiment=paper_001" in said.out
-    studies = sorted({study for claim in claim_records.read_claims() for study in claim.studies})
-    assert f"holds no results of {', '.join(studies)}. Next: make studies" in said.out
-    there(tmp_path, *(f"results/{study}/a.npz" for study in studies[1:]))
-    assert f"holds no results of {studies[0]}." in pfbench("report", "all", home=tmp_path).out
-    there(tmp_path, f"results/{studies[0]}/a.npz")
+    assert "holds no runs of claims. Next: pfbench claims run" in said.out
+    there(tmp_path, "results/claims_2/a.npz", "results/claims_2/a.values.json")
     assert pfbench("report", "all", home=tmp_path).code == 0
-    assert list(made)[-1] == "claims"  # after the pages that it links to
+    assert list(made)[-1] == "claims"  # and no study of this name
+    assert "claims_2" not in made
 
 
 def test_a_page_alone_is_published_too_and_a_first_ledger_is_written_of_what_there_is(
     made: dict[str, Any], tmp_path: Path
 ) -> None:
     there(tmp_path, "results/paper_001/a.npz", "reports/all_seven/index.html")
+    there(tmp_path, "reports/claims_2/index.html")
     said = pfbench("report", "all", home=tmp_path)
     assert "all_seven: the published report is unchanged" in said.out
     assert list(made) == ["paper_001", "claims"]

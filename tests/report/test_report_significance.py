@@ -1,4 +1,4 @@
-"""Statistics of the claims: Wilcoxon's test, Holm's correction and log ratios against other implementations."""
+"""Statistics: Wilcoxon's test, Holm's correction and log ratios against other implementations."""
 
 import numpy as np
 import pytest

@@ -1,0 +1,266 @@
+"""Lines of each claim: comparisons of filters in the readings of its paper, read from claim_lines.yaml."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from pfbench.claims.claim_list import PrintedClaim, read_printed_claims
+from pfbench.claims.measures import Measure
+from pfbench.results.paper_block import conf_dir
+
+_DATA = Path(__file__).with_name("claim_lines.yaml")
+CENTRAL_READING = "central"
+PUBLISHED, REPAIRED = "published", "repaired"
+COLUMNS = (PUBLISHED, REPAIRED)
+DIRECTION_PART, SIZE_PART = "direction", "size"
+TIMING = "seconds_per_step"
+METHOD = "method"
+_KEYS = {
+    *("compare", "windows", "toy", "method", "word", "why", "proved"),
+}
+_SIDE_KEYS = {"metric": "metric", "group": "group", "component": "component", "from": "start", "to": "end", "settled": "settled"}  # fmt: skip
+_LISTS = ("a", "b", "group", "component", "metric", "settled", "worlds")
+_ENTRY_KEYS = {*_SIDE_KEYS, *(f"b_{key}" for key in _SIDE_KEYS), *_LISTS, "printed", "level", "form", "pairs", "rows"}  # fmt: skip
+
+
+class Side(NamedTuple):
+    """Side of a comparison: a filter with settings and words of its own, or a number.
+
+    Attributes:
+        measure: Quantity.
+        filter: Name of the filter; empty for a number.
+        words: Words of its jobs beyond those of the reading.
+        number: Value of a number.
+    """
+
+    measure: Measure
+    filter: str = ""
+    words: tuple[str, ...] = ()
+    number: float = math.nan
+
+
+class LineComparison(NamedTuple):
+    """Comparison of a claim in which a is the smaller side.
+
+    Attributes:
+        kind: Kind, as of `words.Comparison`.
+        a: Smaller side.
+        b: Larger side.
+        printed: Printed ratio, of the kind "size".
+    """
+
+    kind: str
+    a: Side
+    b: Side
+    printed: float = math.nan
+
+
+class Reading(NamedTuple):
+    """Reading of a paper.
+
+    Attributes:
+        name: Name of the file.
+        factor: Factor; "none" for the central reading.
+        grade: Class: printed, cited, ours or fitted.
+        why: Reason.
+        text: First line of the file.
+        filters: Filters that it sets; None if it sets the world, so that it concerns all of them.
+    """
+
+    name: str
+    factor: str
+    grade: str
+    reason: str
+    text: str
+    filters: tuple[str, ...] | None
+
+
+class ClaimPlan(NamedTuple):
+    """Claim with the comparisons that decide it.
+
+    Attributes:
+        claim: Claim.
+        parts: Comparisons by column and part, "direction" or "size".
+        windows: First and last time by name; the first is central. Empty for the times of the measures.
+        toy: Words of a world without readings; empty for the worlds of the paper.
+        word: Word without runs; empty where runs decide.
+        why: Reason of that word.
+        proved: Outcome of a proof in all readings but those of `but`; empty without.
+        but: Factors whose readings run although there is a proof.
+    """
+
+    claim: PrintedClaim
+    parts: Mapping[tuple[str, str], tuple[LineComparison, ...]]
+    windows: Mapping[str, tuple[float, float]]
+    toy: tuple[str, ...] = ()
+    word: str = ""
+    reason: str = ""
+    proved: str = ""
+    but: tuple[str, ...] = ()
+
+
+@cache
+def read_paper_settings() -> Mapping[str, Mapping[str, Any]]:
+    """Read the settings of each paper: forms, numbers of runs, prices, and filters of single readings."""
+    return yaml.safe_load(_DATA.read_text(encoding="utf-8"))["papers"]
+
+
+@cache
+def read_seven() -> Sequence[Mapping[str, str]]:
+    """Read the seven methods: name, filter, the claim that it beats its own baseline, and a description."""
+    return yaml.safe_load(_DATA.read_text(encoding="utf-8"))["seven"]
+
+
+@cache
+def read_readings(paper: str) -> Mapping[str, Reading]:
+    """Read the readings of a paper by name, the central one first."""
+    entries_read = {}
+    for path in sorted((conf_dir() / "reading" / f"paper_{paper}").glob("*.yaml")):
+        text = path.read_text(encoding="utf-8")
+        content = yaml.safe_load(text)
+        stated = content["reading"][paper]
+        sets_world = (
+            path.stem == CENTRAL_READING or len(content) > 2 or len(content["defaults"]) > 2
+        )
+        filters = None if sets_world else tuple(stated.get("filters", ()))
+        line = next(row for row in text.splitlines() if row.startswith("# ") and "@" not in row)
+        row = (stated["factor"], stated["class"], stated["why"], line.removeprefix("# "))
+        entries_read[path.stem] = Reading(path.stem, *row, filters)
+    return {CENTRAL_READING: entries_read[CENTRAL_READING], **entries_read}
+
+
+def read_plans(path: Path = _DATA) -> list[ClaimPlan]:
+    """Read what decides each of the 88 claims, in their order.
+
+    Raises ValueError if the entry of a claim is missing, or has other keys.
+    """
+    entries = yaml.safe_load(path.read_text(encoding="utf-8"))["claims"]
+    claims = read_printed_claims()
+    if set(entries) != {claim.id for claim in claims}:
+        wrong = sorted(set(entries) ^ {claim.id for claim in claims})
+        raise ValueError(
+            f"{path.name}: claims must be those of claims_2.yaml, got or missing {wrong}. Correct them."
+        )
+    return [_parse_plan(path, claim, entries[claim.id]) for claim in claims]
+
+
+def _parse_plan(path: Path, claim: PrintedClaim, entry: Mapping[str, Any]) -> ClaimPlan:
+    """Parse the entry of a claim."""
+    rows = entry.get("compare", ())
+    wrong = sorted({*entry} - _KEYS) + sorted({key for row in rows for key in row} - _ENTRY_KEYS)
+    if wrong or bool(rows) == ("word" in entry):
+        raise ValueError(
+            f"{path.name}: {claim.id} must have comparisons or a word, and other keys, got {wrong or sorted(entry)}. "
+            "Correct them."
+        )
+    forms = entry.get("method", read_paper_settings()[claim.paper]["method"])
+    has_forms = METHOD in str(rows) or "form" in str(rows)
+    parts: dict[tuple[str, str], tuple[LineComparison, ...]] = {}
+    for column in COLUMNS if has_forms else (PUBLISHED,):
+        entries_read = [
+            item for row in rows if row.get("form", column) == column
+            for item in _expand(claim, row, forms[column])
+        ]  # fmt: skip
+        for portion in (DIRECTION_PART, SIZE_PART):
+            members = tuple(item for name, item in entries_read if name == portion)
+            parts |= {(column, portion): members} if members else {}
+    windows = {name: (float(a), float(b)) for name, (a, b) in entry.get("windows", {}).items()}
+    proved = entry.get("proved", {"outcome": "", "but": ()})
+    texts = (tuple(entry.get("toy", ())), entry.get("word", ""), entry.get("why", ""))
+    return ClaimPlan(claim, parts, windows, *texts, proved["outcome"], tuple(proved["but"]))
+
+
+def _expand(
+    claim: PrintedClaim, row: Mapping[str, Any], method: str
+) -> Iterator[tuple[str, LineComparison]]:
+    """Yield part and comparison of all values of an entry."""
+    for more in row.get("rows", ({},)):
+        merged = {**row, **more}
+        if "pairs" in merged:
+            alternatives = [{"a": a, "b": b} for a, b in merged["pairs"]]
+        else:
+            alternatives = [{}]
+        for choice in alternatives:
+            full = {**merged, **choice}
+            lists = {key: full[key] for key in _LISTS if isinstance(full.get(key), list)}
+            for values in product(*lists.values()):
+                single = {**full, **dict(zip(lists, values, strict=True))}
+                yield from _parse_comparison(claim, single, method)
+
+
+def _parse_comparison(
+    claim: PrintedClaim, row: Mapping[str, Any], method: str
+) -> Iterator[tuple[str, LineComparison]]:
+    """Yield the direction of an entry, and its size if a number is printed."""
+    keys = {name: row[key] for key, name in _SIDE_KEYS.items() if key in row}
+    of_b = {name: row[f"b_{key}"] for key, name in _SIDE_KEYS.items() if f"b_{key}" in row}
+    world = (row["worlds"],) if "worlds" in row else ()
+    a = _parse_side(row["a"], _make_measure(keys), method, world)
+    b = _parse_side(row["b"], _make_measure({**keys, **of_b}), method, world)
+    if row.get("level"):
+        yield SIZE_PART, LineComparison("level", a, b)
+        return
+    kind = "better" if claim.kind == "number" else claim.kind
+    yield DIRECTION_PART, LineComparison(kind, a, b)
+    if "printed" in row:
+        yield SIZE_PART, LineComparison("size", a, b, float(row["printed"]))
+
+
+def _make_measure(keys: Mapping[str, Any]) -> Measure:
+    """Make a measure with numbers as floats."""
+    numbers: dict[str, Any] = {k: float(keys[k]) for k in ("start", "end", "settled") if k in keys}
+    return Measure(**{**keys, **numbers})
+
+
+def _parse_side(text: Any, measure: Measure, method: str, world: tuple[str, ...]) -> Side:
+    """Parse a side: a number, or a filter with settings in brackets and words after @."""
+    if not isinstance(text, str):
+        return Side(measure, number=float(text))
+    head, *words = text.split(" @")
+    name, _, settings = head.removesuffix("]").partition("[") if "[" in head else (head, "", "")
+    pairs = tuple(f"filter.{setting}" for setting in settings.split(",") if setting)
+    name = method if name == METHOD else name
+    return Side(measure, name, (*pairs, *words, *world))
+
+
+def list_dots(plan: ClaimPlan) -> dict[str, tuple[str, str]]:
+    """List the readings of a claim: reading and window by name, the central one first.
+
+    A window is a factor of the central reading that takes no runs of its own.
+    """
+    if plan.toy:
+        return {CENTRAL_READING: (CENTRAL_READING, "")}
+    first = next(iter(plan.windows), "")
+    readings = read_readings(plan.claim.paper).values()
+    names = [CENTRAL_READING, *(r.name for r in readings if r.factor in plan.claim.factors)]
+    others = {f"window {name}": (CENTRAL_READING, name) for name in list(plan.windows)[1:]}
+    return {name: (name, first) for name in names} | others
+
+
+def make_cell(plan: ClaimPlan, reading: str, side: Side) -> tuple[str, ...]:
+    """Make the words of the jobs of a side in a reading, without seed, runs and folder."""
+    paper = plan.claim.paper
+    if plan.toy:
+        return (*plan.toy, f"filter={side.filter}", *side.words)
+    settings = read_paper_settings()[paper]
+    limits: Mapping[str, Sequence[str]] = settings.get("only", {})
+    concerned = read_readings(paper)[reading].filters
+    if side.filter not in limits.get(reading, concerned or (side.filter,)):
+        reading = CENTRAL_READING  # the same job
+    name = settings.get("instead", {}).get(reading, {}).get(side.filter, side.filter)
+    return (f"reading/{paper}={reading}", f"filter={name}", *side.words)
+
+
+def apply_window(measure: Measure, window: tuple[float, float] | None) -> Measure:
+    """Replace the times of a measure by those of a window."""
+    if window is None:
+        return measure
+    return replace(measure, start=window[0], end=window[1])

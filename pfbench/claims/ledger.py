@@ -1,0 +1,207 @@
+"""The ledger: the word on each claim in both columns, what turns it, and the price of the runs that it lacks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import yaml
+
+from pfbench.claims.claim_lines import (
+    COLUMNS,
+    DIRECTION_PART,
+    PUBLISHED,
+    REPAIRED,
+    SIZE_PART,
+    ClaimPlan,
+    list_dots,
+    read_paper_settings,
+    read_readings,
+)
+from pfbench.claims.claim_list import KINDS, find_tipping_bound
+from pfbench.claims.run_claims import Decisions
+from pfbench.claims.words import (
+    CONFIRMED,
+    DEPENDS,
+    NOT_RUN,
+    OPEN,
+    REFUTED,
+    UNDECIDED,
+    ClaimDecision,
+)
+from pfbench.results.paper_block import conf_dir
+
+_OLD = Path(__file__).with_name("ledger_1.yaml")
+_KIND_TEXTS = {
+    "better": "a smaller figure than the other one",
+    "much better": "a figure at least a fifth smaller",
+    "same": "figures within 10 %",
+    "number": "a printed number",
+}
+
+
+class ClaimWord(NamedTuple):
+    """Word on a claim.
+
+    Attributes:
+        plan: Claim and what decides it.
+        word: Word as published.
+        why: Reason in words; empty for a word that runs give.
+        repaired: Word for our repair; empty if the claim is about no repaired form.
+        size: Word on the printed number; empty if the claim has a direction only, or a number only.
+        factors: Factors on which it depends.
+        decision: Decision by runs; None for a word without.
+    """
+
+    plan: ClaimPlan
+    word: str
+    reason: str
+    repaired: str
+    size: str
+    factors: tuple[str, ...]
+    decision: ClaimDecision | None
+
+    @property
+    def label(self) -> str:
+        """Word with the factors on which it depends."""
+        return f"{DEPENDS} on {', '.join(self.factors)}" if self.word == DEPENDS else self.word
+
+
+def conclude(plan: ClaimPlan, decisions: Decisions) -> ClaimWord:
+    """Conclude on a claim from its decisions, or from what decides it without runs."""
+    if plan.word:
+        return ClaimWord(plan, plan.word, plan.reason, "", "", (), None)
+    by_part = {
+        (column, portion): decisions[plan.claim.id, column, portion]
+        for column, portion in plan.parts
+    }
+    main = {column: _choose_part(by_part, column) for column in COLUMNS}
+    published, repaired = main[PUBLISHED], main[REPAIRED]
+    assert published is not None  # each claim has a published column
+    size = by_part.get((PUBLISHED, SIZE_PART))
+    has_both = size is not None and (PUBLISHED, DIRECTION_PART) in by_part
+    return ClaimWord(
+        plan,
+        published.word,
+        _explain(plan, published),
+        repaired.word if repaired else "",
+        size.word if size is not None and has_both else "",
+        published.factors,
+        published,
+    )
+
+
+def _choose_part(
+    by_part: Mapping[tuple[str, str], ClaimDecision], column: str
+) -> ClaimDecision | None:
+    """Choose the decision of a column: that of the direction, else that of the number."""
+    return by_part.get((column, DIRECTION_PART)) or by_part.get((column, SIZE_PART))
+
+
+def _explain(plan: ClaimPlan, decision: ClaimDecision) -> str:
+    """Explain a word that runs do not give, or not alone."""
+    outcomes = list(decision.outcomes.values())
+    missing = outcomes.count(NOT_RUN)
+    if decision.word == OPEN and missing:
+        has_runs = decision.runs or UNDECIDED in outcomes
+        return f"{missing} of {len(outcomes)} readings not run" if has_runs else NOT_RUN
+    return f"proof {plan.claim.proof}" if plan.proved and not decision.runs else ""
+
+
+def describe_tip(line: ClaimWord) -> str:
+    """Describe where the word would turn: the bound of the ratio of a to b."""
+    decision = line.decision
+    if (
+        decision is None
+        or not decision.runs
+        or not math.isfinite(decision.high)
+        or decision.low <= 0
+    ):
+        return ""
+    kind = line.plan.claim.kind
+    bound = find_tipping_bound(kind, decision.low, decision.high)
+    return f"true with every bound of the ratio above {bound:.3g}; the bound is {KINDS[kind][0]:g}"
+
+
+def describe_turns(line: ClaimWord) -> list[str]:
+    """Describe the readings that differ from the central one."""
+    if line.decision is None:
+        return []
+    outcomes = dict(line.decision.outcomes)
+    first = next(iter(outcomes.values()))
+    readings = read_readings(line.plan.claim.paper)
+    return [
+        f"{readings[name].text.rstrip('.') if name in readings else name}: {outcome}"
+        for name, outcome in outcomes.items()
+        if outcome != first and outcome not in (NOT_RUN, OPEN)
+    ]
+
+
+def describe_kind(plan: ClaimPlan) -> str:
+    """Describe what a claim must show."""
+    return _KIND_TEXTS[plan.claim.kind]
+
+
+def list_choices(plan: ClaimPlan) -> list[str]:
+    """List the choices of this project that enter a claim: completions of the central reading, and own levels."""
+    paper = plan.claim.paper
+    if plan.toy:
+        return ["a world of this project: " + ", ".join(plan.toy)]
+    path = conf_dir() / "reading" / f"paper_{paper}" / "central.yaml"
+    stated = yaml.safe_load(path.read_text(encoding="utf-8"))["reading"][paper]
+    completed = [entry["why"] for entry in stated.get("completions", ())]
+    names = [name for name, _ in list_dots(plan).values() if name in read_readings(paper)]
+    ours = [read_readings(paper)[name] for name in dict.fromkeys(names)]
+    return [*completed, *(f"{r.text} {r.reason}" for r in ours if r.grade in ("ours", "fitted"))]
+
+
+class OldClaim(NamedTuple):
+    """Verdict of version 1 of the ledger, and the word of this one.
+
+    Attributes:
+        id: Claim; version 1 has the same ids.
+        verdict: Verdict of version 1.
+        word: Word now.
+        turned: What turned: "yes", "no", "open now" or "was open".
+    """
+
+    id: str
+    verdict: str
+    word: str
+    turned: str
+
+
+_AGREES = {"reproduced": CONFIRMED, "reproduced only as printed": CONFIRMED, "not reproduced": REFUTED, "reproduced only as repaired": REFUTED}  # fmt: skip
+
+
+def compare_versions(lines: Sequence[ClaimWord]) -> list[OldClaim]:
+    """Compare the 71 verdicts of version 1 with the words of this one."""
+    old: Mapping[str, str] = yaml.safe_load(_OLD.read_text(encoding="utf-8"))
+    words = {line.plan.claim.id: line for line in lines}
+    return [
+        OldClaim(name, verdict, words[name].label, _compare_word(verdict, words[name].word))
+        for name, verdict in old.items()
+    ]
+
+
+def _compare_word(verdict: str, word: str) -> str:
+    """Compare a verdict of version 1 with a word: only as repaired is refuted as published."""
+    if word == OPEN:
+        return "open now"
+    if verdict not in _AGREES:
+        return "was open"
+    return "no" if _AGREES[verdict] == word else "yes"
+
+
+def count_by_paper(lines: Sequence[ClaimWord]) -> dict[str, dict[str, int]]:
+    """Count the words of each paper."""
+    papers = read_paper_settings()
+    return {
+        paper: {
+            word: sum(line.word == word and line.plan.claim.paper == paper for line in lines)
+            for word in ("confirmed", "refuted", "depends", "untestable", "open")
+        }
+        for paper in papers
+    }

@@ -1,0 +1,352 @@
+"""Runs of claims: the cheapest undecided claim first, in jobs that `pfbench run` would write under the same keys."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import random
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pfbench.claims.claim_lines import TIMING, ClaimPlan, list_dots, read_paper_settings
+from pfbench.claims.claim_runs import (
+    CENTRE,
+    CLAIMS_STUDY,
+    MOVER,
+    SCREEN,
+    Batch,
+    Cell,
+    ClaimRuns,
+    StoredValues,
+    estimate_seconds,
+    list_batches,
+    list_claim_cells,
+    list_dot_cells,
+    name_timing,
+    write_values,
+)
+from pfbench.claims.measures import Measure, measure_runs
+from pfbench.claims.words import DEPENDS, FALSE, OPEN, TRUE, UNDECIDED, ClaimDecision
+from pfbench.job.config import compose
+from pfbench.results import store
+
+WORKERS = 2
+_ROUNDS = 20  # of times that are measured in turn
+_ROUND_S = 0.05
+_VERIFIED = 20
+_VERIFIED_IN_PAPER = 3
+_VERIFY_S = 200.0  # of recomputed runs in all, s
+_TOLERANCE = 1e-6  # relative; the stored values are the same numbers in other batches
+
+
+class Task(NamedTuple):
+    """A job to run, or two filters to time in turn.
+
+    Attributes:
+        paper: Number of the paper.
+        cell: Words of the job, or the name of a timing.
+        batch: Runs.
+        measures: Quantities of its runs by name.
+        timed: Cells that are timed in turn; empty for a job.
+        seconds: Estimate of its time, s.
+    """
+
+    paper: str
+    cell: Cell
+    batch: Batch
+    measures: Mapping[str, Measure]
+    timed: tuple[Cell, ...] = ()
+    seconds: float = 0.0
+
+
+class ClaimPrice(NamedTuple):
+    """Price of the next stage of a claim.
+
+    Attributes:
+        plan: Claim.
+        stage: Stage: screen, centre or mover.
+        tasks: Jobs that are missing.
+    """
+
+    plan: ClaimPlan
+    stage: str
+    tasks: tuple[Task, ...]
+
+    @property
+    def seconds(self) -> float:
+        """Time of the missing jobs, s."""
+        return sum(task.seconds for task in self.tasks)
+
+
+Decisions = Mapping[tuple[str, str, str], ClaimDecision]
+
+
+def price_claims(
+    plans: Sequence[ClaimPlan], runs: ClaimRuns, decisions: Decisions
+) -> list[ClaimPrice]:
+    """Price the next stage of each claim that runs can still decide, the cheapest first."""
+    prices = []
+    for plan in plans:
+        mine = [decided for (claim, _, _), decided in decisions.items() if claim == plan.claim.id]
+        for stage in (SCREEN, CENTRE, MOVER):
+            tasks = tuple(_list_missing(plan, stage, runs, mine))
+            if tasks and (stage == SCREEN or any(d.word in (OPEN, DEPENDS) for d in mine)):
+                prices.append(ClaimPrice(plan, stage, tasks))
+                break
+    order = {SCREEN: 0, CENTRE: 1, MOVER: 2}
+    return sorted(prices, key=lambda p: (order[p.stage], p.seconds, p.plan.claim.id))
+
+
+def _list_missing(
+    plan: ClaimPlan, stage: str, runs: ClaimRuns, decisions: Sequence[ClaimDecision]
+) -> Iterator[Task]:
+    """Yield the missing jobs of a claim at a stage."""
+    paper, cells = plan.claim.paper, list_claim_cells(plan)
+    selected = _select_readings(plan, stage, decisions)
+    places = [cell for name, measured in list_dot_cells(plan) if name in selected for cell, _ in measured]  # fmt: skip
+    for cell in dict.fromkeys(places):
+        price = estimate_seconds(paper, cell, runs)
+        for batch in list_batches(paper, stage):
+            if not runs.has(cell, batch, [n for n, m in cells[cell].items() if m.metric != TIMING]):
+                yield Task(paper, cell, batch, cells[cell], seconds=price * batch.runs)
+    if stage == SCREEN:
+        yield from _list_timings(plan, runs)
+
+
+def _select_readings(
+    plan: ClaimPlan, stage: str, decisions: Sequence[ClaimDecision]
+) -> Sequence[str]:
+    """Select the readings of a stage: all, the central one, or those that turn the claim or are open."""
+    names = list(list_dots(plan))
+    if stage == SCREEN:
+        return names
+    if stage == CENTRE:
+        return names[:1]
+    outcomes = [(d.outcomes, next(iter(d.outcomes.values()))) for d in decisions]
+    return [
+        name for name in names[1:]
+        if any(outcome.get(name) in (UNDECIDED, TRUE, FALSE) and outcome.get(name) != first for outcome, first in outcomes)
+    ]  # fmt: skip
+
+
+def _list_timings(plan: ClaimPlan, runs: ClaimRuns) -> Iterator[Task]:
+    """Yield the timings of a claim that are missing."""
+    comparisons = [c for parts in plan.parts.values() for c in parts if c.a.measure.metric == TIMING]  # fmt: skip
+    if not comparisons:
+        return
+    batch = list_batches(plan.claim.paper, SCREEN)[0]
+    for _, measured in list_dot_cells(plan):
+        cells = [cell for cell, _ in measured]
+        start = 0
+        for c in [c for parts in plan.parts.values() for c in parts]:
+            size = sum(bool(side.filter) for side in (c.a, c.b))
+            pair = tuple(cells[start : start + size])
+            start += size
+            name = name_timing(pair[0], pair[-1])
+            if c.a.measure.metric == TIMING and not runs.find(name):
+                price = _ROUNDS * _ROUND_S * size * 3
+                yield Task(plan.claim.paper, name, batch, {}, pair, price)
+
+
+# --------------------------------------------------------------------------------------------------
+# Jobs.
+
+
+def run_claim_task(task: Task, results: str) -> StoredValues:
+    """Run a job, or read it if it exists, and write its values."""
+    folder = Path(results) / CLAIMS_STUDY
+    if task.timed:
+        record = _time_in_turn(task, results)
+    else:
+        record = _run_job(task, results)
+    if not record.failed or may_refuse(task):
+        write_values(folder, record)
+    return record
+
+
+def may_refuse(task: Task) -> bool:
+    """Return whether the error of a job is an outcome: that of a form that refuses to run, by a proof."""
+    forms = read_paper_settings()[task.paper].get("refuses", ())
+    return any(f"filter={name}" in task.cell for name in forms)
+
+
+def list_words(cell: Cell, batch: Batch, results: str) -> list[str]:
+    """List the words of a job, as for `pfbench run`."""
+    runs_words = (f"seed={batch.seed}", f"first_run={batch.first_run}", f"runs={batch.runs}")
+    return [*cell, *runs_words, f"study={CLAIMS_STUDY}", f"results_dir={results}"]
+
+
+def _run_job(task: Task, results: str) -> StoredValues:
+    """Run a job; an error is stated in the result."""
+    from pfbench.job.plan import read_versions
+    from pfbench.job.run_job import run
+
+    commit = read_versions()["commit"]
+    empty = StoredValues(task.cell, *task.batch, "", commit, 0.0, "", (), {})
+    words = list_words(task.cell, task.batch, results)
+    begin = time.process_time()
+    try:
+        outcome = run(compose(words))
+    except Exception as error:
+        text = f"{type(error).__name__}: {error}"
+        return replace(empty, failed=text[:300], seconds=time.process_time() - begin)
+    result = store.read_result(outcome.path)
+    seconds = result.meta["seconds"]
+    values = {
+        name: [float(value) for value in measure_runs(result, measure)]
+        for name, measure in task.measures.items()
+        if measure.metric != TIMING
+    }
+    return replace(
+        empty,
+        key=outcome.path.stem,
+        commit=result.meta["versions"]["commit"],
+        seconds=float(seconds["world"] + seconds["filter"]),
+        lost=tuple(int(value) for value in result.data["lost"]),
+        values=values,
+    )
+
+
+def _time_in_turn(task: Task, results: str) -> StoredValues:
+    """Time the filters of stored jobs in turn, 20 rounds."""
+    from pfbench.job.plan import read_versions
+    from pfbench.job.run_job import run
+    from pfbench.job.step_timing import time_condition
+    from pfbench.results.conditions import Condition, JobFile
+
+    cells = list(dict.fromkeys(task.timed))
+    jobs = []
+    for cell in cells:
+        path = run(compose(list_words(cell, task.batch, results))).path
+        jobs.append(JobFile(path, " ".join(cell), store.read_metadata(path)))
+    choices = jobs[0].meta["choices"]
+    names = (choices["scenario"], choices["noise"], choices["model"])
+    begin = time.process_time()
+    measured = time_condition(Condition(*names, tuple(jobs)), {}, _ROUNDS, _ROUND_S)
+    times = {str(k): measured["jobs"][job.path.stem]["cpu"] for k, job in enumerate(jobs)}
+    commit, spent = read_versions()["commit"], time.process_time() - begin
+    zeros = (0,) * _ROUNDS
+    return StoredValues(
+        task.cell, *task.batch, "", commit, spent, "", zeros, times if len(times) > 1 else {**times, "1": times["0"]},
+    )  # fmt: skip
+
+
+def run_tasks(
+    tasks: Sequence[Task], results: str, workers: int, seconds: float
+) -> Iterator[tuple[Task, StoredValues]]:
+    """Run jobs in at most two processes until the time is over, and yield each as it ends."""
+    if workers == 1:
+        begin = time.monotonic()
+        for task in tasks:
+            if time.monotonic() - begin > seconds:
+                return
+            yield task, run_claim_task(task, results)
+        return
+    context = multiprocessing.get_context("spawn")
+    begin = time.monotonic()
+    with ProcessPoolExecutor(min(workers, WORKERS), mp_context=context) as pool:
+        waiting = list(reversed(tasks))
+        running: dict[Future[StoredValues], Task] = {}
+        while waiting or running:
+            is_over = time.monotonic() - begin > seconds
+            while waiting and len(running) < workers and not is_over:
+                task = waiting.pop()
+                future = pool.submit(run_claim_task, task, results)
+                running[future] = task
+            if not running:
+                return
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield running.pop(future), future.result()
+
+
+# --------------------------------------------------------------------------------------------------
+# Verification: stored cells again, and words from the stored values.
+
+
+class Check(NamedTuple):
+    """A stored job that was computed again.
+
+    Attributes:
+        record: Stored values.
+        runs: Runs that were computed.
+        fault: What differs; empty if nothing does.
+    """
+
+    record: StoredValues
+    runs: int
+    fault: str
+
+
+def draw_records(runs: ClaimRuns, seed: int) -> list[StoredValues]:
+    """Draw 20 stored jobs, at least three of each paper that has them."""
+    draws = random.Random(seed)
+    jobs = [r for r in runs.records if r.key]
+    papers: dict[str, list[StoredValues]] = {}
+    for record in jobs:
+        papers.setdefault(record.cell[0].partition("=")[0], []).append(record)
+    drawn_records = [r for group in papers.values() for r in draws.sample(group, min(_VERIFIED_IN_PAPER, len(group)))]  # fmt: skip
+    rest = [r for r in jobs if r not in drawn_records]
+    return drawn_records + draws.sample(
+        rest, min(max(_VERIFIED - len(drawn_records), 0), len(rest))
+    )
+
+
+def verify_record(record: StoredValues, measures: Mapping[str, Measure], results: str, seconds: float = _VERIFY_S / _VERIFIED) -> Check:  # fmt: skip
+    """Compute the first runs of a stored job again, as many as the time allows, and compare key and values."""
+    from pfbench.job.inputs import find_inputs
+    from pfbench.job.plan import build_plan, job_key
+    from pfbench.job.run_job import compute_job
+
+    config = compose(list_words(record.cell, record.batch, results))
+    key = job_key(config.values, find_inputs(config.values, config.trusted))
+    if key != record.key:
+        return Check(
+            record, 0, f"the key is {key}, stored {record.key}: the configuration has changed"
+        )
+    price = record.seconds / record.runs
+    count = max(1, min(record.runs, int(seconds / price) if price else record.runs))
+    small = compose(list_words(record.cell, record.batch._replace(runs=count), results))
+    meta, data = compute_job(build_plan(small), "verify")
+    result = store.JobResult({"key": key, "config": small.values, **meta}, data)
+    for name in record.values:
+        again, stored = measure_runs(result, measures[name]), np.array(record.values[name][:count])
+        is_equal = np.isclose(again, stored, rtol=_TOLERANCE, atol=0.0, equal_nan=True)
+        if not is_equal.all():
+            k = int(np.argmin(is_equal))
+            return Check(record, count, f"run {record.first_run + k} has {name} {again[k]:.8g}, stored {stored[k]:.8g}")  # fmt: skip
+    return Check(record, count, "")
+
+
+def find_measures(plans: Sequence[ClaimPlan]) -> dict[Cell, dict[str, Measure]]:
+    """Find the quantities of each cell over all claims."""
+    decided: dict[Cell, dict[str, Measure]] = {}
+    for plan in plans:
+        for cell, measures in list_claim_cells(plan).items():
+            decided.setdefault(cell, {}).update(measures)
+    return decided
+
+
+def merge_tasks(tasks: Sequence[Task], plans: Sequence[ClaimPlan]) -> list[Task]:
+    """List each job once, with the quantities of all claims that use it; timings follow their jobs."""
+    measures = find_measures(plans)
+    once = {(task.cell, task.batch): task for task in tasks}
+    merged = [t._replace(measures=measures.get(t.cell, {})) for t in once.values()]
+    return [t for t in merged if not t.timed] + [t for t in merged if t.timed]
+
+
+def describe_words(decisions: Decisions) -> dict[str, str]:
+    """Return the word of each claim, column and part as text."""
+    return {" ".join(key): decided.word for key, decided in decisions.items()}
+
+
+def read_words(folder: Path) -> dict[str, str]:
+    """Read the words that the page states; empty without a page."""
+    path = folder / "words.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}

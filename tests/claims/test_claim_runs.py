@@ -1,0 +1,348 @@
+"""Runs of claims: what decides each, plans and prices, keys of `pfbench run`, stored values, verification, the page."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from checkout import ROOT
+from config_cases import GROUPS
+
+from pfbench import job
+from pfbench.claims import claim_lines, claim_runs
+from pfbench.claims.claim_lines import (
+    COLUMNS,
+    list_dots,
+    make_cell,
+    read_paper_settings,
+    read_plans,
+    read_readings,
+)
+from pfbench.claims.claim_runs import (
+    CLAIMS_STUDY,
+    SEEDS,
+    Batch,
+    Cell,
+    ClaimRuns,
+    StoredValues,
+    decide_claims,
+    list_batches,
+    list_claim_cells,
+    write_values,
+)
+from pfbench.claims.ledger import compare_versions, conclude
+from pfbench.claims.page import write_claims
+from pfbench.claims.run_claims import (
+    Task,
+    draw_records,
+    find_measures,
+    list_words,
+    merge_tasks,
+    price_claims,
+    run_claim_task,
+    verify_record,
+)
+from pfbench.claims.words import CONFIRMED, OPEN, REFUTED, WORDS
+from pfbench.cli import claims as command
+from pfbench.job.inputs import find_inputs
+
+PLANS = {plan.claim.id: plan for plan in read_plans()}
+PAPERS = ("000", "001", "002", "003", "004")
+
+
+# what decides a claim
+
+
+def test_each_claim_has_comparisons_or_a_word_with_a_reason() -> None:
+    assert len(PLANS) == 88
+    for plan in PLANS.values():
+        assert bool(plan.parts) != bool(plan.word)
+        assert not plan.word or (plan.word in WORDS and len(plan.reason.split()) > 2)
+        for comparisons in plan.parts.values():
+            for c in comparisons:
+                sides = [side for side in (c.a, c.b) if side.filter]
+                assert sides
+                assert all(side.filter in GROUPS["filter"] for side in sides), plan.claim.id
+                assert c.kind != "size" or 0 < c.printed < 1
+    for paper, settings in read_paper_settings().items():
+        assert set(settings["method"]) == set(COLUMNS)
+        assert set(settings.get("instead", {})) | set(settings.get("only", {})) <= set(
+            read_readings(paper)
+        )
+
+
+def test_a_claim_runs_in_the_central_reading_and_the_levels_of_its_factors() -> None:
+    for plan in PLANS.values():
+        names = list(list_dots(plan))
+        assert names[0] == "central"
+        readings = read_readings(plan.claim.paper)
+        factors = {readings[name].factor for name in names[1:] if name in readings}
+        assert plan.toy or plan.word or factors == set(plan.claim.factors)
+
+
+def test_a_reading_that_does_not_concern_a_filter_is_the_central_job() -> None:
+    plan = PLANS["002-18"]
+    (c,) = plan.parts["published", "direction"]
+    assert make_cell(plan, "adaptation_095", c.b) == make_cell(plan, "central", c.b)
+    assert make_cell(plan, "adaptation_095", c.a) != make_cell(plan, "central", c.a)
+    assert make_cell(plan, "each", c.b) == ("reading/002=each", "filter=cpf_each")
+    assert make_cell(plan, "receiver_3", c.b) == ("reading/002=receiver_3", "filter=cpf")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("paper", PAPERS)
+def test_each_cell_composes_and_builds_its_filter(paper: str) -> None:
+    """A planted silent choice: a setting of a reading or a claim that the filter does not have."""
+    cells = {cell for plan in PLANS.values() if plan.claim.paper == paper for cell in list_claim_cells(plan)}  # fmt: skip
+    for cell in sorted(cells)[::7]:
+        values = job.compose([*cell, "runs=2"]).values
+        for group in ("scenario", "model", "noise", "filter"):
+            job.instantiate(values[group])
+
+
+def test_wrong_entries_are_told(tmp_path: Path) -> None:
+    text = (ROOT / "pfbench" / "claims" / "claim_lines.yaml").read_text()
+    file = tmp_path / "claim_lines.yaml"
+    file.write_text(text.replace("metric: iterations", "metrics: iterations"))
+    with pytest.raises(ValueError, match=r"004-C7 must have comparisons or a word.*metrics"):
+        read_plans(file)
+    file.write_text(re.sub(r"\n  C001-10:.*", "", text))
+    with pytest.raises(ValueError, match=r"got or missing \['C001-10'\]"):
+        read_plans(file)
+
+
+# stored values
+
+
+def store(cell: Cell, batch: Batch, values: dict[str, Any], **changes: Any) -> StoredValues:
+    lost = tuple(0 for _ in range(batch.runs))
+    record = StoredValues(cell, *batch, "k" * 16, "abc", 10.0, "", lost, values)
+    return replace(record, **changes)
+
+
+def draw_values(plan_id: str, ratio: float, batches: tuple[Batch, ...] | None = None) -> Iterator[StoredValues]:  # fmt: skip
+    """Yield values of all cells of a claim, in which a is `ratio` times b."""
+    plan = PLANS[plan_id]
+    used = batches or tuple(list_batches(plan.claim.paper, "screen"))
+    is_a = {make_cell(plan, r, c.a) for p in plan.parts.values() for c in p for r, _ in list_dots(plan).values()}  # fmt: skip
+    for k, (cell, measures) in enumerate(list_claim_cells(plan).items()):
+        for batch in used:
+            g = np.random.default_rng([k, batch.seed])
+            size = ratio if cell in is_a else 1.0
+            draws = {name: list(size * np.exp(0.2 * g.standard_normal(batch.runs))) for name in measures}  # fmt: skip
+            yield store(cell, batch, draws)
+
+
+def test_values_are_stored_whole_and_found_by_their_words(tmp_path: Path) -> None:
+    batch = Batch(2001, 0, 3)
+    record = store(("a=b", "c=d"), batch, {"x": [1.0, math.inf, math.nan]}, lost=(0, 0, 1))
+    write_values(tmp_path, record)
+    (tmp_path / f"damaged{claim_runs.VALUES_SUFFIX}").write_text('{"cell": ')
+    runs = ClaimRuns.read(tmp_path)
+    assert runs.has(record.cell, batch, ["x"])
+    assert not runs.has(record.cell, batch, ["y"])
+    assert not runs.has(record.cell, batch._replace(seed=2002))
+    series = runs.join(record.cell, "x")
+    assert series is not None
+    assert list(series.lost) == [False, False, True]
+    assert series.values[1] == math.inf
+
+
+def test_runs_are_those_of_fresh_seeds_without_repetition() -> None:
+    for paper in PAPERS:
+        for stage in ("screen", "centre", "mover"):
+            batches = list_batches(paper, stage)
+            numbers = [(b.seed, r) for b in batches for r in range(b.first_run, b.first_run + b.runs)]  # fmt: skip
+            assert len(numbers) == len(set(numbers))
+            assert {b.seed for b in batches} <= set(SEEDS)
+            assert batches[0] == list_batches(paper, "screen")[0]
+
+
+@pytest.mark.parametrize(("ratio", "word"), [(0.6, CONFIRMED), (1.4, REFUTED)])
+def test_a_planted_effect_in_stored_values_gives_the_word_of_its_claim(
+    ratio: float, word: str
+) -> None:
+    runs = ClaimRuns(list(draw_values("003-C11", ratio)))
+    plans = [PLANS["003-C11"]]
+    line = conclude(plans[0], decide_claims(plans, runs))
+    assert (line.word, line.repaired) == (word, word)
+    assert conclude(plans[0], decide_claims(plans, ClaimRuns([]))).reason == "not run"
+
+
+def test_a_proof_decides_the_readings_that_it_covers() -> None:
+    """On the linear model a rule is not better; the readings of another heading still run."""
+    plan = PLANS["002-32"]
+    decision = decide_claims([plan], ClaimRuns([]))["002-32", "published", "direction"]
+    assert decision.word == OPEN
+    assert decision.outcomes == {"central": "false", "heading_45": "not run", "heading_80": "not run"}  # fmt: skip
+    worse = decide_claims([plan], ClaimRuns(list(draw_values("002-32", 1.2))))
+    assert worse["002-32", "published", "direction"].word == REFUTED
+    better = decide_claims([plan], ClaimRuns(list(draw_values("002-32", 0.8))))
+    assert better["002-32", "published", "direction"].factors == ("heading",)
+
+
+def test_a_fitted_reading_does_not_count() -> None:
+    runs = ClaimRuns(list(draw_values("004-C5", 0.6)))
+    decision = decide_claims([PLANS["004-C5"]], runs)["004-C5", "published", "direction"]
+    assert decision.outcomes["receiver_fitted"] == "not counted"
+    assert decision.word == CONFIRMED
+
+
+def test_no_word_changes_with_the_order_of_the_files() -> None:
+    records = [*draw_values("003-C11", 0.7), *draw_values("003-C4", 1.0)]
+    plans = [PLANS["003-C11"], PLANS["003-C4"]]
+    first = decide_claims(plans, ClaimRuns(records))
+    again = decide_claims(plans[::-1], ClaimRuns(records[::-1]))
+    assert {k: d.word for k, d in first.items()} == {k: d.word for k, d in again.items()}
+
+
+# plans
+
+
+def test_the_cheapest_undecided_claim_is_first_and_a_decided_one_is_not_run() -> None:
+    plans = [PLANS["004-C5"], PLANS["003-C11"], PLANS["C001-10"]]
+    empty = ClaimRuns([])
+    prices = price_claims(plans, empty, decide_claims(plans, empty))
+    assert [p.plan.claim.id for p in prices] == ["003-C11", "004-C5"]
+    assert prices[0].seconds < prices[1].seconds
+    decided = ClaimRuns(list(draw_values("003-C11", 0.6)))
+    prices = price_claims(plans, decided, decide_claims(plans, decided))
+    assert [p.plan.claim.id for p in prices] == ["004-C5"]
+    undecided = ClaimRuns(list(draw_values("003-C11", 1.0)))
+    prices = price_claims(plans[1:2], undecided, decide_claims(plans, undecided))
+    assert [p.stage for p in prices] == ["centre"]
+    tasks = merge_tasks([*prices[0].tasks, *prices[0].tasks], list(PLANS.values()))
+    assert len(tasks) == len(prices[0].tasks)
+    assert len(tasks[0].measures) > 1  # the quantities of all claims of the cell
+
+
+def test_cells_are_verified_by_a_seed_at_least_three_a_paper() -> None:
+    cells = [(f"reading/{paper}=central", f"filter=f{k}") for paper in PAPERS for k in range(9)]
+    runs = ClaimRuns([store(cell, Batch(2001, 0, 1), {}) for cell in cells])
+    drawn = draw_records(runs, 5)
+    assert drawn == draw_records(runs, 5)
+    assert drawn != draw_records(runs, 6)
+    assert len(drawn) == 20
+    for paper in PAPERS:
+        assert sum(r.cell[0].startswith(f"reading/{paper}") for r in drawn) >= 3
+
+
+# runs: a cheap claim in seconds
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a cell of paper 001 have twelve runs."""
+    settings = {k: {**v, "runs": {"screen": 12, "centre": 14, "mover": 2}} for k, v in read_paper_settings().items()}  # fmt: skip
+    monkeypatch.setattr(claim_lines, "read_paper_settings", lambda: settings)
+    monkeypatch.setattr(claim_runs, "read_paper_settings", lambda: settings)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("small")
+def test_a_cheap_claim_is_run_decided_verified_and_shown(tmp_path: Path) -> None:
+    results = str(tmp_path / "results")
+    plan = PLANS["C001-5"]
+    plans, empty = [plan], ClaimRuns([])
+    prices = price_claims(plans, empty, decide_claims(plans, empty))
+    central = [t for t in prices[0].tasks if t.cell[0] == "reading/001=central"]
+    tasks = merge_tasks([t for t in central if "scenario=passive_1" in t.cell], list(PLANS.values()))  # fmt: skip
+    records = [run_claim_task(task, results) for task in tasks]
+    assert not any(record.failed for record in records)
+    for task, record in zip(tasks, records, strict=True):  # the key of `pfbench run`
+        config = job.compose(list_words(task.cell, task.batch, "elsewhere"))
+        assert job.job_key(config.values, find_inputs(config.values, config.trusted)) == record.key
+        assert set(record.values) == set(task.measures)
+    measures = find_measures(list(PLANS.values()))
+    assert verify_record(records[0], measures[records[0].cell], results).fault == ""
+    name = next(iter(records[0].values))
+    planted = replace(records[0], values={name: [2 * v for v in records[0].values[name]]})
+    assert "stored" in verify_record(planted, measures[records[0].cell], results).fault
+    assert "the key is" in verify_record(replace(records[0], key="0" * 16), {}, results).fault
+    assert run_claim_task(tasks[0], results).key == records[0].key  # resumes
+    page = write_claims(results, tmp_path / "reports")
+    assert "C001-5" in page.read_text()
+    again = write_claims(tmp_path / "none", tmp_path / "reports")  # from the stored values
+    assert len(ClaimRuns.read(Path(results) / CLAIMS_STUDY).records) == len(records)
+    assert f"{len(records)} jobs" in again.read_text()
+
+
+def test_an_error_of_a_form_that_does_not_refuse_is_a_fault(tmp_path: Path) -> None:
+    """A planted admission fault: a job that fails must not count as a form that cannot run."""
+    cell = ("reading/001=central", "filter=sir", "filter.no_such_key=1")
+    record = run_claim_task(Task("001", cell, Batch(2001, 0, 2), {}), str(tmp_path))
+    assert record.failed
+    assert ClaimRuns.read(tmp_path / CLAIMS_STUDY).records == []
+
+
+# the command
+
+
+def test_words_of_the_command_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+    for words, message in (
+        (["run", "C009"], r"ID must be a claim such as C001-7 or a paper such as 001, got C009"),
+        (["run", "hours=0"], r"hours must be a positive number, got 0"),
+        (["run", "workers=3"], r"workers must be 1 or 2, got 3"),
+        (["run", "hour=2"], r"key must be one of hours"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            command.report_claims(words)
+    monkeypatch.setattr("pfbench.job.plan.read_versions", lambda: {"commit": "abc-dirty"})
+    with pytest.raises(ValueError, match=r"the code must be committed.*got abc-dirty"):
+        command.check_committed(False)
+    command.check_committed(True)
+
+
+def test_a_dry_run_prints_prices_and_runs_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+    command.report_claims(["run", "C001-7", "dry=true", f"results_dir={tmp_path}"])
+    printed = capsys.readouterr().out
+    assert re.search(r"C001-7 +screen +\d+ jobs", printed)
+    assert "plan: 1 claims" in printed
+    assert list(tmp_path.iterdir()) == []
+
+
+# the page
+
+
+def test_the_page_says_what_is_not_run_and_at_what_price(tmp_path: Path) -> None:
+    page = write_claims(tmp_path, tmp_path / "out")
+    text = page.read_text()
+    assert text.count('class="square ') == 2 * 88 + len(WORDS)
+    assert re.search(r"C001-5: open: not run, price \d+ (s|min)", text)
+    assert "Nothing has run yet" in text
+    first = text[text.index("<main>") : text.index("<details")]
+    assert not re.search(r"\de[+-]?\d", first)  # no scientific notation on the first screen
+    cells = re.findall(r"<td[^>]*>(.*?)</td>", first)
+    assert len(cells) == 7 * 5
+    assert all(len(re.sub(r"<[^>]+>", "", cell).split()) <= 12 for cell in cells)
+    words = json.loads((page.parent / "words.json").read_text())
+    assert set(words.values()) <= set(WORDS)
+    assert (page.parent / "report.md").read_text().count("C000-1") > 1
+
+
+def test_the_table_of_version_1_has_all_71_claims() -> None:
+    plans = list(PLANS.values())
+    decisions = decide_claims(plans, ClaimRuns([]))
+    old = compare_versions([conclude(plan, decisions) for plan in plans])
+    assert len(old) == 71
+    turned = {row.id: row.turned for row in old}
+    assert turned["002-01"] == "no"
+    assert turned["002-25"] == "was open"
+    assert turned["C000-1"] == "open now"
+
+
+def test_a_sentence_of_a_paper_names_proofs_of_that_paper() -> None:
+    from pfbench.claims import read_proofs
+
+    proofs = {proof.id: proof.paper for proof in read_proofs()}
+    for paper, settings in read_paper_settings().items():
+        named = re.findall(r"P\d+", settings["sentence"])
+        assert named
+        assert {proofs[name] for name in named} == {paper}
