@@ -168,7 +168,7 @@ def test_what_does_not_fit_is_refused_with_the_models_that_do(name: str) -> None
 
 def test_a_wrong_value_of_a_model_that_fits_keeps_its_own_message() -> None:
     with pytest.raises(InstantiationException) as error:  # not a refusal of the pair
-        job.build_plan(job.compose(["scenario=growth", "model.process_sd=-1"]))
+        job.build_plan(job.compose(["scenario=terrain", "model.measurement_sd=-1"]))
     assert "must" in str(error.value.__cause__)
 
 
