@@ -54,9 +54,9 @@ def add_to_tuned_file(
 ) -> None:
     """Add filters to the file of a tuning of the same world, or replace them; the rest of the file stays."""
     done = {*unsupported, *(result.method for result in results)}
-    parts = re.split(r"^(?=\w+:)", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    kept = "".join(part for part in parts if part.split(":")[0] not in done)
-    _write_lines(path, [*kept.splitlines(), *_list_methods(results, unsupported)])
+    entries = re.split(r"^(?=\w+:)", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    others = "".join(entry for entry in entries if entry.split(":")[0] not in done)
+    _write_lines(path, [*others.splitlines(), *_list_methods(results, unsupported)])
 
 
 def _write_lines(path: Path, lines: Sequence[str]) -> None:

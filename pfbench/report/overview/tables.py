@@ -208,8 +208,8 @@ def build_overviews(
     printed = [label for label, look in looks.items() if is_printed(look)]
     overviews = {}
     for key in levels or [0]:
-        own = [label for label in looks if label not in timed and _level(label) in (None, key)]
-        overviews[key] = _build_tab(table, looks, parts, own if levels else list(looks))
+        labels = [label for label in looks if label not in timed and _level(label) in (None, key)]
+        overviews[key] = _build_tab(table, looks, parts, labels if levels else list(looks))
     if sum(is_method(looks[label]) for label in timed) >= FEWEST_METHODS:
         fixed = [label for label in looks if _level(label) is None]
         overviews[EQUAL_TIME] = _build_tab(table, looks, parts, [*timed, *fixed])
@@ -228,21 +228,22 @@ def _build_tab(
     labels: Sequence[str],
     is_shown: Callable[[MethodLook], bool] = is_method,
 ) -> Overview:
-    """Decide the tables of some filters, named without their numbers of particles."""
+    """Decide the tables of some filters, present_looks without their numbers of particles."""
     names = {label: name_without_level(label) for label in labels}
     rows = table[table["filter"].isin(labels)]
-    own = [
-        label for label in labels if name_without_level(label) != label or is_shown is is_printed
+    swept = [
+        label for label in labels if is_shown is is_printed or name_without_level(label) != label
     ]
-    own = [label for label in own if is_shown(looks[label])]
-    if own:
-        rows = rows[rows["scenario"].isin(rows.loc[rows["filter"].isin(own), "scenario"].unique())]
+    methods = [label for label in swept if is_shown(looks[label])]
+    if methods:
+        worlds = rows.loc[rows["filter"].isin(methods), "scenario"].unique()
+        rows = rows[rows["scenario"].isin(worlds)]
     rows = rows.assign(filter=rows["filter"].map(names))
     present = [name for name in dict.fromkeys(names.values()) if name in set(rows["filter"])]
     plain = find_looks(present)
     kinds = {names[label]: looks[label] for label in labels}
-    shown = {k: plain[k] if plain[k].family else replace(kinds[k], key=k) for k in present}
-    return build_overview(rows, shown, parts, is_shown)
+    present_looks = {k: plain[k] if plain[k].family else replace(kinds[k], key=k) for k in present}
+    return build_overview(rows, present_looks, parts, is_shown)
 
 
 def list_levels(looks: Mapping[str, MethodLook]) -> list[int]:
