@@ -35,7 +35,7 @@ def explain_error(
     """Explain an error of a shipped model that has another scenario than it is made for.
 
     Returns a refusal with the shipped models that fit. The error itself if there is none, or if the
-    model, or another with its class where its name is unknown, fits this scenario: then one of its values is wrong.
+    model fits this scenario, so that one of its values is wrong. A model without a name is judged by its class.
     """
     target, fitting = (
         str(tree["model"].get("_target_")),
