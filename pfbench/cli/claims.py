@@ -8,8 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from pfbench.cli.compose import split_words
-from pfbench.cli.progress import format_duration
 from pfbench.job.config import compose
 
 if TYPE_CHECKING:
@@ -110,6 +108,7 @@ def run_claims(words: Sequence[str]) -> None:
 def read_request(words: Sequence[str]) -> RunRequest:
     """Read the words of a command."""
     from pfbench.claims.run_claims import WORKERS
+    from pfbench.cli.compose import split_words
 
     keys = ("hours", "workers", "readings", "dry", "uncommitted", *_PLACES)
     values = split_words([w for w in words if "=" in w], keys, (), "pfbench claims run")
@@ -194,6 +193,8 @@ def _restrict(prices: Sequence[ClaimPrice], readings: str) -> list[ClaimPrice]:
 
 def print_plan(prices: Sequence[ClaimPrice]) -> None:
     """Print what runs next and its price."""
+    from pfbench.cli.progress import format_duration
+
     once: dict[tuple[object, ...], Task] = {}
     for price in prices:
         mine = [task for task in price.tasks if (task.cell, task.batch) not in once]
@@ -222,6 +223,7 @@ def check_committed(is_allowed: bool) -> None:
 def _describe_task(task: Task, record: StoredValues) -> str:
     """Describe a job that has ended."""
     from pfbench.claims.run_claims import may_refuse
+    from pfbench.cli.progress import format_duration
 
     name = " ".join(task.cell)
     runs = f"seed {record.seed} runs {record.first_run} to {record.first_run + record.runs - 1}"
@@ -253,6 +255,7 @@ def verify_claims(words: Sequence[str]) -> None:
         read_words,
         verify_record,
     )
+    from pfbench.cli.compose import split_words
 
     values = split_words(words, ("seed", *_PLACES), (), "pfbench claims verify")
     places, plans = _read_places(values), select_plans(())

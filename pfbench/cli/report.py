@@ -8,7 +8,6 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from pfbench.cli.claims import write_claims_page
 from pfbench.cli.compose import compose_study, count_planned_jobs, given_keys
 from pfbench.cli.messages import format_error, suggest_similar
 from pfbench.files.command_start import start_work
@@ -158,6 +157,8 @@ def _report_all(words: list[str]) -> None:
 
 def _write_claims(words: list[str]) -> str:
     """Write the page of the claims if there are runs of them, or a page that stores some; return a line for the user."""
+    from pfbench.cli.claims import write_claims_page
+
     values = compose(words).values
     results = Path(values["results_dir"]) / CLAIMS
     if not any(results.glob("*.json")) and not (Path(values["reports_dir"]) / CLAIMS).is_dir():

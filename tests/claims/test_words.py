@@ -27,6 +27,7 @@ from pfbench.claims.words import (
     ReadingDot,
     decide_paper,
 )
+from pfbench.results import compare, decide
 
 
 def load_rates() -> ModuleType:
@@ -158,6 +159,29 @@ def test_no_word_changes_with_the_order_of_readings_and_claims() -> None:
     for name, decision in found.items():
         assert again[name].word == decision.word
         assert dict(again[name].outcomes) == dict(decision.outcomes)
+
+
+def test_looks_that_contradict_each_other_decide_nothing() -> None:
+    """A planted contradiction: the first runs say true, all runs say false."""
+    pair = draw(1.0, n=300)
+    turned = pair._replace(a=pair.b * np.where(pair.early, 0.2, 4.0) * (pair.a / pair.b))
+    assert decide_single(turned.select(turned.early)).word == CONFIRMED
+    assert decide_single(turned._replace(early=np.zeros(300, bool))).word == REFUTED
+    found = decide_single(turned)
+    assert found.word == OPEN
+    assert found.outcomes == {"central": OPEN}
+
+
+def test_no_word_has_the_opposite_sign_of_the_verdict_of_a_study_page() -> None:
+    """A page compares the same runs by `compare` and `decide`, with its own margin and level."""
+    opposite, agreed = {CONFIRMED: "worse", REFUTED: "better"}, 0
+    for seed, ratio in enumerate((0.6, 0.8, 0.95, 1.0, 1.05, 1.3, 1.8)):
+        pair = draw(ratio, n=200, seed=seed)
+        (verdict,) = decide([compare(("a", np.log(pair.a)), ("b", np.log(pair.b)))])
+        word = decide_single(pair).word
+        assert verdict.word != opposite.get(word)
+        agreed += (word, verdict.word) in ((CONFIRMED, "better"), (REFUTED, "worse"))
+    assert agreed >= 4
 
 
 def test_halves_of_the_runs_give_no_opposite_words() -> None:
