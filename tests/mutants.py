@@ -129,7 +129,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", help="faults; all by default")
     parser.add_argument(
-        "--check", action="store_true", help="only check that each text occurs once, and that what replaces it is Python"
+        "--check",
+        action="store_true",
+        help="only check that each text occurs once, and that what replaces it is Python",
     )
     parser.add_argument(
         "--baseline", action="store_true", help="only check that the tests pass without the fault"
