@@ -134,7 +134,7 @@ def _check_same_world(path: Path, world: Mapping[str, Any]) -> None:
         if stated.get(key) != world[key]:
             raise ValueError(
                 f"{key} must be {stated.get(key)!r} as in {path}, to which filters are added, got {world[key]!r}. "
-                f"Add filter={','.join(TUNED_METHODS)} to tune all anew, or name=NAME for another file."
+                f"Add filter={','.join(TUNED_METHODS)} to tune all again, or name=NAME for another file."
             )
 
 

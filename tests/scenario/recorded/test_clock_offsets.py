@@ -113,3 +113,19 @@ def offsets(read: NavigationLog, imu: float, fixes: float) -> tuple[float | None
         find_fix_offset(read.fixes._replace(time=read.fixes.time + fixes), read.reference),
     )
     return tuple(offset and offset.late_s for offset in found)  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("arm", [0.0, 3.0])
+def test_a_lever_arm_is_told_from_a_late_clock(arm: float) -> None:
+    """An antenna ahead of the reference point is 0.3 s early at 10 m/s; turns and changes of speed tell them apart."""
+    time, rng = np.arange(1801) / 10, np.random.default_rng(2)
+    yaw, speed = 1.2 * np.sin(0.25 * time) + 0.6 * np.sin(0.11 * time), 10 + 5 * np.sin(0.4 * time)
+    ahead = np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], -1)
+    velocity = speed[:, None] * ahead
+    position = np.r_[np.zeros((1, 3)), np.cumsum(0.05 * (velocity[1:] + velocity[:-1]), 0)]
+    turned = np.stack([np.cos(yaw / 2), 0 * yaw, 0 * yaw, np.sin(yaw / 2)], -1)
+    seen = position + arm * ahead + 0.3 * rng.normal(size=position.shape)
+    fixes = GnssLog(time[::5] + 1.0, seen[::5], position[::5] * np.nan)
+    found = find_fix_offset(fixes, ReferenceLog(time, turned, velocity, position))
+    assert found is not None
+    assert found.late_s == pytest.approx(1.0, abs=0.03)  # 361 fixes of 0.3 m at 10 m/s: 0.002 s
