@@ -75,7 +75,7 @@ def count_planned_jobs(study: str) -> int | None:
         return None
     total = math.prod(map(len, expand_sweep(overrides)))
     for path in experiments_dir().glob(f"{study}_*.yaml"):
-        if OmegaConf.load(path).get("study") == study:
+        if OmegaConf.select(OmegaConf.load(path), "study") == study:
             total += math.prod(map(len, expand_sweep(read_sweep(path.stem))))
     return total
 
