@@ -20,7 +20,7 @@ Without FOLDER that of the environment variable PFBENCH_DATA is checked, or none
   pfbench data
   pfbench data ~/navigation_data
 
-A data set may be missing as a whole: its scenarios are then refused. A file that is missing from a data set, or that
+A whole data set may be missing: its scenarios are then refused. A file that is missing from a data set, or that
 differs, is an error. Page: docs/data_sets.md"""
 
 _LIST = Path(__file__).parents[1] / "scenario" / "recorded" / "data_sets.yaml"
