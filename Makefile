@@ -14,8 +14,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e ".[dev]"
 	touch $@
 
-demo: $(VENV)/.installed        ## quickstart study: run, compare, report
+demo: $(VENV)/.installed        ## quickstart study: two worlds, one report
 	$(BIN)/pfbench run -m +experiment=quickstart
+	$(BIN)/pfbench run -m +experiment=quickstart_bearings
 	$(BIN)/pfbench report study=quickstart
 
 report: $(VENV)/.installed      ## all reports, from results/ or stored runs

@@ -6,14 +6,21 @@ import pytest
 from checkout import ROOT, list_published
 
 # use_your_data.md and write_a_scenario.md also run shell commands: their own tests run all blocks
-# glossary.md and results.md have tables only; tests/door/test_python_page.py runs README.md and python.md as scripts
+# glossary.md, results.md and data_sets.md have tables only; tests/door/test_python_page.py runs README.md and python.md as scripts
 ALL_PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 METHODS = (
     page
     for page in sorted((ROOT / "docs" / "methods").glob("*.md"))
     if "```python" in page.read_text()
 )
-NOT_RUN = {"README.md", "glossary.md", "results.md", "use_your_data.md", "python.md"}
+NOT_RUN = {
+    "README.md",
+    "glossary.md",
+    "results.md",
+    "data_sets.md",
+    "use_your_data.md",
+    "python.md",
+}
 PAGES = [*(page for page in ALL_PAGES if page.name not in NOT_RUN), *METHODS]
 LINKING_PAGES = (
     ROOT / "README.md",
@@ -49,6 +56,9 @@ def test_links_and_images_exist():
 
 def test_pages_show_every_picture_and_stand_alone_in_docs():
     files = [f for name in ("docs", "benchmarks") for f in (ROOT / name).rglob("*.*")]
-    assert {f.suffix for f in files if f.is_relative_to(ROOT / "docs")} == {".md", ".png"}
+    assert {f.suffix for f in files if f.is_relative_to(ROOT / "docs")} == {".md", ".png", ".svg"}
     pages = " ".join(page.read_text() for page in LINKING_PAGES)
-    assert [f.name for f in files if f.suffix == ".png" and f"]({f.name})" not in pages] == []
+    pictures = [f for f in files if f.suffix in (".png", ".svg")]
+    assert [
+        f.name for f in pictures if not re.search(rf"\]\((docs/)?{re.escape(f.name)}\)", pages)
+    ] == []

@@ -43,12 +43,15 @@ def check_installation(words: Sequence[str]) -> None:
         raise ValueError("configurations must compose, got errors:\n  " + "\n  ".join(errors))
 
 
+_ADDED = ("experiment", "infer")  # groups that are not in the list of defaults
+
+
 def _compose_all() -> Iterator[tuple[str, str]]:
     """Yield the choice of each configuration file, and its error or an empty text."""
     for group, files in list_groups().items():
         for path in files:
-            is_experiment = group == "experiment"
-            choice = f"+experiment={path.stem}" if is_experiment else f"{group}={path.stem}"
+            sign = "+" if group in _ADDED else ""
+            choice = f"{sign}{group}={path.stem}"
             try:
                 compose([choice, *_matching_scenario(group, path.stem), "data.root=somewhere"])
                 yield choice, ""

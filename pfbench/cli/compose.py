@@ -64,12 +64,20 @@ def split_words(
 
 
 def count_planned_jobs(study: str) -> int | None:
-    """Count the jobs of the sweep of an experiment.
+    """Count the jobs of the sweeps of a study: its experiment, and those whose names start with its name.
 
     Returns the number, or None if the experiment does not exist or does not define a sweep.
     """
+    from omegaconf import OmegaConf
+
     overrides = read_sweep(study)
-    return math.prod(map(len, expand_sweep(overrides))) if overrides else None
+    if not overrides:
+        return None
+    total = math.prod(map(len, expand_sweep(overrides)))
+    for path in experiments_dir().glob(f"{study}_*.yaml"):
+        if OmegaConf.select(OmegaConf.load(path), "study") == study:
+            total += math.prod(map(len, expand_sweep(read_sweep(path.stem))))
+    return total
 
 
 def read_sweep(experiment: str) -> list[str]:

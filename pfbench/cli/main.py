@@ -37,6 +37,8 @@ COMMANDS = {
     "judge": ("judge_trajectories", "compare trajectories of other programs with a reference"),
     "tune": ("tune_filters", "tune the baselines of a study of robustness alike"),
     "train": ("train_network", "train the network of a neural_* filter or of kalman_net"),
+    "infer": ("infer_parameters", "infer parameters of a model by NUTS, SVI, PMMH or SMC2"),
+    "data": ("list_data", "list the recorded data sets, and check a folder of them"),
     "status": ("report_status", "print what is finished, failed and running, and the time left"),
     "open": (
         "open_report",
@@ -47,7 +49,13 @@ COMMANDS = {
     "check": ("check_installation", "compose all configurations and print versions"),
     "completion": ("print_completion", "print the completion of words for a shell"),
 }
-_COMPOSING = ("run", "tune", "train", "datasheet")  # that may choose files of the current folder
+_COMPOSING = (
+    "run",
+    "tune",
+    "train",
+    "infer",
+    "datasheet",
+)  # that may choose files of the current folder
 USAGE = """\
 pfbench {version}: benchmarks of particle filters in integrated navigation
 

@@ -1,5 +1,6 @@
 """Public names of `pfbench.ppl` and the modules that define them."""
 
+from pfbench.ppl.guide_proposal import GuideProposal as GuideProposal
 from pfbench.ppl.ibis_smc2 import smc2 as smc2
 from pfbench.ppl.likelihood import (
     FilterLikelihood as FilterLikelihood,

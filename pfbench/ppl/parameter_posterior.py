@@ -103,6 +103,27 @@ class ParameterPosterior:
             }
         return pd.DataFrame.from_dict(rows, orient="index")
 
+    def to_arviz(self) -> Any:
+        """Return the draws as ArviZ reads them, with the axes chain, draw and, if runs have their own parameters, run.
+
+        Returns:
+            Inference data of ArviZ with the group `posterior`.
+
+        Raises:
+            ModuleNotFoundError: If ArviZ is not installed.
+        """
+        try:
+            from arviz_base import from_dict
+        except ModuleNotFoundError as error:
+            raise ModuleNotFoundError(
+                "to_arviz must have arviz-base, got no such package. Install it: pip install pfbench[arviz]"
+            ) from error
+        draws = {name: a.double().numpy() for name, a in self.draws.items()}
+        dims = {name: ["run"] for name, a in draws.items() if a.ndim == 3}
+        return from_dict(
+            {"posterior": draws}, dims=dims, attrs={"posterior": {"method": self.method}}
+        )
+
     @property
     def has_converged(self) -> bool:
         """True if split r-hat of all parameters is below 1.05.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations
@@ -147,6 +148,9 @@ def render_study(
     stored = (folder / HEADLINE).read_bytes() if (folder / HEADLINE).is_file() else b""
     headline = render_headline(pack, stored)
     pack["headline"] = "Error of each filter relative to the baseline" if headline else ""
+    if headline and pack.get("world_orders"):
+        pack["headline"] += ", in each world"
+        pack["world_picture"] = f"data:image/svg+xml;base64,{base64.b64encode(headline).decode()}"
     files: Files = {
         "verdicts.csv": format_verdicts(pack),
         "decisions.csv": format_csv(list_decisions(pack, table)),

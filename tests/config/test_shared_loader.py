@@ -75,12 +75,13 @@ def chosen_together() -> Iterator[list[str]]:
     together = [
         [f"{group}={path.stem}" for path in paths]
         for group, paths in GROUPS.items()
-        if group not in ("model", "experiment")
+        if group not in ("model", "experiment", "infer")
     ]
     for place in range(max(map(len, together))):
         yield [words[place % len(words)] for words in together]
-    for path in GROUPS["experiment"]:
-        yield [f"+experiment={path.stem}"]
+    for group in ("experiment", "infer"):  # that are not in the list of defaults
+        for path in GROUPS[group]:
+            yield [f"+{group}={path.stem}"]
     for path in GROUPS["model"]:
         yield [f"model={path.stem}", *_matching_scenario("model", path.stem)]
 

@@ -36,6 +36,7 @@ from pfbench.report.board.entries import (
 )
 from pfbench.report.board.study_views import build_views, decide_planned, planned_entries
 from pfbench.report.board.sweeps import list_sweeps
+from pfbench.report.board.world_orders import order_worlds
 from pfbench.report.methods_text import collect_methods_facts
 from pfbench.report.options import ReportOptions
 from pfbench.report.overview.tables import read_world_facts
@@ -306,6 +307,7 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
         "baselines": baselines,
         "views": views,
         "planned": planned_entries(planned, runs, looks, worlds, options),
+        "world_orders": order_worlds(runs, views, looks, options),
         "warnings": [
             text for text in (_count_failures(len(facts.failures)), facts.warning) if text
         ],

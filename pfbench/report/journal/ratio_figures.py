@@ -25,7 +25,15 @@ from pfbench.report.journal.figure_style import (
     ratio_limits,
     use_ratio_scale,
 )
-from pfbench.report.journal.study_pack import Pack, filters_by_key, find_rows, is_number, list_pairs
+from pfbench.report.journal.study_pack import (
+    Pack,
+    Row,
+    filters_by_key,
+    find_rows,
+    is_number,
+    list_pairs,
+    name_of,
+)
 from pfbench.results.plotting import LETTER, SMALL, set_plain_ticks
 
 # --------------------------------------------------------------------------------------------------
@@ -37,10 +45,42 @@ _HALF_DIAMOND = 0.26  # rows
 
 def plot_leaderboard(pack: Pack, setting: FigureSetting) -> Figure:
     """Plot the error of each filter relative to the baseline, with its interval."""
-    looks, rows = filters_by_key(pack), find_rows(pack)
-    rows_with_ratio = {key: row for key, row in rows.items() if is_number(row["ratio"])}
-    figure = setting.make_figure(MARGIN + ROW * max(len(rows_with_ratio), 2))
-    axis = figure.subplots()
+    rows = _select_ratios(find_rows(pack))
+    figure = setting.make_figure(MARGIN + ROW * max(len(rows), 2))
+    _draw_leaderboard(figure.subplots(), pack, rows, setting)
+    return figure
+
+
+def plot_worlds(pack: Pack, setting: FigureSetting) -> Figure:
+    """Plot the leaderboard of each world side by side, in its own order, with the share of runs that keep track."""
+    worlds = [str(order["world"]) for order in pack["world_orders"]]
+    tables = [_select_ratios(find_rows(pack, world)) for world in worlds]
+    figure = setting.make_figure(MARGIN + 0.2 + 1.3 * ROW * max(map(len, tables)))
+    for axis, world, rows in zip(
+        figure.subplots(1, len(worlds), squeeze=False)[0], worlds, tables, strict=True
+    ):
+        _draw_leaderboard(axis, pack, rows, setting)
+        axis.set_title(setting.escape(name_of(pack, "worlds", world)), fontweight="bold")
+        for y, row in enumerate(rows.values()):
+            if row["verdict"] == "loses track" or "loses" in row["words"]:
+                text = setting.escape(f"{100 * float(row['track']):.0f} % keep track")
+                axis.annotate(
+                    text, (0.02, y), xycoords=("axes fraction", "data"), ha="left", va="center",
+                    fontsize=setting.page.tick_size, color=_GREY,
+                )  # fmt: skip
+    return figure
+
+
+def _select_ratios(rows: Mapping[str, Row]) -> dict[str, Row]:
+    """Select the rows that have a ratio."""
+    return {key: row for key, row in rows.items() if is_number(row["ratio"])}
+
+
+def _draw_leaderboard(
+    axis: Axes, pack: Pack, rows_with_ratio: Mapping[str, Row], setting: FigureSetting
+) -> None:
+    """Draw the rows of a leaderboard."""
+    looks = filters_by_key(pack)
     limits = ratio_limits([
         float(row[name]) for row in rows_with_ratio.values() for name in ("ratio", "ratio_low", "ratio_high") if is_number(row[name])
     ])  # fmt: skip
@@ -62,7 +102,6 @@ def plot_leaderboard(pack: Pack, setting: FigureSetting) -> Figure:
             _write_dagger(axis, y, text, setting)
     baseline = looks[str(pack["baselines"][0])]["name"] if pack["baselines"] else ""
     axis.set_xlabel(setting.escape(f"{pack['metrics'][0]['name']} relative to {baseline}"))
-    return figure
 
 
 def plot_planned(pack: Pack, setting: FigureSetting) -> Figure:
@@ -329,7 +368,7 @@ def _lines_cross(a: np.ndarray, ends: np.ndarray, c: np.ndarray, d: np.ndarray) 
 # Static figure of a published study: the leaderboard, drawn as for a paper.
 
 HEADLINE = "headline.svg"
-_WIDTH = "150mm"
+_WIDTH, _WIDE = "150mm", "210mm"
 _NUMBER = re.compile(r"(?<![\w#.])-?\d+\.\d+(?!\w)")  # not in names
 _EQUAL_WITHIN = 1e-3  # units of the drawing
 _SVG: Any = {"svg.hashsalt": "pfbench", "svg.fonttype": "none"}  # equal bytes, text as text
@@ -347,9 +386,11 @@ def render_headline(pack: Pack, stored: bytes = b"") -> bytes:
     opening = next(iter(pack["views"].values()))
     if all(row["ratio"] is None for row in opening["rows"]):
         return b""
-    setting, buffer = FigureSetting(find_page_format(width=_WIDTH)), io.BytesIO()
+    width = _WIDE if pack.get("world_orders") else _WIDTH
+    setting, buffer = FigureSetting(find_page_format(width=width)), io.BytesIO()
+    plot = plot_worlds if pack.get("world_orders") else plot_leaderboard
     with setting.applied(), matplotlib.rc_context(_SVG):
-        plot_leaderboard(pack, setting).savefig(buffer, format="svg", metadata={"Date": None})
+        plot(pack, setting).savefig(buffer, format="svg", metadata={"Date": None})
     drawing = buffer.getvalue()
     return stored if stored and is_equal_drawing(stored, drawing) else drawing
 

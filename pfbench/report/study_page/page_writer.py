@@ -18,7 +18,9 @@ from pfbench.results.looks import describe_foreign_knobs, find_stored_world
 PAGE_BYTES = 1_500_000
 _HERE = Path(__file__).parent
 _SCRIPTS = ("kit", "state", "board", "cost", "pairs", "worlds", "time", "runs", "main")
-_OPTIONAL = ("paper_figures", "failures", "definitions", "filter_notes", "choices", "warnings")
+_OPTIONAL = (
+    "paper_figures", "failures", "definitions", "filter_notes", "choices", "warnings", "world_orders", "world_picture",
+)  # fmt: skip
 _STATIC = (
     *_OPTIONAL,
     "facts",
@@ -176,17 +178,40 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
         _scope(pack["regimes"], regime, "noise regime"),
         f"ratio to {names[baseline]['name']}",
     )
+    orders = pack.get("world_orders", ())
+    caption = f"{'; '.join(parts)}."
+    tables = [_table_of_world(pack, key, order["world"], names) for order in orders]
     return {
         "sentence": format_sentence(view["sentence"]),
-        "text": _remove_marks(view["sentence"]),
+        "worlds": [format_sentence(order["sentence"]) for order in orders],
+        "texts": (texts := [_remove_marks(order["sentence"]) for order in orders or [view]]),
+        "text": "\n".join(texts),
         "small_print": view["small_print"],
         "warnings": " ".join(pack.get("warnings", ())),
         "foreign_knobs": describe_page_knobs(pack),
         "overconfidence": describe_overconfidence(pack),
-        "caption": f"{'; '.join(parts)}.",
+        "caption": caption,
         "heads": _heads(names[baseline]["name"]),
-        "rows": [_row(row, names[row["filter"]]) for row in view["rows"]],
+        "rows": (rows := [_row(row, names[row["filter"]]) for row in view["rows"]]),
+        "tables": tables or [{"caption": caption, "rows": rows}],
         "has_costs": any(row.get("cost") is not None for row in view["rows"]),
+    }
+
+
+def _table_of_world(
+    pack: Mapping[str, Any], opening: Any, world: str, names: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return caption and rows of the table of one world."""
+    rows = pack["views"][opening._replace(world=world)]["rows"]
+    parts = (
+        _name(pack["metrics"], opening.metric),
+        _name(pack["worlds"], world),
+        f"ratio to {names[opening.baseline]['name']}",
+    )
+    present = [row for row in rows if row["rank"] is not None]
+    return {
+        "caption": f"{'; '.join(parts)}.",
+        "rows": [_row(row, names[row["filter"]]) for row in present],
     }
 
 

@@ -1,0 +1,107 @@
+"""A guide of a Pyro program as a proposal, against the exact answers of a linear model."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+import numpy as np
+import pyro
+import pytest
+import torch
+from pyro.distributions import Gamma, Laplace, MultivariateNormal, Normal
+from torch import Tensor
+
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.model.linear_gaussian import local_level
+from pfbench.ppl.guide_proposal import GuideProposal
+from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood
+from pfbench.ppl.parameter_posterior import ParameterPosterior
+
+Q, S = 0.6, 1.0  # standard deviations of a step and of a measurement
+MODEL = local_level(Q, S, 0.0, 2.0)
+
+
+def optimal(model: Any, x: Tensor, record: Record) -> None:
+    """The law of the noise given parent and measurement."""
+    sd = S / math.hypot(Q, S)
+    pyro.sample("noise", Normal(Q / (Q**2 + S**2) * (record.y.unsqueeze(1) - x), sd).to_event(1))
+
+
+def wide(model: Any, x: Tensor, record: Record) -> None:
+    """Another law, with heavier tails than the noise."""
+    pyro.sample("noise", Laplace(0.2 * torch.ones_like(x), 1.2).to_event(1))
+
+
+def tilted(model: Any, x: Tensor, record: Record) -> None:
+    scale = 1.4 * torch.eye(1, dtype=x.dtype).expand(*x.shape[:2], 1, 1)
+    pyro.sample("noise", MultivariateNormal(0.3 * torch.ones_like(x), scale_tril=scale))
+
+
+def draw(guide: Any, runs: int = 3, n: int = 50, seed: int = 1) -> tuple[Any, Tensor, Record]:
+    stream = PhiloxStream(seed, torch.arange(runs))
+    x = 2.0 * stream.at_step(0).normal("x", n, 1)
+    log_w = torch.full((runs, n), -math.log(n), dtype=torch.float64)
+    belief = ParticleBelief(x, log_w, torch.zeros(runs, dtype=torch.float64))
+    record = Record(torch.tensor([[0.4]] * runs, dtype=torch.float64))
+    return GuideProposal(guide)(MODEL, belief, record, stream.at_step(1)), x, record
+
+
+def test_the_weights_of_the_optimal_guide_depend_on_the_parent_alone() -> None:
+    """p(w) p(y | x) / q(w) is the predictive density N(y; parent, Q^2 + S^2), whatever was drawn."""
+    sample, parents, record = draw(optimal)
+    log_weight = sample.log_ratio + MODEL.log_likelihood(record.y, sample.x, record.u)
+    variance = Q**2 + S**2
+    expected = -0.5 * (math.log(2 * math.pi * variance) + (0.4 - parents[..., 0]) ** 2 / variance)
+    torch.testing.assert_close(log_weight, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("guide", [optimal, wide, tilted])
+def test_the_likelihood_is_unbiased_for_any_guide(guide: Any) -> None:
+    """Mean over runs of the estimate divided by the exact likelihood is 1, within four standard errors."""
+    runs, steps = 400, 8
+    y = torch.randn(1, steps, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    record = Record(y.expand(runs, steps, 1))
+    log_exact = GaussianHmmLikelihood()(MODEL, Record(y))
+    method = ParticleFilter(60, proposal=GuideProposal(guide))
+    ratio = (FilterLikelihood(method, seed=5)(MODEL, record) - log_exact).exp().numpy()
+    assert abs(ratio.mean() - 1) < 4 * ratio.std(ddof=1) / math.sqrt(runs)
+    assert ratio.std() < 1.0
+
+
+def test_the_numbers_are_those_of_the_stream_and_not_of_torch() -> None:
+    torch.manual_seed(1)
+    first = draw(wide)[0].w
+    torch.manual_seed(2)
+    state = torch.get_rng_state()
+    assert torch.equal(draw(wide)[0].w, first)
+    assert torch.equal(torch.get_rng_state(), state)
+    assert not torch.equal(draw(wide, seed=2)[0].w, first)
+    assert torch.equal(draw(wide, runs=2)[0].w, first[:2])
+
+
+@pytest.mark.parametrize(
+    ("guide", "sentence"),
+    [
+        (lambda model, x, record: None, "must sample the site 'noise', got none"),
+        (lambda model, x, record: pyro.sample("z", Normal(x, 1.0).to_event(1)), "and no other one, got 'z'"),
+        (lambda model, x, record: pyro.sample("noise", Normal(x, 1.0)), "must have a site of 1 noises (event [1]), got []"),
+        (lambda model, x, record: pyro.sample("noise", Gamma(x.abs() + 1, 1.0).to_event(1)), "got Gamma. Use Normal"),
+    ],
+)  # fmt: skip
+def test_other_guides_are_refused_in_a_sentence(guide: Any, sentence: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        draw(guide)
+
+
+def test_draws_pass_to_arviz_with_chains_draws_and_runs() -> None:
+    pytest.importorskip("arviz_base")
+    shared, own = torch.randn(2, 5), torch.randn(2, 5, 3)
+    posterior = ParameterPosterior({"a": shared, "b": own}, method="NUTS").to_arviz().posterior
+    assert posterior["a"].dims == ("chain", "draw")
+    assert posterior["b"].dims == ("chain", "draw", "run")
+    np.testing.assert_array_equal(posterior["b"].values, own.double().numpy())
