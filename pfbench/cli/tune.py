@@ -6,10 +6,13 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pfbench.job.config import TUNED_METHODS, JobConfig, compose
 from pfbench.job.tuned_knobs import AUTO, NOMINAL, SEED_SHIFT
+
+if TYPE_CHECKING:
+    from pfbench.job.tuning import CandidateSearch, TuningResult
 
 HELP = """\
 pfbench tune scenario=NAME [model=NAME] [filter=NAME,NAME] [key=value ...]
@@ -105,6 +108,19 @@ def _search(
     fixed = [f"seed={world['seed']}", f"runs={world['runs']}", "pcrb=false", "score_steps=0"]
     fixed += ["budget=particles", "engine=kernels"]  # whatever an experiment sets
     search = CandidateSearch([*settings, *fixed], world["regimes"], print, world["start_time_s"])
+    results, unsupported = _tune_each(search, grids)
+    if adds:
+        add_to_tuned_file(results, present, unsupported)
+        return present
+    fit = measure_fit(search, results, *fit_size)
+    print(f"best: {fit.best}\nkalman_fits: {str(fit.kalman_fits).lower()}")
+    return write_tuned_file(results, folder, name, world, fit, unsupported)
+
+
+def _tune_each(
+    search: CandidateSearch, grids: Mapping[str, Sequence[dict[str, float]]]
+) -> tuple[list[TuningResult], dict[str, str]]:
+    """Search the knobs of each filter. Returns the results, and why the others cannot run in this world."""
     results, unsupported = [], {}
     for method, grid in grids.items():
         try:
@@ -117,12 +133,7 @@ def _search(
     for result in results:
         values = ", ".join(f"{key}={value:g}" for key, value in result.choice.values.items())
         print(f"{result.method}: {values}")
-    if adds:
-        add_to_tuned_file(results, present, unsupported)
-        return present
-    fit = measure_fit(search, results, *fit_size)
-    print(f"best: {fit.best}\nkalman_fits: {str(fit.kalman_fits).lower()}")
-    return write_tuned_file(results, folder, name, world, fit, unsupported)
+    return results, unsupported
 
 
 def _check_same_world(path: Path, world: Mapping[str, Any]) -> None:

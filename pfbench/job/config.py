@@ -176,8 +176,7 @@ def resolve_config(
             raise
         raise explained from error
     knobs = values.pop(TUNED, {})  # the filter has them
-    for table in [key for key in values if key.endswith(_TABLE)]:
-        del values[table]
+    values = {key: value for key, value in values.items() if not key.endswith(_TABLE)}
     if has_knobs:
         check_tuned_seed(values, names.get("scenario"), knobs)
         mark_foreign(values, names, knobs.get("world", {}), trusted)
