@@ -42,7 +42,7 @@ def methods(particles: int) -> dict[str, Any]:
         words = (
             f"particles={particles}",
             "checkpoint=untrained",
-            "tuned=flight_500s_with_ins_gnss_inflated",
+            "tuned=gps_ins_inflated_nominal",
         )
         return {
             name: job.instantiate(compose("config", [f"filter={name}", *words])["filter"])

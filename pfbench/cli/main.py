@@ -27,6 +27,7 @@ from pfbench.job.trust import ENVIRONMENT, split_trust
 COMMANDS = {
     "run": ("run_jobs", "run one job, or a sweep with -m"),
     "report": ("report_study", "write the report of a study: figures, tables and tests"),
+    "compare": ("compare_study", "compare an own study with a published one in the same runs"),
     "cost": ("measure_cost", "measure the time per step of the filters of a study in turn"),
     "paper": ("write_study_paper", "write figures, tables and text of a study for a journal"),
     "claims": ("report_claims", "write the page of the papers' claims and verdicts"),

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from pfbench.door.comparisons import Comparison, Summary
+    from pfbench.report.published_study import PublishedComparison
     from pfbench.results.conditions import Condition
 
 
@@ -106,6 +107,27 @@ class Study:
 
         with plain_errors():
             return compare_in_conditions(self.conditions(), a, b)
+
+    def against(self, published: str | Path) -> PublishedComparison:
+        """Compare the filters of this study with all filters of a published one, which do not run again.
+
+        A filter of the published study runs here, too, in each world: its errors must agree, else the worlds differ.
+
+        Args:
+            published: Name of a report, such as `"all_seven"`, or the folder of its `runs.parquet`.
+
+        Returns:
+            Verdicts by condition. Printed, each own filter has its counts and the strongest published filter.
+
+        Raises:
+            ValueError: If no world, seed and witness are shared.
+        """
+        from pfbench.report.board import build_run_table
+        from pfbench.report.published_study import compare_with_published, find_published
+
+        with plain_errors():
+            folder = find_published(str(published), Path(self.reports))
+            return compare_with_published(build_run_table(self.conditions()), folder)
 
     def plot(self, kind: str = "cost", ax: Axes | None = None, **choice: Any) -> Axes:
         """Draw a figure in the looks of the report.

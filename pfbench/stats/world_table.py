@@ -175,6 +175,18 @@ def compare_methods(
     return [WorldPair(w.name, verdict) for (w, _, _), verdict in zip(keys, verdicts, strict=True)]
 
 
+def compare_with_each(
+    worlds: Sequence[tuple[World, Sequence[tuple[str, str]]]], alpha: float = ALPHA
+) -> list[list[Verdict]]:
+    """Compare some pairs of filters in each world, in one family.
+
+    Returns the verdicts of each world.
+    """
+    keys = [(world, *pair) for world, pairs in worlds for pair in pairs]
+    verdicts = iter(decide([_compare(*key) for key in keys], alpha=alpha))
+    return [[next(verdicts) for _ in pairs] for _, pairs in worlds]
+
+
 def find_winners(
     worlds: Sequence[World], methods: Sequence[str], baselines: Sequence[str], alpha: float = ALPHA
 ) -> list[Winner]:

@@ -1,0 +1,46 @@
+"""Command `pfbench compare`: own filters against a published study, whose filters do not run again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pfbench.cli.compose import compose_study
+from pfbench.cli.report import check_has_results
+from pfbench.files.atomic_write import write_atomically
+
+HELP = """\
+pfbench compare study=NAME published=all_seven [key=value ...]
+
+Compare the filters of an own study with all filters of a published one, in the same worlds and runs. The
+published filters do not run again: random numbers follow from seed and run. At least one filter of the
+published study runs again in each world as a witness; its errors must agree, else the worlds differ.
+
+  pfbench run -m +experiment=all_seven scenario=growth particles=100 study=mine filter=ukf,my_filter
+  pfbench compare study=mine published=all_seven
+
+  published=...   name of a report among reports_dir, or a folder with its runs.parquet
+
+The verdicts are written to REPORTS_DIR/NAME/published.csv. In Python: study.against("all_seven")."""
+
+
+def compare_study(words: Sequence[str]) -> None:
+    """Compare a study with a published one, print the verdicts and write them."""
+    from pfbench.report.board import build_run_table
+    from pfbench.report.published_study import compare_with_published, find_published
+    from pfbench.results.conditions import load_conditions
+
+    given = [word for word in words if word.partition("=")[0] == "published"]
+    if len(given) != 1 or not given[0].partition("=")[2]:
+        raise ValueError(
+            f"published must be one name of a report, got {' '.join(given) or 'none'}. Add published=all_seven."
+        )
+    config = compose_study([word for word in words if word not in given])
+    study, results = config.values["study"], Path(config.values["results_dir"])
+    check_has_results(study, results)
+    folder = find_published(given[0].partition("=")[2], Path(config.values["reports_dir"]))
+    compared = compare_with_published(build_run_table(load_conditions(study, results)), folder)
+    print(compared)
+    path = Path(config.values["reports_dir"]) / study / "published.csv"
+    write_atomically(path, lambda file: file.write(compared.table().to_csv(index=False).encode()))
+    print(f"verdicts: {path.resolve()}")

@@ -1,0 +1,205 @@
+"""Own filters beside a published study, whose filters do not run again.
+
+Random numbers are functions of seed and run, so that an own filter is paired with the stored runs of a study. A
+witness shows that the worlds are the same: a filter of the published study that runs again in each world of the own
+one, and whose errors must agree in all common runs. That checks data, build and settings of a world at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from pfbench.report.board.pack import StudyFacts
+from pfbench.report.overview.tables import read_world_facts
+from pfbench.report.stored_study import RUNS_FILE, read_stored_study
+from pfbench.results.conditions import parse_label
+from pfbench.results.looks import PartName
+from pfbench.stats.comparison import Verdict
+from pfbench.stats.world_table import World, build_world, compare_with_each
+
+_TOLERANCE = (
+    1e-3  # relative difference of errors that are equal but for rounding on another machine [ours]
+)
+_CONDITION = ["scenario", "regime", "model"]
+
+
+class PublishedComparison(NamedTuple):
+    """Own filters against each filter of a published study.
+
+    Attributes:
+        verdicts: Verdicts of one family of tests, by the name of the condition.
+        witnesses: Filter by condition that ran in both studies with equal errors.
+        left_out: Conditions of the own study that are not compared, with the reason.
+    """
+
+    verdicts: Mapping[str, list[Verdict]]
+    witnesses: Mapping[str, str]
+    left_out: Mapping[str, str]
+
+    def table(self) -> pd.DataFrame:
+        """Return the verdicts as a table, a row per condition and pair."""
+        rows = [
+            {"condition": name, "witness": self.witnesses[name], **verdict._asdict()}
+            for name, verdicts in self.verdicts.items()
+            for verdict in verdicts
+        ]
+        return pd.DataFrame(rows)
+
+    def __str__(self) -> str:
+        lines = []
+        for name, verdicts in self.verdicts.items():
+            lines.append(
+                f"{name}: {self.witnesses[name]} has the errors of the published study in all runs"
+            )
+            for label in dict.fromkeys(verdict.a for verdict in verdicts):
+                lines += _word_filter(label, [v for v in verdicts if v.a == label])
+        lines += [f"{name} is not compared: {reason}." for name, reason in self.left_out.items()]
+        return "\n".join(lines)
+
+
+def _word_filter(label: str, verdicts: Sequence[Verdict]) -> Iterator[str]:
+    """Yield how an own filter compares with all published ones, and with the strongest of them."""
+    words = Counter(verdict.word for verdict in verdicts)
+    counts = ", ".join(f"{word} {count}" for word, count in words.items())
+    strongest = max(verdicts, key=lambda verdict: verdict.ratio)
+    yield f"  {label} against {len(verdicts)} filters: {counts}"
+    yield (
+        f"  {label} / {strongest.b}, which has the smallest error: {strongest.ratio:.3g} "
+        f"[{strongest.low:.3g}, {strongest.high:.3g}] in {strongest.n} paired runs, {strongest.word}"
+    )
+
+
+def find_published(name: str, reports: Path) -> Path:
+    """Return the folder of a published study: one of the reports, or a folder or file by its path.
+
+    Raises:
+        ValueError: If it has no runs.parquet.
+    """
+    candidates = (reports / name, Path(name), Path(name).parent)
+    folders = [folder for folder in candidates if (folder / RUNS_FILE).is_file()]
+    if not folders:
+        stored = sorted(path.parent.name for path in reports.glob(f"*/{RUNS_FILE}"))
+        raise ValueError(
+            f"published must be a report with {RUNS_FILE}, got {name!r}. In {reports}: {', '.join(stored) or 'none'}. "
+            "Set reports_dir, or the path of its folder."
+        )
+    return folders[0]
+
+
+def compare_with_published(table: pd.DataFrame, folder: Path) -> PublishedComparison:
+    """Compare the own filters of a study with all filters of a published one in the same runs.
+
+    Particle filters are compared at an equal number of particles, and with all others.
+
+    Args:
+        table: Runs of the own study, with a row per filter, condition and run.
+        folder: Folder of the published report, with its runs.parquet.
+
+    Raises:
+        ValueError: If no condition has a witness whose errors agree.
+    """
+    pack, published = read_stored_study(folder)
+    worlds = StudyFacts.from_pack(pack).worlds
+    witnesses, left_out, members = {}, {}, []
+    for key, rows in table.groupby(_CONDITION, observed=True, sort=False):
+        name = " / ".join(map(str, key))
+        stored = published[(published[_CONDITION] == list(key)).all(axis=1)]
+        try:
+            witnesses[name] = find_witness(rows, stored)
+            cap = _find_cap(worlds[str(key[0])], str(key[2]))
+        except ValueError as error:
+            left_out[name] = str(error)
+            continue
+        members.append((name, cap, rows, stored))
+    if not members:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
+        raise ValueError(
+            f"{folder / RUNS_FILE} must share a world with the study, got none. {reasons}"
+        )
+    verdicts = compare_with_each([_make_pairs(*member) for member in members])
+    return PublishedComparison(
+        dict(zip([m[0] for m in members], verdicts, strict=True)), witnesses, left_out
+    )
+
+
+def _find_cap(world: PartName, model: str) -> float:
+    """Return the largest error that counts in a world, of its file or of the file of its tuning."""
+    facts = read_world_facts(parse_label(world.key)[0], model)
+    cap = world.limit or (facts.cap if facts else math.nan)
+    if not math.isfinite(cap):
+        raise ValueError("no file states the error above which a run has lost track")
+    return float(cap)
+
+
+def find_witness(rows: pd.DataFrame, stored: pd.DataFrame) -> str:
+    """Find a filter whose errors agree in all common runs of a condition of two studies.
+
+    Raises:
+        ValueError: If the published study has no such runs, no filter is in both, or the errors of all differ.
+    """
+    if stored.empty:
+        raise ValueError("the published study has no runs in it. Choose one of its worlds")
+    seeds = sorted(stored["seed"].unique())
+    rows = rows[rows["seed"].isin(seeds)]
+    if rows.empty:
+        raise ValueError(f"its runs must have seed={seeds[0]}. Set it")
+    both = _pair(rows, stored)
+    if both.empty:
+        fastest = stored.groupby("filter", observed=True)["ms"].median().idxmin()
+        raise ValueError(
+            f"a filter of the published study must run again as a witness. Add filter={parse_label(str(fastest))[0]} to your study"
+        )
+    differs = ~np.isclose(
+        both["rmse"], both["rmse_stored"], rtol=_TOLERANCE, atol=0, equal_nan=True
+    )
+    by_filter = pd.Series(differs).groupby(both["filter"].to_numpy()).sum()
+    if by_filter.min() > 0:
+        name = str(by_filter.idxmin())
+        raise ValueError(
+            f"{name} has other errors than in the published study in {by_filter.min()} of "
+            f"{(both['filter'] == name).sum()} runs, so that the worlds differ. Use the settings and the build of its page"
+        )
+    return str(by_filter.idxmin())
+
+
+def _pair(rows: pd.DataFrame, stored: pd.DataFrame) -> pd.DataFrame:
+    """Pair the rows of filters that two studies share: a row per filter, number of particles and run."""
+    keys = ["filter", "particles", "run"]
+    plain = [
+        frame.assign(
+            filter=[parse_label(str(v))[0] for v in frame["filter"]],
+            particles=frame["particles"].fillna(0),
+        )
+        for frame in (rows, stored)
+    ]
+    return plain[0].merge(plain[1], on=keys, suffixes=("", "_stored"))
+
+
+def _make_pairs(
+    name: str, cap: float, rows: pd.DataFrame, stored: pd.DataFrame
+) -> tuple[World, list[tuple[str, str]]]:
+    """Make the world of a condition with the filters of both studies, and the pairs of own and published filters."""
+    published = {str(v): parse_label(str(v))[0] for v in stored["filter"].unique()}
+    labels = [
+        str(v) for v in rows["filter"].unique() if parse_label(str(v))[0] not in published.values()
+    ]
+    counts = {
+        str(label): group["particles"].iloc[0]
+        for frame in (rows, stored)
+        for label, group in frame.groupby("filter", observed=True)
+    }
+    pairs = [
+        (a, b)
+        for a in labels
+        for b in published
+        if pd.isna(counts[a]) or pd.isna(counts[b]) or counts[a] == counts[b]
+    ]
+    joined = pd.concat([rows[rows["filter"].isin(labels)], stored]).assign(scenario=name)
+    return build_world(joined, next(iter(published)), cap), pairs

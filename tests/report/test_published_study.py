@@ -1,0 +1,83 @@
+"""An own filter beside a published study: the verdicts of one study of all filters, and no comparison of other worlds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import pfbench
+from pfbench.cli.compare import compare_study
+from pfbench.report.published_study import compare_with_published, find_witness
+from pfbench.report.stored_study import RUNS_FILE, read_stored_study
+
+WORLD = {"seed": 7, "runs": 12, "particles": 50, "progress": False}
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A published study of three filters in a world, an own study of two, and a study of all of them."""
+    folder = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for study, filters in {
+            "public": ["ukf", "sir", "rpf"], "mine": ["ukf", "apf"], "all": ["ukf", "sir", "rpf", "apf"],
+        }.items():  # fmt: skip
+            pfbench.run("linear_walk", filters, scenario__steps=20, study=study, **WORLD)
+        pfbench.study("public").report()
+    return folder
+
+
+def test_verdicts_are_those_of_one_study_of_all_filters(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(home)
+    compared = pfbench.study("mine").against("public")
+    (verdicts,) = compared.verdicts.values()
+    assert list(compared.witnesses.values()) == ["ukf"]
+    assert {(v.a, v.b) for v in verdicts} == {("apf", "ukf"), ("apf", "sir"), ("apf", "rpf")}
+    for verdict in verdicts:
+        joint = pfbench.study("all").compare(verdict.a, verdict.b)
+        assert verdict.ratio == pytest.approx(joint.ratio, rel=1e-5)
+        assert verdict.n == 12
+    assert "apf against 3 filters" in str(compared)
+    compare_study(["study=mine", "published=public"])
+    assert "ukf has the errors of the published study" in capsys.readouterr().out
+    table = pd.read_csv(home / "reports" / "mine" / "published.csv")
+    assert list(table["ratio"]) == pytest.approx([v.ratio for v in verdicts])
+
+
+def test_other_worlds_are_not_compared(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(home)
+    _, stored = read_stored_study(home / "reports" / "public")
+    own = stored[stored["filter"] == "ukf"]
+    assert find_witness(own, stored) == "ukf"
+    moved = own.assign(rmse=own["rmse"] * np.where(own["run"] == 3, 1.01, 1.0))
+    with pytest.raises(ValueError, match=r"ukf has other errors .* in 1 of 12 runs"):
+        find_witness(moved, stored)
+    with pytest.raises(ValueError, match=r"its runs must have seed=7"):
+        find_witness(own.assign(seed=8), stored)
+    with pytest.raises(ValueError, match=r"must run again as a witness. Add filter=\w+"):
+        find_witness(own.assign(filter="apf"), stored)
+    with pytest.raises(
+        ValueError, match=r"must share a world with the study, got none\. elsewhere / nominal"
+    ):
+        compare_with_published(own.assign(scenario="elsewhere"), home / "reports" / "public")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["study=mine"], r"published must be one name of a report, got none\. Add published=all_seven"),
+        (["study=mine", "published=nothing"], rf"published must be a report with {RUNS_FILE}, got 'nothing'.*public"),
+        (["study=nothing", "published=public"], r"study must be a study with results, got nothing"),
+    ],
+)  # fmt: skip
+def test_what_is_missing_is_said(
+    words: list[str], message: str, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(home)
+    with pytest.raises(ValueError, match=message):
+        compare_study(words)
