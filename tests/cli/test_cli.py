@@ -385,7 +385,7 @@ def test_list_of_what_fits_needs_the_other_part(tmp_path: Path) -> None:
 def test_list_of_no_group(tmp_path: Path) -> None:
     said = pfbench("list", "filters", home=tmp_path)
     assert said.code == 2
-    assert "error list: group must be one of filter, model" in said.err
+    assert "error list: group must be one of filter, infer, model" in said.err
     assert "got filters. Similar: filter." in said.err
 
 
