@@ -233,7 +233,7 @@ COMP_LINE="$1"; COMP_POINT=${#COMP_LINE}; COMP_CWORD="$2"; _pfbench; echo "${COM
     assert complete("pfbench sta", 1) == ["status"]
     assert "scenario=" in complete("pfbench run s", 2)
     assert set(complete("pfbench run -m filter=ekf,mcmc_", 3)) >= {"mcmc_rpf", "mcmc_mine"}
-    assert complete("pfbench run +experiment=quick", 2) == ["quickstart"]
+    assert complete("pfbench run +experiment=quick", 2) == ["quickstart", "quickstart_bearings"]
     assert make_script("zsh").startswith("autoload -U +X bashcompinit")
 
 
