@@ -26,7 +26,7 @@ _SCALE = math.log(3.0)  # log ratio of the strongest colour
 _DPI = 96  # a pixel of CSS
 GROUPS = {
     True: "Worlds that Kalman filters fit",
-    False: "Worlds that they do not fit",
+    False: "Worlds that Kalman filters do not fit",
     None: "Worlds",
 }
 
