@@ -389,7 +389,7 @@ def tie() -> str:
         "{:.2f} [{:.2f}, {:.2f}]".format(*content["fit"]["ratios"][key]) for key in ("sir", "rpf")
     )
     is_tie = all(low < 1 < high for _, low, high in content["fit"]["ratios"].values())
-    verdict = "the same scene is a tie" if is_tie else "one side wins the same scene"
+    verdict = "the same scene shows no difference" if is_tie else "one side wins the same scene"
     return (
         f"At 200 m/s in place of 20 m/s {verdict}: SIR has {sir} and RPF {rpf} times the error of `{content['best']}`, "
         "with ten thousand particles."
