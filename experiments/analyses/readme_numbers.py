@@ -10,7 +10,7 @@ from __future__ import annotations
 import gzip
 import json
 import re
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from importlib import import_module
@@ -23,6 +23,9 @@ import yaml
 
 from pfbench.files import markdown_bullets
 from pfbench.report import read_stored_study
+from pfbench.report.overview.figures import describe_cell, format_reference_error
+from pfbench.report.overview.page import choose_level
+from pfbench.report.study_report import find_overviews
 
 TOP = Path(__file__).parents[2]
 PAGES = (
@@ -193,32 +196,42 @@ def claims() -> str:
 
 
 def all_seven() -> str:
-    """Scenarios, first sentences and planned comparisons of the study of all methods."""
+    """First sentences of the study of all methods, and its heat map as a table."""
     folder = TOP / "reports" / "all_seven"
-    pack = read_stored_study(folder).pack
-    experiment = (TOP / "experiments" / "all_seven.yaml").read_text()
-    scenarios = re.search(r"^      scenario: (.+)$", experiment, re.MULTILINE)
-    names = "; ".join(world["name"] for world in pack["worlds"])
-    count = f"{len(pack['worlds'])} of {len(scenarios[1].split(','))}" if scenarios else ""
+    pack, table = read_stored_study(folder)
+    overviews = find_overviews(pack, table)
+    assert overviews is not None
+    level = choose_level(overviews)
+    overview = overviews[level]
+    columns = [*overview.methods, *overview.conventional]
+    cells = {(cell.world, cell.filter): cell for cell in overview.cells}
+    rows = [
+        [world.name, f"{world.reference}, {format_reference_error(world.level, world.unit)}"]
+        + [_format_cell(cells, world, label, overview) for label in columns]
+        for world in overview.worlds
+    ]
+    head = ("world", "best Kalman filter = 1", *(overview.names[label] for label in columns))
+    number = f" The table is for {level} particles." if level else ""
+    legend = (
+        f"Ratio of errors to the best Kalman filter of the world.{number} Bold: shown to be better. In brackets: not decided. "
+        "=: within 5 %. A percentage is the share of runs that keep track, where it is shown to be below 80 %."
+    )
     text = (folder / "report.md").read_text()
     _, first, second, *_ = text.split("\n\n")
-    return f"The report has {count} scenarios: {names}.\n\n{first}\n\n{second}\n\n{_planned_table(pack)}{describe_knobs('all_seven')}"
+    return f"{first}\n\n{second}\n\n{format_table(head, rows)}\n\n{legend}{describe_knobs('all_seven')}".rstrip()
 
 
-def _planned_table(pack: Mapping[str, Any]) -> str:
-    """Decisions on the planned pairs of each proposed method, by kind of baseline."""
-    names = {look["key"]: look["name"] for look in pack["filters"]}
-    groups: dict[tuple[str, str], dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
-    for pair in pack["planned"]:
-        groups[names[pair["a"]], pair["kind"]][pair["word"]].append(names[pair["b"]])
-
-    def describe(method: str, kind: str) -> str:
-        words = groups[method, kind].items()
-        return "; ".join(f"{word}: {', '.join(others)}" for word, others in words) or "–"
-
-    methods = dict.fromkeys(method for method, _ in groups)
-    head = ("method", "decision against the baselines of its paper", "against tuned baselines")
-    return format_table(head, ((m, describe(m, "paper"), describe(m, "tuned")) for m in methods))
+def _format_cell(
+    cells: Mapping[tuple[str, str], Any], world: Any, label: str, overview: Any
+) -> str:
+    """Format a cell of the heat map as text."""
+    look = describe_cell(cells, world, label, overview)
+    cell = cells.get((world.key, label))
+    if cell is None or look.is_grey or look.text == "=":
+        return look.text
+    if cell.verdict.word == "better":
+        return f"**{look.text}**"
+    return look.text if cell.verdict.word == "worse" else f"({look.text})"
 
 
 def speed() -> str:
