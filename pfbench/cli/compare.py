@@ -30,15 +30,15 @@ def compare_study(words: Sequence[str]) -> None:
     from pfbench.report.published_study import compare_with_published, find_published
     from pfbench.results.conditions import load_conditions
 
-    given = [word for word in words if word.partition("=")[0] == "published"]
-    if len(given) != 1 or not given[0].partition("=")[2]:
+    references = [word for word in words if word.partition("=")[0] == "published"]
+    if len(references) != 1 or not references[0].partition("=")[2]:
         raise ValueError(
-            f"published must be one name of a report, got {' '.join(given) or 'none'}. Add published=all_seven."
+            f"published must be one name of a report, got {' '.join(references) or 'none'}. Add published=all_seven."
         )
-    config = compose_study([word for word in words if word not in given])
+    config = compose_study([word for word in words if word not in references])
     study, results = config.values["study"], Path(config.values["results_dir"])
     check_has_results(study, results)
-    folder = find_published(given[0].partition("=")[2], Path(config.values["reports_dir"]))
+    folder = find_published(references[0].partition("=")[2], Path(config.values["reports_dir"]))
     compared = compare_with_published(build_run_table(load_conditions(study, results)), folder)
     print(compared)
     path = Path(config.values["reports_dir"]) / study / "published.csv"
