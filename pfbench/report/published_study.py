@@ -1,8 +1,8 @@
 """Own filters beside a published study, whose filters do not run again.
 
 Random numbers are functions of seed and run, so that an own filter is paired with the stored runs of a study. A
-witness shows that the worlds are the same: a filter of the published study that runs again in each world of the own
-one, and whose errors must agree in all common runs. That checks data, build and settings of a world at once.
+witness shows that the worlds are the same: a filter of the published study that runs again in each of them. Its errors
+must agree in all common runs, which checks data, build and settings of a world at once.
 """
 
 from __future__ import annotations
