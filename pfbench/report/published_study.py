@@ -1,4 +1,4 @@
-"""Own filters beside a published study, whose filters do not run again.
+"""Own filters next to a published study, whose filters do not run again.
 
 Random numbers are functions of seed and run, so that an own filter is paired with the stored runs of a study. A
 witness shows that the worlds are the same: a filter of the published study that runs again in each of them. Its errors
@@ -25,7 +25,7 @@ from pfbench.stats.comparison import Verdict
 from pfbench.stats.world_table import World, build_world, compare_with_each
 
 _TOLERANCE = (
-    1e-3  # relative difference of errors that are equal but for rounding on another machine [ours]
+    1e-3  # relative difference of errors that agree up to rounding on another machine [ours]
 )
 _CONDITION = ["scenario", "regime", "model"]
 
@@ -80,7 +80,7 @@ def find_published(name: str, reports: Path) -> Path:
     """Return the folder of a published study: one of the reports, or a folder or file by its path.
 
     Raises:
-        ValueError: If it has no runs.parquet.
+        ValueError: If runs.parquet is missing in it.
     """
     candidates = (reports / name, Path(name), Path(name).parent)
     folders = [folder for folder in candidates if (folder / RUNS_FILE).is_file()]
@@ -142,10 +142,12 @@ def find_witness(rows: pd.DataFrame, stored: pd.DataFrame) -> str:
     """Find a filter whose errors agree in all common runs of a condition of two studies.
 
     Raises:
-        ValueError: If the published study has no such runs, no filter is in both, or the errors of all differ.
+        ValueError: If the published study lacks such runs, the two have different filters, or the errors of all differ.
     """
     if stored.empty:
-        raise ValueError("the published study has no runs in it. Choose one of its worlds")
+        raise ValueError(
+            "its world must be one of the published study, got another. Choose one of its scenarios"
+        )
     seeds = sorted(stored["seed"].unique())
     rows = rows[rows["seed"].isin(seeds)]
     if rows.empty:
