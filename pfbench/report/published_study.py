@@ -134,7 +134,7 @@ def _find_cap(world: PartName, model: str) -> float:
     facts = read_world_facts(parse_label(world.key)[0], model)
     cap = world.limit or (facts.cap if facts else math.nan)
     if not math.isfinite(cap):
-        raise ValueError("no file states the error above which a run has lost track")
+        raise ValueError("its file must state the error above which a run has lost track, got none")
     return float(cap)
 
 
@@ -165,8 +165,8 @@ def find_witness(rows: pd.DataFrame, stored: pd.DataFrame) -> str:
     if by_filter.min() > 0:
         name = str(by_filter.idxmin())
         raise ValueError(
-            f"{name} has other errors than in the published study in {by_filter.min()} of "
-            f"{(both['filter'] == name).sum()} runs, so that the worlds differ. Use the settings and the build of its page"
+            f"{name} must have the errors of the published study, got others in {by_filter.min()} of "
+            f"{(both['filter'] == name).sum()} runs: the worlds differ. Use the settings and the build of its page"
         )
     return str(by_filter.idxmin())
 
