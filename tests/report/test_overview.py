@@ -19,7 +19,12 @@ from scipy import stats
 
 from pfbench.report import study_report
 from pfbench.report.overview import figures
-from pfbench.report.overview.page import list_verdicts, render_overview, word_headline
+from pfbench.report.overview.page import (
+    choose_level,
+    list_verdicts,
+    render_overview,
+    word_headline,
+)
 from pfbench.report.overview.tables import (
     EQUAL_TIME,
     PRINTED,
@@ -470,6 +475,9 @@ def test_the_first_sentence_says_what_holds_at_equal_time(tabs: dict[TabKey, Ove
     assert said[2].startswith("None of the seven is shown")
     assert f"At equal time: {name} (azimuth)." in said[2]
     assert "in any of 3 worlds, nor at equal time." in said[3]
+    assert choose_level(tabs) == 1000
+    fewer = first._replace(worlds=first.worlds[:1])
+    assert choose_level({**tabs, 1000: fewer}) == 100  # the number that most worlds have
     assert all(len(text.split()) <= 55 for text in said)
 
 

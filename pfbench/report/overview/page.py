@@ -83,8 +83,9 @@ def render_overview(
 
 
 def choose_level(overviews: Mapping[TabKey, Overview]) -> TabKey:
-    """Return the number of particles that opens the page: the middle one."""
-    levels = list(_select_levels(overviews))
+    """Return the number of particles that opens the page: the middle one of those with the most worlds."""
+    worlds = {key: len(overview.worlds) for key, overview in _select_levels(overviews).items()}
+    levels = [key for key, count in worlds.items() if count == max(worlds.values())]
     return levels[len(levels) // 2]
 
 
