@@ -52,7 +52,7 @@ BASED = (
     "dmc_noise",
     "dmc_optimal",
     "fmcpf",
-    "fmcpf_each",
+    "fmcpf_each", "rpf_tuned",
     *("rpf_half", "rpf_epanechnikov", "mcmc_rpf_literal", "qmc_polymerised_literal", "sir_literal"),
     *(
         "dmc_reconstructed_literal",
@@ -117,6 +117,8 @@ WORLDS = (
         "recorded_car_drive",
         "recorded_fixed_wing_aided",
         "recorded_walk",
+        "recorded_canyon",
+        "gps_ins_inflated",
         "terrain",
     ),
 )
