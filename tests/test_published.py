@@ -252,7 +252,6 @@ def test_studies_run_cheapest_first_and_within_a_limit() -> None:
 
 # Studies with jobs of uncommitted code. They run again; no study is added.
 WAITING_FOR_A_RERUN = [
-    "all_seven",
     "learned_azimuth",
     "learned_passive",
     "paper_000",

@@ -52,7 +52,8 @@ BASED = (
     "dmc_noise",
     "dmc_optimal",
     "fmcpf",
-    "fmcpf_each", "rpf_tuned",
+    "fmcpf_each",
+    "rpf_tuned",
     *("rpf_half", "rpf_epanechnikov", "mcmc_rpf_literal", "qmc_polymerised_literal", "sir_literal"),
     *(
         "dmc_reconstructed_literal",

@@ -460,6 +460,27 @@ def test_filters_at_equal_time_and_as_printed_have_tables_of_their_own(
     assert ratios["passive_1", "sir"] == plain["passive_1", "sir"]
 
 
+def test_a_world_with_one_number_of_particles_stands_in_its_table(
+    table: pd.DataFrame, parts: dict[str, PartName], tabs: dict[TabKey, Overview]
+) -> None:
+    """Labels have a number only where a filter has several; the column of the number decides for the others."""
+    particle = ["mcmc_rpf", "qmc_polymerised", "cpso_escape", "dmc_reconstructed", "sir", "rpf"]
+    swept = table[table["filter"].isin(particle)]
+    alone = swept["scenario"] == "azimuth"
+    kinds = [
+        swept[alone].assign(particles=100),
+        *(
+            swept[~alone].assign(filter=swept["filter"] + f"[particles={n}]", particles=n)
+            for n in (100, 1000)
+        ),
+    ]
+    both = pd.concat([table[~table["filter"].isin(particle)].assign(particles=pd.NA), *kinds])
+    found = build_overviews(both, find_looks(sorted(both["filter"].unique())), parts)
+    assert [len(found[n].worlds) for n in (100, 1000)] == [3, 2]
+    ratios = {(c.world, c.filter): c.verdict.ratio for c in found[100].cells}
+    assert ratios == {(c.world, c.filter): c.verdict.ratio for c in tabs[100].cells}
+
+
 def test_the_first_sentence_says_what_holds_at_equal_time(tabs: dict[TabKey, Overview]) -> None:
     first, timed = tabs[1000], tabs[EQUAL_TIME]
     winner = Winner("azimuth", "mcmc_rpf", 0.01, True)

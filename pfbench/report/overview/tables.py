@@ -203,6 +203,7 @@ def build_overviews(
     A filter without a number of particles is in all of them. Filters at equal time, and methods as printed,
     have tables of their own. A table has the worlds in which it has other runs than the others.
     """
+    table = _add_levels(table, looks)
     levels: list[TabKey] = [*list_levels(looks)]
     timed = [label for label in looks if _has_equal_time(label)]
     printed = [label for label, look in looks.items() if is_printed(look)]
@@ -219,6 +220,23 @@ def build_overviews(
         others = [label for label in same if not is_method(looks[label])]
         overviews[PRINTED] = _build_tab(table, looks, parts, others, is_printed)
     return overviews
+
+
+def _add_levels(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> pd.DataFrame:
+    """Name the filters of worlds with one number of particles as those of worlds with several."""
+    swept = {
+        (parse_label(label)[0], _level(label)): label
+        for label in looks
+        if _level(label) is not None and not _has_equal_time(label)
+    }
+    if not swept or "particles" not in table:
+        return table
+    plain, counts = table["filter"].astype(str), table["particles"]
+    labels = [
+        label if "[" in label or pd.isna(count) else swept.get((label, int(count)), label)
+        for label, count in zip(plain, counts, strict=True)
+    ]
+    return table.assign(filter=labels)
 
 
 def _build_tab(
