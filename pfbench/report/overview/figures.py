@@ -25,8 +25,8 @@ BLUE, ORANGE, GREY, INK = "#2166ac", "#c4561a", "#d4d4d4", "#1b1b1b"
 _SCALE = math.log(3.0)  # log ratio of the strongest colour
 _DPI = 96  # a pixel of CSS
 GROUPS = {
-    True: "Worlds that Kalman filters fit",
-    False: "Worlds that Kalman filters do not fit",
+    True: "Worlds that Kalman filters fit, by runs of another seed",
+    False: "Worlds that Kalman filters do not fit, by runs of another seed",
     None: "Worlds",
 }
 
@@ -365,7 +365,7 @@ def _name_columns(axes: Axes, names: Sequence[str], methods: int, size: Format) 
 def _name_references(axes: Axes, worlds: Sequence[WorldRow], columns: int, size: Format) -> None:
     """Write the reference of each world and its error at the right of the row."""
     for i, world in enumerate(worlds):
-        text = f"1 = {world.reference}, {format_reference_error(world.level, world.unit)} RMS"
+        text = f"1 = {world.reference}, {format_reference_error(world.level, world.unit)}"
         axes.text(
             columns + 0.2, i + 0.5, text, va="center", fontsize=0.9 * size.font, color="#555555"
         )
