@@ -26,7 +26,6 @@ The verdicts are written to REPORTS_DIR/NAME/published.csv. In Python: study.aga
 
 def compare_study(words: Sequence[str]) -> None:
     """Compare a study with a published one, print the verdicts and write them."""
-    from pfbench.report.board import build_run_table
     from pfbench.report.published_study import compare_with_published, find_published
     from pfbench.results.conditions import load_conditions
 
@@ -39,7 +38,7 @@ def compare_study(words: Sequence[str]) -> None:
     study, results = config.values["study"], Path(config.values["results_dir"])
     check_has_results(study, results)
     folder = find_published(references[0].partition("=")[2], Path(config.values["reports_dir"]))
-    compared = compare_with_published(build_run_table(load_conditions(study, results)), folder)
+    compared = compare_with_published(load_conditions(study, results), folder)
     print(compared)
     path = Path(config.values["reports_dir"]) / study / "published.csv"
     write_atomically(path, lambda file: file.write(compared.table().to_csv(index=False).encode()))

@@ -122,12 +122,11 @@ class Study:
         Raises:
             ValueError: If no world, seed and witness are shared.
         """
-        from pfbench.report.board import build_run_table
         from pfbench.report.published_study import compare_with_published, find_published
 
         with plain_errors():
             folder = find_published(str(published), Path(self.reports))
-            return compare_with_published(build_run_table(self.conditions()), folder)
+            return compare_with_published(self.conditions(), folder)
 
     def plot(self, kind: str = "cost", ax: Axes | None = None, **choice: Any) -> Axes:
         """Draw a figure in the looks of the report.

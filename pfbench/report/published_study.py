@@ -16,10 +16,11 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from pfbench.report.board import build_run_table
 from pfbench.report.board.pack import StudyFacts
 from pfbench.report.overview.tables import read_world_facts
-from pfbench.report.stored_study import RUNS_FILE, read_stored_study
-from pfbench.results.conditions import parse_label
+from pfbench.report.stored_study import RUNS_FILE, StoredStudy, read_stored_study
+from pfbench.results.conditions import Condition, parse_label
 from pfbench.results.looks import PartName
 from pfbench.stats.comparison import Verdict
 from pfbench.stats.world_table import World, build_world, compare_with_each
@@ -28,6 +29,7 @@ _TOLERANCE = (
     1e-3  # relative difference of errors that agree up to rounding on another machine [ours]
 )
 _CONDITION = ["scenario", "regime", "model"]
+_NO_WITNESS = "dead_reckoning"
 
 
 class PublishedComparison(NamedTuple):
@@ -35,7 +37,7 @@ class PublishedComparison(NamedTuple):
 
     Attributes:
         verdicts: Verdicts of one family of tests, by the name of the condition.
-        witnesses: Filter by condition that ran in both studies with equal errors.
+        witnesses: A filter of each condition that ran in both studies, with equal errors.
         left_out: Conditions of the own study that are not compared, with the reason.
     """
 
@@ -68,10 +70,10 @@ def _word_filter(label: str, verdicts: Sequence[Verdict]) -> Iterator[str]:
     """Yield how an own filter compares with all published ones, and with the strongest of them."""
     words = Counter(verdict.word for verdict in verdicts)
     counts = ", ".join(f"{word} {count}" for word, count in words.items())
-    strongest = max(verdicts, key=lambda verdict: verdict.ratio)
+    strongest = max(verdicts, key=lambda verdict: verdict.ratio if verdict.n else 0.0)
     yield f"  {label} against {len(verdicts)} filters: {counts}"
     yield (
-        f"  {label} / {strongest.b}, which has the smallest error: {strongest.ratio:.3g} "
+        f"  {label} / {strongest.b}, the strongest in these runs: {strongest.ratio:.3g} "
         f"[{strongest.low:.3g}, {strongest.high:.3g}] in {strongest.n} paired runs, {strongest.word}"
     )
 
@@ -93,36 +95,45 @@ def find_published(name: str, reports: Path) -> Path:
     return folders[0]
 
 
-def compare_with_published(table: pd.DataFrame, folder: Path) -> PublishedComparison:
+def compare_with_published(conditions: Sequence[Condition], folder: Path) -> PublishedComparison:
     """Compare the own filters of a study with all filters of a published one in the same runs.
 
-    Particle filters are compared at an equal number of particles, and with all others.
+    Particle filters are compared at an equal number of particles, and with all others. Errors count from the time
+    from which those of the published study do.
 
     Args:
-        table: Runs of the own study, with a row per filter, condition and run.
+        conditions: Conditions of the own study.
         folder: Folder of the published report, with its runs.parquet.
 
     Raises:
         ValueError: If no condition has a witness whose errors agree.
     """
-    pack, published = read_stored_study(folder)
-    worlds = StudyFacts.from_pack(pack).worlds
+    study = read_stored_study(folder)
+    options = StudyFacts.from_pack(study.pack).options
+    table = build_run_table(conditions, options.start_time_s)
+    compared = compare_runs(table, study)
+    if not compared.verdicts:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in compared.left_out.items())
+        raise ValueError(
+            f"{folder / RUNS_FILE} must share a world with the study, got none. {reasons}"
+        )
+    return compared
+
+
+def compare_runs(table: pd.DataFrame, study: StoredStudy) -> PublishedComparison:
+    """Compare own runs, a row per filter, condition and run, with those of a published study."""
+    worlds = StudyFacts.from_pack(study.pack).worlds
     witnesses, left_out, members = {}, {}, []
     for key, rows in table.groupby(_CONDITION, observed=True, sort=False):
         name = " / ".join(map(str, key))
-        stored = published[(published[_CONDITION] == list(key)).all(axis=1)]
+        stored = study.table[(study.table[_CONDITION] == list(key)).all(axis=1)]
         try:
             witnesses[name] = find_witness(rows, stored)
             cap = _find_cap(worlds[str(key[0])], str(key[2]))
         except ValueError as error:
             left_out[name] = str(error)
             continue
-        members.append((name, cap, rows, stored))
-    if not members:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
-        raise ValueError(
-            f"{folder / RUNS_FILE} must share a world with the study, got none. {reasons}"
-        )
+        members.append((name, cap, rows, stored[stored["seed"] == rows["seed"].iloc[0]]))
     verdicts = compare_with_each([_make_pairs(*member) for member in members])
     return PublishedComparison(
         dict(zip([m[0] for m in members], verdicts, strict=True)), witnesses, left_out
@@ -139,41 +150,42 @@ def _find_cap(world: PartName, model: str) -> float:
 
 
 def find_witness(rows: pd.DataFrame, stored: pd.DataFrame) -> str:
-    """Find a filter whose errors agree in all common runs of a condition of two studies.
+    """Find a filter that ran in a condition of both studies; the errors of all such filters must agree in all common runs.
+
+    Dead reckoning is not a witness: it would agree with any measurements.
 
     Raises:
-        ValueError: If the published study lacks such runs, the two have different filters, or the errors of all differ.
+        ValueError: If the published study lacks such runs, the two have different filters, or errors differ.
     """
     if stored.empty:
         raise ValueError(
             "its world must be one of the published study, got another. Choose one of its scenarios"
         )
-    seeds = sorted(stored["seed"].unique())
-    rows = rows[rows["seed"].isin(seeds)]
-    if rows.empty:
-        raise ValueError(f"its runs must have seed={seeds[0]}. Set it")
+    seeds, stored_seeds = set(rows["seed"]), sorted(stored["seed"].unique())
+    if len(seeds) > 1 or not seeds <= set(stored_seeds):
+        raise ValueError(f"its runs must have seed={stored_seeds[0]}, got {sorted(seeds)}. Set it")
+    stored = stored[stored["filter"] != _NO_WITNESS]
     both = _pair(rows, stored)
     if both.empty:
         fastest = stored.groupby("filter", observed=True)["ms"].median().idxmin()
         raise ValueError(
             f"a filter of the published study must run again as a witness. Add filter={parse_label(str(fastest))[0]} to your study"
         )
-    differs = ~np.isclose(
-        both["rmse"], both["rmse_stored"], rtol=_TOLERANCE, atol=0, equal_nan=True
-    )
-    by_filter = pd.Series(differs).groupby(both["filter"].to_numpy()).sum()
-    if by_filter.min() > 0:
-        name = str(by_filter.idxmin())
+    agrees = np.isclose(both["rmse"], both["rmse_stored"], rtol=_TOLERANCE, atol=0, equal_nan=True)
+    differing = both[~agrees]["filter"].value_counts()
+    if len(differing):
+        name = str(differing.index[0])
         raise ValueError(
-            f"{name} must have the errors of the published study, got others in {by_filter.min()} of "
-            f"{(both['filter'] == name).sum()} runs: the worlds differ. Use the settings and the build of its page"
+            f"{name} must have the errors of the published study, got others in {differing.iloc[0]} of "
+            f"{(both['filter'] == name).sum()} runs: the worlds or the filter differ. "
+            "Use the settings and the build of its page"
         )
-    return str(by_filter.idxmin())
+    return str(both["filter"].iloc[0])
 
 
 def _pair(rows: pd.DataFrame, stored: pd.DataFrame) -> pd.DataFrame:
     """Pair the rows of filters that two studies share: a row per filter, number of particles and run."""
-    keys = ["filter", "particles", "run"]
+    keys = ["filter", "particles", "seed", "run"]
     plain = [
         frame.assign(
             filter=[parse_label(str(v))[0] for v in frame["filter"]],

@@ -10,7 +10,7 @@ import pytest
 
 import pfbench
 from pfbench.cli.compare import compare_study
-from pfbench.report.published_study import compare_with_published, find_witness
+from pfbench.report.published_study import compare_runs, find_witness
 from pfbench.report.stored_study import RUNS_FILE, read_stored_study
 
 WORLD = {"seed": 7, "runs": 12, "particles": 50, "progress": False}
@@ -51,7 +51,8 @@ def test_verdicts_are_those_of_one_study_of_all_filters(
 
 def test_other_worlds_are_not_compared(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(home)
-    _, stored = read_stored_study(home / "reports" / "public")
+    study = read_stored_study(home / "reports" / "public")
+    stored = study.table
     own = stored[stored["filter"] == "ukf"]
     assert find_witness(own, stored) == "ukf"
     moved = own.assign(rmse=own["rmse"] * np.where(own["run"] == 3, 1.01, 1.0))
@@ -64,10 +65,25 @@ def test_other_worlds_are_not_compared(home: Path, monkeypatch: pytest.MonkeyPat
         find_witness(own.assign(seed=8), stored)
     with pytest.raises(ValueError, match=r"must run again as a witness. Add filter=\w+"):
         find_witness(own.assign(filter="apf"), stored)
+    both = pd.concat([own, own.assign(seed=8)])
+    with pytest.raises(ValueError, match=r"its runs must have seed=7, got \[7, 8\]"):
+        find_witness(both, stored)
+    compared = compare_runs(own.assign(scenario="elsewhere"), study)
+    assert compared.verdicts == {}
+    assert "Choose one of its scenarios" in str(compared)
+
+
+def test_a_filter_that_ignores_the_measurements_is_no_witness(home: Path) -> None:
+    """Its errors agree whatever is measured; and one agreeing filter does not excuse another."""
+    stored = read_stored_study(home / "reports" / "public").table
+    ukf, sir = stored[stored["filter"] == "ukf"], stored[stored["filter"] == "sir"]
+    blind = ukf.assign(filter="dead_reckoning")
+    with pytest.raises(ValueError, match=r"must run again as a witness"):
+        find_witness(blind, pd.concat([stored, blind]))
     with pytest.raises(
-        ValueError, match=r"must share a world with the study, got none\. elsewhere / nominal"
+        ValueError, match=r"ukf must have the errors .* got others in 12 of 12 runs"
     ):
-        compare_with_published(own.assign(scenario="elsewhere"), home / "reports" / "public")
+        find_witness(pd.concat([sir, ukf.assign(rmse=2 * ukf["rmse"])]), stored)
 
 
 @pytest.mark.parametrize(
