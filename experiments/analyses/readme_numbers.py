@@ -201,8 +201,7 @@ def all_seven() -> str:
     pack, table = read_stored_study(folder)
     overviews = find_overviews(pack, table)
     assert overviews is not None
-    level = choose_level(overviews)
-    overview = overviews[level]
+    overview = overviews[choose_level(overviews)]
     columns = [*overview.methods, *overview.conventional]
     cells = {(cell.world, cell.filter): cell for cell in overview.cells}
     rows = [
@@ -211,9 +210,8 @@ def all_seven() -> str:
         for world in overview.worlds
     ]
     head = ("world", "best Kalman filter = 1", *(overview.names[label] for label in columns))
-    number = f" The table is for {level} particles." if level else ""
     legend = (
-        f"Ratio of errors to the best Kalman filter of the world.{number} Bold: shown to be better. In brackets: not decided. "
+        "Ratio of errors to the best Kalman filter of the world. Bold: shown to be better. Plain: shown to be worse. In brackets: not decided. "
         "=: within 5 %. A percentage is the share of runs that keep track, where it is shown to be below 80 %."
     )
     text = (folder / "report.md").read_text()

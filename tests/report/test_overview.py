@@ -409,6 +409,7 @@ def test_the_page_of_several_numbers_shows_them(levels: dict[TabKey, Overview]) 
     files = render_overview(levels, pack)
     page = files["index.html"]
     assert "How many particles are enough?" in page
+    assert "paired runs each, 1000 particles." in page
     assert "<summary>100 particles</summary>" in page
     table = pd.read_csv(io.StringIO(files["cells.csv"]))
     assert set(table["table"]) == {100, 1000}

@@ -60,7 +60,7 @@ def render_overview(
             (_name_tab(key, item), _suffix(key)) for key, item in overviews.items() if key != level
         ],
         "headline": word_headline(overview, overviews.get(EQUAL_TIME)),
-        "setting": describe_setting(overview),
+        "setting": describe_setting(overview, level),
         "foreign_knobs": describe_page_knobs(pack) if "worlds" in pack else "",
         "ratios": list_ratios(overview),
         "filters": [overview.names[label] for label in (*overview.methods, *overview.conventional)],
@@ -173,12 +173,12 @@ def _name_winners(overview: Overview, most: int = 2) -> str:
     return f"{', '.join(wins)}{more}"
 
 
-def describe_setting(overview: Overview) -> str:
-    """Describe worlds, runs and losses in a line."""
+def describe_setting(overview: Overview, level: TabKey = 0) -> str:
+    """Describe worlds, runs, number of particles and losses in a line."""
     runs = sorted({world.runs for world in overview.worlds})
     counts = f"{runs[0]}" if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
     return (
-        f"{len(overview.worlds)} worlds, {counts} paired runs each. A lost run counts as an error at the track limit. "
+        f"{len(overview.worlds)} worlds, {counts} paired runs each{f', {level} particles' if level else ''}. A lost run counts as an error at the track limit. "
         "The best Kalman filter of a world was chosen on another seed. Conventional are all filters but the proposed ones."
     )
 

@@ -34,7 +34,7 @@ from pfbench.stats.world_table import (
 
 FEWEST_METHODS, FEWEST_WORLDS = 3, 2  # from which a study has this page
 CENTRAL = "nominal"  # regime of the page, if a world has several
-CONVENTIONAL = ("sir", "rpf", "ekf_bank", "gpf")  # that stand next to the methods
+CONVENTIONAL = ("sir", "rpf", "rpf_tuned", "ekf_bank")  # that stand next to the methods
 TabKey = int | str  # a number of particles, 0 for a study of one number, or one of the two below
 EQUAL_TIME, PRINTED = "equal time", "as printed"
 _TUNING_BYTES = 1_000_000
