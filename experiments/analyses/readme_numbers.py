@@ -11,7 +11,7 @@ import gzip
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -22,10 +22,7 @@ from typing import Any
 import yaml
 
 from pfbench.files import markdown_bullets
-from pfbench.report import read_stored_study
-from pfbench.report.overview.figures import describe_cell, format_reference_error
-from pfbench.report.overview.page import choose_level
-from pfbench.report.study_report import find_overviews
+from pfbench.report import find_overviews, read_stored_study, tabulate_heat_map
 
 TOP = Path(__file__).parents[2]
 PAGES = (
@@ -201,15 +198,7 @@ def all_seven() -> str:
     pack, table = read_stored_study(folder)
     overviews = find_overviews(pack, table)
     assert overviews is not None
-    overview = overviews[choose_level(overviews)]
-    columns = [*overview.methods, *overview.conventional]
-    cells = {(cell.world, cell.filter): cell for cell in overview.cells}
-    rows = [
-        [world.name, f"{world.reference}, {format_reference_error(world.level, world.unit)}"]
-        + [_format_cell(cells, world, label, overview) for label in columns]
-        for world in overview.worlds
-    ]
-    head = ("world", "best Kalman filter = 1", *(overview.names[label] for label in columns))
+    head, rows = tabulate_heat_map(overviews)
     legend = (
         "Ratio of errors to the best Kalman filter of the world. Bold: shown to be better. Plain: shown to be worse. In brackets: not decided. "
         "=: within 5 %. A percentage is the share of runs that keep track, where it is shown to be below 80 %."
@@ -217,19 +206,6 @@ def all_seven() -> str:
     text = (folder / "report.md").read_text()
     _, first, second, *_ = text.split("\n\n")
     return f"{first}\n\n{second}\n\n{format_table(head, rows)}\n\n{legend}{describe_knobs('all_seven')}".rstrip()
-
-
-def _format_cell(
-    cells: Mapping[tuple[str, str], Any], world: Any, label: str, overview: Any
-) -> str:
-    """Format a cell of the heat map as text."""
-    look = describe_cell(cells, world, label, overview)
-    cell = cells.get((world.key, label))
-    if cell is None or look.is_grey or look.text == "=":
-        return look.text
-    if cell.verdict.word == "better":
-        return f"**{look.text}**"
-    return look.text if cell.verdict.word == "worse" else f"({look.text})"
 
 
 def speed() -> str:

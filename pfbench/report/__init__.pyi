@@ -14,7 +14,10 @@ from pfbench.report.journal.ratio_figures import (
 )
 from pfbench.report.journal.table_layout import text_width as text_width
 from pfbench.report.options import ReportOptions as ReportOptions
-from pfbench.report.overview.page import render_overview as render_overview
+from pfbench.report.overview.page import (
+    render_overview as render_overview,
+    tabulate_heat_map as tabulate_heat_map,
+)
 from pfbench.report.papers.specs import (
     PaperFigure as PaperFigure,
     PaperFigureInput as PaperFigureInput,

@@ -111,7 +111,7 @@ def compare_with_published(conditions: Sequence[Condition], folder: Path) -> Pub
     study = read_stored_study(folder)
     options = StudyFacts.from_pack(study.pack).options
     table = build_run_table(conditions, options.start_time_s)
-    compared = compare_runs(table, study)
+    compared = compare_tables(table, study)
     if not compared.verdicts:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in compared.left_out.items())
         raise ValueError(
@@ -120,7 +120,7 @@ def compare_with_published(conditions: Sequence[Condition], folder: Path) -> Pub
     return compared
 
 
-def compare_runs(table: pd.DataFrame, study: StoredStudy) -> PublishedComparison:
+def compare_tables(table: pd.DataFrame, study: StoredStudy) -> PublishedComparison:
     """Compare own runs, a row per filter, condition and run, with those of a published study."""
     worlds = StudyFacts.from_pack(study.pack).worlds
     witnesses, left_out, members = {}, {}, []

@@ -10,7 +10,7 @@ import pytest
 
 import pfbench
 from pfbench.cli.compare import compare_study
-from pfbench.report.published_study import compare_runs, find_witness
+from pfbench.report.published_study import compare_tables, find_witness
 from pfbench.report.stored_study import RUNS_FILE, read_stored_study
 
 WORLD = {"seed": 7, "runs": 12, "particles": 50, "progress": False}
@@ -68,7 +68,7 @@ def test_other_worlds_are_not_compared(home: Path, monkeypatch: pytest.MonkeyPat
     both = pd.concat([own, own.assign(seed=8)])
     with pytest.raises(ValueError, match=r"its runs must have seed=7, got \[7, 8\]"):
         find_witness(both, stored)
-    compared = compare_runs(own.assign(scenario="elsewhere"), study)
+    compared = compare_tables(own.assign(scenario="elsewhere"), study)
     assert compared.verdicts == {}
     assert "Choose one of its scenarios" in str(compared)
 

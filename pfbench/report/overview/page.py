@@ -25,6 +25,7 @@ from pfbench.report.writers import format_csv, template_environment
 from pfbench.results.conditions import parse_label
 from pfbench.results.paper_block import read_paper_block
 from pfbench.stats.comparison import Verdict
+from pfbench.stats.world_table import WorldResult
 
 BOARD_PAGE = "worlds.html"  # the page of each world, which is the first page of other studies
 _HERE = Path(__file__).parent
@@ -203,6 +204,43 @@ def list_ratios(overview: Overview) -> list[tuple[WorldRow, list[str]]]:
             texts.append(text + share)
         rows.append((world, texts))
     return rows
+
+
+def tabulate_heat_map(overviews: Mapping[TabKey, Overview]) -> tuple[list[str], list[list[str]]]:
+    """Tabulate the heat map that opens the page, for a text: names of columns, and a row per world.
+
+    Args:
+        overviews: Tables of the page, as `find_overviews` returns them.
+
+    Returns:
+        Names of columns and rows. Shown to be better is bold, not decided in brackets.
+    """
+    overview = overviews[choose_level(overviews)]
+    columns = [*overview.methods, *overview.conventional]
+    table = {(cell.world, cell.filter): cell for cell in overview.cells}
+    rows = [
+        [
+            world.name,
+            f"{world.reference}, {figures.format_reference_error(world.level, world.unit)}",
+        ]
+        + [_format_cell(table, world, label, overview) for label in columns]
+        for world in overview.worlds
+    ]
+    head = ["world", "best Kalman filter = 1", *(overview.names[label] for label in columns)]
+    return head, rows
+
+
+def _format_cell(
+    table: Mapping[tuple[str, str], WorldResult], world: WorldRow, label: str, overview: Overview
+) -> str:
+    """Format a cell of the heat map as text."""
+    look = figures.describe_cell(table, world, label, overview)
+    cell = table.get((world.key, label))
+    if cell is None or look.is_grey or look.text == "=":
+        return look.text
+    if cell.verdict.word == "better":
+        return f"**{look.text}**"
+    return look.text if cell.verdict.word == "worse" else f"({look.text})"
 
 
 def _format_ratio(verdict: Verdict) -> str:
