@@ -7,8 +7,6 @@ user trusts, and folders and Hydra's own settings come from the command line or 
 
 from __future__ import annotations
 
-import ast
-import hashlib
 import importlib.util
 import os
 import re
@@ -19,11 +17,10 @@ from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from importlib.machinery import ModuleSpec, PathFinder
-from pathlib import Path
 from typing import Any
 
-import pfbench
 from pfbench.files import limits
+from pfbench.files.source_digest import BROAD, PACKAGE, find_module, hash_folder, hash_modules
 from pfbench.results.paper_block import conf_dir, experiments_dir
 
 ENVIRONMENT = "PFBENCH_TRUST"  # trusted packages, for the processes of a sweep
@@ -33,12 +30,6 @@ BUILDERS = {
     "nav": ("accelerate", "climb", "cruise", "turn"),
     "model": ("linear_walk", "local_level"),
 }
-# packages that are too large to be trusted as a whole: each can read, write or run files
-BROAD = (
-    "__main__", "cloudpickle", "fsspec", "hydra", "hydra_plugins", "jinja2", "joblib", "matplotlib", "numpy",
-    "omegaconf", "pandas", "pip", "pkg_resources", "pyro", "ray", "scipy", "seaborn", "setuptools", "sympy",
-    "torch", "triton", "yaml",
-)  # fmt: skip
 HARMLESS = ("pyro.distributions", "torch.distributions", "torch.nn")  # parts of them
 HYDRA_KEYS = ("_target_", "_args_", "_partial_", "_convert_", "_recursive_")
 NAME = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)+")
@@ -256,13 +247,9 @@ def _is_defined_in(target: str, trusted: Sequence[str]) -> bool:
 
 
 # --------------------------------------------------------------------------------------------------
-# Digests of the source code of a user's classes, for the key of a job, and of that of pfbench.
+# Source code of a user's classes and of pfbench, as part of the key and of the record of a job.
 #
 # The code of pfbench is not part of a key: a report refuses results of several builds.
-
-PACKAGE = Path(pfbench.__file__).resolve().parent
-_COMPILED = (".pyc", ".so", ".pyd")
-_LIBRARIES = ("site-packages", "dist-packages")
 
 
 def hash_user_code(values: Any) -> dict[str, str]:
@@ -271,34 +258,18 @@ def hash_user_code(values: Any) -> dict[str, str]:
     The files are those of the modules that `_target_` names, and of all modules that these import,
     directly or through others. Installed libraries and pfbench are left out.
     """
-    files: dict[str, bytes] = {}
-    for target in sorted(set(_user_targets(values))):
-        _collect(_module_of(target), files)
-    return {name: hashlib.sha256(source).hexdigest()[:16] for name, source in sorted(files.items())}
+    return hash_modules(find_module(target) for target in sorted(set(_user_targets(values))))
 
 
 @cache
 def hash_package() -> str:
     """Compute a digest of the sources of the installed pfbench.
 
-    It depends on the names and contents of the files only, not on times or compiled files. Configuration
-    files do not count: what a job takes from them is part of its key.
+    Configuration files do not count: what a job takes from them is part of its key.
     """
-    sha256 = hashlib.sha256()
-    configurations = {str(conf_dir()), str(experiments_dir())}  # inside of the package in a wheel
-    for folder, below, files in os.walk(PACKAGE):  # an order of its own for each file system
-        below[:] = sorted(
-            name
-            for name in below
-            if name != "__pycache__" and f"{folder}/{name}" not in configurations
-        )
-        for file in sorted(files):
-            if not file.endswith(_COMPILED):
-                with open(f"{folder}/{file}", "rb", buffering=0) as source:
-                    content = source.read()
-                name = f"{folder.removeprefix(str(PACKAGE))}/{file}"
-                sha256.update(f"{name} {len(content)};".encode() + content)
-    return sha256.hexdigest()[:12]
+    return hash_folder(
+        PACKAGE, {str(conf_dir()), str(experiments_dir())}
+    )  # inside of it in a wheel
 
 
 def list_user_packages(values: Any, trusted: Sequence[str]) -> list[str]:
@@ -318,68 +289,3 @@ def _user_targets(node: Any) -> Iterator[str]:
     elif isinstance(node, list | tuple):
         for value in node:
             yield from _user_targets(value)
-
-
-def _find_file(module: str) -> Path | None:
-    """Return the file of a module, or None if the module or its file does not exist."""
-    try:
-        spec = importlib.util.find_spec(module)
-    except (ImportError, AttributeError, ValueError):  # a parent is missing, or is not a package
-        return None
-    origin = None if spec is None or not spec.has_location else spec.origin
-    return None if origin is None else Path(origin)
-
-
-def _module_of(target: str) -> str:
-    """Return the module of a class: the longest part of its name that is a module."""
-    parts = target.split(".")[:-1]
-    while len(parts) > 1 and _find_file(".".join(parts)) is None:
-        parts.pop()
-    return ".".join(parts)
-
-
-def _collect(module: str, files: dict[str, bytes]) -> None:
-    """Add the source of a module and of the modules of its package that it needs."""
-    file = _find_file(module)
-    if module in files or file is None:
-        return
-    files[module] = source = file.read_bytes()
-    parent = module.rpartition(".")[0]
-    if parent:
-        _collect(parent, files)  # Python runs the packages first
-    if file.suffix == ".py":
-        package = module if file.name == "__init__.py" else parent
-        for name in _imports(ast.parse(source), package):
-            if _is_beside(name.split(".")[0], module.split(".")[0]):
-                _collect(name, files)
-
-
-def _is_beside(name: str, module: str) -> bool:
-    """Return whether a top-level module is a user's own one or a helper in the same folder."""
-    if name == module:
-        return True
-    if name in sys.stdlib_module_names or name in ("pfbench", *BROAD):
-        return False
-    home = _find_home(module)
-    return home is not None and home == _find_home(name)
-
-
-def _find_home(name: str) -> Path | None:
-    """Return the folder of a top-level module, or None for an installed library."""
-    file = _find_file(name)
-    if file is None:
-        return None
-    home = (file.parent if file.name == "__init__.py" else file).parent
-    return None if home.name in _LIBRARIES else home
-
-
-def _imports(tree: ast.AST, package: str) -> Iterator[str]:
-    """Yield the names that a module imports. `from a import b` gives a and a.b, which may be a module."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            parts = package.split(".")
-            base = parts[: len(parts) - node.level + 1] if node.level else []
-            stem = ".".join([*base, *([node.module] if node.module else [])])
-            yield from (stem, *(f"{stem}.{alias.name}" for alias in node.names))

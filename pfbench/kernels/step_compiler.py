@@ -33,10 +33,12 @@ class NativeEntry(NamedTuple):
     Attributes:
         step: Number of the function, see `step_table.register_step`.
         constants: Tensors that it takes before the arguments.
+        library: File of its code.
     """
 
     step: int
     constants: list[Tensor]
+    library: str
 
 
 class OperatorRegistry(dict[str, list[str]]):
@@ -165,7 +167,7 @@ def _register_entry(
 ) -> NativeEntry:
     """Return the entry of a library, after registering what it takes."""
     path = encode_path(library)
-    return NativeEntry(register_step(path, outputs, [*constants, *example]), constants)
+    return NativeEntry(register_step(path, outputs, [*constants, *example]), constants, library)
 
 
 def _find_entry(artefacts: list[Any], run: Any, example: list[Tensor]) -> NativeEntry | None:

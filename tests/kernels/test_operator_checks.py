@@ -277,7 +277,7 @@ def test_a_compiled_step_takes_the_arguments_that_it_was_compiled_for() -> None:
     example = [torch.rand(3, 2), torch.rand(4, dtype=torch.float64)]
     _, entry = compile_function(lambda a, b: [a + 1.0, b * 2.0], example)
     assert entry is not None
-    number, constants = entry
+    number, constants, _ = entry
     good = [torch.rand(1, 3, 2), torch.rand(1, 4).double()]
     first, second = step_compiler.run_steps(number, constants, [], good, [])
     assert torch.equal(first, good[0][0] + 1.0)

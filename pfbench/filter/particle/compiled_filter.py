@@ -6,8 +6,10 @@ import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any, Protocol
 
 import torch
@@ -18,6 +20,7 @@ from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record, map_inputs
 from pfbench.filter.belief import Filter, GaussianBelief, ParticleBelief, StepInfo, StepSummary
 from pfbench.filter.loop import MultiStepFilter, RecordStartedFilter
+from pfbench.filter.particle import step_store
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.kernels import dispatch, step_compiler
 from pfbench.kernels.step_compiler import (
@@ -48,6 +51,7 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         method: The filter. With moves, or a proposal that stores paths, it runs uncompiled.
         counter: Counter of likelihood evaluations, which compiled steps cannot increment.
         clock: Clock that measures the time of compilation, s.
+        builds: Whether a step that is not stored is compiled.
         seconds: Time of compilation so far, s.
         graphs: Compiled step by kind of step; None if that kind runs uncompiled.
     """
@@ -55,6 +59,7 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     method: ParticleFilter
     counter: CallCounter | None = None
     clock: Callable[[], float] = time.perf_counter
+    builds: bool = True
     seconds: float = 0.0
     graphs: dict[Any, CompiledStep | None] = field(default_factory=dict)
 
@@ -156,10 +161,12 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     def _compile(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: PhiloxStream
     ) -> CompiledStep | None:
-        """Compile a step; log a warning and return None if that fails."""
+        """Load or compile a step; log a warning and return None if that fails."""
         start_time = self.clock()
         try:
-            graph = compile_step(self.method, model, belief, record, draws, self.counter)
+            graph = compile_step(
+                self.method, model, belief, record, draws, self.counter, self.builds
+            )
         except Exception as error:  # torch raises many kinds
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             log.warning(
@@ -170,7 +177,9 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
             return None
         elapsed = self.clock() - start_time
         self.seconds += elapsed
-        log.info("engine=compiled: the step compiled in %.1f s", elapsed)
+        if graph is not None:
+            done = "was loaded" if graph.is_stored else "compiled"
+            log.info("engine=compiled: the step %s in %.1f s", done, elapsed)
         return graph
 
 
@@ -196,22 +205,24 @@ class CompiledStep:
 
     Attributes:
         run: (belief, step number, record, seed, runs) -> next belief, mean, variance, predicted log
-            weights, trace.
-        entry: C++ entry of `run`, or None.
+            weights, trace. None for a step from the store.
+        entry: C++ entry of the step, or None.
         memory: Names of the tensors in the belief's memory.
         trace: Names of the step's diagnostics.
         evaluations: Likelihood evaluations of a step.
         max_steps: Steps that may be taken together.
         model: Model of the step. Its identity is the key of the step, so it must stay alive.
+        is_stored: Whether the step comes from the store on disk.
     """
 
-    run: TensorFunction
+    run: TensorFunction | None
     entry: NativeEntry | None
     memory: list[str]
     trace: list[str]
     evaluations: int
     max_steps: int
     model: StateSpaceModel
+    is_stored: bool = False
 
     def run_steps(
         self, belief: ParticleBelief, record: Record, draws: PhiloxStream
@@ -234,7 +245,7 @@ class CompiledStep:
                 self.entry.step, self.entry.constants, state, inputs, shared
             )
             results = [flat[k : k + width] for k in range(0, len(flat), width)]
-        else:
+        elif self.run is not None:
             for step_inputs in zip(*(a.unbind() for a in inputs), strict=True):
                 stored = self.run([*state, *step_inputs, *shared])
                 results.append([from_storage(a) for a in stored])
@@ -261,32 +272,83 @@ def compile_step(
     record: Record,
     draws: PhiloxStream,
     counter: CallCounter | None = None,
-) -> CompiledStep:
-    """Record and compile a filter's step.
+    builds: bool = True,
+) -> CompiledStep | None:
+    """Load a filter's step from the store, or record and compile it.
 
-    Returns the compiled step.
+    Its numbers are compared with those of the uncompiled step.
+
+    Returns the compiled step; None if it is not stored and `builds` is false.
     """
     names: list[list[str]] = []
-    step = _make_tensor_function(method, model, belief, record, draws, names)
-    plain_step = _make_tensor_function(method, model, belief, record, draws, [], record_step=False)
+    make = partial(_make_tensor_function, method, model, belief, record, draws)
     state, inputs = _belief_to_storage(belief), [to_storage(a) for a in tensors_in(record)]
     shared = [torch.as_tensor(draws.seed), draws.runs]
     example = [*state, torch.as_tensor(draws.step), *inputs, *shared]
-    count = counter.count if counter else 0
+    name = None
+    if not example[0].is_cuda and (builds or step_store.has_steps()):
+        arguments = belief, record, draws.dtype, draws.runs
+        name = step_store.name_step((method, model), arguments, counter)
+    if not builds and not (name and step_store.has_step(name)):
+        return None
+    with _keep_count(counter) as count:
+        expected = make(names, record_step=False)(*example)
+        evaluations = count()
+        run, entry = None, _load_step(name, example, expected, len(state))
+        is_stored = entry is not None
+        if not is_stored and builds:
+            run, entry = _compile_and_store(name, make([]), example, expected, len(state))
+    if not is_stored and not builds:
+        return None
+    memory, trace = names
+    carried_shapes = [a.shape for a in expected[: len(state)]]
+    keeps_shapes = len(memory) + 3 == len(state) and carried_shapes == [a.shape for a in state]
+    max_steps = _choose_max_steps(expected) if keeps_shapes else 1
+    return CompiledStep(run, entry, memory, trace, evaluations, max_steps, model, is_stored)
+
+
+@contextmanager
+def _keep_count(counter: CallCounter | None) -> Iterator[Callable[[], int]]:
+    """Let a counter count, and restore its count at the end. Yields a function that returns what was counted."""
+    before = counter.count if counter else 0
     try:
-        run, entry = compile_function(step, example)
-        evaluations = counter.count - count if counter else 0
-        out = run(example)
-        expected = plain_step(*example)
+        yield lambda: counter.count - before if counter else 0
     finally:
         if counter:
-            counter.count = count
-    memory, trace = names
-    _check_agreement(out, expected, len(state))
-    carried_shapes = [a.shape for a in out[: len(state)]]
-    keeps_shapes = len(memory) + 3 == len(state) and carried_shapes == [a.shape for a in state]
-    max_steps = _choose_max_steps(out) if keeps_shapes else 1
-    return CompiledStep(run, entry, memory, trace, evaluations, max_steps, model)
+            counter.count = before
+
+
+def _compile_and_store(
+    name: str | None,
+    step: Callable[..., list[Tensor]],
+    example: list[Tensor],
+    expected: Sequence[Tensor],
+    carried: int,
+) -> tuple[TensorFunction, NativeEntry | None]:
+    """Compile a step, compare it with the uncompiled one, and store it if it has a name."""
+    run, entry = compile_function(step, example)
+    _check_agreement(run(example), expected, carried)
+    if name and entry:
+        step_store.save_step(name, entry, len(expected))
+    return run, entry
+
+
+def _load_step(
+    name: str | None, example: list[Tensor], expected: Sequence[Tensor], carried: int
+) -> NativeEntry | None:
+    """Load a step from the store; remove it and return None if its numbers are not those of the uncompiled one."""
+    entry = step_store.load_step(name, example) if name else None
+    if entry is None:
+        return None
+    try:
+        batched = [a.unsqueeze(0) for a in example]
+        out = step_compiler.run_steps(entry.step, entry.constants, [], batched, [])
+        _check_agreement([to_storage(a) for a in out], expected, carried)
+    except (ArithmeticError, RuntimeError) as error:
+        log.warning("engine=compiled: a stored step is removed (%s)", error)
+        step_store.remove_step(Path(entry.library).parent.name)
+        return None
+    return entry
 
 
 def _make_tensor_function(

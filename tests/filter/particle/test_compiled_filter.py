@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import pfbench
+from compiled_cases import RUNS, STEPS, agree, compiler, record_of, run
 from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 
@@ -17,8 +17,8 @@ from pfbench.core.linear_algebra import affine_map
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import StepInfo
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle import compiled_filter
+from pfbench.filter.loop import run_filter
+from pfbench.filter.particle import compiled_filter, step_store
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.stages import Proposal
@@ -27,41 +27,13 @@ from pfbench.kernels import dispatch, step_compiler
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.model.textbook import UnivariateGrowth
-from pfbench.noise.base import NominalNoise
 from pfbench.results import store
-from pfbench.scenario.simulated import ModelSimulation
-
-RUNS, STEPS = 4, 12
-compiler = pytest.mark.skipif(
-    not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="no C++ compiler"
-)
 
 
-def record_of(model: StateSpaceModel) -> Record:
-    """A record with a component missing at times, in some runs."""
-    record = ModelSimulation(model, STEPS).draw(NominalNoise(), torch.arange(RUNS), 1).record
-    record.y[1, 4] = record.y[3, 7:9] = torch.nan
-    return record
-
-
-def run(
-    method: Any, model: StateSpaceModel, record: Record, at_once: int | None = None
-) -> FilterResult:
-    with dispatch.use_compiled(), torch.no_grad():
-        return run_filter(
-            method, model, record, PhiloxStream(1, torch.arange(RUNS)), run_batch=at_once
-        )
-
-
-def agree(one: FilterResult, other: FilterResult) -> None:
-    """Every number of two estimates, to rounding."""
-    for name in ("mean", "variance", "log_evidence"):
-        torch.testing.assert_close(
-            getattr(one, name), getattr(other, name), rtol=1e-9, atol=1e-9, equal_nan=True
-        )
-    assert one.trace.keys() == other.trace.keys()
-    for name, value in one.trace.items():
-        torch.testing.assert_close(value.double(), other.trace[name].double(), rtol=1e-9, atol=1e-9)
+@pytest.fixture(autouse=True)
+def empty_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no step of an earlier test or of a user be loaded."""
+    monkeypatch.setattr(step_store, "_folder", lambda: tmp_path / "steps")
 
 
 class Failing(UnivariateGrowth):

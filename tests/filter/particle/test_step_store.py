@@ -1,0 +1,335 @@
+"""Compiled steps on disk: found by what decides their code, and never a wrong number whatever lies in the store."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from compiled_cases import RUNS, agree, compiler, record_of, run
+
+from pfbench.filter.belief import ParticleBelief
+from pfbench.filter.particle import compiled_filter, step_store
+from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.job import filter_pass
+from pfbench.job.scoring import LikelihoodCounter
+from pfbench.model.linear_gaussian import linear_walk
+from pfbench.model.textbook import UnivariateGrowth
+
+FILES = ("step.so", "constants.pt", "step.json")
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the empty store of a test."""
+    folder = tmp_path / "steps"
+    monkeypatch.setattr(step_store, "_folder", lambda: folder)
+    return folder
+
+
+# --------------------------------------------------------------------------------------------------
+# The name of a step
+
+
+def arguments(particles: int = 20, dtype: torch.dtype = torch.float64) -> Any:
+    """Belief, record, type and runs of a step."""
+    x = torch.randn(RUNS, particles, 1, dtype=dtype)
+    belief = ParticleBelief(x, torch.zeros(RUNS, particles, dtype=dtype), torch.zeros(RUNS))
+    return belief, record_of(UnivariateGrowth()).at_step(0), dtype, torch.arange(RUNS)
+
+
+def name(method: Any = None, model: Any = None, given: Any = None, **more: Any) -> str:
+    """Name of the step of a filter, by default of one that differs in nothing from the others."""
+    parts = (method or ParticleFilter(20)), (model or linear_walk(1.0, 0.3, 1.0))
+    found = step_store.name_step(parts, given or arguments(), **more)
+    assert found is not None
+    return found
+
+
+def test_equal_steps_have_one_name_whatever_their_numbers() -> None:
+    """Particles and measurements are arguments, and what was counted decides nothing."""
+    assert name() == name()
+    counted = []
+    for _ in range(2):
+        model = linear_walk(1.0, 0.3, 1.0)
+        counter = LikelihoodCounter(model)
+        counter.count = len(counted)
+        counted.append(name(model=model, uncounted=counter))
+    assert counted[0] == counted[1]
+
+
+def changed_threads() -> str:
+    """Name with another number of threads."""
+    step_store._describe_platform.cache_clear()
+    torch.set_num_threads(2)
+    try:
+        return name()
+    finally:
+        torch.set_num_threads(1)
+        step_store._describe_platform.cache_clear()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        lambda: name(ParticleFilter(21)),
+        lambda: name(model=linear_walk(1.0, 0.3, 1.0 + 1e-15)),
+        lambda: name(model=UnivariateGrowth()),
+        lambda: name(given=arguments(21)),
+        lambda: name(given=arguments(dtype=torch.float32)),
+        lambda: name(library="another"),
+        changed_threads,
+    ],
+    ids=["filter", "last digit", "model", "shape", "precision", "operators", "threads"],
+)  # fmt: skip
+def test_whatever_decides_the_code_decides_the_name(other: Callable[[], str]) -> None:
+    assert other() != name()
+
+
+def test_structure_counts_not_only_values() -> None:
+    """Lists of equal values, values under other names, functions with other defaults and closures."""
+
+    def shifted(by: float) -> Callable[[float], float]:
+        return lambda x: x + by
+
+    a, b = torch.ones(2), torch.ones(2)
+    trees = [
+        [1, 2], (1, 2), [[1], 2], [1, [2]], {"a": 1}, {"b": 1}, 1, 1.0, True, "1", b"1", None, float("nan"),
+        [a, a], [a, b], a, 2 * a, a.double(), a[:1], a.expand(2, 2), np.ones(2), np.ones(2, dtype=np.float32),
+        shifted(1.0), shifted(2.0), partial(max, 1), partial(max, 2), partial(min, 1), torch.sin, torch.cos, {1, 2}, {1, 3},
+        linear_walk, UnivariateGrowth, UnivariateGrowth(), UnivariateGrowth().propagate, UnivariateGrowth().log_likelihood,
+    ]  # fmt: skip
+    names = [step_store.name_step(tree, ()) for tree in trees]
+    assert None not in names
+    assert len(set(names)) == len(trees)
+
+
+class Slotted:
+    """An object whose attributes lie in slots."""
+
+    __slots__ = ("a",)
+
+    def __init__(self, a: float) -> None:
+        self.a = a
+
+
+class Whole(int):
+    """A number with a class of its own."""
+
+
+def test_attributes_in_slots_and_values_of_own_kinds_of_numbers_count() -> None:
+    for kind in (Slotted, Whole):
+        assert step_store.name_step(kind(1), ()) == step_store.name_step(kind(1), ())
+        assert step_store.name_step(kind(1), ()) != step_store.name_step(kind(2), ())
+
+
+def test_cycles_have_an_end() -> None:
+    loop: list[Any] = [1]
+    loop.append(loop)
+    assert step_store.name_step(loop, ()) != step_store.name_step([1, [1]], ())
+
+
+@pytest.mark.parametrize(
+    "value", [torch.Generator(), iter([1]), {Slotted(1)}, np.array([Slotted(1)])], ids=repr
+)
+def test_what_cannot_be_described_has_no_name(value: object) -> None:
+    assert step_store.name_step([ParticleFilter(20), value], ()) is None
+
+
+def test_a_changed_class_of_a_user_or_a_module_that_it_imports_is_another_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    helper, models = tmp_path / "steplab_units.py", tmp_path / "steplab.py"
+    models.write_text("import steplab_units\n\n\nclass Model:\n    scale = 2.0\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    names = []
+    for text in ("METRE = 1.0\n", "METRE = 2.0\n", "METRE = 1.0\n"):
+        helper.write_text(text)
+        importlib.invalidate_caches()
+        names.append(step_store.name_step(importlib.import_module("steplab").Model(), ()))
+    models.write_text(models.read_text().replace("2.0", "2.5"))
+    names.append(step_store.name_step(importlib.import_module("steplab").Model(), ()))
+    assert names[0] == names[2]
+    assert len(set(names)) == 3
+    assert None not in names
+
+
+def test_a_class_without_a_file_has_no_name() -> None:
+    kind = type("Typed", (), {"__module__": "a_notebook"})
+    assert step_store.name_step(kind(), ()) is None
+
+
+# --------------------------------------------------------------------------------------------------
+# Its files. One step is compiled for all tests.
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a store with the step of `filtered`, in place of `step_store._folder`."""
+    folder = tmp_path_factory.mktemp("store") / "steps"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(step_store, "_folder", lambda: folder)
+        filtered()
+    assert len(list(folder.iterdir())) == 1
+    return folder
+
+
+def filtered(builds: bool = True, scale: float = 1.0) -> CompiledParticleFilter:
+    """Filter a record with compiled steps, and compare each number with the uncompiled filter."""
+    model, method = linear_walk(scale, 0.3, 1.0), ParticleFilter(30)
+    record = record_of(model)
+    step = CompiledParticleFilter(method, builds=builds)
+    agree(run(step, model, record), run(method, model, record))
+    return step
+
+
+def stored_graph(step: CompiledParticleFilter) -> Any:
+    (graph,) = step.graphs.values()
+    return graph
+
+
+@pytest.fixture
+def refuse_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a call of torch's compiler fail."""
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("the compiler was asked")
+
+    monkeypatch.setattr(compiled_filter, "compile_function", refuse)
+
+
+needs_step = [pytest.mark.slow, compiler, pytest.mark.filterwarnings("ignore")]
+
+
+class TestStored:
+    """Tests that load the step."""
+
+    pytestmark = needs_step
+
+    @pytest.fixture(autouse=True)
+    def filled(self, built: Path, cache: Path) -> Path:
+        shutil.copytree(built, cache)
+        (folder,) = cache.iterdir()
+        return folder
+
+    def test_a_stored_step_needs_no_compiler(self, refuse_compiler: None) -> None:
+        graph = stored_graph(filtered(builds=False))
+        assert graph.is_stored
+        assert graph.entry is not None
+
+    def test_another_process_loads_it_without_importing_the_compiler(self, cache: Path) -> None:
+        code = (
+            "import sys; from test_step_store import *; torch.set_num_threads(1)\n"
+            f"step_store._folder = lambda: Path({str(cache)!r})\n"
+            "assert stored_graph(filtered(builds=False)).is_stored\n"
+            "assert 'torch._inductor.compile_fx' not in sys.modules\n"
+        )
+        paths = [str(Path(__file__).parent), str(Path(__file__).parents[2]), *sys.path]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+        subprocess.run([sys.executable, "-c", code], check=True, env=environment)
+
+    def test_another_model_is_another_step(self, refuse_compiler: None) -> None:
+        assert stored_graph(filtered(builds=False, scale=1.5)) is None
+
+    @pytest.mark.parametrize("file", FILES)
+    @pytest.mark.parametrize("damage", ["cut", "empty", "flipped", "gone"])
+    def test_a_damaged_step_is_removed_and_said_once(
+        self, filled: Path, file: str, damage: str, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        data = bytearray((filled / file).read_bytes())
+        data[len(data) // 2] ^= 255
+        content = {"cut": data[: len(data) // 2], "empty": b"", "flipped": data}
+        (filled / file).unlink()
+        if damage in content:
+            (filled / file).write_bytes(bytes(content[damage]))
+        with caplog.at_level("INFO", "pfbench"):
+            assert stored_graph(filtered(builds=False)) is None
+        (said,) = [r.getMessage() for r in caplog.records]
+        assert said.startswith("engine=compiled: a stored step is damaged")
+        assert not filled.exists()
+
+    def test_a_step_that_gives_other_numbers_is_not_used(
+        self, filled: Path, cache: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        """A file of another step under this name, with valid digests: as if the name had missed something."""
+        names: list[str] = []
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(step_store, "has_step", names.append)
+            filtered(builds=False, scale=1.5)
+        os.rename(filled, cache / names[0])
+        assert stored_graph(filtered(builds=False, scale=1.5)) is None
+        assert "a stored step is removed (its numbers must be those of" in caplog.text
+        assert not list(cache.iterdir())
+
+    def test_a_store_that_others_can_write_is_not_used(
+        self, filled: Path, refuse_compiler: None, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        filled.chmod(0o777)
+        assert stored_graph(filtered(builds=False)) is None
+        assert "stored steps are not used" in caplog.text
+        assert "others cannot write" in caplog.text
+
+    def test_auto_takes_a_stored_step_and_compiles_none(self, cache: Path) -> None:
+        method = ParticleFilter(30)
+        wrap = partial(filter_pass._compile_step, "kernels", method, None, None)
+        step = wrap(True)
+        assert step is not None
+        assert not step.builds
+        assert wrap(False) is None
+        shutil.rmtree(cache)
+        assert wrap(True) is None
+
+
+@pytest.fixture
+def entry(tmp_path: Path) -> Any:
+    """An entry whose library is a file of some bytes."""
+    library = tmp_path / "made.so"
+    library.write_bytes(b"code")
+    return step_store.NativeEntry(0, [torch.ones(2)], str(library))
+
+
+def test_what_is_stored_is_complete_and_private(entry: Any, cache: Path) -> None:
+    step_store.save_step("a", entry, 3)
+    step_store.save_step("a", entry._replace(constants=[]), 4)  # the first of two processes stays
+    assert [folder.name for folder in cache.iterdir()] == ["a"]
+    assert {file.name for file in (cache / "a").iterdir()} == set(FILES)
+    assert json.loads((cache / "a/step.json").read_text())["outputs"] == 3
+    assert (cache.stat().st_mode | (cache / "a").stat().st_mode) & 0o077 == 0
+
+
+@pytest.mark.parametrize("place", ["copyfile", "mkdir"])
+def test_a_full_or_read_only_disk_loses_nothing_but_the_store(
+    place: str, entry: Any, cache: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:  # fmt: skip
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(*((shutil, "copyfile") if place == "copyfile" else (Path, "mkdir")), fail)
+    step_store.save_step("a", entry, 3)
+    assert "the step is not stored ([Errno 28] No space left" in caplog.text
+    assert not cache.exists() or not list(cache.iterdir())
+
+
+def test_the_store_is_limited_in_size_and_age(
+    entry: Any, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for age, name in enumerate("abcd"):
+        step_store.save_step(name, entry, 3)
+        stamp = (cache / name).stat().st_mtime - 100.0 * age - 91 * 86400.0 * (name == "d")
+        os.utime(cache / name, (stamp, stamp))
+    size = sum(file.stat().st_size for file in (cache / "a").iterdir())
+    monkeypatch.setattr(step_store, "_LARGEST", 2.5 * size)
+    step_store.save_step("e", entry, 3)
+    assert sorted(folder.name for folder in cache.iterdir()) == ["a", "b", "e"]
