@@ -246,6 +246,8 @@ def test_studies_run_cheapest_first_and_within_a_limit() -> None:
     costs = {"a": 3600.0, "b": 60.0, "c": 7200.0}
     assert studies.plan_studies(["c", "a", "unknown", "b"], costs) == ["b", "a", "c", "unknown"]
     assert studies.plan_studies(["c", "a", "b"], costs, hours=1.5) == ["b", "a"]
+    assert studies.list_experiments("quickstart") == ["quickstart", "quickstart_bearings"]
+    assert studies.list_experiments("paper_001") == ["paper_001"]
     scripts = set(load("publish_reports").HEADLINES)  # which are no experiments
     assert set(studies.list_studies()) == {folder.name for folder in list_published()} - scripts
 

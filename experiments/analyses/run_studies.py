@@ -21,11 +21,14 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import yaml
+
 from pfbench.results import read_metadata
 
 TOP = Path(__file__).parents[2]
 COSTS = Path(__file__).with_name("study_costs.json")
 _PARTS = ("world", "pcrb", "scores", "filter")  # of the seconds of a job
+_OPTIONS = ("--hours=", "--list", "--cost")
 LEARNED = "neural_ckf"  # the filter whose network a study named learned_* trains first
 
 
@@ -69,24 +72,31 @@ def plan_studies(
     return plan
 
 
+def list_experiments(study: str) -> list[str]:
+    """List the experiments of a study: that of its name, and others that name it."""
+    files = sorted((TOP / "experiments").glob(f"{study}_*.yaml"))
+    others = [path.stem for path in files if yaml.safe_load(path.read_text())["study"] == study]
+    return [study, *others]
+
+
 def run_study(study: str, results: Path) -> int:
-    """Train the network of a study that needs one, run the sweep, and return the exit code.
+    """Train the network of a study that needs one, run the sweeps, and return the exit code.
 
     Args:
         study: Name of the study.
         results: Folder of all studies.
     """
-    options = [f"+experiment={study}"]
-    commands = [["run", "-m", *options]]
+    commands = [["run", "-m", f"+experiment={name}"] for name in list_experiments(study)]
     if study.startswith("learned_") and not (results / study / "network.pt").exists():
-        commands.insert(0, ["train", *options, f"filter={LEARNED}", "checkpoint=null"])
+        words = [f"+experiment={study}", f"filter={LEARNED}", "checkpoint=null"]
+        commands.insert(0, ["train", *words])
+    codes = []
     for words in commands:
-        code = subprocess.run(
-            [sys.executable, "-m", "pfbench", *words], cwd=TOP, check=False
-        ).returncode
-        if code:
-            return code
-    return 0
+        command = [sys.executable, "-m", "pfbench", *words]
+        codes.append(subprocess.run(command, cwd=TOP, check=False).returncode)
+        if codes[-1] and words[0] == "train":
+            break
+    return max(codes)
 
 
 def measure_step_times(study: str) -> int:
@@ -102,6 +112,9 @@ def measure_step_times(study: str) -> int:
 
 def main(words: Sequence[str]) -> int:
     """Run the planned studies and return 1 if one of them failed."""
+    if unknown := [w for w in words if w.startswith("-") and not w.startswith(_OPTIONS)]:
+        print(__doc__ if unknown[0] in ("-h", "--help") else f"unknown option {unknown[0]}. See --help.")  # fmt: skip
+        return 2 * (unknown[0] not in ("-h", "--help"))
     costs = read_costs()
     hours = [float(word.partition("=")[2]) for word in words if word.startswith("--hours=")]
     names = [word for word in words if not word.startswith("--")]
