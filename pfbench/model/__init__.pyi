@@ -19,6 +19,11 @@ from pfbench.model.base import (
     StaticModel as StaticModel,
 )
 from pfbench.model.constraints import Constraints as Constraints
+from pfbench.model.earth_form import (
+    EarthForm as EarthForm,
+    FlatEarth as FlatEarth,
+    RotatingEarth as RotatingEarth,
+)
 from pfbench.model.ins_gnss import InsGnss as InsGnss
 from pfbench.model.linear_gaussian import (
     LinearGaussian as LinearGaussian,

@@ -12,33 +12,36 @@ from pfbench.core import chart as quaternion
 from pfbench.core.density import independent_normal
 from pfbench.core.parameter_checks import check_tuning, require
 from pfbench.model.constraints import Constraints, swap_axes
+from pfbench.model.earth_form import EarthForm, FlatEarth
 from pfbench.model.strapdown import StrapdownModel, StrapdownTotal
 from pfbench.model.strapdown_tuning import StrapdownTuning
 from pfbench.nav.strapdown import PreintegratedImu, rotate
 
 _MOTION = 16
 _AXES = ("right", "forward", "up")
+_FLAT = FlatEarth()
 
 
 class StrapdownBlocks(StrapdownModel):
     """StrapdownTotal with further components of the measurement, and further states.
 
-    With attitude C, velocity v, position p, gyro bias b, and the mean rate w of a step less b, the
-    components are, in this order,
+    A state has attitude C, velocity v, position p and gyro bias b. w is the mean rate of a step less b. The
+    components are, in this order:
 
-        fix                  p + C l - tau (v + C (w x l)), and v + C (w x l) if velocity is measured
-        non-holonomic        right and up component of C^T v + w x a
-        zero velocity        v
-        zero rate            b
-        odometer             (1 + s) times the forward component of C^T v + w x a
+    - Fix: p + C l - tau (v + C (w x l)), and v + C (w x l) if velocity is measured.
+    - Non-holonomic: right and up component of C^T v + w x a.
+    - Zero velocity: v.
+    - Zero rate: b, and on a rotating Earth its rate in body axes.
+    - Odometer: (1 + s) times the forward component of C^T v + w x a.
 
-    for the lever arm l, the delay tau, the axle a and the scale error s. Lever arm (right, forward, up),
-    scale error and delay are states behind the 16 of StrapdownTotal if the constraints say so. They are
-    constant. A component that is missing at a step is NaN.
+    l is the lever arm, tau the delay, a the axle and s the scale error. Lever arm (right, forward, up), scale
+    error and delay are states behind the 16 of StrapdownTotal if the constraints say so. They are constant. A
+    component that is missing at a step is NaN.
 
     Args:
         tuning: Standard deviations and densities of the motion.
         constraints: Components and states.
+        earth: FlatEarth or RotatingEarth.
 
     Raises:
         ValueError: If a density or standard deviation is not positive, or the delay of fixes with velocity
@@ -49,12 +52,15 @@ class StrapdownBlocks(StrapdownModel):
     measured = "tuning and constraints"
     remedy = "Use scenario.constraints as constraints of the model, and the same velocity_sd in receiver and tuning."
     lever: Tensor
+    site: Tensor
     axle: Tensor
 
-    def __init__(self, tuning: StrapdownTuning, constraints: Constraints) -> None:
+    def __init__(
+        self, tuning: StrapdownTuning, constraints: Constraints, earth: EarthForm = _FLAT
+    ) -> None:
         super().__init__()
         check_tuning(tuning, StrapdownTuning)
-        self.motion, self.constraints = StrapdownTotal(tuning), constraints
+        self.motion, self.constraints, self.earth = StrapdownTotal(tuning), constraints, earth
         delay, remedy = constraints.delay_sd, "Set delay_sd or velocity_sd to null."
         is_of_position = delay is None or len(self.motion.r) == 3
         require(is_of_position, "constraints.delay_sd", "be null for fixes with velocity", delay, remedy)  # fmt: skip
@@ -78,6 +84,7 @@ class StrapdownBlocks(StrapdownModel):
         self.register_buffer("p0", torch.cat([tuning.initial_sd, *sds]))
         self.register_buffer("r", torch.cat([tuning.measurement_sd, constraints.measurement_sd]))
         self.register_buffer("lever", swap_axes(constraints.lever_arm or (0.0, 0.0, 0.0)))
+        self.register_buffer("site", earth.site)
         self.register_buffer("axle", swap_axes(constraints.axle))
         self.has_axle = any(constraints.axle)
         self.channel_names = (
@@ -85,13 +92,15 @@ class StrapdownBlocks(StrapdownModel):
             *constraints.channel_names,
         )
         self.choices = (
-            *self.motion.choices,
+            earth.choice,
+            *self.motion.choices[1:],
             "errors of constraints are correlated over seconds and modelled as white noise",
         )
 
     @override
     def propagate(self, x: Tensor, u: PreintegratedImu, w: Tensor) -> Tensor:
         motion = self.motion.propagate(x[..., :_MOTION], u, w)
+        motion = self.earth.correct(x, motion, u, self.site)
         return torch.cat([motion, x[..., _MOTION:]], -1) if self.further else motion
 
     @override
@@ -100,23 +109,24 @@ class StrapdownBlocks(StrapdownModel):
 
     @override
     def observation(self, x: Tensor, u: PreintegratedImu) -> Distribution:
-        known, v = self.constraints, x[..., 4:7]
-        seen = [self._observe_fix(x, u)]
-        if known.non_holonomic_sd is not None or known.odometer_sd is not None:
-            velocity = self._body_velocity(x, u)
-        if known.non_holonomic_sd is not None:
-            seen.append(velocity[..., ::2])
-        if known.zero_velocity_sd is not None:
-            seen.append(v)
-        if known.zero_rate_sd is not None:
-            seen.append(x[..., 10:13])
-        if known.odometer_sd is not None:
+        constraints = self.constraints
+        to_body = torch.cat([x[..., :1], -x[..., 1:4]], -1)
+        means = [self._observe_fix(x, u)]
+        if constraints.non_holonomic_sd is not None or constraints.odometer_sd is not None:
+            velocity = self._body_velocity(x, u, to_body)
+        if constraints.non_holonomic_sd is not None:
+            means.append(velocity[..., ::2])
+        if constraints.zero_velocity_sd is not None:
+            means.append(x[..., 4:7])
+        if constraints.zero_rate_sd is not None:
+            means.append(x[..., 10:13] + self.earth.sense(to_body, self.site))
+        if constraints.odometer_sd is not None:
             forward = velocity[..., 1:2]
             scaled = "odometer_scale" in self.places
-            seen.append(
+            means.append(
                 forward * (1.0 + x[..., self.places["odometer_scale"]]) if scaled else forward
             )
-        return independent_normal(torch.cat(seen, -1), self.r)
+        return independent_normal(torch.cat(means, -1), self.r)
 
     def _observe_fix(self, x: Tensor, u: PreintegratedImu) -> Tensor:
         """Return position, and velocity if it is measured, of the antenna, [R, N, 3 or 6]."""
@@ -131,9 +141,8 @@ class StrapdownBlocks(StrapdownModel):
             p = p - x[..., self.places["delay"]] * v
         return torch.cat([p, v], -1) if has_velocity else p
 
-    def _body_velocity(self, x: Tensor, u: PreintegratedImu) -> Tensor:
+    def _body_velocity(self, x: Tensor, u: PreintegratedImu, to_body: Tensor) -> Tensor:
         """Return the velocity of the axle in body axes, [R, N, 3]."""
-        to_body = torch.cat([x[..., :1], -x[..., 1:4]], -1)
         velocity = rotate(to_body, x[..., 4:7])
         if not self.has_axle:
             return velocity

@@ -49,8 +49,8 @@ class ConstrainedDrive(RecordedDrive):
     @property
     @override
     def channel_names(self) -> tuple[str, ...]:
-        known = self.constraints
-        return (*known.name_fixes(super().channel_names), *known.channel_names)
+        constraints = self.constraints
+        return (*constraints.name_fixes(super().channel_names), *constraints.channel_names)
 
     @override
     def input_files(self) -> list[Path]:
@@ -81,13 +81,13 @@ class ConstrainedDrive(RecordedDrive):
         self, log: NavigationLog, leg: ResampledLog
     ) -> tuple[list[Tensor], tuple[str, ...]]:
         """Return the components without an odometer, each [1, T, k], and notes."""
-        known, zero = self.constraints, torch.zeros(1, len(leg.time), 3, dtype=torch.float64)
-        extra = [zero[..., :2]] if known.non_holonomic_sd is not None else []
-        if not known.needs_standing:
+        constraints, zero = self.constraints, torch.zeros(1, len(leg.time), 3, dtype=torch.float64)
+        extra = [zero[..., :2]] if constraints.non_holonomic_sd is not None else []
+        if not constraints.needs_standing:
             return extra, ()
         standing, note = detect_standing(log, leg.time)
         mask = torch.from_numpy(standing)[:, None]
         rate = torch.from_numpy(leg.sensed()["rate"])
-        sources = ((known.zero_velocity_sd, zero), (known.zero_rate_sd, rate))
+        sources = ((constraints.zero_velocity_sd, zero), (constraints.zero_rate_sd, rate))
         extra += [torch.where(mask, a, torch.nan) for sd, a in sources if sd is not None]
         return extra, (note,)

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
@@ -29,17 +30,41 @@ class Odometer(Protocol):
     """Source of the speed of the wheels."""
 
     def list_files(self, root: str | None, folder: str) -> list[Path]:
-        """List the files that it reads."""
+        """List the files that it reads.
+
+        Args:
+            root: Folder of all data sets.
+            folder: Folder of the log.
+
+        Returns:
+            Files.
+        """
 
     def measure(self, folder: Path, leg: ResampledLog, draws: RandomStream) -> Tensor:
-        """Return the speed at the end of each step, m/s, [R, T], NaN where it is missing."""
+        """Measure the speed at the end of each step.
+
+        Args:
+            folder: Folder of the log.
+            leg: Log on its steps.
+            draws: Random stream of the runs.
+
+        Returns:
+            Speed, m/s, [R or 1, T]. NaN where it is missing.
+        """
 
     def make_truth(self, steps: int) -> dict[str, Tensor]:
-        """Return the true scale error if it is known, by the name of its group, [T, 1]."""
+        """Make the true scale error, if it is known.
+
+        Args:
+            steps: Number of steps.
+
+        Returns:
+            Scale error, [T, 1], by the name of its group.
+        """
 
 
 @dataclass(frozen=True)
-class RecordedOdometer:
+class RecordedOdometer(Odometer):
     """Speeds of a table with columns t and v_fwd, interpolated to the ends of the steps.
 
     Attributes:
@@ -48,12 +73,12 @@ class RecordedOdometer:
 
     table: str = "odometer"
 
+    @override
     def list_files(self, root: str | None, folder: str) -> list[Path]:
-        """List the file of the table."""
         return list_tables(root, folder, (self.table,))
 
+    @override
     def measure(self, folder: Path, leg: ResampledLog, draws: RandomStream) -> Tensor:
-        """Return the recorded speed, m/s, [1, T]."""
         table = read_table(folder, self.table, {})
         time, speed = read_times(table, 1.0), parse_numbers(table, ("v_fwd",))
         check_changes(table, ("v_fwd",), time, speed)
@@ -63,13 +88,13 @@ class RecordedOdometer:
         values = np.interp(leg.time, time, speed[:, 0])
         return torch.from_numpy(np.where(near & inside, values, np.nan)).unsqueeze(0)
 
+    @override
     def make_truth(self, steps: int) -> dict[str, Tensor]:
-        """Return nothing: the scale error of a recorded odometer is unknown."""
-        return {}
+        return {}  # unknown
 
 
 @dataclass(frozen=True)
-class SimulatedOdometer:
+class SimulatedOdometer(Odometer):
     """Forward speed of the reference times one plus a scale error, with white noise.
 
     Attributes:
@@ -86,17 +111,17 @@ class SimulatedOdometer:
     def __post_init__(self) -> None:
         require_ranges("scenario.odometer", self, scale_error="(-1, inf)", sd="[0, inf)")
 
+    @override
     def list_files(self, root: str | None, folder: str) -> list[Path]:
-        """List no file."""
         return []
 
+    @override
     def measure(self, folder: Path, leg: ResampledLog, draws: RandomStream) -> Tensor:
-        """Return the simulated speed, m/s, [R, T]."""
         q, v = torch.from_numpy(leg.truth[:, :4]), torch.from_numpy(leg.truth[:, 4:7])
         forward = rotate(torch.cat([q[:, :1], -q[:, 1:]], -1), v)[:, 1]
         errors = draws.normal("world.odometer", len(forward), 1)[..., 0]
         return (1.0 + self.scale_error) * forward + self.sd * errors
 
+    @override
     def make_truth(self, steps: int) -> dict[str, Tensor]:
-        """Return the scale error, [T, 1]."""
         return {"odometer_scale": torch.full((steps, 1), self.scale_error, dtype=torch.float64)}

@@ -21,9 +21,9 @@ _LARGEST_FALSE = 0.05  # share of the moving steps; 0 on a car and a walk
 def detect_standing(log: NavigationLog, time: Array) -> tuple[NDArray[np.bool_], str]:
     """Detect the steps that end while the IMU stands, and did so at the step before.
 
-    Over half a second at the rate of the sensor, three numbers must be as small as in the longest part of
-    the log at which the reference stands: mean rate less its bias, scatter of the force, and change of the
-    mean force from the half second before. The last one must have been small for a second.
+    Three numbers of the last half second must be as small as in the longest part of the log at which the
+    reference stands. They are the mean rate less its bias, the scatter of the force, and the change of the mean
+    force from the half second before. The last one must have been small for a second.
 
     Args:
         log: Log with the reference, which decides the thresholds alone.
@@ -35,10 +35,10 @@ def detect_standing(log: NavigationLog, time: Array) -> tuple[NDArray[np.bool_],
     Raises:
         ValueError: If the log has no such part, or the thresholds take motion for standing.
     """
-    part = find_standing(log.imu, log.reference)
+    stretch = find_standing(log.imu, log.reference)
     remedy = "Set constraints.zero_velocity_sd and zero_rate_sd to null."
-    require(part is not None, "the log", "stand for 8 s, for the thresholds of standing", "no such part", remedy)  # fmt: skip
-    at = log.imu.time[part]
+    require(stretch is not None, "the log", "stand for 8 s, for the thresholds of standing", "no such part", remedy)  # fmt: skip
+    at = log.imu.time[stretch]
     rate, *others = _measure_windows(log.imu, at[at >= at[0] + 2.0 * _WINDOW])
     bias = np.median(rate, axis=0)
     limits = [m * float(np.quantile(a, _QUANTILE)) for m, a in zip(_MARGINS, (_norm(rate - bias), *others), strict=True)]  # fmt: skip

@@ -199,7 +199,7 @@ def car(fix_sd: list[float], known: Constraints, **changes: Any) -> UserLog:
     )  # fmt: skip
     return UserLog(
         DATA, "car_rtk_mems", tuning, FixReceiver(position_sd=fix_sd), 0.5, 40.0, 380.0,
-        LogFiles(gnss="gnss_rtk"), constraints=known, **changes,
+        LogFiles(gnss="gnss_rtk"), fix_codes=[1], constraints=known, **changes,
     )  # fmt: skip
 
 
