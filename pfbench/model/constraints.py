@@ -1,4 +1,4 @@
-"""What a filter knows beside inertial data and fixes: constraints of the motion, an odometer, place and delay of the antenna."""
+"""Settings of further components and states: constraints of the motion, odometer, place and delay of the antenna."""
 
 from __future__ import annotations
 

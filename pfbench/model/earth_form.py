@@ -44,7 +44,7 @@ class EarthForm(Protocol):
         """
 
     def sense(self, to_body: Tensor, site: Tensor) -> Tensor | float:
-        """Compute the rate that a gyro at rest measures beside its bias.
+        """Compute the rate that a gyro at rest measures besides its bias.
 
         Args:
             to_body: Quaternions from level to body axes, [R, N, 4].
@@ -79,9 +79,9 @@ class FlatEarth(EarthForm):
 class RotatingEarth(EarthForm):
     """The WGS-84 Earth: its rate, Coriolis acceleration, and normal gravity with height and direction.
 
-    Attitude, velocity and position are those in East, North, Up of the start, which are fixed to the Earth. There
-    is no transport rate in these axes: it is that of level axes which move with the vehicle. The direction of
-    gravity, normal to the ellipsoid at the vehicle, takes its place.
+    Attitude, velocity and position are those in East, North, Up of the start, which are fixed to the Earth.
+    Transport rate belongs to level axes that move with the vehicle. Here the direction of gravity, normal to the
+    ellipsoid at the vehicle, takes its place.
 
     Attributes:
         latitude_deg: Latitude of the start, deg.

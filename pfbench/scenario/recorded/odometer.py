@@ -23,7 +23,7 @@ from pfbench.scenario.recorded.log_tables import (
 )
 from pfbench.scenario.recorded.time_grid import ResampledLog
 
-_LONGEST = 1.9  # intervals of the table; a longer gap has no speed
+_LONGEST = 1.9  # intervals of the table; the speed is missing in a longer gap
 
 
 class Odometer(Protocol):

@@ -1,4 +1,4 @@
-"""Steps at which a vehicle stands, by the IMU alone, with thresholds from a part of the log where it stands without doubt."""
+"""Detection of standing steps by the IMU alone, with thresholds from a standing part of the log."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _LARGEST_FALSE = 0.05  # share of the moving steps; 0 on a car and a walk
 
 
 def detect_standing(log: NavigationLog, time: Array) -> tuple[NDArray[np.bool_], str]:
-    """Detect the steps that end while the IMU stands, and did so at the step before.
+    """Detect the steps at which the IMU is standing, and was quiet at the step before.
 
-    Three numbers of the last half second must be as small as in the longest part of the log at which the
-    reference stands. They are the mean rate less its bias, the scatter of the force, and the change of the mean
-    force from the half second before. The last one must have been small for a second.
+    Three numbers of the last half second must be as small as in the longest part of the log in which the
+    reference is standing. They are the mean rate less its bias, the scatter of the force, and the change of the
+    mean force from the half second before. The last one must have been small for a second.
 
     Args:
         log: Log with the reference, which decides the thresholds alone.
@@ -33,7 +33,7 @@ def detect_standing(log: NavigationLog, time: Array) -> tuple[NDArray[np.bool_],
         Mask, [T], and a note with thresholds and shares.
 
     Raises:
-        ValueError: If the log has no such part, or the thresholds take motion for standing.
+        ValueError: If the log lacks such a part, or the thresholds take motion for standing.
     """
     stretch = find_standing(log.imu, log.reference)
     remedy = "Set constraints.zero_velocity_sd and zero_rate_sd to null."
