@@ -44,13 +44,13 @@ def stop_and_go(vibration: float = 0.5, seconds: float = 60.0) -> dict[str, pd.D
     """A drive that bends and stops, and starts with a steady acceleration; the IMU shakes while it moves."""
     t = np.arange(0.0, seconds + 1e-9, 0.01)
     moves = np.interp(t, [15.0, 20.0, 30.0, 35.0, 43.0, 48.0], [0, 1, 1, 0, 0, 1])
-    speed, turn = 6.0 * moves, 0.2 * np.sin(0.3 * t) * moves
+    speed, turn = 6.0 * moves, 0.2 * np.sin(0.3 * t) * np.clip(2 * moves - 1, 0, 1)
     along = 1.2 * np.select(
         [(t >= 15) & (t < 20), (t >= 30) & (t < 35), (t >= 43) & (t < 48)], [1, -1, 1], 0
     )
     yaw, zero = 0.4 + np.cumsum(turn) * 0.01, np.zeros_like(t)
     rng = np.random.default_rng(0)
-    fast = np.where(speed > 0.5, vibration, 0.0)[:, None]  # a start is as quiet as rest at first
+    fast = np.where(speed > 2.0, vibration, 0.0)[:, None]  # a start is as quiet as rest at first
     force, rate = rng.normal(size=(2, t.size, 3)) * np.stack([0.05 + fast, 0.002 + 0.02 * fast])
     vn, ve = speed * np.cos(yaw), speed * np.sin(yaw)
     motion = {
