@@ -189,6 +189,7 @@ def test_every_filter_runs(method: str) -> None:
 
 HOMES = {
     "strapdown_total": ["recorded_car_drive"],
+    "strapdown_blocks": ["recorded_car_constrained"],
     "strapdown_aided": ["recorded_fixed_wing_aided"],
     "strapdown_tight": ["recorded_walk"],
     "passive_location": ["passive_1"],

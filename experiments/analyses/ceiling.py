@@ -71,6 +71,7 @@ LEFT_OUT = {
     "drawn from the initial distribution of the model. The limits of a mean over runs do not hold then.",
     "`terrain`, `terrain_fixed_wing`": "the smoothers have one mode. The exact filter is in "
     "[robustness.md](robustness.md#terrain-referenced-navigation).",
+    "`recorded_car_constrained`": "the scenario `recorded_car_drive` with further components of the measurement.",
     "`recorded_canyon`, `gps_ins_inflated`": "the scenarios `recorded_berlin` and `gps_ins_generic` with another model.",
     "`user_log`": "the data are of the user.",
 }

@@ -18,6 +18,12 @@ from pfbench.model.base import (
     StateSpaceModel as StateSpaceModel,
     StaticModel as StaticModel,
 )
+from pfbench.model.constraints import Constraints as Constraints
+from pfbench.model.earth_form import (
+    EarthForm as EarthForm,
+    FlatEarth as FlatEarth,
+    RotatingEarth as RotatingEarth,
+)
 from pfbench.model.ins_gnss import InsGnss as InsGnss
 from pfbench.model.linear_gaussian import (
     LinearGaussian as LinearGaussian,
@@ -35,6 +41,7 @@ from pfbench.model.strapdown import (
     StrapdownTight as StrapdownTight,
     StrapdownTotal as StrapdownTotal,
 )
+from pfbench.model.strapdown_blocks import StrapdownBlocks as StrapdownBlocks
 from pfbench.model.strapdown_tuning import (
     AidedTuning as AidedTuning,
     RangeErrorModel as RangeErrorModel,

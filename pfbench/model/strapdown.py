@@ -51,7 +51,7 @@ def _block_diagonal(a: Tensor, b: Tensor) -> Tensor:
     return torch.cat([torch.cat(row, -1) for row in rows], -2)
 
 
-class _StrapdownModel(StateSpaceModel):
+class StrapdownModel(StateSpaceModel):
     """Preintegrated inertial increments, and a start of each run from the recorded scenario."""
 
     input_type: type = PreintegratedImu
@@ -100,7 +100,7 @@ class _StrapdownModel(StateSpaceModel):
         return normal_batch(runs, self.p0)
 
 
-class StrapdownTotal(_StrapdownModel):
+class StrapdownTotal(StrapdownModel):
     """Motion of a vehicle with the biases of its IMU.
 
     State [16]: quaternion body to level, velocity and position (East, North, Up), gyro and
@@ -225,7 +225,7 @@ INSTRUMENT_CHANNELS = (
 _DRIVEN = StrapdownTotal.noise_dim
 
 
-class StrapdownAided(_StrapdownModel):
+class StrapdownAided(StrapdownModel):
     """StrapdownTotal with barometer and magnetometer biases.
 
     State [20]: the state of StrapdownTotal, then the barometer bias m and the magnetometer bias,
@@ -370,7 +370,7 @@ class TightMemsInputs(NamedTuple):
         return PreintegratedImu(*self[: len(PreintegratedImu._fields)])
 
 
-class StrapdownTight(_StrapdownModel):
+class StrapdownTight(StrapdownModel):
     """StrapdownTotal with a receiver clock, measured by pseudoranges and range rates.
 
     State [19]: the state of StrapdownTotal, then bias m and drift m/s of the receiver clock, and

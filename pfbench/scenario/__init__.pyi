@@ -12,6 +12,7 @@ from pfbench.scenario.passive_location import (
     PassiveLocationScenario as PassiveLocationScenario,
     QuadratureEmitterPrior as QuadratureEmitterPrior,
 )
+from pfbench.scenario.recorded.constrained import ConstrainedDrive as ConstrainedDrive
 from pfbench.scenario.recorded.corrections import LogCorrections as LogCorrections
 from pfbench.scenario.recorded.drive import (
     BaroMagSensors as BaroMagSensors,
@@ -22,6 +23,11 @@ from pfbench.scenario.recorded.drive import (
 )
 from pfbench.scenario.recorded.log_reader import read_log as read_log
 from pfbench.scenario.recorded.log_tables import LogFiles as LogFiles, find_dataset as find_dataset
+from pfbench.scenario.recorded.odometer import (
+    Odometer as Odometer,
+    RecordedOdometer as RecordedOdometer,
+    SimulatedOdometer as SimulatedOdometer,
+)
 from pfbench.scenario.recorded.raw_gnss import (
     RawGnssReceiver as RawGnssReceiver,
     RecordedWalk as RecordedWalk,

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from pfbench.files.table_file import Array
-from pfbench.scenario.diagnosis.raw_log import RawLog
+from pfbench.scenario.diagnosis.raw_log import RawImu, RawLog, RawReference
+from pfbench.scenario.recorded.log_tables import ImuLog, ReferenceLog
 
 _BLOCK = 0.5  # s; mean values that show rest
 _QUIET_SPEED, _QUIET_RATE = 0.15, 0.03  # m/s, rad/s
@@ -18,7 +19,7 @@ _GRADES = ((1e-5, "navigation or fibre-optic"), (1e-4, "tactical"), (1e-3, "indu
 
 def measure_noise(log: RawLog, facts: dict[str, Any]) -> None:
     """Measure the noise at rest, by the speed of the reference and quiet rates."""
-    standing = find_standing(log)
+    standing = find_standing(log.imu, log.reference)
     facts["standing [s]"] = None
     if standing is None:
         return
@@ -32,17 +33,17 @@ def measure_noise(log: RawLog, facts: dict[str, Any]) -> None:
     facts["grade"] = next(name for limit, name in _GRADES if gyroscope.max() <= limit)
 
 
-def find_standing(log: RawLog) -> slice | None:
+def find_standing(imu: RawImu | ImuLog, reference: RawReference | ReferenceLog) -> slice | None:
     """Return the samples of the longest stretch at rest, None if it is short."""
-    time = log.imu.time
+    time = imu.time
     step = float(np.median(np.diff(time)))
     size = int(_BLOCK / step)
     count = len(time) // size if size >= 3 else 0
     if not count:
         return None
-    rate = log.imu.rate[: count * size].reshape(count, size, 3).mean(1)
+    rate = imu.rate[: count * size].reshape(count, size, 3).mean(1)
     speed = np.interp(
-        time[: count * size : size], log.reference.time, np.linalg.norm(log.reference.velocity, axis=1)
+        time[: count * size : size], reference.time, np.linalg.norm(reference.velocity, axis=1)
     )  # fmt: skip
     turning = np.linalg.norm(rate - np.median(rate, 0), axis=1)
     quiet = (speed < _QUIET_SPEED) & (turning < _QUIET_RATE)

@@ -107,16 +107,19 @@ class RecordedDrive(Scenario):
 
     def read(self) -> ResampledLog:
         """Read the log and resample it to filter steps."""
-        folder = find_dataset(self.root, self.folder)
+        return self.resample(self._read_log(find_dataset(self.root, self.folder)))
+
+    def resample(self, log: NavigationLog) -> ResampledLog:
+        """Resample a log to filter steps."""
         leg = resample_log(
-            self._read_log(folder),
+            log,
             self.receiver.fix_interval_s,
             self.filter_step_s,
             self.receiver.velocity_sd is not None,
             self.start_s,
             self.end_s,
         )
-        announce_notes(folder, leg.notes)
+        announce_notes(find_dataset(self.root, self.folder), leg.notes)
         return leg
 
     def _read_log(self, folder: Path) -> NavigationLog:

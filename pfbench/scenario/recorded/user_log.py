@@ -7,15 +7,17 @@ from pathlib import Path
 
 from typing_extensions import override
 
+from pfbench.scenario.recorded.constrained import ConstrainedDrive
 from pfbench.scenario.recorded.corrections import LogCorrections
-from pfbench.scenario.recorded.drive import RecordedDrive
 from pfbench.scenario.recorded.log_reader import read_log
 from pfbench.scenario.recorded.log_tables import NavigationLog
 
 
 @dataclass(frozen=True)
-class UserLog(RecordedDrive):
-    """Recorded drive with corrections of its tables; the other attributes are those of `RecordedDrive`.
+class UserLog(ConstrainedDrive):
+    """Recorded drive with corrections of its tables.
+
+    The other attributes are those of `ConstrainedDrive`.
 
     Attributes:
         corrections: Corrections that the reader applies before its checks.
