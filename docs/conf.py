@@ -43,6 +43,7 @@ html_theme_options = {
     "home_page_in_toc": True,
     "collapse_navigation": True,  # else each page repeats the list of all
     "max_navbar_depth": 2,
+    "navbar_persistent": [],  # the list of pages has the search
     "use_download_button": False,
     "use_fullscreen_button": False,
 }
