@@ -84,6 +84,7 @@ bench: $(VENV)/.installed .venv-bench/.installed .venv-peers/.installed   ## spe
 	$(BIN)/python benchmarks/methods.py
 	$(BIN)/python benchmarks/scaling.py
 	$(BIN)/python benchmarks/latency.py
+	$(BIN)/python benchmarks/online.py
 
 wheel: $(VENV)/.installed       ## a wheel in dist/ with a manylinux tag; uploads nothing
 	rm -rf build/bdist* build/lib* build/temp* build/wheel dist
