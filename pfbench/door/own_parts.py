@@ -39,7 +39,8 @@ def make_own(
     A class of a script or a notebook is stored with all that it uses and named by its source: another source is another job.
 
     Args:
-        thing: Filter, stage of a particle filter, model, scenario or noise regime. An object, or its class.
+        thing: Filter, stage of a particle filter, model, scenario or noise regime. An object, or its class. Also the class
+            of a network that `pfbench.train` trains as a proposal.
         name: Name in tables and figures. The name of the class by default.
         base: Particle filter that receives a stage.
         **arguments: Arguments of a class. For a scenario also `divergence_threshold`, the error above which a run has
@@ -62,11 +63,12 @@ def make_own(
         title = name or (thing if isinstance(thing, type) else type(thing)).__name__
         limit = arguments.pop("divergence_threshold", None) if group == "scenario" else None
         writer = _NodeWriter()
-        node = (
-            writer.write_class(thing, arguments)
-            if isinstance(thing, type)
-            else writer.write(thing, title)
-        )
+        if stage == "network":
+            node = writer.write_network(thing, arguments)
+        elif isinstance(thing, type):
+            node = writer.write_class(thing, arguments)
+        else:
+            node = writer.write(thing, title)
         if not isinstance(thing, type) and arguments:
             raise TypeError(
                 f"{title} must be a class if arguments are given, got an object. Use own({type(thing).__name__}, "
@@ -95,6 +97,8 @@ def find_group(thing: Any) -> tuple[str, str]:
             f"{cls.__name__} must be a subclass of pfbench.model.StateSpaceModel to be a model, which is a module of torch, "
             f"got a subclass of {cls.__mro__[1].__name__}. Write class {cls.__name__}(StateSpaceModel)."
         )
+    if _is_network(cls):
+        return "filter", "network"
     methods = {"noise": ("draw_errors",), "scenario": ("draw",), "filter": ("init", "step")}
     for group, names in methods.items():
         if all(callable(getattr(cls, name, None)) for name in names):
@@ -109,6 +113,14 @@ def find_group(thing: Any) -> tuple[str, str]:
         f"{describe_value(thing)} must have the methods of a part: filter init and step, scenario draw, noise regime draw_errors, "
         f"or of a stage: {forms}. Got {_list_methods(cls)}. Add the method."
     )
+
+
+def _is_network(cls: type) -> bool:
+    """Return whether a class is a module of torch that is made of a number of features and a dimension of the noise."""
+    from torch import nn
+
+    names = list(inspect.signature(cls).parameters) if issubclass(cls, nn.Module) else []
+    return names[:2] == ["features", "noise"]
 
 
 def _find_call(cls: type) -> Callable[..., Any] | None:
@@ -206,6 +218,14 @@ class _NodeWriter:
             )
         return node
 
+    def write_network(self, cls: Any, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Describe the class of a network. The proposal gives it the number of features and the dimension of the noise."""
+        if not isinstance(cls, type):
+            raise TypeError(
+                f"{type(cls).__name__} must be a class, got an object. Pass the class: the proposal makes the network."
+            )
+        return {**self._write_fields(cls, arguments), "_partial_": True}
+
     def _write_fields(self, cls: type, fields: Mapping[str, Any]) -> dict[str, Any]:
         """Describe a class with the values of its arguments."""
         values = {
@@ -257,12 +277,16 @@ class _NodeWriter:
 
     def put_stage(self, base: str, stage: str, node: dict[str, Any]) -> dict[str, Any]:
         """Return a shipped particle filter with another stage."""
+        base = "neural_sir" if stage == "network" and base == "sir" else base
         config = compose([f"filter={base}"])
         values = {key: value for key, value in config.values["filter"].items() if key != "paper"}
         if "particles" not in values:
             raise ValueError(f"base must be a particle filter, got {base}. Use base='sir'.")
         if config.uses_shared_particles:
             values["particles"] = "${particles}"
+        if stage == "network":
+            proposal = {**values["proposal"], "network": node, "checkpoint": "${checkpoint}"}
+            return {**values, "proposal": proposal}
         if stage == "scheme":
             return {**values, "resampler": {**values["resampler"], "scheme": node}}
         return {**values, stage: [node] if stage == "moves" else node}

@@ -69,10 +69,10 @@ def run_filters(
             f"workers must be a whole number of at least 1, got {workers!r}. Set workers=2."
         )
     parts = [
-        _list_parts(group, value)
+        list_parts(group, value)
         for group, value in (("scenario", scenario), ("noise", noise), ("filter", filters))
     ]
-    models = [None] if model is None else _list_parts("model", model)
+    models = [None] if model is None else list_parts("model", model)
     words = format_words({"runs": 50, **settings, "study": study})
     jobs = [_list_words(choice, words) for choice in product(*parts, models)]
     with preserved_process():
@@ -85,7 +85,7 @@ def run_filters(
     )
 
 
-def _list_parts(group: str, value: Any) -> list[Part]:
+def list_parts(group: str, value: Any) -> list[Part]:
     """Return the parts of a group that a name, a part, an object or a list of them means."""
     items = list(value) if isinstance(value, list | tuple | set) else [value]
     if not items:

@@ -71,7 +71,7 @@ def set_aside(path: Path, reason: str = "damaged") -> Path:
 # --------------------------------------------------------------------------------------------------
 # Digest of the content of a file: dictionaries, lists, plain values, arrays and tensors.
 
-DIGEST = "digest"  # name of the digest in a file
+DIGEST = "digest"  #: name of the digest in a file
 
 
 def hash_content(content: Any) -> str:

@@ -40,7 +40,7 @@ from pfbench.scenario.base import RecordingRegime, Scenario
 # --------------------------------------------------------------------------------------------------
 # Plan of a job: a checked configuration and its objects, each built once.
 
-# paths of the configuration that do not enter the key of a job
+#: paths of the configuration that do not enter the key of a job
 IGNORED_IN_KEY = (
     *PLACE_SETTINGS,
     *(f"{group}.{PAPER}" for group in PARTS),  # names and limits for reports

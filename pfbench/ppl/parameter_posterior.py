@@ -23,7 +23,7 @@ from pfbench.results.plotting import COLUMN, RC, add_legend, line_styles
 # --------------------------------------------------------------------------------------------------
 # Posterior draws of parameters: table, convergence diagnostics and plot.
 
-WELL_MIXED = 1.05  # upper limit of split r-hat for chains that agree
+WELL_MIXED = 1.05  #: upper limit of split r-hat for chains that agree
 
 
 @dataclass(frozen=True)

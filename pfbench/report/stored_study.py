@@ -23,7 +23,7 @@ from pfbench.files.table_file import check_parquet
 from pfbench.report.board.pack import StudyFacts, decide_parts
 from pfbench.report.methods_text import MethodsFacts
 
-RUNS_FILE = "runs.parquet"
+RUNS_FILE = "runs.parquet"  #: name of the file with the values of all runs of a study
 _KEY = b"pfbench"  # of the metadata of the file
 _KEYED = ("curves",)  # parts with a tuple as key
 _OMITTED = ("tracks", "downloads", "definitions")  # large, or made again with the page

@@ -69,7 +69,7 @@ class MetricInput(NamedTuple):
         return self.result.data[name][..., self.group.places].astype(np.float64) * self.group.scale
 
 
-ByComponent = Mapping[str, Array]
+ByComponent = Mapping[str, Array]  #: values by the name of a component
 
 
 def particles_in_use(result: store.JobResult) -> Array | int:
@@ -259,7 +259,7 @@ def compute_seconds_per_step(data: MetricInput) -> ByComponent:
 # Table of metrics: name, function, unit, direction and caption of each, defined once.
 
 COVERAGE_LEVELS = (50, 90, 99)  # percent
-GROUP_UNIT = "unit of the group"
+GROUP_UNIT = "unit of the group"  #: unit of a metric that is in the unit of its group, such as m
 MetricScope = Literal["components", "group", "job"]
 Direction = Literal["lower", "higher", "target"]
 
@@ -341,6 +341,7 @@ _INTERVAL = (
     "valid runs, components and scored steps. Its nominal value is {level} %."
 )
 
+#: all metrics of a report, in their order
 METRICS: tuple[Metric, ...] = (
     Metric(
         "rmse", compute_rmse, "components", GROUP_UNIT, "lower",

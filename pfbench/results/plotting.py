@@ -23,11 +23,12 @@ from pfbench.results.paper_block import MARKERS
 # --------------------------------------------------------------------------------------------------
 # Common parts of figures: size, palette, line styles, legends, quantiles over runs.
 
-COLUMN = 3.5  # inches, width of a column of print
+COLUMN = 3.5  #: inches, width of a column of print
 INSTANTS = 180  # points of a curve at most: a column of print is 250 points wide
 SMALL = 6.5  # points, smallest font size
 LETTER = 0.62 * SMALL  # points, mean width of a letter of that size
 _WIDE_LABEL = 24  # letters; a legend with longer labels has a single column
+#: settings of matplotlib for all figures
 RC: Any = {
     "font.size": 8,
     "font.family": ["DejaVu Sans", "sans-serif"],  # the second is for SVG viewers without the first

@@ -182,8 +182,8 @@ _NEGLIGIBLE = 1e-9  # weight of a particle that is discarded
 class GaussianSplitFilter:
     """Particles that are normal distributions, each with a Gaussian filter, for few nonlinear states.
 
-    Before a step, a run whose particles have a variance above `largest_sd`^2 in a sampled state is
-    resampled. Each particle is split: its mean moves by an offset along the regression on the state,
+    Before a step, a run whose particles have a standard deviation above `largest_sd` in a sampled state
+    is resampled. Each particle is split: its mean moves by an offset along the regression on the state,
     and half the limit remains. After a step, a mixture with less than that is merged to its moments.
 
     On a linear model without merging, mean and evidence are unbiased for any number of particles.
