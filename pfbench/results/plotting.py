@@ -25,6 +25,7 @@ from pfbench.results.paper_block import MARKERS
 # Common parts of figures: size, palette, line styles, legends, quantiles over runs.
 
 COLUMN = 3.5  # inches, width of a column of print
+CURVE_RANGE = 1e4  # of an axis, above the typical value of the best filter
 INSTANTS = 180  # points of a curve at most: a column of print is 250 points wide
 SMALL = 6.5  # points, smallest font size
 LETTER = 0.62 * SMALL  # points, mean width of a letter of that size
@@ -49,6 +50,7 @@ RC: Any = {
     "figure.dpi": 150,  # equal to savefig.dpi, so that text widths of the layout hold in the file
     "savefig.dpi": 150,
     "text.parse_math": False,  # a label from a file may contain $ as a plain character
+    "pdf.fonttype": 42,  # TrueType: journals refuse Type 3
     "svg.hashsalt": "pfbench",  # SVG identifiers are random otherwise
     "svg.fonttype": "none",  # text stays text, which is searchable and smaller than outlines
 }
@@ -327,6 +329,9 @@ def _render(figure: Figure, suffix: str) -> bytes:
     if suffix == "png":
         return render_palette_png(figure)
     buffer = io.BytesIO()
+    if suffix == "pdf":
+        figure.savefig(buffer, format="pdf", metadata={"CreationDate": None, "ModDate": None})
+        return buffer.getvalue()
     figure.savefig(buffer, format="svg", metadata={"Date": None})  # equal bytes
     return slim_svg(buffer.getvalue())
 

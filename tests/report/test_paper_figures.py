@@ -459,7 +459,7 @@ def test_values_of_a_parameter_have_a_line_each(tmp_path: Path) -> None:
         synthetic.write(tmp_path / "paper_002_bound", method, runs=20, steps=30)
     ((caption, figure),) = drawn(tmp_path, "002-3-bound", study="paper_002_bound").values()
     results = {r.meta["label"]: r for r in store.list_results(tmp_path / "paper_002_bound")}
-    for key, text in (("1.0", "ratio bound 1"), ("1000000000.0", "ratio bound 1e+09")):
+    for key, text in (("1.0", "ratio bound 1"), ("1000000000.0", "ratio bound 10⁹")):
         error = np.abs(results[name(key)].data["error"][..., 6].astype(float))
         np.testing.assert_allclose(line(figure.axes[0], text)[1], np.median(error, 0), rtol=1e-6)
     colours = {one.get_color() for one in figure.axes[0].lines}

@@ -231,8 +231,9 @@ _SECOND = "section on simulation 2"
 FIGURES: Mapping[str, PaperFigure] = {
     "000-1": PaperFigure(
         f"{_YAN}, figure 1", _MODIFIED, make_flight_figures, ("paper_000",),
-        printed=(PrintedValue("", "Up", 0.0, 2000.0), PrintedValue("", "Up", 1000.0, 2748.0)),
-        source="Crosses: 2000 m at the start and 2748 m at the end, as the section on performance prints.",
+        printed=(PrintedValue("", "Up", 480.0, 3875.0), PrintedValue("", "Up", 1000.0, 748.0)),
+        source="Crosses: 3875 m at most and 748 m at the end above the start, from 2000, 5875 and 2748 m in the section on performance, "
+        "which prints no time of the highest point.",
     ),
     "000-2": PaperFigure(
         f"{_YAN}, figure 2", _MODIFIED, make_error_figures, ("paper_000",), groups=("attitude",), source=_NO_TRANSITION,

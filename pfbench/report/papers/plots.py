@@ -15,6 +15,7 @@ from pfbench.results.conditions import ComponentGroup
 from pfbench.results.frame import select_indices
 from pfbench.results.plotting import (
     COLUMN,
+    CURVE_RANGE,
     SMALL,
     LineStyle,
     add_legend,
@@ -29,7 +30,6 @@ BAND = "80 % of runs"
 _INSTANTS = 90  # points of a curve: three panels of four curves stay below 60 kB
 _MARKS = 4  # of a curve
 _WIDE = 10.0  # ratio of the values from which an axis is logarithmic
-_RANGE = 1e4  # of a logarithmic axis above the typical value of the best filter
 _DOTS, _DASHES = (0, (1.0, 1.0)), (0, (4.0, 2.0))
 _DIRECTIONS = {"E": "East", "N": "North", "U": "Up"}
 ResultsWithGroup = Mapping[str, tuple[store.JobResult, ComponentGroup]]
@@ -345,7 +345,7 @@ def _set_scale(axes: Sequence[Axes], panels: Sequence[Levels]) -> None:
     lowest = min(
         float(np.quantile(v[v > 0], 0.02, method="lower")) for _, v in medians if (v > 0).any()
     )
-    high = min(float(positive.max()), _RANGE * least)
+    high = min(float(positive.max()), CURVE_RANGE * least)
     is_log = high > _WIDE * least
     low = min([max(float(positive.min()), lowest / _WIDE), *printed]) if is_log else 0.0
     for axis in axes:

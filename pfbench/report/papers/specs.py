@@ -16,7 +16,14 @@ from pfbench.report.papers.plots import CurveLook, Looks, PrintedValue, ResultsW
 from pfbench.results import store
 from pfbench.results.conditions import Condition, component_groups
 from pfbench.results.frame import select_indices
-from pfbench.results.plotting import COLUMN, FigureSpec, format_axis_label, format_slug, line_styles
+from pfbench.results.plotting import (
+    COLUMN,
+    FigureSpec,
+    format_axis_label,
+    format_slug,
+    format_ticks,
+    line_styles,
+)
 from pfbench.results.step_times import StepTimes
 
 _FIRST = (
@@ -299,7 +306,7 @@ def make_parameter_figures(name: str, source: PaperFigureInput) -> list[FigureSp
         if len(results) < 2:
             continue
         values = {n: float(n.rpartition("=")[2].rstrip("]")) for n in source.figure.filters}
-        names = {label: f"{name} {value:g}" for label, value in values.items()}
+        names = {label: f"{name} {format_ticks([value])[0]}" for label, value in values.items()}
         plain = source._replace(looks=_make_plain_looks(names))
         text = f"{source.format_head(data)}: size of the {group} error over time for values of the {name}. "
         make = partial(plots.plot_errors, {"": results}, plain.looks)
@@ -369,7 +376,7 @@ def plot_flight(result: store.JobResult, printed: Sequence[PrintedValue] = ()) -
         )  # fmt: skip
     if printed:
         height.legend(loc="best")
-    height.set(xlabel="time [s]", ylabel="Up [m]")
+    height.set(xlabel="time [s]", ylabel="height [m]")
     return figure
 
 
