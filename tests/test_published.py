@@ -97,6 +97,11 @@ def check_published_page(folder: Path, copy: Path) -> None:
     """Decide and write a page again, as from a fresh clone, with the runs of git only."""
     copy.mkdir()
     (copy / RUNS_FILE).symlink_to(folder / RUNS_FILE)
+    figures = {entry["file"] for entry in read_stored_study(folder).pack["paper_figures"]}
+    for name in figures:
+        (copy / "figures").mkdir(exist_ok=True)
+        shutil.copy(folder / name, copy / name)
+        assert (folder / name).stat().st_size < 60_000, name
     page = rebuild_page(copy).read_text()
     drawings = ["headline.svg"]
     pages = ["report.md"]
@@ -113,9 +118,9 @@ def check_published_page(folder: Path, copy: Path) -> None:
         stored.table, again.table
     )  # bytes differ between versions of pyarrow
     links = set(re.findall(r'href="([^#"]+)" download', page))
-    assert links == {"verdicts.csv", "decisions.csv", RUNS_FILE, "pfbench.bib", "headline.svg"}, (
-        folder.name
-    )
+    numbers = {"verdicts.csv", "decisions.csv", RUNS_FILE, "pfbench.bib", "headline.svg"}
+    assert links == numbers | figures, folder.name
+    assert page.count('src="data:image/svg+xml;base64') >= len(figures)
     title = stored.pack["title"]
     assert f"<title>{escape(title)} – pfbench</title>" in page, folder.name
 

@@ -18,6 +18,7 @@ from pfbench.report.overview.page import (
     render_overview as render_overview,
     tabulate_heat_map as tabulate_heat_map,
 )
+from pfbench.report.papers.plots import CurveLook as CurveLook
 from pfbench.report.papers.specs import (
     PaperFigure as PaperFigure,
     PaperFigureInput as PaperFigureInput,

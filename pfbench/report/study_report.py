@@ -37,10 +37,8 @@ from pfbench.results.conditions import (
     component_groups,
     load_conditions,
 )
-from pfbench.results.looks import study_looks
 from pfbench.results.metrics import METRICS
 from pfbench.results.paper_block import name_run_command
-from pfbench.results.plotting import line_styles
 from pfbench.results.step_times import STEP_TIMES
 from pfbench.stats.comparison import Verdict, decide
 from pfbench.stats.consistency_bands import assess_consistency
@@ -125,7 +123,12 @@ def rebuild_page(folder: Path) -> Path:
     pack["bibtex"] = renew_bibliography(pack)
     pack["replay_first"] = name_run_command(str(pack["study"]))
     pack["paper_figures"] = [
-        {**entry, "source": writers.format_data_address(folder / entry["file"])}
+        {
+            **entry,
+            "source": writers.format_data_address(
+                Path(entry["file"]).suffix, (folder / entry["file"]).read_bytes()
+            ),
+        }
         for entry in pack["paper_figures"]
     ]
     others = {name: (folder / name).read_bytes() for name in _TITLES if (folder / name).is_file()}
@@ -254,11 +257,14 @@ def _draw_paper_figures(
     study: str, conditions: Sequence[Condition], options: ReportOptions
 ) -> tuple[list[dict[str, Any]], Files]:
     """Draw the figures of the paper of a study; return template variables and files."""
-    labels = sorted({job.label for c in conditions for job in c.jobs}, key=natural_sort_key)
-    style = line_styles(labels, study_looks(conditions))
     names, start = options.paper_figures, options.start_time_s
-    drawings = figures.paper_figures(study, conditions, style, names, start)
+    pairs = figures.paper_figures(study, conditions, names, start)
+    drawings = [drawing for _, drawing in pairs]
     entries, files = writers.render_figures(drawings, "paper", options.figure_formats)
+    for (name, _), entry in zip(pairs, entries, strict=True):
+        path = Path(entry["file"])  # the page shows the file that is stored
+        source = writers.format_data_address(path.suffix, files[entry["file"]])
+        entry |= {"entry": name, "source": source}
     return entries, dict(files)
 
 

@@ -62,7 +62,7 @@ def render_figures(
         entries.append({
             "file": f"{stem}.{max(contents)}",  # svg if available
             "caption": drawing.caption,
-            "source": min(itertools.starmap(_data_address, contents.items()), key=len),
+            "source": min(itertools.starmap(format_data_address, contents.items()), key=len),
             "name": drawing.name,
             "anchor": format_slug(f"{prefix}_{drawing.name}"),
         })  # fmt: skip
@@ -86,14 +86,9 @@ def write_table(folder: RecordedFolder, name: str, table: pd.DataFrame, note: st
     folder.write(f"tables/{name}.tex", format_latex(table, note))
 
 
-def format_data_address(path: Path) -> str:
-    """Return a file of an image as a data URI."""
-    return _data_address(path.suffix[1:], path.read_bytes())
-
-
-def _data_address(suffix: str, content: bytes) -> str:
+def format_data_address(suffix: str, content: bytes) -> str:
     """Return an image as a data URI, so that the page needs no file."""
-    kind = "svg+xml" if suffix == "svg" else "png"
+    kind = "svg+xml" if suffix.removeprefix(".") == "svg" else "png"
     return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from itertools import cycle
@@ -23,7 +24,12 @@ from pfbench.results.paper_block import MARKERS
 # --------------------------------------------------------------------------------------------------
 # Common parts of figures: size, palette, line styles, legends, quantiles over runs.
 
+<<<<<<< HEAD
 COLUMN = 3.5  #: inches, width of a column of print
+=======
+COLUMN = 3.5  # inches, width of a column of print
+CURVE_RANGE = 1e4  # of an axis, above the typical value of the best filter
+>>>>>>> figs
 INSTANTS = 180  # points of a curve at most: a column of print is 250 points wide
 SMALL = 6.5  # points, smallest font size
 LETTER = 0.62 * SMALL  # points, mean width of a letter of that size
@@ -49,6 +55,7 @@ RC: Any = {
     "figure.dpi": 150,  # equal to savefig.dpi, so that text widths of the layout hold in the file
     "savefig.dpi": 150,
     "text.parse_math": False,  # a label from a file may contain $ as a plain character
+    "pdf.fonttype": 42,  # TrueType: journals refuse Type 3
     "svg.hashsalt": "pfbench",  # SVG identifiers are random otherwise
     "svg.fonttype": "none",  # text stays text, which is searchable and smaller than outlines
 }
@@ -58,6 +65,11 @@ PLAIN_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#56B4E9
 SHADES = (
     "#dfedf5", "#aad0e5", "#74b2d5", "#3e94c5", "#0474b3", "#005788", "#003c5d", "#002235",
 )  # fmt: skip
+_COORDINATES = re.compile(rb' (?:d|x|y|transform)="[^"]*"')
+_DIGITS = re.compile(rb"-?\d+\.\d+")
+_LINES = re.compile(rb"M [\d. e-]+(?:\nL [\d. e-]+)+")  # of a path, whose letters may be left out
+_STYLE = re.compile(rb'style="([^"]*)"')
+_INDENT = re.compile(rb"\n\s+(?=<)")
 _Dash = str | tuple[int, tuple[float, ...]]
 _DASHES: tuple[_Dash, ...] = (
     "-",
@@ -322,8 +334,26 @@ def _render(figure: Figure, suffix: str) -> bytes:
     if suffix == "png":
         return render_palette_png(figure)
     buffer = io.BytesIO()
+    if suffix == "pdf":
+        figure.savefig(buffer, format="pdf", metadata={"CreationDate": None, "ModDate": None})
+        return buffer.getvalue()
     figure.savefig(buffer, format="svg", metadata={"Date": None})  # equal bytes
-    return buffer.getvalue()
+    return slim_svg(buffer.getvalue())
+
+
+def slim_svg(drawing: bytes) -> bytes:
+    """Round the coordinates of a drawing to hundredths of a point, and write each style once.
+
+    A drawing becomes half as large. It is used as an image, since the names of its styles are its own.
+    """
+    rounded = _COORDINATES.sub(
+        lambda match: _DIGITS.sub(lambda n: b"%g" % round(float(n[0]), 2), match[0]), drawing
+    )
+    paths = _LINES.sub(lambda lines: lines[0].replace(b"\nL ", b""), rounded)
+    classes = {style: b"s%d" % k for k, style in enumerate(dict.fromkeys(_STYLE.findall(paths)))}
+    rules = b"".join(b".%s{%s}" % (name, style) for style, name in classes.items())
+    short = _STYLE.sub(lambda style: b'class="%s"' % classes[style[1]], paths)
+    return _INDENT.sub(b"\n", short.replace(b"</style>", rules + b"</style>", 1))
 
 
 def render_palette_png(figure: Figure) -> bytes:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+import warnings
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from checkout import ROOT
@@ -92,6 +94,65 @@ def test_pdf_has_the_exact_width_and_truetype_fonts(
         assert b"/CIDFontType2" in content
         again = draw_paper_figure(plots[name], pack, FigureSetting(page))
         assert content == render_pdf(again, page)
+
+
+LONG = {k: f"EKF {k} (tuned on a world with other settings) [{k}]" for k in range(12)}
+
+
+def test_long_names_leave_room_for_the_axes_and_captions_say_where_filters_were_tuned() -> None:
+    page, setting = find_page_format("ieee"), FigureSetting(find_page_format("ieee"))
+    pack = paper_folder.shorten_names(
+        build_pack(12, 2, 1, runs=5, instants=10, carried=0, names=LONG)
+    )
+    assert pack["filters"][3]["name"] == "EKF 3 (tuned elsewhere) [3]"
+    for name, plot in select_figures(pack).items():
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # of axes without a size
+            figure = draw_paper_figure(plot, pack, setting)
+            with setting.applied():
+                figure.draw_without_rendering()
+        width = sum(axis.get_window_extent().width for axis in figure.axes[:2])
+        assert width > 0.35 * figure.bbox.width, name
+        caption = paper_folder.format_caption(name, pack)
+        assert "Tuned elsewhere: on a world with other settings." in caption
+    assert "Shown: 9 of 12 filters." in paper_folder.format_caption("over_time", pack)
+    plain = build_pack(3, 2, 1, runs=5, instants=10, carried=0)
+    text = paper_folder.format_caption("over_time", paper_folder.shorten_names(plain))
+    assert "Shown" not in text
+    assert "Tuned" not in text
+    assert page.column == 252.0
+
+
+def test_a_filter_that_diverges_leaves_the_axis_of_time_to_the_others() -> None:
+    pack = build_pack(4, 1, 1, runs=5, instants=10, carried=0)
+    curves = next(iter(pack["curves"].values()))["filters"]
+    first, *others = curves
+    curves[first]["median"] = [1e30] * len(curves[first]["median"])
+    plot, setting = select_figures(pack)["over_time"], FigureSetting(find_page_format("ieee"))
+    (axis,) = draw_paper_figure(plot, pack, setting).axes
+    best = min(float(np.median(curves[key]["median"])) for key in others)
+    assert axis.get_ylim()[1] <= 1.01e4 * best
+    assert axis.get_ylim()[0] <= best
+
+
+def test_the_figures_of_the_paper_are_in_the_export(
+    conditions: list[Condition], tmp_path: Path
+) -> None:
+    pack = build_pack(3, 1, 1, runs=3, instants=4, carried=0)
+    pack["methods"] = collect_methods_facts(conditions).to_entries() | {"particles": {}}
+    pack["bibtex"] = provenance.format_bibliography(pack, conditions)
+    drawings = {
+        "paper_1_a.pdf": ("Figure 1: 80 % of runs.", b"%PDF"), "paper_2.svg": ("Figure 2.", b"<svg/>"),
+    }  # fmt: skip
+    with RecordedFolder(tmp_path) as target:
+        remarks = paper_folder.write_paper(pack, find_page_format("ieee"), target, drawings)
+    text = (tmp_path / "paper.tex").read_text()
+    assert r"\includegraphics[width=\columnwidth]{paper_1_a.pdf}" in text
+    assert r"\caption{Figure 1: 80 \% of runs.}" in text
+    assert r"\IfFileExists{paper_2.pdf}" in text
+    assert text.index("leaderboard.pdf") < text.index("paper_1_a.pdf") < text.index("paper_2")
+    assert (tmp_path / "paper_1_a.pdf").read_bytes() == b"%PDF"
+    assert any("convert them to PDF" in remark for remark in remarks)
 
 
 def test_millimetres_are_converted() -> None:

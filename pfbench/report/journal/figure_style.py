@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -58,9 +59,21 @@ def line_style(look: LookData) -> dict[str, Any]:
     return {**mark_style(look), "linestyle": "-" if look["proposed"] else (0, (3.5, 1.5))}
 
 
+def break_name(name: str, page: PageFormat) -> str:
+    """Break a long name into lines that leave room for an axis."""
+    return "\n".join(textwrap.wrap(name, int(page.column / page.tick_size)))
+
+
+def measure_rows(names: Sequence[str], page: PageFormat) -> float:
+    """Return the height of rows with names, in inches."""
+    lines = [break_name(name, page).count("\n") for name in names]
+    return ROW * max(len(names), 2) * (1 + 0.7 * max(lines, default=0))
+
+
 def label_rows(axis: Axes, names: Sequence[str], setting: FigureSetting) -> None:
     """Write the names of rows at the left axis, the first on top."""
-    axis.set_yticks(range(len(names)), [setting.escape(name) for name in names])
+    texts = [setting.escape(break_name(name, setting.page)) for name in names]
+    axis.set_yticks(range(len(names)), texts, linespacing=0.9)
     axis.set_ylim(len(names) - 0.4, -0.6)
     axis.tick_params(axis="y", length=0)
     axis.grid(visible=False, axis="y")

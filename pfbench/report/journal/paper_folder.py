@@ -32,11 +32,17 @@ from pfbench.report.journal.table_layout import (
     format_table,
     measure_table,
 )
-from pfbench.report.journal.time_figures import plot_calibration, plot_over_time
+from pfbench.report.journal.time_figures import (
+    plot_calibration,
+    plot_over_time,
+    select_curves,
+    select_worlds,
+)
 from pfbench.report.methods_text import write_methods
 from pfbench.report.provenance import SELF, cite, list_cited_keys, renew_bibliography
 
 _CAPTION_LINES = 8
+_TUNED_ON = re.compile(r"\(tuned on ([^)]*)\)")
 _PDF_METADATA = {"CreationDate": None, "ModDate": None, "Producer": "pfbench", "Creator": "pfbench"}
 
 Plot = Callable[[Pack, FigureSetting], Figure]
@@ -65,11 +71,19 @@ def write_paper(
     pack: Pack,
     page: PageFormat,
     folder: RecordedFolder,
+    drawings: Mapping[str, tuple[str, bytes]] | None = None,
 ) -> list[str]:
     """Write the files of a paper except its data.
 
+    Args:
+        pack: Data of the page.
+        page: Format of the journal.
+        folder: Folder of the paper.
+        drawings: Caption and content by file name of the figures of the paper of the study, PDF or SVG.
+
     Returns remarks for the user: tables in a supplement, and figures without PGF.
     """
+    pack = shorten_names(pack)
     tables = _format_tables(pack, page)
     plots = select_figures(pack)
     remarks = _list_remarks(pack, tables, plots)
@@ -89,11 +103,34 @@ def write_paper(
     folder.write("pfbench.bib", renew_bibliography(pack))
     main = [name for name in tables if "supplement" not in name]
     main.sort(key=lambda name: "{table*}" in tables[name])  # wide floats hold up others
-    folder.write("paper.tex", format_document(pack, page, widths, main))
+    for name, (_, content) in (drawings or {}).items():
+        folder.write(name, content)
+    captions = {name: caption for name, (caption, _) in (drawings or {}).items()}
+    if any(name.endswith(".svg") for name in captions):
+        remarks.append(
+            "the figures of the paper are SVG, since there are no results: convert them to PDF"
+        )
+    folder.write("paper.tex", format_document(pack, page, widths, main, captions))
     if len(main) < len(tables):
         supplement = [name for name in tables if "supplement" in name]
         folder.write("supplement.tex", format_document(pack, page, {}, supplement))
     return remarks
+
+
+def shorten_names(pack: Pack) -> Pack:
+    """Return the data of a study whose filters that were tuned on other data are named so; captions say on which."""
+    looks = [dict(look) for look in pack["filters"]]
+    data: dict[str, None] = {}
+    for look in looks:
+        data |= dict.fromkeys(_TUNED_ON.findall(look["name"]))
+        look["name"] = _TUNED_ON.sub("(tuned elsewhere)", look["name"])
+    return {**pack, "filters": looks, "tuned_elsewhere": list(data)}
+
+
+def _describe_tuning(pack: Pack) -> str:
+    """Say on which data filters were tuned that are named so; empty without any."""
+    data = pack.get("tuned_elsewhere", ())
+    return f" Tuned elsewhere: on {escape_latex(', '.join(data))}." if data else ""
 
 
 def _list_remarks(pack: Pack, tables: Iterable[str], plots: Iterable[str]) -> list[str]:
@@ -139,6 +176,8 @@ def _format_tables(pack: Pack, page: PageFormat) -> dict[str, str]:
         *make_main_tables(pack, fits), *([planned] if planned else []),
         make_cost_table(pack, _list_particles(pack)), *make_supplement(pack, fits),
     ]  # fmt: skip
+    note = _describe_tuning(pack)
+    tables = [table._replace(caption=table.caption + note) for table in tables]
     return {f"table_{table.name}": _format_fitting(table, page) for table in tables}
 
 
@@ -233,6 +272,9 @@ def format_caption(name: str, pack: Pack) -> str:
     text = CAPTIONS[name]
     for word, value in words.items():
         text = text.replace(word, value)
+    text += _describe_tuning(pack)
+    if name == "over_time":
+        text += _describe_selection(pack)
     rows = find_rows(pack).values()
     absent = sum(not is_number(row["ratio"]) for row in rows)
     is_ratio = name in ("leaderboard", "cost")
@@ -243,10 +285,23 @@ def format_caption(name: str, pack: Pack) -> str:
     )
 
 
+def _describe_selection(pack: Pack) -> str:
+    """Say how many filters and worlds a figure of curves shows, where it does not show all; else empty."""
+    counts = (
+        (len(select_curves(pack)), len(pack["filters"]), "filters"),
+        (len(select_worlds(pack)), len(pack["worlds"]), "worlds"),
+    )
+    return "".join(f" Shown: {n} of {total} {noun}." for n, total, noun in counts if n < total)
+
+
 def format_document(
-    pack: Pack, page: PageFormat, figures: Mapping[str, bool], tables: Sequence[str]
+    pack: Pack,
+    page: PageFormat,
+    figures: Mapping[str, bool],
+    tables: Sequence[str],
+    captions: Mapping[str, str] | None = None,
 ) -> str:
-    """Format paper.tex.
+    """Format paper.tex; captions by file name of the figures of the paper of the study.
 
     Returns the document. It needs the other files of its folder.
     """
@@ -268,7 +323,20 @@ def format_document(
         page.head, *_PACKAGES, r"\begin{document}", *start,
         r"\section{Experiments}", r"\input{methods.tex}", methods, "", r"\section{Results}", _MINUS.sub("$-$", escape_latex(plain)), "",
         *floats, *(rf"\input{{{name}.tex}}" for name in tables),
+        *(_format_drawing(name, caption) for name, caption in (captions or {}).items()),
         rf"\bibliographystyle{{{page.bibliography}}}", r"\bibliography{pfbench}", r"\end{document}", "",
+    ])  # fmt: skip
+
+
+def _format_drawing(name: str, caption: str) -> str:
+    """Format a figure of the paper of the study in the width of a column."""
+    stem, _, suffix = name.rpartition(".")
+    drawing = rf"\includegraphics[width=\columnwidth]{{{stem}.pdf}}"
+    if suffix != "pdf":  # the paper compiles before the drawing is converted
+        drawing = rf"\IfFileExists{{{stem}.pdf}}{{{drawing}}}{{{escape_latex(f'Convert {name} to PDF.')}}}"
+    return "\n".join([
+        r"\begin{figure}[t]\centering", drawing,
+        rf"\caption{{{_MINUS.sub('$-$', escape_latex(caption))}}}\label{{fig:{stem}}}", r"\end{figure}",
     ])  # fmt: skip
 
 

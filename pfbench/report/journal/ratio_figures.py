@@ -22,6 +22,7 @@ from pfbench.report.journal.figure_style import (
     find_page_format,
     label_rows,
     mark_style,
+    measure_rows,
     ratio_limits,
     use_ratio_scale,
 )
@@ -46,7 +47,9 @@ _HALF_DIAMOND = 0.26  # rows
 def plot_leaderboard(pack: Pack, setting: FigureSetting) -> Figure:
     """Plot the error of each filter relative to the baseline, with its interval."""
     rows = _select_ratios(find_rows(pack))
-    figure = setting.make_figure(MARGIN + ROW * max(len(rows), 2))
+    looks = filters_by_key(pack)
+    names = [str(looks[key]["name"]) for key in rows]
+    figure = setting.make_figure(MARGIN + measure_rows(names, setting.page))
     _draw_leaderboard(figure.subplots(), pack, rows, setting)
     return figure
 
@@ -107,14 +110,15 @@ def _draw_leaderboard(
 def plot_planned(pack: Pack, setting: FigureSetting) -> Figure:
     """Plot the pairs that were compared in advance: ratio of errors in these worlds, in each, and in a new world."""
     pairs, looks = list_pairs(pack), filters_by_key(pack)
-    figure = setting.make_figure(MARGIN + 1.05 * ROW * max(len(pairs), 2))
+    names = [f"{looks[p['a']]['name']} / {looks[p['b']]['name']}" for p in pairs]
+    figure = setting.make_figure(MARGIN + 1.05 * measure_rows(names, setting.page))
     axis = figure.subplots()
     effects = [pair[name] for pair in pairs for name in ("estimate", "low", "high")]
     effects += [cell["estimate"] for pair in pairs for cell in pair["cells"]]
     limits = ratio_limits([float(value) for value in effects if is_number(value)])
     use_ratio_scale(axis, *limits)
     axis.set_xlabel("ratio of errors, first / second", loc="right")  # names are wide
-    label_rows(axis, [f"{looks[p['a']]['name']} / {looks[p['b']]['name']}" for p in pairs], setting)
+    label_rows(axis, names, setting)
     for y, pair in enumerate(pairs):
         new, colour = pair.get("new_world"), str(looks[pair["a"]]["colour"])
         if new and is_number(new["low"]) and is_number(new["high"]):

@@ -8,11 +8,11 @@ from matplotlib.figure import Figure
 
 from pfbench.report.journal.figure_style import (
     MARGIN,
-    ROW,
     FigureSetting,
     label_rows,
     line_style,
     mark_style,
+    measure_rows,
 )
 from pfbench.report.journal.study_pack import (
     ALL,
@@ -22,7 +22,7 @@ from pfbench.report.journal.study_pack import (
     is_number,
     name_of,
 )
-from pfbench.results.plotting import use_log_if_wide
+from pfbench.results.plotting import CURVE_RANGE, use_log_if_wide
 
 _CURVES = 9  # filters at most
 _PANELS = 6  # worlds at most
@@ -44,11 +44,16 @@ def select_curves(pack: Pack) -> list[str]:
     return [key for key in looks if key in selection]
 
 
+def select_worlds(pack: Pack) -> list[str]:
+    """Select the worlds with curves under the first noise regime, six at most."""
+    regime, worlds = str(pack["regimes"][0]["key"]), [str(world["key"]) for world in pack["worlds"]]
+    return [world for world in worlds if (world, regime) in pack["curves"]][:_PANELS]
+
+
 def plot_over_time(pack: Pack, setting: FigureSetting) -> Figure:
     """Plot the median error over time in each world under the first noise regime."""
     regime, looks = str(pack["regimes"][0]["key"]), filters_by_key(pack)
-    worlds = [str(world["key"]) for world in pack["worlds"]]
-    worlds = [world for world in worlds if (world, regime) in pack["curves"]][:_PANELS]
+    worlds = select_worlds(pack)
     is_wide = setting.page.has_columns and len(worlds) > 1
     across = max(1, min(len(worlds), 3 if is_wide or setting.page.column > 320 else 1))
     down = -(-len(worlds) // across)
@@ -76,10 +81,11 @@ def plot_calibration(pack: Pack, setting: FigureSetting) -> Figure:
     keys = [key for key in find_rows(pack) if key in values] or [
         key for key in looks if key in values
     ]
-    figure = setting.make_figure(MARGIN + 0.1 + ROW * max(len(keys), 2))
+    names = [str(looks[key]["name"]) for key in keys]
+    figure = setting.make_figure(MARGIN + 0.1 + measure_rows(names, setting.page))
     coverage_axis, nees_axis = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1.0))
-    label_rows(coverage_axis, [str(looks[key]["name"]) for key in keys], setting)
-    label_rows(nees_axis, [str(looks[key]["name"]) for key in keys], setting)
+    label_rows(coverage_axis, names, setting)
+    label_rows(nees_axis, names, setting)
     nees_axis.tick_params(labelleft=False)
     for level in (50, 90):
         coverage_axis.axvline(level, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
@@ -123,6 +129,9 @@ def _plot_curves(
         axis.plot(time, median, zorder=order, markevery=(start, step), **line_style(looks[key]))
         lines.append(median)
     use_log_if_wide(axis, axis.yaxis, lines)
+    best = min((float(np.nanmedian(v)) for v in lines if np.isfinite(v).any()), default=np.nan)
+    if best > 0:  # a filter that diverges leaves the axis
+        axis.set_ylim(top=min(axis.get_ylim()[1], CURVE_RANGE * best))
     axis.set_xlim(float(time[0]), float(time[-1]))
     return present
 

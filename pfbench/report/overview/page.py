@@ -20,6 +20,7 @@ from pfbench.report.overview.tables import (
     WorldRow,
     tell_story,
 )
+from pfbench.report.papers.figures import list_paper_pages
 from pfbench.report.study_page.page_writer import describe_page_knobs
 from pfbench.report.writers import format_csv, template_environment
 from pfbench.results.conditions import parse_label
@@ -69,6 +70,7 @@ def render_overview(
         "count": spell_number(len(overview.methods)),
         "pictures": {name: Markup(_data_address(text)) for name, text in pictures.items()},
         "decided": sum(pair.verdict.word in ("better", "worse") for pair in overview.pairs),
+        "papers": list_paper_pages(overview.methods),
         "board": BOARD_PAGE,
         "css": Markup(
             "\n".join(

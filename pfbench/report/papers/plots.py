@@ -1,9 +1,10 @@
-"""Plots of the paper figures over time, with bands over runs."""
+"""Plots of the paper figures: medians over runs with one band, and crosses at the numbers that a paper prints."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,104 +14,185 @@ from pfbench.results import store
 from pfbench.results.conditions import ComponentGroup
 from pfbench.results.frame import select_indices
 from pfbench.results.plotting import (
+    COLUMN,
+    CURVE_RANGE,
+    SMALL,
     LineStyle,
     add_legend,
     compute_run_quantiles,
     format_axis_label,
-    format_ticks,
-    stacked_axes,
-    use_log_if_wide,
+    set_plain_ticks,
 )
 from pfbench.stats import error_measures
 
-SYMLOG = " Outside the grey lines, if any, the scale is logarithmic."
-BAND_QUANTILES = (0.05, 0.5, 0.95)
-_SIDE = 3  # ticks on each side of 0 at most
+BAND_QUANTILES = (0.1, 0.5, 0.9)
+BAND = "80 % of runs"
+_INSTANTS = 90  # points of a curve: three panels of four curves stay below 60 kB
+_MARKS = 4  # of a curve
+_WIDE = 10.0  # ratio of the values from which an axis is logarithmic
+_DOTS, _DASHES = (0, (1.0, 1.0)), (0, (4.0, 2.0))
+_DIRECTIONS = {"E": "East", "N": "North", "U": "Up"}
 ResultsWithGroup = Mapping[str, tuple[store.JobResult, ComponentGroup]]
 
 
+class CurveLook(NamedTuple):
+    """Name and line style of a curve; the form that a paper prints is dotted."""
+
+    name: str
+    line: LineStyle
+
+    @classmethod
+    def of(cls, name: str, line: LineStyle, is_printed: bool = False) -> CurveLook:
+        """Return the look of a filter by its name and style in the study.
+
+        Args:
+            name: Name of the filter.
+            line: Line style of the filter.
+            is_printed: Whether it is the form that a paper prints.
+        """
+        return cls(name, line._replace(dash=_DOTS) if is_printed and line.filled else line)
+
+
+Looks = Mapping[str, CurveLook]
+
+
+class PrintedValue(NamedTuple):
+    """Number that a paper prints.
+
+    Attributes:
+        filter: Label of the filter.
+        component: Component of the error; empty for a trace.
+        at: Time in s, or the measure: RMSE or maximum.
+        value: Number in the displayed unit.
+    """
+
+    filter: str
+    component: str
+    at: float | str
+    value: float
+
+
+Printed = Sequence[PrintedValue]
+
+
 def plot_errors(
-    results: ResultsWithGroup, style: Mapping[str, LineStyle], before: bool = False
+    columns: Mapping[str, ResultsWithGroup],
+    looks: Looks,
+    printed: Printed = (),
+    start: float = 0.0,
+    before: bool = False,
 ) -> Figure:
-    """Plot the signed error over time, 5 to 95 % and median of the runs, a panel per component."""
-    components = list(
-        dict.fromkeys(name for _, block in results.values() for name in block.components)
-    )
-    figure, panels = stacked_axes(len(components), 1.45)
-    for component, axis in zip(components, panels, strict=True):
-        curves = []
-        for label, (result, block) in results.items():
-            if component not in block.components:
-                continue
-            index = block.places[block.components.index(component)]
-            time, values = _valid_runs(result, result.data["error"][..., index])
-            band = compute_run_quantiles(values * block.scale, BAND_QUANTILES)
-            _draw_band(axis, time, band, style[label], label, len(results))
-            curves.append(band)
-            if before and len(curves) == 1:  # equal for all filters, which share the data
-                for edge in band[::2, 0]:
-                    axis.axhline(edge, color="black", lw=0.9, ls=(0, (4, 2)), zorder=4)
-        unit = next(block.unit for _, block in results.values())
-        axis.set(title=component, ylabel=format_axis_label("error", unit))
-        _symlog_if_wide(axis, curves)
-    panels[-1].set_xlabel("time [s]")
-    add_legend(figure, panels[0])
+    """Plot the size of the error over time, a row per component, with the measures that the paper prints."""
+    blocks = [block for results in columns.values() for _, block in results.values()]
+    components = list(dict.fromkeys(name for block in blocks for name in block.components))
+    measures = list(dict.fromkeys(p.at for p in printed if isinstance(p.at, str)))
+    strips = list(product(measures, columns))
+    widths = [1.0] * len(columns) + [0.06 + 0.24 * len(strips)] * bool(strips)
+    figure, rows = _make_grid(len(components), widths, 1.3)
+    for component, row in zip(components, rows, strict=True):
+        numbers = [p for p in printed if p.component == component]
+        values: list[Levels] = []
+        for axis, results in zip(row, columns.values(), strict=False):
+            curves = {
+                label: _select_runs(result, np.abs(_component(result, block, component)))
+                for label, (result, block) in results.items()
+                if component in block.components
+            }
+            values.append(_draw_curves(axis, curves, looks, numbers, _INSTANTS // len(columns)))
+            if before:
+                values.append(_draw_first(axis, *next(iter(curves.values()))))
+        if strips:
+            points = {
+                (measure if len(columns) == 1 else title, measure): {
+                    label: measure_error(measure, result, block, component, start)
+                    for label, (result, block) in columns[title].items()
+                }
+                for measure, title in strips
+            }
+            values.append(_draw_points(row[-1], points, looks, numbers))
+        _set_scale(row, values)
+    label = format_axis_label("error", blocks[0].unit)
+    _name_panels(rows, list(map(name_component, components)), list(columns), label)
+    if len(measures) == 1 < len(columns):
+        rows[0][-1].set_title(measures[0])
+    _finish(figure, rows, len(columns), looks)
     return figure
 
 
-def plot_paper_trace(
-    results: Mapping[str, store.JobResult],
-    name: str,
-    unit: str,
-    style: Mapping[str, LineStyle],
-    printed: Sequence[float],
+def plot_curves(
+    rows: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]],
+    time: np.ndarray,
+    label: str,
+    looks: Looks,
+    printed: Printed = (),
 ) -> Figure:
-    """Plot a trace over time, and the limits that the paper prints."""
-    figure, (axis,) = stacked_axes(1, 2.0)
-    for label, result in results.items():
-        time, values = _valid_runs(result, result.data[name])
-        band = compute_run_quantiles(values, BAND_QUANTILES)
-        _draw_band(axis, time, band, style[label], label, len(results))
-    if np.isfinite(printed).all():
-        axis.axhspan(*printed, color="0.88", lw=0, zorder=0)
-    axis.set(xlabel="time [s]", ylabel=unit)
+    """Plot traces over time: values [R, T] by the title of a row, of a column, and by filter."""
+    titles = list(next(iter(rows.values())))
+    figure, axes = _make_grid(len(rows), [1.0] * len(titles), 2.0 if len(rows) == 1 else 1.4)
+    for row, columns in zip(axes, rows.values(), strict=True):
+        values = [
+            _draw_curves(
+                axis, {n: (time, v) for n, v in columns[title].items()}, looks, printed, _INSTANTS // len(titles)
+            )
+            for axis, title in zip(row, titles, strict=True)
+        ]  # fmt: skip
+        _set_scale(row, values)
+    _name_panels(axes, list(rows), titles, label)
+    _finish(figure, axes, len(titles), looks)
+    return figure
+
+
+def plot_points(
+    columns: Mapping[str, Mapping[str, Mapping[str, np.ndarray]]],
+    looks: Looks,
+    label: str,
+    xlabel: str = "",
+    printed: Mapping[str, Printed] | None = None,
+) -> Figure:
+    """Plot medians and bands of values [n] by the title of a column, category and filter, on one scale."""
+    figure, rows = _make_grid(1, [1.0] * len(columns), 2.1)
+    values = [
+        _draw_points(
+            axis, {(name, name): v for name, v in groups.items()}, looks, (printed or {}).get(title, ())
+        )
+        for axis, (title, groups) in zip(rows[0], columns.items(), strict=True)
+    ]  # fmt: skip
+    for axis in rows[0]:
+        axis.set_xlabel(xlabel)
+    _name_panels(rows, [""], list(columns), label)
+    _set_scale(rows[0], values)
+    _finish(figure, rows, 0, looks)
+    return figure
+
+
+def plot_escape(curves: Mapping[str, np.ndarray], looks: Looks) -> Figure:
+    """Plot escape factors over the iterations of a step as a share of all, curves [k] by name."""
+    figure, ((axis,),) = _make_grid(1, [1.0], 2.0)
+    for name, values in curves.items():
+        share = np.linspace(0.0, 1.0, len(values))
+        look = looks[name]
+        axis.plot(share, values, **look.line.line(look.name), markevery=0.1, **look.line.mark())
+    axis.set(xlabel="iteration / number of iterations", ylabel="c3 = c4")
     axis.set_ylim(bottom=0)
-    add_legend(figure, axis)
+    add_legend(figure, axis, 1)
     return figure
 
 
-def plot_escape(factors: Mapping[str, tuple[float, int]], style: Mapping[str, LineStyle]) -> Figure:
-    """Plot escape factors over the iterations, as repaired and as printed."""
-    figure, (axis,) = stacked_axes(1, 2.0)
-    for label, (size, most) in factors.items():
-        k = np.arange(most + 1)
-        repaired = size * (1.0 - np.cos(np.pi * k / most))
-        printed = size - size * np.cos(np.pi * k) / most
-        axis.plot(k, repaired, marker="." if most < 10 else "", **style[label].line(label))
-        axis.plot(k, printed, color=style[label].colour, ls=":", lw=0.8)
-    axis.set(xlabel="iteration", ylabel="c3")
-    axis.set_ylim(bottom=0)
-    add_legend(figure, axis)
-    return figure
+def name_component(name: str) -> str:
+    """Name a component of the state in words, such as position North."""
+    group, _, direction = name.rpartition("_")
+    return f"{group} {_DIRECTIONS.get(direction, direction)}".replace("_", " ").strip()
 
 
-def plot_relative_errors(
-    experiments: Mapping[str, Mapping[str, store.JobResult]], style: Mapping[str, LineStyle]
-) -> Figure:
-    """Plot the horizontal error in % of the range over time, a panel per experiment."""
-    figure, panels = stacked_axes(len(experiments), 1.6)
-    for (name, results), axis in zip(experiments.items(), panels, strict=True):
-        lines = []
-        for label, result in results.items():
-            time, values = _valid_runs(result, relative_error_percent(result))
-            band = compute_run_quantiles(values, BAND_QUANTILES)
-            _draw_band(axis, time, band, style[label], label, len(results))
-            lines += list(band)
-        axis.set(title=name, ylabel="Err [%]")
-        use_log_if_wide(axis, axis.yaxis, lines)
-    panels[-1].set_xlabel("time [s]")
-    add_legend(figure, panels[0])
-    return figure
+def measure_error(
+    measure: str, result: store.JobResult, block: ComponentGroup, component: str, start: float
+) -> np.ndarray:
+    """Compute the RMSE or the maximum of the error of a component from a time on, for each valid run, [n]."""
+    late = result.data["time"] >= start
+    error = _component(result, block, component)[~result.data["lost"]][:, late, None]
+    no_run_lost = np.zeros(len(error), dtype=bool)
+    compute = error_measures.rmse_per_run if measure == "RMSE" else error_measures.max_error
+    return compute(error, no_run_lost)
 
 
 def relative_error_percent(result: store.JobResult) -> np.ndarray:
@@ -120,168 +202,203 @@ def relative_error_percent(result: store.JobResult) -> np.ndarray:
     return np.asarray(100 * np.sqrt((error**2).sum(-1)) / result.data["range"])
 
 
-def _valid_runs(result: store.JobResult, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return thinned times and values [R, T] of the valid runs."""
-    valid = values[~result.data["lost"]].astype(np.float64)
-    steps = np.flatnonzero(~np.isnan(valid).all(0))
-    steps = steps[select_indices(steps.size)]
-    return result.data["time"][steps], valid[:, steps]
+def select_valid(result: store.JobResult, values: np.ndarray) -> np.ndarray:
+    """Return the rows of valid runs, [n, T]."""
+    return values[~result.data["lost"]].astype(np.float64)
 
 
-def _draw_band(
-    axis: Axes, time: np.ndarray, band: np.ndarray, look: LineStyle, label: str, among: int
-) -> None:
-    """Draw a median with its band, whose edges are lines so that overlapping bands stay distinct."""
-    low, middle, high = band
-    axis.fill_between(time, low, high, color=look.colour, alpha=0.24 / (1 + among), lw=0)
-    for edge in (low, high):
-        axis.plot(time, edge, color=look.colour, ls=look.dash, lw=0.6)
-    axis.plot(
-        time,
-        middle,
-        color=look.colour,
-        ls=look.dash,
-        lw=look.width,
-        label=label,
-        marker="." if time.size == 1 else "",
-    )
-
-
-def _late_level(curve: np.ndarray) -> float:
-    """Return the 90 % quantile of absolute values [q, T] after the first third, 0 without values."""
-    sizes = np.abs(curve[:, curve.shape[1] // 3 :])
-    finite = sizes[np.isfinite(sizes)]
-    return float(np.quantile(finite, 0.9)) if finite.size else 0.0
-
-
-def _symlog_if_wide(axis: Axes, curves: Sequence[np.ndarray]) -> None:
-    """Use a symmetric logarithmic scale if the values span a wide range.
-
-    The scale is linear up to the late level of the best filter, where good filters stay distinct.
-    """
-    sizes = np.concatenate([np.abs(curve).ravel() for curve in curves]) if curves else np.empty(0)
-    sizes = sizes[np.isfinite(sizes)]
-    late = [_late_level(curve) for curve in curves]
-    level = min((size for size in late if size > 0), default=0.0)
-    if sizes.max(initial=0.0) > 8 * level > 0:
-        decades = float(np.log10(sizes.max() / level))
-        axis.set_yscale(
-            "symlog", linthresh=level, linscale=max(1.2, 0.7 * decades)
-        )  # at least two fifths are linear
-        for edge in (level, -level):
-            axis.axhline(edge, color="0.55", lw=0.7, zorder=1)
-        tens = 10.0 ** np.arange(np.floor(np.log10(level)), np.floor(np.log10(sizes.max())) + 1)
-        outer = tens[tens >= 1.5 * level]
-        top = np.floor(sizes.max() / tens[-1]) * tens[-1]  # the largest one-digit multiple
-        if not outer.size or top > 3 * outer[-1]:
-            outer = np.append(outer, top)
-        outer = outer[:: -(-outer.size // _SIDE)]
-        ticks = [*(-outer[::-1]), 0.0, *outer]
-        axis.set_yticks(ticks, format_ticks(ticks))
-        axis.minorticks_off()
+def average_runs(values: np.ndarray) -> np.ndarray:
+    """Compute the mean over time of each run, [n]."""
+    return error_measures.mean_per_run(values, np.zeros(len(values), dtype=bool))
 
 
 # --------------------------------------------------------------------------------------------------
-# Plots of the paper figures by experiment or component.
+# Curves, points, scales and legends of all plots.
 
 
-def plot_against(
-    values: Mapping[str, Mapping[str, np.ndarray]], style: Mapping[str, LineStyle], ylabel: str
-) -> Figure:
-    """Plot the median and the band over runs by experiment.
+class Levels(NamedTuple):
+    """Values of one panel: medians by name of the filter, what else is drawn, and the printed numbers."""
 
-    Shapes: values [n].
-    """
-    labels = list(dict.fromkeys(label for runs in values.values() for label in runs))
-    figure, (axis,) = stacked_axes(1, 2.1)
-    for i, label in enumerate(labels):
-        offset = 0.7 * ((i + 0.5) / len(labels) - 0.5)
-        points = [
-            (x + offset, runs[label]) for x, runs in enumerate(values.values()) if label in runs
-        ]
-        _draw_points(axis, points, style[label], label)
-    axis.set_xticks(range(len(values)), list(values))
-    axis.set(ylabel=ylabel, xlim=(-0.6, len(values) - 0.4))
-    axis.grid(False, axis="x")
-    use_log_if_wide(axis, axis.yaxis, [v for runs in values.values() for v in runs.values()])
-    if axis.get_yscale() == "linear":
-        axis.set_ylim(bottom=0)
-    add_legend(figure, axis)
-    return figure
+    medians: dict[str, np.ndarray]
+    others: np.ndarray
+    printed: np.ndarray
 
 
-def plot_maxima(
-    results: ResultsWithGroup,
-    style: Mapping[str, LineStyle],
-    start: float,
-    printed: Mapping[str, Sequence[float]],
-) -> Figure:
-    """Plot maximum error and RMSE by component, with crosses at values of the paper."""
-    components = dict.fromkeys(name for _, block in results.values() for name in block.components)
-    # In the order of the printed values.
-    names = sorted(components, key=lambda name: "NEU".find(name[-1]))
-    figure, (axis,) = stacked_axes(1, 2.3)
-    values: list[np.ndarray] = []
-    for i, (label, (result, block)) in enumerate(results.items()):
-        offset = 0.75 * ((i + 0.5) / len(results) - 0.5)
-        measures = [_error_measures(result, block, name, start) for name in names]
-        peaks = [(x + offset - 0.05, peak) for x, (peak, _) in enumerate(measures)]
-        sizes = [(x + offset + 0.05, rmse) for x, (_, rmse) in enumerate(measures)]
-        _draw_points(axis, peaks, style[label], label)
-        _draw_points(axis, sizes, style[label], "", open_=True)
-        values += [value for _, value in (*peaks, *sizes)]
-        if label in printed:
-            cross: Any = {"ls": "none", "marker": "x", "ms": 6, "mew": 1.3, "zorder": 5}
-            axis.plot([x for x, _ in peaks], printed[label][: len(names)], color="black", **cross)
-            values.append(np.asarray(printed[label]))
-    axis.set_xticks(range(len(names)), names)
-    unit = next(block.unit for _, block in results.values())
-    axis.set(ylabel=format_axis_label("error", unit), xlim=(-0.6, len(names) - 0.4))
-    axis.grid(False, axis="x")
-    use_log_if_wide(axis, axis.yaxis, values)
-    add_legend(figure, axis)
-    return figure
-
-
-def _error_measures(
-    result: store.JobResult, block: ComponentGroup, component: str, start: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the maximum error and the RMSE of a component for each valid run, [n]."""
+def _component(result: store.JobResult, block: ComponentGroup, component: str) -> np.ndarray:
+    """Return the error of a component in its displayed unit, [R, T]."""
     index = block.places[block.components.index(component)]
-    late = result.data["time"] >= start
-    error = result.data["error"][~result.data["lost"]][:, late][..., [index]]
-    no_run_lost = np.zeros(len(error), dtype=bool)
-    peak = error_measures.max_error(error, no_run_lost)
-    return block.scale * peak, block.scale * error_measures.rmse_per_run(error, no_run_lost)
+    return np.asarray(block.scale * result.data["error"][..., index].astype(np.float64))
 
 
-def mean_relative_error(result: store.JobResult) -> np.ndarray:
-    """Compute the mean over time of Err of each valid run, %."""
-    valid = relative_error_percent(result)[~result.data["lost"]]
-    return error_measures.mean_per_run(valid, np.zeros(len(valid), dtype=bool))
+def _select_runs(result: store.JobResult, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return times, and values of the valid runs."""
+    return result.data["time"], select_valid(result, values)
 
 
-def mean_trace_per_run(result: store.JobResult, name: str) -> np.ndarray:
-    """Compute the mean over time of a trace of each valid run."""
-    valid = result.data[name][~result.data["lost"]]
-    return error_measures.mean_per_run(valid, np.zeros(len(valid), dtype=bool))
+def _thin(time: np.ndarray, values: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times of a curve, and values there [R, T]."""
+    steps = np.flatnonzero(~np.isnan(values).all(0))
+    steps = steps[select_indices(steps.size, most)]
+    return time[steps], values[:, steps]
+
+
+def _draw_curves(
+    axis: Axes,
+    curves: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    looks: Looks,
+    printed: Printed,
+    instants: int,
+) -> Levels:
+    """Draw medians over runs, the band of the last filter, and crosses at printed numbers."""
+    medians, others = {}, [np.empty(0)]
+    for k, (label, curve) in enumerate(curves.items()):
+        (time, values), (name, line) = _thin(*curve, instants), looks[label]
+        low, medians[name], high = compute_run_quantiles(values, BAND_QUANTILES)
+        every = max(1, time.size // _MARKS)
+        axis.plot(
+            time, medians[name], ms=3.2, markevery=(k * every // max(1, len(curves)), every),
+            **line.line(name), **line.mark(),
+        )  # fmt: skip
+        if k == len(curves) - 1:
+            axis.fill_between(time, low, high, color=line.colour, alpha=0.18, lw=0)
+            others += [low, high]
+    crosses = [p for p in printed if p.filter in curves and not isinstance(p.at, str)]
+    for p in crosses:
+        _draw_cross(axis, p.at, p.value, looks[p.filter].line.colour)
+    return Levels(medians, np.concatenate(others), np.array([p.value for p in crosses]))
 
 
 def _draw_points(
     axis: Axes,
-    points: Sequence[tuple[float, np.ndarray]],
-    look: LineStyle,
-    label: str,
-    open_: bool = False,
-) -> None:
-    """Draw the medians and bands of points (x, values [n])."""
-    for k, (x, values) in enumerate(points):
-        finite = values[np.isfinite(values)]
-        if not finite.size:
-            continue
-        low, middle, high = np.quantile(finite, BAND_QUANTILES)
-        axis.plot([x, x], [low, high], color=look.colour, lw=1.0, zorder=2)
-        axis.plot(
-            x, middle, ls="none", ms=4.5, **look.mark() | ({"mfc": "white"} if open_ else {}),
-            label=label if k == 0 and label else "", zorder=3,
+    groups: Mapping[tuple[str, str], Mapping[str, np.ndarray]],
+    looks: Looks,
+    printed: Printed,
+) -> Levels:
+    """Draw medians and bands of values [n] by category (its name and measure) and filter, with crosses at printed numbers."""
+    medians: dict[str, np.ndarray] = {}
+    others, crosses = [], []
+    for x, ((_, measure), values) in enumerate(groups.items()):
+        for i, (label, all_values) in enumerate(values.items()):
+            finite = all_values[np.isfinite(all_values)]
+            x_filter = x + 0.8 * ((i + 0.5) / len(values) - 0.5)
+            numbers = [p.value for p in printed if (p.at, p.filter) == (measure, label)]
+            for value in numbers:
+                _draw_cross(axis, x_filter, value, "black")
+            crosses += numbers
+            if not finite.size:
+                continue
+            name, line = looks[label]
+            low, middle, high = np.quantile(finite, BAND_QUANTILES)
+            axis.plot([x_filter, x_filter], [low, high], color=line.colour, lw=1.0, zorder=2)
+            axis.plot(
+                x_filter,
+                middle,
+                ls="none",
+                ms=4.2,
+                zorder=3,
+                label="" if name in medians else name,
+                **line.mark(),
+            )
+            medians[name] = np.append(medians.get(name, np.empty(0)), middle)
+            others += [low, high]
+    names = [name.replace("maximum", "max").rpartition(" ")[2] for name, _ in groups]
+    axis.set_xticks(range(len(groups)), names)
+    axis.set_xlim(-0.6, len(groups) - 0.4)
+    axis.grid(False, axis="x")
+    return Levels(medians, np.array(others), np.array(crosses))
+
+
+def _draw_first(axis: Axes, time: np.ndarray, values: np.ndarray) -> Levels:
+    """Draw the edges of the band at the first step, at which filters that share data are equal."""
+    edges = np.quantile(values[:, 0], BAND_QUANTILES[::2])
+    axis.hlines(edges, time[0], time[-1], colors="black", linestyles=_DASHES, lw=0.9, zorder=4)
+    return Levels({}, edges, np.empty(0))
+
+
+def _draw_cross(axis: Axes, x: Any, y: float, colour: str) -> None:
+    """Draw a cross at a printed number."""
+    style: Any = {"ls": "none", "marker": "x", "ms": 6.5, "mew": 1.5, "zorder": 6}
+    axis.plot(x, y, color=colour, clip_on=False, label="_printed", **style)
+
+
+def _find_typical(values: np.ndarray) -> float:
+    """Return the median of the positive values, NaN without one."""
+    positive = values[np.isfinite(values) & (values > 0)]
+    return float(np.median(positive)) if positive.size else float("nan")
+
+
+def _set_scale(axes: Sequence[Axes], panels: Sequence[Levels]) -> None:
+    """Use one scale in a row of panels, where good filters stay distinct whatever a bad one does.
+
+    The scale is logarithmic if the values span a factor of ten. It ends at 10000 times the typical value of the best
+    filter, and names the filters that lie beyond.
+    """
+    medians = [item for panel in panels for item in panel.medians.items()]
+    printed = np.concatenate([panel.printed for panel in panels])
+    others = [panel.others for panel in panels]
+    positive = np.concatenate([*(values for _, values in medians), *others, printed])
+    positive = positive[np.isfinite(positive) & (positive > 0)]
+    typical = [_find_typical(values) for _, values in medians]
+    if not positive.size or np.isnan(typical).all():
+        return
+    least = float(np.nanmin(typical))
+    lowest = min(
+        float(np.quantile(v[v > 0], 0.02, method="lower")) for _, v in medians if (v > 0).any()
+    )
+    high = min(float(positive.max()), CURVE_RANGE * least)
+    is_log = high > _WIDE * least
+    low = min([max(float(positive.min()), lowest / _WIDE), *printed]) if is_log else 0.0
+    for axis in axes:
+        if is_log:
+            axis.set_yscale("log")
+            set_plain_ticks(axis.yaxis, np.array([low, high]))
+            axis.minorticks_off()  # a third of the drawing
+        axis.set_ylim(low / 1.2, 1.3 * high if is_log else 1.08 * high)
+    for axis in axes[1:]:
+        axis.tick_params(labelleft=False)
+    outside = dict.fromkeys(name for name, values in medians if np.nanmax(values) > high)
+    if outside:
+        axes[0].annotate(
+            f"beyond the axis: {', '.join(outside)}", (0.02, 0.97), xycoords="axes fraction",
+            va="top", fontsize=SMALL,
         )  # fmt: skip
+
+
+def _make_grid(
+    rows: int, widths: Sequence[float], height: float
+) -> tuple[Figure, Sequence[Sequence[Axes]]]:
+    """Create a figure of one column of print with panels in rows."""
+    figure = Figure(figsize=(COLUMN, 0.3 + height * rows), layout="constrained")
+    grid = figure.subplots(rows, len(widths), squeeze=False, sharex="col", width_ratios=widths)
+    return figure, [list(row) for row in grid]
+
+
+def _name_panels(
+    rows: Sequence[Sequence[Axes]], names: Sequence[str], titles: Sequence[str], label: str
+) -> None:
+    """Write the names of rows and columns, and the quantity at the left."""
+    for row, name in zip(rows, names, strict=True):
+        row[0].set_ylabel(f"{name}\n{label}".strip() if len(titles) > 1 else label)
+        if len(titles) == 1:
+            row[0].set_title(titles[0] or name)
+    if len(titles) > 1:
+        for axis, title in zip(rows[0], titles, strict=False):
+            axis.set_title(title)
+
+
+def _finish(figure: Figure, rows: Sequence[Sequence[Axes]], curves: int, looks: Looks) -> None:
+    """Label the time axes of the columns of curves, and add the legend: filters, band, printed numbers."""
+    for axis in rows[-1][:curves]:
+        axis.set_xlabel("time [s]")
+    first, axes = rows[0][0], [axis for row in rows for axis in row]
+    labels = {line.get_label() for axis in axes for line in axis.lines}
+    present = {line.get_label() for line in first.lines}
+    for name, line in looks.values():
+        if name in labels - present:
+            style = line.line(name) if curves else {"ls": "none", "label": name}
+            first.plot([], [], ms=3.2, **style, **line.mark())
+    if curves:
+        first.fill_between([], [], color="0.8", lw=0, label=BAND)
+    if "_printed" in labels:
+        first.plot([], [], "x", color="black", ms=6.5, mew=1.5, label="printed")
+    add_legend(figure, first)

@@ -2,26 +2,36 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from pfbench.report.papers import plots
-from pfbench.report.papers.plots import ResultsWithGroup
+from pfbench.report.papers.plots import CurveLook, Looks, PrintedValue, ResultsWithGroup
 from pfbench.results import store
-from pfbench.results.conditions import ComponentGroup, Condition, component_groups
+from pfbench.results.conditions import Condition, component_groups
 from pfbench.results.frame import select_indices
-from pfbench.results.plotting import COLUMN, FigureSpec, LineStyle, format_slug, line_styles
+from pfbench.results.plotting import (
+    COLUMN,
+    FigureSpec,
+    format_axis_label,
+    format_slug,
+    format_ticks,
+    line_styles,
+)
+from pfbench.results.step_times import StepTimes
 
-_BAND = "median and 5 to 95 %"
 _FIRST = (
-    " Dashed black: 5 to 95 % before correction, at the first step. "
+    " Dashed black: 80 % of runs before correction, at the first step. "
     "The error there equals the bias, because the filter has processed no measurement."
 )
+
+_Values = TypeVar("_Values", bound=Mapping[str, Any])
 
 
 class PaperFigureData(NamedTuple):
@@ -31,11 +41,13 @@ class PaperFigureData(NamedTuple):
         condition: Condition.
         results: Results by label, with all times.
         start_time_s: Start time of the measures, s.
+        where: Names of the scenario and the noise regime.
     """
 
     condition: Condition
     results: dict[str, store.JobResult]
     start_time_s: float
+    where: str
 
     @property
     def prefix(self) -> str:
@@ -43,12 +55,13 @@ class PaperFigureData(NamedTuple):
         scenario, noise, model = self.condition[:3]
         return format_slug(f"{scenario}_{noise}_{model}")
 
-    def select_group(self, group: str) -> dict[str, tuple[store.JobResult, ComponentGroup]]:
-        """Return the results that have a component group, with the group, by label."""
+    def select_group(self, group: str, labels: Sequence[str] = ()) -> ResultsWithGroup:
+        """Return the results of filters, of all by default, that have a component group, with the group, by label."""
         return {
-            label: (result, block)
-            for label, result in self.results.items()
-            for block in component_groups(result.meta["state"])
+            label: (self.results[label], block)
+            for label in labels or self.results
+            if label in self.results
+            for block in component_groups(self.results[label].meta["state"])
             if block.group == group
         }
 
@@ -58,19 +71,30 @@ class PaperFigure(NamedTuple):
 
     Attributes:
         title: Paper and figure, as text.
-        filters: Labels of the filters; those without results are left out.
+        columns: Labels of the filters of each column of panels, four at most; the band is that of the last.
         draw: Function that returns the figures of conditions, none without data.
+        studies: Studies that show the figure, first the one whose experiment is that of the paper.
         noise: Noise regime of the conditions, empty for any.
         groups: Component groups, for figures of errors.
-        printed: Values of the paper by label, in the displayed unit.
+        printed: Numbers that the text of the paper prints.
+        source: Where it prints them, and what else a reader must know.
+        titles: Titles of the columns.
     """
 
     title: str
-    filters: tuple[str, ...]
+    columns: tuple[tuple[str, ...], ...]
     draw: Callable[[PaperFigureInput], list[FigureSpec]]
+    studies: tuple[str, ...] = ()
     noise: str = ""
     groups: tuple[str, ...] = ()
-    printed: Mapping[str, tuple[float, ...]] = {}
+    printed: tuple[PrintedValue, ...] = ()
+    source: str = ""
+    titles: tuple[str, ...] = ("",)
+
+    @property
+    def filters(self) -> tuple[str, ...]:
+        """Labels of all filters."""
+        return tuple(dict.fromkeys(label for column in self.columns for label in column))
 
 
 class PaperFigureInput(NamedTuple):
@@ -79,12 +103,12 @@ class PaperFigureInput(NamedTuple):
     Attributes:
         figure: Figure of the paper.
         data: Data of each condition.
-        style: Line styles by label.
+        looks: Names and line styles by label.
     """
 
     figure: PaperFigure
     data: Sequence[PaperFigureData]
-    style: Mapping[str, LineStyle]
+    looks: Looks
 
     def list_groups(self) -> Iterator[tuple[PaperFigureData, str, ResultsWithGroup]]:
         """Yield the data, group and results of each condition and group with results."""
@@ -92,18 +116,48 @@ class PaperFigureInput(NamedTuple):
             if results := data.select_group(group):
                 yield data, group, results
 
-    def format_head(self, data: PaperFigureData) -> str:
+    def arrange(self, select: Callable[[Sequence[str]], _Values]) -> dict[str, _Values]:
+        """Return the values of the filters of each column by its title, without columns that have none."""
+        columns = zip(self.figure.titles, map(select, self.figure.columns), strict=True)
+        return {title: values for title, values in columns if values}
+
+    def format_head(self, *data: PaperFigureData) -> str:
         """Format the start of a caption."""
-        return f"{self.figure.title}, here {data.condition.scenario} / {data.condition.noise}"
+        return f"{self.figure.title}, here {' and '.join(d.where for d in data)}"
+
+    def describe_runs(self, *data: PaperFigureData, has_curves: bool = True) -> str:
+        """Describe medians, bands, runs and absent filters, and the place of printed numbers, as the end of a caption."""
+        results = [(label, r) for d in data for label, r in d.results.items()]
+        runs = sorted({int(r.meta["runs"]) for _, r in results})
+        present = {label for label, _ in results}
+        columns = [[n for n in column if n in present] for column in self.figure.columns]
+        names = dict.fromkeys(self.looks[column[-1]].name for column in columns if column)
+        band = f"band: 80 % of runs of {' and of '.join(names)}" if has_curves else "bars: 80 % of runs"  # fmt: skip
+        parts = [f"Medians of {' or '.join(map(str, runs))} runs; {band}.", self.figure.source]
+        lost: Counter[str] = Counter()
+        for label, result in results:
+            lost[self.looks[label].name] += int(result.data["lost"].sum())
+        if counts := [f"{name} {number}" for name, number in lost.items() if number]:
+            parts.append(f"Without lost runs: {', '.join(counts)}.")
+        absent = [self.looks[n].name for n in self.figure.filters if n not in present]
+        if absent:
+            parts.append(f"No results of {', '.join(dict.fromkeys(absent))}.")
+        return " ".join(filter(None, parts))
 
 
 def make_error_figures(source: PaperFigureInput, before: bool = False) -> list[FigureSpec]:
-    """Return figures of the error over time, one per condition and group."""
+    """Return figures of the size of the error over time, one per condition and group."""
     figures = []
     for data, group, results in source.list_groups():
-        text = f"{source.format_head(data)}: error of {group} over time, {describe_band(data)}."
-        text += (_FIRST if before else "") + plots.SYMLOG
-        make = partial(plots.plot_errors, results, source.style, before)
+        columns = source.arrange(partial(data.select_group, group))
+        components = {name for _, block in results.values() for name in block.components}
+        printed = [p for p in source.figure.printed if p.component in components]
+        since = f" after {data.start_time_s:g} s" if data.start_time_s else ""
+        text = f"{source.format_head(data)}: size of the {group.replace('_', ' ')} error over time"
+        measures = dict.fromkeys(p.at for p in printed if isinstance(p.at, str))
+        text += f", and its {' and '.join(map(str, measures))}{since}" if measures else ""
+        text += f". {source.describe_runs(data)}{_FIRST if before else ''}"
+        make = partial(plots.plot_errors, columns, source.looks, printed, data.start_time_s, before)
         figures.append(FigureSpec(f"{data.prefix}_{format_slug(group)}", text, make))
     return figures
 
@@ -113,151 +167,187 @@ def make_trace_figures(
 ) -> list[FigureSpec]:
     """Return figures of a trace over time, one per condition."""
     figures = []
-    low, high = source.figure.printed.get("", (np.nan, np.nan))
     for data in source.data:
         results = {label: r for label, r in data.results.items() if name in r.data}
         if results:
-            text = f"{source.format_head(data)}: {words} over time, {describe_band(data)}."
-            text += f" Grey: {low:g} to {high:g}, as printed." if np.isfinite(low) else ""
-            make = partial(plots.plot_paper_trace, results, name, unit, source.style, (low, high))
+            time = next(iter(results.values())).data["time"]
+            curves = {label: plots.select_valid(r, r.data[name]) for label, r in results.items()}
+            rows = {"": source.arrange(partial(_select, curves))}
+            printed = [p for p in source.figure.printed if p.filter in results]
+            text = f"{source.format_head(data)}: {words} over time. {source.describe_runs(data)}"
+            make = partial(plots.plot_curves, rows, time, unit, source.looks, printed)
             figures.append(FigureSpec(f"{data.prefix}_{name}", text, make))
     return figures
 
 
 def make_escape_figure(source: PaperFigureInput) -> list[FigureSpec]:
-    """Return the figure of the escape factor over the iterations of a step."""
-    factors: dict[str, tuple[float, int]] = {}
-    for label, result in (item for data in source.data for item in data.results.items()):
+    """Return the figure of the escape factor over the iterations of a step, by the equation as printed and as repaired."""
+    ran: dict[int, float] = {}
+    for result in (result for data in source.data for result in data.results.values()):
         proposal = result.meta["config"].get("filter", {}).get("proposal") or {}
         if escape := (proposal.get("velocity") or {}).get("escape_coefficient"):
-            factors[label] = float(escape), int(proposal["iterations"])
-    if not factors:
+            ran[int(proposal["iterations"])] = float(escape)
+    if not ran:
         return []
+    (size,) = set(ran.values())
+    share = np.linspace(0.0, 1.0, _PRINTED_ITERATIONS + 1)
+    curves = {"as repaired": size * (1 - np.cos(np.pi * share))}
+    for most in (_PRINTED_ITERATIONS, *sorted(ran, reverse=True)):
+        k = np.arange(most + 1)
+        curves[f"eq. 35 as printed, {most} iterations"] = size * (1 - np.cos(np.pi * k) / most)
     text = (
-        f"{source.figure.title}: escape factor c3 = c4 over the iterations of a step, as repaired "
-        "and as used by the filters. Dotted: eq. 35 as printed."
+        f"{source.figure.title}: escape factor c3 = c4 over the iterations of a step, for the {_PRINTED_ITERATIONS} "
+        f"iterations that the paper draws and the {' and '.join(map(str, sorted(ran)))} of the filters. {source.figure.source}"
     )
-    return [FigureSpec("", text, partial(plots.plot_escape, factors, source.style))]
+    looks = _make_plain_looks({name: name for name in curves})
+    return [FigureSpec("", text, partial(plots.plot_escape, curves, looks))]
 
 
 def make_relative_error_figures(source: PaperFigureInput) -> list[FigureSpec]:
-    """Return figures of Err by experiment, over time and its mean."""
-    experiments = {
-        data.condition.scenario: data.results
-        for data in source.data
-        if all("range" in r.data for r in data.results.values())
-    }
-    if not experiments:
+    """Return figures of Err by experiment: its mean, and over time."""
+    with_range = all("range" in r.data for data in source.data for r in data.results.values())
+    if not source.data or not with_range:
         return []
-    quantity = "Err, the horizontal error in % of the horizontal range [eq. 20 as repaired]"
-    head, runs = f"{source.figure.title}: {quantity}", describe_band(*source.data)
-    values = {
-        name: {label: plots.mean_relative_error(r) for label, r in results.items()}
-        for name, results in experiments.items()
+    errors = [
+        {
+            label: plots.select_valid(r, plots.relative_error_percent(r))
+            for label, r in data.results.items()
+        }
+        for data in source.data
+    ]
+    quantity = "Err, the horizontal error in % of the horizontal range (eq. 20 as repaired)"
+    rows = {
+        f"experiment {k + 1}": source.arrange(partial(_select, values))
+        for k, values in enumerate(errors)
     }
+    time = next(iter(source.data[0].results.values())).data["time"]
+    words = source.describe_runs(*source.data)
+    over_time = partial(plots.plot_curves, rows, time, "Err [%]", source.looks)
+    head = f"{source.format_head(*source.data)}: {quantity}"
     return [
-        FigureSpec(
-            "",
-            f"{head}, mean over time, by experiment: {runs}.",
-            partial(plots.plot_against, values, source.style, "mean Err [%]"),
-        ),
-        FigureSpec(
-            "over_time",
-            f"{head}, over time in each experiment, {runs}.",
-            partial(plots.plot_relative_errors, experiments, source.style),
-        ),
+        _make_experiment_figure(source, errors, "mean Err [%]", f"{quantity}, mean over time"),
+        FigureSpec("over_time", f"{head}, over time. {words}", over_time),
     ]
 
 
 def make_ess_figure(source: PaperFigureInput) -> list[FigureSpec]:
     """Return the figure of the mean effective number of particles by experiment."""
-    values = {
-        data.condition.scenario: {
-            label: plots.mean_trace_per_run(r, "ess")
-            for label, r in data.results.items()
+    values = [
+        {
+            n: plots.select_valid(r, r.data["ess"])
+            for n, r in data.results.items()
             if "ess" in r.data
         }
         for data in source.data
-    }
-    values = {name: by_label for name, by_label in values.items() if by_label}
-    if not values:
+    ]
+    if not any(values):
         return []
-    text = (
-        f"{source.figure.title}: effective number of particles, mean over time [eq. 21], "
-        f"{describe_band(*source.data)}."
-    )
-    make = partial(plots.plot_against, values, source.style, "mean Neff")
-    return [FigureSpec("", text, make)]
+    quantity = "effective number of particles, mean over time (eq. 21)"
+    return [_make_experiment_figure(source, values, "mean Neff", quantity)]
 
 
 def make_time_figure(source: PaperFigureInput) -> list[FigureSpec]:
-    """Return the figure of the time per step by experiment."""
-    values = {
-        data.condition.scenario: {
-            label: 1e3 * np.array([r.meta["seconds"]["per_step"]])
-            for label, r in data.results.items()
-        }
-        for data in source.data
-    }
-    if not values:
+    """Return the figure of the time per step by experiment: of rounds in turn where they were measured."""
+    if not source.data:
         return []
+    values = []
+    for data in source.data:
+        rounds = {n: StepTimes.from_metadata(r.meta) for n, r in data.results.items()}
+        values.append({
+            n: 1e3 * (times.seconds if (times := rounds[n]) else np.array([r.meta["seconds"]["per_step"]]))
+            for n, r in data.results.items()
+        })  # fmt: skip
+    columns = _arrange_experiments(source, values)
     runs = sorted({r.meta["runs"] for data in source.data for r in data.results.values()})
     text = (
-        f"{source.figure.title}: time per step of all {' or '.join(map(str, runs))} runs together. "
-        "Each value is one measurement on one machine, without an interval."
+        f"{source.format_head(*source.data)}: time per step of all {' or '.join(map(str, runs))} runs together. Filters "
+        "took turns in rounds; bars: 80 % of rounds. Without a bar: one timing of the job."
     )
-    make = partial(plots.plot_against, values, source.style, "time per step [ms]")
+    make = partial(
+        plots.plot_points, columns, source.looks, "time per step [ms]", xlabel="experiment"
+    )
     return [FigureSpec("", text, make)]
 
 
 def make_maximum_figures(source: PaperFigureInput) -> list[FigureSpec]:
-    """Return figures of maximum error and RMSE, with the values of the paper."""
-    figures, printed = [], source.figure.printed
+    """Return figures of RMSE and maximum error, a panel per component, with the values of the paper."""
+    figures = []
     for data, group, results in source.list_groups():
-        start = data.start_time_s
-        since = f" after {start:g} s" if start else ""
-        quantity = f"maximum error of {group}{since} (filled) and RMSE (open)"
-        text = f"{source.format_head(data)}: {quantity}, {describe_band(data)}."
-        text += " Crosses: maximum errors as printed." if set(printed) & set(results) else ""
-        make = partial(plots.plot_maxima, results, source.style, start, printed)
+        names = list(dict.fromkeys(n for _, block in results.values() for n in block.components))
+        titles = {name: plots.name_component(name).rpartition(" ")[2] for name in names}
+        columns = {
+            titles[name]: {
+                measure: {
+                    label: plots.measure_error(measure, result, block, name, data.start_time_s)
+                    for label, (result, block) in results.items()
+                }
+                for measure in ("RMSE", "maximum")
+            }
+            for name in names
+        }
+        printed = {
+            titles[name]: [p for p in source.figure.printed if p.component == name]
+            for name in names
+        }
+        unit = next(block.unit for _, block in results.values())
+        since = f" after {data.start_time_s:g} s" if data.start_time_s else ""
+        text = f"{source.format_head(data)}: RMSE and maximum of the {group} error{since}. "
+        text += source.describe_runs(data, has_curves=False)
+        unit = format_axis_label("error", unit)
+        make = partial(plots.plot_points, columns, source.looks, unit, printed=printed)
         figures.append(FigureSpec(f"{data.prefix}_{format_slug(group)}", text, make))
     return figures
 
 
-def describe_band(*conditions: PaperFigureData) -> str:
-    """Format the band, the number of runs and of lost runs for a caption."""
-    results = [(data, label, r) for data in conditions for label, r in data.results.items()]
-    runs = sorted({int(r.meta["runs"]) for _, _, r in results})
-    lost = [
-        f"{label} {n}{f' in {data.condition.scenario}' if len(conditions) > 1 else ''}"
-        for data, label, r in results if (n := int(r.data["lost"].sum()))
-    ]  # fmt: skip
-    note = f" (lost runs excluded: {', '.join(lost)})" if lost else ""
-    return f"{_BAND} of {' or '.join(map(str, runs))} runs{note}"
-
-
-# --------------------------------------------------------------------------------------------------
-# Figures of a paper that show the error for several values of one parameter.
-
-
-def make_parameter_figures(name: str, remark: str, source: PaperFigureInput) -> list[FigureSpec]:
+def make_parameter_figures(name: str, source: PaperFigureInput) -> list[FigureSpec]:
     """Return figures of the error over time for each value of a parameter, one per condition."""
     figures = []
     for data, group, results in source.list_groups():
         if len(results) < 2:
             continue
-        values = {
-            f"{name} {label.rpartition('=')[2].rstrip(']')}": result
-            for label, result in results.items()
-        }
-        style = line_styles(list(values), {})  # values of one method would have one colour
-        text = (
-            f"{source.format_head(data)}: error of {group} over time for values of the {name}, "
-            f"{describe_band(data)}. {remark}{plots.SYMLOG}"
-        )
-        make = partial(plots.plot_errors, values, style)
+        values = {n: float(n.rpartition("=")[2].rstrip("]")) for n in source.figure.filters}
+        names = {label: f"{name} {format_ticks([value])[0]}" for label, value in values.items()}
+        plain = source._replace(looks=_make_plain_looks(names))
+        text = f"{source.format_head(data)}: size of the {group} error over time for values of the {name}. "
+        make = partial(plots.plot_errors, {"": results}, plain.looks)
+        text += plain.describe_runs(data)
         figures.append(FigureSpec(f"{data.prefix}_{format_slug(group)}", text, make))
     return figures
+
+
+_PRINTED_ITERATIONS = 150  # [Tian et al., section 5.3]
+
+
+def _make_plain_looks(names: Mapping[str, str]) -> Looks:
+    """Return looks for curves of one method, which would have one colour."""
+    styles = line_styles(list(names), {})
+    return {label: CurveLook(name, styles[label]) for label, name in names.items()}
+
+
+def _select(values: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
+    """Return the values of filters that have some."""
+    return {label: values[label] for label in labels if label in values}
+
+
+def _arrange_experiments(
+    source: PaperFigureInput, values: Sequence[Mapping[str, np.ndarray]]
+) -> dict[str, dict[str, dict[str, np.ndarray]]]:
+    """Arrange values by the title of the column, number of the experiment, and filter."""
+    return source.arrange(
+        lambda labels: {str(k + 1): _select(v, labels) for k, v in enumerate(values)}
+    )
+
+
+def _make_experiment_figure(
+    source: PaperFigureInput, values: Sequence[Mapping[str, np.ndarray]], label: str, quantity: str
+) -> FigureSpec:
+    """Return the figure of a mean over time of each run, by experiment."""
+    means = [{n: plots.average_runs(v) for n, v in runs.items()} for runs in values]
+    text = f"{source.format_head(*source.data)}: {quantity}, by experiment. "
+    text += source.describe_runs(*source.data, has_curves=False)
+    columns = _arrange_experiments(source, means)
+    make = partial(plots.plot_points, columns, source.looks, label, xlabel="experiment")
+    return FigureSpec("", text, make)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -268,8 +358,8 @@ _AXES = ("East", "North", "Up")
 _KILOMETRE = 1e3
 
 
-def plot_flight(result: store.JobResult) -> Figure:
-    """Plot the true track of the first run from above, and its height over time."""
+def plot_flight(result: store.JobResult, printed: Sequence[PrintedValue] = ()) -> Figure:
+    """Plot the true track of the first run from above, and its height over time with the printed heights."""
     steps = select_indices(len(result.data["time"]))
     track = result.data["track"][0, steps].astype(np.float64) / _KILOMETRE
     figure = Figure(figsize=(COLUMN, 3.6), layout="constrained")
@@ -279,7 +369,14 @@ def plot_flight(result: store.JobResult) -> Figure:
     plan.set(xlabel="East [km]", ylabel="North [km]")
     plan.set_aspect("equal", adjustable="datalim")
     height.plot(result.data["time"][steps], track[:, 2] * _KILOMETRE, color=_COLOUR)
-    height.set(xlabel="time [s]", ylabel="Up [m]")
+    for k, p in enumerate(printed):
+        height.plot(
+            p.at, p.value, "x", color="black", ms=6.5, mew=1.5, clip_on=False,
+            label="printed" if k == 0 else "",
+        )  # fmt: skip
+    if printed:
+        height.legend(loc="best")
+    height.set(xlabel="time [s]", ylabel="height [m]")
     return figure
 
 
@@ -300,14 +397,15 @@ def plot_flight_velocity(result: store.JobResult) -> Figure:
 
 def make_flight_figures(source: PaperFigureInput) -> list[FigureSpec]:
     """Return the figure of the flight of each scenario."""
+    printed = source.figure.printed
     return [
         FigureSpec(
-            format_slug(scenario),
-            f"{source.figure.title}, here {scenario}: true track of the first run from above, and its "
-            "height. The dot is the start.",
-            partial(plot_flight, result),
+            format_slug(data.condition.scenario),
+            f"{source.format_head(data)}: true track of the first run from above, and its height. The dot is the "
+            f"start. {source.figure.source}".rstrip(),
+            partial(plot_flight, result, printed),
         )
-        for scenario, result in _list_flights(source)
+        for data, result in _list_flights(source)
     ]
 
 
@@ -315,20 +413,19 @@ def make_flight_velocity_figures(source: PaperFigureInput) -> list[FigureSpec]:
     """Return the figure of the velocity of each scenario."""
     return [
         FigureSpec(
-            format_slug(scenario),
-            f"{source.figure.title}, here {scenario}: velocity of the first run, from differences of "
-            "its true positions.",
+            format_slug(data.condition.scenario),
+            f"{source.format_head(data)}: velocity of the first run, from differences of its true positions.",
             partial(plot_flight_velocity, result),
         )
-        for scenario, result in _list_flights(source)
+        for data, result in _list_flights(source)
     ]
 
 
-def _list_flights(source: PaperFigureInput) -> Iterator[tuple[str, store.JobResult]]:
-    """Yield each scenario with a result that has a track."""
+def _list_flights(source: PaperFigureInput) -> Iterator[tuple[PaperFigureData, store.JobResult]]:
+    """Yield the data of each scenario with a result that has a track."""
     scenarios: set[str] = set()
     for data in source.data:
         result = next((r for r in data.results.values() if "track" in r.data), None)
         if result is not None and data.condition.scenario not in scenarios:
             scenarios.add(data.condition.scenario)
-            yield data.condition.scenario, result
+            yield data, result

@@ -11,6 +11,7 @@ from typing import Any
 from markupsafe import Markup, escape
 
 from pfbench.report.methods_text import write_methods
+from pfbench.report.papers.figures import list_page_figures
 from pfbench.report.study_page.encoding import encode_pack
 from pfbench.report.writers import template_environment
 from pfbench.results.looks import describe_foreign_knobs, find_stored_world
@@ -31,9 +32,9 @@ _STATIC = (
 )  # not read by the script
 _COLOUR = re.compile(r"#[0-9a-fA-F]{6}")
 _SECTIONS = (
-    ("planned", "planned", "Compared in advance"), ("cells", "worlds", "Scenarios"), ("curves", "time", "Over time"),
+    ("paper_figures", "figures", "Figures of the paper"), ("planned", "planned", "Compared in advance"), ("cells", "worlds", "Scenarios"), ("curves", "time", "Over time"),
     ("calibration", "calibration", "Calibration"), ("runs", "runs", "Single runs"), ("sweeps", "sweeps", "Dose and response"),
-    ("paper_figures", "figures", "Figures of the paper"), ("cells", "table", "Table"), ("methods", "methods", "Methods"), ("downloads", "downloads", "Downloads"),
+    ("cells", "table", "Table"), ("methods", "methods", "Methods"), ("downloads", "downloads", "Downloads"),
 )  # fmt: skip
 
 
@@ -74,7 +75,7 @@ def render_page(pack: Mapping[str, Any], name: str = "index.html") -> dict[str, 
 
 def render_markdown(pack: Mapping[str, Any]) -> str:
     """Render the page of a study as Markdown, one screen."""
-    pack = {"headline": "", "failures": (), "choices": (), **pack}
+    pack = {"headline": "", "failures": (), "choices": (), "paper_figures": (), **pack}
     template = template_environment(_HERE, is_html=False).get_template("report.md.jinja")
     return template.render(_describe_page(pack))
 
@@ -87,6 +88,7 @@ def _describe_page(pack: Mapping[str, Any]) -> dict[str, Any]:
         "planned": describe_pairs(pack),
         "level": _format_level(pack),
         "choices": pack["choices"],
+        "figures": list_page_figures(pack["study"], pack["paper_figures"]),
     }
 
 
