@@ -24,12 +24,8 @@ from pfbench.results.paper_block import MARKERS
 # --------------------------------------------------------------------------------------------------
 # Common parts of figures: size, palette, line styles, legends, quantiles over runs.
 
-<<<<<<< HEAD
 COLUMN = 3.5  #: inches, width of a column of print
-=======
-COLUMN = 3.5  # inches, width of a column of print
 CURVE_RANGE = 1e4  # of an axis, above the typical value of the best filter
->>>>>>> figs
 INSTANTS = 180  # points of a curve at most: a column of print is 250 points wide
 SMALL = 6.5  # points, smallest font size
 LETTER = 0.62 * SMALL  # points, mean width of a letter of that size
