@@ -101,20 +101,29 @@ def write_paper(
         folder.write(f"{name}.tex", text)
     folder.write("methods.tex", format_methods(write_methods(pack)))
     folder.write("pfbench.bib", renew_bibliography(pack))
-    main = [name for name in tables if "supplement" not in name]
-    main.sort(key=lambda name: "{table*}" in tables[name])  # wide floats hold up others
-    for name, (_, content) in (drawings or {}).items():
-        folder.write(name, content)
-    captions = {name: caption for name, (caption, _) in (drawings or {}).items()}
-    if any(name.endswith(".svg") for name in captions):
-        remarks.append(
-            "the figures of the paper are SVG, since there are no results: convert them to PDF"
-        )
+    main = sorted(  # wide floats hold up others
+        (name for name in tables if "supplement" not in name),
+        key=lambda name: "{table*}" in tables[name],
+    )
+    captions = _write_drawings(drawings or {}, folder, remarks)
     folder.write("paper.tex", format_document(pack, page, widths, main, captions))
     if len(main) < len(tables):
         supplement = [name for name in tables if "supplement" in name]
         folder.write("supplement.tex", format_document(pack, page, {}, supplement))
     return remarks
+
+
+def _write_drawings(
+    drawings: Mapping[str, tuple[str, bytes]], folder: RecordedFolder, remarks: list[str]
+) -> dict[str, str]:
+    """Write the figures of the paper of a study, and a remark on SVG; return their captions by file name."""
+    for name, (_, content) in drawings.items():
+        folder.write(name, content)
+    if any(name.endswith(".svg") for name in drawings):
+        remarks.append(
+            "the figures of the paper are SVG, since there are no results: convert them to PDF"
+        )
+    return {name: caption for name, (caption, _) in drawings.items()}
 
 
 def shorten_names(pack: Pack) -> Pack:

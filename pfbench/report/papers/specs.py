@@ -342,7 +342,7 @@ def _make_experiment_figure(
     source: PaperFigureInput, values: Sequence[Mapping[str, np.ndarray]], label: str, quantity: str
 ) -> FigureSpec:
     """Return the figure of a mean over time of each run, by experiment."""
-    means = [{n: plots.average_runs(v) for n, v in runs.items()} for runs in values]
+    means = [{n: plots.average_over_time(v) for n, v in runs.items()} for runs in values]
     text = f"{source.format_head(*source.data)}: {quantity}, by experiment. "
     text += source.describe_runs(*source.data, has_curves=False)
     columns = _arrange_experiments(source, means)
