@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from copy import deepcopy
 from functools import cache
+from pathlib import Path
 
 import torch
 from hydra import compose, initialize_config_dir
@@ -60,8 +62,11 @@ def world(scenario: str) -> Episode:
     return WORLDS[scenario]
 
 
-RECORDED = [
-    file.stem
-    for file in sorted((CONF / "scenario").glob("*.yaml"))
-    if "${data.root}" in file.read_text()
-]
+def is_recorded(file: Path) -> bool:
+    """Return whether a scenario, or one that it starts from, reads recorded data."""
+    text = file.read_text()
+    starts = [file.with_name(f"{name}.yaml") for name in re.findall(r"^  - (\w+)$", text, re.M)]
+    return "${data.root}" in text or any(f.is_file() and is_recorded(f) for f in starts)
+
+
+RECORDED = [file.stem for file in sorted((CONF / "scenario").glob("*.yaml")) if is_recorded(file)]

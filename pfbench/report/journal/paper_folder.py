@@ -87,16 +87,7 @@ def write_paper(
     tables = _format_tables(pack, page)
     plots = select_figures(pack)
     remarks = _list_remarks(pack, tables, plots)
-    has_latex = shutil.which("pdflatex") is not None
-    widths = {}
-    for name, plot in plots.items():
-        figure = draw_paper_figure(plot, pack, FigureSetting(page))
-        widths[name] = float(figure.get_size_inches()[0]) * POINTS_PER_INCH > page.column + 1
-        folder.write(f"{name}.pdf", render_pdf(figure, page))
-        if has_latex:
-            folder.write(f"{name}.pgf", render_pgf(plot, pack, page))
-    if not has_latex:
-        remarks.append("figures are PDF only: PGF needs pdflatex")
+    widths = _write_plots(plots, pack, page, folder, remarks)
     for name, text in tables.items():
         folder.write(f"{name}.tex", text)
     folder.write("methods.tex", format_methods(write_methods(pack)))
@@ -111,6 +102,27 @@ def write_paper(
         supplement = [name for name in tables if "supplement" in name]
         folder.write("supplement.tex", format_document(pack, page, {}, supplement))
     return remarks
+
+
+def _write_plots(
+    plots: Mapping[str, Plot],
+    pack: Pack,
+    page: PageFormat,
+    folder: RecordedFolder,
+    remarks: list[str],
+) -> dict[str, bool]:
+    """Write the figures of a study, with PGF where pdflatex is there; return by name which need two columns."""
+    has_latex = shutil.which("pdflatex") is not None
+    widths = {}
+    for name, plot in plots.items():
+        figure = draw_paper_figure(plot, pack, FigureSetting(page))
+        widths[name] = float(figure.get_size_inches()[0]) * POINTS_PER_INCH > page.column + 1
+        folder.write(f"{name}.pdf", render_pdf(figure, page))
+        if has_latex:
+            folder.write(f"{name}.pgf", render_pgf(plot, pack, page))
+    if not has_latex:
+        remarks.append("figures are PDF only: PGF needs pdflatex")
+    return widths
 
 
 def _write_drawings(
