@@ -59,7 +59,7 @@ def test_git_stores_only_the_published_files_of_a_report() -> None:
         worlds = ROOT / "reports" / study / "worlds.md"
         text = (worlds if worlds.exists() else worlds.with_name("report.md")).read_text()
         assert len(figures) == text.count("](headline."), study
-        assert len(figures) == 1, study
+        assert len(figures) == (study != "claims_2"), study  # its picture is a table of the page
         assert f"reports/{study}/report.md" in stored
 
 
