@@ -274,7 +274,6 @@ def test_studies_run_cheapest_first_and_within_a_limit() -> None:
 WAITING_FOR_A_RERUN = [
     "learned_azimuth",
     "learned_passive",
-    "paper_000",
     "paper_001_200",
     "paper_001_seed_2",
     "paper_001_seed_3",
