@@ -142,7 +142,9 @@ def test_cycles_have_an_end() -> None:
 
 
 @pytest.mark.parametrize(
-    "value", [torch.Generator(), iter([1]), {Slotted(1)}, np.array([Slotted(1)])], ids=repr
+    "value",
+    [torch.Generator(), iter([1]), {Slotted(1)}, np.array([Slotted(1)])],
+    ids=["generator", "iterator", "set", "array"],
 )
 def test_what_cannot_be_described_has_no_name(value: object) -> None:
     assert step_store.name_step([ParticleFilter(20), value], ()) is None
