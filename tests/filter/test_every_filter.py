@@ -116,6 +116,7 @@ WORLDS = (
     *(
         "recorded_berlin",
         "recorded_car_drive",
+        "recorded_car_constrained",
         "recorded_fixed_wing_aided",
         "recorded_walk",
         "recorded_canyon",

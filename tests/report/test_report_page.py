@@ -113,7 +113,7 @@ def test_a_new_report_removes_the_figures_of_the_old_one_alone(tmp_path, caplog)
         replace(QUICK, paper_figures=("001-3", "001-4")),
     )
     old = {path.name for path in (folder / "figures").iterdir()}
-    assert old == {"paper_001-3.svg", "paper_001-4.svg"}
+    assert old == {"paper_001_3.svg", "paper_001_4.svg"}
     mine = [folder / "figures" / "photo.png", folder / "tables" / "mine.csv", folder / "notes.txt"]
     for path in mine:
         path.parent.mkdir(exist_ok=True)
@@ -122,7 +122,7 @@ def test_a_new_report_removes_the_figures_of_the_old_one_alone(tmp_path, caplog)
         "paper_001", tmp_path, tmp_path / "reports", replace(QUICK, paper_figures=("001-3",))
     )
     assert {path.name for path in (folder / "figures").iterdir()} == {
-        "paper_001-3.svg",
+        "paper_001_3.svg",
         "photo.png",
     }
     assert all(path.read_text() == "mine" for path in mine)
