@@ -240,7 +240,8 @@ class TestStored:
         )
         paths = [str(Path(__file__).parent), str(Path(__file__).parents[2]), *sys.path]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
-        subprocess.run([sys.executable, "-c", code], check=True, env=environment)
+        done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)  # fmt: skip
+        assert done.returncode == 0, done.stderr
 
     def test_another_model_is_another_step(self, refuse_compiler: None) -> None:
         assert stored_graph(filtered(builds=False, scale=1.5)) is None
