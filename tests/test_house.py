@@ -336,3 +336,9 @@ def test_scripts_import_names_that_exist() -> None:
     assert len(files) > 20
     assert {str(f.name): names for f in files if (names := missing_imports(f.read_text()))} == {}
     assert missing_imports("from pfbench.filter import Chaos") == ["pfbench.filter.Chaos"]
+
+
+def test_no_file_has_the_marks_of_a_merge() -> None:
+    listed = subprocess.run(["git", "grep", "-lE", "^(<{7}|>{7}) "], cwd=ROOT, capture_output=True, text=True)  # fmt: skip
+    assert listed.stdout == ""
+    assert listed.returncode == 1  # nothing, and no error

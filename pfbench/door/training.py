@@ -44,12 +44,7 @@ def train_filter(
     from pfbench.cli.train import fit_network
 
     values = {"scenario": scenario, "noise": noise, "model": model, "filter": method}
-    parts = [
-        item
-        for group, value in values.items()
-        if value is not None
-        for item in list_parts(group, value)[:1]
-    ]
+    parts = [_find_part(group, value) for group, value in values.items() if value is not None]
     words = [word for item in parts for word in item.words()]
     words += [f"train={objective}", *(f"train.{word}" for word in format_words(settings))]
     words += [*format_words({"study": study}), *place_words(parts)]
@@ -57,3 +52,13 @@ def train_filter(
     with plain_errors(words), preserved_process(), trusting(packages):
         path = fit_network(words, print if progress else lambda line: None)
     return add_changes(parts[-1], format_words({"checkpoint": str(path.resolve())}))
+
+
+def _find_part(group: str, value: Any) -> Part:
+    """Return the part of a group that is trained with; several are refused."""
+    parts = list_parts(group, value)
+    if len(parts) > 1:
+        raise ValueError(
+            f"{group} must be one {group}, got {len(parts)}. Train with each in a call of its own."
+        )
+    return parts[0]

@@ -81,3 +81,12 @@ def test_what_cannot_be_trained_is_refused(notebook: Notebook) -> None:
     with pytest.raises(ValueError, match="train"):
         pfbench.train(WORLD, "neural_sir", objective="wish", progress=False)
     assert not Path("results").exists()
+
+
+def test_several_filters_or_worlds_are_refused_before_anything_is_trained(
+    notebook: Notebook,
+) -> None:
+    for scenario, method in ((["growth", WORLD], "neural_sir"), (WORLD, ["neural_sir", "neural_ckf"])):  # fmt: skip
+        with pytest.raises(ValueError, match=r"must be one (scenario|filter), got 2"):
+            pfbench.train(scenario, method, **PLAN)
+    assert not Path("results").exists()
