@@ -10,6 +10,7 @@ import base64
 import gzip
 import io
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +26,7 @@ from pfbench.report.methods_text import MethodsFacts
 
 RUNS_FILE = "runs.parquet"  #: name of the file with the values of all runs of a study
 _KEY = b"pfbench"  # of the metadata of the file
+_FIGURE = re.compile(r"figures/paper_[\w.+-]+\.(svg|png)")
 _KEYED = ("curves",)  # parts with a tuple as key
 _OMITTED = ("tracks", "downloads", "definitions")  # large, or made again with the page
 _DECIDED = (
@@ -101,5 +103,10 @@ def read_stored_study(folder: Path) -> StoredStudy:
             f"{', '.join(sorted(missing))}. Run the study and write its report again."
         )
     MethodsFacts.from_entries(pack.get("methods"), str(path))
+    foreign = [f["file"] for f in pack["paper_figures"] if not _FIGURE.fullmatch(f["file"])]
+    if foreign:  # the file may come from a stranger, and the page shows what it names
+        raise ValueError(
+            f"paper_figures of {path} must name figures/paper_NAME.svg or .png, got {foreign[0]!r}. Write its report again."
+        )
     figures = [figure for figure in pack["paper_figures"] if (folder / figure["file"]).is_file()]
     return StoredStudy({**pack, "tracks": {}, "paper_figures": figures, **decided}, table)

@@ -248,3 +248,27 @@ def test_warnings_stand_below_the_sentence_of_each_view(study: Path, tmp_path: P
         assert view["small_print"].endswith(" Jobs differ.")
     page = render_page({**pack, **decided, "downloads": []})["index.html"]
     assert "missing from all tables. Runs are copies." in page
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "../secret.svg",
+        "figures/../../secret.svg",
+        "/etc/passwd",
+        "figures/a.txt",
+        "../figures/paper_1.svg",
+    ],
+)
+def test_a_stored_study_names_figures_of_its_folder_only(
+    study: Path, tmp_path: Path, place: str
+) -> None:
+    """The file of a stranger must not bring another file of the user into the page."""
+    folder = Path(shutil.copytree(study, tmp_path / "reports" / "demo"))
+    (tmp_path / "reports" / "secret.svg").write_text("<svg/>")
+    stored = read_stored_study(folder)
+    figures = [{"file": place, "caption": "a", "alt": "a"}]
+    content = format_runs(stored.table, {**stored.pack, "paper_figures": figures})
+    (folder / RUNS_FILE).write_bytes(content)
+    with pytest.raises(ValueError, match=r"must name figures/paper_NAME\.svg or \.png"):
+        rebuild_page(folder)
