@@ -65,6 +65,9 @@ REMEMBERING = (
 WITHOUT_FIXES = ("Benes", "StochasticVolatility", "TerrainAided")
 
 
+ROBUST_WEIGHTS = ("correntropy_pf", "gate_pf", "huber_pf", "student_pf", "wolf_pf")
+
+
 def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
     """Return the pattern of the error of a filter that refuses a model or a record; else empty."""
     x, first = model.origin.expand(2, 1, -1), model.prepare(record).at_step(0)
@@ -86,7 +89,10 @@ def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
         return "must lie within 115 degrees"
     if name in EACH and not _has_density_in_chart(model, x, first.u):
         return "transition density in the chart"
-    is_blank = bool(torch.isnan(record.y).all())  # the first steps of a recorded drive
+    if name in ROBUST_WEIGHTS and type(model).__name__ == "UrbanGnss":
+        return "must be normal for a robust weight update"  # its errors have a tail on one side
+    fixes = record.y[..., :3] if type(model).__name__ == "StrapdownBlocks" else record.y
+    is_blank = bool(torch.isnan(fixes).all())  # the first steps of a recorded drive
     if name == "raw_fix" and (is_blank or type(model).__name__ in WITHOUT_FIXES):
         return "filter=raw_fix must have measurements that determine"
     is_single = not method_past(name) and not name.startswith("rbpf") and name not in BRANCHING
