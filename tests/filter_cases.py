@@ -89,8 +89,8 @@ def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
         return "must lie within 115 degrees"
     if name in EACH and not _has_density_in_chart(model, x, first.u):
         return "transition density in the chart"
-    if name in ROBUST_WEIGHTS and type(model).__name__ == "UrbanGnss":
-        return "must be normal for a robust weight update"  # its errors have a tail on one side
+    if name in ROBUST_WEIGHTS and "Mixture" in repr(model.observation(x, first.u)):
+        return "must be normal for a robust weight update"
     fixes = record.y[..., :3] if type(model).__name__ == "StrapdownBlocks" else record.y
     is_blank = bool(torch.isnan(fixes).all())  # the first steps of a recorded drive
     if name == "raw_fix" and (is_blank or type(model).__name__ in WITHOUT_FIXES):

@@ -51,13 +51,14 @@ def mark(items: list[pytest.Item]) -> None:
 
 def is_selected(nodeid: str, words: str) -> bool:
     """Return whether `-k` with these words selects a test, by the names of its file and function."""
-    name = nodeid.rpartition("/")[2].lower()
+    file, _, test = nodeid.lower().partition("::")  # an id may hold a slash
+    parts = [file.rpartition("/")[2], test]
     terms = re.sub(
         r"[^\s()]+",
         lambda term: (
             term[0]
             if term[0] in ("and", "or", "not")
-            else str(any(term[0].lower() in part for part in name.split("::")))
+            else str(any(term[0].lower() in part for part in parts))
         ),
         words,
     )

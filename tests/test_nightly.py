@@ -73,5 +73,6 @@ def test_words_select_as_pytest_does() -> None:
     test = "tests/a/test_of_it.py::test_of_that[Case-2]"
     for words in ("that", "case-2 and not other", "(other or of_it) and test_of", "not (other)"):
         assert nightly.is_selected(test, words), words
+        assert nightly.is_selected(test.replace("]", "-../a.b]"), words), words
     for words in ("tests/a", "not that", "other or (that and no_case)"):
         assert not nightly.is_selected(test, words), words
