@@ -176,10 +176,6 @@ def test_a_file_has_the_name_under_which_its_world_is_found(name: str) -> None:
     assert {c.values["filter"]["paper"]["tuning"] for c in found} == {read_tuned(name)["data"]}
 
 
-# studies of a long flight, whose filters were tuned on a shorter one and say so
-SHORTER_WORLD = {"paper_002": "anshun_short"}
-
-
 def list_tuned_studies() -> list[tuple[str, str, bool]]:
     """Experiments with tuned filters, each scenario, and whether its noise is nominal alone."""
     studies = []
@@ -197,11 +193,6 @@ def test_studies_use_the_knobs_of_their_own_world(
     study: str, scenario: str, is_nominal: bool
 ) -> None:
     """Tuned on other seeds, and for a study of nominal noise in nominal noise alone."""
-    if study in SHORTER_WORLD:
-        config = job.compose([f"+experiment={study}", "filter=gate_tuned"])
-        name = config.values["filter"]["paper"]["name"]
-        assert name == f"Gated EKF (tuned on {SHORTER_WORLD[study]})"
-        return
     chosen = [f"scenario={scenario}"] if scenario else []
     config = job.compose([f"+experiment={study}", *chosen, "filter=gate_tuned"])
     paper = config.values["filter"]["paper"]
