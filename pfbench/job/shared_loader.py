@@ -11,6 +11,7 @@ import copy
 import os
 import pickle
 import re
+import traceback
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -102,6 +103,17 @@ class SharedLoader(ConfigLoaderImpl):
         except RecursionError as error:
             raise UntrustedConfigError(
                 "defaults must name files that do not name each other, got a circle. Remove one of the names."
+            ) from error
+        except (
+            AssertionError
+        ) as error:  # Hydra cannot word this refusal where a list of files follows
+            if "_update_overrides" not in [
+                f.name for f in traceback.extract_tb(error.__traceback__)
+            ]:
+                raise
+            raise UntrustedConfigError(
+                "defaults must have each override after the files that it overrides, got one before a list of files. "
+                "Put the overrides last."
             ) from error
 
         def compose_reference(words: list[str]) -> DictConfig:

@@ -46,6 +46,9 @@ REFUSED: dict[str, tuple[str, str, str]] = {  # place, text, message
     "nested key": ("train/a", "c: data\nb: ${${train.c}.root}\n", "plain keys"),
     "quoted key": ("train/a", "b: ${oc.select:'data.root'}\n", "plain keys"),
     "circle": ("train/a", "defaults: [a]\n", "at most 300 files"),
+    "override before a list": (
+        "train/a", "defaults: [{override /noise: outliers}, {/noise: [outliers, student]}]\n", "Put the overrides last"
+    ),
     "many files": ("train/a", f"defaults: [{','.join(f'/filter@a{i}: sir' for i in range(400))}]\n", "at most 300 files"),
     "bomb of texts": (
         "noise/a", NOISE + "b0: xxxxxxxx\n" + "".join(f"b{i + 1}: ${{noise.b{i}}}${{noise.b{i}}}\n" for i in range(40)),
