@@ -155,6 +155,7 @@ def test_the_page_of_the_claims_is_made_of_its_values(tmp_path: Path) -> None:
     folder = ROOT / "reports" / "claims_2"
     (tmp_path / "claims_2").mkdir()
     shutil.copy(folder / "values.json.gz", tmp_path / "claims_2")
+    (tmp_path / "all_seven").symlink_to(ROOT / "reports" / "all_seven")
     write_claims(tmp_path / "none", tmp_path)
     for name in ("words.json", "report.md", "values.json.gz"):
         assert (tmp_path / "claims_2" / name).read_bytes() == (folder / name).read_bytes(), name

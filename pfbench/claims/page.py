@@ -32,9 +32,11 @@ from pfbench.claims.proofs import read_proofs
 from pfbench.claims.run_claims import Decisions, describe_words, price_claims
 from pfbench.claims.words import NOT_RUN, WORDS, ClaimDecision
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report import RUNS_FILE, count_better_worlds, find_overviews, read_stored_study
 from pfbench.report.writers import render_template
 
 VALUES = "values.json.gz"
+COMPARISON = "all_seven"  # study that compares the methods with the best Kalman filter of each world
 RULES = (
     "Confirmed or refuted: the same outcome in all readings that can run, at 2.5 % for all claims of a paper.",
     "Depends: outcomes of both kinds, after correction over claims times readings.",
@@ -59,7 +61,7 @@ def write_claims(results: str | Path = "results", out: str | Path = "reports") -
     plans, target = read_plans(), Path(out) / CLAIMS_STUDY
     runs = _read_runs(Path(results) / CLAIMS_STUDY, target / VALUES)
     decisions = decide_claims(plans, runs)
-    context = make_context(plans, runs, decisions)
+    context = make_context(plans, runs, decisions, _count_worlds(Path(out) / COMPARISON))
     with RecordedFolder(target) as folder:
         folder.write("words.json", json.dumps(describe_words(decisions), indent=1) + "\n")
         text = json.dumps([asdict(record) for record in runs.records], separators=(",", ":"))
@@ -79,10 +81,21 @@ def _read_runs(results: Path, stored: Path) -> ClaimRuns:
     return ClaimRuns([*runs.records, *(r for r in older if not runs.has(r.cell, r.batch))])
 
 
+def _count_worlds(study: Path) -> dict[str, tuple[int, int]]:
+    """Count the worlds in which each method beats the best Kalman filter; empty without the stored runs of the study."""
+    if not (study / RUNS_FILE).is_file():
+        return {}
+    overviews = find_overviews(*read_stored_study(study))
+    return count_better_worlds(overviews) if overviews else {}
+
+
 def make_context(
-    plans: Sequence[ClaimPlan], runs: ClaimRuns, decisions: Decisions
+    plans: Sequence[ClaimPlan],
+    runs: ClaimRuns,
+    decisions: Decisions,
+    worlds: Mapping[str, tuple[int, int]],
 ) -> dict[str, Any]:
-    """Make the values of the templates."""
+    """Make the values of the templates; `worlds` are those won of those run, by method."""
     lines = [conclude(plan, decisions) for plan in plans]
     missing = price_claims(plans, runs, decisions)
     prices = {price.plan.claim.id: price.seconds for price in missing}
@@ -102,7 +115,8 @@ def make_context(
     commits = sorted({record.commit or "not stored" for record in runs.records})
     return {
         "papers": papers,
-        "seven": make_seven(lines),
+        "seven": make_seven(lines, worlds),
+        "compared": bool(worlds),
         "total": total,
         "rules": RULES,
         "proofs": read_proofs(),
@@ -192,7 +206,9 @@ def _make_dots(line: ClaimWord) -> list[dict[str, str]]:
     ]
 
 
-def make_seven(lines: Sequence[ClaimWord]) -> list[dict[str, str]]:
+def make_seven(
+    lines: Sequence[ClaimWord], worlds: Mapping[str, tuple[int, int]]
+) -> list[dict[str, str]]:
     """Make the table of the seven methods."""
     words = {line.plan.claim.id: line for line in lines}
     return [
@@ -201,8 +217,13 @@ def make_seven(lines: Sequence[ClaimWord]) -> list[dict[str, str]]:
             "claim": entry["claim"],
             "published": words[entry["claim"]].label,
             "repaired": words[entry["claim"]].repaired or "no repair",
-            "tuned": "not run",
+            "tuned": _say_worlds(*worlds.get(entry["filter"], (0, 0))),
             "is": entry["is"],
         }
         for entry in read_seven()
     ]
+
+
+def _say_worlds(better: int, count: int) -> str:
+    """Say in how many worlds a method beats the best Kalman filter."""
+    return (f"in {better} of {count} worlds" if better else f"in none of {count}") if count else NOT_RUN

@@ -15,6 +15,7 @@ from pfbench.report.journal.ratio_figures import (
 from pfbench.report.journal.table_layout import text_width as text_width
 from pfbench.report.options import ReportOptions as ReportOptions
 from pfbench.report.overview.page import (
+    count_better_worlds as count_better_worlds,
     render_overview as render_overview,
     tabulate_heat_map as tabulate_heat_map,
 )

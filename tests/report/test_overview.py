@@ -21,6 +21,7 @@ from pfbench.report import study_report
 from pfbench.report.overview import figures
 from pfbench.report.overview.page import (
     choose_level,
+    count_better_worlds,
     list_verdicts,
     render_overview,
     word_headline,
@@ -256,6 +257,19 @@ def test_sentences_are_short_and_state_numbers_of_the_tables(overview: Overview)
             r"(\w+) \((\d+\.\d+)\)", f"{story['wins']}; {story['loses']}"
         ):
             assert f"{cells.loc[(world, method), 'ratio']:.2f}" == ratio
+
+
+def test_worlds_are_counted_in_which_a_method_beats_the_best_kalman_filter(
+    overview: Overview,
+) -> None:
+    """As the stories of the methods name them, which are worded from other tables."""
+    counts = count_better_worlds({100: overview, EQUAL_TIME: overview._replace(cells=[])})
+    assert set(counts) == set(overview.methods)
+    for method, (better, count) in counts.items():
+        wins = tell_story(overview, method, "")["wins"]
+        named = len(re.findall(r"\(\d", wins)) + sum(map(int, re.findall(r"and (\d+) more", wins)))
+        assert (better, count) == (named, len(overview.worlds)), method
+    assert sum(better for better, _ in counts.values()) > 0
 
 
 @pytest.mark.parametrize("kind", ["heat map", "matrices"])

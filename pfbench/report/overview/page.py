@@ -232,6 +232,23 @@ def tabulate_heat_map(overviews: Mapping[TabKey, Overview]) -> tuple[list[str], 
     return head, rows
 
 
+def count_better_worlds(overviews: Mapping[TabKey, Overview]) -> dict[str, tuple[int, int]]:
+    """Count the worlds in which each proposed method is shown to be better than the best Kalman filter, in the first table.
+
+    Args:
+        overviews: Tables of the page, as `find_overviews` returns them.
+
+    Returns:
+        Number of these worlds, and of all worlds in which the method ran, by the key of the method.
+    """
+    overview = overviews[choose_level(overviews)]
+    words = {
+        method: [cell.verdict.word for cell in overview.cells if cell.filter == method]
+        for method in overview.methods
+    }
+    return {method: (found.count("better"), len(found)) for method, found in words.items()}
+
+
 def _format_cell(
     table: Mapping[tuple[str, str], WorldResult], world: WorldRow, label: str, overview: Overview
 ) -> str:
