@@ -246,7 +246,9 @@ def count_better_worlds(overviews: Mapping[TabKey, Overview]) -> dict[str, tuple
         method: [cell.verdict.word for cell in overview.cells if cell.filter == method]
         for method in overview.methods
     }
-    return {method: (found.count("better"), len(found)) for method, found in words.items()}
+    return {
+        method: (all_words.count("better"), len(all_words)) for method, all_words in words.items()
+    }
 
 
 def _format_cell(
