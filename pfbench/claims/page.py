@@ -87,7 +87,7 @@ def _count_worlds(study: Path) -> dict[str, tuple[int, int]]:
     """Count the worlds in which each method beats the best Kalman filter; empty without the stored runs of the study."""
     if not (study / RUNS_FILE).is_file():
         return {}
-    overviews = find_overviews(*read_stored_study(study))
+    overviews = find_overviews(*read_stored_study(study, decides=False))
     return count_better_worlds(overviews) if overviews else {}
 
 

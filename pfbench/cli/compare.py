@@ -21,11 +21,13 @@ published study runs again in each world as a witness; its errors must agree, el
 
   published=...   name of a report among reports_dir, or a folder with its runs.parquet
 
-The verdicts are written to REPORTS_DIR/NAME/published.csv. In Python: study.against("all_seven")."""
+The verdicts are written to REPORTS_DIR/NAME/published.csv, and published_heat_map.svg has the own filters
+next to the seven methods. In Python: study.against("all_seven"), and .plot()."""
 
 
 def compare_study(words: Sequence[str]) -> None:
     """Compare a study with a published one, print the verdicts and write them."""
+    from pfbench.report.overview.figures import to_svg
     from pfbench.report.published_study import compare_with_published, find_published
     from pfbench.results.conditions import load_conditions
 
@@ -43,3 +45,8 @@ def compare_study(words: Sequence[str]) -> None:
     path = Path(config.values["reports_dir"]) / study / "published.csv"
     write_atomically(path, lambda file: file.write(compared.table().to_csv(index=False).encode()))
     print(f"verdicts: {path.resolve()}")
+    if compared.cells:
+        picture = path.with_name("published_heat_map.svg")
+        svg = to_svg(compared.plot()).encode()
+        write_atomically(picture, lambda file: file.write(svg))
+        print(f"heat map: {picture.resolve()}")

@@ -11,19 +11,30 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
 from pfbench.report.board import build_run_table
 from pfbench.report.board.pack import StudyFacts
-from pfbench.report.overview.tables import read_world_facts
+from pfbench.report.overview.figures import HEAT_FORMATS, draw_heat_map
+from pfbench.report.overview.page import choose_level
+from pfbench.report.overview.tables import CENTRAL, has_overview, read_world_facts
 from pfbench.report.stored_study import RUNS_FILE, StoredStudy, read_stored_study
+from pfbench.report.study_report import find_overviews
 from pfbench.results.conditions import Condition, parse_label
-from pfbench.results.looks import PartName
+from pfbench.results.looks import PartName, study_looks
 from pfbench.stats.comparison import Verdict
-from pfbench.stats.world_table import World, build_world, compare_with_each
+from pfbench.stats.world_table import (
+    World,
+    WorldResult,
+    build_world,
+    compare_with_each,
+    decide_cells,
+)
 
 _TOLERANCE = (
     1e-3  # relative difference of errors that agree up to rounding on another machine [ours]
@@ -39,11 +50,47 @@ class PublishedComparison(NamedTuple):
         verdicts: Verdicts of one family of tests, by the name of the condition.
         witnesses: A filter of each condition that ran in both studies, with equal errors.
         left_out: Conditions of the own study that are not compared, with the reason.
+        cells: Own filters against the reference of each world, for the heat map; of these verdicts.
+        names: Names of the own filters for a reader.
+        particles: Number of particles of the own filters, 0 without any.
+        study: The published study.
     """
 
     verdicts: Mapping[str, list[Verdict]]
     witnesses: Mapping[str, str]
     left_out: Mapping[str, str]
+    cells: Sequence[WorldResult] = ()
+    names: Mapping[str, str] = MappingProxyType({})
+    particles: int = 0
+    study: StoredStudy | None = None
+
+    def plot(self) -> Figure:
+        """Draw the heat map of the published study with the own filters before all others.
+
+        Colours, words and lost tracks are as in the report: each filter against the reference of each world. A world in
+        which the own filter did not run has a dash.
+
+        Returns:
+            The figure. `figure.savefig` writes it.
+
+        Raises:
+            ValueError: If the published study is without a heat map, or no world of it with a reference is shared.
+        """
+        overviews = find_overviews(*self.study) if self.study else None
+        if overviews is None or not self.cells:
+            raise ValueError(
+                "a heat map must have a published study of several methods in several worlds, one of them shared with its "
+                "reference, got none. Use table()."
+            )
+        level = self.particles if self.particles in overviews else choose_level(overviews)
+        overview = overviews[level]
+        own = tuple(dict.fromkeys(cell.filter for cell in self.cells))
+        joined = overview._replace(
+            methods=(*own, *overview.methods),
+            names={**overview.names, **self.names},
+            cells=[*overview.cells, *self.cells],
+        )
+        return draw_heat_map(joined, HEAT_FORMATS[0])
 
     def table(self) -> pd.DataFrame:
         """Return the verdicts as a table, a row per condition and pair."""
@@ -108,10 +155,12 @@ def compare_with_published(conditions: Sequence[Condition], folder: Path) -> Pub
     Raises:
         ValueError: If no condition has a witness whose errors agree.
     """
-    study = read_stored_study(folder)
+    study = read_stored_study(folder, decides=False)
     options = StudyFacts.from_pack(study.pack).options
     table = build_run_table(conditions, options.start_time_s)
     compared = compare_tables(table, study)
+    names = {label: look.name for label, look in study_looks(conditions).items()}
+    compared = compared._replace(names=names)
     if not compared.verdicts:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in compared.left_out.items())
         raise ValueError(
@@ -122,22 +171,53 @@ def compare_with_published(conditions: Sequence[Condition], folder: Path) -> Pub
 
 def compare_tables(table: pd.DataFrame, study: StoredStudy) -> PublishedComparison:
     """Compare own runs, a row per filter, condition and run, with those of a published study."""
-    worlds = StudyFacts.from_pack(study.pack).worlds
+    facts = StudyFacts.from_pack(study.pack)
     witnesses, left_out, members = {}, {}, []
     for key, rows in table.groupby(_CONDITION, observed=True, sort=False):
         name = " / ".join(map(str, key))
         stored = study.table[(study.table[_CONDITION] == list(key)).all(axis=1)]
         try:
             witnesses[name] = find_witness(rows, stored)
-            cap = _find_cap(worlds[str(key[0])], str(key[2]))
+            cap = _find_cap(facts.worlds[str(key[0])], str(key[2]))
         except ValueError as error:
             left_out[name] = str(error)
             continue
         members.append((name, cap, rows, stored[stored["seed"] == rows["seed"].iloc[0]]))
-    verdicts = compare_with_each([_make_pairs(*member) for member in members])
+    pairs = [_make_pairs(*member) for member in members]
+    verdicts = dict(zip([m[0] for m in members], compare_with_each(pairs), strict=True))
+    counts = {int(n) for _, _, rows, _ in members for n in rows["particles"].dropna()}
     return PublishedComparison(
-        dict(zip([m[0] for m in members], verdicts, strict=True)), witnesses, left_out
-    )
+        verdicts, witnesses, left_out,
+        _list_cells([w for w, _ in pairs], verdicts) if has_overview(study.table, facts.looks) else (),
+        particles=counts.pop() if len(counts) == 1 else 0, study=study,
+    )  # fmt: skip
+
+
+def _list_cells(
+    worlds: Sequence[World], verdicts: Mapping[str, list[Verdict]]
+) -> list[WorldResult]:
+    """List the own filters against the reference of each world in nominal noise, with the verdicts that are decided.
+
+    A world without a stated reference, or whose reference did not run in the published study, has none.
+    """
+    members: list[World] = []
+    chosen: dict[tuple[str, str], Verdict] = {}
+    for world in worlds:
+        scenario, regime, model = world.name.split(" / ")
+        facts = read_world_facts(scenario, model)
+        if regime != CENTRAL or facts is None:
+            continue
+        against = {v.a: v for v in verdicts[world.name] if parse_label(v.b)[0] == facts.reference}
+        if against:
+            reference = next(iter(against.values())).b
+            members.append(world._replace(name=scenario, reference=reference))
+            chosen |= {(scenario, label): verdict for label, verdict in against.items()}
+    labels = list(dict.fromkeys(label for _, label in chosen))
+    return [
+        cell._replace(verdict=chosen[cell.world, cell.filter])
+        for cell in decide_cells(members, labels)
+        if (cell.world, cell.filter) in chosen
+    ]
 
 
 def _find_cap(world: PartName, model: str) -> float:

@@ -70,11 +70,12 @@ def format_runs(table: pd.DataFrame, pack: Mapping[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-def read_stored_study(folder: Path) -> StoredStudy:
+def read_stored_study(folder: Path, decides: bool = True) -> StoredStudy:
     """Read a study from its file, and decide it.
 
     Args:
         folder: Folder of the report.
+        decides: Whether the views of its page are decided: seconds for a large study, which its runs alone do not need.
 
     Raises:
         ValueError: If the file is damaged, or is of another version of pfbench.
@@ -89,7 +90,8 @@ def read_stored_study(folder: Path) -> StoredStudy:
             pack[name] = {tuple(key): value for key, value in pack[name]}
         table = arrow.to_pandas()
         missing = {look["key"] for look in pack["facts"]["looks"]} - set(table["filter"])
-        decided = {} if missing else decide_parts(table, StudyFacts.from_pack(pack))
+        facts = StudyFacts.from_pack(pack)
+        decided = decide_parts(table, facts) if decides and not missing else {}
     except limits.LimitError:
         raise
     except (OSError, EOFError, ValueError, TypeError, KeyError, AttributeError, pa.ArrowException) as error:  # fmt: skip

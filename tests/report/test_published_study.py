@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from checkout import ROOT
 
 import pfbench
 from pfbench.cli.compare import compare_study
 from pfbench.report.published_study import compare_tables, find_witness
-from pfbench.report.stored_study import RUNS_FILE, read_stored_study
+from pfbench.report.stored_study import RUNS_FILE, StoredStudy, read_stored_study
+from pfbench.report.study_report import find_overviews
 
 WORLD = {"seed": 7, "runs": 12, "particles": 50, "progress": False}
 
@@ -71,6 +73,54 @@ def test_other_worlds_are_not_compared(home: Path, monkeypatch: pytest.MonkeyPat
     compared = compare_tables(own.assign(scenario="elsewhere"), study)
     assert compared.verdicts == {}
     assert "Choose one of its scenarios" in str(compared)
+
+
+def test_a_copy_of_a_filter_has_its_column_in_the_heat_map() -> None:
+    """Worlds in which it did not run have a dash, and the columns of all others are as published."""
+    pack, table = read_stored_study(ROOT / "reports" / "all_seven", decides=False)
+    names = table["filter"].astype(str).str.partition("[")[0]
+    some = [
+        "mcmc_rpf",
+        "dmc_reconstructed",
+        "qmc_polymerised",
+        "sir",
+        "ekf",
+        "ukf",
+        "ekf_scaled_tuned",
+    ]
+    table = table[table["scenario"].isin(["growth", "lorenz63", "pendulum"]) & names.isin(some)]
+    table = table[table["particles"].isna() | (table["particles"] == 100)]
+    labels = set(table["filter"])
+    looks = [look for look in pack["facts"]["looks"] if look["key"] in labels]
+    pack = {**pack, "facts": {**pack["facts"], "looks": looks}}
+    study = StoredStudy(pack, table)
+    copied = table[table["filter"].astype(str).str.startswith("sir[")]
+    own = pd.concat([copied.assign(filter="copy"), table[table["filter"] == "ekf"]])
+    compared = compare_tables(own[own["scenario"] != "pendulum"], study)
+    cells = {cell.world: cell for cell in compared.cells}
+    assert set(cells) == {"growth", "lorenz63"}
+    overviews = find_overviews(pack, table)
+    assert overviews is not None
+    published = {c.world: c for c in next(iter(overviews.values())).cells if c.filter == "sir"}
+    for world, cell in cells.items():
+        assert cell.verdict.ratio == published[world].verdict.ratio
+        assert cell.track_share == published[world].track_share
+    figure = compared._replace(names={"copy": "Copy of SIR"}).plot()
+    texts = [text.get_text() for axes in figure.axes for text in axes.texts]
+    assert texts.count("Copy of SIR") == 1
+    assert texts.count("–") >= 1
+
+
+def test_a_study_of_one_world_has_a_table_alone(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(home)
+    compared = pfbench.study("mine").against("public")
+    assert not compared.cells
+    with pytest.raises(
+        ValueError, match=r"must have a published study of several methods.*Use table"
+    ):
+        compared.plot()
 
 
 def test_a_filter_that_ignores_the_measurements_is_no_witness(home: Path) -> None:
