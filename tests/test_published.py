@@ -274,12 +274,7 @@ def test_studies_run_cheapest_first_and_within_a_limit() -> None:
 # Studies with jobs of uncommitted code. They run again; no study is added.
 WAITING_FOR_A_RERUN = [
     "learned_azimuth",
-    "learned_passive",
-    "paper_001_200",
-    "paper_001_seed_2",
-    "paper_001_seed_3",
     "recorded_car",
-    "recorded_quad",
     "robust_canyon",
     "robust_car",
     "robust_flight",
