@@ -134,13 +134,15 @@ def test_400_of_588_pairs_of_the_old_study_reject(parts: dict[str, PartName]) ->
 
 
 def test_another_filter_changes_no_number(
-    table: pd.DataFrame, looks: dict[str, MethodLook], parts: dict[str, PartName]
+    table: pd.DataFrame,
+    looks: dict[str, MethodLook],
+    parts: dict[str, PartName],
+    overview: Overview,
 ) -> None:
     fewer = table[table["filter"] != "gpf"]
-    first = build_overview(table, looks, parts)
     second = build_overview(fewer, {k: v for k, v in looks.items() if k != "gpf"}, parts)
-    assert [p.verdict for p in first.pairs] == [p.verdict for p in second.pairs]
-    ratios = {(c.world, c.filter): (c.verdict.ratio, c.track_share) for c in first.cells}
+    assert [p.verdict for p in overview.pairs] == [p.verdict for p in second.pairs]
+    ratios = {(c.world, c.filter): (c.verdict.ratio, c.track_share) for c in overview.cells}
     assert all(ratios[c.world, c.filter] == (c.verdict.ratio, c.track_share) for c in second.cells)
 
 
@@ -404,18 +406,6 @@ def test_labels_without_their_number_of_particles() -> None:
     ]
 
 
-def test_the_page_of_several_numbers_shows_them(levels: dict[TabKey, Overview]) -> None:
-    pack = {"study": "s", "title": "T", "generated": {"version": "0", "commit": "abc", "date": ""}}
-    files = render_overview(levels, pack)
-    page = files["index.html"]
-    assert "How many particles are enough?" in page
-    assert "paired runs each, 1000 particles." in page
-    assert "<summary>100 particles</summary>" in page
-    table = pd.read_csv(io.StringIO(files["cells.csv"]))
-    assert set(table["table"]) == {100, 1000}
-    assert len(files["error_by_time.svg"]) < 60_000
-
-
 @pytest.fixture(scope="module")
 def tabs(table: pd.DataFrame, parts: dict[str, PartName]) -> dict[TabKey, Overview]:
     """Two numbers of particles; at equal time with twice the errors of the larger one; three forms as printed."""
@@ -506,7 +496,12 @@ def test_the_first_sentence_says_what_holds_at_equal_time(tabs: dict[TabKey, Ove
 def test_the_page_shows_all_tables(tabs: dict[TabKey, Overview]) -> None:
     pack = {"study": "s", "title": "T", "generated": {"version": "0", "commit": "abc", "date": ""}}
     files = render_overview(tabs, pack)
-    assert "<summary>The methods as printed</summary>" in files["index.html"]
+    page = files["index.html"]
+    assert "How many particles are enough?" in page
+    assert "paired runs each, 1000 particles." in page
+    assert "<summary>100 particles</summary>" in page
+    assert "<summary>The methods as printed</summary>" in page
+    assert len(files["error_by_time.svg"]) < 60_000
     cells = pd.read_csv(io.StringIO(files["cells.csv"]))
     assert set(cells["table"]) == {"100", "1000", EQUAL_TIME, PRINTED}
     assert {"heat_map_equal_time.svg", "matrices_as_printed.svg"} <= set(files)
