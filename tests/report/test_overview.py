@@ -170,6 +170,15 @@ def make_world(rng: np.random.Generator, name: str, shifts: dict[str, float], se
     return World(name, "ekf", None, 100.0, losses, kept, seed)
 
 
+def test_runs_are_paired_by_their_numbers() -> None:
+    world = make_world(np.random.default_rng(6), "w", {"m": -0.3, "ekf": 0.0}, 1)
+    turned = world._replace(losses={**world.losses, "m": world.losses["m"].iloc[::-1]})
+    other = world._replace(losses={**world.losses, "m": world.losses["m"].iloc[1:]})
+    found = [decide_cells([w], ["m"])[0].verdict for w in (world, turned, other)]
+    assert found[0] == found[1]
+    assert [verdict.n for verdict in found] == [40, 40, 39]
+
+
 def test_a_winner_is_better_than_every_baseline() -> None:
     rng = np.random.default_rng(2)
     clear = make_world(rng, "clear", {"m": -0.8, "ekf": 0.0, "sir": 0.2}, 1)
