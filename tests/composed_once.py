@@ -1,11 +1,14 @@
 """Compositions by Hydra, each made once in a process: tests compose the same words a dozen times, and each takes 0.1 s.
 
-Files of conf/ do not change during a test. Words that read more than these files, and those about Hydra itself, are composed
+Files of YAML are read by the parser in C, which is six times as fast, and those that it refuses once more by that in Python,
+whose messages users see. Files of conf/ do not change during a test. Words that read more than these files, and those about Hydra itself, are composed
 each time, and processes that a test starts compose as users do.
 """
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import pickle
 import re
@@ -24,15 +27,48 @@ from pfbench.results.paper_block import conf_dir
 
 READS_MORE = re.compile(r"\$|hydra")
 
+_SafeLoader = yaml.SafeLoader
+_Loader = _utils.get_yaml_loader()  # a subclass of that in Python
 with mock.patch.object(yaml, "SafeLoader", getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
-    _Loader = _utils.get_yaml_loader()  # a subclass, here of the parser in C, which is faster
+    _FastLoader = _utils.get_yaml_loader()  # and of that in C
 compose_by_hydra = ConfigLoaderImpl._load_configuration_impl
 _store = ConfigStore.store
 _composed: dict[Any, bytes] = {}  # pickled: loading takes a quarter of the time of a deep copy
 
 
+class TwoParsers:
+    """A loader for `yaml.load`: the parser in C, and that in Python for what it refuses."""
+
+    fast, slow = _FastLoader, _Loader
+
+    def __init__(self, stream: Any) -> None:
+        self.text = stream if isinstance(stream, str | bytes) else stream.read()
+        self.name = getattr(stream, "name", None)
+
+    def get_single_data(self) -> Any:
+        """Return the content of the only document."""
+        with contextlib.suppress(yaml.YAMLError):
+            return self.fast(self.text).get_single_data()
+        again: Any = self.text
+        if self.name is not None:
+            again = io.StringIO(self.text)
+            again.name = self.name
+        return self.slow(again).get_single_data()
+
+    def dispose(self) -> None:
+        """Nothing is open."""
+
+
+class TwoSafeParsers(TwoParsers):
+    """The same for `yaml.safe_load`."""
+
+    fast, slow = getattr(yaml, "CSafeLoader", _SafeLoader), _SafeLoader
+
+
 def install() -> None:
-    """Make Hydra return copies of what it has composed before."""
+    """Make Hydra return copies of what it has composed before, and YAML be read by the parser in C."""
+    _utils.get_yaml_loader = lambda: TwoParsers
+    yaml.safe_load = lambda stream: yaml.load(stream, Loader=TwoSafeParsers)  # type: ignore[arg-type]
     ConfigLoaderImpl._load_configuration_impl = compose_once  # type: ignore[method-assign,assignment]
     ConfigStore.store = store_node  # type: ignore[method-assign]
 
@@ -60,8 +96,7 @@ def compose_once(
     options = {name: value for name, value in more.items() if name != "from_shell"}
     key = (config_name, *words, str(sorted(options.items())), version.getbase(), os.getcwd())
     if key not in _composed:
-        with mock.patch.object(_utils, "get_yaml_loader", return_value=_Loader):
-            composed = compose_by_hydra(self, config_name, words, **more)
+        composed = compose_by_hydra(self, config_name, words, **more)
         _composed[key] = pickle.dumps(composed, pickle.HIGHEST_PROTOCOL)
     copied = pickle.loads(_composed[key])
     if "hydra" in copied:

@@ -35,3 +35,4 @@ def pytest_collection_finish() -> None:
     """Modules and collected tests live until the end: without them a full collection is short."""
     gc.collect()
     gc.freeze()
+    gc.get_freeze_count = lambda: 1  # else each command that a test runs counts all of them

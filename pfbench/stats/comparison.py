@@ -27,6 +27,7 @@ from scipy.special import ndtri, stdtr, stdtrit
 from pfbench.stats.error_measures import Array, Flags
 from pfbench.stats.rank_tests import (
     EXACT_DIFFERENCES,
+    Alternative,
     holm,
     rank_sum_cdf,
     wilcoxon_signed_rank_rows,
@@ -162,14 +163,9 @@ def compare_all(
                 f"{np.shape(second)}. Select common {unit}s."
             )
         differences.append(subtract_losses(first, second))
-    p = np.ones(len(pairs))
-    sizes = np.array([len(d) for d in differences], dtype=int)
-    for size in np.unique(sizes[sizes > 0]):
-        rows = np.flatnonzero(sizes == size)
-        p[rows] = wilcoxon_signed_rank_rows(np.stack([differences[k] for k in rows]))[1]
     return [
         Effect(a[0], b[0], unit, d, float(value), _trimmed_p(d))
-        for (a, b), d, value in zip(pairs, differences, p, strict=True)
+        for (a, b), d, value in zip(pairs, differences, _signed_rank_p(differences), strict=True)
     ]
 
 
@@ -216,8 +212,18 @@ def find_largest_p(pairs: Sequence[tuple[Array, Array]]) -> float:
     differences = [subtract_losses(first, second) for first, second in pairs]
     if not differences or not all(map(_varies, differences)):
         return 1.0
-    signed = [float(wilcoxon_signed_rank_rows(d[None], "less")[1][0]) for d in differences]
+    signed = map(float, _signed_rank_p(differences, "less"))
     return max(*signed, *(_trimmed_p(d, "less") for d in differences))
+
+
+def _signed_rank_p(differences: Sequence[Array], alternative: Alternative = "two-sided") -> Array:
+    """Return a p-value for each array of differences [n], 1 for an empty one: those of equal length in one call."""
+    p = np.ones(len(differences))
+    sizes = np.array([len(d) for d in differences], dtype=int)
+    for size in np.unique(sizes[sizes > 0]):
+        d = np.stack([row for row in differences if len(row) == size])
+        p[sizes == size] = wilcoxon_signed_rank_rows(d, alternative)[1]
+    return p
 
 
 def subtract_losses(first: Array, second: Array) -> Array:

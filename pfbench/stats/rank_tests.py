@@ -68,9 +68,9 @@ def wilcoxon_signed_rank_rows(
     """
     n = d.shape[1]
     size = np.abs(d)
-    ranks = np.asarray(scipy.stats.rankdata(size, axis=1), dtype=np.float64)
-    ordered = np.sort(size, axis=1)
-    has_ties = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1) | (d == 0).any(axis=1)
+    last, first = (scipy.stats.rankdata(size, method=m, axis=1) for m in ("max", "min"))
+    ranks = (first + last) / 2  # the mean rank of those that are tied
+    has_ties = (first != last).any(axis=1) | (d == 0).any(axis=1)
     half_zero = np.where(d == 0, ranks, 0.0).sum(axis=1) / 2
     above = np.where(d > 0, ranks, 0.0).sum(axis=1) + half_zero
     below = np.where(d < 0, ranks, 0.0).sum(axis=1) + half_zero
@@ -85,7 +85,7 @@ def wilcoxon_signed_rank_rows(
     two_sided = np.minimum(1.0, 2 * np.minimum(more, less))
     normal = ~exact & ~enumerated
     if normal.any():
-        z = _normal_score(ranks[normal], size[normal], above[normal])
+        z = _normal_score((last - first + 1.0)[normal], above[normal])
         more[normal], less[normal], two_sided[normal] = ndtr(-z), ndtr(z), 2 * ndtr(-np.abs(z))
     constant = ~d.any(axis=1)
     p = {"two-sided": two_sided, "greater": more, "less": less}[alternative]
@@ -111,11 +111,9 @@ def rank_sum_cdf(n: int) -> Array:
     return np.asarray(np.cumsum(count) / 2.0**n)
 
 
-def _normal_score(ranks: Array, size: Array, above: Array) -> Array:
-    """Standardise positive rank sums [K], with the variance corrected for ties."""
-    n = ranks.shape[1]
-    last, first = (scipy.stats.rankdata(size, method=m, axis=1) for m in ("max", "min"))
-    count = (last - first + 1).astype(np.float64)
+def _normal_score(count: Array, above: Array) -> Array:
+    """Standardise positive rank sums [K], with the variance corrected for ties: how many have each value, [K, n]."""
+    n = count.shape[1]
     ties = (count**2 - 1).sum(axis=1)  # over values, equals the sum of t^3 - t over ties
     deviation = np.sqrt((n * (n + 1) * (2 * n + 1) - ties / 2) / 24)
     with np.errstate(invalid="ignore"):  # all zero; the caller sets p = 1

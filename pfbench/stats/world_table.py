@@ -242,6 +242,8 @@ def _compare(world: World, a: str, b: str) -> Effect:
 def _common(world: World, a: str, b: str) -> tuple[Array, Array]:
     """Return the losses of two filters in their common runs."""
     first, second = world.losses[a], world.losses[b]
+    if first.index.is_monotonic_increasing and first.index.equals(second.index):
+        return first.to_numpy(), second.to_numpy()  # as below, which takes ten times as long
     runs = first.index.intersection(second.index).sort_values()
     return first.loc[runs].to_numpy(), second.loc[runs].to_numpy()
 

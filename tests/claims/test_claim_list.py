@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ CLAIMS = read_printed_claims()
 READINGS = ROOT / "conf" / "reading"
 
 
+@cache
 def list_factors(paper: str) -> set[str]:
     files = sorted((READINGS / f"paper_{paper}").glob("*.yaml"))
     return {yaml.safe_load(file.read_text())["reading"][paper]["factor"] for file in files} - {

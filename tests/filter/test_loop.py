@@ -174,14 +174,17 @@ def is_walk(node: ast.AST) -> bool:
     if not isinstance(node, ast.For | ast.comprehension):
         return False
     call = node.iter
-    if not (isinstance(call, ast.Call) and ast.unparse(call.func) == "range"):
+    if not (isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id == "range"):  # fmt: skip
         return False
     target, length = ast.unparse(node.target), ast.unparse(call)
     return target == "t" or "y.shape[1]" in length
 
 
 def constructs(node: ast.AST, name: str) -> bool:
-    return isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] == name
+    return isinstance(node, ast.Call) and name in (
+        getattr(node.func, "id", ""),
+        getattr(node.func, "attr", ""),
+    )
 
 
 def places(source: str) -> Iterator[str]:

@@ -135,13 +135,15 @@ def test_400_of_588_pairs_of_the_old_study_reject(parts: dict[str, PartName]) ->
 
 
 def test_another_filter_changes_no_number(
-    table: pd.DataFrame, looks: dict[str, MethodLook], parts: dict[str, PartName]
+    table: pd.DataFrame,
+    looks: dict[str, MethodLook],
+    parts: dict[str, PartName],
+    overview: Overview,
 ) -> None:
     fewer = table[table["filter"] != "gpf"]
-    first = build_overview(table, looks, parts)
     second = build_overview(fewer, {k: v for k, v in looks.items() if k != "gpf"}, parts)
-    assert [p.verdict for p in first.pairs] == [p.verdict for p in second.pairs]
-    ratios = {(c.world, c.filter): (c.verdict.ratio, c.track_share) for c in first.cells}
+    assert [p.verdict for p in overview.pairs] == [p.verdict for p in second.pairs]
+    ratios = {(c.world, c.filter): (c.verdict.ratio, c.track_share) for c in overview.cells}
     assert all(ratios[c.world, c.filter] == (c.verdict.ratio, c.track_share) for c in second.cells)
 
 
@@ -167,6 +169,15 @@ def make_world(rng: np.random.Generator, name: str, shifts: dict[str, float], se
     losses = {k: pd.Series(base + v + rng.normal(0, 0.2, 40)) for k, v in shifts.items()}
     kept = {k: pd.Series(np.ones(40, bool)) for k in shifts}
     return World(name, "ekf", None, 100.0, losses, kept, seed)
+
+
+def test_runs_are_paired_by_their_numbers() -> None:
+    world = make_world(np.random.default_rng(6), "w", {"m": -0.3, "ekf": 0.0}, 1)
+    turned = world._replace(losses={**world.losses, "m": world.losses["m"].iloc[::-1]})
+    other = world._replace(losses={**world.losses, "m": world.losses["m"].iloc[1:]})
+    found = [decide_cells([w], ["m"])[0].verdict for w in (world, turned, other)]
+    assert found[0] == found[1]
+    assert [verdict.n for verdict in found] == [40, 40, 39]
 
 
 def test_a_winner_is_better_than_every_baseline() -> None:
@@ -418,18 +429,6 @@ def test_labels_without_their_number_of_particles() -> None:
     ]
 
 
-def test_the_page_of_several_numbers_shows_them(levels: dict[TabKey, Overview]) -> None:
-    pack = {"study": "s", "title": "T", "generated": {"version": "0", "commit": "abc", "date": ""}}
-    files = render_overview(levels, pack)
-    page = files["index.html"]
-    assert "How many particles are enough?" in page
-    assert "paired runs each, 1000 particles." in page
-    assert "<summary>100 particles</summary>" in page
-    table = pd.read_csv(io.StringIO(files["cells.csv"]))
-    assert set(table["table"]) == {100, 1000}
-    assert len(files["error_by_time.svg"]) < 60_000
-
-
 @pytest.fixture(scope="module")
 def tabs(table: pd.DataFrame, parts: dict[str, PartName]) -> dict[TabKey, Overview]:
     """Two numbers of particles; at equal time with twice the errors of the larger one; three forms as printed."""
@@ -520,7 +519,12 @@ def test_the_first_sentence_says_what_holds_at_equal_time(tabs: dict[TabKey, Ove
 def test_the_page_shows_all_tables(tabs: dict[TabKey, Overview]) -> None:
     pack = {"study": "s", "title": "T", "generated": {"version": "0", "commit": "abc", "date": ""}}
     files = render_overview(tabs, pack)
-    assert "<summary>The methods as printed</summary>" in files["index.html"]
+    page = files["index.html"]
+    assert "How many particles are enough?" in page
+    assert "paired runs each, 1000 particles." in page
+    assert "<summary>100 particles</summary>" in page
+    assert "<summary>The methods as printed</summary>" in page
+    assert len(files["error_by_time.svg"]) < 60_000
     cells = pd.read_csv(io.StringIO(files["cells.csv"]))
     assert set(cells["table"]) == {"100", "1000", EQUAL_TIME, PRINTED}
     assert {"heat_map_equal_time.svg", "matrices_as_printed.svg"} <= set(files)

@@ -30,7 +30,7 @@ def table(sizes: dict[str, float], seed: int, runs: int = RUNS) -> pd.DataFrame:
 
 def test_consistent_filters_are_rarely_called_otherwise() -> None:
     """The level holds for all filters together, although the worlds of a run are not independent."""
-    studies, wrong = 100, 0
+    studies, wrong = 50, 0
     for seed in range(studies):
         bands = assess_consistency(table(dict.fromkeys("abcd", 1.0), seed))
         words = bands["word"] != "no deviation shown"

@@ -117,6 +117,10 @@ def test_the_first_filter_beats_all_others_only_if_it_beats_each() -> None:
         worse[0][:20],
     )  # a baseline with fewer runs does not take those of the others
     assert find_largest_p([*pairs, fewer]) == max(find_largest_p(pairs), find_largest_p([fewer]))
+    # outliers that are trimmed, but ranked
+    outliers = np.hstack([rng.normal(-0.5, 0.5, (3, 26)), np.full((3, 4), 5.0)])
+    signed = max(stats.wilcoxon(d, alternative="less").pvalue for d in outliers)
+    assert find_largest_p([(d, 0 * d) for d in outliers]) == pytest.approx(signed)
 
 
 def false_words(
