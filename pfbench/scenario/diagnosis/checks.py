@@ -9,6 +9,7 @@ import numpy as np
 from pfbench.scenario.diagnosis.alignment import align_clocks
 from pfbench.scenario.diagnosis.bad_samples import check_samples
 from pfbench.scenario.diagnosis.clock_checks import check_clocks, sort_tables
+from pfbench.scenario.diagnosis.course_checks import check_course
 from pfbench.scenario.diagnosis.finding import REFUSE, Finding, Picture, thin_curve
 from pfbench.scenario.diagnosis.fix_checks import check_codes, check_fixes
 from pfbench.scenario.diagnosis.raw_log import RawLog
@@ -23,7 +24,7 @@ FEWEST_ROWS = 10  # of a table
 # checks that need no reference; the others compare IMU or fixes with it
 WITHOUT_REFERENCE = (
     "time order", "repeated times", "imu gap", "imu jitter", "imu rate", "fix hole", "absurd samples", "stuck samples",
-    "spikes", "unit of force", "fix codes",
+    "spikes", "unit of force", "fix codes", "turn of the course",
 )  # fmt: skip
 
 
@@ -42,7 +43,7 @@ def run_checks(log: RawLog) -> tuple[list[Finding], dict[str, Any], RawLog]:
     log, more = _check_force_unit(log, facts)
     findings += more
     if not len(log.reference.time):
-        return [*findings, *check_codes(log)], facts, log
+        return [*findings, *check_codes(log), *check_course(log, facts)], facts, log
     aligned, more = align_clocks(log, facts)
     findings += more
     log = aligned.log if aligned else log
