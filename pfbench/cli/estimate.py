@@ -30,13 +30,15 @@ def estimate_log(words: Sequence[str]) -> None:
         raise ValueError(
             f"estimate needs one folder, got {' '.join(folders) or 'none'}. Use: pfbench estimate my_log"
         )
-    own = {key: value for key, _, value in (word.partition("=") for word in words) if key in _OWN}
+    options = {
+        key: value for key, _, value in (word.partition("=") for word in words) if key in _OWN
+    }
     settings = [word for word in words if "=" in word and word.partition("=")[0] not in _OWN]
     from pfbench.job import estimate_track
     from pfbench.judge.track_page import describe_track, write_track_page
 
-    names = [name for name in own.get("filter", "ekf,ukf").strip("[]").split(",") if name]
+    names = [name for name in options.get("filter", "ekf,ukf").strip("[]").split(",") if name]
     estimate = estimate_track(folders[0], names, settings)
-    page = write_track_page(estimate, own.get("reports_dir", "reports"))
+    page = write_track_page(estimate, options.get("reports_dir", "reports"))
     print("\n".join(describe_track(estimate)))
     print(f"report: {page.resolve()}")

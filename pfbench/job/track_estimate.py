@@ -30,7 +30,7 @@ from pfbench.scenario.recorded.aligned_log import AlignedLog
 from pfbench.scenario.recorded.log_tables import find_dataset
 
 _DEGREE = np.pi / 180.0
-_SWAP = [1, 0, 2]  # East, North, Up and North, East, Down, but for the last sign
+_SWAP = [1, 0, 2]  # from East, North, Up to North, East, Down; the last sign follows
 _DOWN = np.array([1.0, 1.0, -1.0])
 
 
@@ -189,8 +189,8 @@ def estimate_track(
     """
     path = Path(folder).resolve()
     require(path.is_dir(), "the log", "be a folder with imu and gnss", folder, "Check the path.")
-    place = [f"data.root={json.dumps(str(path.parent))}", f"scenario.folder={json.dumps(path.name)}"]  # fmt: skip
-    words = ["scenario=user_log_aligned", *place, *settings]
+    location = [f"data.root={json.dumps(str(path.parent))}", f"scenario.folder={json.dumps(path.name)}"]  # fmt: skip
+    words = ["scenario=user_log_aligned", *location, *settings]
     plans = {name: build_plan(compose([*words, f"filter={name}"])) for name in filters}
     require(plans, "filters", "name a filter", "none", "Use filter=ekf.")
     return _estimate(path.name, plans)
@@ -222,17 +222,17 @@ def _estimate(name: str, plans: dict[str, JobPlan]) -> TrackEstimate:
     assert isinstance(scenario, AlignedLog)
     assert holdout is not None
     period = holdout.used_fixes + holdout.withheld_fixes
-    held = plan.draw_episode(torch.arange(period if holdout.shift_between_runs else 1))
-    whole = replace(plan, scenario=replace(scenario, holdout=None)).draw_episode(torch.arange(1))
+    withheld = plan.draw_episode(torch.arange(period if holdout.shift_between_runs else 1))
+    complete = replace(plan, scenario=replace(scenario, holdout=None)).draw_episode(torch.arange(1))
     log = scenario.read_checked(find_dataset(scenario.root, scenario.folder))
     start = scenario.alignment.find(log, scenario.tuning, scenario.start_s).state[7:]
-    measured = held.measured_truth
+    measured = withheld.measured_truth
     assert measured is not None
-    passes = _Passes(_join(held.record, whole.record), held.truth["position"], measured.sd["position"], start)  # fmt: skip
+    passes = _Passes(_join(withheld.record, complete.record), withheld.truth["position"], measured.sd["position"], start)  # fmt: skip
     usable = np.isfinite(log.fixes.position).all(1)
     truth = passes.truth.numpy()
     _, steps = np.nonzero(np.isfinite(truth[..., 0]))
-    time = held.time.numpy()
+    time = withheld.time.numpy()
     rule = (
         f"fixes are held out in turn, {holdout.withheld_fixes} of every {period}"
         f"{f', in {period} passes, so that each is held out once' if holdout.shift_between_runs else ''}"
@@ -240,15 +240,15 @@ def _estimate(name: str, plans: dict[str, JobPlan]) -> TrackEstimate:
     return TrackEstimate(
         name, time, tuple(_answer(label, item, passes) for label, item in plans.items()),
         np.column_stack([log.fixes.time, log.fixes.position])[usable], time[steps], _join_neighbours(passes, time),
-        rule, log.centre, held.notes,
+        rule, log.centre, withheld.notes,
     )  # fmt: skip
 
 
-def _join(held: Record, whole: Record) -> Record:
+def _join(withheld: Record, complete: Record) -> Record:
     """Join the runs of two records of one log."""
-    parts = zip((held.y, held.start, held.spread), (whole.y, whole.start, whole.spread), strict=True)  # fmt: skip
+    parts = zip((withheld.y, withheld.start, withheld.spread), (complete.y, complete.start, complete.spread), strict=True)  # fmt: skip
     y, start, spread = (torch.cat([a, b]) for a, b in parts if a is not None and b is not None)
-    return held._replace(y=y, start=start, spread=spread)
+    return withheld._replace(y=y, start=start, spread=spread)
 
 
 def _answer(name: str, plan: JobPlan, passes: _Passes) -> FilterAnswer:
@@ -295,7 +295,9 @@ def _join_neighbours(passes: _Passes, time: Array) -> Array:
     """Return the line between the given fixes around each held-out fix minus the fix, m, [m, 3]."""
     rows = []
     for y, truth in zip(passes.record.y[:-1, :, :3].numpy(), passes.truth.numpy(), strict=True):
-        given, held = np.isfinite(y[:, 0]), np.isfinite(truth[:, 0])
-        line = np.stack([np.interp(time[held], time[given], c) for c in y[given].T], -1)
-        rows.append(line - truth[held])
+        used_mask, withheld_mask = np.isfinite(y[:, 0]), np.isfinite(truth[:, 0])
+        line = np.stack(
+            [np.interp(time[withheld_mask], time[used_mask], c) for c in y[used_mask].T], -1
+        )
+        rows.append(line - truth[withheld_mask])
     return np.concatenate(rows)

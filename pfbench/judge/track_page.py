@@ -58,19 +58,19 @@ def describe_track(estimate: TrackEstimate) -> list[str]:
     """
     lines = [f"{estimate.name}: {len(estimate.time)} steps from t = {estimate.time[0]:.1f} to {estimate.time[-1]:.1f} s; {estimate.rule}"]  # fmt: skip
     for name, motion in estimate.tracks().items():
-        held, half = measure_held_out(motion), _NORMAL * np.median(motion.sd[:, 6:9], axis=0)
+        distances, half = measure_held_out(motion), _NORMAL * np.median(motion.sd[:, 6:9], axis=0)
         lines.append(
-            f"{name}: {held.rms:.2f} m RMS, 95 % within {held.largest:.2f} m, horizontally from {held.fixes} held-out fixes; "
-            f"mean square over the expected one {held.ratio:.2f}; 95 % interval of the track in the median +-{half[0]:.2f}, "
+            f"{name}: {distances.rms:.2f} m RMS, 95 % within {distances.largest:.2f} m, horizontally from {distances.fixes} held-out fixes; "
+            f"mean square over the expected one {distances.ratio:.2f}; 95 % interval of the track in the median +-{half[0]:.2f}, "
             f"{half[1]:.2f}, {half[2]:.2f} m East, North, Up"
         )
     line = _rms(np.linalg.norm(estimate.neighbours[:, :2], axis=1))
     lines.append(f"for comparison, a line between the neighbouring fixes: {line:.2f} m RMS")
     lines += [_describe_innovations(answer) for answer in estimate.answers]
     first, *others = estimate.answers
-    for other in others:
-        apart = _distances(first, other)
-        lines.append(f"{first.name} and {other.name}: {_rms(apart):.2f} m RMS apart, at most {apart.max():.2f} m")  # fmt: skip
+    for answer in others:
+        distance = _distances(first, answer)
+        lines.append(f"{first.name} and {answer.name}: {_rms(distance):.2f} m RMS apart, at most {distance.max():.2f} m")  # fmt: skip
     return lines
 
 
@@ -204,8 +204,8 @@ def _draw_agreement(estimate: TrackEstimate) -> Figure:
     """Draw the distances of the other filters from the first one."""
     figure, (axis,) = stacked_axes(1, 2.2)
     first, *others = estimate.answers
-    for k, other in enumerate(others, 1):
-        axis.plot(estimate.time, _distances(first, other), color=_COLOURS[k % len(_COLOURS)], linewidth=0.8, label=other.name)  # fmt: skip
+    for k, answer in enumerate(others, 1):
+        axis.plot(estimate.time, _distances(first, answer), color=_COLOURS[k % len(_COLOURS)], linewidth=0.8, label=answer.name)  # fmt: skip
     axis.set(xlabel="t [s]", ylabel="distance [m]")
     axis.set_ylim(bottom=0.0)
     axis.legend(fontsize="x-small")

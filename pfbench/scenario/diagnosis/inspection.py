@@ -112,7 +112,7 @@ def inspect_log(
 
     Args:
         folder: Folder of the tables.
-        files: Names of the tables. None for the usual ones, of which the reference can be missing.
+        files: Names of the tables. None for the usual ones; the reference can be missing.
         limits: Limits of the platform. None for the default limits.
         **options: Other attributes of a source: path, imu, origin, fix_codes, corrections.
 

@@ -45,14 +45,14 @@ def read_aligned_log(
 ) -> NavigationLog:
     """Read and check a log without a reference of the attitude; the arguments are those of `read_log`.
 
-    Returns the log. Its reference has no attitude, and is the track of the fixes if the log has none.
+    Returns the log. Its reference is without attitude, and without a reference it is the track of the fixes.
     """
     mending, select = corrections or LogCorrections(), {"path": path, "imu": imu}
     check_corrections(mending, files.reference is not None)
     inertial, gnss = (read_table(folder, name, select, limits) for name in (files.imu, files.gnss))  # fmt: skip
     truth = read_table(folder, files.reference, select, limits) if files.reference else None  # fmt: skip
-    (inertial, gnss, other), mended = mending.correct_tables(inertial, gnss, truth or gnss)  # fmt: skip
-    truth = other if truth else None
+    (inertial, gnss, third), mended = mending.correct_tables(inertial, gnss, truth or gnss)  # fmt: skip
+    truth = third if truth else None
     sensors, notes = read_samples(inertial)
     check_level(sensors.force, inertial.name)
     centre = find_origin(origin, gnss, truth or gnss)
@@ -91,15 +91,19 @@ def check_corrections(corrections: LogCorrections, has_positions: bool) -> None:
         key: getattr(corrections, key) or {}
         for key in ("times", "scale", "bias", "shift_s", "level_axes")
     }
-    named = [
+    unusable = [
         f"{key}.{name}"
         for key, names in tables.items()
         for name in names
         if name.startswith("reference") and not has_positions
     ]
-    named += [name for name in ("attitude", "lever_arm") if getattr(corrections, name) is not None]
-    named += [f"drop={name}" for name in corrections.drop or () if name in ("outliers", "frozen")]
-    require(not named, "scenario.corrections", "not need a reference that the log lacks", ", ".join(named), _REMEDY)  # fmt: skip
+    unusable += [
+        name for name in ("attitude", "lever_arm") if getattr(corrections, name) is not None
+    ]
+    unusable += [
+        f"drop={name}" for name in corrections.drop or () if name in ("outliers", "frozen")
+    ]
+    require(not unusable, "scenario.corrections", "not need a reference that the log lacks", ", ".join(unusable), _REMEDY)  # fmt: skip
 
 
 def _join_fixes(fixes: GnssLog) -> ReferenceLog:

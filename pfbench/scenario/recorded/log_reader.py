@@ -23,7 +23,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pfbench.core.parameter_checks import require
 from pfbench.files.reader_notes import announce_notes
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.scenario.diagnosis.checks import run_checks
@@ -104,8 +103,6 @@ def read_log(
         ValueError: If a check or the diagnosis refuses the log. The message names file, column, row, value and remedy.
     """
     names, limits = files or LogFiles(), limits or PlausibleLimits()
-    remedy = "Without a reference use scenario=user_log_aligned."
-    require(names.reference is not None, "files.reference", "name a table", None, remedy)
     select = {"path": path, "imu": imu}
     inertial, gnss, truth = (
         read_table(Path(folder), name, select, limits)

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.table_file import Array as Array, read_table_file
 from pfbench.nav.plausible_limits import LIMIT_COLUMNS, PlausibleLimits, Quantity
 from pfbench.scenario.recorded.time_order import find_order_remedy
@@ -60,15 +61,19 @@ def list_tables(root: str | None, folder: str, names: Iterable[str | None]) -> l
 
     Returns the files that exist.
     """
-    named = [name for name in names if name is not None]
     paths = (
-        Path(root or "") / folder / f"{name}{suffix}" for name in named for suffix in _SUFFIXES
+        Path(root or "") / folder / f"{name}{suffix}"
+        for name in names
+        for suffix in _SUFFIXES
+        if name is not None
     )
     return [path for path in dict.fromkeys(paths) if root is not None and path.is_file()]
 
 
 def find_table(folder: Path, name: str | None) -> Path:
     """Return the file of a table."""
+    remedy = "Without a reference use scenario=user_log_aligned."
+    require(name is not None, "scenario.files", "name each table", "none", remedy)
     files = list_tables(str(folder), "", (name,))
     if not files:
         raise ValueError(

@@ -152,23 +152,32 @@ class StartAlignment:
             aim, drift_up = self.heading_sd_deg * _DEGREE, tuning.gyro_bias_sd_deg_s * _DEGREE * (time[-1] - samples.time[0])  # fmt: skip
         else:
             drift_up = drift
-        turn = samples.turn[rows][-1]
-        back = torch.cat([turn[:1], -turn[1:]])
-        body = [rotate(back, torch.from_numpy(a)).numpy() for a in (force, forward)]
         level = [fit.acceleration + gravity * _UP, course if speed > 0.0 else _UP[[2, 0, 1]]]
-        q = quaternion_from_dcm(torch.from_numpy(_triad(level) @ _triad(body).T)).numpy()
+        q = _find_attitude(samples.turn[rows][-1], [force, forward], level)
         tilt = np.sqrt((fit.sd[2, :2].max() ** 2 + tuning.accelerometer_bias_sd**2) / gravity**2 + drift**2)  # fmt: skip
         heading = np.hypot(aim, drift_up)
         sd = np.concatenate([[tilt, tilt, heading], fit.sd[1], fit.sd[0]])
-        north = rotate(torch.from_numpy(q), _FORWARD).numpy()
-        note = (
-            f"start at t = {time[-1]:.2f} from {len(time)} fixes since t = {time[0]:.2f}, which are not used again: heading "
-            f"{np.rad2deg(np.arctan2(north[0], north[1])) % 360:.0f} deg with a standard deviation of {heading / _DEGREE:.1f}, "
-            f"level {tilt / _DEGREE:.1f} deg, speed {float(np.linalg.norm(fit.velocity)):.1f} m/s"
-        )
+        note = _describe_start(time, q, (heading, tilt), float(np.linalg.norm(fit.velocity)))
         return StartEstimate(
             float(time[-1]), np.concatenate([q, fit.velocity, fit.position]), sd, note
         )
+
+
+def _find_attitude(turn: torch.Tensor, body: list[Array], level: list[Array]) -> Array:
+    """Return the attitude quaternion, [4], with two directions in level axes and in the body axes before a turn."""
+    back = torch.cat([turn[:1], -turn[1:]])
+    turned = [rotate(back, torch.from_numpy(a)).numpy() for a in body]
+    return np.asarray(quaternion_from_dcm(torch.from_numpy(_triad(level) @ _triad(turned).T)))
+
+
+def _describe_start(time: Array, q: Array, sd: tuple[float, float], speed: float) -> str:
+    """Describe a start from a window of fixes; sd is of heading and level, rad."""
+    north = rotate(torch.from_numpy(q), _FORWARD).numpy()
+    heading = np.rad2deg(np.arctan2(north[0], north[1])) % 360
+    return (
+        f"start at t = {time[-1]:.2f} from {len(time)} fixes since t = {time[0]:.2f}, which are not used again: heading "
+        f"{heading:.0f} deg with a standard deviation of {sd[0] / _DEGREE:.1f}, level {sd[1] / _DEGREE:.1f} deg, speed {speed:.1f} m/s"
+    )
 
 
 def _list_windows(time: Array, end: int) -> list[slice]:
@@ -227,7 +236,7 @@ def _turn_samples(log: NavigationLog, time: Array, tuning: StrapdownTuning) -> _
 
 
 def _triad(vectors: list[Array]) -> Array:
-    """Return the axes of two directions, of which the first one is exact, as columns, [3, 3]."""
+    """Return the axes of two directions as columns, [3, 3]; the first direction is exact."""
     first = vectors[0] / np.linalg.norm(vectors[0])
     third = np.cross(first, vectors[1])
     third /= np.linalg.norm(third)
