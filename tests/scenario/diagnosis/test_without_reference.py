@@ -86,3 +86,19 @@ def test_the_command_lists_what_works_and_suggests_the_same_scenario(
         (tmp_path / "reports/inspect_log/scenario/suggested.yaml").read_text()
     )
     assert suggested["defaults"] == ["user_log_aligned", "_self_"]
+
+
+def test_import_and_python_take_a_log_without_a_reference(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_log(tmp_path / "log")
+    main(["import", "copy", "imu=log/imu.csv", "gnss=log/gnss.csv"])
+    assert {file.name for file in (tmp_path / "copy").iterdir()} == {"imu.csv", "gnss.csv"}
+    assert "no reference. These checks work" in capsys.readouterr().out
+    part = pfbench.log("log/imu.csv", "log/gnss.csv")
+    assert part.name == "user_log_aligned"
+    scenario = pfbench.job.build_plan(
+        pfbench.job.compose([f"scenario={part.name}", *part.changes, "filter=ekf"])
+    ).scenario
+    assert not scenario.read_checked(Path(scenario.root) / scenario.folder).notes[1:]
