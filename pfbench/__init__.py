@@ -40,6 +40,7 @@ if TYPE_CHECKING:
         run_filters as run,
         train_filter as train,
     )
+    from pfbench.job import estimate_track as estimate_track
     from pfbench.scenario import inspect_log as inspect_log
 
 # torch reads this before its first tensor: blocks above 2 MB then lie at the start of a page and in large pages. Else glibc
@@ -58,6 +59,7 @@ __all__ = [
     "check",
     "claims",
     "core",
+    "estimate_track",
     "files",
     "filter",
     "get",
@@ -95,6 +97,7 @@ _DOOR = {
     "study": "open_study",
     "train": "train_filter",
 }
+_ROOMS = {"estimate_track": "job", "inspect_log": "scenario"}  # of other names
 
 
 def __getattr__(name: str) -> Any:
@@ -103,8 +106,8 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"pfbench does not define {name!r}. Choose a name of pfbench.__all__.")
     if name in _DOOR:
         return getattr(import_module("pfbench.door"), _DOOR[name])
-    if name == "inspect_log":
-        return import_module("pfbench.scenario").inspect_log
+    if name in _ROOMS:
+        return getattr(import_module(f"pfbench.{_ROOMS[name]}"), name)
     return import_module(f"pfbench.{name}")
 
 

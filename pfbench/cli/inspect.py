@@ -16,7 +16,7 @@ each finding and scenario/suggested.yaml, settings that mend them.
   pfbench inspect my_log
   pfbench inspect my_log gnss=fixes fix_codes=nmea
 
-  imu=NAME gnss=NAME reference=NAME   names of the tables (imu, gnss, reference)
+  imu=NAME gnss=NAME reference=NAME   names of the tables (imu, gnss, reference); a log can have no reference
   path=N sensor=N            flight and sensor of tables with the columns path and imu
   fix_codes=NAME|[4,5]       codes of the column fix: nmea, rtklib, ublox or a list
   origin=LAT,LON,H           origin of local positions, deg, deg, m
@@ -33,11 +33,14 @@ def inspect_folder(words: Sequence[str]) -> None:
     folder, values = _split_folder(words)
     from pfbench.judge.log_page import describe_run, write_log_page
     from pfbench.scenario import LogFiles, inspect_log
+    from pfbench.scenario.diagnosis.thresholds import THRESHOLDS
 
     names: dict[str, str] = {k: values[k] for k in ("imu", "gnss", "reference") if k in values}
     options = _convert_options(values)
-    diagnosis = inspect_log(folder, LogFiles(**names), **options)
+    diagnosis = inspect_log(folder, LogFiles(**names) if names else None, **options)
+    works = diagnosis.facts.get("checks without a reference", ())
     source = {
+        "scenario": "user_log_aligned" if works else "user_log",
         "name": folder.name,
         "root": folder.parent,
         "folder": folder.name,
@@ -46,6 +49,10 @@ def inspect_folder(words: Sequence[str]) -> None:
     page = write_log_page(diagnosis, source, values.get("reports_dir", "reports"))
     for finding in diagnosis.findings:
         print(f"{finding.level:7} {finding.check}: {finding.text}")
+    if works:
+        others = [name for name in THRESHOLDS if name not in works]
+        print(f"no reference. These checks work without one: {', '.join(works)}")
+        print(f"These compare with a reference and were left out: {', '.join(others)}")
     counts = {level: len(diagnosis.of(level)) for level in ("refuse", "warn", "tell")}
     print(f"{folder.name}: {', '.join(f'{n} {level}' for level, n in counts.items())}")
     print(f"report: {page.resolve()}")
@@ -76,7 +83,7 @@ def _split_folder(words: Sequence[str]) -> tuple[Path, dict[str, str]]:
     folder = Path(folders[0])
     if not folder.is_dir():
         raise ValueError(
-            f"{folders[0]} must be a folder with imu, gnss and reference, got none. Check the path."
+            f"{folders[0]} must be a folder with imu, gnss and, if there is one, reference, got none. Check the path."
         )
     return folder.resolve(), values
 

@@ -35,6 +35,7 @@ COMMANDS = {
     "replay": ("replay_run", "compute one stored run again, with all its traces"),
     "import": ("import_log", "write the tables of an own log from files of other programs"),
     "inspect": ("inspect_folder", "name the faults of an own log, and the settings that mend them"),
+    "estimate": ("estimate_log", "estimate the track of an own log without a reference"),
     "judge": ("judge_trajectories", "compare trajectories of other programs with a reference"),
     "tune": ("tune_filters", "tune the baselines of a study of robustness alike"),
     "train": ("train_network", "train the network of a neural_* filter or of kalman_net"),

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 HELP = """\
-pfbench import FOLDER imu=FILE gnss=FILE reference=FILE [NAME.key=value ...]
+pfbench import FOLDER imu=FILE gnss=FILE [reference=FILE] [NAME.key=value ...]
 
-Write the tables imu, gnss and reference of an own log to a new folder, and inspect it.
+Write the tables imu, gnss and, if there is one, reference of an own log to a new folder, and inspect it.
 
   pfbench import my_log imu=imu.csv gnss=rover.pos reference=truth.tum reference.frame=enu
   pfbench import my_log imu=raw.csv imu.columns=t:time,fx:ax,fy:ay,fz:az,wx:gx,wy:gy,wz:gz imu.time=ms ...
@@ -40,8 +40,8 @@ def import_log(words: Sequence[str]) -> None:
     from pfbench.cli.inspect import inspect_folder
     from pfbench.judge.own_log import ImportOptions, import_table, write_log
 
-    readers = {role: ImportOptions(**options.get(role, {})) for role in _TABLES}
-    tables = {role: import_table(role, Path(files[role]), readers[role]) for role in _TABLES}
+    readers = {role: ImportOptions(**options.get(role, {})) for role in files}
+    tables = {role: import_table(role, Path(files[role]), readers[role]) for role in files}
     write_log(folder, tables)
     for role, table in tables.items():
         notes = "".join(f"; {note}" for note in table.notes)
@@ -73,10 +73,10 @@ def _split_words(
                 f"words must be FOLDER, imu=, gnss=, reference= and NAME.key=value, got {word}. "
                 "See pfbench import --help."
             )
-    missing = [role for role in _TABLES if role not in files]
+    missing = [role for role in _TABLES[:2] if role not in files]
     if len(folders) != 1 or missing:
         raise ValueError(
-            f"import needs a new folder and the files of {', '.join(_TABLES)}, got no "
+            f"import needs a new folder and the files of imu and gnss, got no "
             f"{', '.join(missing) or 'folder'}. Use: pfbench import my_log imu=a.csv gnss=b.csv reference=c.csv"
         )
     return Path(folders[0]), files, options, others

@@ -120,6 +120,18 @@ def map_inputs(function: Any, u: Any) -> Any:
     return type(u)(*values)
 
 
+class MeasuredTruth(NamedTuple):
+    """Truth that is itself measured, such as fixes that were withheld from the filter.
+
+    Attributes:
+        name: What the estimates are compared with, in the plural.
+        sd: Standard deviations of its errors by component group, in the units of the truth, each [k].
+    """
+
+    name: str
+    sd: dict[str, Tensor]
+
+
 @dataclass(frozen=True)
 class Episode:
     """Record of a batch of runs, with the truth for scoring.
@@ -134,6 +146,7 @@ class Episode:
         notes: Modelling choices of this episode that a report must mention.
         datasheet: Data of run 0 for the datasheet: `force` [T, 3] m/s^2 and `rate` [T, 3] rad/s in
             body axes, `azimuth` and `elevation` of the satellites [T, S] rad (NaN below the horizon).
+        measured_truth: What the truth is, if it has errors of its own. None for a truth without errors.
     """
 
     record: Record
@@ -142,6 +155,7 @@ class Episode:
     track: Tensor | None = None
     notes: tuple[str, ...] = ()
     datasheet: dict[str, Tensor] = field(default_factory=dict)
+    measured_truth: MeasuredTruth | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Own recorded logs: tables with any column names, axes and units of time as the scenario `user_log`."""
+"""Own recorded logs: tables with any column names, axes and units of time as `user_log` or `user_log_aligned`."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _SIGNS = {"frd": (1.0, 1.0, 1.0), "flu": (1.0, -1.0, -1.0)}
 def make_log(
     imu: Any,
     gnss: Any,
-    reference: Any,
+    reference: Any = None,
     *,
     columns: Mapping[str, str] | None = None,
     axes: str = "frd",
@@ -58,14 +58,15 @@ def make_log(
     Args:
         imu: Table of the IMU: a file in CSV or Parquet, or a data frame. Force [m/s^2] and angular rate [rad/s].
         gnss: Table of the fixes.
-        reference: Table of the reference, which gives the truth.
+        reference: Table of the reference, which gives the truth. None for a log without one: filters start from level
+            and course, and errors are distances to held-out fixes.
         columns: Your names of columns that are not understood by themselves, such as `{"my_ax": "fx"}`.
         axes: Body axes of the IMU: frd (forward, right, down) or flu (forward, left, up).
         time: Unit of the times: s, ms, us or ns.
         **settings: Other values of the scenario, such as `fix_codes="nmea"` or `filter_step_s=0.5`.
 
     Returns:
-        The scenario, a variant of `user_log`.
+        The scenario, a variant of `user_log`, or of `user_log_aligned` without a reference.
 
     Raises:
         ValueError: If a column is missing, or the log is not valid; the message has the mapping to complete.
@@ -77,15 +78,19 @@ def make_log(
             )
     tables, notes = {}, []
     with plain_errors():
-        for name, source in (("imu", imu), ("gnss", gnss), ("reference", reference)):
+        sources = {"imu": imu, "gnss": gnss} | (
+            {} if reference is None else {"reference": reference}
+        )
+        for name, source in sources.items():
             tables[name], note = _convert(name, _read(name, source), columns or {}, _SECONDS[time])
             notes.append(f"{name}: {note}")
         for column, sign in zip("xyz", _SIGNS[axes], strict=True):
             tables["imu"][[f"f{column}", f"w{column}"]] *= sign
         folder = _store(tables)
         words = format_words({"root": str(folder.parent), "folder": folder.name, **settings})
-        scenario = Part("scenario", "user_log", tuple(f"scenario.{word}" for word in words))
-        _check(folder, settings)
+        kind = "user_log_aligned" if reference is None else "user_log"
+        scenario = Part("scenario", kind, tuple(f"scenario.{word}" for word in words))
+        _check(folder, settings, has_reference=reference is not None)
     print("\n".join([*notes, f"axes {axes}, times in {time}, stored in {folder}"]))
     return scenario
 
@@ -173,9 +178,13 @@ def _write_text(text: str, file: IO[bytes]) -> None:
     file.write(text.encode())
 
 
-def _check(folder: Path, settings: Mapping[str, Any]) -> None:
+def _check(folder: Path, settings: Mapping[str, Any], *, has_reference: bool) -> None:
     """Read the log as a job would, so that its errors appear at once."""
-    from pfbench.scenario import read_log
+    from pfbench.scenario import LogFiles, read_log
+    from pfbench.scenario.recorded.aligned_reader import read_aligned_log
 
     options = {key: settings[key] for key in ("origin", "fix_codes") if key in settings}
-    read_log(folder, **options)
+    if has_reference:
+        read_log(folder, **options)
+    else:
+        read_aligned_log(folder, LogFiles(reference=None), **options)

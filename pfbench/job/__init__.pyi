@@ -29,4 +29,10 @@ from pfbench.job.scoring import (
     ProperScores as ProperScores,
     ScoreRecorder as ScoreRecorder,
 )
+from pfbench.job.track_estimate import (
+    FilterAnswer as FilterAnswer,
+    MotionEstimate as MotionEstimate,
+    TrackEstimate as TrackEstimate,
+    estimate_track as estimate_track,
+)
 from pfbench.results.paper_block import conf_dir as conf_dir, experiments_dir as experiments_dir

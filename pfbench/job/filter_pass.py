@@ -97,7 +97,7 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
         engine = "kernels"  # as the trials that gave the number of particles
     model, steps = plan.make_filter_model(episode), episode.record.y.shape[1]
     truth = model.assemble(episode.truth).to(device, plan.dtype)
-    recorder = ScoreRecorder(model, truth, values["score_steps"], clock)
+    recorder = ScoreRecorder(model, truth, values["score_steps"], clock, episode.measured_truth)
     counter = LikelihoodCounter(model)
 
     def watch(t: int, info: StepInfo) -> dict[str, Tensor]:

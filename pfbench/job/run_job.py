@@ -275,6 +275,8 @@ def _batch_metadata(
     """Collect the metadata of a batch."""
     runs, steps = episode.record.y.shape[:2]
     meta = make_metadata(plan, result.model, steps, episode.notes) | result.cost
+    if episode.measured_truth is not None:
+        meta["measured_truth"] = episode.measured_truth.name
     if (number := result.estimate.trace.get("particles")) is not None:
         extremes = {"least": int(number.min()), "most": int(number.max())}
         meta["particles_used"] = extremes | {"mean": float(number.mean())}

@@ -19,6 +19,7 @@ from torch.distributions import Distribution
 
 from pfbench.core.linear_algebra import factor, squared_length
 from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import MeasuredTruth
 from pfbench.filter.belief import StepInfo, normalise_log_weights
 from pfbench.kernels import dispatch
 from pfbench.kernels.dispatch import compilable
@@ -79,6 +80,7 @@ class ScoreRecorder:
         truth: True state, [R, T, D]. NaN where it is unknown.
         score_steps: Number of scored steps, spread evenly up to the last step. 0 scores nothing.
         clock: Clock that measures the time of scoring, in seconds.
+        measured: Errors of the truth itself, which are added to the distribution of the filter. None for none.
 
     Attributes:
         at_step: Indices of the scored steps.
@@ -94,8 +96,10 @@ class ScoreRecorder:
         truth: Tensor,
         score_steps: int = 0,
         clock: Callable[[], float] = time.perf_counter,
+        measured: MeasuredTruth | None = None,
     ) -> None:
         steps = truth.shape[1]
+        self.truth_sd = _place_sd(model, measured, truth)
         self.model, self.truth, self.clock = model, truth, clock
         groups = list(model.groups.values())
         sizes = sorted({len(components) for components in groups})
@@ -130,7 +134,10 @@ class ScoreRecorder:
         nees = error.new_empty(len(error), len(self.model.groups))
         for index, components in self._groups_by_size:
             e = error[:, components]
-            value = squared_length(e, info.covariance_of(components))
+            covariance = info.covariance_of(components)
+            if self.truth_sd is not None:
+                covariance = covariance + torch.diag_embed(self.truth_sd[components] ** 2)
+            value = squared_length(e, covariance)
             has_truth = ~torch.isnan(e).any(-1) & info.has_covariance
             nees[:, index] = torch.where(has_truth & ~(value >= 0.0), torch.inf, value)
         if t in self.at_step and info.has_covariance:
@@ -158,13 +165,30 @@ class ScoreRecorder:
 
     def _score(self, t: int, error: Tensor, info: StepInfo) -> ProperScores:
         """Compute the scores of one step."""
-        groups = self.model.groups.values()
-        if info.cloud is not None:
-            return score_particles(error, *info.cloud(), groups)
+        groups, sd = self.model.groups.values(), self.truth_sd
         shared_run = torch.zeros(1, dtype=torch.int64, device=error.device)  # same numbers for all
         draws = PhiloxStream(0, shared_run, error.dtype, t)
-        z = draws.normal("energy score", _POINTS, error.shape[1])
-        return score_normal(error, info.covariance(), z, groups)
+        if info.cloud is not None:
+            deviation, log_w = info.cloud()
+            if sd is not None:  # particles of the measured truth
+                deviation = deviation + sd * draws.normal("measured truth", *deviation.shape[1:])
+            return score_particles(error, deviation, log_w, groups)
+        z, covariance = draws.normal("energy score", _POINTS, error.shape[1]), info.covariance()
+        if sd is not None:
+            covariance = covariance + torch.diag(sd**2)
+        return score_normal(error, covariance, z, groups)
+
+
+def _place_sd(
+    model: StateSpaceModel, measured: MeasuredTruth | None, truth: Tensor
+) -> Tensor | None:
+    """Return the standard deviations of the errors of the truth by component, [d]; 0 where it has none."""
+    if measured is None:
+        return None
+    sd = truth.new_zeros(model.chart.dimension)
+    for group, values in measured.sd.items():
+        sd[list(model.groups[group])] = values.to(sd)
+    return sd
 
 
 def score_particles(

@@ -93,7 +93,7 @@ def format_settings(settings: Mapping[str, Any], source: Mapping[str, Any]) -> s
         YAML.
     """
     content: dict[str, Any] = {
-        "defaults": ["user_log", "_self_"],
+        "defaults": [source.get("scenario", "user_log"), "_self_"],
         "folder": source["folder"],
         **source["words"],
         **settings,

@@ -266,7 +266,9 @@ def describe_runs(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> str:
     }
     present = {name: number for name, number in kinds.items() if number}
     value = main_rmse(outputs, meta)
-    rmse = f"{group.group} RMSE {value:.4g} {group.unit}".rstrip()
+    truth = meta.get("measured_truth", "")
+    kind = f"distance to {truth}, RMS" if truth else "RMSE"
+    rmse = f"{group.group} {kind} {value:.4g} {group.unit}".rstrip()
     if not math.isfinite(value):
         rmse = f"no finite {group.group} error"
     if not present:

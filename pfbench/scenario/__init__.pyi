@@ -12,6 +12,7 @@ from pfbench.scenario.passive_location import (
     PassiveLocationScenario as PassiveLocationScenario,
     QuadratureEmitterPrior as QuadratureEmitterPrior,
 )
+from pfbench.scenario.recorded.aligned_log import AlignedLog as AlignedLog
 from pfbench.scenario.recorded.constrained import ConstrainedDrive as ConstrainedDrive
 from pfbench.scenario.recorded.corrections import LogCorrections as LogCorrections
 from pfbench.scenario.recorded.drive import (
@@ -32,6 +33,7 @@ from pfbench.scenario.recorded.raw_gnss import (
     RawGnssReceiver as RawGnssReceiver,
     RecordedWalk as RecordedWalk,
 )
+from pfbench.scenario.recorded.start_alignment import StartAlignment as StartAlignment
 from pfbench.scenario.recorded.time_grid import FixReceiver as FixReceiver
 from pfbench.scenario.recorded.trajectory_file import RecordedTrajectory as RecordedTrajectory
 from pfbench.scenario.recorded.urban import (

@@ -53,13 +53,14 @@ KINDS = {
     "recorded_quad_flights": {"strapdown_total"},
     "recorded_car_constrained": {"strapdown_blocks"},
     "user_log": {"strapdown_total", "strapdown_blocks"},
+    "user_log_aligned": {"strapdown_total", "strapdown_blocks"},
     "recorded_fixed_wing_aided": {"strapdown_aided"},
     "recorded_walk": {"strapdown_tight"},
     "recorded_berlin": {"urban_gnss", "urban_gnss_mixture"},
 }
 # of a kind with another one of the list: among the slow tests
 ALIKE = {
-    "azimuth_closed_loop", "recorded_boreas", "flight_500s", "anshun_real_orbits", "recorded_quad_flights",
+    "azimuth_closed_loop", "recorded_boreas", "flight_500s", "anshun_real_orbits", "recorded_quad_flights", "user_log_aligned",
 }  # fmt: skip
 
 
@@ -85,7 +86,7 @@ def test_models_that_fit_each_kind_of_scenario(scenario: str) -> None:
     "scenario", slow_if(lambda name: name in ALIKE or name not in KINDS, GROUPS["scenario"])
 )
 def test_each_pair_that_fits_runs(scenario: str) -> None:
-    if scenario == "user_log" or (scenario in RECORDED and DATA is None):
+    if scenario.startswith("user_log") or (scenario in RECORDED and DATA is None):
         pytest.skip("needs recorded data")
     names = fitting(scenario)
     assert names

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
 from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import MeasuredTruth
 from pfbench.filter.belief import ParticleBelief, StepInfo, make_step_info, summarise
 from pfbench.filter.gaussian.ensemble_kalman import EnsembleKalmanFilter
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
@@ -286,3 +287,45 @@ def test_what_the_judge_asks_is_not_counted_as_the_filters_likelihoods() -> None
 
     run_filter(ParticleFilter(50), model, episode.record, PhiloxStream(3, torch.arange(3)), watch)
     assert tally.count == 3 * 6 * 50
+
+
+@pytest.mark.parametrize("is_cloud", [False, True], ids=["normal", "particles"])
+def test_errors_of_a_measured_truth_are_part_of_all_scores(*, is_cloud: bool) -> None:
+    """A truth of sd 2 about which the filter is sure: NEES, ranks and CRPS are those of the sum of both errors."""
+    steps, runs, sd, own = 400, 2, 2.0, 0.5
+    draws = PhiloxStream(3, torch.arange(runs))
+    model = linear_walk(1.0, 0.3, 1.0)
+    d = model.chart.dimension
+    group = next(iter(model.groups))
+    size = len(model.groups[group])
+    errors = (sd**2 + own**2) ** 0.5 * draws.normal("truth", steps, d)
+    truth = torch.zeros(runs, steps, d, dtype=torch.float64) - errors
+    measured = MeasuredTruth("fixes", {group: torch.full((size,), sd, dtype=torch.float64)})
+    recorder = ScoreRecorder(model, truth, steps, measured=measured)
+    mean, covariance = (
+        torch.zeros(runs, d, dtype=torch.float64),
+        own**2 * torch.eye(d).double().expand(runs, -1, -1),
+    )
+    nees = []
+    for t in range(steps):
+        cloud = own * draws.at_step(t + 1).normal("cloud", 400, d)
+        log_w = torch.full((runs, 400), -math.log(400), dtype=torch.float64)
+        info = StepInfo(
+            mean, covariance.diagonal(dim1=-2, dim2=-1), lambda: covariance, {},
+            (lambda cloud=cloud, log_w=log_w: (cloud, log_w)) if is_cloud else None,
+        )  # fmt: skip
+        nees.append(recorder(t, info)["nees"])
+    place = list(model.groups).index(group)
+    count = runs * steps
+    mean_nees = float(torch.stack(nees)[..., place].mean())
+    assert abs(mean_nees - size) < 5 * math.sqrt(2 * size / count)
+    scores = recorder.arrays()
+    inside = (scores["pit"][..., list(model.groups[group])] - 0.5).abs() < 0.25
+    assert abs(float(inside.double().mean()) - 0.5) < 5 * 0.5 / math.sqrt(count * size)
+    total = (sd**2 + own**2) ** 0.5
+    crps = scores["crps"][..., list(model.groups[group])]
+    spread = float(crps.std())
+    assert (
+        abs(float(crps.mean()) - total / math.sqrt(math.pi))
+        < 5 * spread / math.sqrt(count * size) + total / 400
+    )

@@ -15,7 +15,7 @@ from pfbench.filter.belief import GaussianBelief, StepInfo
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.innovation import compute_innovation
 from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
-from pfbench.filter.loop import FilterResult, prepare_record, run_filter
+from pfbench.filter.loop import FilterResult, Watch, prepare_record, run_filter
 from pfbench.model.base import StateSpaceModel
 
 
@@ -33,7 +33,9 @@ class SmoothedStates(NamedTuple):
     filtered: FilterResult
 
 
-def smooth(method: GaussianFilter, model: StateSpaceModel, record: Record) -> SmoothedStates:
+def smooth(
+    method: GaussianFilter, model: StateSpaceModel, record: Record, watch: Watch | None = None
+) -> SmoothedStates:
     """Compute smoothed means and covariances (Rauch-Tung-Striebel).
 
     The covariance between consecutive states comes from the filter's linearisation rule. The result
@@ -44,6 +46,7 @@ def smooth(method: GaussianFilter, model: StateSpaceModel, record: Record) -> Sm
         method: Gaussian filter without noise or gain adaptations.
         model: State-space model of the filter.
         record: Measurements [R, T, Dy] and inputs.
+        watch: Function of each step of the filter, see `run_filter`.
 
     Returns:
         Smoothed means and covariances, and the result of the filter.
@@ -65,7 +68,7 @@ def smooth(method: GaussianFilter, model: StateSpaceModel, record: Record) -> Sm
 
     def store(t: int, info: StepInfo) -> dict[str, Tensor]:
         filtered_moments.append((info.mean, info.covariance()))
-        return {}
+        return watch(t, info) if watch else {}
 
     runs = torch.arange(len(record.y))
     filtered = run_filter(method, model, record, PhiloxStream(0, runs), store)

@@ -138,7 +138,7 @@ class StudyData(NamedTuple):
         tracks: Single runs by condition.
         notes: Notes on the filters.
         times: Times in rounds by label, of each condition; without filters that were not measured.
-        warning: Sentence on runs that are not independent; empty if none is shown.
+        warning: Sentences on a truth that is measured, and on runs that are not independent; empty for none.
     """
 
     table: pd.DataFrame
@@ -181,17 +181,19 @@ def read_study(
             )
     long_rows = pd.concat(metrics, ignore_index=True) if metrics else data.metrics
     return _leave_out_copies(
-        data._replace(table=join_rows(rows, options.metric), metrics=long_rows)
+        data._replace(
+            table=join_rows(rows, options.metric), metrics=long_rows, warning=notes.describe_truth()
+        )
     )
 
 
 def _leave_out_copies(data: StudyData) -> StudyData:
     """Leave out copies of runs, and state runs that are not independent."""
-    copies, warning = assess_runs(data.table, "rmse", RUN)
+    copies, sentence = assess_runs(data.table, "rmse", RUN)
     return data._replace(
         table=drop_runs(data.table, copies, RUN),
         metrics=drop_runs(data.metrics, copies, RUN),
-        warning=warning,
+        warning=" ".join(filter(None, (data.warning, sentence))),
     )
 
 
@@ -377,6 +379,7 @@ class MethodNotes:
         self._exact: dict[str, bool] = {}
         self._bounded: dict[str, set[bool | None]] = {}
         self._choices: dict[str, dict[str, None]] = {}
+        self._truths: dict[str, None] = {}
 
     def add(self, label: str, result: JobResult) -> None:
         """Add a job."""
@@ -389,8 +392,15 @@ class MethodNotes:
         self._particles.setdefault(label, {})[str(particles)] = None
         self._exact[label] = self._exact.get(label, True) and bool(meta.get("is_exact"))
         self._bounded.setdefault(label, set()).add(meta.get("has_bounded_weights"))
+        if "measured_truth" in meta:
+            self._truths[str(meta["measured_truth"])] = None
         for text in meta.get("modelling_choices", ()):
             self._choices.setdefault(str(text), {})[label] = None
+
+    def describe_truth(self) -> str:
+        """State what the errors are distances to, if that is measured; empty if it is not."""
+        names = " and ".join(self._truths)
+        return f"Errors are distances to {names}, which have errors of their own." if names else ""
 
     def to_entries(self, looks: Mapping[str, MethodLook]) -> dict[str, Any]:
         """Return the entries of the page."""

@@ -9,8 +9,9 @@ import numpy as np
 from pfbench.scenario.diagnosis.alignment import align_clocks
 from pfbench.scenario.diagnosis.bad_samples import check_samples
 from pfbench.scenario.diagnosis.clock_checks import check_clocks, sort_tables
+from pfbench.scenario.diagnosis.course_checks import check_course
 from pfbench.scenario.diagnosis.finding import REFUSE, Finding, Picture, thin_curve
-from pfbench.scenario.diagnosis.fix_checks import check_fixes
+from pfbench.scenario.diagnosis.fix_checks import check_codes, check_fixes
 from pfbench.scenario.diagnosis.raw_log import RawLog
 from pfbench.scenario.diagnosis.reference_checks import check_reference
 from pfbench.scenario.diagnosis.specific_force import check_force_and_rate
@@ -20,22 +21,29 @@ _GRAVITY = 9.80665
 _UNITS = {"in g": _GRAVITY, "in mg": 1e-3 * _GRAVITY, "in cm/s^2": 0.01}
 _UNIT_ERROR = 0.25  # relative
 FEWEST_ROWS = 10  # of a table
+# checks that need no reference; the others compare IMU or fixes with it
+WITHOUT_REFERENCE = (
+    "time order", "repeated times", "imu gap", "imu jitter", "imu rate", "fix hole", "absurd samples", "stuck samples",
+    "spikes", "unit of force", "fix codes", "turn of the course",
+)  # fmt: skip
 
 
 def run_checks(log: RawLog) -> tuple[list[Finding], dict[str, Any], RawLog]:
-    """Run all checks of a log with times in any order.
+    """Run all checks of a log with times in any order; without a reference those of `WITHOUT_REFERENCE`.
 
     Returns findings, facts and the log with what the checks mended for each other.
     """
     facts: dict[str, Any] = {}
     findings = list(check_clocks(log, facts))
     log = sort_tables(log)
-    if min(len(log.imu.time), len(log.reference.time)) < FEWEST_ROWS:
+    if len(log.imu.time) < FEWEST_ROWS or 0 < len(log.reference.time) < FEWEST_ROWS:
         return findings, facts, log
     log, more = check_samples(log, facts)
     findings += more
     log, more = _check_force_unit(log, facts)
     findings += more
+    if not len(log.reference.time):
+        return [*findings, *check_codes(log), *check_course(log, facts)], facts, log
     aligned, more = align_clocks(log, facts)
     findings += more
     log = aligned.log if aligned else log

@@ -74,7 +74,7 @@ class JointFit(NamedTuple):
 
 def check_fixes(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
     """Check the fixes."""
-    yield from _check_codes(log)
+    yield from check_codes(log)
     if len(log.fixes.time) < _FEWEST:
         return
     errors = _find_coarse_offset(log)
@@ -92,7 +92,7 @@ def check_fixes(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
     yield from _check_joint(log, errors, jumps.mask, facts)
 
 
-def _check_codes(log: RawLog) -> Iterator[Finding]:
+def check_codes(log: RawLog) -> Iterator[Finding]:
     """Check that the column `fix` has the codes 0 and 1, if no program is stated."""
     if log.codes is None:
         return

@@ -12,10 +12,11 @@ import torch
 
 from pfbench.nav import earth
 from pfbench.nav.plausible_limits import PlausibleLimits
-from pfbench.scenario.diagnosis.checks import run_checks
+from pfbench.scenario.diagnosis.checks import WITHOUT_REFERENCE, run_checks
 from pfbench.scenario.diagnosis.finding import REFUSE, Finding, LogDiagnosis, merge_settings
 from pfbench.scenario.diagnosis.raw_log import RawImu, RawLog, take_log, take_rows
 from pfbench.scenario.diagnosis.sensor_grade import measure_noise
+from pfbench.scenario.recorded.aligned_reader import read_aligned_log
 from pfbench.scenario.recorded.corrections import LogCorrections
 from pfbench.scenario.recorded.fix_codes import FixCodes, select_usable
 from pfbench.scenario.recorded.log_frames import (
@@ -35,6 +36,7 @@ from pfbench.scenario.recorded.log_tables import (
     LogTable,
     ReferenceLog,
     convert_column,
+    list_tables,
     read_table,
     swap_frd_rfu,
 )
@@ -71,17 +73,19 @@ class LogSource:
     def read(self) -> RawLog:
         """Read the tables with the corrections, without a check of their contents."""
         names, select = self.files, {"path": self.path, "imu": self.imu}
-        inertial, gnss, truth = (
+        inertial, gnss, *truth = (
             read_table(self.folder, name, select, self.limits)
             for name in (names.imu, names.gnss, names.reference)
+            if name is not None
         )
-        tables, _ = self.corrections.correct_tables(inertial, gnss, truth)
-        return take_tables(tables, self)
+        tables, _ = self.corrections.correct_tables(inertial, gnss, *(truth or [gnss]))
+        return take_tables(tables if truth else (*tables[:2], None), self)
 
     def check_reading(self) -> str:
         """Read the log as a run does; return the message if it is refused."""
+        read = read_log if self.files.reference else read_aligned_log
         try:
-            read_log(
+            read(
                 self.folder, self.files, self.path, self.imu, self.origin, self.limits, self.fix_codes,
                 self.corrections,
             )  # fmt: skip
@@ -107,8 +111,8 @@ def inspect_log(
     """Inspect a log and name its faults.
 
     Args:
-        folder: Folder of the three tables.
-        files: Names of the tables.
+        folder: Folder of the tables.
+        files: Names of the tables. None for the usual ones; the reference can be missing.
         limits: Limits of the platform. None for the default limits.
         **options: Other attributes of a source: path, imu, origin, fix_codes, corrections.
 
@@ -118,7 +122,10 @@ def inspect_log(
     Raises:
         ValueError: If a table cannot be read at all.
     """
-    source = LogSource(Path(folder), files or LogFiles(), limits=limits, **options)
+    usual = LogFiles()
+    if not list_tables(str(folder), "", (usual.reference,)):
+        usual = LogFiles(reference=None)
+    source = LogSource(Path(folder), files or usual, limits=limits, **options)
     findings, facts = _inspect(source)
     settings = merge_settings(finding.settings for finding in findings)
     checks = [finding.check for finding in findings if not finding.settings]
@@ -136,7 +143,10 @@ def _inspect(source: LogSource) -> tuple[list[Finding], dict[str, Any]]:
     """Run all checks, and read the log as a run does."""
     log = source.read()
     findings, facts, mended = run_checks(log)
-    measure_noise(mended, facts)
+    if len(log.reference.time):
+        measure_noise(mended, facts)
+    else:
+        facts["checks without a reference"] = list(WITHOUT_REFERENCE)
     if not any(finding.level == REFUSE for finding in findings):
         message = source.check_reading()
         if message:
@@ -146,22 +156,31 @@ def _inspect(source: LogSource) -> tuple[list[Finding], dict[str, Any]]:
     return findings, facts
 
 
-def take_tables(tables: tuple[LogTable, LogTable, LogTable], source: LogSource) -> RawLog:
+def take_tables(tables: tuple[LogTable, LogTable, LogTable | None], source: LogSource) -> RawLog:
     """Convert corrected tables without checks of their contents.
 
     Args:
-        tables: Tables of IMU, fixes and reference.
+        tables: Tables of IMU, fixes and reference, None for a log without one.
         source: How the log is read.
 
     Returns:
         The log.
     """
     inertial, gnss, truth = tables
-    centre = find_origin(source.origin, gnss, truth)
+    centre = find_origin(source.origin, gnss, truth or gnss)
     gravity, _ = gravity_at(centre)
     imu = ImuLog(_time(inertial), _vectors(inertial, _FORCE), _vectors(inertial, _RATE))
     position = _positions(gnss, centre)
     fixes = GnssLog(_time(gnss), position, np.full_like(position, np.nan))
+    codes = None
+    if "fix" in gnss.rows and source.fix_codes is None:
+        codes = convert_column(gnss, "fix")
+    elif "fix" in gnss.rows:
+        usable, _ = select_usable(gnss, source.fix_codes)
+        position[~usable] = np.nan
+    if truth is None:
+        log = take_log((inertial, gnss, gnss), imu, fixes, None, gravity)
+        return log._replace(codes=codes, imu=RawImu(*take_rows(log.imu, np.isfinite(imu.time))))
     angles = _columns(truth, _ANGLES)
     velocity = _vectors(truth, ("vn", "ve", "vd") if "vn" in truth.rows else ("vn_d", "ve_d", "vd_d"))  # fmt: skip
     track = _positions(truth, centre)
@@ -169,15 +188,9 @@ def take_tables(tables: tuple[LogTable, LogTable, LogTable], source: LogSource) 
     reference = ReferenceLog(
         _time(truth)[keep], quaternion_of_angles(*angles[keep].T), velocity[keep], track[keep]
     )
-    codes = None
-    if "fix" in gnss.rows and source.fix_codes is None:
-        codes = convert_column(gnss, "fix")
-    elif "fix" in gnss.rows:
-        usable, _ = select_usable(gnss, source.fix_codes)
-        position[~usable] = np.nan
     if len(reference.time) > 1:
         fixes, _ = source.corrections.correct_fixes(fixes, reference, gnss.name)
-    log = take_log(tables, imu, fixes, reference, gravity)
+    log = take_log((inertial, gnss, truth), imu, fixes, reference, gravity)
     return log._replace(
         reference=log.reference._replace(angles=angles[keep], rows=np.flatnonzero(keep)),
         codes=codes,

@@ -97,27 +97,35 @@ def take_log(
     tables: tuple[LogTable, LogTable, LogTable],
     imu: ImuLog,
     fixes: GnssLog,
-    reference: ReferenceLog,
+    reference: ReferenceLog | None,
     gravity: float,
 ) -> RawLog:
-    """Return what a reader has read in the axes of the tables."""
+    """Return what a reader has read in the axes of the tables; without a reference its table is empty."""
     usable = np.flatnonzero(np.isfinite(fixes.position).all(1))
-    q = reference.attitude[:, [1, 2, 3, 0]]
-    axes = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # of both frames
-    dcm = axes @ Rotation.from_quat(q).as_matrix() @ axes
     return RawLog(
         RawImu(imu.time, swap_frd_rfu(imu.force), swap_frd_rfu(imu.rate), np.arange(len(imu.time))),
         RawFixes(fixes.time[usable], swap_frd_rfu(fixes.position[usable]), usable),
-        RawReference(
-            reference.time,
-            euler_of(dcm),
-            swap_frd_rfu(reference.velocity),
-            swap_frd_rfu(reference.position),
-            np.arange(len(reference.time)),
-        ),
+        _take_reference(reference) if reference else _NO_REFERENCE,
         gravity,
         (tables[0].name, tables[1].name, tables[2].name),
         (tables[0].row, tables[1].row, tables[2].row),
+    )
+
+
+_NO_ROWS = np.empty((0, 3))
+_NO_REFERENCE = RawReference(np.empty(0), _NO_ROWS, _NO_ROWS, _NO_ROWS, np.empty(0, np.intp))
+
+
+def _take_reference(reference: ReferenceLog) -> RawReference:
+    """Return a reference in the axes of the tables."""
+    q = reference.attitude[:, [1, 2, 3, 0]]
+    axes = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # of both frames
+    return RawReference(
+        reference.time,
+        euler_of(axes @ Rotation.from_quat(q).as_matrix() @ axes),
+        swap_frd_rfu(reference.velocity),
+        swap_frd_rfu(reference.position),
+        np.arange(len(reference.time)),
     )
 
 

@@ -54,6 +54,7 @@ THRESHOLDS = {
     "fix outliers": Threshold(12.0, "times the level", 2.6, 18.3),
     "frozen fixes": Threshold(2.0, "m", 0.0, 0.01),
     "fix codes": Threshold(0.5, "share of fixes"),
+    "turn of the course": Threshold(0.3, "1"),
 }
 REFUSED_OFFSET = 0.5  # s of a clock
 SPIKE_DEVIATIONS = (

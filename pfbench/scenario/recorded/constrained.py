@@ -73,9 +73,18 @@ class ConstrainedDrive(RecordedDrive):
         y = [episode.record.y, *(a.expand(len(runs), -1, -1) for a in extra)]
         start = (episode.record.start, self.constraints.start.expand(len(runs), -1))
         record = episode.record._replace(
-            y=torch.cat(y, -1), start=torch.cat([a for a in start if a is not None], -1)
+            y=torch.cat(y, -1),
+            start=torch.cat([a for a in start if a is not None], -1),
+            spread=self._extend_spread(episode.record.spread),
         )
         return replace(episode, record=record, truth=truth, notes=(*episode.notes, *notes))
+
+    def _extend_spread(self, spread: Tensor | None) -> Tensor | None:
+        """Add the standard deviations of the states of the constraints to the root of a start."""
+        if spread is None:
+            return None
+        sds = [sd for _, _, sd in self.constraints.states.values()]
+        return torch.stack([torch.block_diag(root, *map(torch.diag, sds)) for root in spread])
 
     def _observe_standing(
         self, log: NavigationLog, leg: ResampledLog

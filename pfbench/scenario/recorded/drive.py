@@ -452,7 +452,9 @@ class FixHoldout:
             (number + shift) % (self.used_fixes + self.withheld_fixes) >= self.used_fixes
         )
 
-    def score(self, episode: Episode, leg: ResampledLog, runs: Tensor, reference: str) -> Episode:
+    def score(
+        self, episode: Episode, leg: ResampledLog, runs: Tensor, reference: str | None
+    ) -> Episode:
         """Remove the withheld fixes from an episode and make them its truth.
 
         Args:
@@ -468,6 +470,29 @@ class FixHoldout:
         Raises:
             ValueError: If a run does not have a withheld fix.
         """
+        scored, count = self.withhold(episode, leg, runs)
+        notes = (
+            f"position and velocity are scored at {count} withheld fixes (run 0) only. "
+            "Errors of these fixes increase the NEES, so that a consistent filter exceeds its band",
+            f"attitude errors are differences from {reference}, which is not a truth, and the track is from {reference}",
+        )
+        truth = {"attitude": episode.truth["attitude"], **scored.truth}
+        return replace(scored, truth=truth, notes=(*scored.notes, *notes))
+
+    def withhold(self, episode: Episode, leg: ResampledLog, runs: Tensor) -> tuple[Episode, int]:
+        """Remove the withheld fixes from an episode, and make them its only truth.
+
+        Args:
+            episode: Episode whose first measurement components are those of the fixes.
+            leg: Resampled log with the fixes as recorded.
+            runs: Run numbers, [R].
+
+        Returns:
+            The episode, and the number of withheld fixes of the first run.
+
+        Raises:
+            ValueError: If a run does not have a withheld fix.
+        """
         recorded = torch.from_numpy(leg.fixes)
         withheld_mask = self.select(
             torch.from_numpy(leg.fix_steps) & ~torch.isnan(recorded[:, 0]), episode.time, runs
@@ -478,17 +503,10 @@ class FixHoldout:
                 f"t = {leg.time[0]:.3f} and {leg.time[-1]:.3f}, got {self}. "
                 "Start earlier or withhold more fixes."
             )
-        notes = (
-            f"position and velocity are scored at {int(withheld_mask[0].sum())} withheld fixes (run 0) only. "
-            "Errors of these fixes increase the NEES, so that a consistent filter exceeds its band",
-            f"attitude errors are differences from {reference}, which is not a truth, and the track is from {reference}",
-        )
-        withheld_mask = withheld_mask.unsqueeze(-1)
+        count, withheld_mask = int(withheld_mask[0].sum()), withheld_mask.unsqueeze(-1)
         position, velocity = (
             torch.where(withheld_mask, values, torch.nan) for values in recorded.split(3, -1)
         )
-        truth = {"attitude": episode.truth["attitude"], "velocity": velocity, "position": position}
+        truth = {"velocity": velocity, "position": position}
         record = episode.record._replace(y=torch.where(withheld_mask, torch.nan, episode.record.y))
-        return Episode(
-            record, episode.time, truth, episode.track, (*episode.notes, *notes), episode.datasheet
-        )
+        return replace(episode, record=record, truth=truth), count

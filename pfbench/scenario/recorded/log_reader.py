@@ -110,10 +110,10 @@ def read_log(
     )
     mending = corrections or LogCorrections()
     (inertial, gnss, truth), mended = mending.correct_tables(inertial, gnss, truth)
-    sensors, notes = _samples(inertial)
+    sensors, notes = read_samples(inertial)
     centre = find_origin(origin, gnss, truth)
     usable, usable_notes = select_usable(gnss, fix_codes)
-    fixes, reference = _fixes(gnss, centre, usable), _motion(truth, centre)
+    fixes, reference = read_fixes(gnss, centre, usable), _motion(truth, centre)
     fixes, mended_fixes = mending.correct_fixes(fixes, reference, gnss.name)
     for name, time in ((gnss.name, fixes.time), (truth.name, reference.time)):
         check_overlap(inertial.name, sensors.time, name, time)
@@ -124,18 +124,18 @@ def read_log(
         notes += compare_inertial(truth, sensors, reference, gravity)
     fixes, fix_notes = _compare_fixes(gnss, fixes, (truth, reference), limits)
     dropped = dict.fromkeys(note for table in (inertial, gnss, truth) for note in table.notes)
-    diagnosed = _diagnose(
+    diagnosed = diagnose(
         take_log((inertial, gnss, truth), sensors, fixes, reference, gravity),
-        gnss.name != truth.name,
+        has_own_fixes=gnss.name != truth.name,
     )
     notes = (*dropped, *mended, *mended_fixes, late, *usable_notes, *notes, *fix_notes)
     spans = ((inertial.name, sensors.time), (gnss.name, fixes.time), (truth.name, reference.time))
     notes = (*_leave_out_offsets(notes, diagnosed), *diagnosed, *compare_times(spans))
     announce_notes(folder, notes)
-    return NavigationLog(sensors, fixes, reference, gravity, notes)
+    return NavigationLog(sensors, fixes, reference, gravity, notes, centre)
 
 
-def _diagnose(log: RawLog, has_own_fixes: bool) -> tuple[str, ...]:
+def diagnose(log: RawLog, *, has_own_fixes: bool) -> tuple[str, ...]:
     """Return the findings of the quick checks as notes; raise those that refuse the log."""
     findings, _, _ = run_checks(log)
     refused = [finding for finding in findings if finding.level == REFUSE]
@@ -200,7 +200,7 @@ def _explain(offset: str) -> Iterator[None]:
         raise ValueError(text) from None
 
 
-def _samples(table: LogTable) -> tuple[ImuLog, tuple[str, ...]]:
+def read_samples(table: LogTable) -> tuple[ImuLog, tuple[str, ...]]:
     """Read and check the IMU samples."""
     time, notes = _imu_time(table)
     force, rate = (
@@ -259,7 +259,10 @@ def _longest_part(table: LogTable, time: Array, is_gap: NDArray[np.bool_]) -> st
     )
 
 
-def _fixes(table: LogTable, origin: tuple[float, ...] | None, usable: NDArray[np.bool_]) -> GnssLog:
+def read_fixes(
+    table: LogTable, origin: tuple[float, ...] | None, usable: NDArray[np.bool_]
+) -> GnssLog:
+    """Read fixes in East, North, Up from the origin; NaN where they are not usable."""
     time, position = read_times(table, longest=100.0), read_positions(table, origin)
     recorded = table.has(_VELOCITY)
     columns = _VELOCITY if recorded else _DERIVED

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.table_file import Array as Array, read_table_file
 from pfbench.nav.plausible_limits import LIMIT_COLUMNS, PlausibleLimits, Quantity
 from pfbench.scenario.recorded.time_order import find_order_remedy
@@ -55,24 +56,29 @@ _COLUMN_REMEDY = "Fill this column. Of fixes, vn, ve, vd and fix can be left out
 _LARGEST_NUMBERS = {"G": 63, "R": 32, "E": 36, "C": 63, "J": 202, "I": 14, "S": 158}
 
 
-def list_tables(root: str | None, folder: str, names: Iterable[str]) -> list[Path]:
+def list_tables(root: str | None, folder: str, names: Iterable[str | None]) -> list[Path]:
     """List the files of tables, which `read_table` would read.
 
     Returns the files that exist.
     """
     paths = (
-        Path(root or "") / folder / f"{name}{suffix}" for name in names for suffix in _SUFFIXES
+        Path(root or "") / folder / f"{name}{suffix}"
+        for name in names
+        for suffix in _SUFFIXES
+        if name is not None
     )
     return [path for path in dict.fromkeys(paths) if root is not None and path.is_file()]
 
 
-def find_table(folder: Path, name: str) -> Path:
+def find_table(folder: Path, name: str | None) -> Path:
     """Return the file of a table."""
+    remedy = "Without a reference use scenario=user_log_aligned."
+    require(name is not None, "scenario.files", "name each table", "none", remedy)
     files = list_tables(str(folder), "", (name,))
     if not files:
         raise ValueError(
-            f"{folder} must contain {name}.parquet or {name}.csv. "
-            "Store a log as a folder with imu, gnss and reference."
+            f"{folder} must contain {name}.parquet or {name}.csv. Store a log as a folder with imu, gnss and "
+            "reference. Without a reference use scenario=user_log_aligned, or pfbench estimate."
         )
     if len(files) > 1:
         raise ValueError(
@@ -83,7 +89,7 @@ def find_table(folder: Path, name: str) -> Path:
 
 def read_table(
     folder: Path,
-    name: str,
+    name: str | None,
     select: dict[str, int | None],
     limits: PlausibleLimits | None = None,
 ) -> LogTable:
@@ -299,6 +305,7 @@ class NavigationLog:
         reference: Reference motion.
         gravity: Normal gravity at the origin, m/s^2.
         notes: Corrections and assumptions of the reader, for the report.
+        centre: lat_deg, lon_deg, h_m of the origin, None if the log does not contain it.
     """
 
     imu: ImuLog
@@ -306,6 +313,7 @@ class NavigationLog:
     reference: ReferenceLog
     gravity: float
     notes: tuple[str, ...] = ()
+    centre: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -315,12 +323,12 @@ class LogFiles:
     Attributes:
         imu: Name of the IMU table.
         gnss: Name of the table of fixes. It can be the reference.
-        reference: Name of the reference table.
+        reference: Name of the reference table. None without a reference.
     """
 
     imu: str = "imu"
     gnss: str = "gnss"
-    reference: str = "reference"
+    reference: str | None = "reference"
 
 
 def swap_frd_rfu(a: Array) -> Array:

@@ -46,6 +46,7 @@ class ResampledLog(NamedTuple):
         spans: Durations of the pieces, s, [T, S]. Unused pieces have duration 0.
         gravity: Gravity, m/s^2.
         notes: Corrections and assumptions, for the report.
+        start_sd: Standard deviations of `start` in the chart, rad, m/s, m, [9]. None if `start` is of a reference.
     """
 
     start_s: float
@@ -59,6 +60,7 @@ class ResampledLog(NamedTuple):
     spans: Array
     gravity: float
     notes: tuple[str, ...]
+    start_sd: Array | None = None
 
     @property
     def since_start(self) -> Array:
@@ -107,7 +109,7 @@ def resample_log(
     fixes = np.full((len(grid), 6), np.nan)
     fixes[fix_mask] = np.hstack([log.fixes.position, log.fixes.velocity])[selection]
     truth = interpolate(log.reference, grid)
-    if np.isnan(truth[0]).any():
+    if np.isnan(truth[0, 4:]).any():  # a reference can lack the attitude
         raise ValueError(
             f"scenario.start_s must not be in a gap of the reference, got t = {grid[0]:.3f}. "
             "Select another start."
@@ -311,9 +313,8 @@ def assemble(
     # errors are drawn per fix, so that they do not depend on the filter step
     check_unit_process(noise, t)
     y[:, fix_mask] += noise.draw_errors(draws.at_step(0), receiver.channels, t[fix_mask])
-    record = Record(
-        y, _preintegrate_logs(legs, log_index, tuning), _draw_start(legs, log_index, tuning, draws)
-    )
+    start, spread = _draw_start(legs, log_index, tuning, draws)
+    record = Record(y, _preintegrate_logs(legs, log_index, tuning), start, spread)
     groups = {"attitude": truth[..., :4], "velocity": truth[..., 4:7], "position": truth[..., 7:]}
     notes = tuple(dict.fromkeys(note for leg in legs for note in leg.notes))
     first = legs[int(log_index[0])] if len(log_index) else longest
@@ -326,14 +327,21 @@ def assemble(
 
 def _draw_start(
     legs: Sequence[ResampledLog], log_index: Tensor, tuning: StrapdownTuning, draws: PhiloxStream
-) -> Tensor:
-    """Draw starts [R, 16], about which the true state has the assumed distribution."""
+) -> tuple[Tensor, Tensor | None]:
+    """Draw starts [R, 16], about which the true state has the assumed distribution.
+
+    A start with its own standard deviations is an estimate: it stays, and their root [R, 15, 15] follows.
+    """
     recorded = torch.from_numpy(np.stack([leg.start for leg in legs]))[log_index]
     nominal = torch.cat([recorded, tuning.bias.expand(len(log_index), -1)], -1)
+    stated = legs[0].start_sd
+    if stated is not None:
+        sd = torch.cat([torch.from_numpy(stated), tuning.initial_sd[len(stated) :]])
+        return nominal, torch.diag(sd).expand(len(log_index), -1, -1)
     error = (
         tuning.initial_sd * draws.at_step(0).normal("world.start", 1, len(tuning.initial_sd))[:, 0]
     )
-    return StrapdownTotal(tuning).chart.add(nominal, -error)
+    return StrapdownTotal(tuning).chart.add(nominal, -error), None
 
 
 def _preintegrate_logs(

@@ -147,7 +147,7 @@ def test_exit_codes_tell_warnings_from_refusals(
     ("words", "said"),
     [
         ((), "inspect needs one folder, got none"),
-        (("nowhere",), "nowhere must be a folder with imu, gnss and reference"),
+        (("nowhere",), "nowhere must be a folder with imu, gnss and, if there is one, reference"),
         ((".", "imus=a"), "words must be FOLDER and key=value with the keys imu, gnss"),
         ((".", "path=x"), "path must be a number, got x"),
         ((".",), "must contain imu.parquet or imu.csv"),

@@ -1,0 +1,212 @@
+"""Page of the answer for a log without a reference: tracks, intervals, innovations, agreement and held-out fixes."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.report import writers
+from pfbench.results.plotting import FigureSpec, format_slug, stacked_axes
+
+if TYPE_CHECKING:
+    from pfbench.job import FilterAnswer, MotionEstimate, TrackEstimate
+
+_NORMAL = 1.96  # standard deviations of a 95 % interval
+_COLOURS = ("C0", "C1", "C2", "C3", "C4", "C5")
+
+
+class HeldOutDistance(NamedTuple):
+    """Distances to held-out fixes.
+
+    Attributes:
+        rms: Root mean square of the horizontal distances, m.
+        largest: Distance that 95 % do not exceed, m.
+        ratio: Mean square of the differences over their standard deviations; 1 if both are right.
+        fixes: Number of fixes.
+    """
+
+    rms: float
+    largest: float
+    ratio: float
+    fixes: int
+
+
+def measure_held_out(motion: MotionEstimate) -> HeldOutDistance:
+    """Measure the distances of a track to held-out fixes; lost passes are left out."""
+    valid = np.isfinite(motion.held_out).all(1)
+    error, sd = motion.held_out[valid], motion.held_out_sd[valid]
+    if not len(error):
+        return HeldOutDistance(np.nan, np.nan, np.nan, 0)
+    distance = np.linalg.norm(error[:, :2], axis=1)
+    ratio = float(np.square(error / sd).mean())
+    return HeldOutDistance(_rms(distance), float(np.quantile(distance, 0.95)), ratio, len(error))
+
+
+def describe_track(estimate: TrackEstimate) -> list[str]:
+    """Describe an answer in sentences: held-out fixes, innovations and agreement.
+
+    Args:
+        estimate: Answers of the filters.
+
+    Returns:
+        Lines for the console and the page.
+    """
+    lines = [f"{estimate.name}: {len(estimate.time)} steps from t = {estimate.time[0]:.1f} to {estimate.time[-1]:.1f} s; {estimate.rule}"]  # fmt: skip
+    for name, motion in estimate.tracks().items():
+        distances, half = measure_held_out(motion), _NORMAL * np.median(motion.sd[:, 6:9], axis=0)
+        lines.append(
+            f"{name}: {distances.rms:.2f} m RMS, 95 % within {distances.largest:.2f} m, horizontally from {distances.fixes} held-out fixes; "
+            f"mean square over the expected one {distances.ratio:.2f}; 95 % interval of the track in the median +-{half[0]:.2f}, "
+            f"{half[1]:.2f}, {half[2]:.2f} m East, North, Up"
+        )
+    line = _rms(np.linalg.norm(estimate.neighbours[:, :2], axis=1))
+    lines.append(f"for comparison, a line between the neighbouring fixes: {line:.2f} m RMS")
+    lines += [_describe_innovations(answer) for answer in estimate.answers]
+    first, *others = estimate.answers
+    for answer in others:
+        distance = _distances(first, answer)
+        lines.append(f"{first.name} and {answer.name}: {_rms(distance):.2f} m RMS apart, at most {distance.max():.2f} m")  # fmt: skip
+    return lines
+
+
+def _describe_innovations(answer: FilterAnswer) -> str:
+    """Describe the innovations of a filter."""
+    if not len(answer.nis):
+        return f"{answer.name}: the filter states no innovations"
+    mean, band = (
+        float(answer.nis.sum() / answer.dof.sum()),
+        _NORMAL * np.sqrt(2.0 / answer.dof.sum()),
+    )
+    where = "within" if abs(mean - 1.0) <= band else "above" if mean > 1.0 else "below"
+    cause = {
+        "within": "", "above": ": the noise that the tuning states is too small, or the log has a fault, see pfbench inspect",
+        "below": ": the noise that the tuning states is too large",
+    }[where]  # fmt: skip
+    return (
+        f"{answer.name}: mean NIS per component {mean:.2f}, {where} {1.0 - band:.2f} to {1.0 + band:.2f}, the 95 % band of "
+        f"independent innovations{cause}"
+    )
+
+
+def _distances(a: FilterAnswer, b: FilterAnswer) -> Any:
+    """Return the horizontal distances between the filtered tracks of two filters, m, [T]."""
+    return np.linalg.norm(a.filtered.state[:, 7:9] - b.filtered.state[:, 7:9], axis=1)
+
+
+def _rms(distance: Any) -> float:
+    return float(np.sqrt(np.mean(np.square(distance)))) if len(distance) else float("nan")
+
+
+def write_track_page(
+    estimate: TrackEstimate, out: str | Path, formats: tuple[str, ...] = ("svg", "png")
+) -> Path:
+    """Write `<out>/estimate_<name>/`: the page, a table of each track, and GPX and KML if the log contains its place.
+
+    Args:
+        estimate: Answers of the filters.
+        out: Folder of all reports.
+        formats: Formats of the pictures.
+
+    Returns:
+        Path of index.html.
+    """
+    with RecordedFolder(Path(out) / format_slug(f"estimate_{estimate.name}")) as folder:
+        for name, motion in estimate.tracks().items():
+            table = estimate.table(motion)
+            folder.write(f"{format_slug(name)}.csv", table.to_csv(index=False, float_format="%.9g"))
+        if estimate.centre is not None:
+            folder.write("track.gpx", estimate.to_gpx())
+            folder.write("track.kml", estimate.to_kml())
+        context = {
+            "name": estimate.name,
+            "lines": describe_track(estimate),
+            "notes": list(dict.fromkeys(estimate.notes)),
+            "figures": writers.write_figures(_list_figures(estimate), "track", folder, formats),
+            "files": [f"{format_slug(name)}.csv" for name in estimate.tracks()],
+            "has_place": estimate.centre is not None,
+        }
+        return writers.render_template("track_page", folder, context, Path(__file__).parent)
+
+
+def _list_figures(estimate: TrackEstimate) -> list[FigureSpec]:
+    """List the figures of the page."""
+    first = estimate.answers[0]
+    specs = [
+        ("map", "Tracks and fixes.", _draw_map),
+        ("intervals", f"Half-width of the 95 % intervals of {first.name}. They hold if the stated noise is right.", _draw_intervals),
+        ("held_out", "Horizontal distance to held-out fixes, each by a pass that did not get the fix.", _draw_held_out),
+    ]  # fmt: skip
+    if any(len(answer.nis) for answer in estimate.answers):
+        specs.append(("innovations", "Normalised innovations squared per component. 1 is expected in the mean.", _draw_innovations))  # fmt: skip
+    if len(estimate.answers) > 1:
+        specs.append(("agreement", f"Horizontal distance of each filter from {first.name}.", _draw_agreement))  # fmt: skip
+    return [FigureSpec(name, caption, partial(draw, estimate)) for name, caption, draw in specs]
+
+
+def _draw_map(estimate: TrackEstimate) -> Figure:
+    """Draw the tracks from above."""
+    figure, (axis,) = stacked_axes(1, 3.2)
+    axis.plot(estimate.fixes[:, 1], estimate.fixes[:, 2], ".", color="0.6", markersize=3, label="fixes")  # fmt: skip
+    for name, motion in estimate.tracks().items():
+        axis.plot(motion.state[:, 7], motion.state[:, 8], linewidth=0.9, label=name)
+    axis.set(xlabel="East [m]", ylabel="North [m]")
+    axis.set_aspect("equal", adjustable="datalim")
+    axis.legend(fontsize="x-small")
+    return figure
+
+
+def _draw_intervals(estimate: TrackEstimate) -> Figure:
+    """Draw the half-widths of the intervals of the first filter."""
+    figure, (axis,) = stacked_axes(1, 2.2)
+    first = estimate.answers[0]
+    kinds = [("", first.filtered, "-"), (" smoothed", first.smoothed, "--")]
+    for k, name in enumerate(("East", "North", "Up")):
+        for ending, motion, line in kinds:
+            if motion is not None:
+                axis.plot(estimate.time, _NORMAL * motion.sd[:, 6 + k], line, color=_COLOURS[k], linewidth=0.8, label=name + ending)  # fmt: skip
+    axis.set(xlabel="t [s]", ylabel="half-width [m]")
+    axis.set_ylim(bottom=0.0)
+    axis.legend(fontsize="x-small", ncols=3)
+    return figure
+
+
+def _draw_held_out(estimate: TrackEstimate) -> Figure:
+    """Draw the distances to held-out fixes over time."""
+    figure, (axis,) = stacked_axes(1, 2.2)
+    order = np.argsort(estimate.held_out_time)
+    for name, motion in estimate.tracks().items():
+        distance = np.linalg.norm(motion.held_out[:, :2], axis=1)
+        axis.plot(estimate.held_out_time[order], distance[order], ".", markersize=4, label=name)
+    axis.set(xlabel="t [s]", ylabel="distance [m]")
+    axis.set_ylim(bottom=0.0)
+    axis.legend(fontsize="x-small")
+    return figure
+
+
+def _draw_innovations(estimate: TrackEstimate) -> Figure:
+    """Draw the normalised innovations by number of the fix."""
+    figure, (axis,) = stacked_axes(1, 2.2)
+    for answer in estimate.answers:
+        if len(answer.nis):
+            axis.plot(answer.nis / answer.dof, ".", markersize=4, label=answer.name)
+    axis.axhline(1.0, color="0.5", linewidth=0.8)
+    axis.set(xlabel="measurement", ylabel="NIS per component")
+    axis.legend(fontsize="x-small")
+    return figure
+
+
+def _draw_agreement(estimate: TrackEstimate) -> Figure:
+    """Draw the distances of the other filters from the first one."""
+    figure, (axis,) = stacked_axes(1, 2.2)
+    first, *others = estimate.answers
+    for k, answer in enumerate(others, 1):
+        axis.plot(estimate.time, _distances(first, answer), color=_COLOURS[k % len(_COLOURS)], linewidth=0.8, label=answer.name)  # fmt: skip
+    axis.set(xlabel="t [s]", ylabel="distance [m]")
+    axis.set_ylim(bottom=0.0)
+    axis.legend(fontsize="x-small")
+    return figure
