@@ -19,6 +19,7 @@ from typing_extensions import override
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record, map_inputs
 from pfbench.filter.belief import (
+    ComputedWeights,
     Filter,
     GaussianBelief,
     KeptSteps,
@@ -27,6 +28,7 @@ from pfbench.filter.belief import (
     StepInfo,
     StepSummary,
     compute_once,
+    exponentiate,
 )
 from pfbench.filter.linearisation import compute_nis
 from pfbench.filter.loop import MultiStepFilter, RecordStartedFilter
@@ -59,7 +61,7 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     not change a number that a stage stores between steps.
 
     Attributes:
-        method: The filter. With moves, or a proposal that stores paths, it runs uncompiled.
+        method: The filter. It runs uncompiled if it states an obstacle.
         counter: Counter of likelihood evaluations, which compiled steps cannot increment.
         clock: Clock that measures the time of compilation, s.
         builds: Whether a step that is not stored is compiled.
@@ -182,10 +184,9 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> CompiledStep | None:
         """Return the compiled step of this kind; None if the step must run uncompiled."""
-        grows = self.method.history is not None or self.method.stores_path
-        if not isinstance(draws, PhiloxStream) or grows:
+        if not isinstance(draws, PhiloxStream) or self.method.obstacle:
             return None
-        belief = belief._replace(weights=None)  # a compiled step computes them
+        belief = belief._replace(weights=None)  # a compiled step carries them as a tensor
         key = id(model), belief.x.shape, len(tensors_in((belief, record)))
         if key not in self.graphs:
             if int(draws.step) == 1:
@@ -225,6 +226,8 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
 # operations that it consists of, and torch's compiler makes one function of them.
 
 _MAX_NUMBERS = 1 << 20  # results of steps taken together; they share the overhead of a call
+# tensors without memory that a step carries: particles, log weights, log evidence, weights
+_CARRIED = 4
 _UNKEPT = (
     8  # times as many steps where particles of few steps are kept: about 0.1 s without a signal
 )
@@ -242,7 +245,7 @@ class CompiledStep:
     """A compiled step for one kind of belief and record.
 
     Attributes:
-        run: (belief, step number, record, seed, runs) -> next belief, mean, variance, predicted log
+        run: (belief, step number, record, seed, runs) -> next belief with its weights, mean, variance, predicted log
             weights, trace. None for a step from the store.
         entry: C++ entry of the step, or None.
         memory: Names of the tensors in the belief's memory.
@@ -298,7 +301,7 @@ class CompiledStep:
     @cached_property
     def _joined(self) -> Tensor:
         """Numbers of the results without an axis of particles: mean (the first that is checked), variance, evidence and trace."""
-        carried = 3 + len(self.memory)
+        carried = _CARRIED + len(self.memory)
         trace = range(carried + 3, carried + 3 + len(self.trace))
         return torch.tensor([carried, carried + 1, 2, *trace])
 
@@ -306,7 +309,7 @@ class CompiledStep:
         self, state: list[Tensor], inputs: list[Tensor], shared: list[Tensor], kept: Sequence[int]
     ) -> TakenSteps:
         """Take steps by the function of torch's compiler, called from Python."""
-        carried, joined = 3 + len(self.memory), self._joined.tolist()
+        carried, joined = _CARRIED + len(self.memory), self._joined.tolist()
         results: list[Sequence[Tensor]] = []
         for step_inputs in zip(*(a.unbind() for a in inputs), strict=True):
             assert self.run is not None
@@ -333,12 +336,15 @@ class CompiledStep:
         steps = mean.shape[1]
         rows = [k for k in kept if k < steps]
         rows += [steps - 1] if steps and steps - 1 not in rows else []
-        width = 3 + len(self.memory)  # particles, log weights, memory, predicted log weights
+        width = _CARRIED + len(
+            self.memory
+        )  # all that is carried less the evidence, and predicted log weights
         results: dict[int, tuple[ParticleBelief, Tensor]] = {}
         for place, k in enumerate(rows):
-            x, log_w, *memory, expected = others[place * width : (place + 1) * width]
-            named = dict(zip(self.memory, memory, strict=True))
-            results[k] = ParticleBelief(x, log_w, log_evidence[:, k], memory=named), expected
+            x, log_w, w, *memory, expected = others[place * width : (place + 1) * width]
+            named, weights = dict(zip(self.memory, memory, strict=True)), ComputedWeights(log_w, w)
+            belief = ParticleBelief(x, log_w, log_evidence[:, k], memory=named, weights=weights)
+            results[k] = belief, expected
         last = results[rows[-1]][0] if rows else None
         kept_results = {k: value for k, value in results.items() if k in kept}
         named_trace = dict(zip(self.trace, trace, strict=True))
@@ -425,7 +431,9 @@ def compile_step(
         return None
     memory, trace = names
     carried_shapes = [a.shape for a in expected[: len(state)]]
-    keeps_shapes = len(memory) + 3 == len(state) and carried_shapes == [a.shape for a in state]
+    keeps_shapes = len(memory) + _CARRIED == len(state) and carried_shapes == [
+        a.shape for a in state
+    ]
     max_steps = _choose_max_steps(expected) if keeps_shapes else 1
     return CompiledStep(run, entry, memory, trace, evaluations, max_steps, model, is_stored)
 
@@ -488,16 +496,19 @@ def _make_tensor_function(
     def step(*flat: Tensor) -> list[Tensor]:
         number, *inputs, seed, runs = flat[carried_count:]
         remaining = map(from_storage, [*flat[:carried_count], *inputs])
-        x, log_w, log_z = (next(remaining) for _ in range(3))
+        x, log_w, log_z, w = (next(remaining) for _ in range(_CARRIED))
         memory = replace_tensors(belief.memory, remaining)
         step_record = replace_tensors(record, remaining)
-        before = belief._replace(x=x, log_w=log_w, log_evidence=log_z, memory=memory)
+        weights = ComputedWeights(log_w, w)
+        before = belief._replace(
+            x=x, log_w=log_w, log_evidence=log_z, memory=memory, weights=weights
+        )
         stream = PhiloxStream(seed, runs, draws.dtype, number)
         with torch.no_grad(), dispatch.capture_graph(record_step):
             after, summary = method.compute_step(model, before, step_record, stream)
         names[:] = [list(after.memory), list(summary.trace)]
-        carried = [after.x, after.log_w, after.log_evidence, *after.memory.values()]
-        return [to_storage(a) for a in (*carried, *summary[:3], *summary.trace.values())]
+        carried = _belief_to_storage(after)
+        return [*carried, *map(to_storage, (*summary[:3], *summary.trace.values()))]
 
     return step
 
@@ -554,7 +565,8 @@ def replace_tensors(tree: Any, tensors: Iterator[Tensor]) -> Any:
 
 def _belief_to_storage(belief: ParticleBelief) -> list[Tensor]:
     """Return the tensors that a step carries, in storage layout."""
-    carried = tensors_in((belief.x, belief.log_w, belief.log_evidence, belief.memory))
+    w = exponentiate(belief.log_w, belief.weights)
+    carried = tensors_in((belief.x, belief.log_w, belief.log_evidence, w, belief.memory))
     return [to_storage(a) for a in carried]
 
 
