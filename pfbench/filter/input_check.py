@@ -85,7 +85,7 @@ class _CheckedState(NamedTuple):
     Attributes:
         identities: Name and identity of each attribute of the model, and identity of each tensor of
             model and record with the number of its changes.
-        tensors: The tensors, of which none may have ended: another would then have its identity.
+        tensors: The tensors. After the end of one, another may have its identity.
     """
 
     identities: list[tuple[str | int, int]]
@@ -94,12 +94,14 @@ class _CheckedState(NamedTuple):
     @staticmethod
     def of(model: StateSpaceModel, record: Record) -> _CheckedState:
         """Describe the present state, without a look at numbers."""
-        parts = list(model.modules())
+        modules = list(model.modules())
         identities: list[tuple[str | int, int]] = [
-            (name, id(value)) for part in parts for name, value in vars(part).items()
+            (name, id(value)) for module in modules for name, value in vars(module).items()
         ]
         tensors = [
-            a for part in parts for a in (*part._buffers.values(), *part._parameters.values())
+            a
+            for module in modules
+            for a in (*module._buffers.values(), *module._parameters.values())
         ]
         tensors += [record.y, record.start, record.spread]
         tensors += [value for _, value in _named_inputs(record.u)]

@@ -77,7 +77,7 @@ class MultiStepFilter(Protocol):
         t: int,
         draws: RandomStream,
         limit: int,
-        kept: KeptSteps,
+        selection: KeptSteps,
     ) -> tuple[StepBlock, Any, int]:
         """Take at least one and at most `limit` steps from step `t` on.
 
@@ -89,7 +89,7 @@ class MultiStepFilter(Protocol):
             draws: Random stream of the record.
             limit: Maximum number of steps, as the call before it returned it. 0 for one step that
                 cannot be taken together with others.
-            kept: Steps whose belief and information are read.
+            selection: Steps whose belief and information are read.
 
         Returns:
             The steps, the belief after them, and the limit of the next call.
@@ -162,7 +162,7 @@ class FilterPass:
                 self.belief, info = self.method.step(model, self.belief, record, draws)
             yield PassStep(t, model, record, info, draws)
 
-    def iterate_blocks(self, kept: KeptSteps) -> Iterator[StepBlock]:
+    def iterate_blocks(self, selection: KeptSteps) -> Iterator[StepBlock]:
         """Take the steps, several in one call where the filter can do so.
 
         The caller must not change belief or model.
@@ -175,7 +175,7 @@ class FilterPass:
         limit = steps
         while t < steps:
             block, self.belief, limit = self.method.take_steps(
-                self.model, self.belief, self.record, t, self.draws, limit, kept
+                self.model, self.belief, self.record, t, self.draws, limit, selection
             )
             t += block.mean.shape[1]
             yield block
@@ -244,9 +244,9 @@ def run_filter(
     batches = _split_runs(prepared, draws, None if feedback is not None else run_batch)
     monitor = HealthMonitor(prepared, fits_tails=has_bounded_weights(method) is False)
     passes = [FilterPass(method, model, *batch, feedback) for batch in batches]
-    kept = KeptSteps(monitor.visited, all_steps=watch is not None)
+    selection = KeptSteps(monitor.visited, all_steps=watch is not None)
     blocks: list[StepBlock] = []
-    for block in _join_passes([run.iterate_blocks(kept) for run in passes], monitor.steps):
+    for block in _join_passes([run.iterate_blocks(selection) for run in passes], monitor.steps):
         blocks.append(_watch_block(block, watch, on_step))
         monitor.check(model, prepared, block.beliefs, block.infos)
     mean, variance, log_evidence = (

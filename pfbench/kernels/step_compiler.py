@@ -243,17 +243,17 @@ def run_steps(
     inputs: list[Tensor],
     shared: list[Tensor],
     joined: Tensor,
-    kept: Tensor,
+    kept_steps: Tensor,
 ) -> list[Tensor]:
     """Run a compiled step T times, or until output joined[0] of a step is not finite: S times.
 
     Returns the outputs with the numbers `joined` of all steps, [S, ...] each. The other outputs of the
-    steps `kept` (ascending) and of the last one follow, as views [R, N, ...] of [..., R, N]. Shapes:
-    inputs [T, ...], joined int64 [J], kept int64 [K].
+    steps `kept_steps` (ascending) and of the last one follow, as views [R, N, ...] of [..., R, N]. Shapes:
+    inputs [T, ...], joined int64 [J], kept_steps int64 [K].
     """
     load_library()
     results: list[Tensor] = torch.ops.pfbench.run_steps.default(
-        step, constants, state, inputs, shared, joined, kept
+        step, constants, state, inputs, shared, joined, kept_steps
     )
     return results
 

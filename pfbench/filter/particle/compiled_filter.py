@@ -128,10 +128,10 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         t: int,
         draws: RandomStream,
         limit: int,
-        kept: KeptSteps,
+        selection: KeptSteps,
     ) -> tuple[StepBlock, ParticleBelief, int]:
         stream = draws.at_step(t + 1)
-        return self._take_steps(model.at_step(t), belief, record, t, stream, limit, kept)
+        return self._take_steps(model.at_step(t), belief, record, t, stream, limit, selection)
 
     def _take_steps(
         self,
@@ -141,44 +141,49 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         t: int,
         draws: RandomStream,
         limit: int,
-        kept: KeptSteps,
+        selection: KeptSteps,
     ) -> tuple[StepBlock, ParticleBelief, int]:
         """Take steps of a record from `t` on. `model` and `draws` belong to the first of them."""
         step_record = record.at_step(t)
         graph = self._graph(model, belief, step_record, draws)
         if graph is not None and isinstance(draws, PhiloxStream) and limit:
-            steps = min(limit, graph.choose_steps(kept), record.y.shape[1] - t)
-            rows = kept.select_rows(t, steps)
+            steps = min(limit, graph.choose_steps(selection), record.y.shape[1] - t)
+            rows = selection.select_rows(t, steps)
             block_record = record.select_steps(slice(t, t + steps))
-            taken = graph.run_steps(belief, block_record, draws, rows)
-            count = taken.mean.shape[1]
+            outcome = graph.run_steps(belief, block_record, draws, rows)
+            count = outcome.mean.shape[1]
             if self.counter:
                 self.counter.count += count * graph.evaluations
             if count:
-                block = self._make_block(model, block_record, t, taken, kept)
-                return block, taken.last, 2 * steps if count == steps else 0
+                block = self._make_block(model, block_record, t, outcome, selection)
+                return block, outcome.last, 2 * steps if count == steps else 0
         belief, info = self.method.step(model, belief, step_record, draws)
         return StepBlock.of_step(t, belief, info), belief, 1 if graph is not None else limit
 
     def _make_block(
-        self, model: StateSpaceModel, record: Record, first: int, taken: TakenSteps, kept: KeptSteps
+        self,
+        model: StateSpaceModel,
+        record: Record,
+        first: int,
+        outcome: TakenSteps,
+        selection: KeptSteps,
     ) -> StepBlock:
         """Return the block of steps that were taken together, from number `first` on."""
         infos = {
             first + k: self.method.make_info(
-                model, belief, taken.summarise(k), partial(record.at_step, k)
+                model, belief, outcome.summarise(k), partial(record.at_step, k)
             )
-            for k, (belief, _) in taken.kept.items()
+            for k, (belief, _) in outcome.selection.items()
         }
-        checked = [k for k in taken.kept if first + k in kept.checked]
-        x = taken.last.x
+        checked = [k for k in outcome.selection if first + k in selection.checked]
+        x = outcome.last.x
         if len(x) == 1 and len(checked) * x.numel() <= _MAX_NUMBERS:  # as `may_join_steps`
-            pairs = _compute_nis_together(model, record, {k: taken.kept[k] for k in checked})
+            pairs = _compute_nis_together(model, record, {k: outcome.selection[k] for k in checked})
             for k, nis in zip(checked, pairs, strict=True):
                 infos[first + k] = infos[first + k]._replace(nis=nis)
-        beliefs = {first + k: (belief,) for k, (belief, _) in taken.kept.items()}
-        moments = taken.mean, taken.variance, taken.log_evidence
-        return StepBlock(first, *moments, taken.trace, beliefs, infos)
+        beliefs = {first + k: (belief,) for k, (belief, _) in outcome.selection.items()}
+        moments = outcome.mean, outcome.variance, outcome.log_evidence
+        return StepBlock(first, *moments, outcome.trace, beliefs, infos)
 
     def _graph(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
@@ -265,17 +270,17 @@ class CompiledStep:
     model: StateSpaceModel
     is_stored: bool = False
 
-    def choose_steps(self, kept: KeptSteps) -> int:
+    def choose_steps(self, selection: KeptSteps) -> int:
         """Return how many steps may be taken together: fewer where all of them are kept, and where the device is a GPU."""
-        grows = kept.all_steps or self.entry is None
+        grows = selection.all_steps or self.entry is None
         return self.max_steps if grows or self.max_steps == 1 else _UNKEPT * self.max_steps
 
     def run_steps(
-        self, belief: ParticleBelief, record: Record, draws: PhiloxStream, kept: Sequence[int]
+        self, belief: ParticleBelief, record: Record, draws: PhiloxStream, selection: Sequence[int]
     ) -> TakenSteps:
         """Take all steps of a record in one call, as far as the first one with a NaN particle.
 
-        Shapes: record [R, T, Dy]. `kept` are the indices of the steps whose particles are returned.
+        Shapes: record [R, T, Dy]. `selection` has the indices of the steps whose particles are returned.
         """
         first, steps = int(draws.step), record.y.shape[1]
         state = _belief_to_storage(belief)
@@ -284,7 +289,7 @@ class CompiledStep:
         shared = [to_storage(a) for a in tensors_in((record.start, record.spread))]
         shared += [torch.as_tensor(draws.seed), draws.runs]
         if self.entry is not None:
-            kept_steps = torch.tensor(kept, dtype=torch.int64)
+            kept_steps = torch.tensor(selection, dtype=torch.int64)
             flat = step_compiler.run_steps(
                 self.entry.step,
                 self.entry.constants,
@@ -295,8 +300,8 @@ class CompiledStep:
                 kept_steps,
             )
             count = len(self._joined)
-            return self._unpack(flat[:count], flat[count:], kept)
-        return self._run_from_python(state, inputs, shared, kept)
+            return self._unpack(flat[:count], flat[count:], selection)
+        return self._run_from_python(state, inputs, shared, selection)
 
     @cached_property
     def _joined(self) -> Tensor:
@@ -306,7 +311,11 @@ class CompiledStep:
         return torch.tensor([carried, carried + 1, 2, *trace])
 
     def _run_from_python(
-        self, state: list[Tensor], inputs: list[Tensor], shared: list[Tensor], kept: Sequence[int]
+        self,
+        state: list[Tensor],
+        inputs: list[Tensor],
+        shared: list[Tensor],
+        selection: Sequence[int],
     ) -> TakenSteps:
         """Take steps by the function of torch's compiler, called from Python."""
         carried, joined = _CARRIED + len(self.memory), self._joined.tolist()
@@ -322,31 +331,36 @@ class CompiledStep:
             else results[0][k].unsqueeze(0)[:0]
             for k in joined
         ]
-        wanted = sorted({k for k in kept if k < valid} | ({valid - 1} if valid else set()))
+        returned = sorted({k for k in selection if k < valid} | ({valid - 1} if valid else set()))
         others = [
-            from_storage(a) for t in wanted for k, a in enumerate(results[t]) if k not in joined
+            from_storage(a) for t in returned for k, a in enumerate(results[t]) if k not in joined
         ]
-        return self._unpack(blocks, others, kept)
+        return self._unpack(blocks, others, selection)
 
     def _unpack(
-        self, joined: Sequence[Tensor], others: Sequence[Tensor], kept: Sequence[int]
+        self, joined: Sequence[Tensor], others: Sequence[Tensor], selection: Sequence[int]
     ) -> TakenSteps:
         """Return the results of steps from their tensors: joined ones [S, ...], others of the kept steps and of the last one."""
         mean, variance, log_evidence, *trace = map(steps_from_storage, joined)
         steps = mean.shape[1]
-        rows = [k for k in kept if k < steps]
+        rows = [k for k in selection if k < steps]
         rows += [steps - 1] if steps and steps - 1 not in rows else []
         width = _CARRIED + len(
             self.memory
         )  # all that is carried less the evidence, and predicted log weights
         results: dict[int, tuple[ParticleBelief, Tensor]] = {}
-        for place, k in enumerate(rows):
-            x, log_w, w, *memory, expected = others[place * width : (place + 1) * width]
-            named, weights = dict(zip(self.memory, memory, strict=True)), ComputedWeights(log_w, w)
-            belief = ParticleBelief(x, log_w, log_evidence[:, k], memory=named, weights=weights)
+        for index, k in enumerate(rows):
+            x, log_w, w, *memory, expected = others[index * width : (index + 1) * width]
+            named_memory, weights = (
+                dict(zip(self.memory, memory, strict=True)),
+                ComputedWeights(log_w, w),
+            )
+            belief = ParticleBelief(
+                x, log_w, log_evidence[:, k], memory=named_memory, weights=weights
+            )
             results[k] = belief, expected
         last = results[rows[-1]][0] if rows else None
-        kept_results = {k: value for k, value in results.items() if k in kept}
+        kept_results = {k: value for k, value in results.items() if k in selection}
         named_trace = dict(zip(self.trace, trace, strict=True))
         return TakenSteps(mean, variance, log_evidence, named_trace, kept_results, last)
 
@@ -359,7 +373,7 @@ class TakenSteps(NamedTuple):
         variance: [R, S, d].
         log_evidence: [R, S].
         trace: {name: [R, S]}.
-        kept: Belief and predicted log weights [R, N] after the kept steps, by index.
+        selection: Belief and predicted log weights [R, N] after the kept steps, by index.
         last: Belief after the last step; None if there is none.
     """
 
@@ -367,13 +381,13 @@ class TakenSteps(NamedTuple):
     variance: Tensor
     log_evidence: Tensor
     trace: dict[str, Tensor]
-    kept: dict[int, tuple[ParticleBelief, Tensor]]
+    selection: dict[int, tuple[ParticleBelief, Tensor]]
     last: Any
 
     def summarise(self, k: int) -> StepSummary:
         """Return the summary of a kept step."""
         trace = {name: a[:, k] for name, a in self.trace.items()}
-        return StepSummary(self.mean[:, k], self.variance[:, k], self.kept[k][1], trace)
+        return StepSummary(self.mean[:, k], self.variance[:, k], self.selection[k][1], trace)
 
 
 def _compute_nis_together(
@@ -387,11 +401,11 @@ def _compute_nis_together(
         log_w = torch.cat([expected for _, expected in steps.values()])
         return compute_nis(model, x.permute(1, 2, 0), log_w, record.steps_as_runs(list(steps)))
 
-    def select(place: int) -> tuple[Tensor, Tensor]:
+    def select(index: int) -> tuple[Tensor, Tensor]:
         nis, observed = compute()
-        return nis[place : place + 1], observed[place : place + 1]
+        return nis[index : index + 1], observed[index : index + 1]
 
-    return [partial(select, place) for place in range(len(steps))]
+    return [partial(select, index) for index in range(len(steps))]
 
 
 def compile_step(
