@@ -248,7 +248,8 @@ def run_filter(
     blocks: list[StepBlock] = []
     for block in _join_passes([run.iterate_blocks(selection) for run in passes], monitor.steps):
         blocks.append(_watch_block(block, watch, on_step))
-        monitor.check(model, prepared, block.beliefs, block.infos)
+        if not monitor.visited.isdisjoint(block.infos):
+            monitor.check(model, prepared, block.beliefs, block.infos)
     mean, variance, log_evidence = (
         torch.cat(parts, 1) for parts in zip(*(block[1:4] for block in blocks), strict=True)
     )
