@@ -119,7 +119,8 @@ def of(method: Any, particles: int, work: Any, dtype: torch.dtype, engine: str) 
         else method
     )
     runs = torch.arange(len(work.y))
-    block = choose_run_batch(len(runs), particles, model.chart.size)
+    compiled_type = dtype if isinstance(method, CompiledParticleFilter) else None
+    block = choose_run_batch(len(runs), particles, model.chart.size, compiled_type)
 
     def run(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
         with dispatch.use_compiled(engine != "eager"), torch.no_grad():

@@ -63,6 +63,10 @@ class Record(NamedTuple):
         """Return the record of some time steps, with the axis of time."""
         return self._replace(y=self.y[:, steps], u=map_inputs(lambda a: a[:, steps], self.u))
 
+    def steps_as_runs(self, steps: list[int]) -> Record:
+        """Return steps of the only run as if they were runs: y [S, Dy], inputs [S, ...]."""
+        return Record(self.y[0, steps], map_inputs(lambda a: a[0, steps], self.u))
+
     def select_runs(self, runs: slice) -> Record:
         """Return the record of some runs."""
 

@@ -95,6 +95,65 @@ class StepInfo(NamedTuple):
         return self.covariance()[:, groups.unsqueeze(-1), groups.unsqueeze(-2)]
 
 
+class KeptSteps(NamedTuple):
+    """Steps whose belief and information are read when several steps were taken together.
+
+    Attributes:
+        checked: Step numbers from 0. Their NIS is read, so it is computed together.
+        all_steps: Whether those of all other steps are read, too.
+    """
+
+    checked: frozenset[int] = frozenset()
+    all_steps: bool = True
+
+    def select_rows(self, first: int, steps: int) -> list[int]:
+        """Return the kept ones of some steps from `first` on, as indices from 0."""
+        return [k for k in range(steps) if self.all_steps or first + k in self.checked]
+
+
+class StepBlock(NamedTuple):
+    """Consecutive steps of a filter.
+
+    Attributes:
+        first: Number of the first step, from 0.
+        mean: [R, S, D].
+        variance: [R, S, d].
+        log_evidence: Log evidence so far, [R, S].
+        trace: Numbers per run and step, {name: [R, S]}.
+        beliefs: Belief of each batch of runs after the kept steps, by step number.
+        infos: Information of the kept steps.
+    """
+
+    first: int
+    mean: Tensor
+    variance: Tensor
+    log_evidence: Tensor
+    trace: dict[str, Tensor]
+    beliefs: dict[int, tuple[Any, ...]]
+    infos: dict[int, StepInfo]
+
+    @staticmethod
+    def of_step(t: int, belief: Any, info: StepInfo) -> StepBlock:
+        """Return the block of a single step."""
+        trace = {name: a.unsqueeze(1) for name, a in info.trace.items()}
+        moments = info.mean.unsqueeze(1), info.variance.unsqueeze(1)
+        log_evidence = belief.log_evidence.unsqueeze(1)
+        return StepBlock(t, *moments, log_evidence, trace, {t: (belief,)}, {t: info})
+
+    @property
+    def steps(self) -> range:
+        """Numbers of the steps."""
+        return range(self.first, self.first + self.mean.shape[1])
+
+    def select(self, rows: slice) -> StepBlock:
+        """Return some of the steps, as indices from 0."""
+        steps, (mean, variance, log_evidence) = self.steps[rows], (a[:, rows] for a in self[1:4])
+        trace = {name: a[:, rows] for name, a in self.trace.items()}
+        beliefs = {t: belief for t, belief in self.beliefs.items() if t in steps}
+        infos = {t: info for t, info in self.infos.items() if t in steps}
+        return StepBlock(steps.start, mean, variance, log_evidence, trace, beliefs, infos)
+
+
 @runtime_checkable
 class Filter(Protocol):
     """Stateless filter: computes the next belief from a belief and a record."""

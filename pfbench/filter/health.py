@@ -30,7 +30,7 @@ truth exists, `pfbench.results.status` decides by the error instead.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -39,7 +39,7 @@ from scipy.special import chdtri
 from torch import Tensor
 
 from pfbench.core.density import has_finite_moments
-from pfbench.core.record import Record, map_inputs
+from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, StepInfo, compute_once, join_runs
 from pfbench.filter.linearisation import compute_nis
 from pfbench.model.base import ModelWrapper, StateSpaceModel, initial_law
@@ -113,36 +113,44 @@ class HealthMonitor:
 
     def check(
         self,
-        t: int,
         model: StateSpaceModel,
         record: Record,
-        info: StepInfo,
-        beliefs: Sequence[Any] = (),
+        beliefs: Mapping[int, Sequence[Any]],
+        infos: Mapping[int, StepInfo],
     ) -> None:
-        """Check a step, if it is one of `steps`."""
-        if t in self.steps:
-            if beliefs and isinstance(beliefs[0], ParticleBelief):
-                self._check_particles(model.at_step(t), record.at_step(t), beliefs)
-            self._has_particles, self._has_covariance = info.cloud is not None, info.has_covariance
-            with uncounted_observation(model):
+        """Check the steps that are among `visited`, from the belief of each batch and the information by step."""
+        steps = [t for t in infos if t in self.steps]
+        if steps and beliefs and isinstance(beliefs[steps[0]][0], ParticleBelief):
+            self._check_particles(model, record, [beliefs[t] for t in steps], steps)
+        with uncounted_observation(model):
+            for t in steps:
+                info = infos[t]
+                self._has_particles = info.cloud is not None
+                self._has_covariance = info.has_covariance
                 nis = info.nis()[0] if info.nis is not None else None
-            self._nis[t] = torch.full_like(info.mean[:, 0], torch.nan) if nis is None else nis
-        is_judged = info.cloud is None and info.has_covariance and info.mean.dtype != torch.float64
-        if is_judged and t in self.visited:
-            self._collapsed |= is_ill_conditioned(info.covariance())
+                self._nis[t] = torch.full_like(info.mean[:, 0], torch.nan) if nis is None else nis
+        for info in (info for t, info in infos.items() if t in self.visited):
+            if info.cloud is None and info.has_covariance and info.mean.dtype != torch.float64:
+                self._collapsed |= is_ill_conditioned(info.covariance())
 
     def _check_particles(
-        self, model: StateSpaceModel, record: Record, beliefs: Sequence[ParticleBelief]
+        self,
+        model: StateSpaceModel,
+        record: Record,
+        beliefs: Sequence[Sequence[ParticleBelief]],
+        steps: list[int],
     ) -> None:
-        """Try the likelihood of some particles, and fit the tail of their weights."""
-        spacing = max(1, beliefs[0].x.shape[1] // _TRIED)
-        x = join_runs([belief.x[:, ::spacing] for belief in beliefs])
-        with uncounted_observation(model):
-            log_likelihood = model.log_likelihood(record.y, x, record.u)
-        is_undefined = torch.isnan(log_likelihood) & torch.isfinite(x).all(-1)
-        self._undefined |= is_undefined.any(1)
+        """Try the likelihood of some particles after each step, and fit the tail of their weights."""
+        spacing = max(1, beliefs[0][0].x.shape[1] // _TRIED)
+        x = [join_runs([belief.x[:, ::spacing] for belief in batches]) for batches in beliefs]
+        if may_join_steps(model, len(record.y), steps):
+            self._undefined |= _is_undefined(model, torch.cat(x), record.steps_as_runs(steps)).any()
+        else:
+            for t, some in zip(steps, x, strict=True):
+                self._undefined |= _is_undefined(model.at_step(t), some, record.at_step(t))
         if self._fits_tails:
-            self._tails.append(fit_pareto_k(join_runs([belief.log_w for belief in beliefs])))
+            log_w = [join_runs([belief.log_w for belief in batches]) for batches in beliefs]
+            self._tails += fit_pareto_k(torch.cat(log_w)).chunk(len(steps))
 
     def check_evidence(self, log_evidence: Tensor) -> Tensor:
         """Mark the runs that a measurement is far from in some step.
@@ -244,6 +252,13 @@ class HealthMonitor:
         return HealthCheck(nis, misfit, observed, has_spread, is_finite, coarse)
 
 
+def _is_undefined(model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
+    """Return the runs [R] with a finite state in x [R, N, D] whose log likelihood is NaN."""
+    with uncounted_observation(model):
+        log_likelihood = model.log_likelihood(record.y, x, record.u)
+    return (torch.isnan(log_likelihood) & torch.isfinite(x).all(-1)).any(1)
+
+
 def with_cached_nis(info: StepInfo) -> StepInfo:
     """Return an info whose NIS is computed once, for the health and for scores."""
     return info if info.nis is None else info._replace(nis=compute_once(info.nis))
@@ -310,6 +325,14 @@ def compute_misfit(model: StateSpaceModel, record: Record, mean: Tensor) -> tupl
         return compute_nis(model, mean.unsqueeze(1), torch.zeros_like(mean[:, :1]), record)
 
 
+def may_join_steps(model: StateSpaceModel, runs: int, steps: Sequence[int]) -> bool:
+    """Return whether steps of a single run may be evaluated as runs: ten calls take a third of a small filter's time.
+
+    A model may have parameters of each run, so that several runs are evaluated step by step.
+    """
+    return runs == 1 and all(model.at_step(t) is model for t in steps)
+
+
 def compute_misfits(
     model: StateSpaceModel, record: Record, mean: Tensor, steps: list[int]
 ) -> tuple[Tensor, Tensor]:
@@ -317,10 +340,8 @@ def compute_misfits(
 
     Returns NIS and the number of observed components, [C, R] each. Shapes: mean [R, T, D].
     """
-    if len(mean) == 1 and all(model.at_step(t) is model for t in steps):
-        # the steps of a single run as runs: ten calls would take a third of a small filter's time
-        u = map_inputs(lambda a: a[0, steps], record.u)
-        misfit, observed = compute_misfit(model, Record(record.y[0, steps], u), mean[0, steps])
+    if may_join_steps(model, len(mean), steps):
+        misfit, observed = compute_misfit(model, record.steps_as_runs(steps), mean[0, steps])
         return misfit.unsqueeze(1), observed.unsqueeze(1)
     results = [compute_misfit(model.at_step(t), record.at_step(t), mean[:, t]) for t in steps]
     misfits, observed_counts = zip(*results, strict=True)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+import weakref
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -75,6 +77,60 @@ def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) ->
     _check_initial("start", record.start, (runs, model.chart.size))
     size = len(model.names)
     _check_initial("spread", record.spread, (runs, size, size))
+
+
+class _CheckedState(NamedTuple):
+    """State in which a model was checked with a record.
+
+    Attributes:
+        identities: Name and identity of each attribute of the model, and identity of each tensor of
+            model and record with the number of its changes.
+        tensors: The tensors. After the end of one, another may have its identity.
+    """
+
+    identities: list[tuple[str | int, int]]
+    tensors: list[weakref.ref[Tensor]]
+
+    @staticmethod
+    def of(model: StateSpaceModel, record: Record) -> _CheckedState:
+        """Describe the present state, without a look at numbers."""
+        modules = list(model.modules())
+        identities: list[tuple[str | int, int]] = [
+            (name, id(value)) for module in modules for name, value in vars(module).items()
+        ]
+        tensors = [
+            a
+            for module in modules
+            for a in (*module._buffers.values(), *module._parameters.values())
+        ]
+        tensors += [record.y, record.start, record.spread]
+        tensors += [value for _, value in _named_inputs(record.u)]
+        present = [a for a in tensors if a is not None]
+        identities += [(id(a), a._version) for a in present]
+        return _CheckedState(identities, list(map(weakref.ref, present)))
+
+
+_checked: WeakKeyDictionary[StateSpaceModel, _CheckedState] = WeakKeyDictionary()
+
+
+def check_model_once(model: StateSpaceModel, record: Record, prepared: Record) -> None:
+    """Check a model with a record, unless that was done before and neither has changed since.
+
+    Shapes: record [R, T, Dy], and the same prepared by the model.
+    """
+    if any(a.is_inference() for a in (record.y, model.anchor)):  # their changes are not counted
+        check_model(model, prepared)
+        return
+    state, before = _CheckedState.of(model, record), _checked.get(model)
+    if (
+        before
+        and before.identities == state.identities
+        and all(ref() is not None for ref in before.tensors)
+    ):
+        return
+    _checked.pop(model, None)
+    check_model(model, prepared)
+    _checked[model] = state
 
 
 def check_model(model: StateSpaceModel, record: Record) -> None:

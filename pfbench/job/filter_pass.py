@@ -151,7 +151,7 @@ def _filter_episode(
     """Run a filter over an episode, with a progress bar."""
     device, trim = plan.values["device"], MemoryTrimmer()
     draws = PhiloxStream(plan.values["seed"], runs.to(device), plan.dtype)
-    batch = plan.choose_run_batch(plan.method, len(runs))
+    batch = plan.choose_run_batch(plan.method, len(runs), is_compiled=method is not plan.method)
 
     def tick() -> None:
         bar.update()
@@ -195,7 +195,7 @@ def choose_engine(
     if engine != "auto":
         return "compiled" if engine == "compiled" else "kernels"
     saved = 0.0
-    if isinstance(method, ParticleFilter) and method.history is None:
+    if isinstance(method, ParticleFilter) and not method.obstacle:
         saved = steps * (_SAVED_PER_STEP + _SAVED_PER_PARTICLE * runs * method.particles)
     if saved < 2.0 * _COMPILATION:
         _say_once("engine=auto: C++ operators")
@@ -231,14 +231,13 @@ def _compile_step(
 
     A job with `kernels` that may load stored steps compiles none.
     """
-    is_step = isinstance(method, ParticleFilter) and method.history is None
+    is_step = isinstance(method, ParticleFilter) and not method.obstacle
     takes_stored = engine == "kernels" and may_load and is_step and step_store.has_steps()
     if engine != "compiled" and not takes_stored:
         return None
     if not is_step:
-        reason = f"it is a {type(method).__name__}"
-        if isinstance(method, ParticleFilter):
-            reason = "its moves use past states"
+        is_other = not isinstance(method, ParticleFilter)
+        reason = f"it is a {type(method).__name__}" if is_other else method.obstacle
         log.info("engine=compiled: only inner loops are compiled, not the step (%s)", reason)
         return None
     from pfbench.filter.particle.compiled_filter import CompiledParticleFilter

@@ -108,16 +108,18 @@ class JobPlan:
             model = self.recording_regime.to_oracle_model(model, episode.time)
         return model.to(self.values["device"], self.dtype)
 
-    def choose_run_batch(self, method: Any, runs: int) -> int:
+    def choose_run_batch(self, method: Any, runs: int, is_compiled: bool = False) -> int:
         """Choose how many runs are stepped together. On a GPU all runs are.
 
         Args:
             method: Filter.
             runs: Number of runs.
+            is_compiled: Whether its step may be compiled as a whole.
         """
         if self.values["device"] != "cpu" or not isinstance(method, ParticleFilter):
             return runs
-        return choose_run_batch(runs, method.particles, self.model.chart.size)
+        compiled_type = self.dtype if is_compiled else None
+        return choose_run_batch(runs, method.particles, self.model.chart.size, compiled_type)
 
     def choose_timer(self) -> Callable[[], float]:
         """Choose processor time for one CPU thread, which other programs do not affect.

@@ -191,9 +191,7 @@ def _find_entry(artefacts: list[Any], run: Any, example: list[Tensor]) -> Native
             raise TypeError("its arguments must be in the order of the example")
         library = inspect.getclosurevars(call).nonlocals["f"].__self__.__file__
         entry = _register_entry(library, constants, example, len(expected))
-        batched = [a.unsqueeze(0) for a in example]
-        results = run_steps(entry.step, constants, [], batched, [])
-        pairs = zip(results, expected, strict=True)
+        pairs = zip(run_once(entry, example), expected, strict=True)
         if not all(
             torch.allclose(a.double(), from_storage(b).double(), equal_nan=True) for a, b in pairs
         ):
@@ -222,6 +220,13 @@ def steps_to_storage(a: Tensor) -> Tensor:
     return a.permute(1, *range(3, a.dim()), 0, *range(2, min(a.dim(), 3))).contiguous()
 
 
+def steps_from_storage(a: Tensor) -> Tensor:
+    """Return results of steps [T, ..., R, N] as a view [R, T, N, ...]; [T, R] as [R, T]."""
+    if a.dim() < 4:
+        return a.transpose(0, 1)
+    return a.permute(a.dim() - 2, 0, a.dim() - 1, *range(1, a.dim() - 2))
+
+
 # --------------------------------------------------------------------------------------------------
 # Table of compiled steps: C++ code holds the addresses, and Python the numbers of the steps.
 #
@@ -237,17 +242,26 @@ def run_steps(
     state: list[Tensor],
     inputs: list[Tensor],
     shared: list[Tensor],
+    joined: Tensor,
+    kept_steps: Tensor,
 ) -> list[Tensor]:
-    """Run a compiled step T times.
+    """Run a compiled step T times, or until output joined[0] of a step is not finite: S times.
 
-    Returns the outputs of each step, in order, as views [R, N, ...] of [..., R, N]. Shapes: inputs
-    [T, ...].
+    Returns the outputs with the numbers `joined` of all steps, [S, ...] each. The other outputs of the
+    steps `kept_steps` (ascending) and of the last one follow, as views [R, N, ...] of [..., R, N]. Shapes:
+    inputs [T, ...], joined int64 [J], kept_steps int64 [K].
     """
     load_library()
     results: list[Tensor] = torch.ops.pfbench.run_steps.default(
-        step, constants, state, inputs, shared
+        step, constants, state, inputs, shared, joined, kept_steps
     )
     return results
+
+
+def run_once(entry: NativeEntry, arguments: list[Tensor]) -> list[Tensor]:
+    """Run a compiled step once. Returns its outputs, as views [R, N, ...] of [..., R, N]."""
+    rows, none = [a.unsqueeze(0) for a in arguments], torch.zeros(0, dtype=torch.int64)
+    return run_steps(entry.step, entry.constants, [], rows, [], none, none)
 
 
 def register_step(library: Tensor, outputs: int, arguments: list[Tensor]) -> int:

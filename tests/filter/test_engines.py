@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,13 +14,14 @@ from config_cases import composed, truncated, world
 from filter_cases import NAMES, ON_ANY_MODEL, TEXTS, method_of, refusal
 from model_cases import tracker
 from torch import Tensor
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import StepInfo
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle import compiled_filter
+from pfbench.filter.particle import compiled_filter, step_store
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.proposed.swarm import SwarmProposal
@@ -27,6 +30,7 @@ from pfbench.kernels import dispatch
 pytestmark = pytest.mark.filterwarnings("ignore:ParticleGuideProposal")  # it says that it is dear
 
 RUNS, STEPS = 3, 4
+PAGE = (Path(__file__).parents[2] / "docs" / "scaling.md").read_text()
 Y = torch.tensor(
     [
         [[0.8, -1.0], [1.9, 0.4], [1.1, 0.3], [0.2, 0.7]],
@@ -120,6 +124,44 @@ def test_a_recorded_step_computes_what_the_step_as_it_is_computes(
         with dispatch.capture_graph():
             recorded = run_filter(method, model, record, draws)
     assert_results_agree(recorded, expected)
+
+
+@pytest.mark.slow
+@compiler
+@pytest.mark.parametrize("name", TEXTS)
+def test_a_filter_is_recorded_or_the_page_says_why_not(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Recorded as the compiler does it, which refuses a branch on the numbers of a tensor."""
+    model = job.instantiate(composed(*MODELS["growth"]).model)
+    record = truncated(world("growth"), 4).record
+    method = small_method_of(name)
+    if isinstance(method, ParticleFilter):
+        (rows,) = re.findall(r"54 filters compile.*?\n\n(\|.*?)\n\n", PAGE, re.DOTALL)
+        assert (f"`{name}`" in rows) == bool(method.obstacle)
+    if not isinstance(method, ParticleFilter) or method.obstacle:
+        pytest.skip("is not compiled")
+    if name in NAMES and refusal(name, model, record):
+        pytest.skip("refuses this model")
+    monkeypatch.setattr(compiled_filter, "compile_function", record_only)
+    monkeypatch.setattr(step_store, "name_step", lambda *_: None)
+    step, draws = CompiledParticleFilter(method), PhiloxStream(5, torch.arange(len(record.y)))
+    with dispatch.use_compiled(), torch.no_grad():
+        compiled = run_filter(step, model, record, draws)
+        assert_results_agree(compiled, run_filter(method, model, record, draws))
+    assert step.is_active
+
+
+def record_only(function: Any, example: list[Tensor]) -> Any:
+    """Record a step as `compile_function` does, and run the recorded operations."""
+    graph = make_fx(function)(*example)
+    return lambda given: graph(*given), None
+
+
+def test_the_page_counts_the_filters_that_compile() -> None:
+    methods = [small_method_of(name) for name in TEXTS]
+    compiled = [a for a in methods if isinstance(a, ParticleFilter) and not a.obstacle]
+    assert f"{len(compiled)} filters compile" in PAGE
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from typing_extensions import override
 from pfbench.core.density import log_density
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
+from pfbench.filter import input_check
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import CubaturePoints
 from pfbench.filter.loop import run_filter
@@ -280,6 +281,33 @@ def test_what_fits_is_computed() -> None:
     for record in (Record(Y), Record(Y.float()), Record(Y, inputs), Record(Y * torch.nan)):
         result = run_filter(ParticleFilter(20), MODEL, record, DRAWS)
         assert not result.lost.any()
+
+
+def test_a_model_is_checked_again_where_it_or_its_record_has_changed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    checks: list[Any] = []
+    monkeypatch.setattr(input_check, "check_model", lambda *given: checks.append(given))
+    model, y = linear_walk(1.0, 0.3, 1.0), Y.clone()
+
+    def count(record: Record) -> int:
+        checks.clear()
+        run_filter(ParticleFilter(20), model, record, DRAWS)
+        run_filter(ParticleFilter(30), model, record, DRAWS)  # the filter does not count
+        return len(checks)
+
+    assert count(Record(y)) == 1
+    assert count(Record(y)) == 0
+    y[0, 0] = 1.0
+    assert count(Record(y)) == 1  # the same tensor, with another number
+    assert count(Record(y.clone())) == 1
+    model.r.mul_(2.0)
+    assert count(Record(y)) == 1
+    model.choices = ("another attribute",)
+    assert count(Record(y)) == 1
+    assert count(Record(y, Inputs(torch.zeros(1, STEPS, 2, dtype=torch.float64)))) == 1
+    for _ in range(20):  # memory of an earlier record may serve a later one
+        assert count(Record(Y.clone())) == 1
 
 
 LAWS = {

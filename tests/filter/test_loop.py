@@ -119,6 +119,17 @@ def test_blocks_of_runs_are_of_about_equal_size(runs: int, blocks: int) -> None:
     assert size * blocks - runs < blocks
 
 
+@pytest.mark.parametrize(
+    ("dtype", "dimension", "size"),
+    [(torch.float64, 15, 25), (torch.float32, 15, 50), (torch.float64, 4, 100), (None, 15, 100)],
+)
+def test_compiled_steps_of_many_components_take_batches_by_bytes(
+    dtype: torch.dtype | None, dimension: int, size: int
+) -> None:
+    """500 particles of 15 doubles are 60 kB: 25 runs are 1.5 MB. In single precision twice as many."""
+    assert choose_run_batch(100, 500, dimension, dtype) == size
+
+
 @every_method
 def test_the_evidence_is_additive(method: ParticleFilter | GaussianFilter) -> None:
     """Unseen steps at the end add nothing to it."""

@@ -31,6 +31,7 @@ from pfbench.kernels.step_compiler import compile_function
 
 COMPILER = shutil.which("c++") or shutil.which("g++")
 compiler = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler")
+NONE = torch.zeros(0, dtype=torch.int64)
 X, W = torch.rand(2, 3, 4), torch.rand(3, 4)
 ONE = torch.ones(3, 1)
 
@@ -223,7 +224,7 @@ def test_a_step_is_called_by_its_number_only() -> None:
     """No address goes through Python, and a library without a step is not taken."""
     for number in (-1, 0, 4096, 2**62, id(X)):
         with pytest.raises(RuntimeError, match="must be the number of a registered step"):
-            step_compiler.run_steps(number, [], [], [torch.rand(2, 1)], [])
+            step_compiler.run_steps(number, [], [], [torch.rand(2, 1)], [], NONE, NONE)
     loaded = str(Path(torch.__file__).parent / "lib/libc10.so").encode()  # may be another user's
     names = [b"", b"no such file", b"libc10.so", loaded, b"\xff" * 5000]
     for name in names:
@@ -279,9 +280,9 @@ def test_a_compiled_step_takes_the_arguments_that_it_was_compiled_for() -> None:
     assert entry is not None
     number, constants, _ = entry
     good = [torch.rand(1, 3, 2), torch.rand(1, 4).double()]
-    first, second = step_compiler.run_steps(number, constants, [], good, [])
-    assert torch.equal(first, good[0][0] + 1.0)
-    assert torch.equal(second, good[1][0] * 2.0)
+    first, second = step_compiler.run_once(entry, example)
+    assert torch.equal(first, example[0] + 1.0)
+    assert torch.equal(second, example[1] * 2.0)
     wrong = {
         "arguments": [good[0]],
         "argument 0": [torch.rand(1, 2, 3), good[1]],
@@ -291,11 +292,46 @@ def test_a_compiled_step_takes_the_arguments_that_it_was_compiled_for() -> None:
     }
     for words, inputs in wrong.items():
         with pytest.raises(RuntimeError, match=words):
-            step_compiler.run_steps(number, constants, [], inputs, [])
+            step_compiler.run_steps(number, constants, [], inputs, [], NONE, NONE)
     with pytest.raises(RuntimeError, match="inputs must have at least one"):
-        step_compiler.run_steps(number, constants, example, [], [])
+        step_compiler.run_steps(number, constants, example, [], [], NONE, NONE)
     with pytest.raises(RuntimeError, match="state must have at most 2 tensors"):
-        step_compiler.run_steps(number, constants, [*example, example[0]], [good[0]], [])
+        step_compiler.run_steps(
+            number, constants, [*example, example[0]], [good[0]], [], NONE, NONE
+        )
+    for numbers, words in (([2], "joined must be numbers of results"), ([-1], "joined must be")):
+        with pytest.raises(RuntimeError, match=words):
+            step_compiler.run_steps(number, constants, [], good, [], torch.tensor(numbers), NONE)
+    with pytest.raises(RuntimeError, match=r"kept must be int64 \[n\]"):
+        step_compiler.run_steps(number, constants, [], good, [], NONE, torch.zeros(2))
+
+
+@compiler
+def test_steps_end_before_the_first_result_that_is_not_finite() -> None:
+    """Joined results of the steps before it, the others of the kept steps and of the last one."""
+    example = [torch.zeros(2), torch.zeros(3, 1, 4), torch.zeros(())]
+    _, entry = compile_function(
+        lambda a, x, t: [a + t, x - t, (a + t).log().sum().reshape(1), (x + t).sum(-1)], example
+    )
+    assert entry is not None
+    number, constants, _ = entry
+
+    def run(steps: list[float], kept: list[int]) -> list[torch.Tensor]:
+        joined = torch.tensor([2, 3])
+        state, inputs = [torch.ones(2), torch.zeros(3, 1, 4)], [torch.tensor(steps)]
+        return step_compiler.run_steps(
+            number, constants, state, inputs, [], joined, torch.tensor(kept, dtype=torch.int64)
+        )
+
+    sums, first, *others = run([1.0, 2.0, -9.0, 3.0], [0])  # 2, 4, and the logarithm of -5
+    torch.testing.assert_close(sums, 2.0 * torch.tensor([[2.0], [4.0]]).log())
+    assert first.shape == (2, 3, 1)
+    assert [tuple(a.shape) for a in others] == [(2,), (1, 4, 3)] * 2
+    assert [float(a.flatten()[0]) for a in others] == [2.0, -1.0, 4.0, -3.0]
+    assert len(run([1.0, 2.0, 3.0], [2])) == 4  # the last one, once
+    assert len(run([1.0, 2.0, 3.0], [0, 1, 2])) == 8
+    nothing = run([-9.0, 1.0], [0, 1])
+    assert [tuple(a.shape) for a in nothing] == [(0, 1), (0, 3, 1)]
 
 
 def test_the_python_check_names_the_argument() -> None:

@@ -42,6 +42,7 @@ from pfbench.filter.whitening import (
     log_determinant,
     whiten,
 )
+from pfbench.kernels.dispatch import is_capturing
 from pfbench.model.base import ModelWrapper, StateSpaceModel, StaticModel
 
 # --------------------------------------------------------------------------------------------------
@@ -195,7 +196,7 @@ def _adapted_noise_ratio(
         mask_covariance(noise, mask)
         for noise, mask in zip((innovation.noise, innovation.nominal), masks, strict=True)
     ]
-    if torch.equal(*noises) and torch.equal(*masks):
+    if not is_capturing() and torch.equal(*noises) and torch.equal(*masks):
         return torch.zeros_like(x[..., 0])
     if not is_normal(model.observation(x, record.u)):
         raise ValueError(
@@ -210,7 +211,8 @@ def _adapted_noise_ratio(
             root
         ).unsqueeze(-1)
         values.append(torch.where(ok.unsqueeze(-1), value, torch.nan))
-    return values[0] - values[1]
+    is_nominal = (noises[0] == noises[1]).all(-1).all(-1) & (masks[0] == masks[1]).all(-1)
+    return torch.where(is_nominal.unsqueeze(-1), 0.0, values[0] - values[1])
 
 
 # --------------------------------------------------------------------------------------------------

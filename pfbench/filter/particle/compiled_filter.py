@@ -8,9 +8,9 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -18,7 +18,19 @@ from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record, map_inputs
-from pfbench.filter.belief import Filter, GaussianBelief, ParticleBelief, StepInfo, StepSummary
+from pfbench.filter.belief import (
+    ComputedWeights,
+    Filter,
+    GaussianBelief,
+    KeptSteps,
+    ParticleBelief,
+    StepBlock,
+    StepInfo,
+    StepSummary,
+    compute_once,
+    exponentiate,
+)
+from pfbench.filter.linearisation import compute_nis
 from pfbench.filter.loop import MultiStepFilter, RecordStartedFilter
 from pfbench.filter.particle import step_store
 from pfbench.filter.particle.particle_filter import ParticleFilter
@@ -28,6 +40,7 @@ from pfbench.kernels.step_compiler import (
     TensorFunction,
     compile_function,
     from_storage,
+    steps_from_storage,
     steps_to_storage,
     to_storage,
 )
@@ -48,7 +61,7 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     not change a number that a stage stores between steps.
 
     Attributes:
-        method: The filter. With moves, or a proposal that stores paths, it runs uncompiled.
+        method: The filter. It runs uncompiled if it states an obstacle.
         counter: Counter of likelihood evaluations, which compiled steps cannot increment.
         clock: Clock that measures the time of compilation, s.
         builds: Whether a step that is not stored is compiled.
@@ -101,8 +114,10 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     ) -> tuple[ParticleBelief, StepInfo]:
         u = map_inputs(lambda a: a.unsqueeze(1), record.u)
         with_time_axis = record._replace(y=record.y.unsqueeze(1), u=u)
-        results, _ = self._take_steps(model, belief, with_time_axis, draws, 1)
-        return results[0]
+        block, belief, _ = self._take_steps(
+            model, belief, with_time_axis, 0, draws, 1, KeptSteps(frozenset())
+        )
+        return belief, block.infos[0]
 
     @override
     def take_steps(
@@ -113,44 +128,70 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         t: int,
         draws: RandomStream,
         limit: int,
-    ) -> tuple[list[tuple[ParticleBelief, StepInfo]], int]:
-        rest = record.select_steps(slice(t, None))
-        return self._take_steps(model.at_step(t), belief, rest, draws.at_step(t + 1), limit)
+        selection: KeptSteps,
+    ) -> tuple[StepBlock, ParticleBelief, int]:
+        stream = draws.at_step(t + 1)
+        return self._take_steps(model.at_step(t), belief, record, t, stream, limit, selection)
 
     def _take_steps(
         self,
         model: StateSpaceModel,
         belief: ParticleBelief,
         record: Record,
+        t: int,
         draws: RandomStream,
         limit: int,
-    ) -> tuple[list[tuple[ParticleBelief, StepInfo]], int]:
-        """Take several steps of a record. `draws` belongs to the first of them."""
-        graph = self._graph(model, belief, record.at_step(0), draws)
-        results: list[tuple[ParticleBelief, StepInfo]] = []
-        if graph is not None and isinstance(draws, PhiloxStream):
-            steps = min(limit, graph.max_steps, record.y.shape[1])
-            for after, summary in graph.run_steps(belief, record.select_steps(slice(steps)), draws):
-                step_record = partial(record.at_step, len(results))
-                results.append((after, self.method.make_info(model, after, summary, step_record)))
+        selection: KeptSteps,
+    ) -> tuple[StepBlock, ParticleBelief, int]:
+        """Take steps of a record from `t` on. `model` and `draws` belong to the first of them."""
+        step_record = record.at_step(t)
+        graph = self._graph(model, belief, step_record, draws)
+        if graph is not None and isinstance(draws, PhiloxStream) and limit:
+            steps = min(limit, graph.choose_steps(selection), record.y.shape[1] - t)
+            rows = selection.select_rows(t, steps)
+            block_record = record.select_steps(slice(t, t + steps))
+            outcome = graph.run_steps(belief, block_record, draws, rows)
+            count = outcome.mean.shape[1]
             if self.counter:
-                self.counter.count += len(results) * graph.evaluations
-            if len(results) == steps:
-                return results, 2 * steps
-            if results:
-                belief = results[-1][0]
-            draws, limit = draws.at_step(int(draws.step) + len(results)), 1
-        results.append(self.method.step(model, belief, record.at_step(len(results)), draws))
-        return results, limit
+                self.counter.count += count * graph.evaluations
+            if count:
+                block = self._make_block(model, block_record, t, outcome, selection)
+                return block, outcome.last, 2 * steps if count == steps else 0
+        belief, info = self.method.step(model, belief, step_record, draws)
+        return StepBlock.of_step(t, belief, info), belief, 1 if graph is not None else limit
+
+    def _make_block(
+        self,
+        model: StateSpaceModel,
+        record: Record,
+        first: int,
+        outcome: TakenSteps,
+        selection: KeptSteps,
+    ) -> StepBlock:
+        """Return the block of steps that were taken together, from number `first` on."""
+        infos = {
+            first + k: self.method.make_info(
+                model, belief, outcome.summarise(k), partial(record.at_step, k)
+            )
+            for k, (belief, _) in outcome.selection.items()
+        }
+        checked = [k for k in outcome.selection if first + k in selection.checked]
+        x = outcome.last.x
+        if len(x) == 1 and len(checked) * x.numel() <= _MAX_NUMBERS:  # as `may_join_steps`
+            pairs = _compute_nis_together(model, record, {k: outcome.selection[k] for k in checked})
+            for k, nis in zip(checked, pairs, strict=True):
+                infos[first + k] = infos[first + k]._replace(nis=nis)
+        beliefs = {first + k: (belief,) for k, (belief, _) in outcome.selection.items()}
+        moments = outcome.mean, outcome.variance, outcome.log_evidence
+        return StepBlock(first, *moments, outcome.trace, beliefs, infos)
 
     def _graph(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> CompiledStep | None:
         """Return the compiled step of this kind; None if the step must run uncompiled."""
-        grows = self.method.history is not None or self.method.stores_path
-        if not isinstance(draws, PhiloxStream) or grows:
+        if not isinstance(draws, PhiloxStream) or self.method.obstacle:
             return None
-        belief = belief._replace(weights=None)  # a compiled step computes them
+        belief = belief._replace(weights=None)  # a compiled step carries them as a tensor
         key = id(model), belief.x.shape, len(tensors_in((belief, record)))
         if key not in self.graphs:
             if int(draws.step) == 1:
@@ -190,6 +231,11 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
 # operations that it consists of, and torch's compiler makes one function of them.
 
 _MAX_NUMBERS = 1 << 20  # results of steps taken together; they share the overhead of a call
+# tensors without memory that a step carries: particles, log weights, log evidence, weights
+_CARRIED = 4
+_UNKEPT = (
+    8  # times as many steps where particles of few steps are kept: about 0.1 s without a signal
+)
 _MAX_STEPS_CUDA = 64
 
 
@@ -204,7 +250,7 @@ class CompiledStep:
     """A compiled step for one kind of belief and record.
 
     Attributes:
-        run: (belief, step number, record, seed, runs) -> next belief, mean, variance, predicted log
+        run: (belief, step number, record, seed, runs) -> next belief with its weights, mean, variance, predicted log
             weights, trace. None for a step from the store.
         entry: C++ entry of the step, or None.
         memory: Names of the tensors in the belief's memory.
@@ -224,45 +270,142 @@ class CompiledStep:
     model: StateSpaceModel
     is_stored: bool = False
 
-    def run_steps(
-        self, belief: ParticleBelief, record: Record, draws: PhiloxStream
-    ) -> list[tuple[ParticleBelief, StepSummary]]:
-        """Take all steps of a record in one call, without a check of numbers between them.
+    def choose_steps(self, selection: KeptSteps) -> int:
+        """Return how many steps may be taken together: fewer where all of them are kept, and where the device is a GPU."""
+        grows = selection.all_steps or self.entry is None
+        return self.max_steps if grows or self.max_steps == 1 else _UNKEPT * self.max_steps
 
-        Returns belief and summary after each step before the first one with a NaN particle. Shapes:
-        record [R, T, Dy].
+    def run_steps(
+        self, belief: ParticleBelief, record: Record, draws: PhiloxStream, selection: Sequence[int]
+    ) -> TakenSteps:
+        """Take all steps of a record in one call, as far as the first one with a NaN particle.
+
+        Shapes: record [R, T, Dy]. `selection` has the indices of the steps whose particles are returned.
         """
-        first, steps, carried = int(draws.step), record.y.shape[1], 3 + len(self.memory)
+        first, steps = int(draws.step), record.y.shape[1]
         state = _belief_to_storage(belief)
         inputs = [steps_to_storage(a) for a in tensors_in((record.y, record.u))]
         inputs = [torch.arange(first, first + steps), *inputs]
         shared = [to_storage(a) for a in tensors_in((record.start, record.spread))]
         shared += [torch.as_tensor(draws.seed), draws.runs]
-        results: list[list[Tensor]] = []
         if self.entry is not None:
-            width = carried + 3 + len(self.trace)
+            kept_steps = torch.tensor(selection, dtype=torch.int64)
             flat = step_compiler.run_steps(
-                self.entry.step, self.entry.constants, state, inputs, shared
+                self.entry.step,
+                self.entry.constants,
+                state,
+                inputs,
+                shared,
+                self._joined,
+                kept_steps,
             )
-            results = [flat[k : k + width] for k in range(0, len(flat), width)]
-        elif self.run is not None:
-            for step_inputs in zip(*(a.unbind() for a in inputs), strict=True):
-                stored = self.run([*state, *step_inputs, *shared])
-                results.append([from_storage(a) for a in stored])
-                state = list(stored[:carried])
-        valid = _count_finite([result[carried] for result in results])
-        return [self._unpack(result) for result in results[:valid]]
+            count = len(self._joined)
+            return self._unpack(flat[:count], flat[count:], selection)
+        return self._run_from_python(state, inputs, shared, selection)
 
-    def _unpack(self, result: list[Tensor]) -> tuple[ParticleBelief, StepSummary]:
-        """Return belief and summary from the tensors of a step."""
-        carried = 3 + len(self.memory)
-        x, log_w, log_z = result[:3]
-        memory = dict(zip(self.memory, result[3:carried], strict=True))
-        mean, variance, expected = result[carried : carried + 3]
-        trace = dict(zip(self.trace, result[carried + 3 :], strict=True))
-        return ParticleBelief(x, log_w, log_z, memory=memory), StepSummary(
-            mean, variance, expected, trace
-        )
+    @cached_property
+    def _joined(self) -> Tensor:
+        """Numbers of the results without an axis of particles: mean (the first that is checked), variance, evidence and trace."""
+        carried = _CARRIED + len(self.memory)
+        trace = range(carried + 3, carried + 3 + len(self.trace))
+        return torch.tensor([carried, carried + 1, 2, *trace])
+
+    def _run_from_python(
+        self,
+        state: list[Tensor],
+        inputs: list[Tensor],
+        shared: list[Tensor],
+        selection: Sequence[int],
+    ) -> TakenSteps:
+        """Take steps by the function of torch's compiler, called from Python."""
+        carried, joined = _CARRIED + len(self.memory), self._joined.tolist()
+        results: list[Sequence[Tensor]] = []
+        for step_inputs in zip(*(a.unbind() for a in inputs), strict=True):
+            assert self.run is not None
+            results.append(self.run([*state, *step_inputs, *shared]))
+            state = list(results[-1][:carried])
+        valid = _count_finite([result[carried] for result in results])
+        blocks = [
+            torch.stack([result[k] for result in results[:valid]])
+            if valid
+            else results[0][k].unsqueeze(0)[:0]
+            for k in joined
+        ]
+        returned = sorted({k for k in selection if k < valid} | ({valid - 1} if valid else set()))
+        others = [
+            from_storage(a) for t in returned for k, a in enumerate(results[t]) if k not in joined
+        ]
+        return self._unpack(blocks, others, selection)
+
+    def _unpack(
+        self, joined: Sequence[Tensor], others: Sequence[Tensor], selection: Sequence[int]
+    ) -> TakenSteps:
+        """Return the results of steps from their tensors: joined ones [S, ...], others of the kept steps and of the last one."""
+        mean, variance, log_evidence, *trace = map(steps_from_storage, joined)
+        steps = mean.shape[1]
+        rows = [k for k in selection if k < steps]
+        rows += [steps - 1] if steps and steps - 1 not in rows else []
+        width = _CARRIED + len(
+            self.memory
+        )  # all that is carried less the evidence, and predicted log weights
+        results: dict[int, tuple[ParticleBelief, Tensor]] = {}
+        for index, k in enumerate(rows):
+            x, log_w, w, *memory, expected = others[index * width : (index + 1) * width]
+            named_memory, weights = (
+                dict(zip(self.memory, memory, strict=True)),
+                ComputedWeights(log_w, w),
+            )
+            belief = ParticleBelief(
+                x, log_w, log_evidence[:, k], memory=named_memory, weights=weights
+            )
+            results[k] = belief, expected
+        last = results[rows[-1]][0] if rows else None
+        kept_results = {k: value for k, value in results.items() if k in selection}
+        named_trace = dict(zip(self.trace, trace, strict=True))
+        return TakenSteps(mean, variance, log_evidence, named_trace, kept_results, last)
+
+
+class TakenSteps(NamedTuple):
+    """Results of steps that were taken together.
+
+    Attributes:
+        mean: [R, S, D].
+        variance: [R, S, d].
+        log_evidence: [R, S].
+        trace: {name: [R, S]}.
+        selection: Belief and predicted log weights [R, N] after the kept steps, by index.
+        last: Belief after the last step; None if there is none.
+    """
+
+    mean: Tensor
+    variance: Tensor
+    log_evidence: Tensor
+    trace: dict[str, Tensor]
+    selection: dict[int, tuple[ParticleBelief, Tensor]]
+    last: Any
+
+    def summarise(self, k: int) -> StepSummary:
+        """Return the summary of a kept step."""
+        trace = {name: a[:, k] for name, a in self.trace.items()}
+        return StepSummary(self.mean[:, k], self.variance[:, k], self.selection[k][1], trace)
+
+
+def _compute_nis_together(
+    model: StateSpaceModel, record: Record, steps: dict[int, tuple[ParticleBelief, Tensor]]
+) -> list[Callable[[], tuple[Tensor, Tensor]]]:
+    """Return functions of the NIS of some steps of a single run, which compute it for all of them at once."""
+
+    @compute_once
+    def compute() -> tuple[Tensor, Tensor]:
+        x = torch.cat([belief.x.permute(2, 0, 1) for belief, _ in steps.values()], 1)
+        log_w = torch.cat([expected for _, expected in steps.values()])
+        return compute_nis(model, x.permute(1, 2, 0), log_w, record.steps_as_runs(list(steps)))
+
+    def select(index: int) -> tuple[Tensor, Tensor]:
+        nis, observed = compute()
+        return nis[index : index + 1], observed[index : index + 1]
+
+    return [partial(select, index) for index in range(len(steps))]
 
 
 def compile_step(
@@ -302,7 +445,9 @@ def compile_step(
         return None
     memory, trace = names
     carried_shapes = [a.shape for a in expected[: len(state)]]
-    keeps_shapes = len(memory) + 3 == len(state) and carried_shapes == [a.shape for a in state]
+    keeps_shapes = len(memory) + _CARRIED == len(state) and carried_shapes == [
+        a.shape for a in state
+    ]
     max_steps = _choose_max_steps(expected) if keeps_shapes else 1
     return CompiledStep(run, entry, memory, trace, evaluations, max_steps, model, is_stored)
 
@@ -341,9 +486,8 @@ def _load_step(
     if entry is None:
         return None
     try:
-        batched = [a.unsqueeze(0) for a in example]
-        out = step_compiler.run_steps(entry.step, entry.constants, [], batched, [])
-        _check_agreement([to_storage(a) for a in out], expected, carried)
+        out = [to_storage(a) for a in step_compiler.run_once(entry, example)]
+        _check_agreement(out, expected, carried)
     except (ArithmeticError, RuntimeError) as error:
         log.warning("engine=compiled: a stored step is removed (%s)", error)
         step_store.remove_step(Path(entry.library).parent.name)
@@ -366,16 +510,19 @@ def _make_tensor_function(
     def step(*flat: Tensor) -> list[Tensor]:
         number, *inputs, seed, runs = flat[carried_count:]
         remaining = map(from_storage, [*flat[:carried_count], *inputs])
-        x, log_w, log_z = (next(remaining) for _ in range(3))
+        x, log_w, log_z, w = (next(remaining) for _ in range(_CARRIED))
         memory = replace_tensors(belief.memory, remaining)
         step_record = replace_tensors(record, remaining)
-        before = belief._replace(x=x, log_w=log_w, log_evidence=log_z, memory=memory)
+        weights = ComputedWeights(log_w, w)
+        before = belief._replace(
+            x=x, log_w=log_w, log_evidence=log_z, memory=memory, weights=weights
+        )
         stream = PhiloxStream(seed, runs, draws.dtype, number)
         with torch.no_grad(), dispatch.capture_graph(record_step):
             after, summary = method.compute_step(model, before, step_record, stream)
         names[:] = [list(after.memory), list(summary.trace)]
-        carried = [after.x, after.log_w, after.log_evidence, *after.memory.values()]
-        return [to_storage(a) for a in (*carried, *summary[:3], *summary.trace.values())]
+        carried = _belief_to_storage(after)
+        return [*carried, *map(to_storage, (*summary[:3], *summary.trace.values()))]
 
     return step
 
@@ -432,7 +579,8 @@ def replace_tensors(tree: Any, tensors: Iterator[Tensor]) -> Any:
 
 def _belief_to_storage(belief: ParticleBelief) -> list[Tensor]:
     """Return the tensors that a step carries, in storage layout."""
-    carried = tensors_in((belief.x, belief.log_w, belief.log_evidence, belief.memory))
+    w = exponentiate(belief.log_w, belief.weights)
+    carried = tensors_in((belief.x, belief.log_w, belief.log_evidence, w, belief.memory))
     return [to_storage(a) for a in carried]
 
 

@@ -156,6 +156,17 @@ class ParticleFilter(Filter):
         """True if the proposal stores noise and states of past steps, so that its memory grows."""
         return bool(getattr(self.proposal, "stores_path", False))
 
+    @property
+    def obstacle(self) -> str:
+        """Reason why a step cannot be compiled as a whole; empty if it can."""
+        if self.history is not None:
+            return "its moves use past states"
+        if self.stores_path:
+            return "its proposal stores the paths of particles"
+        if getattr(self.proposal, "ends_early", False):
+            return "a rule ends the iterations of its proposal"
+        return ""
+
     @override
     def init(
         self,

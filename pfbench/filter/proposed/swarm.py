@@ -51,6 +51,7 @@ from pfbench.filter.proposed.swarm_motion import (
     select_swarm_by_run,
 )
 from pfbench.filter.proposed.swarm_weighting import MixtureWeighting, SwarmWeighting
+from pfbench.kernels.dispatch import is_capturing
 from pfbench.model.base import StateSpaceModel
 
 # --------------------------------------------------------------------------------------------------
@@ -226,6 +227,11 @@ class SwarmProposal(Proposal):
     def has_bounded_weights(self) -> bool:
         return bool(has_bounded_weights(self.weighting))
 
+    @property
+    def ends_early(self) -> bool:
+        """True if a rule may end the iterations, so that the work of a step depends on its numbers."""
+        return self.stopping is not None
+
     @override
     def __call__(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
@@ -284,7 +290,7 @@ class SwarmProposal(Proposal):
         active = observed_runs = ~torch.isnan(record.y).all(1)
         iterations = torch.zeros_like(active, dtype=torch.long)
         for i in range(1, self.iterations + 1):
-            if not active.is_cuda and not bool(active.any()):
+            if not (active.is_cuda or is_capturing()) and not bool(active.any()):
                 break
             v = self.velocity(swarm, active_mask, i / self.iterations, draws, f"swarm.velocity.{i}")
             iterations = iterations + active

@@ -3,7 +3,10 @@
 // A small step takes a fraction of what Python takes to call it.
 #include <dlfcn.h>
 
+#include <algorithm>
+#include <cmath>
 #include <cstdint>
+#include <cstring>
 #include <mutex>
 #include <stdexcept>
 #include <string>
@@ -131,34 +134,119 @@ AtenTensorHandle particles_first(const Tensor& a) {
     return made;
 }
 
-// All that each step leaves, one step after the other, with the axes of particles first. A step is given `constants`, `state` (which is what the one before left
-// first), its part of `seen` [T, ...] and `shared`.
+// Entries of an int64 tensor [n].
+std::vector<int64_t> read_indices(const Tensor& a, const char* name) {
+    if (a.dtype() != aoti_torch_dtype_int64() || a.dim() != 1 || (a.size(0) > 1 && a.stride(0) != 1))
+        throw std::runtime_error(std::string("run_steps: ") + name + " must be int64 [n].");
+    const auto* const first = static_cast<const int64_t*>(a.data_ptr());
+    return {first, first + a.size(0)};
+}
+
+size_t bytes_of(const Tensor& a) {
+    const int32_t type = a.dtype();
+    const int64_t size = type == aoti_torch_dtype_float64() || type == aoti_torch_dtype_int64() ? 8 : type == aoti_torch_dtype_float32() ? 4
+                         : type == aoti_torch_dtype_bool()                                      ? 1
+                                                                                                : 0;
+    if (size == 0) throw std::runtime_error("run_steps: joined results must be float64, float32, int64 or bool.");
+    return static_cast<size_t>(size * a.numel());
+}
+
+bool is_finite(const Tensor& a) {
+    const auto all_finite = [n = a.numel()](const auto* value) {
+        return std::all_of(value, value + n, [](auto number) { return std::isfinite(number); });
+    };
+    if (a.dtype() == aoti_torch_dtype_float64()) return all_finite(static_cast<const double*>(a.data_ptr()));
+    if (a.dtype() == aoti_torch_dtype_float32()) return all_finite(static_cast<const float*>(a.data_ptr()));
+    return true;
+}
+
+// Memory for a result of all steps, one row for each step, each like `row`.
+Tensor make_rows(const Tensor& row, int64_t steps) {
+    std::vector<int64_t> size{steps}, stride{row.numel()};
+    int64_t expected = row.numel();
+    for (int64_t k = 0; k < row.dim(); ++k) {
+        size.push_back(row.size(k));
+        expected /= row.size(k) > 0 ? row.size(k) : 1;
+        if (row.size(k) > 1 && row.numel() > 0 && row.stride(k) != expected)
+            throw std::runtime_error("run_steps: joined results must be contiguous.");
+        stride.push_back(expected);
+    }
+    AtenTensorHandle made;
+    TORCH_CALL(aoti_torch_empty_strided, static_cast<int64_t>(size.size()), size.data(), stride.data(), row.dtype(),
+               aoti_torch_device_type_cpu(), 0, &made);
+    return Tensor(made);
+}
+
+struct Block {
+    Tensor rows;
+    size_t bytes;  // of a row
+
+    Block(const Tensor& row, int64_t steps) : rows(make_rows(row, steps)), bytes(bytes_of(row)) {}
+
+    void store(int64_t t, const Tensor& row) { std::memcpy(static_cast<char*>(rows.data_ptr()) + t * bytes, row.data_ptr(), bytes); }
+
+    // The first rows, which share the memory.
+    Tensor head(int64_t steps) const {
+        std::vector<int64_t> size(rows.sizes(), rows.sizes() + rows.dim());
+        size[0] = steps;
+        AtenTensorHandle made;
+        TORCH_CALL(aoti_torch__reinterpret_tensor, rows.get(), rows.dim(), size.data(), rows.strides(), 0, &made);
+        return Tensor(made);
+    }
+};
+
+// The steps until the first of which joined result 0 is not finite. A step is given `constants`, `state` (which is what the one
+// before left first), its part of `seen` [T, ...] and `shared`. First come the results that `joined` numbers, of all steps, [S, ...].
+// Then come the other results of the steps in `kept`, which ascends, and of the last one, with the axes of particles first.
 std::vector<Tensor> follow(int64_t number, std::vector<Tensor> constants, std::vector<Tensor> state, std::vector<Tensor> seen,
-                           std::vector<Tensor> shared) {
+                           std::vector<Tensor> shared, Tensor joined_numbers, Tensor kept_steps) {
     const auto [step, outputs, layouts] = check_step(number, constants, state, seen, shared);
+    const std::vector<int64_t> joined = read_indices(joined_numbers, "joined"), kept = read_indices(kept_steps, "kept");
+    std::vector<bool> is_joined(outputs, false);
+    for (const int64_t k : joined) {
+        if (k < 0 || k >= outputs) throw std::runtime_error("run_steps: joined must be numbers of results.");
+        is_joined[k] = true;
+    }
     const Lock held;
     const Flush flushed;
     const int64_t steps = seen[0].size(0);
     std::vector<AtenTensorHandle> given, left(outputs);
-    std::vector<Tensor> all;
-    all.reserve(steps * outputs);
-    for (int64_t t = 0; t < steps; ++t) {
+    std::vector<Block> blocks;
+    std::vector<Tensor> others, last;
+    const auto keep = [&] {
+        for (size_t k = 0; k < last.size(); ++k)
+            if (!is_joined[k]) others.push_back(last[k].dim() > 2 ? Tensor(particles_first(last[k])) : last[k]);
+        last.clear();
+    };
+    auto next_kept = kept.begin();
+    int64_t t = 0;
+    for (; t < steps; ++t) {
         given.clear();
         for (const Tensor& a : constants) given.push_back(again(a));
         for (const Tensor& a : state) given.push_back(again(a));
         for (const Tensor& a : seen) given.push_back(at(a, t));
         for (const Tensor& a : shared) given.push_back(again(a));
         step(given.data(), left.data());
-        for (size_t k = 0; k < left.size(); ++k) {
-            const Tensor a(left[k]);
-            all.push_back(a.dim() > 2 ? Tensor(particles_first(a)) : a);
-            if (k < state.size()) state[k] = a;
-        }
+        std::vector<Tensor> now;
+        now.reserve(left.size());
+        for (AtenTensorHandle a : left) now.emplace_back(a);
         // a step always leaves the same layouts, so the first one is enough
         for (size_t k = 0; t == 0 && steps > 1 && k < state.size(); ++k)
-            if (layout(state[k]) != layouts[constants.size() + k])
+            if (layout(now[k]) != layouts[constants.size() + k])
                 throw std::runtime_error("run_steps: result " + std::to_string(k) + " must have the layout that the next step takes.");
+        if (t == 0)
+            for (const int64_t k : joined) blocks.emplace_back(now[k], steps);
+        if (!joined.empty() && !is_finite(now[joined[0]])) break;
+        for (size_t j = 0; j < joined.size(); ++j) blocks[j].store(t, now[joined[j]]);
+        std::copy_n(now.begin(), state.size(), state.begin());
+        last = std::move(now);
+        next_kept = std::find_if(next_kept, kept.end(), [t](int64_t k) { return k >= t; });
+        if (next_kept != kept.end() && *next_kept == t) keep();
     }
+    keep();
+    std::vector<Tensor> all;
+    for (const Block& block : blocks) all.push_back(block.head(t));
+    all.insert(all.end(), others.begin(), others.end());
     return all;
 }
 

@@ -16,7 +16,9 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from pfbench.core.linear_algebra import affine_map
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
+from pfbench.filter import loop
 from pfbench.filter.belief import StepInfo
+from pfbench.filter.health import HealthMonitor
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle import compiled_filter, step_store
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
@@ -221,6 +223,37 @@ def test_steps_taken_together_are_the_steps_taken_one_by_one(recorded: list[list
     assert counted == tally.count - counted == RUNS * 40 * STEPS
     # the recording; all, of which the seventh fails and is done again as it is; then one, two and the last two
     assert recorded == [[2, *range(2, STEPS + 1), *range(8, STEPS + 1)]]
+
+
+@compiler
+@pytest.mark.parametrize("runs", [1, RUNS])
+def test_health_is_the_same_where_steps_are_taken_together(
+    recorded: list[list[int]], runs: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The checked steps of a block are evaluated together: their particles, NIS and tails are those of each step."""
+    record = record_of(UnivariateGrowth()).select_runs(slice(runs))
+    kept: list[Any] = []
+
+    class Kept(HealthMonitor):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            self._fits_tails = True
+            kept.append(self)
+
+    monkeypatch.setattr(loop, "HealthMonitor", Kept)
+    method, draws = ParticleFilter(60), PhiloxStream(1, torch.arange(runs))
+    with dispatch.use_compiled(), torch.no_grad():
+        for filtered in (CompiledParticleFilter(method), method):
+            run_filter(filtered, Fragile(), record, draws)
+    together, apart = kept
+    assert recorded
+    assert together._nis.keys() == apart._nis.keys() == together.steps
+    for t in together.steps:
+        torch.testing.assert_close(together._nis[t], apart._nis[t], rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(together.pareto_k, apart.pareto_k, rtol=1e-9, atol=1e-9)
+    assert bool(torch.isfinite(apart.pareto_k).any())
+    for name in ("_undefined", "_collapsed", "_implausible"):
+        assert torch.equal(getattr(together, name), getattr(apart, name))
 
 
 @compiler
