@@ -84,7 +84,7 @@ def _read_runs(results: Path, stored: Path) -> ClaimRuns:
 
 
 def _count_worlds(study: Path) -> dict[str, tuple[int, int]]:
-    """Count the worlds in which each method beats the best Kalman filter; empty without the stored runs of the study."""
+    """Count the worlds in which each method beats every single Kalman filter; empty without the stored runs of the study."""
     if not (study / RUNS_FILE).is_file():
         return {}
     overviews = find_overviews(*read_stored_study(study, decides=False))
@@ -119,6 +119,7 @@ def make_context(
         "papers": papers,
         "seven": make_seven(lines, worlds),
         "compared": bool(worlds),
+        "open_said": _say_open(lines),
         "total": total,
         "rules": RULES,
         "proofs": read_proofs(),
@@ -227,9 +228,16 @@ def make_seven(
 
 
 def _say_worlds(better: int, count: int) -> str:
-    """Say in how many worlds a method beats the best Kalman filter."""
+    """Say in how many worlds a method beats every single Kalman filter."""
     return (
         (f"in {better} of {count} worlds" if better else f"in none of {count}")
         if count
         else NOT_RUN
     )
+
+
+def _say_open(lines: Sequence[ClaimWord]) -> str:
+    """Say how many of the open claims are not decided by their runs, and how many lack runs."""
+    some = [line for line in lines if line.word == "open"]
+    missing = sum(line.reason.endswith(NOT_RUN) for line in some)
+    return f"Of {len(some)} open claims, {missing} lack runs of a reading, and {len(some) - missing} are not decided by their runs."

@@ -84,9 +84,9 @@ class PublishedComparison(NamedTuple):
             )
         level = self.particles if self.particles in overviews else choose_level(overviews)
         overview = overviews[level]
-        own = tuple(dict.fromkeys(cell.filter for cell in self.cells))
+        labels = tuple(dict.fromkeys(cell.filter for cell in self.cells))
         joined = overview._replace(
-            methods=(*own, *overview.methods),
+            methods=(*labels, *overview.methods),
             names={**overview.names, **self.names},
             cells=[*overview.cells, *self.cells],
         )
@@ -201,7 +201,7 @@ def _list_cells(
     A world without a stated reference, or whose reference did not run in the published study, has none.
     """
     members: list[World] = []
-    chosen: dict[tuple[str, str], Verdict] = {}
+    decided: dict[tuple[str, str], Verdict] = {}
     for world in worlds:
         scenario, regime, model = world.name.split(" / ")
         facts = read_world_facts(scenario, model)
@@ -211,12 +211,12 @@ def _list_cells(
         if against:
             reference = next(iter(against.values())).b
             members.append(world._replace(name=scenario, reference=reference))
-            chosen |= {(scenario, label): verdict for label, verdict in against.items()}
-    labels = list(dict.fromkeys(label for _, label in chosen))
+            decided |= {(scenario, label): verdict for label, verdict in against.items()}
+    labels = list(dict.fromkeys(label for _, label in decided))
     return [
-        cell._replace(verdict=chosen[cell.world, cell.filter])
+        cell._replace(verdict=decided[cell.world, cell.filter])
         for cell in decide_cells(members, labels)
-        if (cell.world, cell.filter) in chosen
+        if (cell.world, cell.filter) in decided
     ]
 
 

@@ -255,7 +255,8 @@ def parse_label(label: str) -> tuple[str, dict[str, str]]:
 def make_distinct_label(meta: Mapping[str, Any], twins: Sequence[Mapping[str, Any]]) -> str:
     """Extend a label by the settings in which jobs of that label differ.
 
-    Settings of the filter alone are used if they suffice.
+    Settings of the filter alone are used if they suffice, and the budget: a job at equal time has another number of
+    particles than its settings say.
     """
     if len(twins) == 1:
         return str(meta["label"])
@@ -265,7 +266,7 @@ def make_distinct_label(meta: Mapping[str, Any], twins: Sequence[Mapping[str, An
         names.remove("particles")
     of_filter = [name for name in names if name.startswith("filter.")]
     if len({tuple(repr(config.get(name)) for name in of_filter) for config in flat}) == len(flat):
-        names = of_filter
+        names = [*(name for name in names if name == "budget"), *of_filter]
     text = _format_settings(meta, names, "filter.")
     return f"{meta['label']}[{text or meta['key']}]"
 

@@ -63,6 +63,7 @@ def render_overview(
         ],
         "headline": word_headline(overview, overviews.get(EQUAL_TIME)),
         "setting": describe_setting(overview, level),
+        "has_printed": PRINTED in overviews,
         "foreign_knobs": describe_page_knobs(pack) if "worlds" in pack else "",
         "ratios": list_ratios(overview),
         "filters": [overview.names[label] for label in (*overview.methods, *overview.conventional)],
@@ -148,7 +149,11 @@ def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> 
         first = f"{better.capitalize()} with as many particles: {winners}."
     else:
         first = f"None of the {count} is shown to be {better} in any of {number} worlds"
-        first += ", nor at equal time." if at_equal_time and not timed else "."
+        first += (
+            f", nor at equal time in {len(at_equal_time.worlds)}."
+            if at_equal_time and not timed
+            else "."
+        )
     if timed:
         first += f" {'Also at' if winners else 'At'} equal time: {timed}."
     elif winners and at_equal_time:
@@ -181,9 +186,23 @@ def describe_setting(overview: Overview, level: TabKey = 0) -> str:
     runs = sorted({world.runs for world in overview.worlds})
     counts = f"{runs[0]}" if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
     return (
-        f"{len(overview.worlds)} worlds, {counts} paired runs each{f', {level} particles' if level else ''}. A lost run counts as an error at the track limit. "
-        "The best Kalman filter of a world was chosen on another seed. Conventional are all filters but the proposed ones."
+        f"{len(overview.worlds)} worlds, {counts} paired runs each{f', {level} particles' if level else ''}. An error counts up to the track limit of its "
+        f"world, which a lost run has. {_describe_reference(overview)} Conventional are all filters but the proposed ones, a bank of EKFs among them."
     )
+
+
+def _describe_reference(overview: Overview) -> str:
+    """Say how the best Kalman filter was chosen, where it is not the best in these runs, and what each one beats."""
+    worlds = {world.key: world.name for world in overview.worlds}
+    better = [
+        f"{overview.names[v.b]} in {worlds[key]} (the chosen one has {v.ratio:.2f} times its error)"
+        for key, v in overview.outdone.items()
+    ]
+    wins = sum(winner.wins for winner in overview.kalman_winners)
+    text = "The best Kalman filter of a world was chosen on another seed, tuned ones among the candidates; the methods are not tuned."
+    if better:
+        text += f" In these runs another one is better: {', '.join(better)}."
+    return f"{text} Better than every single Kalman filter: in {wins} of {len(overview.kalman_winners)} cells."
 
 
 def spell_number(number: int) -> str:
@@ -233,7 +252,7 @@ def tabulate_heat_map(overviews: Mapping[TabKey, Overview]) -> tuple[list[str], 
 
 
 def count_better_worlds(overviews: Mapping[TabKey, Overview]) -> dict[str, tuple[int, int]]:
-    """Count the worlds in which each proposed method is shown to be better than the best Kalman filter, in the first table.
+    """Count the worlds in which each proposed method is better than every single Kalman filter, in the first table.
 
     Args:
         overviews: Tables of the page, as `find_overviews` returns them.
@@ -242,13 +261,11 @@ def count_better_worlds(overviews: Mapping[TabKey, Overview]) -> dict[str, tuple
         Number of these worlds, and of all worlds in which the method ran, by the key of the method.
     """
     overview = overviews[choose_level(overviews)]
-    words = {
-        method: [cell.verdict.word for cell in overview.cells if cell.filter == method]
+    wins = {
+        method: [winner.wins for winner in overview.kalman_winners if winner.filter == method]
         for method in overview.methods
     }
-    return {
-        method: (all_words.count("better"), len(all_words)) for method, all_words in words.items()
-    }
+    return {method: (sum(won), len(won)) for method, won in wins.items()}
 
 
 def _format_cell(
@@ -274,13 +291,14 @@ def _format_ratio(verdict: Verdict) -> str:
 def list_verdicts(overview: Overview) -> pd.DataFrame:
     """List the filters against the reference of each world."""
     references = {world.key: world.reference for world in overview.worlds}
+    limits = {world.key: world.limit for world in overview.worlds}
     winners = {(w.world, w.filter): w for w in overview.winners}
     rows: list[dict[str, Any]] = []
     for cell in overview.cells:
         winner = winners.get((cell.world, cell.filter))
         verdict = {k: v for k, v in cell.verdict._asdict().items() if k not in ("a", "b")}
         rows.append({
-            "world": cell.world, "filter": cell.filter, "reference": references[cell.world], **verdict,
+            "world": cell.world, "filter": cell.filter, "reference": references[cell.world], "limit": limits[cell.world], **verdict,
             "track_share": cell.track_share, "loses_track": cell.loses_track,
             "p_every_baseline": winner.p if winner else "", "is_winner": winner.wins if winner else "",
             "ms_per_step": overview.times.get((cell.world, cell.filter), ""),

@@ -19,6 +19,7 @@ from pfbench.results.conditions import parse_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.results.paper_block import conf_dir, read_paper_block
 from pfbench.results.store import SAME_TIME
+from pfbench.stats.comparison import Verdict
 from pfbench.stats.world_table import (
     MeanRanks,
     Winner,
@@ -27,6 +28,7 @@ from pfbench.stats.world_table import (
     WorldResult,
     build_world,
     compare_methods,
+    compare_with_each,
     decide_cells,
     find_winners,
     rank_methods,
@@ -54,6 +56,7 @@ class WorldRow(NamedTuple):
         runs: Number of runs.
         kalman_fits: Whether Kalman filters fit the world; None without a tuning.
         words: What the world is, in a line.
+        limit: Largest error that counts.
     """
 
     key: str
@@ -64,6 +67,7 @@ class WorldRow(NamedTuple):
     runs: int
     kalman_fits: bool | None
     words: str = ""
+    limit: float = math.nan
 
 
 class Overview(NamedTuple):
@@ -80,6 +84,8 @@ class Overview(NamedTuple):
         ranks: Mean ranks over the worlds.
         times: Median time of a step [ms] by world and filter.
         left_out: Worlds that are not on the page, with the reason.
+        kalman_winners: Methods that are better than each single Kalman filter of a world.
+        outdone: Worlds in whose runs another single Kalman filter is better than the reference: the best of them.
     """
 
     worlds: tuple[WorldRow, ...]
@@ -92,6 +98,8 @@ class Overview(NamedTuple):
     ranks: MeanRanks
     times: Mapping[tuple[str, str], float]
     left_out: Mapping[str, str]
+    kalman_winners: Sequence[Winner]
+    outdone: Mapping[str, Verdict]
 
 
 class WorldFacts(NamedTuple):
@@ -187,12 +195,33 @@ def build_overview(
     order = sorted(range(len(worlds)), key=lambda k: worlds[k].kalman_fits is False)
     worlds, rows = [worlds[k] for k in order], [rows[k] for k in order]
     baselines = [label for label, look in looks.items() if not look.proposed]
+    single = [
+        v
+        for v in baselines
+        if looks[v].family == "kalman" and parse_label(v)[0] not in CONVENTIONAL
+    ]
     return Overview(
         tuple(rows), methods, conventional, {label: look.name for label, look in looks.items()},
         decide_cells(worlds, [*methods, *conventional]), compare_methods(worlds, methods),
         find_winners(worlds, methods, baselines), rank_methods(worlds, methods),
         _list_times(table, [row.key for row in rows]), left_out,
+        find_winners(worlds, methods, single), _find_outdone(worlds, single),
     )  # fmt: skip
+
+
+def _find_outdone(worlds: Sequence[World], single: Sequence[str]) -> dict[str, Verdict]:
+    """Find worlds whose reference, chosen on another seed, is worse than another single Kalman filter in these runs."""
+    pairs = [
+        [(w.reference, v) for v in single if v in w.losses and v != w.reference] for w in worlds
+    ]
+    verdicts = compare_with_each(list(zip(worlds, pairs, strict=True)))
+    worse = {
+        world.name: [verdict for verdict in some if verdict.word == "worse"]
+        for world, some in zip(worlds, verdicts, strict=True)
+    }
+    return {
+        name: max(some, key=lambda verdict: verdict.ratio) for name, some in worse.items() if some
+    }
 
 
 def build_overviews(
@@ -210,7 +239,8 @@ def build_overviews(
     overviews = {}
     for key in levels or [0]:
         labels = [label for label in looks if label not in timed and _level(label) in (None, key)]
-        overviews[key] = _build_tab(table, looks, parts, labels if levels else list(looks))
+        tab = _build_tab(table, looks, parts, labels if levels else list(looks))
+        overviews[key] = _name_other_numbers(tab, table[table["filter"].isin(labels)], int(key))
     if sum(is_method(looks[label]) for label in timed) >= FEWEST_METHODS:
         fixed = [label for label in looks if _level(label) is None]
         overviews[EQUAL_TIME] = _build_tab(table, looks, parts, [*timed, *fixed])
@@ -220,6 +250,20 @@ def build_overviews(
         others = [label for label in same if not is_method(looks[label])]
         overviews[PRINTED] = _build_tab(table, looks, parts, others, is_printed)
     return overviews
+
+
+def _name_other_numbers(tab: Overview, rows: pd.DataFrame, level: int) -> Overview:
+    """Name the methods that have another number of particles than their table, since they choose it themselves."""
+    if not level or "particles" not in rows:
+        return tab
+    names = rows["filter"].astype(str).map(name_without_level)
+    counts = rows.groupby(names)["particles"].median().dropna()
+    others = {
+        str(label): f"{tab.names[str(label)]} (N = {count:.0f})"
+        for label, count in counts.items()
+        if label in tab.names and count != level
+    }
+    return tab._replace(names={**tab.names, **others})
 
 
 def _add_levels(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> pd.DataFrame:
@@ -323,7 +367,7 @@ def _describe_world(world: World, name: PartName, looks: Mapping[str, MethodLook
     losses = world.losses[world.reference]
     return WorldRow(
         world.name, name.name, looks[world.reference].name, float(np.exp(losses.mean())), name.unit,
-        len(losses), world.kalman_fits, name.words,
+        len(losses), world.kalman_fits, name.words, world.cap,
     )  # fmt: skip
 
 
