@@ -240,4 +240,4 @@ def _say_open(lines: Sequence[ClaimWord]) -> str:
     """Say how many of the open claims are not decided by their runs, and how many lack runs."""
     some = [line for line in lines if line.word == "open"]
     missing = sum(line.reason.endswith(NOT_RUN) for line in some)
-    return f"Of {len(some)} open claims, {missing} lack runs of a reading, and {len(some) - missing} are not decided by their runs."
+    return f"Of the open ones, {missing} lack runs of a reading, and {len(some) - missing} are not decided by their runs."
