@@ -26,6 +26,7 @@ from faults.sweeps import CLEAR
 from faults.tally import FINE, Tally
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
+from pfbench.filter.exactness import has_covariance, has_evidence
 from pfbench.filter.health import HEALTH
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
@@ -68,7 +69,7 @@ def evidence_errors(estimate: FilterResult, particles: int) -> Tensor:
 
 def bounds_of(method: Any, model: LinearGaussian, y: Tensor, estimate: FilterResult) -> list[float]:
     """Return the largest log evidence that is possible in each run."""
-    if getattr(method, "noise_adaptations", ()):
+    if getattr(method, "noise_adaptations", ()) or not has_evidence(method):
         return [math.inf] * RUNS
     errors = evidence_errors(estimate, getattr(method, "particles", 1))
     return (largest_evidence(model, y) + STANDARD_ERRORS * errors).tolist()
@@ -126,6 +127,8 @@ def try_case(name: str, case: Extreme, engine: str) -> list[Any]:
     except Exception as error:
         return [classify_error(error)] * RUNS
     bounds, marks = bounds_of(method, model, case.y, estimate), marked_runs(estimate)
+    if not has_covariance(method):  # it states none: the estimates alone are judged
+        estimate = estimate._replace(variance=torch.ones_like(estimate.mean))
     return [class_of(estimate, run, marks[run], bounds[run], case) for run in range(RUNS)]
 
 
