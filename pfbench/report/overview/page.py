@@ -186,17 +186,24 @@ def describe_setting(overview: Overview, level: TabKey = 0) -> str:
     runs = sorted({world.runs for world in overview.worlds})
     counts = f"{runs[0]}" if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
     return (
-        f"{len(overview.worlds)} worlds, {counts} paired runs each{f', {level} particles' if level else ''}. An error counts up to the track limit of its "
+        f"{len(overview.worlds)} worlds, {counts} paired runs each{f', {level} particles' if level else ''}{_name_numbers(overview)}. An error counts up to the track limit of its "
         f"world, which a lost run has. {_describe_reference(overview)} Conventional are all filters but the proposed ones, a bank of EKFs among them."
     )
 
 
+def _name_numbers(overview: Overview) -> str:
+    """Name the methods that set their number of particles themselves."""
+    shown = [label for label in overview.methods if label in overview.numbers]
+    some = [f"{overview.names[label]} {overview.numbers[label]:.0f}" for label in shown]
+    return f" (its own number: {', '.join(some)})" if some else ""
+
+
 def _describe_reference(overview: Overview) -> str:
     """Say how the best Kalman filter was chosen, where it is not the best in these runs, and what each one beats."""
-    worlds = {world.key: world.name for world in overview.worlds}
     better = [
-        f"{overview.names[v.b]} in {worlds[key]} (the chosen one has {v.ratio:.2f} times its error)"
-        for key, v in overview.outdone.items()
+        f"{overview.names[world.outdone.b]} in {world.name} (the chosen one has {world.outdone.ratio:.2f} times its error)"
+        for world in overview.worlds
+        if world.outdone
     ]
     wins = sum(winner.wins for winner in overview.kalman_winners)
     text = "The best Kalman filter of a world was chosen on another seed, tuned ones among the candidates; the methods are not tuned."

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,6 +58,7 @@ class WorldRow(NamedTuple):
         kalman_fits: Whether Kalman filters fit the world; None without a tuning.
         words: What the world is, in a line.
         limit: Largest error that counts.
+        outdone: Verdict on the reference against the best other single Kalman filter, if that is better in these runs.
     """
 
     key: str
@@ -68,6 +70,7 @@ class WorldRow(NamedTuple):
     kalman_fits: bool | None
     words: str = ""
     limit: float = math.nan
+    outdone: Verdict | None = None
 
 
 class Overview(NamedTuple):
@@ -85,7 +88,7 @@ class Overview(NamedTuple):
         times: Median time of a step [ms] by world and filter.
         left_out: Worlds that are not on the page, with the reason.
         kalman_winners: Methods that are better than each single Kalman filter of a world.
-        outdone: Worlds in whose runs another single Kalman filter is better than the reference: the best of them.
+        numbers: Number of particles of the filters that have another one than their table.
     """
 
     worlds: tuple[WorldRow, ...]
@@ -99,7 +102,7 @@ class Overview(NamedTuple):
     times: Mapping[tuple[str, str], float]
     left_out: Mapping[str, str]
     kalman_winners: Sequence[Winner]
-    outdone: Mapping[str, Verdict]
+    numbers: Mapping[str, float] = MappingProxyType({})
 
 
 class WorldFacts(NamedTuple):
@@ -200,12 +203,13 @@ def build_overview(
         for v in baselines
         if looks[v].family == "kalman" and parse_label(v)[0] not in CONVENTIONAL
     ]
+    outdone = _find_outdone(worlds, single)
     return Overview(
-        tuple(rows), methods, conventional, {label: look.name for label, look in looks.items()},
+        tuple(row._replace(outdone=outdone.get(row.key)) for row in rows), methods, conventional, {label: look.name for label, look in looks.items()},
         decide_cells(worlds, [*methods, *conventional]), compare_methods(worlds, methods),
         find_winners(worlds, methods, baselines), rank_methods(worlds, methods),
         _list_times(table, [row.key for row in rows]), left_out,
-        find_winners(worlds, methods, single), _find_outdone(worlds, single),
+        find_winners(worlds, methods, single),
     )  # fmt: skip
 
 
@@ -240,7 +244,7 @@ def build_overviews(
     for key in levels or [0]:
         labels = [label for label in looks if label not in timed and _level(label) in (None, key)]
         tab = _build_tab(table, looks, parts, labels if levels else list(looks))
-        overviews[key] = _name_other_numbers(tab, table[table["filter"].isin(labels)], int(key))
+        overviews[key] = _count_other_numbers(tab, table[table["filter"].isin(labels)], int(key))
     if sum(is_method(looks[label]) for label in timed) >= FEWEST_METHODS:
         fixed = [label for label in looks if _level(label) is None]
         overviews[EQUAL_TIME] = _build_tab(table, looks, parts, [*timed, *fixed])
@@ -252,18 +256,14 @@ def build_overviews(
     return overviews
 
 
-def _name_other_numbers(tab: Overview, rows: pd.DataFrame, level: int) -> Overview:
-    """Name the methods that have another number of particles than their table, since they choose it themselves."""
+def _count_other_numbers(tab: Overview, rows: pd.DataFrame, level: int) -> Overview:
+    """Count the particles of the filters that have another number than their table, since they set it themselves."""
     if not level or "particles" not in rows:
         return tab
     names = rows["filter"].astype(str).map(name_without_level)
     counts = rows.groupby(names)["particles"].median().dropna()
-    others = {
-        str(label): f"{tab.names[str(label)]} (N = {count:.0f})"
-        for label, count in counts.items()
-        if label in tab.names and count != level
-    }
-    return tab._replace(names={**tab.names, **others})
+    others = {str(k): n for k, n in counts.items() if k in tab.names and n != level}
+    return tab._replace(numbers=others)
 
 
 def _add_levels(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> pd.DataFrame:
