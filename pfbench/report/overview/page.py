@@ -193,8 +193,8 @@ def describe_setting(overview: Overview, level: TabKey = 0) -> str:
 
 def _name_numbers(overview: Overview) -> str:
     """Name the methods that set their number of particles themselves."""
-    shown = [label for label in overview.methods if label in overview.numbers]
-    some = [f"{overview.names[label]} {overview.numbers[label]:.0f}" for label in shown]
+    labels = [label for label in overview.methods if label in overview.numbers]
+    some = [f"{overview.names[label]} {overview.numbers[label]:.0f}" for label in labels]
     return f" (its own number: {', '.join(some)})" if some else ""
 
 
