@@ -36,9 +36,7 @@ from pfbench.report import RUNS_FILE, count_better_worlds, find_overviews, read_
 from pfbench.report.writers import render_template
 
 VALUES = "values.json.gz"
-COMPARISON = (
-    "all_seven"  # study that compares the methods with the best Kalman filter of each world
-)
+COMPARISON = "all_seven"  # study that compares the methods with the Kalman filters of each world
 RULES = (
     "Confirmed or refuted: the same outcome in all readings that can run, at 2.5 % for all claims of a paper.",
     "Depends: outcomes of both kinds, after correction over claims times readings.",

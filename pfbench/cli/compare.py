@@ -46,7 +46,11 @@ def compare_study(words: Sequence[str]) -> None:
     write_atomically(path, lambda file: file.write(compared.table().to_csv(index=False).encode()))
     print(f"verdicts: {path.resolve()}")
     if compared.cells:
+        try:
+            svg = to_svg(compared.plot()).encode()
+        except ValueError as error:  # the verdicts above stand without it
+            print(f"no heat map: {error}")
+            return
         picture = path.with_name("published_heat_map.svg")
-        svg = to_svg(compared.plot()).encode()
         write_atomically(picture, lambda file: file.write(svg))
         print(f"heat map: {picture.resolve()}")

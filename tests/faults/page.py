@@ -40,8 +40,13 @@ def format_row(row: dict[str, Any]) -> list[str]:
 
 
 def format_reasons(row: dict[str, Any]) -> list[str]:
-    """Return a line for each way in which trials of a class were false, with its reason."""
-    lines, prefix = [], f"{readers.load_mutations().EVERY_ROW}: "
+    """Return a line for each way in which trials of a class were false, with its reason or an example."""
+    lines = [
+        f"- {row['name']}: {example}."
+        for example in row["examples"].get("false", ())
+        if row["name"].startswith("extreme")
+    ]
+    prefix = f"{readers.load_mutations().EVERY_ROW}: "
     for remark, trials in sorted(row["remarks"].items()):
         columns = remark.removeprefix(prefix)
         if remark != columns:
@@ -56,7 +61,7 @@ def format_block(rows: Sequence[dict[str, Any]]) -> str:
     lines = [head, ["---"] * len(head), *map(format_row, rows)]
     table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
     reasons = "".join(f"\n{line}" for row in rows for line in format_reasons(row))
-    reasons = f"\n\nFalse trials of damaged logs:\n{reasons}" if reasons else ""
+    reasons = f"\n\nFalse trials:\n{reasons}" if reasons else ""
     return f"<!-- numbers:reliability -->\n{table}{reasons}\n<!-- numbers:end -->"
 
 

@@ -41,6 +41,7 @@ from pfbench.report.overview.tables import (
     read_world_facts,
     tell_story,
 )
+from pfbench.results.conditions import make_distinct_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.stats.world_table import (
     SHARED_SEEDS,
@@ -307,6 +308,41 @@ def test_a_win_against_kalman_filters_is_one_against_each_of_them(
     assert outdone == {key: "ukf" for key, name in references.items() if name != ukf}
     assert "In these runs another one is better: UKF in" in describe_setting(changed)
     assert not any(won for won, _ in count_better_worlds({0: changed}).values())
+
+
+def test_a_method_with_another_number_of_particles_than_its_table_is_named(
+    table: pd.DataFrame, looks: dict[str, MethodLook], parts: dict[str, PartName]
+) -> None:
+    """An adaptive method, whose number its file sets."""
+    both = [
+        table.assign(
+            filter=[
+                f"{v}[particles={n}]" if n and looks[str(v)].proposed else v
+                for v in table["filter"]
+            ],
+            particles=[200.0 if v == "cofm_amssrcpf" else float(n) for v in table["filter"]],
+        )
+        for n in (100, 1000)
+    ]
+    joined = pd.concat([both[0], both[1][both[1]["filter"].astype(str).str.contains("particles=")]])
+    overviews = build_overviews(joined, find_looks(sorted(set(joined["filter"]))), parts)
+    assert overviews[1000].numbers["cofm_amssrcpf"] == 200.0
+    assert "mcmc_rpf" not in overviews[1000].numbers
+    name = overviews[1000].names["cofm_amssrcpf"]
+    assert f"1000 particles (its own number: {name} 200)" in describe_setting(overviews[1000], 1000)
+
+
+def test_a_job_at_equal_time_has_its_budget_in_its_label() -> None:
+    """Its number of particles follows from the time: 63 where its settings say 1000."""
+    config = {
+        "particles": {"budget": "particles", "particles": 100, "filter": {"particles": 100}},
+        "time": {"budget": "time", "particles": 1000, "filter": {"particles": 1000}},
+    }
+    metas = [{"label": "cpso_escape", "key": k, "config": c} for k, c in config.items()]
+    labels = [make_distinct_label(meta, metas) for meta in metas]
+    assert labels == [
+        "cpso_escape[budget=particles,particles=100]", "cpso_escape[budget=time,particles=1000]",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", ["heat map", "matrices"])

@@ -187,7 +187,8 @@ def describe_setting(overview: Overview, level: TabKey = 0) -> str:
     counts = f"{runs[0]}" if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
     return (
         f"{len(overview.worlds)} worlds, {counts} paired runs each{f', {level} particles' if level else ''}{_name_numbers(overview)}. An error counts up to the track limit of its "
-        f"world, which a lost run has. {_describe_reference(overview)} Conventional are all filters but the proposed ones, a bank of EKFs among them."
+        f"world, which a lost run has. {_describe_reference(overview)} Conventional are all filters but the proposed ones"
+        f"{', a bank of EKFs among them' if 'ekf_bank' in overview.conventional else ''}."
     )
 
 
@@ -206,7 +207,9 @@ def _describe_reference(overview: Overview) -> str:
         if world.outdone
     ]
     wins = sum(winner.wins for winner in overview.kalman_winners)
-    text = "The best Kalman filter of a world was chosen on another seed, tuned ones among the candidates; the methods are not tuned."
+    text = "The best Kalman filter of a world was chosen on another seed, tuned ones among the candidates"
+    blocks = [read_paper_block("filter", parse_label(method)[0]) for method in overview.methods]
+    text += "." if any(block.get("tuning") for block in blocks) else "; the methods are not tuned."
     if better:
         text += f" In these runs another one is better: {', '.join(better)}."
     return f"{text} Better than every single Kalman filter: in {wins} of {len(overview.kalman_winners)} cells."
