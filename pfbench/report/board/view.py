@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy  # scipy.stats is imported at its first use
 
+from pfbench.report.writers import format_ratio
 from pfbench.results.looks import MethodLook
 from pfbench.results.step_times import StepTimes, describe_costs
 from pfbench.stats.comparison import MIN_RUNS, Verdict, decide
@@ -254,7 +255,7 @@ def describe_view(
     head += f" {'is' if len(better) < 2 else 'are'} better than {base} {where}"
     if better:
         first = better[0]
-        head += f" (best: [[{looks[first['filter']].name}]], {_show_ratio(first)} of its {metric})"
+        head += f" (best: [[{looks[first['filter']].name}]], {format_ratio(first['ratio'], first['ratio_low'], first['ratio_high'])} of its {metric})"
     head = f"{head}; {rest}." if rest else f"{head}."
     texts = [f"{head} {text}".rstrip() for text in _describe_proposed(others, better, looks)]
     return next((text for text in texts if len(text.split()) <= _MOST_WORDS), head)
@@ -262,9 +263,7 @@ def describe_view(
 
 def _show_ratio(row: BoardRow) -> str:
     """Format the ratio of a row with its interval."""
-    if not math.isfinite(row["ratio_high"]):
-        return f"{row['ratio']:.2f}"
-    return f"{row['ratio']:.2f} [{row['ratio_low']:.2f}, {row['ratio_high']:.2f}]"
+    return format_ratio(row["ratio"], row["ratio_low"], row["ratio_high"])
 
 
 def _describe_proposed(
@@ -277,7 +276,11 @@ def _describe_proposed(
     row = min(proposed, key=lambda r: (r["verdict"] == LOSES_TRACK, r["ratio"]))
     head = f"Best proposed method: [[{looks[row['filter']].name}]]"
     return [
-        f"{head}, {ratio}, {row['verdict']}." for ratio in (_show_ratio(row), f"{row['ratio']:.2f}")
+        f"{head}, {ratio}, {row['verdict']}."
+        for ratio in (
+            format_ratio(row["ratio"], row["ratio_low"], row["ratio_high"]),
+            f"{row['ratio']:.2f}",
+        )
     ]
 
 

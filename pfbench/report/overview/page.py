@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,10 +21,9 @@ from pfbench.report.overview.tables import (
 )
 from pfbench.report.papers.figures import list_paper_pages
 from pfbench.report.study_page.page_writer import describe_page_knobs
-from pfbench.report.writers import format_csv, template_environment
+from pfbench.report.writers import format_csv, format_ratio, template_environment
 from pfbench.results.conditions import parse_label
 from pfbench.results.paper_block import read_paper_block
-from pfbench.stats.comparison import Verdict
 from pfbench.stats.world_table import WorldResult
 
 BOARD_PAGE = "worlds.html"  # the page of each world, which is the first page of other studies
@@ -228,7 +226,11 @@ def list_ratios(overview: Overview) -> list[tuple[WorldRow, list[str]]]:
         texts = []
         for label in (*overview.methods, *overview.conventional):
             cell = cells.get((world.key, label))
-            text = "–" if cell is None else _format_ratio(cell.verdict)
+            text = (
+                "–"
+                if cell is None
+                else format_ratio(cell.verdict.ratio, cell.verdict.low, cell.verdict.high)
+            )
             share = (
                 f"; {100 * cell.track_share:.0f} % keep track" if cell and cell.loses_track else ""
             )
@@ -289,13 +291,6 @@ def _format_cell(
     if cell.verdict.word == "better":
         return f"**{look.text}**"
     return look.text if cell.verdict.word == "worse" else f"({look.text})"
-
-
-def _format_ratio(verdict: Verdict) -> str:
-    """Format the ratio of a verdict with its interval."""
-    if not math.isfinite(verdict.high):
-        return f"{verdict.ratio:.2f}"
-    return f"{verdict.ratio:.2f} [{verdict.low:.2f}, {verdict.high:.2f}]"
 
 
 def list_verdicts(overview: Overview) -> pd.DataFrame:

@@ -404,7 +404,7 @@ def tell_story(overview: Overview, method: str, summary: str) -> dict[str, str]:
 
 
 def format_times(overview: Overview, method: str) -> str:
-    """Return the range over worlds of the time of a step, relative to that of the reference of the world."""
+    """Return median and range over worlds of the time of a step, relative to that of the reference of the world."""
     labels = {name: label for label, name in overview.names.items()}
     ratios = [
         overview.times[world.key, method] / overview.times[world.key, labels[world.reference]]
@@ -414,8 +414,8 @@ def format_times(overview: Overview, method: str) -> str:
     finite = [ratio for ratio in ratios if np.isfinite(ratio)]
     if not finite:
         return "–"
-    low, high = (format_factor(value) for value in (min(finite), max(finite)))
-    return low if low == high else f"{low} to {high}"
+    middle, low, high = (format_factor(f(finite)) for f in (np.median, min, max))
+    return middle if low == high else f"{middle} ({low} to {high})"
 
 
 def format_factor(value: float) -> str:
