@@ -78,8 +78,8 @@ class Study(NamedTuple):
 
 LARGE = (DEFAULT, DEFAULT32, FLOAT32, PARTICLES, COUNT, RUN_BY_RUN)
 ONE_JOB = (DEFAULT, DEFAULT32, NUMBA, COUNT, RUN_BY_RUN)
-GOALS = (Goal(DEFAULT.label, "particles", 3.0, 4.0), Goal(DEFAULT.label, "JAX", 4.0, 6.0))
-FASTEST = (Goal(DEFAULT.label, "", 2.0, 3.0),)
+GOALS = (Goal(DEFAULT.label, "particles", 2.0, 3.0), Goal(DEFAULT.label, "JAX", 3.0, 4.0))
+FASTEST = (Goal(DEFAULT.label, "", 1.5, 2.0),)
 STUDIES = (
     Study("six campaigns of W4", "15-state INS error model", "ins", 200, 500, 6, LARGE, GOALS),
     Study("W1, one job", "growth model", "growth", 100, 10_000, 1, ONE_JOB, FASTEST),

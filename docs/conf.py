@@ -1,5 +1,6 @@
 """Settings of the site: `make site` copies this file next to all pages and runs Sphinx there."""
 
+import os
 import re
 from importlib import metadata
 from typing import Any
@@ -28,6 +29,7 @@ nb_execution_timeout = 300
 nb_execution_in_temp = True
 nb_execution_raise_on_error = True
 nb_merge_streams = True
+os.environ["PYTHONWARNINGS"] = "ignore:IProgress not found"  # of pyro in a notebook without widgets; kernels inherit it
 
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_member_order = "bysource"
