@@ -29,7 +29,9 @@ nb_execution_timeout = 300
 nb_execution_in_temp = True
 nb_execution_raise_on_error = True
 nb_merge_streams = True
-os.environ["PYTHONWARNINGS"] = "ignore:IProgress not found"  # of pyro in a notebook without widgets; kernels inherit it
+os.environ["PYTHONWARNINGS"] = (
+    "ignore:IProgress not found"  # of pyro in a notebook without widgets; kernels inherit it
+)
 
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_member_order = "bysource"

@@ -275,7 +275,6 @@ def test_studies_run_cheapest_first_and_within_a_limit() -> None:
 WAITING_FOR_A_RERUN = [
     "robust_car",
     "robust_quad",
-    "robust_simulated",
 ]
 
 
