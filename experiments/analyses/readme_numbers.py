@@ -396,7 +396,7 @@ def contents() -> str:
         return len(list((TOP / "conf" / group).glob("*.yaml")))
 
     decided = re.findall(
-        r"(\d+) (confirmed|refuted|depends|untestable|open)", claims_2().split("\n")[0]
+        r"(\d+) (confirmed|refuted|depends|untestable|open|not run)", claims_2().split("\n")[0]
     )
     words = ", ".join(f"{number} {word}" for number, word in decided)
     return "\n".join(markdown_bullets(

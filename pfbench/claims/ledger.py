@@ -29,6 +29,7 @@ from pfbench.claims.words import (
     OPEN,
     REFUTED,
     UNDECIDED,
+    WORDS,
     ClaimDecision,
 )
 from pfbench.results.paper_block import conf_dir
@@ -67,6 +68,11 @@ class ClaimWord(NamedTuple):
     def label(self) -> str:
         """Word with the factors on which it depends."""
         return f"{DEPENDS} on {', '.join(self.factors)}" if self.word == DEPENDS else self.word
+
+    @property
+    def state(self) -> str:
+        """Word, or "not run" of an open claim that lacks runs of a reading."""
+        return NOT_RUN if self.word == OPEN and self.reason.endswith(NOT_RUN) else self.word
 
 
 def conclude(plan: ClaimPlan, decisions: Decisions) -> ClaimWord:
@@ -196,12 +202,11 @@ def _compare_word(verdict: str, word: str) -> str:
 
 
 def count_by_paper(lines: Sequence[ClaimWord]) -> dict[str, dict[str, int]]:
-    """Count the words of each paper."""
-    papers = read_paper_settings()
+    """Count the words of each paper, and the open claims that lack runs apart."""
     return {
         paper: {
-            word: sum(line.word == word and line.plan.claim.paper == paper for line in lines)
-            for word in ("confirmed", "refuted", "depends", "untestable", "open")
+            state: sum(line.state == state and line.plan.claim.paper == paper for line in lines)
+            for state in (*WORDS, NOT_RUN)
         }
-        for paper in papers
+        for paper in read_paper_settings()
     }

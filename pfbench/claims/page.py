@@ -30,7 +30,7 @@ from pfbench.claims.ledger import (
 )
 from pfbench.claims.proofs import read_proofs
 from pfbench.claims.run_claims import Decisions, describe_words, price_claims
-from pfbench.claims.words import NOT_RUN, WORDS, ClaimDecision
+from pfbench.claims.words import NOT_RUN, OPEN, WORDS, ClaimDecision
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import RUNS_FILE, count_better_worlds, find_overviews, read_stored_study
 from pfbench.report.writers import render_template
@@ -111,13 +111,12 @@ def make_context(
         }
         for paper, settings in read_paper_settings().items()
     ]
-    total = {word: sum(count[word] for count in counts.values()) for word in WORDS}
+    total = {state: sum(count[state] for count in counts.values()) for state in (*WORDS, NOT_RUN)}
     commits = sorted({record.commit or "not stored" for record in runs.records})
     return {
         "papers": papers,
         "seven": make_seven(lines, worlds),
         "compared": bool(worlds),
-        "open_said": _say_open(lines),
         "total": total,
         "rules": RULES,
         "proofs": read_proofs(),
@@ -141,7 +140,7 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
     """Make the row of a claim."""
     claim, decision = line.plan.claim, line.decision
     price = prices.get(claim.id, 0.0)
-    reason = f"{line.reason}, price {_format_price(price)}" if price and line.reason.endswith(NOT_RUN) else line.reason  # fmt: skip
+    reason = f"{line.reason}, price {_format_price(price)}" if price and line.state == NOT_RUN else line.reason  # fmt: skip
     statement = f"{line.label}: {reason}" if reason else line.label
     measured = _format_measured(decision)
     repaired = decisions.get((claim.id, REPAIRED, "direction"))
@@ -151,6 +150,7 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
         "words": claim.words,
         "section": claim.section,
         "word": line.word,
+        "state": line.state,
         "said": statement,
         "tip": f"{claim.id}: {statement}. “{claim.words}” {measured}".strip(),
         "repaired": line.repaired,
@@ -216,13 +216,20 @@ def make_seven(
         {
             "name": entry["name"],
             "claim": entry["claim"],
-            "published": words[entry["claim"]].label,
-            "repaired": words[entry["claim"]].repaired or "no repair",
+            "published": _say_fate(words[entry["claim"]], words[entry["claim"]].label),
+            "repaired": _say_fate(
+                words[entry["claim"]], words[entry["claim"]].repaired or "no repair"
+            ),
             "tuned": _say_worlds(*worlds.get(entry["filter"], (0, 0))),
             "is": entry["is"],
         }
         for entry in read_seven()
     ]
+
+
+def _say_fate(line: ClaimWord, word: str) -> str:
+    """Say the word on a method, or that its claim has not run."""
+    return NOT_RUN if word == OPEN and line.state == NOT_RUN else word
 
 
 def _say_worlds(better: int, count: int) -> str:
@@ -232,10 +239,3 @@ def _say_worlds(better: int, count: int) -> str:
         if count
         else NOT_RUN
     )
-
-
-def _say_open(lines: Sequence[ClaimWord]) -> str:
-    """Say how many of the open claims are not decided by their runs, and how many lack runs."""
-    some = [line for line in lines if line.word == "open"]
-    missing = sum(line.reason.endswith(NOT_RUN) for line in some)
-    return f"Of the open ones, {missing} lack runs of a reading, and {len(some) - missing} are not decided by their runs."

@@ -316,7 +316,11 @@ def test_a_dry_run_prints_prices_and_runs_nothing(tmp_path: Path, capsys: pytest
 def test_the_page_says_what_is_not_run_and_at_what_price(tmp_path: Path) -> None:
     page = write_claims(tmp_path, tmp_path / "out")
     text = page.read_text()
-    assert text.count('class="square ') == 2 * 88 + len(WORDS)
+    assert text.count('class="square ') == 2 * 88 + len(WORDS) + 1  # of the key, with those not run
+    shown = {word: text.count(f'class="square {word}"') + text.count(f'class="square {word} far"') for word in (*WORDS, "not-run")}  # fmt: skip
+    counts = {word.replace(" ", "-"): int(n) for n, word in re.findall(r"</i>(\d+) ([a-z ]+)</span>", text)}  # fmt: skip
+    assert shown == {word: 2 * n + 1 for word, n in counts.items()}
+    assert counts["not-run"] > counts["open"] > 0
     assert re.search(r"C001-5: open: not run, price \d+ (s|min)", text)
     assert "Nothing has run yet" in text
     first = text[text.index("<main>") : text.index("<details")]
