@@ -11,7 +11,7 @@ import pytest
 import torch
 from filter_cases import method_of
 
-from pfbench.claims.proofs import read_proofs
+from pfbench.claims.claim_lines import read_proofs
 from pfbench.core.linear_algebra import factor
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
