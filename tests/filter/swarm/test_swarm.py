@@ -33,7 +33,6 @@ from pfbench.filter.proposed.swarm_coordinates import (
     LikelihoodFitness,
     ObservedComponents,
     PosteriorFitness,
-    PrintedFitness,
     SwarmFrame,
     observed_components,
 )
@@ -679,51 +678,6 @@ def test_the_corrected_evidence_converges() -> None:
     assert (estimate.variance.mean(0) / exact[1]).numpy() == pytest.approx(1.0, abs=0.12)
 
 
-def test_the_printed_swarm_returns_the_measurement() -> None:
-    """Thirty iterations towards the likelihood leave nothing of the prediction: the estimate is the fix."""
-    model = LinearGaussian(
-        torch.eye(2), 0.1 * torch.eye(2), torch.eye(2), [1.0, 2.0], [0.0, 0.0], [3.0, 3.0]
-    )
-    y = measured(model, 20, 15)
-    fix = (run(PSO, model, y, 100).mean - y)[:, 3:]
-    kf = (kalman(model, y)[0] - y)[:, 3:]
-    assert fix.square().mean().sqrt() < 0.1
-    assert kf.square().mean().sqrt() > 1.0
-
-
-def test_the_fitness_as_printed_has_no_maximum() -> None:
-    """exp(-(z - z_pred) / 2 R) rewards a prediction beyond the measurement without bound; only the literal form seeks it."""
-    model = LinearGaussian([[1.0]], [[1.0]], [[1.0]], [1.0], [0.0], [1.0])
-    x = draws(1).normal("x", 50, 1)
-    frame = AllComponents()(
-        model, x - x.mean(1, keepdim=True), torch.full((1, 50), 0.02, dtype=torch.float64), ()
-    )
-    found = []
-    for fitness in (PrintedFitness(), LikelihoodFitness()):
-        swarm = SwarmProposal(
-            ESCAPE, None, fitness, AllComponents(), SwarmLimits(max_distance_sd=None), None, 60
-        )
-        flock, _ = swarm.optimise(
-            model,
-            frame,
-            torch.ones(1, 50, dtype=torch.bool),
-            {},
-            Record(torch.zeros(1, 1).double()),
-            draws(1),
-        )
-        found.append(flock.best_position().abs().item())
-    assert found[0] > 20.0
-    assert found[1] < 1.0
-    fitnesses = [
-        composed("linear_walk", f"filter={name}")["filter"].proposal.fitness._target_
-        for name in PRESETS
-    ]
-    assert set(fitnesses) == {
-        "pfbench.filter.LikelihoodFitness",
-        "pfbench.filter.PosteriorFitness",
-    }
-
-
 # anything goes
 
 
@@ -828,6 +782,10 @@ def test_bad_choices_are_told() -> None:
             ("quantile", lambda: ChiSquareStopping(1.0)),
             ("inertia_weight", lambda: InertiaVelocity(inertia_weight=1.0)),
             ("escape_coefficient", lambda: InertiaVelocity(escape_coefficient=-0.1)),
+            (
+                "printed_iterations must be at least 1.* Use null",
+                lambda: InertiaVelocity(printed_iterations=0),
+            ),
             ("beta", lambda: ChaoticPerturbation(0.0)),
             ("max_velocity_sd", lambda: SwarmLimits(max_velocity_sd=0.0)),
             ("max_distance_sd", lambda: SwarmLimits(max_distance_sd=-1.0)),
