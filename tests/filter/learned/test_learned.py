@@ -36,19 +36,20 @@ from pfbench.filter.gaussian.linearisation_rules import (
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.learned import checkpoint
 from pfbench.filter.learned.differentiable_resampling import sample_from
-from pfbench.filter.learned.features import (
-    InnovationFeature,
-    InputFeature,
-    ParentFeature,
-    SpreadFeature,
-    make_feature_context,
-)
 from pfbench.filter.learned.mcmc_kernel import LearnedRandomWalk
 from pfbench.filter.learned.networks import (
     DiagonalNormalHead,
     ZukoFlowHead,
 )
-from pfbench.filter.learned.proposal import PAST, LearnedProposal
+from pfbench.filter.learned.proposal import (
+    PAST,
+    InnovationFeature,
+    InputFeature,
+    LearnedProposal,
+    ParentFeature,
+    SpreadFeature,
+    make_feature_context,
+)
 from pfbench.filter.moves.metropolis import MetropolisHastings, StateHistory
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.stages import (
