@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.distributions import Distribution, Independent
 
-from pfbench.core.chart import Chart, EuclideanBlock
+from pfbench.core.chart import Chart, EuclideanBlock, wrap_angle
+from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
@@ -45,3 +50,53 @@ class Fragile(LinearGaussian):
         moved = super().propagate(x, u, w)
         moved = torch.where(x[..., :1] > 2.5, torch.nan, moved)
         return torch.where(x[..., :1] < -2.5, torch.inf, moved)
+
+
+def four_states(
+    sd: Sequence[float] = (0.5, 20.0, 0.1), kind: type[LinearGaussian] = LinearGaussian
+) -> LinearGaussian:
+    """Damped rotations coupled at random, a singular transition, three components of these deviations."""
+    rng = np.random.default_rng(4)
+    f = 0.4 * rng.normal(size=(4, 4))
+    f *= 0.95 / np.abs(np.linalg.eigvals(f)).max()
+    p = rng.normal(size=(4, 4))
+    root = np.linalg.cholesky(p @ p.T + np.eye(4))
+    g, h = rng.normal(size=(4, 2)), rng.normal(size=(3, 4))
+    return kind(f, g, h, list(sd), rng.normal(size=4), root)
+
+
+class BearingDistance(StateSpaceModel):
+    """A point in the plane that walks, seen by bearing and distance from the origin; `turned` as a whole."""
+
+    def __init__(self, turned: float = 0.0, sd: Sequence[float] = (0.02, 0.1)) -> None:
+        super().__init__()
+        self.register_buffer("s", torch.tensor(sd, dtype=torch.float64))
+        self.names, self.units, self.noise_dim = ("x", "y"), ("m", "m"), 2
+        self.groups = {"position": (0, 1)}
+        self.turned = turned
+
+    @property
+    def rotation(self) -> Tensor:
+        c, s = math.cos(self.turned), math.sin(self.turned)
+        return torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
+
+    def initial(self, runs: int) -> Distribution:
+        start = self.rotation @ self.s.new_tensor([2.0, 0.0])
+        return normal_batch(runs, self.s.new_tensor([0.3, 0.3]), start)
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return x + 0.05 * w @ self.rotation.mT
+
+    def observation(self, x: Tensor, u: Any) -> Independent:
+        seen = torch.stack([torch.atan2(x[..., 1], x[..., 0]), x.norm(dim=-1)], -1)
+        return independent_normal(seen[..., : len(self.s)], self.s)
+
+    def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
+        return torch.cat([wrap_angle(y[..., :1] - y_hat[..., :1]), y[..., 1:] - y_hat[..., 1:]], -1)
+
+
+class Bearing(BearingDistance):
+    """The same, seen by its bearing alone; West of the origin, bearings jump between pi and -pi."""
+
+    def __init__(self, turned: float = 0.0) -> None:
+        super().__init__(turned, (0.05,))

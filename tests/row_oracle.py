@@ -21,7 +21,7 @@ import yaml
 from pyarrow import parquet
 from scipy import stats
 
-FEW, TRACK, EXACT = 10, 0.8, 50
+FEW, EXACT = 10, 50
 TUNED = Path(__file__).parents[1] / "conf" / "tuned"
 
 

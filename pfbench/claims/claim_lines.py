@@ -1,10 +1,10 @@
-"""Lines of each claim: comparisons of filters in the readings of its paper, read from claim_lines.yaml."""
+"""Data of the claims: lines that compare filters in the readings of a paper, and proofs without runs."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -15,6 +15,9 @@ import yaml
 from pfbench.claims.claim_list import PrintedClaim, read_printed_claims
 from pfbench.claims.measures import Measure
 from pfbench.results.paper_block import conf_dir
+
+# --------------------------------------------------------------------------------------------------
+# Lines of each claim: comparisons of filters in the readings of its paper, read from claim_lines.yaml.
 
 _DATA = Path(__file__).with_name("claim_lines.yaml")
 CENTRAL_READING = "central"
@@ -264,3 +267,53 @@ def apply_window(measure: Measure, window: tuple[float, float] | None) -> Measur
     if window is None:
         return measure
     return replace(measure, start=window[0], end=window[1])
+
+
+# --------------------------------------------------------------------------------------------------
+# Proofs on the papers, read from proofs.yaml: statements without runs, margins or choices of this project.
+
+_PROOFS = Path(__file__).with_name("proofs.yaml")
+
+
+@dataclass(frozen=True)
+class Proof:
+    """Statement on a paper that a test shows in less than a second.
+
+    Attributes:
+        id: Identifier, as "P1".
+        paper: Number of the paper.
+        claims: Claims that it decides, alone or in one scope.
+        equation: Equation or sentence of the paper.
+        shows: Line for the page.
+        test: Name of the test, in tests/claims/test_proofs.py.
+    """
+
+    id: str
+    paper: str
+    claims: Sequence[str]
+    equation: str
+    shows: str
+    test: str
+
+
+def read_proofs(path: Path = _PROOFS) -> list[Proof]:
+    """Read the proofs.
+
+    Args:
+        path: Data file.
+
+    Returns:
+        The proofs, in the order of the file.
+
+    Raises:
+        ValueError: If an entry has other keys.
+    """
+    names = {item.name for item in fields(Proof)}
+    rows = yaml.safe_load(path.read_text(encoding="utf-8"))
+    for row in rows:
+        if set(row) != names:
+            raise ValueError(
+                f"{path.name}: {row.get('id')} must have the keys {', '.join(sorted(names))}, got "
+                f"{', '.join(sorted(row))}. Correct them."
+            )
+    return [Proof(**row) for row in rows]

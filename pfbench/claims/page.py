@@ -14,6 +14,7 @@ from pfbench.claims.claim_lines import (
     ClaimPlan,
     read_paper_settings,
     read_plans,
+    read_proofs,
     read_readings,
     read_seven,
 )
@@ -28,7 +29,6 @@ from pfbench.claims.ledger import (
     describe_turns,
     list_choices,
 )
-from pfbench.claims.proofs import read_proofs
 from pfbench.claims.run_claims import Decisions, describe_words, price_claims
 from pfbench.claims.words import NOT_RUN, OPEN, WORDS, ClaimDecision
 from pfbench.files.recorded_folder import RecordedFolder

@@ -68,7 +68,7 @@ class GrowingSweep:
     @classmethod
     def from_plan(cls, plan: StudyPlan) -> GrowingSweep:
         """Read the settings of a study."""
-        from pfbench.stats.main_metrics import check_main_metric
+        from pfbench.stats.error_measures import check_main_metric
         from pfbench.stats.pair_states import LookSchedule
 
         values = plan.first.values

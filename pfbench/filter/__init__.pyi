@@ -64,7 +64,6 @@ from pfbench.filter.learned.differentiable_resampling import (
     SoftResampler as SoftResampler,
     StopGradientResampler as StopGradientResampler,
 )
-from pfbench.filter.learned.features import Feature as Feature
 from pfbench.filter.learned.gain_filter import (
     LearnedGain as LearnedGain,
     LearnedGainFilter as LearnedGainFilter,
@@ -85,7 +84,7 @@ from pfbench.filter.learned.objectives import (
     Objective as Objective,
     StateErrorLoss as StateErrorLoss,
 )
-from pfbench.filter.learned.proposal import LearnedProposal as LearnedProposal
+from pfbench.filter.learned.proposal import Feature as Feature, LearnedProposal as LearnedProposal
 from pfbench.filter.loop import (
     FilterResult as FilterResult,
     MultiStepFilter as MultiStepFilter,
@@ -208,8 +207,11 @@ from pfbench.filter.proposed.reconstructed import (
 )
 from pfbench.filter.proposed.swarm import (
     ChiSquareStopping as ChiSquareStopping,
+    MixtureWeighting as MixtureWeighting,
+    PrintedWeighting as PrintedWeighting,
     SwarmLimits as SwarmLimits,
     SwarmProposal as SwarmProposal,
+    SwarmWeighting as SwarmWeighting,
 )
 from pfbench.filter.proposed.swarm_coordinates import (
     AllComponents as AllComponents,
@@ -229,11 +231,6 @@ from pfbench.filter.proposed.swarm_motion import (
     PriorStart as PriorStart,
     SwarmStart as SwarmStart,
     VelocityUpdate as VelocityUpdate,
-)
-from pfbench.filter.proposed.swarm_weighting import (
-    MixtureWeighting as MixtureWeighting,
-    PrintedWeighting as PrintedWeighting,
-    SwarmWeighting as SwarmWeighting,
 )
 from pfbench.filter.proposed.unprinted import UnprintedFilter as UnprintedFilter
 from pfbench.filter.robust.hypotheses import NoiseHypotheses as NoiseHypotheses

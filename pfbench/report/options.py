@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from pfbench.stats.main_metrics import check_main_metric
+from pfbench.stats.error_measures import check_main_metric
 
 _FORMATS = ("svg", "png")
 

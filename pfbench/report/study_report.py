@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report import cost, provenance, writers
+from pfbench.report import provenance, provenance as cost, writers
 from pfbench.report.board import build_pack, read_study
 from pfbench.report.board.entries import ViewKey
 from pfbench.report.board.pack import StudyFacts, arrange_study

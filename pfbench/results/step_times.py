@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pfbench.files.atomic_write import DIGEST, has_valid_digest, hash_content, write_atomically
-from pfbench.stats.effects import EffectEstimate
+from pfbench.stats.comparison import EffectEstimate
 from pfbench.stats.error_measures import Array
 
 STEP_TIMES = "step_times.json"

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pfbench.stats.comparison import ALPHA, MIN_RUNS
-from pfbench.stats.effects import EffectEstimate, estimate_mean
+from pfbench.stats.comparison import ALPHA, MIN_RUNS, EffectEstimate, estimate_mean
 from pfbench.stats.error_measures import Array
 from pfbench.stats.rank_tests import holm
 from pfbench.stats.study_runs import CONDITION, weigh_conditions

@@ -12,13 +12,13 @@ import yaml
 from checkout import ROOT
 from config_cases import GROUPS
 
+from pfbench.claims.claim_lines import read_proofs
 from pfbench.claims.claim_list import (
     KINDS,
     compute_size_share,
     find_tipping_bound,
     read_printed_claims,
 )
-from pfbench.claims.proofs import read_proofs
 
 CLAIMS = read_printed_claims()
 READINGS = ROOT / "conf" / "reading"

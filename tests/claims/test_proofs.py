@@ -11,7 +11,7 @@ import pytest
 import torch
 from filter_cases import method_of
 
-from pfbench.claims.proofs import read_proofs
+from pfbench.claims.claim_lines import read_proofs
 from pfbench.core.linear_algebra import factor
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
@@ -26,14 +26,13 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import GaussianSmoothing
 from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.filter.proposed.dmc_controller import DmcController
-from pfbench.filter.proposed.swarm import SwarmLimits, SwarmProposal
+from pfbench.filter.proposed.swarm import PrintedWeighting, SwarmLimits, SwarmProposal
 from pfbench.filter.proposed.swarm_coordinates import (
     AllComponents,
     LikelihoodFitness,
     PrintedFitness,
 )
 from pfbench.filter.proposed.swarm_motion import GaussianVelocity, InertiaVelocity, PriorStart
-from pfbench.filter.proposed.swarm_weighting import PrintedWeighting
 from pfbench.model.linear_gaussian import LinearGaussian
 
 RULES = ("ckf", "hckf", "ssrckf", "ssrhckf5", "ssr53", "mssrckf")

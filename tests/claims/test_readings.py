@@ -13,7 +13,7 @@ from command_line import pfbench
 from config_cases import GROUPS
 
 from pfbench import job
-from pfbench.job.readings import CLASSES, check_reading, name_readings
+from pfbench.job.config import CLASSES, check_reading, name_readings
 from pfbench.job.trust import UntrustedConfigError
 
 FOLDER = ROOT / "conf" / "reading"

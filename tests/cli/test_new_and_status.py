@@ -20,7 +20,7 @@ from command_line import environment, pfbench
 
 from pfbench.cli import progress
 from pfbench.cli.completion import make_script
-from pfbench.cli.new_scripts import SCRIPTS
+from pfbench.cli.new import SCRIPTS
 from pfbench.cli.open import open_report
 from pfbench.results import store
 

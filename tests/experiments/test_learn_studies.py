@@ -152,58 +152,6 @@ def test_verdicts_name_the_better_one_and_tables_count_what_a_step_costs() -> No
     assert table["| lower bound, 3 runs"][-3:] == ["80.0", "0.1", "4"]
 
 
-def test_a_study_of_data_efficiency_goes_on_from_where_it_stopped(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    small = Case(
-        volatility,
-        "state",
-        6,
-        0.01,
-        (1, 2),
-        (1, 2),
-        8,
-        particles=20,
-        few=4,
-        dearer={"bootstrap": 60},
-    )
-    monkeypatch.setattr(learn_data_efficiency, "CASES", {"small": small})
-    learned, taught = [], learn_data_efficiency.train_proposal
-
-    def counted(world, count, seed, objective, path):
-        learned.append((type(objective).__name__, count, seed))
-        if len(learned) == 4:
-            raise KeyboardInterrupt
-        return taught(world, count, seed, objective, path)
-
-    monkeypatch.setattr(learn_data_efficiency, "train_proposal", counted)
-    with pytest.raises(KeyboardInterrupt):
-        learn_data_efficiency.main(tmp_path)
-    learn_data_efficiency.main(tmp_path)
-    assert len(learned) == 7
-    assert learned[3] == learned[4]
-    rows = (tmp_path / "report.md").read_text().splitlines()
-    assert [row.split(" | ")[0] for row in rows if row.startswith("| lower bound, ")] == [
-        "| lower bound, 1 run", "| lower bound, 2 runs", *["| lower bound, 2 runs"] * 5
-    ]  # fmt: skip
-    assert len([row for row in rows if row.startswith("| bootstrap, 60 particles | ")]) == 1
-    assert (tmp_path / "data_efficiency.png").stat().st_size > 5000
-    assert "Performance of a learned proposal" in rows[0]
-
-
-def test_the_page_of_data_efficiency_states_the_significant_comparisons() -> None:
-    head = ["| learned | other | RMSE, ratio | p | log evidence | p |", "| --- |"]
-    rows = [
-        "| lower bound, 3 runs | bootstrap | 0.800 (0.700 to 0.900) | 0.01 | 0.1 | 1 |",
-        "| lower bound, 3 runs | guided by a CKF | 0.900 (0.700 to 1.200) | 0.06 | 0.1 | 0.001 |",
-        "| lower bound, 3 runs | dearer | 1.500 (1.300 to 1.800) | 0.002 | 0.1 | 1 |",
-    ]
-    assert learn_data_efficiency.describe_comparisons(head + rows) == [
-        "Lower bound, 3 runs. RMSE smaller than with bootstrap. RMSE larger than with dearer. "
-        "Inconclusive against guided by a CKF."
-    ]
-
-
 def test_few_worlds_come_again_and_no_others_are_seen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,6 +34,25 @@ STATED = {
     "terrain": BOTH,
 }  # fmt: skip
 
+DRIVEN = [
+    *(("flight_300s", name) for name in ("ins_gnss", "ins_gnss_inflated")),
+    ("gps_ins_markov", "ins_gnss18"),
+    *(("azimuth", name) for name in ("sins_gps_azimuth", "sins_gps_azimuth15", "azimuth_small")),
+    *(("anshun_short", name) for name in ("sins_gnss_tight", "sins_gnss_tight_nl")),
+]
+
+
+@pytest.mark.parametrize(("scenario", "name"), DRIVEN)
+def test_noise_enters_a_flight_where_its_gain_says(scenario: str, name: str) -> None:
+    model: Any = job.instantiate(composed(f"scenario={scenario}", f"model={name}").model)
+    u = model.prepare(world(scenario).record).at_step(2).u
+    draws = PhiloxStream(1, torch.arange(len(u[0])))
+    w, d = draws.normal("w", 4, model.noise_dim), draws.normal("x", 4, model.chart.dimension)
+    x = model.chart.add(model.origin.expand(len(d), 4, -1), d * model.p0)
+    moved, still = model.propagate(x, u, w), model.propagate(x, u, torch.zeros_like(w))
+    expected = w @ model.noise_gain(u).mT
+    torch.testing.assert_close(model.chart.subtract(moved, still), expected, rtol=1e-6, atol=1e-9)
+
 
 @pytest.mark.parametrize("name", STATED)
 def test_stated_jacobians_are_difference_quotients(name: str) -> None:

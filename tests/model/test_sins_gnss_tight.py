@@ -128,21 +128,6 @@ def test_the_noise_is_of_rank_eleven_and_exact(flight: Episode) -> None:
     assert torch.allclose(density.diagonal()[:6].sqrt(), walks, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "model",
-    [linear(), linear(ProcessNoiseInflation()), exact()],
-    ids=["linear", "inflated", "nonlinear"],
-)
-def test_the_noise_gain_is_what_propagate_does_with_noise(flight: Episode, model: Any) -> None:
-    seen = model.prepare(flight.record).at_step(20)
-    d = PhiloxStream(1, RUNS).normal("x", 4, 17) * model.p0
-    x = model.chart.add(model.origin.expand(3, 4, -1), d)
-    w = PhiloxStream(1, RUNS).normal("w", 4, model.noise_dim)
-    still = model.propagate(x, seen.u, torch.zeros_like(w))
-    moved = model.chart.subtract(model.propagate(x, seen.u, w), still)
-    assert torch.allclose(moved, w @ model.noise_gain(seen.u).mT, rtol=1e-6, atol=1e-9)
-
-
 def test_the_clock_goes_on_by_its_drift_and_the_biases_stay(flight: Episode) -> None:
     model = linear()
     step = model.prepare(flight.record).at_step(3).u

@@ -304,20 +304,6 @@ def test_biases_are_carried_where_the_azimuth_is_wrong() -> None:
 # noise
 
 
-@every_form
-@pytest.mark.parametrize("biases", [False, True])
-def test_the_noise_gain_is_what_propagate_does_with_noise(
-    worlds: Episode, form: ErrorEquations, biases: bool
-) -> None:
-    model = model_of(form, biases=biases, process_noise_factor=5.0)
-    seen = model.prepare(worlds.record).at_step(20)
-    x, w = states(model, 6), PhiloxStream(1, torch.arange(4)).normal("w", 6, model.noise_dim)
-    moved, still = model.propagate(x, seen.u, w), model.propagate(x, seen.u, torch.zeros_like(w))
-    assert torch.allclose(
-        model.chart.subtract(moved, still), w @ model.noise_gain(seen.u).mT, rtol=1e-9, atol=1e-12
-    )
-
-
 @pytest.mark.parametrize("kappa", [1.0, 5.0])
 @every_step
 def test_biases_count_as_white_noise(worlds: Episode, step: Any, kappa: float) -> None:

@@ -10,10 +10,9 @@ import synthetic_results as synthetic
 
 from pfbench.report import provenance
 from pfbench.report.board import build_pack
-from pfbench.report.board.curves import select_telling_runs
+from pfbench.report.board.curves import read_settings, select_telling_runs
 from pfbench.report.board.entries import describe_uncommitted
 from pfbench.report.board.pack import MethodNotes, select_baselines
-from pfbench.report.board.sweeps import read_settings
 from pfbench.report.methods_text import write_methods
 from pfbench.report.options import ReportOptions
 from pfbench.results.conditions import Condition, JobFile, load_conditions

@@ -26,8 +26,12 @@ from pfbench.report.journal.figure_style import (
     FigureSetting,
     find_page_format,
 )
-from pfbench.report.journal.main_table import format_error_value, make_main_tables, make_supplement
-from pfbench.report.journal.pair_table import make_planned_table
+from pfbench.report.journal.main_table import (
+    format_error_value,
+    make_main_tables,
+    make_planned_table,
+    make_supplement,
+)
 from pfbench.report.journal.paper_folder import (
     draw_paper_figure,
     render_pdf,

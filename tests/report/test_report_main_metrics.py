@@ -15,7 +15,7 @@ from pfbench.report.study_report import write_report
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
 from pfbench.results.frame import load_frame
-from pfbench.stats.main_metrics import MAIN_METRICS
+from pfbench.stats.error_measures import MAIN_METRICS
 
 
 @pytest.fixture(scope="module")

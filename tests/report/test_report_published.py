@@ -12,7 +12,7 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.simulated import ModelSimulation
-from pfbench.stats import effects, rank_tests
+from pfbench.stats import comparison, rank_tests
 
 # R 4, ?wilcox.test: depression of nine patients at two visits [Hollander, Wolfe 1973, p. 29]
 FIRST = np.array([1.83, 0.50, 1.62, 2.48, 1.68, 1.88, 1.55, 3.06, 1.30])
@@ -46,7 +46,7 @@ def test_a_filter_under_two_names_beats_itself_as_seldom_as_alpha() -> None:
     def share_of_wins(a: np.ndarray, b: np.ndarray) -> float:
         return float(
             np.mean(
-                [rank_tests.wilcoxon_signed_rank(d)[1] <= alpha for d in effects.log_ratio(a, b)]
+                [rank_tests.wilcoxon_signed_rank(d)[1] <= alpha for d in comparison.log_ratio(a, b)]
             )
         )
 

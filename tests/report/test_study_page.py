@@ -8,8 +8,7 @@ import page_packs
 import pytest
 
 from pfbench.report.study_page import render_page
-from pfbench.report.study_page.encoding import compress_pack, encode_pack
-from pfbench.report.study_page.page_writer import format_short
+from pfbench.report.study_page.page_writer import compress_pack, encode_pack, format_short
 
 WORDS = ("better", "equal", "identical", "not decided", "worse", "loses track", "missing")
 

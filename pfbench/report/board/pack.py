@@ -17,6 +17,7 @@ from pfbench.report.board.curves import (
     count_carried_runs,
     list_calibration,
     list_runs,
+    list_sweeps,
     make_curves,
     make_tracks,
 )
@@ -34,9 +35,12 @@ from pfbench.report.board.entries import (
     name_regimes,
     regime_entries,
 )
-from pfbench.report.board.study_views import build_views, decide_planned, planned_entries
-from pfbench.report.board.sweeps import list_sweeps
-from pfbench.report.board.world_orders import order_worlds
+from pfbench.report.board.study_views import (
+    build_views,
+    decide_planned,
+    order_worlds,
+    planned_entries,
+)
 from pfbench.report.methods_text import collect_methods_facts
 from pfbench.report.options import ReportOptions
 from pfbench.report.overview.tables import read_world_facts

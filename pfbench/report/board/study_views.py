@@ -1,4 +1,4 @@
-"""All views of a study: metric, world, regime and baseline, each with its sentence and its rows."""
+"""All views of a study: metric, world, regime and baseline, with sentence and rows; the order of each world."""
 
 from __future__ import annotations
 
@@ -49,6 +49,9 @@ from pfbench.stats.study_runs import (
     select_conditions,
     share_conditions,
 )
+
+# --------------------------------------------------------------------------------------------------
+# All views of a study: metric, world, regime and baseline, each with its sentence and its rows.
 
 
 class Selection(NamedTuple):
@@ -347,3 +350,52 @@ def show_ratio(verdict: Verdict) -> dict[str, float | None]:
     """Return the ratio of a verdict and its interval."""
     logs = (math.log(v) if v > 0 else -math.inf for v in (verdict.ratio, verdict.low, verdict.high))
     return dict(zip(_ENDS, map(round_ratio, logs), strict=True))
+
+
+# --------------------------------------------------------------------------------------------------
+# Orders of the filters in each world of a study of few worlds, whose average over worlds is the answer of none of them.
+
+MOST_WORLDS = 3  # more worlds have a page of their own, or an average
+
+
+def order_worlds(
+    runs: StudyRuns,
+    views: Mapping[ViewKey, Mapping[str, Any]],
+    looks: Mapping[str, MethodLook],
+    options: ReportOptions,
+) -> list[dict[str, Any]]:
+    """Describe the order of each world: its sentence, its first filter, and the filters that do as well.
+
+    Empty unless the study has two or three worlds, each one scenario, in one noise regime.
+    """
+    conditions = runs.conditions
+    worlds = list(conditions["scenario"].unique())
+    is_few = 1 < len(worlds) <= MOST_WORLDS and conditions["family"].nunique() == len(worlds)
+    if not is_few or conditions["regime"].nunique() > 1:
+        return []
+    losses, baseline, orders = compute_losses(runs, options.metric), next(iter(views)).baseline, []
+    for world in worlds:
+        view = views[ViewKey(options.metric, world, ALL, baseline)]
+        labels = [row["filter"] for row in view["rows"] if row["rank"] is not None]
+        mask = (conditions["scenario"] == world).to_numpy()
+        pairs = [(label, labels[0]) for label in labels[1:]]
+        effects = compare_filters(runs.select(mask), losses[:, mask], pairs)
+        verdicts = decide(effects, math.log1p(options.equivalence_margin), options.alpha)
+        ties = [v.a for v in verdicts if v.word != "worse"]
+        is_said = not ties and labels[0] == baseline  # by the sentence of the view
+        text = "" if is_said else _describe_ties(labels[0], ties, len(verdicts), looks)
+        orders.append({"world": world, "sentence": f"{view['sentence']} {text}".rstrip()})
+    return orders
+
+
+def _describe_ties(
+    best: str, ties: Sequence[str], others: int, looks: Mapping[str, MethodLook]
+) -> str:
+    """Say which filters are not shown to be worse than the first one of a world."""
+    first = f"[[{looks[best].name}]]"
+    if not ties:
+        return f"All others are worse than {first}."
+    names = ", ".join(f"[[{looks[label].name}]]" for label in ties)
+    verb = "is" if len(ties) == 1 else "are"
+    end = "" if len(ties) == others else " All others are."
+    return f"{names} {verb} not shown to be worse than {first}, the first of this world.{end}"

@@ -14,8 +14,7 @@ import scipy  # scipy.stats is imported at its first use
 from pfbench.report.writers import format_ratio
 from pfbench.results.looks import MethodLook
 from pfbench.results.step_times import StepTimes, describe_costs
-from pfbench.stats.comparison import MIN_RUNS, Verdict, decide
-from pfbench.stats.effects import estimate_mean
+from pfbench.stats.comparison import MIN_RUNS, Verdict, decide, estimate_mean
 from pfbench.stats.error_measures import Array, Flags
 from pfbench.stats.rank_tests import holm
 from pfbench.stats.study_runs import StudyRuns, compare_filters, weigh_conditions

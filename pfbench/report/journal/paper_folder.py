@@ -17,8 +17,12 @@ from pfbench.report.journal.figure_style import (
     FigureSetting,
     PageFormat,
 )
-from pfbench.report.journal.main_table import make_main_tables, make_supplement
-from pfbench.report.journal.pair_table import make_cost_table, make_planned_table
+from pfbench.report.journal.main_table import (
+    make_cost_table,
+    make_main_tables,
+    make_planned_table,
+    make_supplement,
+)
 from pfbench.report.journal.ratio_figures import (
     plot_error_against_cost,
     plot_leaderboard,

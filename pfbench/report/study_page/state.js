@@ -19,7 +19,7 @@ let looks = {};
 let viewKeys = [];
 const views = new Map(); // views that were shown, by key
 
-// The data are a JSON text in gzip and base 64 (encoding.py).
+// The data are a JSON text in gzip and base 64 (page_writer.py).
 async function unpack() {
   const packed = atob(find("#data").textContent.trim());
   const bytes = Uint8Array.from(packed, (sign) => sign.charCodeAt(0));

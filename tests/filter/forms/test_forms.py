@@ -33,14 +33,13 @@ from pfbench.filter.particle.sqmc import HaltonPoints, halton_points
 from pfbench.filter.particle.stages import EssResampler, FixedCount, Systematic
 from pfbench.filter.proposed.dmc_controller import DmcController
 from pfbench.filter.proposed.reconstructed import NoWeightCorrection, ReconstructedProposal
-from pfbench.filter.proposed.swarm import SwarmLimits, SwarmProposal
+from pfbench.filter.proposed.swarm import PrintedWeighting, SwarmLimits, SwarmProposal
 from pfbench.filter.proposed.swarm_coordinates import (
     AllComponents,
     LikelihoodFitness,
     PrintedFitness,
 )
-from pfbench.filter.proposed.swarm_motion import InertiaVelocity, IntervalStart, follow_logistic
-from pfbench.filter.proposed.swarm_weighting import PrintedWeighting
+from pfbench.filter.proposed.swarm_motion import IntervalStart, follow_logistic
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.results.paper_block import (
     METHOD_FORMS,
@@ -293,17 +292,6 @@ def test_the_literal_shift_of_003_counts_twice() -> None:
     torch.testing.assert_close(
         found[True], torch.tensor(twice[1:], dtype=torch.float64), rtol=0, atol=1e-6
     )
-
-
-def test_the_escape_factor_of_004_as_printed_is_constant() -> None:
-    """(35): c3 = c4 = 0.12 - 0.12 cos(k pi) / itermax, itermax = 150: 0.12 +- 0.0008; figure 1 rises to 0.24."""
-    velocity = method_of("cpso_escape_literal").proposal.velocity
-    factors = [velocity.compute_escape_factor(k / 150) for k in range(1, 151)]
-    wanted = [0.12 - 0.12 * math.cos(k * math.pi) / 150 for k in range(1, 151)]
-    assert factors == pytest.approx(wanted, abs=1e-12)
-    assert max(abs(f - 0.12) for f in factors) == pytest.approx(0.0008)
-    with pytest.raises(ValueError, match=r"printed_iterations must be at least 1.* Use null"):
-        InertiaVelocity(printed_iterations=0)
 
 
 def test_the_fitness_of_004_as_printed_is_the_sum_of_residuals() -> None:

@@ -10,12 +10,12 @@ import numpy as np
 import oracles
 import pytest
 import torch
-from model_cases import Fragile, Unrolled, measurements
+from filter_laws import check_lost_alone, check_own, check_single, check_wrapped
+from model_cases import Fragile, four_states, measurements
 from pyro.distributions import MultivariateNormal
 from torch import Tensor
 from torch.distributions import Distribution
 
-from pfbench.core.chart import wrap_angle
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
@@ -38,6 +38,7 @@ ANALYSES: dict[str, EnsembleUpdate] = {
 every_analysis = pytest.mark.parametrize("analysis", ANALYSES.values(), ids=ANALYSES.keys())
 WALK = linear_walk(1.0, 0.5, 1.0)
 WALK_Y = torch.tensor([[0.8], [2.9], [1.2], [math.nan], [3.0], [6.5]], dtype=torch.float64)
+MODERATE = (0.5, 2.0, 0.4)
 PARTS = ("f", "g", "h", "r", "m0", "l0")
 NOISE = torch.tensor([[1.0, 0.8, 0.0], [0.8, 1.0, 0.3], [0.0, 0.3, 0.5]], dtype=torch.float64)
 Y = torch.tensor([0.7, -3.0, 1.1], dtype=torch.float64)
@@ -48,22 +49,6 @@ class Correlated(LinearGaussian):
 
     def observation(self, x: Tensor, u: Any) -> Distribution:
         return MultivariateNormal(x @ self.h.mT, NOISE.expand(*x.shape[:-1], 3, 3))
-
-
-def four_states(kind: type[LinearGaussian] = LinearGaussian) -> LinearGaussian:
-    rng = np.random.default_rng(4)
-    f = 0.4 * rng.normal(size=(4, 4))
-    f *= 0.95 / np.abs(np.linalg.eigvals(f)).max()
-    p = rng.normal(size=(4, 4))
-    root = np.linalg.cholesky(p @ p.T + np.eye(4))
-    return kind(
-        f,
-        rng.normal(size=(4, 2)),
-        rng.normal(size=(3, 4)),
-        [0.5, 2.0, 0.4],
-        rng.normal(size=4),
-        root,
-    )
 
 
 def run(
@@ -108,7 +93,7 @@ def test_the_square_root_keeps_mean_and_covariance_exactly(
     n: int, kind: type[LinearGaussian], unseen: tuple[int, ...]
 ) -> None:
     """Whatever the ensemble is, even with fewer members than states: no statistics here."""
-    model, y = four_states(kind), Y.clone()
+    model, y = four_states(MODERATE, kind), Y.clone()
     y[list(unseen)] = torch.nan
     noise = NOISE.numpy() if kind is Correlated else np.diag(model.r.numpy() ** 2)
     method, draws = (
@@ -158,7 +143,7 @@ def test_perturbed_members_have_the_kalman_update_as_their_expectation(
     kind: type[LinearGaussian],
 ) -> None:
     """Of one predicted ensemble, over the errors drawn: both moments are unbiased for any number of members."""
-    model, runs, n = four_states(kind), 8000, 6
+    model, runs, n = four_states(MODERATE, kind), 8000, 6
     noise = NOISE.numpy() if kind is Correlated else np.diag(model.r.numpy() ** 2)
     y = Y.clone()
     y[1] = torch.nan
@@ -321,33 +306,13 @@ every_toy = pytest.mark.parametrize(
 def test_neither_future_nor_neighbours_are_felt(
     analysis: EnsembleUpdate, model: StateSpaceModel
 ) -> None:
-    method, y = EnsembleKalmanFilter(30, analysis), measurements(model)
-    other = y.clone()
-    other[:, 5:] = other[:, 5:] + 0.7
-    other[:, 6] = torch.nan
-    one, two = run(method, model, y), run(method, model, other)
-    assert torch.equal(one.mean[:, :5], two.mean[:, :5])
-    assert bool(torch.isfinite(one.mean).all())
-    assert bool((one.variance > 0).all())
-    alone = run_filter(method, model, Record(y[2:3]), PhiloxStream(1, torch.tensor([2])))
-    assert torch.allclose(alone.mean[0], one.mean[2], rtol=1e-9, atol=1e-9)
-    assert torch.allclose(alone.log_evidence[0], one.log_evidence[2], rtol=1e-9)
-    single = run(method, model.float(), y)
-    model.double()
-    assert single.mean.dtype == torch.float32
-    assert not bool(single.lost.any())
+    check_own(EnsembleKalmanFilter(30, analysis), model, measurements(model))
+    check_single(EnsembleKalmanFilter(30, analysis), model, measurements(model))
 
 
 @every_analysis
 def test_an_impossible_measurement_loses_its_run_alone(analysis: EnsembleUpdate) -> None:
-    y = measurements(WALK)
-    healthy = run(EnsembleKalmanFilter(30, analysis), WALK, y)
-    y[1, 3] = 1e200
-    estimate = run(EnsembleKalmanFilter(30, analysis), WALK, y)
-    assert estimate.lost.tolist() == [False, True, False, False]
-    assert bool(torch.isnan(estimate.mean[1, 3:]).all())
-    for r in (0, 2, 3):
-        assert torch.allclose(estimate.mean[r], healthy.mean[r], rtol=1e-12, atol=1e-14)
+    check_lost_alone(EnsembleKalmanFilter(30, analysis), WALK, measurements(WALK))
 
 
 @every_analysis
@@ -362,22 +327,7 @@ def test_a_member_that_is_not_finite_goes_on_from_where_it_was(analysis: Ensembl
 
 @every_analysis
 def test_angles_that_cross_the_cut_change_nothing(analysis: EnsembleUpdate) -> None:
-    y = (
-        torch.sin(torch.linspace(3.0, 12.0, 25, dtype=torch.float64))
-        .reshape(1, 25, 1)
-        .expand(2, -1, -1)
-    )
-    start = torch.tensor([[3.0, 8.0], [-3.1, -9.0]], dtype=torch.float64)
-    method = EnsembleKalmanFilter(100, analysis, inflation=1.02)
-    circle, line = (run(method, m, y, start=start) for m in (Pendulum(), Unrolled()))
-    assert float(line.mean[..., 0].abs().max()) > 4.0
-    assert torch.allclose(
-        wrap_angle(circle.mean[..., 0] - line.mean[..., 0]),
-        torch.zeros(2, 25, dtype=torch.float64),
-        atol=1e-7,
-    )
-    assert torch.allclose(circle.variance, line.variance, rtol=1e-6)
-    assert torch.allclose(circle.log_evidence, line.log_evidence, rtol=1e-9)
+    check_wrapped(EnsembleKalmanFilter(100, analysis, inflation=1.02))
 
 
 @every_analysis

@@ -11,13 +11,13 @@ import oracles
 import pytest
 import torch
 from checkout import TESTS
-from model_cases import Unrolled
+from filter_laws import check_own, check_wrapped
+from model_cases import Bearing, four_states, measurements
 from pyro.distributions import GaussianHMM, MultivariateNormal
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
 from pfbench.core.chart import wrap_angle
-from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.linear_algebra import factor
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
@@ -79,23 +79,6 @@ def run(
 
 
 # the oracles themselves, against one big normal law of all states and measurements
-
-
-def four_states() -> LinearGaussian:
-    """Damped rotations coupled at random, a singular transition, three components measured in different units."""
-    rng = np.random.default_rng(4)
-    f = 0.4 * rng.normal(size=(4, 4))
-    f *= 0.95 / np.abs(np.linalg.eigvals(f)).max()
-    p = rng.normal(size=(4, 4))
-    root = np.linalg.cholesky(p @ p.T + np.eye(4))
-    return LinearGaussian(
-        f,
-        rng.normal(size=(4, 2)),
-        rng.normal(size=(3, 4)),
-        [0.5, 20.0, 0.1],
-        rng.normal(size=4),
-        root,
-    )
 
 
 PARTS = ("f", "g", "h", "r", "m0", "l0")
@@ -708,58 +691,7 @@ def test_jacobians_are_the_analytic_ones() -> None:
 
 @every_rule
 def test_angles_that_cross_the_cut_change_nothing(rule: LinearisationRule) -> None:
-    """A whirling pendulum: estimates on the circle are those on the line, wrapped, with the same covariances and evidence."""
-    y = (
-        torch.sin(torch.linspace(3.0, 12.0, 40, dtype=torch.float64))
-        .reshape(1, 40, 1)
-        .expand(2, -1, -1)
-    )
-    start = torch.tensor([[3.0, 8.0], [-3.1, -9.0]], dtype=torch.float64)
-    circle, line = run(rule, Pendulum(), y, start=start), run(rule, Unrolled(), y, start=start)
-    assert float(line.mean[..., 0].abs().max()) > 5.0
-    assert torch.allclose(
-        wrap_angle(circle.mean[..., 0] - line.mean[..., 0]),
-        torch.zeros(2, 40, dtype=torch.float64),
-        atol=1e-9,
-    )
-    assert torch.allclose(circle.mean[..., 1], line.mean[..., 1], atol=1e-9)
-    assert torch.allclose(circle.variance, line.variance, rtol=1e-9)
-    assert torch.allclose(circle.log_evidence, line.log_evidence, rtol=1e-9)
-    assert float(circle.mean[..., 0].abs().max()) <= math.pi
-
-
-class Bearing(StateSpaceModel):
-    """A walk in the plane, seen by its bearing from the origin; West of it, bearings jump between pi and -pi."""
-
-    def __init__(self, turned: float = 0.0) -> None:
-        super().__init__()
-        self.register_buffer("s", torch.tensor([0.05, 0.05], dtype=torch.float64))
-        self.names, self.units, self.groups, self.noise_dim = (
-            ("x", "y"),
-            ("m", "m"),
-            {"position": (0, 1)},
-            2,
-        )
-        self.turned = turned
-
-    @property
-    def rotation(self) -> Tensor:
-        c, s = math.cos(self.turned), math.sin(self.turned)
-        return torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
-
-    def initial(self, runs: int) -> Distribution:
-        return normal_batch(
-            runs, self.s.new_tensor([0.3, 0.3]), self.rotation @ self.s.new_tensor([2.0, 0.0])
-        )
-
-    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
-        return x + self.s * w @ self.rotation.mT
-
-    def observation(self, x: Tensor, u: Any) -> Independent:
-        return independent_normal(torch.atan2(x[..., 1:], x[..., :1]), self.s[:1])
-
-    def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
-        return wrap_angle(y - y_hat)
+    check_wrapped(GaussianFilter(rule), 40, 1e-8)
 
 
 @every_rule
@@ -822,15 +754,4 @@ def test_pendulum_against_many_particles(
 def test_nonlinear_models_run_and_the_future_is_not_used(
     rule: LinearisationRule, model: StateSpaceModel
 ) -> None:
-    dy = model.observation(torch.ones(1, 1, len(model.names), dtype=torch.float64), ()).event_shape[
-        0
-    ]
-    y = torch.randn(2, 12, dy, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    other = y.clone()
-    other[:, 7:] = torch.nan
-    one, two = run(rule, model, y), run(rule, model, other)
-    assert torch.equal(one.mean[:, :7], two.mean[:, :7])
-    assert torch.equal(one.variance[:, :7], two.variance[:, :7])
-    assert not bool(one.lost.any())
-    alone = run(rule, model, y[1:])
-    assert torch.allclose(alone.mean[0], one.mean[1], rtol=1e-9, atol=1e-12)
+    check_own(GaussianFilter(rule), model, measurements(model, 3, 12))

@@ -11,6 +11,8 @@ import numpy as np
 import oracles
 import pytest
 import torch
+from filter_laws import check_lost_alone, check_own
+from model_cases import BearingDistance
 from scipy.optimize import minimize
 from torch import Tensor
 from torch.distributions import Distribution, Independent
@@ -182,41 +184,6 @@ def test_iterations_change_nothing_on_a_linear_model(rule: LinearisationRule) ->
         assert torch.allclose(one.log_evidence, five.log_evidence, rtol=1e-9)
 
 
-class Bearing(StateSpaceModel):
-    """A point in the plane that walks, seen by bearing and distance from the origin; `turned` as a whole."""
-
-    def __init__(self, turned: float = 0.0, sd: Sequence[float] = (0.02, 0.1)) -> None:
-        super().__init__()
-        self.register_buffer("s", torch.tensor(sd, dtype=torch.float64))
-        self.names, self.units, self.groups, self.noise_dim = (
-            ("x", "y"),
-            ("m", "m"),
-            {"position": (0, 1)},
-            2,
-        )
-        self.turned = turned
-
-    @property
-    def rotation(self) -> Tensor:
-        c, s = math.cos(self.turned), math.sin(self.turned)
-        return torch.tensor([[c, -s], [s, c]], dtype=torch.float64)
-
-    def initial(self, runs: int) -> Distribution:
-        return normal_batch(
-            runs, self.s.new_tensor([0.3, 0.3]), self.rotation @ self.s.new_tensor([2.0, 0.0])
-        )
-
-    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
-        return x + 0.05 * w @ self.rotation.mT
-
-    def observation(self, x: Tensor, u: Any) -> Independent:
-        seen = torch.stack([torch.atan2(x[..., 1], x[..., 0]), x.norm(dim=-1)], -1)
-        return independent_normal(seen, self.s)
-
-    def residual(self, y: Tensor, y_hat: Tensor) -> Tensor:
-        return torch.cat([wrap_angle(y[..., :1] - y_hat[..., :1]), y[..., 1:] - y_hat[..., 1:]], -1)
-
-
 @pytest.mark.parametrize(
     "rule", [*RULES.values(), "adapted", "iterated"], ids=[*RULES, "adapted", "iterated"]
 )
@@ -237,7 +204,7 @@ def test_a_bearing_that_crosses_the_cut_changes_nothing(rule: LinearisationRule 
     turned = y.clone()
     turned[..., 0] = wrap_angle(y[..., 0] + math.pi)
     assert float((turned[..., 0] < 0).double().mean()) not in (0.0, 1.0)
-    east, west = run(method, Bearing(), y), run(method, Bearing(math.pi), turned)
+    east, west = run(method, BearingDistance(), y), run(method, BearingDistance(math.pi), turned)
     assert not bool(east.lost.any())
     assert torch.allclose(west.mean, -east.mean, atol=1e-9)
     assert torch.allclose(west.log_evidence, east.log_evidence, rtol=1e-9)
@@ -246,7 +213,7 @@ def test_a_bearing_that_crosses_the_cut_changes_nothing(rule: LinearisationRule 
 def test_the_iterated_filter_finds_the_maximum_a_posteriori() -> None:
     """Bell and Cathey 1993: the iterated update is Gauss-Newton on |x - m|^2_P + |y - h(x)|^2_R; an optimiser that knows nothing
     of it finds the same point, and one iteration does not."""
-    model = Bearing(sd=(0.3, 0.1))
+    model = BearingDistance(sd=(0.3, 0.1))
     y = torch.tensor([[[0.8, 2.2]], [[-0.6, 1.7]]], dtype=torch.float64)
     p = 0.3**2 + 0.05**2
 
@@ -598,7 +565,10 @@ def test_the_widened_ratio_stays_bounded() -> None:
 
 def test_the_factor_widens_what_is_expected_of_a_curved_sight_as_a_whole() -> None:
     """P_zz = C_zz / alpha + R, P_xz = C_xz / alpha, P+ = P- / alpha - K P_zz K', in which C_zz holds the curvature."""
-    model, y = Bearing(sd=(0.05, 0.1)), torch.tensor([[0.9, 3.1], [-0.4, 1.2]], dtype=torch.float64)
+    model, y = (
+        BearingDistance(sd=(0.05, 0.1)),
+        torch.tensor([[0.9, 3.1], [-0.4, 1.2]], dtype=torch.float64),
+    )
     belief = GaussianFilter(MIXED).init(model, 2, PhiloxStream(0, torch.arange(2)))
     whole = [
         GaussianFilter(MIXED, (), gains).advance(model, belief, Record(y))
@@ -800,15 +770,8 @@ def test_fading_and_doubt_of_the_noise_come_in_any_order(kind: type[Tight]) -> N
 def test_runs_do_not_feel_each_other(method: GaussianFilter) -> None:
     y = simulate(Tight(), 4, 30, range(10, 20), r=9.0, q=50.0, missing=0.2)
     y[0, 5:9] = torch.nan
-    together = run(method, Tight(), y)
-    broken = y.clone()
-    broken[2, 12] = 1e200
-    beside = run(method, Tight(), broken)
-    assert beside.lost.tolist() == [False, False, True, False]
-    for i in (0, 1, 3):
-        alone = run(method, Tight(), y[i : i + 1])
-        for other in (together.mean[i], beside.mean[i]):
-            assert torch.allclose(alone.mean[0], other, rtol=1e-8, atol=1e-10)
+    check_own(method, Tight(), y, 1e-8)
+    check_lost_alone(method, Tight(), y)
 
 
 @every_method
@@ -876,7 +839,10 @@ def test_residuals_and_corrections_tell_the_noise_on_average() -> None:
 
 def test_what_is_left_of_a_curved_sight_holds_its_curvature() -> None:
     """e e' + C+_zz, where C+_zz is what the line through C_zz leaves after the update, and all that no line explains."""
-    model, y = Bearing(sd=(0.05, 0.1)), torch.tensor([[0.9, 3.1], [-0.4, 1.2]], dtype=torch.float64)
+    model, y = (
+        BearingDistance(sd=(0.05, 0.1)),
+        torch.tensor([[0.9, 3.1], [-0.4, 1.2]], dtype=torch.float64),
+    )
     method = GaussianFilter(MIXED, (MatrixNoiseAdaptation(0.75),))
     new = method.advance(model, method.init(model, 2, PhiloxStream(0, torch.arange(2))), Record(y))
     seen = new.innovation

@@ -10,14 +10,15 @@ import numpy as np
 import oracles
 import pytest
 import torch
+from filter_laws import check_lost_alone, check_own, check_single, check_wrapped
 from hydra import compose, initialize_config_dir
-from model_cases import Unrolled, measurements
+from model_cases import measurements
 from pyro.distributions import Laplace, MultivariateNormal
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
 from pfbench import job
-from pfbench.core.chart import Chart, wrap_angle
+from pfbench.core.chart import Chart
 from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record, map_inputs
@@ -656,23 +657,7 @@ def test_a_quaternion_may_be_sampled_and_so_may_all_but_it() -> None:
 
 @pytest.mark.parametrize("sampled", [None, ["rate"]], ids=str)
 def test_angles_that_cross_the_cut_change_nothing(sampled: list[str] | None) -> None:
-    y = (
-        torch.sin(torch.linspace(3.0, 12.0, 25, dtype=torch.float64))
-        .reshape(1, 25, 1)
-        .expand(2, -1, -1)
-    )
-    start = torch.tensor([[3.0, 8.0], [-3.1, -9.0]], dtype=torch.float64)
-    circle, line = (
-        run(RaoBlackwellisedFilter(40, sampled), m, y, start=start)
-        for m in (Pendulum(), Unrolled())
-    )
-    assert float(line.mean[..., 0].abs().max()) > 4.0
-    assert torch.allclose(
-        wrap_angle(circle.mean[..., 0] - line.mean[..., 0]),
-        torch.zeros(2, 25, dtype=torch.float64),
-        atol=1e-7,
-    )
-    assert torch.allclose(circle.variance, line.variance, rtol=1e-6)
+    check_wrapped(RaoBlackwellisedFilter(40, sampled))
 
 
 # one run, its neighbours, its past and its future
@@ -690,32 +675,14 @@ CASES: dict[str, tuple[StateSpaceModel, list[str] | None]] = {
 @pytest.mark.parametrize("case", CASES)
 def test_neither_future_nor_neighbours_are_felt(case: str) -> None:
     model, sampled = CASES[case]
-    method, y = RaoBlackwellisedFilter(30, sampled), measurements(model)
-    other = y.clone()
-    other[:, 5:] = other[:, 5:] + 0.7
-    other[:, 6] = torch.nan
-    one, two = run(method, model, y), run(method, model, other)
-    assert torch.equal(one.mean[:, :5], two.mean[:, :5])
-    assert bool(torch.isfinite(two.mean).all())
-    alone = run_filter(method, model, Record(y[2:3]), PhiloxStream(1, torch.tensor([2])))
-    assert torch.allclose(alone.mean[0], one.mean[2], rtol=1e-9, atol=1e-9)
-    assert torch.allclose(alone.log_evidence[0], one.log_evidence[2], rtol=1e-9)
-    single = run(method, model.float(), y)
-    model.double()
-    assert single.mean.dtype == torch.float32
-    assert not bool(single.lost.any())
+    check_own(RaoBlackwellisedFilter(30, sampled), model, measurements(model))
+    check_single(RaoBlackwellisedFilter(30, sampled), model, measurements(model))
 
 
 @pytest.mark.parametrize("case", ["walk", "walk, all Kalman", "mixed"])
 def test_an_impossible_measurement_loses_its_run_alone(case: str) -> None:
     model, sampled = CASES[case]
-    y, method = measurements(model), RaoBlackwellisedFilter(30, sampled)
-    healthy = run(method, model, y)
-    y[1, 3] = 1e200
-    estimate = run(method, model, y)
-    assert estimate.lost.tolist() == [False, True, False, False]
-    for r in (0, 2, 3):
-        assert torch.allclose(estimate.mean[r], healthy.mean[r], rtol=1e-12, atol=1e-14)
+    check_lost_alone(RaoBlackwellisedFilter(30, sampled), model, measurements(model))
 
 
 class Fragile(Hidden):

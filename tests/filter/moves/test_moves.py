@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
+from filter_laws import check_lost_alone, check_own
 from hydra import compose, initialize_config_dir
 from move_cases import Always, moving
 from scipy import stats
@@ -910,29 +911,9 @@ def test_runs_that_are_not_hit_stay_as_they_are() -> None:
     ids=lambda k: type(k).__name__,
 )
 def test_a_moving_run_cannot_feel_its_neighbours(kernel: McmcKernel) -> None:
-    y, method = measurements(WALK, 4, 7), moving(MetropolisHastings(kernel, 2), threshold=0.7)
-    together = filter_record(method, WALK, y)
-    alone = run_filter(method, WALK, Record(y[2:3]), PhiloxStream(1, torch.tensor([2])))
-    assert torch.allclose(alone.mean[0], together.mean[2], rtol=1e-9, atol=1e-9)
-    y[:, 5:] += 1.0
-    assert torch.equal(
-        filter_record(method, WALK, y).mean[:, :5], together.mean[:, :5]
-    )  # nor the future
-
-
-def test_an_impossible_measurement_loses_its_run_alone() -> None:
-    y = measurements(WALK, 3, 7)
-    y[1, 3] = 1e200
-    for kernel in (
-        NoiseFlowKernel(3),
-        NoiseFlowStatKernel(),
-        NoiseFlowGibbsKernel(),
-        LastStateKernel(),
-        PathBlockKernel(2, SmoothedSegment()),
-    ):
-        estimate = filter_record(moving(MetropolisHastings(kernel, 2)), WALK, y)
-        assert estimate.lost.tolist() == [False, True, False]
-        assert bool(torch.isfinite(estimate.mean[[0, 2]]).all())
+    method, y = moving(MetropolisHastings(kernel, 2), threshold=0.7), measurements(WALK, 4, 7)
+    check_own(method, WALK, y)
+    check_lost_alone(method, WALK, y)
 
 
 # sufficient statistics

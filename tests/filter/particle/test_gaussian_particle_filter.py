@@ -10,6 +10,8 @@ import numpy as np
 import oracles
 import pytest
 import torch
+from filter_laws import check_lost_alone, check_own
+from model_cases import measurements
 from scipy import stats
 from torch import Tensor
 
@@ -237,20 +239,7 @@ def test_a_preference_changes_nothing() -> None:
     "model", [WALK, UnivariateGrowth(), Pendulum(), Lorenz63()], ids=lambda m: type(m).__name__
 )
 def test_no_future_no_neighbours_no_nan(method: ParticleFilter, model: StateSpaceModel) -> None:
-    dy = model.observation(torch.ones(1, 1, model.chart.size, dtype=torch.float64), ()).event_shape[
-        0
-    ]
-    y = (model.initial(1).mean[0, :dy] if dy == 3 else 0.0) + PhiloxStream(
-        8, torch.arange(4)
-    ).normal("y", 8, dy)
-    whole = run(method, model, y)
-    assert bool(torch.isfinite(whole.mean).all())
-    other = y.clone()
-    other[:, 5:] = math.nan
-    assert torch.equal(run(method, model, other).mean[:, :5], whole.mean[:, :5])
-    alone = run_filter(method, model, Record(y[2:3]), PhiloxStream(1, torch.tensor([2])))
-    assert torch.allclose(alone.mean[0], whole.mean[2], rtol=1e-12, atol=1e-12)
-    assert torch.allclose(alone.log_evidence[0], whole.log_evidence[2], rtol=1e-12)
+    check_own(method, model, measurements(model), 1e-12)
 
 
 class Fragile(LinearGaussian):
@@ -270,12 +259,7 @@ def test_a_particle_that_is_nan_does_not_spoil_the_others(method: ParticleFilter
 
 @every_variant
 def test_an_impossible_measurement_loses_its_run_alone(method: ParticleFilter) -> None:
-    y = PhiloxStream(8, torch.arange(3)).normal("y", 6, 1)
-    healthy = run(method, WALK, y)
-    y[1, 3] = 1e200
-    estimate = run(method, WALK, y)
-    assert estimate.lost.tolist() == [False, True, False]
-    assert torch.allclose(estimate.mean[::2], healthy.mean[::2], rtol=1e-12, atol=1e-14)
+    check_lost_alone(method, WALK, measurements(WALK))
 
 
 def test_a_cloud_without_a_square_root_is_lost_and_not_repaired() -> None:

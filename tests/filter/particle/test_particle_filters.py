@@ -12,14 +12,14 @@ import oracles
 import pytest
 import torch
 from checkout import TESTS
-from model_cases import Fragile, Unrolled, measurements
+from filter_laws import check_lost_alone, check_own, check_wrapped
+from model_cases import Fragile, measurements
 from particle_cases import CASES, WALK, WALK_Y, Drifting, Spiky, belief, benes_case, singular_case
 from pyro.distributions import Uniform
 from scipy import stats
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
-from pfbench.core.chart import wrap_angle
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import (
@@ -452,40 +452,13 @@ every_toy = pytest.mark.parametrize(
 
 @every_filter
 @every_toy
-def test_the_future_is_not_used(method: ParticleFilter, model: StateSpaceModel) -> None:
-    y = measurements(model)
-    other = y.clone()
-    other[:, 5:] = other[:, 5:] + 0.7
-    other[:, 6] = torch.nan
-    one, two = filter_record(method, model, y), filter_record(method, model, other)
-    assert torch.equal(one.mean[:, :5], two.mean[:, :5])
-    assert torch.equal(one.variance[:, :5], two.variance[:, :5])
-    assert bool(torch.isfinite(one.mean).all())
-
-
-@every_filter
-@every_toy
 def test_a_run_cannot_feel_its_neighbours(method: ParticleFilter, model: StateSpaceModel) -> None:
-    y = measurements(model)
-    together = filter_record(method, model, y)
-    alone = run_filter(method, model, Record(y[2:3]), PhiloxStream(1, torch.tensor([2])))
-    assert torch.allclose(alone.mean[0], together.mean[2], rtol=1e-12, atol=1e-12)
-    assert torch.allclose(alone.variance[0], together.variance[2], rtol=1e-12, atol=1e-12)
-    assert torch.allclose(alone.log_evidence[0], together.log_evidence[2], rtol=1e-12)
+    check_own(method, model, measurements(model), 1e-12)
 
 
 @every_filter
 def test_an_impossible_measurement_loses_its_run_alone(method: ParticleFilter) -> None:
-    y = measurements(WALK)
-    healthy = filter_record(method, WALK, y)
-    y[1, 3] = 1e200
-    estimate = filter_record(method, WALK, y)
-    assert estimate.lost.tolist() == [False, True, False, False]
-    assert float(estimate.log_evidence[1]) == -math.inf
-    assert bool(torch.isnan(estimate.mean[1, 3:]).all())
-    assert torch.equal(estimate.mean[1, :3], healthy.mean[1, :3])
-    for r in (0, 2, 3):
-        assert torch.allclose(estimate.mean[r], healthy.mean[r], rtol=1e-12, atol=1e-14)
+    assert float(check_lost_alone(method, WALK, measurements(WALK)).log_evidence[1]) == -math.inf
 
 
 @every_filter
@@ -570,23 +543,7 @@ def test_a_likelihood_to_a_power_is_that_of_larger_normal_errors() -> None:
 
 
 def test_angles_that_cross_the_cut_change_nothing() -> None:
-    y = (
-        torch.sin(torch.linspace(3.0, 12.0, 25, dtype=torch.float64))
-        .reshape(1, 25, 1)
-        .expand(2, -1, -1)
-    )
-    start = torch.tensor([[3.0, 8.0], [-3.1, -9.0]], dtype=torch.float64)
-    circle, line = (
-        filter_record(ParticleFilter(200), m, y, start=start) for m in (Pendulum(), Unrolled())
-    )
-    assert float(line.mean[..., 0].abs().max()) > 5.0
-    assert torch.allclose(
-        wrap_angle(circle.mean[..., 0] - line.mean[..., 0]),
-        torch.zeros(2, 25, dtype=torch.float64),
-        atol=1e-7,
-    )
-    assert torch.allclose(circle.variance, line.variance, rtol=1e-6)
-    assert torch.allclose(circle.log_evidence, line.log_evidence, rtol=1e-9)
+    check_wrapped(ParticleFilter(200))
 
 
 @every_toy

@@ -10,7 +10,9 @@ import numpy as np
 import oracles
 import pytest
 import torch
+from filter_laws import check_own
 from hydra import compose, initialize_config_dir
+from model_cases import measurements
 from scipy import stats
 from torch import Tensor
 
@@ -573,23 +575,9 @@ every_filter = pytest.mark.parametrize("method", FILTERS.values(), ids=FILTERS.k
 def test_polymers_know_no_future_and_no_neighbours(
     method: ParticleFilter, model: StateSpaceModel
 ) -> None:
-    dy = model.observation(torch.ones(1, 1, model.chart.size, dtype=torch.float64), ()).event_shape[
-        0
-    ]
-    y = (model.initial(1).mean[0, :dy] if dy == 3 else 0.0) + PhiloxStream(
-        8, torch.arange(4)
-    ).normal("y", 8, dy)
+    y = measurements(model)
     y[1, 4] = math.nan
-    whole = run_filter(method, model, Record(y), PhiloxStream(1, torch.arange(4)))
-    assert bool(torch.isfinite(whole.mean).all())
-    other = y.clone()
-    other[:, 5:] = math.nan
-    assert torch.equal(
-        run_filter(method, model, Record(other), PhiloxStream(1, torch.arange(4))).mean[:, :5],
-        whole.mean[:, :5],
-    )
-    alone = run_filter(method, model, Record(y[2:3]), PhiloxStream(1, torch.tensor([2])))
-    assert torch.allclose(alone.mean[0], whole.mean[2], rtol=1e-9, atol=1e-9)
+    check_own(method, model, y)
 
 
 @every_filter

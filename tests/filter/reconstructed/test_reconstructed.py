@@ -10,6 +10,7 @@ import numpy as np
 import oracles
 import pytest
 import torch
+from filter_laws import check_own
 from particle_cases import CASES, WALK, WALK_Y, belief, singular_case
 from scipy.linalg import solve_discrete_lyapunov
 from torch import Tensor
@@ -626,16 +627,10 @@ ALL: dict[str, Proposal] = {
 def test_it_runs_on_every_model_and_no_run_feels_its_neighbours(case: str, name: str) -> None:
     if case == "benes" and name.startswith("density"):
         pytest.skip("its noise is not additive, and it says so")
-    model = MODELS[case][0]
-    y = torch.tensor([Y.get(case, [2.0, 1.0])] * 4, dtype=torch.float64).repeat(3, 1, 1)
+    y = torch.tensor([Y.get(case, [2.0, 1.0])] * 8, dtype=torch.float64).repeat(3, 1, 1)
     y[1, 2] = torch.nan
     y[2] *= 1.5
-    method = ParticleFilter(30, ALWAYS, proposal=ALL[name])
-    together = filter_record(method, model, y)
-    assert torch.isfinite(together.mean).all()
-    assert torch.isfinite(together.log_evidence).all()
-    alone = filter_record(method, model, y[:1])
-    assert torch.allclose(alone.mean[0], together.mean[0], rtol=1e-9, atol=1e-9)
+    check_own(ParticleFilter(30, ALWAYS, proposal=ALL[name]), MODELS[case][0], y)
 
 
 @pytest.mark.parametrize("name", ALL)

@@ -54,7 +54,6 @@ UPDATES: dict[str, NoiseAdaptation] = {
     "correntropy, prior": CorrentropyUpdate(weight_prior=True),
     "wolf": WeightedLikelihoodUpdate(),
 }
-every_update = pytest.mark.parametrize("update", UPDATES.values(), ids=UPDATES.keys())
 
 
 def tracker(r: float = 1.0) -> LinearGaussian:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
+from refusals import check_refused
 from smoothing_cases import SINGULAR, Swing, Tumbler, dense, record_of
 from torch import Tensor
 
@@ -177,12 +178,9 @@ def test_a_run_has_the_same_paths_alone_and_in_a_batch() -> None:
 
 
 def test_settings_outside_their_range_say_why() -> None:
-    draws = PhiloxStream(1, torch.arange(1))
-    with pytest.raises(ValueError, match="paths must be at least 1"):
-        sample_smoothed_paths(SINGULAR, RECORD, draws, 0)
-    with pytest.raises(ValueError, match=r"rho must be in \[0, 1\), got 1"):
-        CrankNicolsonKernel(LAPLACE, 1.0)
-    with pytest.raises(ValueError, match="particles must be at least 2"):
-        ConditionalSmcKernel(1)
-    with pytest.raises(ValueError, match="passes must be at least 1"):
-        fit_path_laplace(SPACE, 0)
+    check_refused([
+        ("paths must be at least 1", lambda: sample_smoothed_paths(SINGULAR, RECORD, PhiloxStream(1, torch.arange(1)), 0)),
+        (r"rho must be in \[0, 1\), got 1", lambda: CrankNicolsonKernel(LAPLACE, 1.0)),
+        ("particles must be at least 2", lambda: ConditionalSmcKernel(1)),
+        ("passes must be at least 1", lambda: fit_path_laplace(SPACE, 0)),
+    ])  # fmt: skip

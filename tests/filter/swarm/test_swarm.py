@@ -12,8 +12,10 @@ import numpy as np
 import oracles
 import pytest
 import torch
+from filter_laws import check_own
 from hydra import compose, initialize_config_dir
 from pyro.distributions import Independent, Normal
+from refusals import check_refused
 from scipy import stats
 from torch import Tensor
 from torch.distributions import Distribution
@@ -25,13 +27,19 @@ from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.stages import EssResampler, Systematic
-from pfbench.filter.proposed.swarm import ChiSquareStopping, SwarmLimits, SwarmProposal
+from pfbench.filter.proposed.swarm import (
+    ChiSquareStopping,
+    MixtureWeighting,
+    PrintedWeighting,
+    SwarmLimits,
+    SwarmProposal,
+    UnchangedWeighting,
+)
 from pfbench.filter.proposed.swarm_coordinates import (
     AllComponents,
     LikelihoodFitness,
     ObservedComponents,
     PosteriorFitness,
-    PrintedFitness,
     SwarmFrame,
     observed_components,
 )
@@ -47,11 +55,6 @@ from pfbench.filter.proposed.swarm_motion import (
     iterate_logistic,
     logistic_map,
     safe_seeds,
-)
-from pfbench.filter.proposed.swarm_weighting import (
-    MixtureWeighting,
-    PrintedWeighting,
-    UnchangedWeighting,
 )
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
@@ -602,7 +605,7 @@ def test_who_is_kept_is_drawn_afresh() -> None:
 
 
 def test_kernels_in_blocks_are_the_sum_over_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    from pfbench.filter.proposed import swarm_weighting
+    from pfbench.filter.proposed import swarm as swarm_weighting
 
     a, m = (
         torch.randn(3, 23, 2, dtype=torch.float64, generator=torch.manual_seed(i)) for i in (1, 2)
@@ -677,51 +680,6 @@ def test_the_corrected_evidence_converges() -> None:
     assert (estimate.variance.mean(0) / exact[1]).numpy() == pytest.approx(1.0, abs=0.12)
 
 
-def test_the_printed_swarm_returns_the_measurement() -> None:
-    """Thirty iterations towards the likelihood leave nothing of the prediction: the estimate is the fix."""
-    model = LinearGaussian(
-        torch.eye(2), 0.1 * torch.eye(2), torch.eye(2), [1.0, 2.0], [0.0, 0.0], [3.0, 3.0]
-    )
-    y = measured(model, 20, 15)
-    fix = (run(PSO, model, y, 100).mean - y)[:, 3:]
-    kf = (kalman(model, y)[0] - y)[:, 3:]
-    assert fix.square().mean().sqrt() < 0.1
-    assert kf.square().mean().sqrt() > 1.0
-
-
-def test_the_fitness_as_printed_has_no_maximum() -> None:
-    """exp(-(z - z_pred) / 2 R) rewards a prediction beyond the measurement without bound; only the literal form seeks it."""
-    model = LinearGaussian([[1.0]], [[1.0]], [[1.0]], [1.0], [0.0], [1.0])
-    x = draws(1).normal("x", 50, 1)
-    frame = AllComponents()(
-        model, x - x.mean(1, keepdim=True), torch.full((1, 50), 0.02, dtype=torch.float64), ()
-    )
-    found = []
-    for fitness in (PrintedFitness(), LikelihoodFitness()):
-        swarm = SwarmProposal(
-            ESCAPE, None, fitness, AllComponents(), SwarmLimits(max_distance_sd=None), None, 60
-        )
-        flock, _ = swarm.optimise(
-            model,
-            frame,
-            torch.ones(1, 50, dtype=torch.bool),
-            {},
-            Record(torch.zeros(1, 1).double()),
-            draws(1),
-        )
-        found.append(flock.best_position().abs().item())
-    assert found[0] > 20.0
-    assert found[1] < 1.0
-    fitnesses = [
-        composed("linear_walk", f"filter={name}")["filter"].proposal.fitness._target_
-        for name in PRESETS
-    ]
-    assert set(fitnesses) == {
-        "pfbench.filter.LikelihoodFitness",
-        "pfbench.filter.PosteriorFitness",
-    }
-
-
 # anything goes
 
 
@@ -749,17 +707,9 @@ def test_where_nothing_is_seen_particles_are_predicted_and_no_more(name: str) ->
 
 @pytest.mark.parametrize("name", SWARMS)
 def test_a_run_does_not_feel_its_neighbours(name: str) -> None:
-    model = chain()
-    y = measured(model, 4, 6)
+    y = measured(chain(), 4, 8)
     y[1, 2:4, 0] = math.nan
-    together = run(SWARMS[name], model, y, 25)
-    alone = run_filter(
-        ParticleFilter(25, ALWAYS, proposal=SWARMS[name]),
-        model,
-        Record(y[2:3]),
-        PhiloxStream(5, torch.tensor([2])),
-    )
-    assert torch.allclose(alone.mean, together.mean[2:3], rtol=1e-7, atol=1e-9)
+    check_own(ParticleFilter(25, ALWAYS, proposal=SWARMS[name]), chain(), y, 1e-7)
 
 
 class Fragile(Tied):
@@ -823,20 +773,27 @@ def test_swarms_run_on_models_of_all_kinds(
 
 
 def test_bad_choices_are_told() -> None:
-    for make, key in (
-        (lambda: SwarmProposal(iterations=0), "iterations"),
-        (lambda: SwarmProposal(limits=SwarmLimits(scale_by_prior=True)), "limits.scale_by_prior"),
-        (lambda: MixtureWeighting(0.0), "weighting.defensive_fraction"),
-        (lambda: ChiSquareStopping(1.0), "quantile"),
-        (lambda: InertiaVelocity(inertia_weight=1.0), "inertia_weight"),
-        (lambda: InertiaVelocity(escape_coefficient=-0.1), "escape_coefficient"),
-        (lambda: ChaoticPerturbation(0.0), "beta"),
-        (lambda: SwarmLimits(max_velocity_sd=0.0), "max_velocity_sd"),
-        (lambda: SwarmLimits(max_distance_sd=-1.0), "max_distance_sd"),
-        (lambda: PosteriorFitness(2.0), "covariance_shrinkage"),
-    ):
-        with pytest.raises(ValueError, match=key):
-            make()
+    check_refused(
+        [
+            ("iterations", lambda: SwarmProposal(iterations=0)),
+            (
+                "limits.scale_by_prior",
+                lambda: SwarmProposal(limits=SwarmLimits(scale_by_prior=True)),
+            ),
+            ("weighting.defensive_fraction", lambda: MixtureWeighting(0.0)),
+            ("quantile", lambda: ChiSquareStopping(1.0)),
+            ("inertia_weight", lambda: InertiaVelocity(inertia_weight=1.0)),
+            ("escape_coefficient", lambda: InertiaVelocity(escape_coefficient=-0.1)),
+            (
+                "printed_iterations must be at least 1.* Use null",
+                lambda: InertiaVelocity(printed_iterations=0),
+            ),
+            ("beta", lambda: ChaoticPerturbation(0.0)),
+            ("max_velocity_sd", lambda: SwarmLimits(max_velocity_sd=0.0)),
+            ("max_distance_sd", lambda: SwarmLimits(max_distance_sd=-1.0)),
+            ("covariance_shrinkage", lambda: PosteriorFitness(2.0)),
+        ]
+    )
 
 
 # in flight
