@@ -401,7 +401,7 @@ def contents() -> str:
     words = ", ".join(f"{number} {word}" for number, word in decided)
     return "\n".join(markdown_bullets(
         f"{count('filter')} filters and forms of filters: Kalman, particle, guided, swarm, robust, adaptive, smoothing and learned ones.",
-        f"Seven methods, literal and repaired; claims of their papers: {words}.",
+        f"Seven methods, literal and repaired; 88 claims: {words}.",
         f"{count('scenario')} scenarios, simulated and recorded, {count('model')} models and {count('noise')} noise regimes; own ones are one class.",
         "All Monte Carlo runs of a job are one tensor axis; each random number is a function of seed, run, step and use.",
         "Better, equal, worse or not decided: each word has a simulated error rate, and a lost run deletes no filter.",

@@ -235,7 +235,7 @@ def _is_number(column: pd.Series) -> bool:
     return bool(pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column))
 
 
-def format_ratio(ratio: float, low: float, high: float) -> str:
+def format_with_interval(ratio: float, low: float, high: float) -> str:
     """Format a ratio with its interval: three decimals where two would put a bound on one that is not one."""
     if not math.isfinite(high):
         return f"{ratio:.2f}"

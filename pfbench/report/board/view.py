@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy  # scipy.stats is imported at its first use
 
-from pfbench.report.writers import format_ratio
+from pfbench.report.writers import format_with_interval
 from pfbench.results.looks import MethodLook
 from pfbench.results.step_times import StepTimes, describe_costs
 from pfbench.stats.comparison import MIN_RUNS, Verdict, decide, estimate_mean
@@ -254,7 +254,7 @@ def describe_view(
     head += f" {'is' if len(better) < 2 else 'are'} better than {base} {where}"
     if better:
         first = better[0]
-        head += f" (best: [[{looks[first['filter']].name}]], {format_ratio(first['ratio'], first['ratio_low'], first['ratio_high'])} of its {metric})"
+        head += f" (best: [[{looks[first['filter']].name}]], {format_with_interval(first['ratio'], first['ratio_low'], first['ratio_high'])} of its {metric})"
     head = f"{head}; {rest}." if rest else f"{head}."
     texts = [f"{head} {text}".rstrip() for text in _describe_proposed(others, better, looks)]
     return next((text for text in texts if len(text.split()) <= _MOST_WORDS), head)
@@ -262,7 +262,7 @@ def describe_view(
 
 def _show_ratio(row: BoardRow) -> str:
     """Format the ratio of a row with its interval."""
-    return format_ratio(row["ratio"], row["ratio_low"], row["ratio_high"])
+    return format_with_interval(row["ratio"], row["ratio_low"], row["ratio_high"])
 
 
 def _describe_proposed(
@@ -277,7 +277,7 @@ def _describe_proposed(
     return [
         f"{head}, {ratio}, {row['verdict']}."
         for ratio in (
-            format_ratio(row["ratio"], row["ratio_low"], row["ratio_high"]),
+            format_with_interval(row["ratio"], row["ratio_low"], row["ratio_high"]),
             f"{row['ratio']:.2f}",
         )
     ]

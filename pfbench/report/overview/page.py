@@ -21,7 +21,7 @@ from pfbench.report.overview.tables import (
 )
 from pfbench.report.papers.figures import list_paper_pages
 from pfbench.report.study_page.page_writer import describe_page_knobs
-from pfbench.report.writers import format_csv, format_ratio, template_environment
+from pfbench.report.writers import format_csv, format_with_interval, template_environment
 from pfbench.results.conditions import parse_label
 from pfbench.results.paper_block import read_paper_block
 from pfbench.stats.world_table import WorldResult
@@ -229,7 +229,7 @@ def list_ratios(overview: Overview) -> list[tuple[WorldRow, list[str]]]:
             text = (
                 "–"
                 if cell is None
-                else format_ratio(cell.verdict.ratio, cell.verdict.low, cell.verdict.high)
+                else format_with_interval(cell.verdict.ratio, cell.verdict.low, cell.verdict.high)
             )
             share = (
                 f"; {100 * cell.track_share:.0f} % keep track" if cell and cell.loses_track else ""
