@@ -72,8 +72,9 @@ from pfbench.filter.proposed.polymerised import (
     divide_cells,
 )
 from pfbench.filter.proposed.reconstructed import NoWeightCorrection, ReconstructedProposal
-from pfbench.filter.proposed.swarm import PrintedWeighting, SwarmLimits, SwarmProposal
+from pfbench.filter.proposed.swarm import SwarmLimits, SwarmProposal
 from pfbench.filter.proposed.swarm_coordinates import AllComponents, LikelihoodFitness
+from pfbench.filter.proposed.swarm_weighting import PrintedWeighting
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 
 PAGES = Path(__file__).parents[2] / "docs" / "methods"

@@ -207,11 +207,8 @@ from pfbench.filter.proposed.reconstructed import (
 )
 from pfbench.filter.proposed.swarm import (
     ChiSquareStopping as ChiSquareStopping,
-    MixtureWeighting as MixtureWeighting,
-    PrintedWeighting as PrintedWeighting,
     SwarmLimits as SwarmLimits,
     SwarmProposal as SwarmProposal,
-    SwarmWeighting as SwarmWeighting,
 )
 from pfbench.filter.proposed.swarm_coordinates import (
     AllComponents as AllComponents,
@@ -231,6 +228,11 @@ from pfbench.filter.proposed.swarm_motion import (
     PriorStart as PriorStart,
     SwarmStart as SwarmStart,
     VelocityUpdate as VelocityUpdate,
+)
+from pfbench.filter.proposed.swarm_weighting import (
+    MixtureWeighting as MixtureWeighting,
+    PrintedWeighting as PrintedWeighting,
+    SwarmWeighting as SwarmWeighting,
 )
 from pfbench.filter.proposed.unprinted import UnprintedFilter as UnprintedFilter
 from pfbench.filter.robust.hypotheses import NoiseHypotheses as NoiseHypotheses

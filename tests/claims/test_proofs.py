@@ -26,13 +26,14 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import GaussianSmoothing
 from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.filter.proposed.dmc_controller import DmcController
-from pfbench.filter.proposed.swarm import PrintedWeighting, SwarmLimits, SwarmProposal
+from pfbench.filter.proposed.swarm import SwarmLimits, SwarmProposal
 from pfbench.filter.proposed.swarm_coordinates import (
     AllComponents,
     LikelihoodFitness,
     PrintedFitness,
 )
 from pfbench.filter.proposed.swarm_motion import GaussianVelocity, InertiaVelocity, PriorStart
+from pfbench.filter.proposed.swarm_weighting import PrintedWeighting
 from pfbench.model.linear_gaussian import LinearGaussian
 
 RULES = ("ckf", "hckf", "ssrckf", "ssrhckf5", "ssr53", "mssrckf")

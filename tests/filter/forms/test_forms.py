@@ -33,13 +33,14 @@ from pfbench.filter.particle.sqmc import HaltonPoints, halton_points
 from pfbench.filter.particle.stages import EssResampler, FixedCount, Systematic
 from pfbench.filter.proposed.dmc_controller import DmcController
 from pfbench.filter.proposed.reconstructed import NoWeightCorrection, ReconstructedProposal
-from pfbench.filter.proposed.swarm import PrintedWeighting, SwarmLimits, SwarmProposal
+from pfbench.filter.proposed.swarm import SwarmLimits, SwarmProposal
 from pfbench.filter.proposed.swarm_coordinates import (
     AllComponents,
     LikelihoodFitness,
     PrintedFitness,
 )
 from pfbench.filter.proposed.swarm_motion import IntervalStart, follow_logistic
+from pfbench.filter.proposed.swarm_weighting import PrintedWeighting
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.results.paper_block import (
     METHOD_FORMS,

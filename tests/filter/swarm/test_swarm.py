@@ -27,14 +27,7 @@ from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.stages import EssResampler, Systematic
-from pfbench.filter.proposed.swarm import (
-    ChiSquareStopping,
-    MixtureWeighting,
-    PrintedWeighting,
-    SwarmLimits,
-    SwarmProposal,
-    UnchangedWeighting,
-)
+from pfbench.filter.proposed.swarm import ChiSquareStopping, SwarmLimits, SwarmProposal
 from pfbench.filter.proposed.swarm_coordinates import (
     AllComponents,
     LikelihoodFitness,
@@ -55,6 +48,11 @@ from pfbench.filter.proposed.swarm_motion import (
     iterate_logistic,
     logistic_map,
     safe_seeds,
+)
+from pfbench.filter.proposed.swarm_weighting import (
+    MixtureWeighting,
+    PrintedWeighting,
+    UnchangedWeighting,
 )
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
@@ -605,7 +603,7 @@ def test_who_is_kept_is_drawn_afresh() -> None:
 
 
 def test_kernels_in_blocks_are_the_sum_over_all_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
-    from pfbench.filter.proposed import swarm as swarm_weighting
+    from pfbench.filter.proposed import swarm_weighting
 
     a, m = (
         torch.randn(3, 23, 2, dtype=torch.float64, generator=torch.manual_seed(i)) for i in (1, 2)
