@@ -10,6 +10,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 # Installs once, and again if the requirements change.
 $(VENV)/.installed: pyproject.toml constraints.txt
+	$(PYTHON) pfbench/kernels/library_build.py &  # while pip fetches packages
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e ".[dev]"
 	touch $@

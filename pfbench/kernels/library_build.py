@@ -7,6 +7,7 @@ of torch.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import platform
@@ -86,3 +87,15 @@ def _link_options(compiler: str, folder: Path) -> list[str]:
     empty = [compiler, "-shared", "-x", "c++", os.devnull, "-o", str(stub)]
     subprocess.run([*empty, f"-Wl,-soname,{stub.name}"], check=True, capture_output=True)
     return [f"-L{folder}", "-Wl,--no-as-needed", "-ltorch_cpu", "-lm", "-ldl"]
+
+
+if (
+    __name__ == "__main__"
+):  # beside pip, which fetches packages for as long; `setup.py` takes what is there
+    for name in find_variants():
+        path = Path(__file__).with_name(name_library(name))
+        if not path.exists():
+            with contextlib.suppress(
+                OSError, subprocess.CalledProcessError
+            ):  # `setup.py` states them
+                build_library(name, path)
