@@ -192,6 +192,7 @@ HOMES = {
     "strapdown_blocks": ["recorded_car_constrained"],
     "strapdown_aided": ["recorded_fixed_wing_aided"],
     "strapdown_tight": ["recorded_walk"],
+    "raw_gnss": ["user_raw_log"],
     "passive_location": ["passive_1"],
     "sins_gnss_tight": ["anshun_fit"],
     "sins_gnss_tight_nl": ["anshun_nl"],

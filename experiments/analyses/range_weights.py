@@ -9,28 +9,31 @@ which are not scored.
 
 from __future__ import annotations
 
-import math
 import os
 import sys
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
+from pfbench.core import PhiloxStream
 from pfbench.files import markdown_head, markdown_row
 from pfbench.filter import run_filter
-from pfbench.job.plan import build_plan
-from pfbench.scenario import range_residuals, read_drive, select_stretch
-from pfbench.scenario.recorded.urban_error_fit import fit_clock
+from pfbench.scenario import (
+    estimate_normal,
+    find_dataset,
+    range_residuals,
+    read_drive,
+    select_stretch,
+)
 
 RUNS = 10
+RATIOS = (0.5, 0.7, 0.9, 1.1, 1.4, 2.0)  # of the two standard deviations
 SEED = 1
 WEIGHTS = "+scenario.receiver.weights._target_=pfbench.scenario.SignalWeights"
-# of a range and a range rate of a satellite together; the canyon has no range rates
+# of a range and a range rate of a satellite together; the canyon lacks range rates
 GATES = {"walk": "satellite", "canyon": "component"}
 WALK = ("scenario=recorded_walk", "scenario.receiver.range_sd=0", "scenario.receiver.rate_sd=0")
 WALK_WEIGHTS = (
@@ -69,28 +72,20 @@ def fit_weights(root: str | None) -> tuple[float, float]:
     Args:
         root: Folder of the data sets.
     """
-    drive = read_drive(job_folder(root))
-    data = range_residuals(select_stretch(drive, 0.0, 100.0))
-    growth = 1.0 / torch.sin(data.elevation).clamp(min=0.05) ** 2
-    noise = 10.0 ** (-(data.cn0 - 45.0) / 10.0)
-
-    def log_density(e: Tensor, p: Tensor) -> Tensor:
-        variance = torch.exp(2.0 * p[0]) * growth + torch.exp(2.0 * p[1]) * noise
-        return -0.5 * (e.square() / variance + torch.log(2.0 * math.pi * variance))
-
-    (a, b), _ = fit_clock(data, log_density, np.log([10.0, 10.0]), 20.0)
-    return float(np.exp(a)), float(np.exp(b))
-
-
-def job_folder(root: str | None) -> Any:
-    """Return the folder of the canyon.
-
-    Args:
-        root: Folder of the data sets.
-    """
-    from pfbench.scenario import find_dataset
-
-    return find_dataset(root, "berlin_urban_tc")
+    data = range_residuals(
+        select_stretch(read_drive(find_dataset(root, "berlin_urban_tc")), 0.0, 100.0)
+    )
+    growth = 1.0 / torch.sin(data.elevation).clamp(min=0.05)
+    noise = 10.0 ** (-(data.cn0 - 45.0) / 20.0)
+    fits = []
+    for ratio in RATIOS:
+        shape = torch.hypot(growth, ratio * noise)
+        error_law, clock = estimate_normal(data._replace(sd=shape))
+        level = torch.from_numpy(np.interp(data.time.numpy(), clock.knots, clock.level))
+        e = data.value - level - clock.inter_system * data.glonass
+        normal = torch.distributions.Normal(0.0, error_law.factor * shape)
+        fits.append((float(normal.log_prob(e).mean()), error_law.factor, ratio * error_law.factor))
+    return max(fits)[1:]
 
 
 def measure(world: str, weights: str, gate: str, words: Sequence[str]) -> Row:
@@ -104,7 +99,7 @@ def measure(world: str, weights: str, gate: str, words: Sequence[str]) -> Row:
     """
     method = "ekf" if gate == "no" else "gate"
     more = () if gate == "no" else (f"filter.noise_adaptations.0.grouping={GATES[world]}",)
-    plan = build_plan(
+    plan = job.build_plan(
         job.compose([*words, *more, f"filter={method}", f"runs={RUNS}", "episode_cache_dir=null"])
     )
     episode, runs = plan.draw_episode(plan.runs), plan.runs

@@ -90,9 +90,8 @@ class RawGnss(StateSpaceModel):
     """An antenna that moves with white acceleration, and a receiver clock.
 
     State [9]: position and velocity (East, North, Up), bias m and drift m/s of the receiver clock, and the
-    inter-system bias m. Over a step T with the integral n of the acceleration, v' = v + n and
-    p' = p + v T + n T / 2 + m, where m is the part of the position that n does not explain, of variance
-    q T^3 / 12. Clock states are differences from a nominal course that the record subtracts.
+    inter-system bias m. A step has duration T, and n is the integral of the acceleration. Then v' = v + n and
+    p' = p + v T + n T / 2 + m. The part m of the position, of variance q T^3 / 12, is independent of n. Clock states are differences from a nominal course that the record subtracts.
 
     The origin is the fixed position, at rest. Recorded scenarios provide the start of each run.
 
@@ -137,14 +136,14 @@ class RawGnss(StateSpaceModel):
     def propagate(self, x: Tensor, u: RawGnssInputs, w: Tensor) -> Tensor:
         position, velocity, bias, drift, inter_system = x.split([3, 3, 1, 1, 1], -1)
         duration = u.duration[:, None, None]
-        moved = [
+        parts = [
             position + velocity * duration,
             velocity,
             bias + drift * duration,
             drift,
             inter_system,
         ]
-        return torch.cat(moved, -1) + w @ self.noise_gain(u).mT
+        return torch.cat(parts, -1) + w @ self.noise_gain(u).mT
 
     @override
     def noise_gain(self, u: RawGnssInputs) -> Tensor:

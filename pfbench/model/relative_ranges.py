@@ -35,7 +35,7 @@ def predict_raw(p: Tensor, v: Tensor, u: Sky) -> tuple[Tensor, Tensor]:
     """Compute ranges minus those from the fixed position, and range rates, without the clock.
 
     With x from the fixed position and r = |reach line - x|, a range is r - reach. A rate is
-    e.(V - v) - line.V, where e points to the satellite. There is no cancellation of two ranges.
+    e.(V - v) - line.V, where e points to the satellite. Two ranges are not subtracted.
 
     Returns ranges and rates, [R, N, S] each, m and m/s. Shapes: p and v [R, N, 3].
     """

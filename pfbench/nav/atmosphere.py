@@ -17,7 +17,7 @@ _LEAST_PERIOD = 72000.0  # s
 
 
 class Sight(NamedTuple):
-    """Where a signal arrives, and from where.
+    """Place at which a signal arrives, and its direction.
 
     Attributes:
         receiver: Latitude, longitude, height, rad and m, [..., 3].

@@ -215,9 +215,9 @@ def read_rinex(file: Path) -> RinexFile:
             f"the file {file.name} must be a RINEX 2, 3 or 4 navigation file, {_describe_kind(lines)}"
         )
     body = next((i + 1 for i, line in enumerate(lines) if "END OF HEADER" in line), len(lines))
-    ionosphere, left = find_ionosphere(lines, body), tuple[str, ...]()
+    ionosphere, skipped = find_ionosphere(lines, body), tuple[str, ...]()
     if version[0] == "4":
-        (lines, left), version = unfold_blocks(lines, body), "3"
+        (lines, skipped), version = unfold_blocks(lines, body), "3"
     records = list(_records(lines, body, int(version[0])))
     rows = [record for record in records if isinstance(record, dict)]
     dropped = [f"{file.name}: {record}" for record in records if isinstance(record, str)]
@@ -232,7 +232,7 @@ def read_rinex(file: Path) -> RinexFile:
             f"the file {file.name} must contain ephemerides of GPS or Galileo, got none{others and ' but '}"
             f"{others}. Choose another file."
         )
-    systems = [*left, *_describe_others(lines, body, version[0])]
+    systems = [*skipped, *_describe_others(lines, body, version[0])]
     unread = (f"{file.name}: not read: {text}" for text in systems)
     return RinexFile(pd.DataFrame(rows), (*dropped, *unread), ionosphere)
 

@@ -10,15 +10,15 @@ _READ = ("LNAV", "INAV", "FNAV")  # messages with the records of RINEX 3
 
 def unfold_blocks(lines: Sequence[str], body: int) -> tuple[list[str], tuple[str, ...]]:
     """Return a RINEX 4 file with the records of RINEX 3 alone, other lines blank, and a note on messages left out."""
-    kept, left = [*lines[:body], *[""] * (len(lines) - body)], set()
+    records, skipped = [*lines[:body], *[""] * (len(lines) - body)], set()
     for begin, block in _blocks(lines, body):
         kind, satellite, message = (*lines[begin][1:].split(), "", "", "")[:3]
         if kind == "EPH" and (satellite[:1] not in ("G", "E") or message in _READ):
-            kept[begin + 1 : begin + 1 + len(block)] = block
+            records[begin + 1 : begin + 1 + len(block)] = block
         elif kind == "EPH":
-            left.add(message)
-    note = f"messages {', '.join(sorted(left))} of GPS and Galileo: LNAV, INAV and FNAV are read"
-    return kept, (note,) if left else ()
+            skipped.add(message)
+    note = f"messages {', '.join(sorted(skipped))} of GPS and Galileo: LNAV, INAV and FNAV are read"
+    return records, (note,) if skipped else ()
 
 
 def find_ionosphere(lines: Sequence[str], body: int) -> tuple[float, ...]:
@@ -31,14 +31,14 @@ def find_ionosphere(lines: Sequence[str], body: int) -> tuple[float, ...]:
                 *_fields(block[2], 4, 19)[:1],
             ]
             return tuple(numbers) if len(numbers) == 8 else ()
-    found = {}
+    fields = {}
     for line in lines[:body]:
         label = line[60:].strip()
         if label in ("ION ALPHA", "ION BETA"):
-            found[label[4]] = _fields(line[:60], 2, 12)[:4]
+            fields[label[4]] = _fields(line[:60], 2, 12)[:4]
         elif label == "IONOSPHERIC CORR" and line[:4] in ("GPSA", "GPSB"):
-            found[line[3]] = _fields(line[:60], 5, 12)[:4]
-    numbers = [*found.get("A", ()), *found.get("B", ())]
+            fields[line[3]] = _fields(line[:60], 5, 12)[:4]
+    numbers = [*fields.get("A", ()), *fields.get("B", ())]
     return tuple(numbers) if len(numbers) == 8 else ()
 
 

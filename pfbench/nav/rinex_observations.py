@@ -49,26 +49,29 @@ def read_observations(file: Path, signals: Mapping[str, Sequence[str]]) -> Obser
     lines = read_text(file).removeprefix(b"\xef\xbb\xbf").decode("latin-1").splitlines()
     check_version(file.name, lines[0] if lines else "")
     header = _read_header(file.name, lines)
-    chosen = {
+    codes_in_use = {
         s: _choose(header.types[s], codes) for s, codes in signals.items() if s in header.types
     }
-    chosen = {system: code for system, code in chosen.items() if code}
-    wanted = ", ".join(f"C{code} of {s}" for s, codes in signals.items() for code in codes)
+    codes_in_use = {system: code for system, code in codes_in_use.items() if code}
+    readable = ", ".join(f"C{code} of {s}" for s, codes in signals.items() for code in codes)
     have = "; ".join(f"{s} {' '.join(types)}" for s, types in header.types.items())
     remedy = "Record these signals, or name others on 1575.42 MHz in scenario.rinex.signals."
     require(
-        chosen,
+        codes_in_use,
         f"{file.name}: the types of observations",
-        f"include {wanted}",
+        f"include {readable}",
         have or "none",
         remedy,
     )
     columns = {
-        s: [_find(header.types[s], kind + code) for kind in "CDS"] for s, code in chosen.items()
+        s: [_find(header.types[s], kind + code) for kind in "CDS"]
+        for s, code in codes_in_use.items()
     }
-    others = ", ".join(sorted(set(header.types) - set(chosen)))
+    others = ", ".join(sorted(set(header.types) - set(codes_in_use)))
     notes = [f"{file.name}: systems {others} are not read"] if others else []
-    notes += [f"{file.name}: {'C' + code} of {system} is read" for system, code in chosen.items()]
+    notes += [
+        f"{file.name}: {'C' + code} of {system} is read" for system, code in codes_in_use.items()
+    ]
     rows: list[tuple[object, ...]] = []
     for time, satellites in _epochs(file.name, lines, header.end, notes):
         for text in satellites:
@@ -82,7 +85,7 @@ def read_observations(file: Path, signals: Mapping[str, Sequence[str]]) -> Obser
     )
     table = table[table["pr"].notna()].reset_index(drop=True).astype({"svid": int})
     require(
-        len(table), f"{file.name}", f"contain ranges of {wanted}", "none", "Choose another file."
+        len(table), f"{file.name}", f"contain ranges of {readable}", "none", "Choose another file."
     )
     return ObservationFile(table, header.position, tuple(notes))
 
@@ -175,7 +178,7 @@ def _epochs(
             flag, count = head[31:32].strip() or "0", int(head[32:35])
             time = parse_date(head[1:29].split()) if flag in "01" else 0.0
             if head[:1] != ">" or count < 0:
-                raise ValueError("an epoch begins with '>' and has a number of satellites")
+                raise ValueError("an epoch must begin with > and have a number of satellites")
         except ValueError as error:
             raise ValueError(
                 f"{name}: line {i + 1} must be the first line of an epoch, got {head[:35]!r} ({error}). {_WHOLE_EPOCH}"

@@ -39,21 +39,21 @@ def write_raw_log(folder: str | Path, seconds: float = 60.0, range_sd: float = 1
     Returns:
         The folder.
     """
-    place = Path(folder)
-    place.mkdir(parents=True, exist_ok=True)
-    write_navigation(place / "drive.nav", make_ephemerides(), IONOSPHERE)
+    target = Path(folder)
+    target.mkdir(parents=True, exist_ok=True)
+    write_navigation(target / "drive.nav", make_ephemerides(), IONOSPHERE)
     epochs = np.arange(0.0, seconds + 0.5)
-    rows = simulate_ranges(place / "drive.nav", epochs)
+    rows = simulate_ranges(target / "drive.nav", epochs)
     noise = np.random.default_rng(1).normal(size=(2, len(rows)))
     rows["pr"] += range_sd * noise[0]
     rows["doppler"] += 0.1 * range_sd * noise[1] * _FREQUENCY / LIGHT
-    write_observations(place / "drive.obs", rows)
+    write_observations(target / "drive.obs", rows)
     motion = drive(np.arange(0.0, seconds + 0.5 / _IMU_RATE, 1.0 / _IMU_RATE))
     imu = ["t", "fx", "fy", "fz", "wx", "wy", "wz"]
-    motion[imu].round(6).to_csv(place / "imu.csv", index=False)
+    motion[imu].round(6).to_csv(target / "imu.csv", index=False)
     truth = ["t", "lat_deg", "lon_deg", "h_m", "vn", "ve", "vd", "roll", "pitch", "yaw"]
-    motion.loc[::10, truth].round(10).to_csv(place / "reference.csv", index=False)
-    return place
+    motion.loc[::10, truth].round(10).to_csv(target / "reference.csv", index=False)
+    return target
 
 
 def drive(time: np.ndarray) -> pd.DataFrame:
@@ -100,14 +100,14 @@ def simulate_ranges(navigation: Path, epochs: np.ndarray) -> pd.DataFrame:
     ahead = OFFSET_S + DRIFT * epochs
     time = torch.from_numpy(epochs - ahead)
     motion = drive(np.concatenate([[0.0], np.maximum(time.numpy(), 0.0)])).iloc[1:]
-    place = torch.from_numpy(motion[["lat_deg", "lon_deg", "h_m"]].to_numpy().copy())
-    place[:, :2] = torch.deg2rad(place[:, :2])
+    antenna = torch.from_numpy(motion[["lat_deg", "lon_deg", "h_m"]].to_numpy().copy())
+    antenna[:, :2] = torch.deg2rad(antenna[:, :2])
     moving = torch.from_numpy(motion[["ve", "vn"]].to_numpy().copy())
     velocity = (torch.cat([moving, torch.zeros(len(time), 1, dtype=torch.float64)], -1).unsqueeze(-2) @ earth.local_axes(_origin())).squeeze(-2)  # fmt: skip
-    signal = receive_signals(constellation, time, earth.ecef(place))
-    line = signal.pos - earth.ecef(place)[:, None]
+    signal = receive_signals(constellation, time, earth.ecef(antenna))
+    line = signal.pos - earth.ecef(antenna)[:, None]
     rate = (line / signal.range.unsqueeze(-1) * (signal.vel - velocity[:, None])).sum(-1)
-    sight = Sight(place, *azimuth_elevation(place, signal.pos))
+    sight = Sight(antenna, *azimuth_elevation(antenna, signal.pos))
     delay = delay_in_troposphere(sight) + delay_in_ionosphere(
         sight, time + START % WEEK, IONOSPHERE
     )
@@ -128,12 +128,12 @@ def _satellite_clock(
     constellation: BroadcastConstellation, time: Tensor, flight: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return clock offset s, with relativity and group delay, and drift of the satellites at transmission, [T, S]."""
-    sent = time - flight.nanmean(-1)
-    offset, drift = constellation.clock(sent)
-    relativity = constellation.relativity(sent)
-    rate = constellation.relativity(sent + 0.5) - constellation.relativity(sent - 0.5)
-    later = time[:, None] - flight - sent[:, None]
-    total = offset + relativity - constellation.group_delay(sent) + (drift + rate) * later
+    typical = time - flight.nanmean(-1)
+    offset, drift = constellation.clock(typical)
+    relativity = constellation.relativity(typical)
+    rate = constellation.relativity(typical + 0.5) - constellation.relativity(typical - 0.5)
+    later = time[:, None] - flight - typical[:, None]
+    total = offset + relativity - constellation.group_delay(typical) + (drift + rate) * later
     return total, drift + rate
 
 
@@ -154,10 +154,10 @@ def write_observations(
     numbers = rows[["time", "svid", "pr", "doppler", "cn0"]].to_numpy(float)
     systems = rows["sys"].tolist()
     for time in np.unique(numbers[:, 0]).tolist():
-        whole = math.floor(time)
-        at = EPOCH + timedelta(seconds=whole)
+        second_of_start = math.floor(time)
+        at = EPOCH + timedelta(seconds=second_of_start)
         places = np.flatnonzero(numbers[:, 0] == time).tolist()
-        second = f"{at.second + (time - whole):11.7f}"
+        second = f"{at.second + (time - second_of_start):11.7f}"
         lines.append(f"> {at:%Y %m %d %H %M}{second}  0{len(places):3d}")
         for i in places:
             cells = [" " * 16 if math.isnan(a) else f"{a:14.3f}  " for a in numbers[i, 2:].tolist()]

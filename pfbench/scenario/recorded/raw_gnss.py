@@ -249,18 +249,18 @@ def remove_clock_jumps(ranges: Array, time: Array) -> tuple[Array, tuple[str, ..
 
     Returns ranges and notes. Shapes: ranges [K, S], time [K].
     """
-    seen = np.flatnonzero(np.isfinite(ranges).any(1))
-    step, duration = np.diff(ranges[seen], axis=0), np.diff(time[seen])
-    known = np.isfinite(step).any(1)
+    epochs_with_data = np.flatnonzero(np.isfinite(ranges).any(1))
+    step, duration = np.diff(ranges[epochs_with_data], axis=0), np.diff(time[epochs_with_data])
+    has_change = np.isfinite(step).any(1)
     change = np.zeros(len(step))
-    change[known] = np.nanmedian(step[known], axis=1)
-    rate = float(np.median(change[known] / duration[known])) if known.any() else 0.0
-    jumps = np.rint((change - rate * duration) / _MILLISECOND) * known
+    change[has_change] = np.nanmedian(step[has_change], axis=1)
+    rate = float(np.median(change[has_change] / duration[has_change])) if has_change.any() else 0.0
+    jumps = np.rint((change - rate * duration) / _MILLISECOND) * has_change
     count = int(np.count_nonzero(jumps))
     if not count:
         return ranges, ()
     shift = np.zeros(len(time))
-    shift[seen[1:]] = np.cumsum(jumps) * _MILLISECOND
+    shift[epochs_with_data[1:]] = np.cumsum(jumps) * _MILLISECOND
     return ranges - shift[:, None], (f"clock: {count} jumps by whole milliseconds removed",)
 
 

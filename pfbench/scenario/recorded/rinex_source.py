@@ -24,7 +24,7 @@ from pfbench.scenario.recorded.log_frames import GEODETIC_COLUMNS
 from pfbench.scenario.recorded.log_tables import Array, LogTable, ReferenceLog
 
 WAVELENGTH = LIGHT / 1575.42e6  # m
-_HEAD = 200  # bytes of a file that show what it is
+_HEAD = 200  # bytes of a file that show its kind
 _KINDS = {"observations": "O", "navigation": "N"}
 
 
@@ -81,12 +81,12 @@ class RinexSource:
 
     def list_files(self, folder: Path) -> list[Path]:
         """List the files that are read; those that are not in the folder are left out."""
-        named = [self.observations, self.navigation]
-        found = [
+        names = [self.observations, self.navigation]
+        lists = [
             [folder / name] if name else list_rinex(folder, kind)
-            for name, kind in zip(named, _KINDS.values(), strict=True)
+            for name, kind in zip(names, _KINDS.values(), strict=True)
         ]
-        return [files[0] for files in found if len(files) == 1 and files[0].is_file()]
+        return [files[0] for files in lists if len(files) == 1 and files[0].is_file()]
 
     def read_epochs(self, folder: Path) -> RawEpochs:
         """Read the observations."""
@@ -129,13 +129,17 @@ class RinexSource:
         names = set(rows["name"])
         rows = rows[rows["name"].isin(constellation.names)].reset_index(drop=True)
         time, step = np.unique(rows["time"].to_numpy(), return_inverse=True)
-        place = step, np.searchsorted(constellation.names, rows["name"].to_numpy(str))
+        index = step, np.searchsorted(constellation.names, rows["name"].to_numpy(str))
         ranges = np.full((len(time), len(constellation.names)), np.nan)
-        ranges[place] = rows["pr"]
-        sent = constellation.transmit(torch.from_numpy(time - first), torch.from_numpy(ranges))
+        ranges[index] = rows["pr"]
+        satellites = constellation.transmit(
+            torch.from_numpy(time - first), torch.from_numpy(ranges)
+        )
         receiver = _place(track, time - epochs.start, centre)
-        sky = _describe_sky(sent, receiver, torch.from_numpy(time % WEEK), constellation.ionosphere)
-        rows = rows.assign(**{name: values.numpy()[place] for name, values in sky.items()})
+        sky = _describe_sky(
+            satellites, receiver, torch.from_numpy(time % WEEK), constellation.ionosphere
+        )
+        rows = rows.assign(**{name: values.numpy()[index] for name, values in sky.items()})
         rows["prr"] = -WAVELENGTH * rows["doppler"]
         rows = rows[rows["sx"].notna()].reset_index(drop=True)
         skip_notes(folder, constellation.notes)
@@ -166,8 +170,8 @@ class RinexSource:
                 ):
                     check_version(file.name, head)
         got = ", ".join(file.name for file in files) or "none"
-        what = {"O": "RINEX 3 observation", "N": "RINEX navigation"}[kind]
-        require(len(files) == 1, f"the folder {folder}", f"contain one {what} file", got, f"Name it by scenario.rinex.{key}.")  # fmt: skip
+        label = {"O": "RINEX 3 observation", "N": "RINEX navigation"}[kind]
+        require(len(files) == 1, f"the folder {folder}", f"contain one {label} file", got, f"Name it by scenario.rinex.{key}.")  # fmt: skip
         return files[0]
 
 
@@ -193,7 +197,7 @@ def _read_head(file: Path) -> str:
 def _looks_like_rinex(file: Path) -> bool:
     """Return whether the name of a compressed file is that of observations."""
     return any(
-        part.lower().endswith(("o", "obs", "rnx", "crx", "d")) for part in file.suffixes[:-1]
+        suffix.lower().endswith(("o", "obs", "rnx", "crx", "d")) for suffix in file.suffixes[:-1]
     )
 
 
@@ -222,22 +226,25 @@ def _place(track: ReferenceLog, time: Array, centre: Sequence[float]) -> torch.T
 
 
 def _describe_sky(
-    sent: Transmission, receiver: torch.Tensor, time: torch.Tensor, ionosphere: Sequence[float]
+    satellites: Transmission,
+    receiver: torch.Tensor,
+    time: torch.Tensor,
+    ionosphere: Sequence[float],
 ) -> dict[str, torch.Tensor]:
     """Return the columns of the table that the satellites and the receiver decide, [T, S] each.
 
     Shapes: receiver [T, 3], m, time of the week [T], s.
     """
-    flight = torch.linalg.vector_norm(sent.position - receiver[:, None], dim=-1) / LIGHT
-    position, velocity = sagnac(sent.position, flight), sagnac(sent.velocity, flight)
-    place = earth.geodetic(receiver)
-    azimuth, elevation = azimuth_elevation(place, position)
-    sight = Sight(place, azimuth, elevation.clamp(min=0.0))
+    flight = torch.linalg.vector_norm(satellites.position - receiver[:, None], dim=-1) / LIGHT
+    position, velocity = sagnac(satellites.position, flight), sagnac(satellites.velocity, flight)
+    antenna = earth.geodetic(receiver)
+    azimuth, elevation = azimuth_elevation(antenna, position)
+    sight = Sight(antenna, azimuth, elevation.clamp(min=0.0))
     delay = torch.zeros_like(flight)
     if ionosphere:
         delay = delay_in_ionosphere(sight, time, ionosphere)
     angles = {"az": torch.rad2deg(azimuth), "el": torch.rad2deg(elevation)}
     axes = zip("xyz", position.unbind(-1), velocity.unbind(-1), strict=True)
     vectors = {key: value for a, p, v in axes for key, value in ((f"s{a}", p), (f"sv{a}", v))}
-    clocks = {"sclk": sent.clock, "sclkd": sent.clock_drift}
+    clocks = {"sclk": satellites.clock, "sclkd": satellites.clock_drift}
     return {**vectors, **clocks, **angles, "tropo": delay_in_troposphere(sight), "iono": delay}

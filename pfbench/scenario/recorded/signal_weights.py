@@ -17,7 +17,7 @@ _LOWEST = 0.05  # least sine of an elevation, of 3 degrees
 class SignalWeights:
     """Standard deviations by elevation e and carrier-to-noise density C.
 
-    sd^2 = (elevation_sd / sin e)^2 + cn0_sd^2 10^(-(C - 45 dB-Hz) / 10). The first term stands for atmosphere and
+    sd^2 = (elevation_sd / sin e)^2 + cn0_sd^2 10^(-(C - 45 dB-Hz) / 10). The first term represents atmosphere and
     multipath [Dach et al. 2015, "Bernese GNSS Software"], the second one is thermal noise [Langley 1997,
     "GPS receiver system noise"; Hartinger and Brunner 1999, SIGMA-epsilon]. The same for range rates.
 

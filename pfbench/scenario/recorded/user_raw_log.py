@@ -71,7 +71,7 @@ def check_weights(receiver: RawGnssReceiver) -> None:
 class UserRawLog(Scenario):
     """Raw ranges of one's own, without an IMU: filters estimate position, velocity and the receiver clock.
 
-    The truth is a table of positions, or the place of an antenna that stands. Runs differ in the initial errors,
+    The truth is a table of positions, or the position of a fixed antenna. Runs differ in the initial errors,
     which have the assumed distribution about the truth, and in the errors that the receiver adds.
 
     Attributes:
@@ -81,7 +81,7 @@ class UserRawLog(Scenario):
         rinex: Files, signals and the time of t = 0.
         reference: Name of the table of positions: t, and lat_deg, lon_deg, h_m or pn, pe, pd; optional vn, ve, vd.
             Not read if `standing` is set.
-        standing: Place of an antenna that stands: `header` of the observations, or lat_deg, lon_deg, h_m. None if it moves.
+        standing: Position of a fixed antenna: `header` of the observations, or lat_deg, lon_deg, h_m. None if it moves.
         receiver: Selection and weights of the measurements, and standard deviations of added errors.
         start_s: Start, s of the tables. None for the first epoch.
         end_s: End, s of the tables. None for the last epoch.
@@ -89,7 +89,7 @@ class UserRawLog(Scenario):
         limits: Limits of the platform for the checks. None for the default limits.
 
     Raises:
-        ValueError: If the receiver has no weights. `draw` raises it for missing or invalid files, or times
+        ValueError: If the receiver is without weights. `draw` raises it for missing or invalid files, or times
             that do not overlap.
     """
 
@@ -144,15 +144,15 @@ class UserRawLog(Scenario):
         epochs = self.rinex.read_epochs(folder)
         track, centre = self._read_truth(folder, epochs)
         table = self.rinex.compute_sky(folder, epochs, track, centre)
-        known = np.unique(table.rows["t"].to_numpy())
+        times = np.unique(table.rows["t"].to_numpy())
         low = -np.inf if self.start_s is None else self.start_s
         high = np.inf if self.end_s is None else self.end_s
         grid = (
-            known[select_fixes(known, self.receiver.fix_interval_s, low, high)]
-            if len(known) > 1
-            else known
+            times[select_fixes(times, self.receiver.fix_interval_s, low, high)]
+            if len(times) > 1
+            else times
         )
-        span = f"{len(grid)} between t = {known[0]:.3f} and {known[-1]:.3f}"
+        span = f"{len(grid)} between t = {times[0]:.3f} and {times[-1]:.3f}"
         must = "have at least 2 epochs between start_s and end_s"
         require(
             len(grid) > 1, f"{epochs.name}", must, span, "Choose an earlier start or a later end."
@@ -189,8 +189,8 @@ class UserRawLog(Scenario):
                 "none",
                 remedy,
             )
-            place = earth.geodetic(torch.tensor(epochs.position, dtype=torch.float64)).tolist()
-            centre = (place[0] / DEGREE, place[1] / DEGREE, place[2])
+            geodetic = earth.geodetic(torch.tensor(epochs.position, dtype=torch.float64)).tolist()
+            centre = (geodetic[0] / DEGREE, geodetic[1] / DEGREE, geodetic[2])
         else:
             is_place = not isinstance(self.standing, str) and len(self.standing) == 3
             require(
