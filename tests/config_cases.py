@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from copy import deepcopy
 from functools import cache
 from pathlib import Path
@@ -14,6 +15,7 @@ from omegaconf import DictConfig
 from pfbench import job
 from pfbench.core.record import Episode, Record, map_inputs
 from pfbench.noise.base import NominalNoise
+from pfbench.testing.raw_log import write_raw_log
 
 CONF = job.conf_dir()
 
@@ -58,7 +60,12 @@ def world(scenario: str) -> Episode:
             elif "duration_s" in cfg.scenario.trajectory:
                 cfg.scenario.trajectory.duration_s = 10.0
             cfg.scenario.imu_rate_hz = 20.0
-        WORLDS[scenario] = truncated(job.instantiate(cfg.scenario).draw(NominalNoise(), RUNS, SEED))
+        with tempfile.TemporaryDirectory() as root:
+            if scenario == "user_raw_log":  # an example in place of the log of a user
+                cfg.scenario.root, cfg.scenario.folder = root, "drive"
+                write_raw_log(Path(root) / "drive", 10.0)
+            scene = job.instantiate(cfg.scenario)
+            WORLDS[scenario] = truncated(scene.draw(NominalNoise(), RUNS, SEED))
     return WORLDS[scenario]
 
 

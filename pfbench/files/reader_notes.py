@@ -37,6 +37,12 @@ def announce_notes(source: str | Path, notes: Sequence[str]) -> None:
             log.warning("note      %s: %s", Path(source).name, note)
 
 
+def skip_notes(source: str | Path, notes: Sequence[str]) -> None:
+    """Do not log notes for a source, because another reader logs them."""
+    sweep = os.environ.get(SWEEP_LOG, "")
+    _announced.update((sweep, str(source), note) for note in notes)
+
+
 def append_line(path: str | Path, line: str) -> None:
     """Append a line to the file of a sweep, whole among those of other processes."""
     os.makedirs(os.path.dirname(path), exist_ok=True)

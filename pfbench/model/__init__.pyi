@@ -35,6 +35,11 @@ from pfbench.model.passive_location import (
     PlatformInputs as PlatformInputs,
     compute_level_attitude as compute_level_attitude,
 )
+from pfbench.model.raw_gnss import (
+    RawGnss as RawGnss,
+    RawGnssInputs as RawGnssInputs,
+    RawGnssTuning as RawGnssTuning,
+)
 from pfbench.model.sins_sar import SinsSar as SinsSar
 from pfbench.model.strapdown import (
     StrapdownAided as StrapdownAided,

@@ -15,9 +15,10 @@ from pfbench.core import chart as quaternion
 from pfbench.core.chart import Chart, EuclideanBlock, LieGroupBlock, QuaternionBlock
 from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.parameter_checks import check_positive, check_tuning, require
-from pfbench.core.record import EACH_SATELLITE, Record, name_channels
+from pfbench.core.record import Record, name_channels
 from pfbench.model.base import StateSpaceModel, check_truth_sizes
 from pfbench.model.ins_gnss import name_components
+from pfbench.model.relative_ranges import RAW_CHANNELS, predict_raw
 from pfbench.model.strapdown_tuning import AidedTuning, StrapdownTuning, TightTuning
 from pfbench.nav.strapdown import PreintegratedImu, rotate
 
@@ -40,7 +41,7 @@ def _chart(attitude: QuaternionBlock | LieGroupBlock, further: int) -> Chart:
     return Chart((attitude, EuclideanBlock(further)))
 
 
-def _block_diagonal(a: Tensor, b: Tensor) -> Tensor:
+def block_diagonal(a: Tensor, b: Tensor) -> Tensor:
     """Return a matrix with two blocks, [B, n + m, p + q].
 
     Shapes: a [B or 1, n, p], b [B or 1, m, q].
@@ -296,7 +297,7 @@ class StrapdownAided(StrapdownModel):
     def noise_gain(self, u: PreintegratedImu) -> Tensor:
         motion = self.motion.noise_gain(u)
         walk = torch.diag_embed(torch.sqrt(u.duration)[:, None] * self.walk)
-        return _block_diagonal(motion, walk)
+        return block_diagonal(motion, walk)
 
     @override
     def observation(self, x: Tensor, u: PreintegratedImu) -> Distribution:
@@ -375,8 +376,7 @@ class StrapdownTight(StrapdownModel):
 
     State [19]: the state of StrapdownTotal, then bias m and drift m/s of the receiver clock, and
     the inter-system bias m. Clock states are differences from a nominal course that the record
-    subtracts. With x from the fixed position and r = |reach line - x|, a range is r - reach + bias.
-    A rate is e.(V - v) - line.V + drift, where e points to the satellite.
+    subtracts. Ranges and rates are those of `predict_raw` plus bias and drift.
 
     The origin is level, facing North, at rest, without biases. Recorded scenarios provide the start
     of each run.
@@ -388,10 +388,7 @@ class StrapdownTight(StrapdownModel):
         ValueError: If a density or standard deviation is not positive.
     """
 
-    channel_names = (
-        f"range {EACH_SATELLITE} minus that from the local origin [m]",
-        f"range rate {EACH_SATELLITE} minus that from the local origin [m/s]",
-    )
+    channel_names = RAW_CHANNELS
     input_type = TightMemsInputs
     other_walk: Tensor
     noise_dim = _DRIVEN_TIGHT + _CLOCK
@@ -429,28 +426,18 @@ class StrapdownTight(StrapdownModel):
     @override
     def noise_gain(self, u: TightMemsInputs) -> Tensor:
         motion, clock = self.motion.noise_gain(u.increments), self._clock_gain(u.duration)
-        return _block_diagonal(motion, clock)
+        return block_diagonal(motion, clock)
 
     def _clock_gain(self, duration: Tensor) -> Tensor:
         """Return the noise gain of bias, drift and inter-system bias [R or 1, 3, 3]."""
         walk = (self.other_walk * torch.sqrt(duration))[:, None, None]
-        return _block_diagonal(self.clock.noise_gain(duration), walk)
+        return block_diagonal(self.clock.noise_gain(duration), walk)
 
     @override
     def observation(self, x: Tensor, u: TightMemsInputs) -> Distribution:
-        v, p = x[..., 4:7], x[..., 7:10]
+        ranges, rates = predict_raw(x[..., 7:10], x[..., 4:7], u)
         bias, drift, inter_system = x[..., _MOTION_TIGHT:].split(1, -1)
-        reach = u.reach.unsqueeze(1)
-        relative = (p.square().sum(-1, keepdim=True) / reach - 2 * p @ u.line.mT) / reach
-        root = torch.sqrt(1 + relative)
-        difference = reach * relative / (1 + root)  # r - reach, without the cancellation
-        r = reach * root
-        # (e - line).V and e.v, with e = (reach line - x) / r
-        line_rate = (u.line * u.velocity).sum(-1).unsqueeze(1)
-        satellite_rate = -(difference * line_rate + p @ u.velocity.mT) / r
-        approach = (reach * (v @ u.line.mT) - (v * p).sum(-1, keepdim=True)) / r
-        ranges = difference + bias + inter_system * u.other_system.unsqueeze(1)
-        rates = satellite_rate - approach + drift
+        ranges, rates = ranges + bias + inter_system * u.other_system.unsqueeze(1), rates + drift
         sd = torch.cat([self.range.sd(u.range_sd), self.rate.sd(u.rate_sd)], -1)
         return independent_normal(torch.cat([ranges, rates], -1), sd.unsqueeze(1))
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import pandas as pd
 import torch
@@ -26,7 +28,36 @@ from pfbench.nav.ephemeris import (
     read_ephemeris,
 )
 from pfbench.nav.ephemeris_checks import EphemerisSelection, check_ephemerides
-from pfbench.nav.orbits import LIGHT, Constellation, eccentric_anomaly
+from pfbench.nav.orbits import LIGHT, TYPICAL_FLIGHT, Constellation, eccentric_anomaly, free_fall
+
+
+class Transmission(NamedTuple):
+    """Satellites when they sent what a receiver measures, in Earth-fixed axes of that time.
+
+    Attributes:
+        position: [T, S, 3], m.
+        velocity: [T, S, 3], m/s.
+        clock: Offset of the satellite's clock for a signal on 1575.42 MHz, with relativity and group delay, [T, S], m.
+        clock_drift: [T, S], m/s.
+    """
+
+    position: Tensor
+    velocity: Tensor
+    clock: Tensor
+    clock_drift: Tensor
+
+
+def parse_gps_time(key: str, value: str | float) -> float:
+    """Return a GPS time, in seconds since 1980-01-06, that is given as seconds or as an ISO date."""
+    with contextlib.suppress(TypeError, ValueError):
+        return float(value)
+    try:
+        return (datetime.fromisoformat(str(value)) - EPOCH).total_seconds()
+    except (TypeError, ValueError):
+        remedy = "Give a date and GPS time without a zone, like 2016-06-06T12:00:00."
+        raise ValueError(
+            f"{key} must be seconds of GPS time or an ISO date, got {value}. {remedy}"
+        ) from None
 
 
 @dataclass(frozen=True)
@@ -35,7 +66,7 @@ class BroadcastConstellation(Constellation):
 
     Attributes:
         root: Folder of all data sets (configuration key data.root).
-        path: RINEX 2 or 3 navigation file in `root`, or a Parquet file with the RINEX names of the
+        path: RINEX 2, 3 or 4 navigation file in `root`, or a Parquet file with the RINEX names of the
             parameters as columns, `prn` and optionally `sys` (G or E). Satellites that are marked
             unhealthy are ignored, and ephemerides that are implausible or contradict their
             neighbours; `notes` names them.
@@ -64,17 +95,7 @@ class BroadcastConstellation(Constellation):
     @cached_property
     def epoch(self) -> float:
         """GPS time of t = 0, seconds since 1980-01-06."""
-        try:
-            return float(self.start_s)
-        except ValueError:
-            pass
-        try:
-            return (datetime.fromisoformat(str(self.start_s)) - EPOCH).total_seconds()
-        except (TypeError, ValueError):
-            raise ValueError(
-                f"start_s must be seconds of GPS time or an ISO date, got {self.start_s}. "
-                "Give a date and GPS time without a zone, like 2016-06-06T12:00:00."
-            ) from None
+        return parse_gps_time("start_s", self.start_s)
 
     @cached_property
     @override
@@ -111,6 +132,34 @@ class BroadcastConstellation(Constellation):
         eph, valid = self._select(time)
         return torch.where(valid, eph["tgd"], torch.nan)
 
+    def transmit(self, time: Tensor, pseudorange: Tensor) -> Transmission:
+        """Compute the satellites at the transmission of signals.
+
+        The satellite's clock shows the time of reception minus pseudorange / c, both by the receiver's clock, whose
+        offset cancels [IS-GPS-200, 20.3.3.3.3]. From a typical time the satellite falls freely, see `receive_signals`.
+
+        Args:
+            time: Times of reception by the receiver's clock, [T], s.
+            pseudorange: [T, S], m.
+
+        Returns:
+            Satellites, NaN without an ephemeris or a pseudorange.
+        """
+        t = time - TYPICAL_FLIGHT
+        position, velocity = self.at(t)
+        offset, drift = self.clock(t)
+        before, after = self.relativity(t - 0.5), self.relativity(t + 0.5)
+        drift = drift + (after - before)
+        offset = offset + 0.5 * (before + after) - self.group_delay(t)
+        later = TYPICAL_FLIGHT - pseudorange / LIGHT - offset
+        move, acceleration = later.unsqueeze(-1), free_fall(position, velocity)
+        return Transmission(
+            position + (velocity + 0.5 * acceleration * move) * move,
+            velocity + acceleration * move,
+            LIGHT * (offset + drift * later),
+            LIGHT * drift,
+        )
+
     def _select(self, time: Tensor) -> tuple[dict[str, Tensor], Tensor]:
         """Return the current parameters [T, S], with `tk`, and a mask of valid ones."""
         columns, names = self._ephemerides
@@ -137,6 +186,11 @@ class BroadcastConstellation(Constellation):
         longest = max(len(block) for block in blocks)
         padded = [torch.cat([b, b[-1:].expand(longest - len(b), -1)]) for b in blocks]
         return torch.stack(padded), tuple(columns)
+
+    @property
+    def ionosphere(self) -> tuple[float, ...]:
+        """Coefficients of the broadcast ionosphere of GPS, [8]. Empty if the file has none."""
+        return self._file.ionosphere
 
     @cached_property
     def notes(self) -> tuple[str, ...]:

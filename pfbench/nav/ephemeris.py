@@ -21,6 +21,7 @@ from pfbench.files.limits import read_text
 from pfbench.files.table_file import read_table_file
 from pfbench.nav import earth
 from pfbench.nav.orbits import GPS_OMEGA, OrbitalElements, eccentric_anomaly
+from pfbench.nav.rinex_blocks import find_ionosphere, unfold_blocks
 
 GM_GPS = 3.986005e14  # [IS-GPS-200, table 20-IV], Galileo uses earth.GM [OS SIS ICD]
 
@@ -153,7 +154,7 @@ def broadcast_elements(eph: Mapping[str, Tensor]) -> OrbitalElements:
 
 
 # --------------------------------------------------------------------------------------------------
-# Ephemerides from RINEX 2 and 3 navigation files. A record that cannot be read is dropped with a note.
+# Ephemerides from RINEX 2, 3 and 4 navigation files. A record that cannot be read is dropped with a note.
 
 WEEK = 604800.0  # s
 EPOCH = datetime(1980, 1, 6)
@@ -194,25 +195,30 @@ class RinexFile(NamedTuple):
     Attributes:
         rows: One row per ephemeris, with `toc` in seconds of the week, and `line`.
         notes: Records and systems that were not read.
+        ionosphere: Coefficients of the broadcast ionosphere of GPS, alpha and beta, [8]. Empty without them.
     """
 
     rows: pd.DataFrame
     notes: tuple[str, ...]
+    ionosphere: tuple[float, ...] = ()
 
 
 def read_rinex(file: Path) -> RinexFile:
-    """Read GPS and Galileo (I/NAV) ephemerides from a RINEX 2 or 3 navigation file.
+    """Read GPS and Galileo (I/NAV) ephemerides from a RINEX 2, 3 or 4 navigation file.
 
     A record that cannot be read is dropped, and a note names its line.
     """
     lines = _lines(file)
     version = lines[0][:9].strip() if lines and "RINEX VERSION" in lines[0] else ""
-    if version[:1] not in ("2", "3") or lines[0][20:21] != "N":
+    if version[:1] not in ("2", "3", "4") or lines[0][20:21] != "N":
         raise ValueError(
-            f"the file {file.name} must be a RINEX 2 or 3 navigation file, {_describe_kind(lines)}"
+            f"the file {file.name} must be a RINEX 2, 3 or 4 navigation file, {_describe_kind(lines)}"
         )
     body = next((i + 1 for i, line in enumerate(lines) if "END OF HEADER" in line), len(lines))
-    records = list(_records(lines, body, 3 if version[0] == "3" else 2))
+    ionosphere, skipped = find_ionosphere(lines, body), tuple[str, ...]()
+    if version[0] == "4":
+        (lines, skipped), version = unfold_blocks(lines, body), "3"
+    records = list(_records(lines, body, int(version[0])))
     rows = [record for record in records if isinstance(record, dict)]
     dropped = [f"{file.name}: {record}" for record in records if isinstance(record, str)]
     if len(dropped) > len(rows):
@@ -226,20 +232,22 @@ def read_rinex(file: Path) -> RinexFile:
             f"the file {file.name} must contain ephemerides of GPS or Galileo, got none{others and ' but '}"
             f"{others}. Choose another file."
         )
-    systems = _describe_others(lines, body, version[0])
+    systems = [*skipped, *_describe_others(lines, body, version[0])]
     unread = (f"{file.name}: not read: {text}" for text in systems)
-    return RinexFile(pd.DataFrame(rows), (*dropped, *unread))
+    return RinexFile(pd.DataFrame(rows), (*dropped, *unread), ionosphere)
 
 
 def _describe_kind(lines: Sequence[str]) -> str:
-    """Describe a file that is not a navigation file of RINEX 2 or 3, and its remedy."""
+    """Describe a file that is not a navigation file of RINEX 2, 3 or 4, and its remedy."""
     first = lines[0] if lines else ""
     if first.startswith("\x1f"):
         return "got a compressed file. Unpack it with gunzip, or gzip -d."
     if "RINEX VERSION" not in first:
         return f"got first line {first[:60]!r}. Choose another file."
     version, kind = first[:9].strip(), _KINDS.get(first[20:21], "unknown")
-    same_day = "Choose the GPS or mixed navigation file (type N) of RINEX 2 or 3 of the same day."
+    same_day = (
+        "Choose the GPS or mixed navigation file (type N) of RINEX 2, 3 or 4 of the same day."
+    )
     return f"got a {kind} file of RINEX {version}. {same_day}"
 
 
@@ -276,12 +284,14 @@ def _records(
     """Yield records from line `body` on, or why one is dropped. Numbers have columns of 19 after an indent."""
     indent = version + 1
     borders = _first_lines(lines, body, version)
-    if borders[0] > body:
+    if any(lines[body : borders[0]]):
         yield f"line {body + 1}, {lines[body][:23]!r} is not the first line of a record"
     for begin, end in pairwise(borders):
         system = lines[begin][0] if version == 3 else "G"
         if system not in "GE":
             continue
+        while not lines[end - 1]:
+            end -= 1
         try:
             prn = lines[begin][version - 2 : indent].strip()
             if not (prn.isascii() and prn.isdigit()):
@@ -304,7 +314,7 @@ def _records(
 def _parse_record(lines: Sequence[str], system: str, version: int) -> dict[str, float]:
     """Parse the fields of a GPS or Galileo record."""
     indent = version + 1
-    date = _parse_date(lines[0][indent : 19 + indent].split())
+    date = parse_date(lines[0][indent : 19 + indent].split())
     for line in lines:
         if line[indent + 76 :].strip():
             raise ValueError(f"expected no text after the last number, got {line[indent + 76 :]!r}")
@@ -340,7 +350,7 @@ def _parse_number(field: str) -> float:
     return float(f"{digits}e{exponent or bare}")
 
 
-def _parse_date(fields: Sequence[str]) -> float:
+def parse_date(fields: Sequence[str]) -> float:
     """Return the GPS time of a date, s since 1980-01-06."""
     if len(fields) != 6 or not all(f.isascii() and f.isdigit() for f in fields[:5]):
         raise ValueError(f"expected year, month, day, hour, minute and second, got {fields}")

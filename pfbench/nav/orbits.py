@@ -20,7 +20,7 @@ from pfbench.nav import earth
 
 LIGHT = 299792458.0  # m/s
 GPS_OMEGA = 7.2921151467e-5  # Earth rate of the ephemerides [rad/s]
-_TYPICAL_FLIGHT = 0.075  # s
+TYPICAL_FLIGHT = 0.075  # s; from a satellite to a receiver
 
 
 class Constellation(Protocol):
@@ -198,18 +198,18 @@ def receive_signals(
 
     Shapes: time [T], receiver [..., T, 3].
     """
-    position, velocity = constellation.at(time - _TYPICAL_FLIGHT)
-    acceleration = _fall(position, velocity)
-    flight = position.new_tensor(_TYPICAL_FLIGHT)
+    position, velocity = constellation.at(time - TYPICAL_FLIGHT)
+    acceleration = free_fall(position, velocity)
+    flight = position.new_tensor(TYPICAL_FLIGHT)
     for _ in range(passes):
-        later = (_TYPICAL_FLIGHT - flight).unsqueeze(-1)
+        later = (TYPICAL_FLIGHT - flight).unsqueeze(-1)
         pos = sagnac(position + (velocity + 0.5 * acceleration * later) * later, flight)
         distance = torch.linalg.vector_norm(pos - receiver.unsqueeze(-2), dim=-1)
         flight = distance / LIGHT
     return ReceivedSignal(pos, sagnac(velocity + acceleration * later, flight), distance)
 
 
-def _fall(position: Tensor, velocity: Tensor) -> Tensor:
+def free_fall(position: Tensor, velocity: Tensor) -> Tensor:
     """Compute free-fall acceleration in Earth-fixed axes [..., 3], spherical Earth."""
     rate = position.new_tensor([0.0, 0.0, earth.OMEGA]).expand_as(position)
     pull = earth.GM * position / torch.linalg.vector_norm(position, dim=-1, keepdim=True) ** 3

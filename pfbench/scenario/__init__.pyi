@@ -33,6 +33,8 @@ from pfbench.scenario.recorded.raw_gnss import (
     RawGnssReceiver as RawGnssReceiver,
     RecordedWalk as RecordedWalk,
 )
+from pfbench.scenario.recorded.rinex_source import RinexSource as RinexSource
+from pfbench.scenario.recorded.signal_weights import SignalWeights as SignalWeights
 from pfbench.scenario.recorded.start_alignment import StartAlignment as StartAlignment
 from pfbench.scenario.recorded.time_grid import FixReceiver as FixReceiver
 from pfbench.scenario.recorded.trajectory_file import RecordedTrajectory as RecordedTrajectory
@@ -48,4 +50,8 @@ from pfbench.scenario.recorded.urban_error_fit import (
     range_residuals as range_residuals,
 )
 from pfbench.scenario.recorded.user_log import UserLog as UserLog
+from pfbench.scenario.recorded.user_raw_log import (
+    UserInsLog as UserInsLog,
+    UserRawLog as UserRawLog,
+)
 from pfbench.scenario.simulated import ModelSimulation as ModelSimulation

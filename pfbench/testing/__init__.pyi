@@ -18,6 +18,7 @@ from pfbench.testing.moves import (
     check_move as check_move,
     simulate_path_posterior as simulate_path_posterior,
 )
+from pfbench.testing.raw_log import write_raw_log as write_raw_log
 from pfbench.testing.reference import (
     FilterMoments as FilterMoments,
     KalmanResult as KalmanResult,

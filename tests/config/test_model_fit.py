@@ -56,11 +56,14 @@ KINDS = {
     "user_log_aligned": {"strapdown_total", "strapdown_blocks"},
     "recorded_fixed_wing_aided": {"strapdown_aided"},
     "recorded_walk": {"strapdown_tight"},
+    "user_raw_log": {"raw_gnss"},
+    "user_ins_log": {"strapdown_tight"},
     "recorded_berlin": {"urban_gnss", "urban_gnss_mixture"},
 }
 # of a kind with another one of the list: among the slow tests
 ALIKE = {
     "azimuth_closed_loop", "recorded_boreas", "flight_500s", "anshun_real_orbits", "recorded_quad_flights", "user_log_aligned",
+    "user_ins_log",
 }  # fmt: skip
 
 
@@ -86,7 +89,7 @@ def test_models_that_fit_each_kind_of_scenario(scenario: str) -> None:
     "scenario", slow_if(lambda name: name in ALIKE or name not in KINDS, GROUPS["scenario"])
 )
 def test_each_pair_that_fits_runs(scenario: str) -> None:
-    if scenario.startswith("user_log") or (scenario in RECORDED and DATA is None):
+    if scenario.startswith("user_") or (scenario in RECORDED and DATA is None):
         pytest.skip("needs recorded data")
     names = fitting(scenario)
     assert names

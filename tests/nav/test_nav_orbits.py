@@ -376,10 +376,10 @@ def test_rinex_files_are_read(tmp_path: Path, version: int) -> None:
 def test_rinex_files_that_are_none_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "nav.rnx"
     for text, message in (
-        ("", "must be a RINEX 2 or 3"),
+        ("", "must be a RINEX 2, 3 or 4"),
         (as_rinex(2).replace("N: GPS", "O: GPS"), r"got a observation file of RINEX 2\.00"),
         (as_rinex(2).replace("N: GPS", "G: GLO"), r"got a GLONASS navigation file of RINEX 2\.00"),
-        (as_rinex(3).replace("3.00", "4.01", 1), r"got a GPS navigation file of RINEX 4\.01"),
+        (as_rinex(3).replace("3.00", "5.00", 1), r"got a GPS navigation file of RINEX 5\.00"),
         ("\x1f\x8b\x08", "got a compressed file. Unpack it with gunzip"),
         (
             as_rinex(2).replace("9.600000000000D-01", "9.6x000000000D-01"),

@@ -68,7 +68,7 @@ def read_aligned_log(
     dropped = dict.fromkeys(note for table in (inertial, gnss) for note in table.notes)
     notes = (*dropped, *mended, *usable_notes, *notes, *gravity_notes, *diagnosed)
     announce_notes(folder, notes)
-    reference = _read_track(truth, centre) if truth else _join_fixes(fixes)
+    reference = read_track(truth, centre) if truth else _join_fixes(fixes)
     return NavigationLog(sensors, fixes, reference, gravity, notes, centre)
 
 
@@ -114,7 +114,7 @@ def _join_fixes(fixes: GnssLog) -> ReferenceLog:
     return ReferenceLog(time, np.full((len(time), 4), np.nan), np.gradient(position, time, axis=0), position)  # fmt: skip
 
 
-def _read_track(table: LogTable, centre: tuple[float, ...] | None) -> ReferenceLog:
+def read_track(table: LogTable, centre: tuple[float, ...] | None) -> ReferenceLog:
     """Read a reference of positions; its velocities are those of the table, or the change of the positions."""
     time, position = read_times(table, longest=100.0), read_positions(table, centre)
     velocity = swap_frd_rfu(parse_numbers(table, _VELOCITY)) if table.has(_VELOCITY) else np.gradient(position, time, axis=0)  # fmt: skip

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import override
 
@@ -19,8 +20,8 @@ from pfbench.files.reader_notes import announce_notes
 from pfbench.model.strapdown import StrapdownTight, TightMemsInputs
 from pfbench.model.strapdown_tuning import TightTuning
 from pfbench.nav import earth
+from pfbench.nav.orbits import LIGHT
 from pfbench.nav.plausible_limits import PlausibleLimits
-from pfbench.nav.strapdown import PreintegratedImu
 from pfbench.noise.base import NoiseRegime, NominalNoise, check_unit_process
 from pfbench.scenario.base import Scenario, check_added_sd, check_duration
 from pfbench.scenario.recorded.fix_codes import FixCodes, check_fix_codes
@@ -36,12 +37,16 @@ from pfbench.scenario.recorded.log_tables import (
     Array,
     LogFiles,
     LogTable,
+    NavigationLog,
+    check_range,
+    convert_column,
     find_dataset,
     list_tables,
     parse_numbers,
     parse_satellites,
     read_table,
 )
+from pfbench.scenario.recorded.signal_weights import SignalWeights
 from pfbench.scenario.recorded.time_grid import (
     FixReceiver,
     ResampledLog,
@@ -52,6 +57,7 @@ from pfbench.scenario.recorded.time_grid import (
 )
 
 _SAME_EPOCH = 0.02  # s; the receiver clock is accurate to some milliseconds
+_MILLISECOND = LIGHT * 1e-3  # m
 _MEASURED = (
     "t",
     "svid",
@@ -100,23 +106,25 @@ class RawGnssLog(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-def read_sky(
-    folder: Path, time: Array, mask_deg: float, origin: Sequence[float] | None = None
+def collect_sky(
+    table: LogTable,
+    time: Array,
+    receiver: RawGnssReceiver,
+    origin: Sequence[float] | None = None,
+    optional: Sequence[str] = (),
 ) -> RawGnssLog:
-    """Read raw measurements at given times.
+    """Collect the raw measurements of a table at given times.
 
-    Each epoch is assigned to the nearest time within a tolerance.
+    Each epoch is assigned to the nearest time within a tolerance. Optional columns can lack values.
 
     Shapes: time [K].
     """
-    table = read_table(folder, SKY, {})
-    value = dict(zip(_COLUMNS, parse_numbers(table, _COLUMNS).T, strict=True))
-    after = np.searchsorted(time, value["t"]).clip(1, len(time) - 1)
-    row = np.where(value["t"] - time[after - 1] < time[after] - value["t"], after - 1, after)
-    selected_mask = (np.abs(time[row] - value["t"]) <= _SAME_EPOCH) & (value["el"] >= mask_deg)
+    value = _read_columns(table, receiver.weights, optional)
+    row, is_near = _find_steps(value["t"], time)
+    selected_mask = is_near & (value["el"] >= receiver.mask_deg)
     if not selected_mask.any():
         raise ValueError(
-            f"{table.name} does not contain a row above {mask_deg} degrees within {_SAME_EPOCH} s of the "
+            f"{table.name} does not contain a row above {receiver.mask_deg} degrees within {_SAME_EPOCH} s of the "
             "end of a step. Use the same clock for t in all tables."
         )
     row_names = np.array(parse_satellites(table, value["svid"]))
@@ -147,6 +155,31 @@ def read_sky(
     return RawGnssLog._make([tuple(names.tolist()), *columns, notes])
 
 
+def _read_columns(
+    table: LogTable, weights: SignalWeights | None, optional: Sequence[str]
+) -> dict[str, Array]:
+    """Read the columns of a table, with standard deviations by weights if there are some."""
+    stated = () if weights is None else ("sd_pr", "sd_prr")
+    names = [name for name in _COLUMNS if name not in (*optional, *stated)]
+    names += [] if weights is None or "cn0" in optional else ["cn0"]
+    value = dict(zip(names, parse_numbers(table, names).T, strict=True))
+    for name in optional:
+        value[name] = convert_column(table, name)
+        check_range(table, name, value[name])
+    if weights is not None:
+        value["sd_pr"], value["sd_prr"] = weights.sd(np.radians(value["el"]), value["cn0"])
+    return value
+
+
+def _find_steps(epochs: Array, time: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Return the nearest time of each epoch, and whether it is within the tolerance."""
+    interval = np.diff(np.unique(epochs))
+    tolerance = min(_SAME_EPOCH, 0.4 * float(np.median(interval))) if len(interval) else _SAME_EPOCH
+    after = np.searchsorted(time, epochs).clip(1, len(time) - 1)
+    row = np.where(epochs - time[after - 1] < time[after] - epochs, after - 1, after)
+    return row, np.abs(time[row] - epochs) <= tolerance
+
+
 def _local(table: LogTable, origin: Sequence[float] | None) -> tuple[Array, Array]:
     """Return Earth-fixed origin, m, [3], and axes East, North, Up, [3, 3]."""
     keys = [f"origin_{name}" for name in ("lat_deg", "lon_deg", "h_m")]
@@ -167,31 +200,80 @@ def subtract_nominal_ranges(
 
     Nominal ranges and rates are those of a receiver at rest at the start.
 
-    Returns reduced ranges, m, and rates, m/s, [K, 2 S], and a note for the report. Shapes: time
+    Returns reduced ranges, m, and rates, m/s, [K, 2 S], and notes for the report. Shapes: time
     [K].
     """
     reach = np.linalg.norm(gnss_log.satellite_position, axis=-1)
     line = gnss_log.satellite_position / reach[..., None]
     ranges, rates = gnss_log.range - reach, gnss_log.rate - (line * gnss_log.velocity).sum(-1)
-    gps = np.array([name.startswith("G") for name in gnss_log.names])
-    if np.isnan(ranges[0, gps]).all():
+    is_other = list_other_system(gnss_log.names)
+    if np.isnan(ranges[0, ~is_other]).all():
         raise ValueError(
-            f"scenario.start_s must have a GPS satellite, got none at t = {time[0]:.3f}. "
-            "Select another start."
+            f"scenario.start_s must have a {find_first_system(gnss_log.names)} satellite, "
+            f"got none at t = {time[0]:.3f}. Select another start."
         )
-    drift = _mean(rates[0] + line[0] @ velocity, gnss_log.rate_sd[0])
-    level = _mean(ranges[0, gps], gnss_log.range_sd[0, gps])
+    ranges, notes = remove_clock_jumps(ranges, time)
+    approach = line[0] @ velocity
+    drift = (
+        _mean(rates[0] + approach, gnss_log.rate_sd[0])
+        if np.isfinite(rates[0]).any()
+        else _find_drift(ranges + approach * (time - time[0])[:, None], time)
+    )
+    level = _mean(ranges[0, ~is_other], gnss_log.range_sd[0, ~is_other])
     other_level = (
-        _mean(ranges[0, ~gps], gnss_log.range_sd[0, ~gps])
-        if np.isfinite(ranges[0, ~gps]).any()
+        _mean(ranges[0, is_other], gnss_log.range_sd[0, is_other])
+        if np.isfinite(ranges[0, is_other]).any()
         else level
     )
-    ranges = ranges - np.where(gps, level, other_level) - drift * (time - time[0])[:, None]
+    ranges = ranges - np.where(is_other, other_level, level) - drift * (time - time[0])[:, None]
     note = (
         f"clock: {level:.0f} m and {drift:.2f} m/s subtracted, "
         f"for other systems {other_level - level:+.1f} m more"
     )
-    return np.concatenate([ranges, rates - drift], -1), (note,)
+    return np.concatenate([ranges, rates - drift], -1), (note, *notes)
+
+
+def find_first_system(names: Sequence[str]) -> str:
+    """Return the system to which the clock of the receiver belongs: GPS, or the first one without GPS."""
+    return "GPS" if any(name.startswith("G") for name in names) else names[0][0]
+
+
+def list_other_system(names: Sequence[str]) -> NDArray[np.bool_]:
+    """Return the mask of satellites of another system than that of the clock."""
+    first = find_first_system(names)[0]
+    return np.array([not name.startswith(first) for name in names])
+
+
+def remove_clock_jumps(ranges: Array, time: Array) -> tuple[Array, tuple[str, ...]]:
+    """Remove jumps of the receiver clock by whole milliseconds, with which receivers steer it.
+
+    Returns ranges and notes. Shapes: ranges [K, S], time [K].
+    """
+    epochs_with_data = np.flatnonzero(np.isfinite(ranges).any(1))
+    step, duration = np.diff(ranges[epochs_with_data], axis=0), np.diff(time[epochs_with_data])
+    has_change = np.isfinite(step).any(1)
+    change = np.zeros(len(step))
+    change[has_change] = np.nanmedian(step[has_change], axis=1)
+    rate = float(np.median(change[has_change] / duration[has_change])) if has_change.any() else 0.0
+    jumps = np.rint((change - rate * duration) / _MILLISECOND) * has_change
+    count = int(np.count_nonzero(jumps))
+    if not count:
+        return ranges, ()
+    shift = np.zeros(len(time))
+    shift[epochs_with_data[1:]] = np.cumsum(jumps) * _MILLISECOND
+    return ranges - shift[:, None], (f"clock: {count} jumps by whole milliseconds removed",)
+
+
+def _find_drift(ranges: Array, time: Array) -> float:
+    """Return the drift of the clock from the first ranges, for a receiver without range rates, m/s.
+
+    Shapes: ranges of a receiver at rest [K, S], time [K].
+    """
+    later = np.flatnonzero(np.isfinite(ranges - ranges[0]).any(1) & (time > time[0]))
+    if not later.size:
+        return 0.0
+    k = int(later[0])
+    return float(np.nanmedian(ranges[k] - ranges[0]) / (time[k] - time[0]))
 
 
 def _mean(values: Array, sd: Array) -> float:
@@ -200,10 +282,10 @@ def _mean(values: Array, sd: Array) -> float:
     return float(np.average(values[finite_mask], weights=sd[finite_mask] ** -2))
 
 
-def make_step_inputs(u: PreintegratedImu, gnss_log: RawGnssLog) -> TightMemsInputs:
-    """Build the inputs of the steps.
+def make_sky_inputs(gnss_log: RawGnssLog) -> tuple[Tensor, ...]:
+    """Build the inputs of the steps that describe the satellites.
 
-    Returns inputs of the tightly coupled model.
+    Returns line, reach, velocity, other_system, range_sd and rate_sd of the models, [1, T, S, ...].
     """
     # finite values replace missing inputs, since a NaN would propagate to gradients
     observed_mask = np.isfinite(gnss_log.range)[1:]
@@ -214,7 +296,7 @@ def make_step_inputs(u: PreintegratedImu, gnss_log: RawGnssLog) -> TightMemsInpu
         [0.0, 0.0, 1.0],
     )
     other_system = np.broadcast_to(
-        [float(not name.startswith("G")) for name in gnss_log.names], observed_mask.shape
+        list_other_system(gnss_log.names).astype(float), observed_mask.shape
     )
     filled = [
         np.where(observed_mask, a[1:], fill)
@@ -222,9 +304,7 @@ def make_step_inputs(u: PreintegratedImu, gnss_log: RawGnssLog) -> TightMemsInpu
     ]
     velocity = np.where(observed_mask[..., None], gnss_log.velocity[1:], 0.0)
     leaves = (line, np.where(observed_mask, reach[1:], 2e7), velocity, other_system, *filled)
-    return TightMemsInputs(
-        *u, *(torch.from_numpy(np.ascontiguousarray(leaf))[None] for leaf in leaves)
-    )
+    return tuple(torch.from_numpy(np.ascontiguousarray(leaf))[None] for leaf in leaves)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -244,6 +324,8 @@ class RawGnssReceiver:
             satellites.
         rate_sd: Standard deviation of added range-rate errors, m/s.
         mask_deg: Smallest elevation, degrees.
+        weights: Standard deviations by elevation and signal strength, in place of those in the columns sd_pr and
+            sd_prr. None for the columns.
 
     Raises:
         ValueError: If the interval is not positive, a standard deviation is negative, or the mask is
@@ -254,6 +336,7 @@ class RawGnssReceiver:
     range_sd: float = 0.0
     rate_sd: float = 0.0
     mask_deg: float = 10.0
+    weights: SignalWeights | None = None
 
     def __post_init__(self) -> None:
         check_duration("scenario.receiver.fix_interval_s", self.fix_interval_s)
@@ -346,7 +429,7 @@ class RecordedWalk(Scenario):
         )
         record = Record(
             y,
-            make_step_inputs(motion.record.u, gnss_log),
+            TightMemsInputs(*motion.record.u, *make_sky_inputs(gnss_log)),
             self._draw_start(motion.record.start, draws),
         )
         azimuth, elevation = (
@@ -376,16 +459,24 @@ class RecordedWalk(Scenario):
         clock = self.tuning.clock_sd * draws.at_step(0).normal("world.clock", 1, 3)[:, 0]
         return torch.cat([clock.new_zeros(len(clock), 0) if motion is None else motion, -clock], -1)
 
-    def _read(self) -> tuple[ResampledLog, RawGnssLog]:
-        """Read the log on filter steps and the raw measurements relative to the start."""
-        folder = find_dataset(self.root, self.folder)
-        log = read_log(
+    def _read_log(self, folder: Path) -> NavigationLog:
+        """Read the log, whose fixes are the times at which steps end."""
+        return read_log(
             folder,
             self.files,
             origin=self.origin,
             limits=self.limits,
             fix_codes=self.fix_codes,
         )
+
+    def _read_sky(self, folder: Path, log: NavigationLog, time: Array) -> RawGnssLog:
+        """Read the raw measurements at some times, s, [K]."""
+        return collect_sky(read_table(folder, SKY, {}), time, self.receiver, self.origin)
+
+    def _read(self) -> tuple[ResampledLog, RawGnssLog]:
+        """Read the log on filter steps and the raw measurements relative to the start."""
+        folder = find_dataset(self.root, self.folder)
+        log = self._read_log(folder)
         leg = resample_log(
             log,
             self.receiver.fix_interval_s,
@@ -393,10 +484,8 @@ class RecordedWalk(Scenario):
             start=self.start_s,
             end=self.end_s,
         )
-        gnss_log = read_sky(
-            folder, np.concatenate([[leg.start_s], leg.time]), self.receiver.mask_deg, self.origin
-        )
         time = np.concatenate([[leg.start_s], leg.time])
+        gnss_log = self._read_sky(folder, log, time)
         motion = interpolate(log.reference, time)
         notes = check_sky(gnss_log, time, motion, self.limits or PlausibleLimits())
         leg = leg._replace(notes=(*leg.notes, *notes))

@@ -43,6 +43,7 @@ from pfbench.scenario.recorded.log_tables import (
     read_table,
     read_times,
 )
+from pfbench.scenario.recorded.signal_weights import SignalWeights
 from pfbench.scenario.recorded.time_grid import encode_names
 
 
@@ -55,6 +56,7 @@ class PseudorangeReceiver:
         range_sd: Standard deviation of added range errors, m. With 0 a noise regime can only remove
             satellites.
         clock_drift: Nominal drift of the receiver clock, m/s. It is subtracted from the ranges.
+        weights: Standard deviations by elevation and signal strength, in place of those of the receiver. None for those.
 
     Raises:
         ValueError: If the interval is not positive, or range_sd is negative.
@@ -63,6 +65,7 @@ class PseudorangeReceiver:
     fix_interval_s: float = 1.0
     range_sd: float = 0.0
     clock_drift: float = -49.7
+    weights: SignalWeights | None = None
 
     def __post_init__(self) -> None:
         check_duration("scenario.receiver.fix_interval_s", self.fix_interval_s)
@@ -112,6 +115,9 @@ class UrbanDrive(Scenario):
         drive = select_stretch(
             read_drive(find_dataset(self.root, self.folder), self.limits), self.start_s, self.end_s
         )
+        if self.receiver.weights is not None:
+            elevation = _find_directions(drive)[1].numpy()
+            drive = drive._replace(sd=self.receiver.weights.sd(elevation, drive.cn0)[0])
         draws = PhiloxStream(seed, runs)
         time, (reduced, inputs) = (
             torch.from_numpy(drive.time[1:]),
@@ -343,16 +349,19 @@ def line_of_sight_directions(drive: UrbanLog) -> dict[str, Tensor]:
 
     Returns azimuth and elevation, rad, [T - 1, S], without the first epoch, and encoded names.
     """
-    origin = torch.from_numpy(drive.position[0])
-    positions = torch.from_numpy(
-        rotate_heading(drive.satellite_position[1:], earth.ecef(origin).numpy())
-    )
-    azimuth, elevation = azimuth_elevation(origin, positions)
+    azimuth, elevation = (angle[1:] for angle in _find_directions(drive))
     return {
         "azimuth": azimuth,
         "elevation": elevation,
         "satellites": encode_names(drive.satellites),
     }
+
+
+def _find_directions(drive: UrbanLog) -> tuple[Tensor, Tensor]:
+    """Compute azimuth and elevation from the start, rad, [T, S]."""
+    origin = torch.from_numpy(drive.position[0])
+    at = earth.ecef(origin).numpy()
+    return azimuth_elevation(origin, torch.from_numpy(rotate_heading(drive.satellite_position, at)))
 
 
 def reduce_ranges(drive: UrbanLog, clock_drift: float) -> tuple[Tensor, UrbanInputs]:

@@ -86,7 +86,7 @@ def test_a_shipped_job_reads_no_file_that_it_does_not_name(
 
 
 def test_every_shipped_scenario_with_a_data_folder_is_among_them() -> None:
-    listed = {*OF_FILES, "user_log"}
+    listed = {*OF_FILES, "user_log", "user_raw_log", "user_ins_log"}
     for file in (job.conf_dir() / "scenario").glob("*.yaml"):
         assert ("${data.root}" in file.read_text()) == (file.stem in listed), file.stem
 
