@@ -274,7 +274,6 @@ def test_studies_run_cheapest_first_and_within_a_limit() -> None:
 # Studies with jobs of uncommitted code. They run again; no study is added.
 WAITING_FOR_A_RERUN = [
     "robust_car",
-    "robust_quad",
 ]
 
 
