@@ -22,7 +22,7 @@ from functools import cache
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from scipy.special import ndtri, stdtr, stdtrit
+import scipy  # scipy.special is imported at its first use, which takes a tenth of the start of a job
 
 from pfbench.stats.error_measures import Array, Flags
 from pfbench.stats.rank_tests import (
@@ -87,7 +87,7 @@ class Effect(NamedTuple):
     def trimmed_interval(self, alpha: float) -> tuple[float, float]:
         """Return the interval of the log ratio that belongs to the trimmed mean."""
         value, error, df = _trimmed_mean(self.differences)
-        width = stdtrit(df, 1 - alpha / 2) * error
+        width = scipy.special.stdtrit(df, 1 - alpha / 2) * error
         return value - width, value + width
 
 
@@ -297,7 +297,7 @@ def _count_outside(n: int, alpha: float) -> int:
     if n <= EXACT_DIFFERENCES:
         return int(np.searchsorted(rank_sum_cdf(n), alpha / 2, side="right"))
     centre, sd = n * (n + 1) / 4, math.sqrt(n * (n + 1) * (2 * n + 1) / 24)
-    return max(int(centre + ndtri(alpha / 2) * sd), 0)
+    return max(int(centre + scipy.special.ndtri(alpha / 2) * sd), 0)
 
 
 def _trimmed_mean(d: Array) -> tuple[float, float, float]:
@@ -326,4 +326,8 @@ def _trimmed_p(d: Array, alternative: str = "two-sided") -> float:
     if value == 0:
         return 1.0
     t = value / error if error > 0 else math.copysign(math.inf, value)
-    return float(stdtr(df, t)) if alternative == "less" else float(2 * stdtr(df, -abs(t)))
+    return (
+        float(scipy.special.stdtr(df, t))
+        if alternative == "less"
+        else float(2 * scipy.special.stdtr(df, -abs(t)))
+    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtr, stdtrit
+import scipy  # scipy.special is imported at its first use, which takes a tenth of the start of a job
 
 from pfbench.stats.comparison import LOG_TOLERANCE
 from pfbench.stats.error_measures import Array
@@ -32,14 +32,14 @@ class EffectEstimate(NamedTuple):
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             t = np.where(self.value == 0.0, 0.0, np.abs(self.value) / self.standard_error)
-            p = 2 * stdtr(self.df, -t)
+            p = 2 * scipy.special.stdtr(self.df, -t)
         return np.where(np.isfinite(self.value) & (self.df > 0), p, np.nan)
 
     def interval(self, alpha: float | Array) -> tuple[Array, Array]:
         """Return the ends of the interval of level 1 - alpha; infinite if it does not exist."""
         df = np.where(self.df > 0, self.df, 1.0)
         with np.errstate(invalid="ignore"):
-            half = -stdtrit(df, np.asarray(alpha) / 2) * self.standard_error
+            half = -scipy.special.stdtrit(df, np.asarray(alpha) / 2) * self.standard_error
         exists = np.isfinite(self.value) & np.isfinite(half) & (self.df > 0)
         half = np.where(exists, half, np.inf)
         centre = np.where(exists, self.value, 0.0)
