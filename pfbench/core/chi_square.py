@@ -11,7 +11,7 @@ def chi_square_limit(dof: int, p: float) -> float:
     """Return the value that a chi-square variable of `dof` degrees of freedom exceeds with probability p."""
     x = dof + 3.0 * math.sqrt(2.0 * dof)
     for _ in range(100):  # Newton's method on the log of the tail, which is concave
-        tail = exceedance(dof, x)
+        tail = _exceedance(dof, x)
         step = math.log(tail / p) * tail / _density(dof, x)
         x = max(x + step, x / 2)
         if abs(step) <= 1e-15 * x:
@@ -19,7 +19,7 @@ def chi_square_limit(dof: int, p: float) -> float:
     return x
 
 
-def exceedance(dof: int, x: float) -> float:
+def _exceedance(dof: int, x: float) -> float:
     """Return the probability that a chi-square variable of whole `dof` exceeds x: a finite sum."""
     start = dof % 2
     tail = math.erfc(math.sqrt(x / 2)) if start else 0.0

@@ -162,8 +162,7 @@ def kept_validation() -> Iterator[None]:
 
 def _compile_by_torch(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function by torch's compiler."""
-    use_private_cache()
-    register_results()
+    prepare_compiler()
     with kept_validation():
         return torch.compile(function, dynamic=True)
 
@@ -178,9 +177,15 @@ def _compile_by_torch(function: Callable[..., Any]) -> Callable[..., Any]:
 _operators = torch.library.Library("pfbench", "DEF")
 
 
+def prepare_compiler() -> None:
+    """Let torch's compiler use the private cache, before its imports choose a folder, and know the operators' results."""
+    use_private_cache()
+    _register_results()
+
+
 @cache
-def register_results() -> None:
-    """State the results of all operators for torch's compiler. It takes a tenth of a second, for the lines of its sources."""
+def _register_results() -> None:
+    """State the results of all operators. It takes a tenth of a second, since torch reads lines of sources."""
     for name in read_operators():
         function: Callable[..., Any] = partial(make_empty_results, name)
         torch.library.register_fake(f"pfbench::{name}", function)
