@@ -119,10 +119,13 @@ import sys
 from pathlib import Path
 import pfbench
 package = str(Path(pfbench.__file__).parent) + "/"
-calls = {}
+calls, importing = {}, 0
 def profile(frame, event, argument):
+    global importing
     name = frame.f_code.co_filename
-    if event == "call" and name.startswith(package) and not frame.f_code.co_name.startswith("<"):
+    if frame.f_code.co_name == "<module>":  # what an import calls is no step of the work
+        importing += {"call": 1, "return": -1}.get(event, 0)
+    elif event == "call" and not importing and name.startswith(package) and not frame.f_code.co_name.startswith("<"):
         key = name[len(package):], frame.f_code.co_name
         calls[key] = calls.get(key, 0) + 1
 """

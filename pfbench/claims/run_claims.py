@@ -300,9 +300,10 @@ def draw_records(runs: ClaimRuns, seed: int) -> list[StoredValues]:
 
 def verify_record(record: StoredValues, measures: Mapping[str, Measure], results: str, seconds: float = _VERIFY_S / _VERIFIED) -> Check:  # fmt: skip
     """Compute the first runs of a stored job again, as many as the time allows, and compare key and values."""
+    from pfbench.job.computation import compute_job
     from pfbench.job.inputs import find_inputs
-    from pfbench.job.plan import build_plan, job_key
-    from pfbench.job.run_job import compute_job
+    from pfbench.job.plan import build_plan
+    from pfbench.job.settings import job_key
 
     config = compose(list_words(record.cell, record.batch, results))
     key = job_key(config.values, find_inputs(config.values, config.trusted))

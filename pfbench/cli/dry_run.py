@@ -99,7 +99,8 @@ def estimate_job(config: JobConfig, worlds: DrawnWorlds) -> JobEstimate:
 
     from pfbench.job.budget import apply_budget, estimate_job_memory
     from pfbench.job.inputs import find_inputs
-    from pfbench.job.plan import build_plan, job_key
+    from pfbench.job.plan import build_plan
+    from pfbench.job.settings import job_key
 
     values = config.values
     key = job_key(values, find_inputs(values, config.trusted))

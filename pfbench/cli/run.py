@@ -152,7 +152,7 @@ def plan_or_none(overrides: Sequence[str], first: JobConfig | None = None) -> St
 
 def print_study_size(plan: StudyPlan | None) -> None:
     """Print what the chosen runs and worlds can show; nothing if the settings of the job are not valid."""
-    from pfbench.job.plan import check_settings
+    from pfbench.job.settings import check_settings
 
     if plan is None:
         return

@@ -104,7 +104,7 @@ class GrowingSweep:
     def job_keys(self, number: int) -> set[str]:
         """Return the keys of all jobs until a look."""
         from pfbench.job.inputs import find_inputs
-        from pfbench.job.plan import job_key
+        from pfbench.job.settings import job_key
 
         keys = set()
         for config in self.jobs:

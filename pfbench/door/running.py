@@ -155,7 +155,7 @@ def _compose_job(words: list[str]) -> JobConfig:
 
 def _check_settings(config: JobConfig) -> None:
     """Check the settings of a job before the first one runs."""
-    from pfbench.job.plan import check_settings
+    from pfbench.job.settings import check_settings
 
     check_settings(config.values)
 

@@ -35,9 +35,9 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
-from scipy.special import chdtri
 from torch import Tensor
 
+from pfbench.core.chi_square import chi_square_limit
 from pfbench.core.density import has_finite_moments
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, StepInfo, compute_once, join_runs
@@ -96,7 +96,7 @@ class HealthMonitor:
             if (k + 1) * count >= _CHECKS
         )
         self._limits = torch.tensor(
-            [torch.inf, *chdtri(range(1, record.y.shape[2] + 1), 0.001)],
+            [torch.inf, *(chi_square_limit(k + 1, 0.001) for k in range(record.y.shape[2]))],
             dtype=torch.float64,
             device=record.y.device,
         )

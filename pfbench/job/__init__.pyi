@@ -1,5 +1,6 @@
 """Public names of `pfbench.job` and the modules that define them."""
 
+from pfbench.job.computation import compute_job as compute_job
 from pfbench.job.config import (
     JobConfig as JobConfig,
     compose as compose,
@@ -12,23 +13,21 @@ from pfbench.job.memory import available_memory as available_memory
 from pfbench.job.model_fit import instantiate as instantiate
 from pfbench.job.pcrb import compute_pcrb as compute_pcrb
 from pfbench.job.plan import (
-    IGNORED_IN_KEY as IGNORED_IN_KEY,
     JobPlan as JobPlan,
     apply_global_settings as apply_global_settings,
     build_plan as build_plan,
-    job_key as job_key,
     read_versions as read_versions,
 )
 from pfbench.job.run_job import (
     JobOutcome as JobOutcome,
     ResumableResults as ResumableResults,
-    compute_job as compute_job,
     run as run,
 )
 from pfbench.job.scoring import (
     ProperScores as ProperScores,
     ScoreRecorder as ScoreRecorder,
 )
+from pfbench.job.settings import IGNORED_IN_KEY as IGNORED_IN_KEY, job_key as job_key
 from pfbench.job.track_estimate import (
     FilterAnswer as FilterAnswer,
     MotionEstimate as MotionEstimate,

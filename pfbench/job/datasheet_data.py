@@ -16,8 +16,9 @@ from pfbench.job.config import JobConfig
 from pfbench.job.inputs import find_inputs
 from pfbench.job.model_fit import instantiate_parts
 from pfbench.job.pcrb import compute_pcrb
-from pfbench.job.plan import IGNORED_IN_KEY, apply_global_settings, describe_state, make_provenance
+from pfbench.job.plan import apply_global_settings, describe_state, make_provenance
 from pfbench.job.raw_estimate import compute_raw_estimate
+from pfbench.job.settings import IGNORED_IN_KEY
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 from pfbench.results.conditions import DATASHEETS, main_component_group

@@ -13,8 +13,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import hydra
-
 from pfbench.files.atomic_write import hash_file
 from pfbench.job.config import CHOICES
 from pfbench.job.trust import check_configuration, hash_user_code, trusted_packages
@@ -24,6 +22,15 @@ from pfbench.results.store import Inputs, remove_digests
 
 CODE_OF = "code of "  # start of the names of source files of a user's classes
 _MISSING = "missing"
+# public classes of pfbench with a method `input_files`, so that no other class is imported to find them
+READERS = {
+    "nav": ("BroadcastConstellation",),
+    "noise": ("ErrorReplay",),
+    "scenario": (
+        "AlignedLog", "ConstrainedDrive", "RecordedAidedFlight", "RecordedDrive", "RecordedFlights", "RecordedTrajectory",
+        "RecordedWalk", "UrbanDrive", "UserLog",
+    ),
+}  # fmt: skip
 
 
 def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Inputs:
@@ -92,6 +99,8 @@ def _list_files(node: Any, trusted: Sequence[str]) -> Iterator[Path]:
 @lru_cache(maxsize=64)
 def _build(reader: str, trusted: tuple[str, ...]) -> Any:
     """Build the object of a node, written as JSON, once for the many jobs of a sweep."""
+    import hydra
+
     node = json.loads(reader)
     check_configuration(node, trusted)
     return hydra.utils.instantiate(remove_all_blocks(node), _convert_="all")
@@ -100,13 +109,22 @@ def _build(reader: str, trusted: tuple[str, ...]) -> Any:
 def _list_readers(node: Any, trusted: Sequence[str]) -> Iterator[Mapping[str, Any]]:
     """Yield the outermost nodes of a configuration whose classes have a method `input_files`."""
     if isinstance(node, Mapping):
-        if hasattr(_find_class(node.get("_target_"), trusted), "input_files"):
+        if _names_reader(node.get("_target_"), trusted):
             yield node
             return
         node = list(node.values())
     if isinstance(node, list | tuple):
         for value in node:
             yield from _list_readers(value, trusted)
+
+
+def _names_reader(target: Any, trusted: Sequence[str]) -> bool:
+    """Return whether a name is that of a class with a method `input_files`."""
+    package, _, name = str(target).partition(".")
+    folder, _, public = name.partition(".")
+    if package == "pfbench" and "." not in public:
+        return public in READERS.get(folder, ())
+    return hasattr(_find_class(target, trusted), "input_files")
 
 
 def _find_class(target: Any, trusted: Sequence[str]) -> Any:

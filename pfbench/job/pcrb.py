@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -312,13 +312,6 @@ def _recipe(
     episodes = values["noise"], values["seed"], int(runs[0]), len(runs)
     read = {group: inputs[group] for group in ("scenario", "noise", "model") if group in inputs}
     return ("bound 1", source_hash, values["model"], scenario, *episodes, *([read] if read else []))
-
-
-def lacks_bound(values: Mapping[str, Any], meta: Mapping[str, Any], names: Container[str]) -> bool:
-    """Return whether a finished job lacks a bound that is requested now and was not when it ran."""
-    strictness = {False: 0, "auto": 1, True: 2}
-    before = strictness.get(meta["config"].get("pcrb"), 0)
-    return "pcrb" not in names and strictness.get(values["pcrb"], 0) > before
 
 
 def _missing_reason(values: Mapping[str, Any], episode: Episode) -> str:

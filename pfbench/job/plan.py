@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import copy
-import math
-import os
 import platform
-import re
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -21,33 +18,21 @@ import torch
 from torch import Tensor
 
 import pfbench
-from pfbench.core.parameter_checks import RUN_NUMBERS
 from pfbench.core.record import Episode
 from pfbench.filter.exactness import has_bounded_weights, has_covariance, has_evidence
 from pfbench.filter.loop import choose_run_batch
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.config import JobConfig
-from pfbench.job.inputs import describe_unnamed_files, find_inputs, names_checkpoint
+from pfbench.job.inputs import describe_unnamed_files
 from pfbench.job.memory import keep_freed_memory
 from pfbench.job.model_fit import instantiate_parts
+from pfbench.job.settings import check_settings
 from pfbench.job.trust import hash_package
 from pfbench.model.base import StateSpaceModel
-from pfbench.results import store
-from pfbench.results.paper_block import PAPER, PARTS
-from pfbench.results.store import PLACE_SETTINGS, Inputs, compute_config_key, extend_key
 from pfbench.scenario.base import RecordingRegime, Scenario
 
 # --------------------------------------------------------------------------------------------------
 # Plan of a job: a checked configuration and its objects, each built once.
-
-#: paths of the configuration that do not enter the key of a job
-IGNORED_IN_KEY = (
-    *PLACE_SETTINGS,
-    *(f"{group}.{PAPER}" for group in PARTS),  # names and limits for reports
-    "particles",  # part of the key where a filter uses it, as filter.particles
-)
-# settings of a comparison that are part of the key only if they differ from the default
-DEFAULTS_NOT_IN_KEY: Mapping[str, Any] = {"budget": store.SAME_N}
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,64 +137,6 @@ def build_plan(config: JobConfig) -> JobPlan:
     return JobPlan(config, model, scenario, RecordingRegime(noise), method, runs)
 
 
-def job_key(values: Mapping[str, Any], inputs: Inputs | None = None) -> str:
-    """Compute the key of a job from all that affects its results.
-
-    That is its settings and the content of all files that it reads, a user's classes included. The source
-    code of pfbench is not part of it: reports refuse results of several builds.
-
-    Args:
-        values: Resolved configuration.
-        inputs: Inputs of the job, see `find_inputs`. None to find them.
-
-    Returns:
-        16 hexadecimal digits. The first half depends on the settings alone.
-    """
-    inputs = find_inputs(values) if inputs is None else inputs
-    if names_checkpoint(values.get("filter")):
-        from pfbench.filter.learned.checkpoint import replace_checkpoint_by_hash
-
-        values = {**values, "filter": replace_checkpoint_by_hash(values["filter"])}
-    defaults = (k for k, default in DEFAULTS_NOT_IN_KEY.items() if values.get(k) == default)
-    return extend_key(compute_config_key(values, (*IGNORED_IN_KEY, *defaults)), inputs)
-
-
-# --------------------------------------------------------------------------------------------------
-# Settings of a job that do not belong to one of its objects: seed, threads, precision, device, engine.
-
-
-def check_settings(values: Mapping[str, Any]) -> None:
-    """Check the settings of a job that do not belong to one of its objects."""
-    valid = {
-        **{
-            key: type(values[key]) is int and least <= values[key] <= _MOST.get(key, math.inf)
-            for key, least in _INTEGERS.items()
-        },
-        "overwrite": type(values.get("overwrite", False)) is bool,
-        "oracle_noise": type(values["oracle_noise"]) is bool,
-        "pcrb": values["pcrb"] in (True, False, "auto"),
-        "memory_limit_gib": _is_memory_limit(values["memory_limit_gib"]),
-        "dtype": values["dtype"] in ("float32", "float64"),
-        "budget": values["budget"] in store.BUDGETS,
-        "engine": values["engine"] in ("auto", "eager", "kernels", "compiled"),
-        "device": re.fullmatch(r"cpu|cuda(:\d{1,3})?", str(values["device"])) is not None,
-    }
-    for key, (requirement, example) in _REQUIREMENTS.items():
-        if not valid[key]:
-            remedy = _advise_integer(key, values[key]) or f"Set {key}={example}."
-            raise ValueError(f"{key} must be {requirement}, got {values.get(key)}. {remedy}")
-    if values["first_run"] + values["runs"] > RUN_NUMBERS:
-        raise ValueError(
-            f"first_run + runs must be at most 2**32 = {RUN_NUMBERS}, got {values['first_run']} + "
-            f"{values['runs']}. Larger run numbers would repeat random numbers: use another seed."
-        )
-    device, count = values["device"], torch.cuda.device_count()
-    if device != "cpu" and (torch.device(device).index or 0) >= count:
-        raise ValueError(
-            f"device must be cpu or one of {count} CUDA devices, got {device}. Use device=cpu."
-        )
-
-
 def apply_global_settings(values: Mapping[str, Any]) -> None:
     """Check the settings of a job, and set threads and memory allocator.
 
@@ -222,44 +149,6 @@ def apply_global_settings(values: Mapping[str, Any]) -> None:
     check_settings(values)
     torch.set_num_threads(values["threads"])
     keep_freed_memory()
-
-
-_LARGEST = 1_000_000_000  # a number that is advised
-_INTEGERS = {"runs": 1, "first_run": 0, "threads": 1, "seed": 0, "score_steps": 0}  # with minimum
-_EXAMPLES = {"runs": 100, "first_run": 0, "threads": 1, "seed": 1, "score_steps": 10}
-# threads beyond the cores only wait, and OpenMP ends the process with a fault if there are many
-_MOST = {"threads": max(256, os.cpu_count() or 1)}
-_REQUIREMENTS = {  # requirement and valid value by key
-    **{
-        key: (
-            f"a whole number of at least {least}" + f", at most {_MOST.get(key)}" * (key in _MOST),
-            str(_EXAMPLES[key]),
-        )
-        for key, least in _INTEGERS.items()
-    },
-    "oracle_noise": ("true (the filter receives the true noise regime) or false", "false"),
-    "overwrite": ("true (repeat finished jobs) or false", "false"),
-    "pcrb": ("auto (where the model's distributions are the simulated ones), true or false", "auto"),
-    "memory_limit_gib": ("the GiB that the job may use, or null for most of the free memory", "null"),
-    "dtype": ("float64 (default) or float32", "float64"),
-    "budget": (f"one of {', '.join(store.BUDGETS)}", store.SAME_N),
-    "engine": ("auto, eager, kernels or compiled", "auto"),
-    "device": ("cpu, cuda, or one of several GPUs such as cuda:1", "cpu"),
-}  # fmt: skip
-
-
-def _advise_integer(key: str, value: Any) -> str:
-    """Return how a whole number is written that was given as 1e9 or 10.0; empty for other values."""
-    if key not in _INTEGERS or not isinstance(value, float) or not value.is_integer():
-        return ""
-    if abs(value) > _LARGEST:
-        return f"Choose at most {_LARGEST}."
-    return f"Write it without exponent and without a decimal point: {key}={int(value)}."
-
-
-def _is_memory_limit(value: Any) -> bool:
-    """Return whether a value is a memory limit: a positive number, or None."""
-    return value is None or (type(value) in (int, float) and 0 < value < math.inf)
 
 
 # --------------------------------------------------------------------------------------------------

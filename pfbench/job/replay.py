@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 
 from pfbench.files.escapes import escape_csv
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.job.computation import compute_job
 from pfbench.job.config import CHOICES, JobConfig
 from pfbench.job.inputs import CODE_OF, find_inputs
 from pfbench.job.plan import build_plan
-from pfbench.job.run_job import compute_job
 from pfbench.job.run_selection import StoredRun
 from pfbench.job.trust import UntrustedConfigError, trusted_packages
 from pfbench.results import store

@@ -12,7 +12,6 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple, TypeAlias
 
-import scoringrules
 import torch
 from torch import Tensor
 from torch.distributions import Distribution
@@ -213,6 +212,8 @@ def score_normal(error: Tensor, covariance: Tensor, z: Tensor, groups: Groups) -
 
     Shapes: error [R, d], covariance [R, d, d], z [R or 1, n, d].
     """
+    import scoringrules  # on use, as below
+
     sd = covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
     spread = torch.where(sd > 0, sd, 1.0)
     crps = scoringrules.crps_normal(torch.zeros_like(error), error, spread, backend="torch")
@@ -223,6 +224,8 @@ def score_normal(error: Tensor, covariance: Tensor, z: Tensor, groups: Groups) -
 
 def _separate_marginals(error: Tensor, deviation: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
     """Compute CRPS and probability below the truth, [R, d], by library operations."""
+    import scoringrules  # on use: it takes a tenth of the start of a job, and the kernels do not need it
+
     off = (error.unsqueeze(1) + deviation).permute(0, 2, 1)  # particles minus truth [R, d, N]
     shared = w.unsqueeze(1).expand_as(off)
     crps = scoringrules.crps_ensemble(
@@ -233,6 +236,8 @@ def _separate_marginals(error: Tensor, deviation: Tensor, w: Tensor) -> tuple[Te
 
 def _separate_energy(points: Tensor) -> Tensor:
     """Compute the energy score [R] of points [R, n, s] by library operations."""
+    import scoringrules  # on use, as above
+
     return scoringrules.es_ensemble(points.new_zeros(points[:, 0].shape), points, backend="torch")
 
 

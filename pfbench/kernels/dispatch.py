@@ -162,7 +162,7 @@ def kept_validation() -> Iterator[None]:
 
 def _compile_by_torch(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function by torch's compiler."""
-    use_private_cache()
+    prepare_compiler()
     with kept_validation():
         return torch.compile(function, dynamic=True)
 
@@ -177,11 +177,18 @@ def _compile_by_torch(function: Callable[..., Any]) -> Callable[..., Any]:
 _operators = torch.library.Library("pfbench", "DEF")
 
 
-def _define(operator: Operator) -> None:
-    """Define an operator for torch, with its results for torch's compiler."""
-    _operators.define(operator.name + operator.schema)
-    function: Callable[..., Any] = partial(make_empty_results, operator.name)
-    torch.library.register_fake(f"pfbench::{operator.name}", function)
+def prepare_compiler() -> None:
+    """Let torch's compiler use the private cache, before its imports choose a folder, and know the operators' results."""
+    use_private_cache()
+    _register_results()
+
+
+@cache
+def _register_results() -> None:
+    """State the results of all operators. It takes a tenth of a second, since torch reads lines of sources."""
+    for name in read_operators():
+        function: Callable[..., Any] = partial(make_empty_results, name)
+        torch.library.register_fake(f"pfbench::{name}", function)
 
 
 def make_empty_results(name: str, *arguments: Any) -> Any:
@@ -254,7 +261,7 @@ def _call_in_batches(operator: Operator, overload: Callable[..., Any], *args: An
 
 
 for _operator in read_operators().values():
-    _define(_operator)
+    _operators.define(_operator.name + _operator.schema)
 cuda.register(_operators)
 
 philox_normals = _make_function("philox_normals")

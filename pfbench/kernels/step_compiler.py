@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 from torch.fx import Graph as Operations, Node
 
-from pfbench.kernels.cpp_library import find_compiled_code, load_library, use_private_cache
-from pfbench.kernels.dispatch import kept_validation
+from pfbench.kernels.cpp_library import find_compiled_code, load_library
+from pfbench.kernels.dispatch import kept_validation, prepare_compiler
 from pfbench.kernels.manifest import Operator, read_operators
 
 log = logging.getLogger("pfbench")
@@ -73,7 +73,7 @@ def compile_function(
 
     Returns the compiled function, and its C++ entry if torch generated one.
     """
-    use_private_cache()  # before the imports, which choose a folder
+    prepare_compiler()  # before the imports, which choose a folder
     from torch._functorch.config import patch as patch_functorch
     from torch._guards import TracingContext, tracing
     from torch._inductor.compile_fx import compile_fx, compile_fx_inner  # takes seconds to import

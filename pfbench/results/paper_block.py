@@ -13,8 +13,6 @@ from typing import Any
 import yaml
 
 import pfbench
-from pfbench.results.conditions import parse_label
-from pfbench.stats.study_runs import natural_sort_key
 
 # --------------------------------------------------------------------------------------------------
 # The node `paper` of a configuration file: names and limits for reports, not for the computation.
@@ -229,6 +227,10 @@ def list_named_parts(group: str) -> list[str]:
 
 def plan_installed_pairs(labels: Collection[str]) -> list[tuple[str, str]]:
     """List the planned pairs of filters by the baselines that installed files state."""
+    from pfbench.results.conditions import (
+        parse_label,
+    )  # on use: the command line starts with this module
+
     methods = {parse_label(label)[0] for label in labels}
     blocks = {method: read_paper_block("filter", method) for method in methods}
     tuned = sorted(method for method, block in blocks.items() if block.get("tuning"))
@@ -285,6 +287,11 @@ def list_planned_pairs(
     Where a study varies a setting, the filters of a pair have the same value of it. A filter without
     the setting is compared with each value.
     """
+    from pfbench.results.conditions import (
+        parse_label,
+    )  # on use: the command line starts with this module
+    from pfbench.stats.study_runs import natural_sort_key
+
     if len(set(labels)) < 2:
         return []
     labels = sorted(set(labels), key=natural_sort_key)
@@ -311,6 +318,10 @@ def list_planned_pairs(
 
 def _same_settings(label: str, method: str, labels: Sequence[str]) -> list[str]:
     """List the labels of a method that do not differ in a setting that a label has too."""
+    from pfbench.results.conditions import (
+        parse_label,
+    )  # on use: the command line starts with this module
+
     settings = parse_label(label)[1]
     candidates = {candidate: parse_label(candidate) for candidate in labels}
     return [

@@ -9,7 +9,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy  # scipy.stats is imported at its first use, which takes longer than a small report
-from scipy.special import ndtr
 
 from pfbench.stats.error_measures import Array
 
@@ -86,7 +85,11 @@ def wilcoxon_signed_rank_rows(
     normal = ~exact & ~enumerated
     if normal.any():
         z = _normal_score((last - first + 1.0)[normal], above[normal])
-        more[normal], less[normal], two_sided[normal] = ndtr(-z), ndtr(z), 2 * ndtr(-np.abs(z))
+        more[normal], less[normal], two_sided[normal] = (
+            scipy.special.ndtr(-z),
+            scipy.special.ndtr(z),
+            2 * scipy.special.ndtr(-np.abs(z)),
+        )
     constant = ~d.any(axis=1)
     p = {"two-sided": two_sided, "greater": more, "less": less}[alternative]
     statistic = np.minimum(above, below) if alternative == "two-sided" else above

@@ -11,13 +11,15 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from pfbench.stats.comparison import Effect, Unit, bound_losses, compare_all
 from pfbench.stats.error_measures import Array, Flags
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 CONDITION = ["family", "scenario", "regime"]
 LOG_SCORE = (
@@ -76,6 +78,8 @@ def arrange_runs(
     Raises:
         ValueError: If a run is there twice.
     """
+    import pandas as pd  # on use, so that a job starts without it
+
     conditions = table[CONDITION].drop_duplicates().sort_values(CONDITION).reset_index(drop=True)
     c = table.groupby(CONDITION, dropna=False, observed=True).ngroup().to_numpy()
     seed = table.groupby("scenario", observed=True)["seed"].rank(method="dense")
@@ -188,9 +192,9 @@ def natural_sort_key(text: str) -> list[tuple[int, int, str]]:
 
 def _check_unique(table: pd.DataFrame, index: np.ndarray) -> None:
     """Check that each filter, condition and run has one row."""
-    repeated = pd.Series(index).duplicated()
-    if repeated.any():
-        row = table.iloc[int(np.argmax(repeated))]
+    first = np.unique(index, return_index=True)[1]
+    if len(first) < len(index):
+        row = table.iloc[int(np.setdiff1d(np.arange(len(index)), first)[0])]
         names = ", ".join(f"{name}={row[name]}" for name in ("filter", *CONDITION, "run"))
         raise ValueError(
             f"runs must be unique per filter, scenario and regime, got {names} twice. Select one model and seed."

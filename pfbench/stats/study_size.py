@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import nctdtr, ndtr, ndtri, stdtrit
+import scipy  # scipy.special is imported at its first use, which takes a tenth of the start of a job
 
 from pfbench.stats.comparison import MIN_RUNS, TRIM_SHARE
 
@@ -40,10 +40,12 @@ def compute_power(
     effect: float, pairs: int, alpha: float = 0.05, efficiency: float = EFFICIENCY
 ) -> float:
     """Compute the probability that the two-sided paired signed-rank test shows an effect."""
-    z = float(-ndtri(alpha / 2))
+    z = float(-scipy.special.ndtri(alpha / 2))
     if pairs < min_pairs(alpha):
         return 0.0
-    return float(ndtr(abs(effect) * math.sqrt(max(efficiency * pairs - z**2 / 2, 0.0)) - z))
+    return float(
+        scipy.special.ndtr(abs(effect) * math.sqrt(max(efficiency * pairs - z**2 / 2, 0.0)) - z)
+    )
 
 
 def required_runs(
@@ -52,8 +54,8 @@ def required_runs(
     """Compute the runs required to show an effect; infinite for no effect."""
     if effect == 0:
         return math.inf
-    z = float(-ndtri(alpha / 2))
-    of_t_test = ((z + ndtri(power)) / effect) ** 2 + z**2 / 2
+    z = float(-scipy.special.ndtri(alpha / 2))
+    of_t_test = ((z + scipy.special.ndtri(power)) / effect) ** 2 + z**2 / 2
     return float(max(math.ceil(of_t_test / efficiency), min_pairs(alpha)))
 
 
@@ -67,7 +69,7 @@ def required_runs_proportion(
     if proportion == limit:
         return math.inf
     at_limit, at_value = (math.sqrt(p * (1 - p)) for p in (limit, proportion))
-    spread = -ndtri(alpha) * at_limit + ndtri(power) * at_value
+    spread = -scipy.special.ndtri(alpha) * at_limit + scipy.special.ndtri(power) * at_value
     distance = abs(proportion - limit)
     smooth = (spread / distance) ** 2
     return float(math.ceil(smooth / 4 * (1 + math.sqrt(1 + 2 / (smooth * distance))) ** 2))
@@ -119,16 +121,20 @@ def t_test_power(score: float, df: float, alpha: float) -> float:
     """Compute the power of the two-sided t test."""
     if df <= 0:
         return 0.0
-    limit = float(-stdtrit(df, alpha / 2))
-    tails = 1 - nctdtr(df, abs(score), limit) + nctdtr(df, abs(score), -limit)
-    return float(tails) if np.isfinite(tails) else float(ndtr(abs(score) - limit))
+    limit = float(-scipy.special.stdtrit(df, alpha / 2))
+    tails = (
+        1
+        - scipy.special.nctdtr(df, abs(score), limit)
+        + scipy.special.nctdtr(df, abs(score), -limit)
+    )
+    return float(tails) if np.isfinite(tails) else float(scipy.special.ndtr(abs(score) - limit))
 
 
 def detectable_score(df: float, alpha: float, power: float = POWER) -> float:
     """Compute the effect in standard errors that the two-sided t test shows with a given power."""
     if df <= 0:
         return math.inf
-    limit = float(-stdtrit(df, alpha / 2))
+    limit = float(-scipy.special.stdtrit(df, alpha / 2))
     low, high = 0.0, 6 * limit + 20
     for _ in range(_HALVINGS):  # scipy.optimize takes a tenth of a second to import
         middle = (low + high) / 2

@@ -15,7 +15,7 @@ from command_line import pfbench
 import pfbench as package
 from pfbench import job
 from pfbench.cli import check
-from pfbench.job import run_job
+from pfbench.job import computation
 
 WALK = ("scenario=linear_walk", "scenario.steps=5", "runs=2", "particles=20")
 no_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a CUDA device")
@@ -275,7 +275,7 @@ def test_the_traceback_is_printed_on_request(
 
 
 def test_an_interrupted_sweep_reports_how_to_resume(tmp_path: Path) -> None:
-    with mock.patch.object(run_job, "compute_job", side_effect=KeyboardInterrupt):
+    with mock.patch.object(computation, "compute_job", side_effect=KeyboardInterrupt):
         said = pfbench("run", *WALK, home=tmp_path)
     assert said.code == 130
     assert "Finished jobs are kept. Repeat the command to resume" in said.err
@@ -296,14 +296,14 @@ def test_a_sweep_counts_its_jobs(tmp_path: Path) -> None:
 
 
 def test_a_sweep_counts_its_own_jobs_beside_another_one(tmp_path: Path) -> None:
-    compute_job = run_job.compute_job
+    compute_job = computation.compute_job
 
     def compute_beside(*arguments: Any) -> Any:
         (tmp_path / "results" / "adhoc" / f"of_another_{time.time()}.npz").write_bytes(b"")
         return compute_job(*arguments)
 
     assert pfbench("run", *WALK, "filter=ekf", home=tmp_path).code == 0
-    with mock.patch.object(run_job, "compute_job", side_effect=compute_beside):
+    with mock.patch.object(computation, "compute_job", side_effect=compute_beside):
         said = pfbench("run", "-m", *WALK, "filter=ekf,ckf,ukf", home=tmp_path)
     assert "sweep: 2 finished, 1 skipped, 0 failed in " in said.out
     assert not list(tmp_path.rglob(".sweep-*"))

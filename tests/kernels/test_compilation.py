@@ -12,6 +12,7 @@ import pytest
 import torch
 from command_line import pfbench
 from torch import Tensor
+from torch._subclasses import FakeTensorMode
 
 from pfbench.core import density, linear_algebra
 from pfbench.core.random_stream import PhiloxStream
@@ -561,3 +562,10 @@ def test_compiling_keeps_the_validation_of_distributions() -> None:
         run_filter(ParticleFilter(20), model, record, PhiloxStream(1, torch.arange(2)))
     dispatch._compile_by_torch(lambda a: a + 1.0)(torch.ones(2))
     assert torch.distributions.Distribution._validate_args == before
+
+
+def test_a_compiler_knows_the_results_of_operators() -> None:
+    dispatch.prepare_compiler()
+    with FakeTensorMode():
+        x, ancestors = torch.empty(3, 2, 5), torch.empty(2, 4, dtype=torch.int64)
+        assert torch.ops.pfbench.gather_particles(x, ancestors).shape == (3, 2, 4)

@@ -8,7 +8,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from pfbench import job
-from pfbench.job.plan import DEFAULTS_NOT_IN_KEY
+from pfbench.job.settings import DEFAULTS_NOT_IN_KEY
 from pfbench.report.study_page.page_writer import offer_budgets, select_equal_time
 from pfbench.results import store
 from pfbench.results.store import compute_config_key

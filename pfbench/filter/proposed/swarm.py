@@ -12,8 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 
+import scipy
 import torch
-from scipy.special import chdtri
 from torch import Tensor
 from typing_extensions import override
 
@@ -159,7 +159,7 @@ class ChiSquareStopping:
 @cache
 def _quantiles(p: float, maximum: int) -> list[float]:
     """Return chi-square quantiles for 0 to `maximum` degrees of freedom."""
-    return [0.0, *(float(chdtri(k, 1.0 - p)) for k in range(1, maximum + 1))]
+    return [0.0, *(float(scipy.special.chdtri(k, 1.0 - p)) for k in range(1, maximum + 1))]
 
 
 # --------------------------------------------------------------------------------------------------

@@ -10,8 +10,8 @@ from functools import lru_cache
 from typing import ClassVar, NamedTuple
 
 import numpy as np
+import scipy
 import torch
-from scipy import special
 from torch import Tensor
 from torch.special import gammainc, gammaincc, gammaln
 from typing_extensions import override
@@ -328,7 +328,7 @@ def _chi_nodes(k: int) -> tuple[Tensor, Tensor]:
     """Return squared distances and their probabilities for d ~ chi_k."""
     d = np.linspace(0.0, math.sqrt(k) + 12.0, _NODES + 1)[1:]
     probability = np.exp(
-        (k - 1) * np.log(d) - d * d / 2 - (k / 2 - 1) * math.log(2.0) - special.gammaln(k / 2)
+        (k - 1) * np.log(d) - d * d / 2 - (k / 2 - 1) * math.log(2.0) - scipy.special.gammaln(k / 2)
     )
     probability *= d[1] - d[0]
     return torch.from_numpy(d * d), torch.from_numpy(probability)
@@ -383,7 +383,9 @@ def quantile_table(probability: float, count: Tensor) -> Tensor:
 
     Shapes: count [R, k].
     """
-    return _look_up([float(special.chdtri(n, 1.0 - probability)) for n in _counts(count)], count)
+    return _look_up(
+        [float(scipy.special.chdtri(n, 1.0 - probability)) for n in _counts(count)], count
+    )
 
 
 def _counts(count: Tensor) -> range:
