@@ -71,7 +71,7 @@ def results(folder: Path, study: str) -> dict[str, store.JobResult]:
 @pytest.mark.parametrize(
     ("title", "study", "jobs"),
     [
-        ("Add a resampler", "resamplers", 2),
+        ("Add a resampling scheme", "resamplers", 2),
         ("Add a filter", "robust", 1),
         ("Add a model", "room", 2),
         ("Add a scenario", "window", 1),
@@ -148,7 +148,7 @@ def test_the_named_door_makes_the_class_of_a_recipe_public(
 
 def test_every_kind_of_part_has_a_recipe() -> None:
     kinds = (
-        *("resampler", "filter", "model", "scenario", "noise regime", "metric", "report figure"),
+        *("resampling scheme", "filter", "model", "scenario", "noise regime", "metric", "report figure"),
     )
     assert list(RECIPES) == [f"Add a {kind}" for kind in kinds]
 
@@ -160,6 +160,17 @@ def test_named_files_exist() -> None:
     paths = re.findall(r"`((?:pfbench|tests|conf|benchmarks)/[\w./]+)`", TEXT)
     assert len(paths) > 20
     assert [path for path in paths if path not in added and not (ROOT / path).exists()] == []
+
+
+def test_the_functions_to_read_are_where_the_page_says() -> None:
+    section = TEXT.partition("## Where to read")[2].partition("## Recipes")[0]
+    places = re.findall(r"((?:`\w+`(?:,? and |, )?)+) in\s+`([\w/]+\.py)`", section)
+    assert len(places) >= 7
+    for names, place in places:
+        code = (ROOT / "pfbench" / place).read_text()
+        assert all(f"def {name}(" in code for name in re.findall(r"`(\w+)`", names)), (names, place)
+    for place in re.findall(r"`([\w/]+\.py)`", section):
+        assert [*(ROOT / "pfbench").rglob(place)], place
 
 
 def test_versions_agree() -> None:

@@ -54,7 +54,7 @@ class LineComparison(NamedTuple):
     """Comparison of a claim in which a is the smaller side.
 
     Attributes:
-        kind: Kind, as of `words.Comparison`.
+        kind: Kind: better, much better, same or number.
         a: Smaller side.
         b: Larger side.
         printed: Printed ratio, of the kind "size".

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from pfbench.cli.compose import given_keys, list_own_files, read_description
+from pfbench.cli.compose import given_keys, read_description
+from pfbench.cli.current_folder import list_own_files
 from pfbench.cli.messages import suggest_similar
 from pfbench.job.config import FILTER_SETS, list_groups
 

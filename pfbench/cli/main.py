@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import Any
 
 import pfbench
-from pfbench.cli.compose import add_search_path
+from pfbench.cli.current_folder import add_search_path
 from pfbench.cli.messages import (
     describe_unknown,
     format_error,

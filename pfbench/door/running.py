@@ -13,7 +13,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from pfbench.cli.compose import add_search_path
+from pfbench.cli.current_folder import add_search_path
 from pfbench.cli.progress import SweepCounter, SweepProgress, list_repeats, note_outcome
 from pfbench.door.own_parts import find_group, make_own
 from pfbench.door.parts import (

@@ -33,7 +33,7 @@ def compute_job(
         episodes: Episodes of the job, None to draw them.
 
     Returns:
-        Metadata and arrays, see `store.Result`.
+        Metadata and arrays, see `store.JobResult`.
 
     Raises:
         ValueError: If a single run does not fit into memory, or if runs that are drawn in batches

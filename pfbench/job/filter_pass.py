@@ -63,7 +63,7 @@ class TimedFilterPass(NamedTuple):
 
         They are NaN from the step at which a run is lost.
 
-        Returns arrays by name, see `store.Result`. Shapes: pcrb [T, d].
+        Returns arrays by name, see `store.JobResult`. Shapes: pcrb [T, d].
         """
         estimate, trace = self.estimate, dict(self.estimate.trace)
         is_lost = torch.isnan(estimate.mean).any(-1, keepdim=True)

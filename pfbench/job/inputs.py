@@ -28,7 +28,7 @@ READERS = {
     "noise": ("ErrorReplay",),
     "scenario": (
         "AlignedLog", "ConstrainedDrive", "RecordedAidedFlight", "RecordedDrive", "RecordedFlights", "RecordedTrajectory",
-        "RecordedWalk", "UrbanDrive", "UserLog",
+        "RecordedWalk", "UrbanDrive", "UserInsLog", "UserLog", "UserRawLog",
     ),
 }  # fmt: skip
 

@@ -44,7 +44,7 @@ class JobOutcome(NamedTuple):
     """Outcome of a job.
 
     Attributes:
-        path: Result file, see `store.load`.
+        path: Result file, see `store.read_result`.
         status: `finished`, or `skipped` because the file exists.
         rmse: Root mean square error of the main group (position if there is one) over all valid
             runs, in its unit.

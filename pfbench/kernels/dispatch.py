@@ -23,7 +23,7 @@ from pfbench.kernels.manifest import Operator, check_arguments, read_operators
 # tensors. Each of its torch operations is a pass over all particles. The C++ operators make one pass. They
 # are the default on the CPU. On other devices they are compiled on request, which takes some seconds:
 #
-#     with compilation.use_compiled():
+#     with dispatch.use_compiled():
 #         run_filter(...)
 #
 # In a compiled step (`pfbench.filter.particle.compiled_filter`) the hand-written kernels stay whole as operators.

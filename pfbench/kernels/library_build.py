@@ -89,9 +89,7 @@ def _link_options(compiler: str, folder: Path) -> list[str]:
     return [f"-L{folder}", "-Wl,--no-as-needed", "-ltorch_cpu", "-lm", "-ldl"]
 
 
-if (
-    __name__ == "__main__"
-):  # beside pip, which fetches packages for as long; `setup.py` takes what is there
+if __name__ == "__main__":  # while pip fetches packages; `setup.py` takes what is there
     for name in find_variants():
         path = Path(__file__).with_name(name_library(name))
         if not path.exists():

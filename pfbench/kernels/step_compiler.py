@@ -31,7 +31,7 @@ class NativeEntry(NamedTuple):
     """Compiled function that C++ code can call.
 
     Attributes:
-        step: Number of the function, see `step_table.register_step`.
+        step: Number of the function, see `register_step`.
         constants: Tensors that it takes before the arguments.
         library: File of its code.
     """

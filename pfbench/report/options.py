@@ -47,12 +47,12 @@ class ReportOptions:
         convergence_threshold: Error limit by group, in the displayed unit, for the convergence time, which
             counts from the start of the record.
         equivalence_margin: Relative difference of RMSE up to which filters are equivalent.
-        paper_figures: Names of `paper_figures.FIGURES`, None for the paper of the study's name.
+        paper_figures: Names of `papers.figures.FIGURES`, None for the paper of the study's name.
         planned: Number of jobs of the experiment, if known.
-        metric: Metric of the main group that decides, one of `main_metrics.MAIN_METRICS`.
+        metric: Metric of the main group that decides, one of `error_measures.MAIN_METRICS`.
         title: Title of the page; empty for the name of the study.
         baseline: Label of the filter with which the opening view compares the others; empty for the first of
-            `baselines.REFERENCES` that the study has. Pairs compared in advance do not depend on it.
+            `REFERENCES` that the study has. Pairs compared in advance do not depend on it.
     """
 
     alpha: float = 0.05

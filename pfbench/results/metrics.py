@@ -384,7 +384,7 @@ METRICS: tuple[Metric, ...] = (
     Metric("overconfident", compute_overconfidence, "group", "", "lower", "1 if NEES is above its 0.999 quantile."),
     Metric(
         "ess", average_trace("ess"), "job", "", "higher",
-        "Effective sample size, mean over time.",
+        "Effective sample size over the number of particles, mean over time.",
     ),
     Metric(
         "ancestors", average_trace("ancestors"), "job", "", "higher",

@@ -122,6 +122,7 @@ WORLDS = (
         "recorded_canyon",
         "gps_ins_inflated",
         "terrain",
+        "user_raw_log",
     ),
 )
 

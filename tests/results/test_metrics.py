@@ -67,7 +67,7 @@ def test_convergence_is_the_last_entry():
     np.testing.assert_array_equal(found, [40.0, 10.0, np.inf, 20.0, np.nan, np.inf])
 
 
-def test_a_run_is_diverged_where_its_error_is_ten_of_its_own_sigmas_on_the_average():
+def test_a_run_is_severely_overconfident_where_its_error_is_ten_of_its_own_sigmas_on_the_average():
     nees = np.full((4, 10, 2), 3.0)
     nees[1, :, 1] = 299.0  # below 100 x 3
     nees[2, :, 1] = 301.0

@@ -58,7 +58,7 @@ def kalman_gain_update(innovation: Innovation) -> tuple[Tensor, Tensor, Tensor]:
 def _separate_update(
     m: Tensor, r: Tensor, omega: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Compute the results of `cpp.kalman_update` by separate operations."""
+    """Compute the results of the operator `kalman_update` by separate operations."""
     root, ok = factor(omega)
     columns = torch.cat([m, r.unsqueeze(-1)], -1)
     white = torch.linalg.solve_triangular(root, columns, upper=False)  # Omega^-1/2 [M r]

@@ -192,7 +192,7 @@ class EssResampler(Resampler):
 
     Attributes:
         scheme: Resampling scheme.
-        ess_threshold: Resample if ESS < threshold n. 1 resamples at every step, 0 never.
+        ess_threshold: Resample if ESS < threshold n, with the weights of the step before. 1 resamples at every step, 0 never.
 
     Raises:
         ValueError: If the threshold is outside [0, 1].

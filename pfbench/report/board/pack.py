@@ -136,7 +136,7 @@ class StudyData(NamedTuple):
     """Data of a study.
 
     Attributes:
-        table: One row per filter, condition and run, see `run_table.build_run_table`.
+        table: One row per filter, condition and run, see `build_run_table`.
         metrics: All metrics in long rows, see `frame.load_frame`; empty unless requested.
         curves: Quantiles of the error over time by condition.
         tracks: Single runs by condition.

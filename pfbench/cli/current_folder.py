@@ -1,0 +1,38 @@
+"""Files of the user in the folder `conf` of the current folder, which the command line and Python use without a search path."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+_CHOICE = re.compile(r"\+?(\w+)=([\w,]+)")
+
+
+def list_own_files(group: str) -> list[Path]:
+    """List the files of a group in `conf` of the current folder, unless that is the folder of pfbench."""
+    from pfbench.results.paper_block import conf_dir
+
+    folder = Path("conf")
+    if not folder.is_dir() or folder.resolve() == conf_dir().resolve():
+        return []
+    return sorted((folder / group).glob("*.yaml"))
+
+
+def add_search_path(words: Sequence[str]) -> list[str]:
+    """Add the folder `conf` to words that choose one of its files, unless they set a search path."""
+    if not Path("conf").is_dir() or any(
+        re.match(r"[+~]*hydra\.searchpath\b|--config-dir\b|-cd\b", word) for word in words
+    ):
+        return list(words)
+    from pfbench.job.config import list_groups
+
+    choices = [match for word in words if (match := _CHOICE.fullmatch(word))]
+    for match in choices:
+        names = set(match[2].split(",")) - {path.stem for path in list_groups().get(match[1], ())}
+        has_knobs = match[1] == "filter" and re.search(r"_tuned\b|tuned_baselines", match[2])
+        if names & {path.stem for path in list_own_files(match[1])} or (
+            has_knobs and list_own_files("tuned")
+        ):
+            return [*words, "hydra.searchpath=[file://conf]"]
+    return list(words)
