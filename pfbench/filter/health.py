@@ -34,10 +34,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+import scipy  # scipy.special is imported at its first use
 import torch
 from torch import Tensor
 
-from pfbench.core.chi_square import chi_square_limit
 from pfbench.core.density import has_finite_moments
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, StepInfo, compute_once, join_runs
@@ -96,7 +96,7 @@ class HealthMonitor:
             if (k + 1) * count >= _CHECKS
         )
         self._limits = torch.tensor(
-            [torch.inf, *(chi_square_limit(k + 1, 0.001) for k in range(record.y.shape[2]))],
+            [torch.inf, *scipy.special.chdtri(range(1, record.y.shape[2] + 1), 0.001)],
             dtype=torch.float64,
             device=record.y.device,
         )

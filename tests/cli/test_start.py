@@ -8,16 +8,12 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-import pytest
-from scipy.special import chdtri
-
-from pfbench.core.chi_square import chi_square_limit
 from pfbench.job.inputs import READERS
 from pfbench.job.trust import FOLDERS
 
 ROOT = Path(__file__).parents[2]
 JOB = ("run", "scenario=linear_walk", "scenario.steps=5", "runs=1", "particles=20", "filter=sir")
-TABLES = {"pandas", "pyarrow", "scipy.special", "scipy.stats", "scoringrules", "matplotlib"}
+TABLES = {"pandas", "pyarrow", "scipy.stats", "scoringrules", "matplotlib"}
 
 
 def list_imports(folder: Path, *words: str) -> set[str]:
@@ -47,9 +43,3 @@ def test_the_readers_are_the_public_classes_that_name_files() -> None:
         for folder, door in doors.items()
     }
     assert {folder: names for folder, names in readers.items() if names} == READERS
-
-
-@pytest.mark.parametrize("p", [0.001, 0.05, 0.5])
-def test_limits_are_quantiles_of_the_chi_square_distribution(p: float) -> None:
-    for dof in (*range(1, 40), 200):
-        assert chi_square_limit(dof, p) == pytest.approx(float(chdtri(dof, p)), rel=1e-12)
