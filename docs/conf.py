@@ -35,6 +35,7 @@ os.environ["PYTHONWARNINGS"] = (
 
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True  # as in the source: no path of a machine
 autodoc_typehints = "none"  # the docstrings name shapes and units
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
