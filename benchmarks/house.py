@@ -4,8 +4,7 @@ W1 to W3 are single runs, W4 a batch. Of W3 the package has no model; `Radar` is
 
     python house.py float32|float64 auto|eager|kernels|compiled [sir|ckf] WORKLOAD
 
-`auto` is what a job takes by default: in double precision the stored compiled step, which its first job of this shape may put
-there and the warm-up puts there here; else the engine for its size. `kernels` is the first job, with an empty store.
+`auto` is the engine that a job of this size takes by default.
 """
 
 from __future__ import annotations
@@ -114,8 +113,6 @@ def of(method: Any, particles: int, work: Any, dtype: torch.dtype, engine: str) 
     model, record = model_and_record(work, dtype)
     if engine == "auto":
         engine = choose_engine(engine, method, model, *work.y.shape[:2])
-        if engine == "kernels" and dtype == torch.float64:
-            engine = "compiled"
     method = (
         CompiledParticleFilter(method)
         if engine == "compiled" and isinstance(method, ParticleFilter)

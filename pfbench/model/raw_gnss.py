@@ -91,7 +91,8 @@ class RawGnss(StateSpaceModel):
 
     State [9]: position and velocity (East, North, Up), bias m and drift m/s of the receiver clock, and the
     inter-system bias m. A step has duration T, and n is the integral of the acceleration. Then v' = v + n and
-    p' = p + v T + n T / 2 + m. The part m of the position, of variance q T^3 / 12, is independent of n. Clock states are differences from a nominal course that the record subtracts.
+    p' = p + v T + n T / 2 + m. The part m of the position, of variance q T^3 / 12, is independent of n.
+    Clock states are differences from a nominal course that the record subtracts.
 
     The origin is the fixed position, at rest. Recorded scenarios provide the start of each run.
 

@@ -426,6 +426,18 @@ def test_undecided_cells_have_no_colour_and_lost_tracks_are_grey(overview: Overv
             assert drawn[key].value == pytest.approx(math.log(cell.verdict.ratio))
 
 
+def test_the_cost_of_a_method_is_the_median_of_its_worlds_with_the_range(
+    overview: Overview,
+) -> None:
+    method = overview.methods[0]
+    labels = {name: label for label, name in overview.names.items()}
+    costs = dict(zip((world.key for world in overview.worlds), (2.0, 9.0, 3.0), strict=True))
+    times = {(world.key, labels[world.reference]): 4.0 for world in overview.worlds}
+    times |= {(key, method): 4.0 * cost for key, cost in costs.items()}
+    story = tell_story(overview._replace(times=times), method, "")
+    assert story["time"] == "3 (2 to 9)"
+
+
 def test_the_page_has_its_figures_tables_and_stories(overview: Overview) -> None:
     pack = {
         "study": "s",

@@ -253,6 +253,17 @@ def test_numbers_have_three_digits(value, text):
     assert writers.format_number(value) == text
 
 
+@pytest.mark.parametrize(
+    ("numbers", "text"),
+    [
+        ((0.951, 0.899, 0.9964), "0.951 [0.899, 0.996]"), ((1.05, 1.0031, 1.1), "1.050 [1.003, 1.100]"),
+        ((0.5, 0.4, 0.6), "0.50 [0.40, 0.60]"), ((1.0, 1.0, 1.0), "1.00 [1.00, 1.00]"), ((2.0, 1.0, float("inf")), "2.00"),
+    ],
+)  # fmt: skip
+def test_an_interval_without_one_does_not_seem_to_end_there(numbers, text):
+    assert writers.format_with_interval(*numbers) == text
+
+
 def test_markdown_columns_line_up():
     text = writers.format_markdown(pd.DataFrame({"a|b": ["x", "yy"], "n": [1.0, 20.0]}))
     assert text.splitlines() == [

@@ -125,7 +125,7 @@ def collect_sky(
     if not selected_mask.any():
         raise ValueError(
             f"{table.name} does not contain a row above {receiver.mask_deg} degrees within {_SAME_EPOCH} s of the "
-            "end of a step. Use the same clock for t in all tables."
+            "end of a step. Use the same clock for t in all tables, or lower scenario.receiver.mask_deg."
         )
     row_names = np.array(parse_satellites(table, value["svid"]))
     names, slot = np.unique(row_names[selected_mask], return_inverse=True)
