@@ -228,10 +228,18 @@ def _parse_side(text: Any, measure: Measure, method: str, world: tuple[str, ...]
     if not isinstance(text, str):
         return Side(measure, number=float(text))
     head, *words = text.split(" @")
-    name, _, settings = head.removesuffix("]").partition("[") if "[" in head else (head, "", "")
-    pairs = tuple(f"filter.{setting}" for setting in settings.split(",") if setting)
+    name, pairs = _split_settings(head)
     name = method if name == METHOD else name
     return Side(measure, name, (*pairs, *words, *world))
+
+
+def _split_settings(text: str) -> tuple[str, tuple[str, ...]]:
+    """Split `name[key=value,+new=value]` into the name of a filter and words that set its keys."""
+    name, _, settings = text.removesuffix("]").partition("[")
+    words = [setting for setting in settings.split(",") if setting]
+    return name, tuple(
+        f"+filter.{word[1:]}" if word.startswith("+") else f"filter.{word}" for word in words
+    )
 
 
 def list_dots(plan: ClaimPlan) -> dict[str, tuple[str, str]]:
@@ -258,8 +266,9 @@ def make_cell(plan: ClaimPlan, reading: str, side: Side) -> tuple[str, ...]:
     concerned = read_readings(paper)[reading].filters
     if side.filter not in limits.get(reading, concerned or (side.filter,)):
         reading = CENTRAL_READING  # the same job
-    name = settings.get("instead", {}).get(reading, {}).get(side.filter, side.filter)
-    return (f"reading/{paper}={reading}", f"filter={name}", *side.words)
+    text = settings.get("instead", {}).get(reading, {}).get(side.filter, side.filter)
+    name, words = _split_settings(text)
+    return (f"reading/{paper}={reading}", f"filter={name}", *words, *side.words)
 
 
 def apply_window(measure: Measure, window: tuple[float, float] | None) -> Measure:
