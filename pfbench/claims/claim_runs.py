@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,6 +38,7 @@ from pfbench.stats.error_measures import Array
 CLAIMS_STUDY = "claims_2"  # folder of the jobs
 SEEDS = (2001, 2002, 2003)
 VALUES_SUFFIX = ".values.json"
+PUBLISHED_VALUES = "values.json.gz"  # of all runs, in the folder of the page
 SCREEN, CENTRE, MOVER = "screen", "centre", "mover"
 Cell = tuple[str, ...]
 
@@ -117,11 +119,18 @@ class ClaimRuns:
             self._by_cell.setdefault(record.cell, []).append(record)
 
     @classmethod
-    def read(cls, folder: Path) -> ClaimRuns:
-        """Read all files of a folder; one that is damaged counts as not run."""
-        return cls(
-            [r for path in sorted(folder.glob(f"*{VALUES_SUFFIX}")) for r in _read_values(path)]
-        )
+    def read(cls, results: Path, reports: Path) -> ClaimRuns:
+        """Read the values of the results, and those of the page that the results do not have.
+
+        A damaged file of the results counts as not run.
+        """
+        paths = sorted((results / CLAIMS_STUDY).glob(f"*{VALUES_SUFFIX}"))
+        runs = cls([r for path in paths for r in _read_values(path)])
+        published = reports / CLAIMS_STUDY / PUBLISHED_VALUES
+        if not published.is_file():
+            return runs
+        records = map(_make_record, json.loads(gzip.decompress(published.read_bytes())))
+        return cls([*runs.records, *(r for r in records if not runs.has(r.cell, r.batch))])
 
     def find(self, cell: Cell) -> list[StoredValues]:
         """Find the jobs of a cell."""
@@ -175,11 +184,14 @@ def write_values(folder: Path, record: StoredValues) -> None:
 def _read_values(path: Path) -> Iterator[StoredValues]:
     """Read a file of values, if it is whole."""
     try:
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        cell, lost = tuple(content.pop("cell")), tuple(content.pop("lost"))
-        yield StoredValues(cell=cell, lost=lost, **content)
+        yield _make_record(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError, KeyError):
         return
+
+
+def _make_record(content: Mapping[str, Any]) -> StoredValues:
+    """Make the values of a job from those of a file."""
+    return StoredValues(**{**content, "cell": tuple(content["cell"]), "lost": tuple(content["lost"])})  # fmt: skip
 
 
 # --------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from pfbench.claims.claim_lines import (
     read_readings,
     read_seven,
 )
-from pfbench.claims.claim_runs import CLAIMS_STUDY, ClaimRuns, StoredValues, decide_claims
+from pfbench.claims.claim_runs import CLAIMS_STUDY, PUBLISHED_VALUES, ClaimRuns, decide_claims
 from pfbench.claims.ledger import (
     ClaimWord,
     compare_versions,
@@ -35,7 +35,6 @@ from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import RUNS_FILE, count_better_worlds, find_overviews, read_stored_study
 from pfbench.report.writers import render_template
 
-VALUES = "values.json.gz"
 COMPARISON = "all_seven"  # study that compares the methods with the Kalman filters of each world
 RULES = (
     "Confirmed or refuted: the same outcome in all readings that can run, at 2.5 % for all claims of a paper.",
@@ -59,26 +58,14 @@ def write_claims(results: str | Path = "results", out: str | Path = "reports") -
         Path of index.html.
     """
     plans, target = read_plans(), Path(out) / CLAIMS_STUDY
-    runs = _read_runs(Path(results) / CLAIMS_STUDY, target / VALUES)
+    runs = ClaimRuns.read(Path(results), Path(out))
     decisions = decide_claims(plans, runs)
     context = make_context(plans, runs, decisions, _count_worlds(Path(out) / COMPARISON))
     with RecordedFolder(target) as folder:
         folder.write("words.json", json.dumps(describe_words(decisions), indent=1) + "\n")
         text = json.dumps([asdict(record) for record in runs.records], separators=(",", ":"))
-        folder.write(VALUES, gzip.compress(text.encode(), mtime=0))
+        folder.write(PUBLISHED_VALUES, gzip.compress(text.encode(), mtime=0))
         return render_template("page", folder, context, Path(__file__).parent)
-
-
-def _read_runs(results: Path, stored: Path) -> ClaimRuns:
-    """Read the values of the results, and those of a page that the results do not have."""
-    runs = ClaimRuns.read(results)
-    if not stored.is_file():
-        return runs
-    entries = json.loads(gzip.decompress(stored.read_bytes()))
-    older = [
-        StoredValues(**{**e, "cell": tuple(e["cell"]), "lost": tuple(e["lost"])}) for e in entries
-    ]
-    return ClaimRuns([*runs.records, *(r for r in older if not runs.has(r.cell, r.batch))])
 
 
 def _count_worlds(study: Path) -> dict[str, tuple[int, int]]:

@@ -36,7 +36,7 @@ readings of its paper. A claim without runs is open, with the price of its runs.
   uncommitted=true           runs from code that is not committed, and says so in each result
   seed=N                     of the cells that verify draws; printed
   results_dir=FOLDER         the runs are in RESULTS/claims_2
-  reports_dir=FOLDER         the page is REPORTS/claims_2/index.html"""
+  reports_dir=FOLDER         the page is REPORTS/claims_2/index.html; its runs are not run again"""
 
 _PLACES = ("results_dir", "reports_dir")
 
@@ -67,6 +67,7 @@ class RunRequest(NamedTuple):
     Attributes:
         plans: Claims to run.
         results: Folder of the results.
+        reports: Folder of the page, whose runs are not run again.
         seconds: Time after which no job starts, s.
         workers: Processes.
         readings: Names of the readings to run; empty for all.
@@ -76,6 +77,7 @@ class RunRequest(NamedTuple):
 
     plans: Sequence[ClaimPlan]
     results: str
+    reports: str
     seconds: float
     workers: int
     readings: str
@@ -115,9 +117,11 @@ def read_request(words: Sequence[str]) -> RunRequest:
     workers = int(_read_number(values, "workers", WORKERS))
     if not 1 <= workers <= WORKERS:
         raise ValueError(f"workers must be 1 or 2, got {workers}. Set workers={WORKERS}.")
+    places = _read_places(values)
     return RunRequest(
         select_plans([word for word in words if "=" not in word]),
-        _read_places(values)["results_dir"],
+        places["results_dir"],
+        places["reports_dir"],
         3600 * _read_number(values, "hours", math.inf),
         workers,
         values.get("readings", ""),
@@ -128,10 +132,10 @@ def read_request(words: Sequence[str]) -> RunRequest:
 
 def list_prices(request: RunRequest) -> list[ClaimPrice]:
     """List what the claims of a request lack; all claims of a paper are one family."""
-    from pfbench.claims.claim_runs import CLAIMS_STUDY, ClaimRuns, decide_claims
+    from pfbench.claims.claim_runs import ClaimRuns, decide_claims
     from pfbench.claims.run_claims import price_claims
 
-    runs = ClaimRuns.read(Path(request.results) / CLAIMS_STUDY)
+    runs = ClaimRuns.read(Path(request.results), Path(request.reports))
     decisions = decide_claims(select_plans(()), runs)
     return _restrict(price_claims(request.plans, runs, decisions), request.readings)
 
@@ -234,10 +238,10 @@ def _describe_task(task: Task, record: StoredValues) -> str:
 
 def print_words(request: RunRequest) -> None:
     """Print the word of each claim of a request."""
-    from pfbench.claims.claim_runs import CLAIMS_STUDY, ClaimRuns, decide_claims
+    from pfbench.claims.claim_runs import ClaimRuns, decide_claims
     from pfbench.claims.ledger import conclude
 
-    runs = ClaimRuns.read(Path(request.results) / CLAIMS_STUDY)
+    runs = ClaimRuns.read(Path(request.results), Path(request.reports))
     decisions = decide_claims(select_plans(()), runs)
     for line in (conclude(plan, decisions) for plan in request.plans):
         print(f"{line.plan.claim.id:8} {line.label}{f': {line.reason}' if line.reason else ''}")
@@ -261,7 +265,7 @@ def verify_claims(words: Sequence[str]) -> None:
     places, plans = _read_places(values), select_plans(())
     seed = int(values.get("seed", secrets.randbelow(10**6)))
     runs, measures = (
-        ClaimRuns.read(Path(places["results_dir"]) / CLAIMS_STUDY),
+        ClaimRuns.read(Path(places["results_dir"]), Path(places["reports_dir"])),
         find_measures(plans),
     )
     drawn_records = draw_records(runs, seed)

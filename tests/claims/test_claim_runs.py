@@ -41,11 +41,13 @@ from pfbench.claims.ledger import compare_versions, conclude
 from pfbench.claims.page import write_claims
 from pfbench.claims.run_claims import (
     Task,
+    describe_words,
     draw_records,
     find_measures,
     list_words,
     merge_tasks,
     price_claims,
+    read_words,
     run_claim_task,
     verify_record,
 )
@@ -145,9 +147,10 @@ def draw_values(plan_id: str, ratio: float, batches: tuple[Batch, ...] | None = 
 def test_values_are_stored_whole_and_found_by_their_words(tmp_path: Path) -> None:
     batch = Batch(2001, 0, 3)
     record = store(("a=b", "c=d"), batch, {"x": [1.0, math.inf, math.nan]}, lost=(0, 0, 1))
-    write_values(tmp_path, record)
-    (tmp_path / f"damaged{claim_runs.VALUES_SUFFIX}").write_text('{"cell": ')
-    runs = ClaimRuns.read(tmp_path)
+    folder = tmp_path / CLAIMS_STUDY
+    write_values(folder, record)
+    (folder / f"damaged{claim_runs.VALUES_SUFFIX}").write_text('{"cell": ')
+    runs = ClaimRuns.read(tmp_path, tmp_path / "none")
     assert runs.has(record.cell, batch, ["x"])
     assert not runs.has(record.cell, batch, ["y"])
     assert not runs.has(record.cell, batch._replace(seed=2002))
@@ -272,7 +275,10 @@ def test_a_cheap_claim_is_run_decided_verified_and_shown(tmp_path: Path) -> None
     page = write_claims(results, tmp_path / "reports")
     assert "C001-5" in page.read_text()
     again = write_claims(tmp_path / "none", tmp_path / "reports")  # from the stored values
-    assert len(ClaimRuns.read(Path(results) / CLAIMS_STUDY).records) == len(records)
+    assert len(ClaimRuns.read(Path(results), tmp_path / "none").records) == len(records)
+    published = ClaimRuns.read(tmp_path / "none", tmp_path / "reports")
+    assert {r.key for r in published.records} == {r.key for r in records}
+    assert not [t for t in tasks if not published.has(t.cell, t.batch, list(t.measures))]
     assert f"{len(records)} jobs" in again.read_text()
 
 
@@ -281,7 +287,7 @@ def test_an_error_of_a_form_that_does_not_refuse_is_a_fault(tmp_path: Path) -> N
     cell = ("reading/001=central", "filter=sir", "filter.no_such_key=1")
     record = run_claim_task(Task("001", cell, Batch(2001, 0, 2), {}), str(tmp_path))
     assert record.failed
-    assert ClaimRuns.read(tmp_path / CLAIMS_STUDY).records == []
+    assert ClaimRuns.read(tmp_path, tmp_path / "none").records == []
 
 
 # the command
@@ -303,11 +309,21 @@ def test_words_of_the_command_are_checked(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_dry_run_prints_prices_and_runs_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
-    command.report_claims(["run", "C001-7", "dry=true", f"results_dir={tmp_path}"])
+    places = [f"results_dir={tmp_path}", f"reports_dir={tmp_path}"]
+    command.report_claims(["run", "C001-7", "dry=true", *places])
     printed = capsys.readouterr().out
     assert re.search(r"C001-7 +screen +\d+ jobs", printed)
     assert "plan: 1 claims" in printed
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_new_clone_runs_only_what_is_not_published(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
+    published = Path(__file__).parents[2] / "reports"
+    command.report_claims(["run", "001", "dry=true", f"results_dir={tmp_path}", f"reports_dir={published}"])  # fmt: skip
+    assert not re.search(r"C001-5 +screen", capsys.readouterr().out)
+    stated = read_words(published / CLAIMS_STUDY)
+    again = describe_words(decide_claims(list(PLANS.values()), ClaimRuns.read(tmp_path, published)))
+    assert again == stated
 
 
 # the page
