@@ -28,7 +28,8 @@ readings of its paper. A claim without runs is open, with the price of its runs.
   pfbench claims run C001-7              one claim; 001 is all claims of a paper
   pfbench claims run 002 readings=each hours=2
   pfbench claims run dry=true            the plan only
-  pfbench claims verify                  computes 20 stored cells again, and all words
+  pfbench claims verify                  computes 20 stored cells again, and all words. Runs must be equal,
+                                         those of a swarm, which amplifies rounding, agree in the mean
 
   hours=H                    starts no job after this time; repeat the command to resume
   workers=2                  processes, at most two
@@ -276,7 +277,7 @@ def verify_claims(words: Sequence[str]) -> None:
     for record in drawn_records:
         check = verify_record(record, measures.get(record.cell, {}), places["results_dir"])
         faults += bool(check.fault)
-        word = "differs" if check.fault else "equal"
+        word = "differs" if check.fault else "equal" if check.is_equal else "agrees"
         print(f"{word:8} {check.runs:4} runs  {' '.join(record.cell)}  {check.fault}", flush=True)
     stated = read_words(Path(places["reports_dir"]) / CLAIMS_STUDY)
     again = describe_words(decide_claims(plans, runs))

@@ -41,6 +41,7 @@ from pfbench.claims.ledger import compare_versions, conclude
 from pfbench.claims.page import write_claims
 from pfbench.claims.run_claims import (
     Task,
+    _has_equal_mean,
     describe_words,
     draw_records,
     find_measures,
@@ -288,6 +289,18 @@ def test_an_error_of_a_form_that_does_not_refuse_is_a_fault(tmp_path: Path) -> N
     record = run_claim_task(Task("001", cell, Batch(2001, 0, 2), {}), str(tmp_path))
     assert record.failed
     assert ClaimRuns.read(tmp_path, tmp_path / "none").records == []
+
+
+def test_runs_of_a_swarm_agree_if_their_mean_difference_is_within_its_error() -> None:
+    g = np.random.default_rng(1)
+    shifts = [0.0, 0.3]  # beside a spread of 0.1
+    passed = [
+        np.mean([_has_equal_mean(5 + shift + 0.1 * g.standard_normal(20), 5 * np.ones(20)) for _ in range(500)])
+        for shift in shifts
+    ]  # fmt: skip
+    assert passed[0] > 0.99
+    assert passed[1] < 0.01
+    assert not _has_equal_mean(np.array([1.0, np.inf, 1.0]), np.ones(3))
 
 
 # the command
