@@ -68,7 +68,7 @@ class GrowingSweep:
     @classmethod
     def from_plan(cls, plan: StudyPlan) -> GrowingSweep:
         """Read the settings of a study."""
-        from pfbench.stats.error_measures import check_main_metric
+        from pfbench.results.metrics import check_page_metric
         from pfbench.stats.pair_states import LookSchedule
 
         values = plan.first.values
@@ -89,7 +89,7 @@ class GrowingSweep:
                 "budget must be particles with runs=until-decided, since a budget would set another "
                 f"number of particles at each look, got {values['budget']}. Use budget=particles."
             )
-        check_main_metric(values["report"]["metric"])
+        check_page_metric(values["report"]["metric"])
         schedule, jobs = LookSchedule(settings["max_runs"]), plan.compose_jobs()
         if all(config.values["filter"] == jobs[0].values["filter"] for config in jobs):
             raise ValueError(

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from pfbench.stats.error_measures import check_main_metric
+from pfbench.results.metrics import check_page_metric
 
 _FORMATS = ("svg", "png")
 
@@ -49,7 +49,7 @@ class ReportOptions:
         equivalence_margin: Relative difference of RMSE up to which filters are equivalent.
         paper_figures: Names of `papers.figures.FIGURES`, None for the paper of the study's name.
         planned: Number of jobs of the experiment, if known.
-        metric: Metric of the main group that decides, one of `error_measures.MAIN_METRICS`.
+        metric: Metric of the main group that decides, one of `metrics.page_metrics`.
         title: Title of the page; empty for the name of the study.
         baseline: Label of the filter with which the opening view compares the others; empty for the first of
             `REFERENCES` that the study has. Pairs compared in advance do not depend on it.
@@ -73,7 +73,7 @@ class ReportOptions:
                 raise ValueError(
                     f"report.{key} must be {requirement}, got {getattr(self, key)!r}. Leave it out for the default."
                 )
-        check_main_metric(self.metric)
+        check_page_metric(self.metric)
         if not 0 < self.alpha < 1:
             raise ValueError(f"report.alpha must be between 0 and 1, got {self.alpha}. Use 0.05.")
         if not self.equivalence_margin > 0:

@@ -1,8 +1,13 @@
 """Table of metrics: name, function, unit, direction and caption of each, defined once.
 
 The table of a study (`frame`), metrics.csv with its definitions, judgements and the claims read
-`METRICS`. To add a metric, add one entry. If it needs an array that no job stores yet, record
-that array in the scoring of jobs too. Name it under `scored_names` if it exists at scored steps only.
+`METRICS`. Pages of a study show those with a `page_name`. To add a metric, add one entry. If it needs
+an array that no job stores yet, record that array in the scoring of jobs too. Name it under `scored_names`
+if it exists at scored steps only.
+
+References:
+    T. Gneiting and A. E. Raftery (2007), Strictly proper scoring rules, prediction, and estimation.
+    F. X. Diebold and R. S. Mariano (1995), Comparing predictive accuracy.
 """
 
 from __future__ import annotations
@@ -277,9 +282,11 @@ class Metric:
         direction: Whether lower or higher is better, or a target value is best.
         caption: Definition shown to readers.
         head: Column head in tables of judgements, without unit; empty for no column.
-        component: Component shown in that column.
+        component: Component shown in that column and on pages.
         factor: Factor of the shown value, 100 for percent.
         scored_names: Arrays that exist at scored steps only.
+        page_name: Name on pages, where smaller values are better; empty for a metric that cannot decide a study.
+        only_decides: Whether pages show it only if it decides the study.
     """
 
     name: str
@@ -292,6 +299,13 @@ class Metric:
     component: str = "norm"
     factor: float = 1.0
     scored_names: tuple[str, ...] = ()
+    page_name: str = ""
+    only_decides: bool = False
+
+    @property
+    def is_of_group(self) -> bool:
+        """True if it is a value of a group of components, in the unit of the group."""
+        return self.unit == GROUP_UNIT
 
     def column_head(self, group_unit: str = "") -> str:
         """Return the column head with its unit."""
@@ -306,6 +320,20 @@ def compute_metric(name: str, data: MetricInput) -> ByComponent:
     Returns values [R] by component.
     """
     return {metric.name: metric for metric in METRICS}[name].compute(data)
+
+
+def page_metrics() -> dict[str, Metric]:
+    """List the metrics that can decide a study, by name."""
+    return {metric.name: metric for metric in METRICS if metric.page_name}
+
+
+def check_page_metric(name: str) -> None:
+    """Check the name of the metric that decides a study."""
+    if name not in page_metrics():
+        raise ValueError(
+            f"report.metric must be one of {', '.join(page_metrics())}, got {name}. "
+            "Choose rmse for estimates, or crps for posterior distributions."
+        )
 
 
 def scored_arrays() -> tuple[str, ...]:
@@ -346,9 +374,11 @@ METRICS: tuple[Metric, ...] = (
     Metric(
         "rmse", compute_rmse, "components", GROUP_UNIT, "lower",
         "Root mean square over time of the error of a component, or of the norm of a group.",
+        page_name="RMS error",
     ),
     Metric(
         "max_error", compute_max_error, "components", GROUP_UNIT, "lower", "Maximum of the norm of the error.",
+        page_name="largest error",
     ),
     Metric(
         "pcrb", compute_bound, "components", GROUP_UNIT, "target",
@@ -358,13 +388,13 @@ METRICS: tuple[Metric, ...] = (
         "crps", compute_crps, "components", GROUP_UNIT, "lower",
         "Continuous ranked probability score, mean over valid runs, components and scored steps. "
         "It equals the absolute error for a distribution without spread.",
-        head="CRPS", component="mean", scored_names=("crps",),
+        head="CRPS", component="mean", scored_names=("crps",), page_name="CRPS",
     ),
     Metric(
         "energy", compute_energy_score, "components", GROUP_UNIT, "lower",
         "Generalisation of the CRPS to the vector of a group, mean over valid runs and scored "
         "steps.",
-        head="energy score", scored_names=("energy_score",),
+        head="energy score", scored_names=("energy_score",), page_name="energy score", only_decides=True,
     ),
     *(
         Metric(
@@ -426,7 +456,10 @@ METRICS: tuple[Metric, ...] = (
         "Logarithm of the estimated probability of the counts of a run. It is not compared with the "
         "log evidence, which is a density.",
     ),
-    Metric("log_score", compute_log_score, "job", "", "higher", "Log evidence per step."),
+    Metric(
+        "log_score", compute_log_score, "job", "", "higher", "Log evidence per step.", component="",
+        page_name="inverse predictive density per step", only_decides=True,
+    ),
     Metric(
         "seconds_per_step", compute_seconds_per_step, "job", "s", "lower",
         "Time per step of all runs: one timing of the job, or median and quartiles of `pfbench cost`.",

@@ -12,10 +12,9 @@ import synthetic_results as synthetic
 from pfbench.report.board.entries import build_run_table
 from pfbench.report.options import ReportOptions
 from pfbench.report.study_report import write_report
-from pfbench.results import store
+from pfbench.results import metrics, store
 from pfbench.results.conditions import load_conditions
 from pfbench.results.frame import load_frame
-from pfbench.stats.error_measures import MAIN_METRICS
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +33,8 @@ def median_ratio(results: Path, metric: str) -> float:
         error = result.data["error"][..., 6:9].astype(float)
         largest, mean = np.linalg.norm(error, axis=-1).max(1), (error**2).sum(-1).mean(1)
         values = largest if metric == "max_error" else np.sqrt(mean)
+        if metric == "first_error":
+            values = np.linalg.norm(error[:, 0], axis=-1)
         if metric == "log_score":
             values = np.exp(-result.data["log_evidence"] / result.meta["steps"])
         logs[result.meta["label"]] = np.log(values)
@@ -58,12 +59,22 @@ def test_values_are_those_of_the_stored_arrays(results: Path) -> None:
             np.testing.assert_allclose(values[~lost], expected[~lost], rtol=1e-6)
 
 
-@pytest.mark.parametrize("metric", ["rmse", "max_error", "log_score"])
-def test_the_metric_of_the_option_decides(metric: str, results: Path, tmp_path: Path) -> None:
+def first_error(data: metrics.MetricInput) -> dict[str, np.ndarray]:
+    return {"norm": np.linalg.norm(data.select("error")[:, 0], axis=-1)}
+
+
+FIRST = metrics.Metric("first_error", first_error, "components", metrics.GROUP_UNIT, "lower", "Error of the first step.", page_name="first error")  # fmt: skip
+
+
+@pytest.mark.parametrize("metric", ["rmse", "max_error", "log_score", "first_error"])
+def test_the_metric_of_the_option_decides(metric: str, results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    """A new metric, too, which is one entry of the table of metrics."""
+    monkeypatch.setattr(metrics, "METRICS", (*metrics.METRICS, FIRST))
     options = ReportOptions(metric=metric, figure_formats=("svg",))
     folder = write_report("demo", results, tmp_path, options).parent
     rows = pd.read_csv(folder / "verdicts.csv")
     assert rows["metric"].iloc[0] == metric
+    assert metrics.page_metrics()[metric].page_name in (folder / "report.md").read_text()
     row = rows.query("filter == 'ukf' and baseline == 'ekf'").iloc[0]
     assert row["ratio"] == pytest.approx(median_ratio(results, metric), rel=1e-3)
     pairs = pd.read_csv(folder / "decisions.csv").set_index(["a", "b"])
@@ -84,6 +95,5 @@ def test_bands_of_a_report(results: Path, tmp_path: Path) -> None:
 
 
 def test_other_metrics_are_refused() -> None:
-    assert "rmse" in MAIN_METRICS
-    with pytest.raises(ValueError, match=r"report\.metric must be one of rmse, crps"):
+    with pytest.raises(ValueError, match=r"report\.metric must be one of rmse, max_error"):
         ReportOptions(metric="nees")

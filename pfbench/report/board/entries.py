@@ -15,10 +15,9 @@ from pfbench.results import metrics, status, store
 from pfbench.results.conditions import ComponentGroup, Condition, main_component_group
 from pfbench.results.frame import drop_before
 from pfbench.results.looks import MethodLook, PartName
-from pfbench.results.metrics import MetricInput
+from pfbench.results.metrics import MetricInput, page_metrics
 from pfbench.results.step_times import STEP_TIME
 from pfbench.results.store import SAME_LIKELIHOODS, SAME_N
-from pfbench.stats.study_runs import LOG_SCORE
 
 # --------------------------------------------------------------------------------------------------
 # Entries of the data of a page: filters, parts, metrics and planned pairs.
@@ -60,7 +59,7 @@ class StudyNames(NamedTuple):
 
 def list_metrics(values: Mapping[str, Any] | pd.DataFrame, main: str = "rmse") -> list[str]:
     """List the metrics of a board: that which decides first, then all that have values."""
-    names = [name for name in METRIC_NAMES if name in values]
+    names = [name for name in page_metrics() if name in values]
     names.sort(key=lambda name: name != main)
     return [n for n in names if n in (main, "rmse") or not np.isnan(np.asarray(values[n])).all()]
 
@@ -152,24 +151,16 @@ def metric_entries(table: pd.DataFrame, main: str) -> list[dict[str, Any]]:
     """List the entries of the metrics."""
     units, groups = table["unit"].unique(), table["group"].unique()
     unit, group = units[0] if len(units) == 1 else "", groups[0] if len(groups) == 1 else "main"
+    entries = {key: page_metrics()[key] for key in list_metrics(table, main)}
     return [
-        {"key": key, "name": METRIC_NAMES[key], "unit": "" if key == LOG_SCORE else unit, "direction": "lower",
-         "caption": f"{METRIC_NAMES[key]} of the {'filter' if key == LOG_SCORE else f'group {group}'}."}
-        for key in list_metrics(table, main)
+        {"key": key, "name": metric.page_name, "unit": unit if metric.is_of_group else "", "direction": "lower",
+         "caption": f"{metric.page_name} of the {f'group {group}' if metric.is_of_group else 'filter'}."}
+        for key, metric in entries.items()
     ]  # fmt: skip
 
 
 # --------------------------------------------------------------------------------------------------
 # Table of a study with one row per filter, condition and run: all numbers behind its board.
-
-# metrics of the main group that a board can show, each with the component of its value
-SHOWN_METRICS: Mapping[str, str] = {"rmse": "norm", "max_error": "norm", "crps": "mean"}
-# metrics that can decide a study, but are shown only if they do
-_MAIN_ONLY: Mapping[str, str] = {"energy": "norm", LOG_SCORE: ""}
-METRIC_NAMES = {
-    "rmse": "RMS error", "max_error": "largest error", "crps": "CRPS", "energy": "energy score",
-    LOG_SCORE: "inverse predictive density per step",
-}  # fmt: skip
 
 
 def build_run_table(
@@ -213,7 +204,11 @@ def job_rows(
     meta, lost = result.meta, np.asarray(result.data["lost"], dtype=bool)
     group = main_component_group(meta["state"])
     particles = meta.get("particles")
-    components = {**SHOWN_METRICS, **{k: v for k, v in _MAIN_ONLY.items() if k == metric}}
+    components = {
+        name: entry.component
+        for name, entry in page_metrics().items()
+        if name == metric or not entry.only_decides
+    }
     columns = {
         "filter": label,
         "scenario": condition.scenario,

@@ -22,7 +22,6 @@ from pfbench.report.board.curves import (
     make_tracks,
 )
 from pfbench.report.board.entries import (
-    METRIC_NAMES,
     StudyNames,
     budget_entries,
     cell_entries,
@@ -55,6 +54,7 @@ from pfbench.results.looks import (
     study_looks,
     study_part_names,
 )
+from pfbench.results.metrics import page_metrics
 from pfbench.results.paper_block import REFERENCES, list_named_parts
 from pfbench.results.status import count_statuses
 from pfbench.results.step_times import StepTimes
@@ -109,7 +109,7 @@ def build_pack(
             conditions,
             alpha=options.alpha,
             margin=options.equivalence_margin,
-            metric=METRIC_NAMES[options.metric],
+            metric=page_metrics()[options.metric].page_name,
         ).to_entries(),
         **data.notes.to_entries(facts.looks),
         "provenance": [list(row) for row in provenance.list_shared_settings(conditions)],

@@ -11,7 +11,6 @@ import pandas as pd
 
 from pfbench.report.board.curves import CellKey
 from pfbench.report.board.entries import (
-    METRIC_NAMES,
     StudyNames,
     ViewKey,
     format_interval_level,
@@ -38,11 +37,11 @@ from pfbench.results.looks import (
     describe_tuning,
     plan_look_pairs,
 )
+from pfbench.results.metrics import page_metrics
 from pfbench.results.step_times import StepTimes
 from pfbench.stats.comparison import MIN_RUNS, Verdict, decide
 from pfbench.stats.error_measures import Array, Flags
 from pfbench.stats.study_runs import (
-    LOG_SCORE,
     StudyRuns,
     compare_filters,
     compute_losses,
@@ -122,7 +121,7 @@ def _make_view(
 ) -> View:
     """Collect the data of a view."""
     groups = selection.groups
-    is_single = len(groups) == 1 and metric != LOG_SCORE
+    is_single = len(groups) == 1 and page_metrics()[metric].is_of_group
     worlds = [names.worlds.get(name) for name in selection.runs.conditions["scenario"].unique()]
     return View(
         selection.runs, losses[:, selection.mask], metric, groups["unit"].iloc[0] if is_single else "",
@@ -150,8 +149,9 @@ def _list_scopes(conditions: pd.DataFrame) -> Iterator[tuple[str, str, Flags]]:
 
 def _name_metric(metric: str, groups: pd.Series[str]) -> str:
     """Name a metric with its group, if all conditions have the same main group."""
-    is_one = groups.nunique() == 1 and metric != LOG_SCORE
-    return f"{groups.iloc[0]} {METRIC_NAMES[metric]}" if is_one else METRIC_NAMES[metric]
+    entry = page_metrics()[metric]
+    is_one = groups.nunique() == 1 and entry.is_of_group
+    return f"{groups.iloc[0]} {entry.page_name}" if is_one else entry.page_name
 
 
 def _select_common(runs: StudyRuns, mask: Flags) -> Flags:
