@@ -143,7 +143,7 @@ def board_table(study: str) -> str:
         f"error [{unit}]" if unit else "error",
         f"ratio to `{baseline}`",
         "track kept",
-        "true values in 90 % regions",
+        "true values in 90 % intervals",
     )
     body = [(", ".join(labels), *cells) for cells, labels in filters_by_cells.items()]
     kept = [i for i in range(len(head)) if any(row[i] != "–" for row in body)]

@@ -28,7 +28,7 @@ class Condition(NamedTuple):
         regime: Noise regime.
         errors: Error of each run by filter, NaN for a lost run.
         kinds: `KALMAN` or one of `KINDS` by filter.
-        coverage: Share of true values in 90 % regions by filter.
+        coverage: Share of true values in 90 % intervals by filter.
     """
 
     study: str
@@ -102,7 +102,7 @@ def describe_win(
     )
     text = (
         f"`{label}` is better than every Kalman filter in `{condition.study}`, {condition.regime}: "
-        f"{describe_comparison(label, found)}, the closest one. The 90 % regions have "
+        f"{describe_comparison(label, found)}, the closest one. The 90 % intervals have "
         f"{' and '.join(shares)} of the true values."
     )
     other = second.get(f"{condition.study} {condition.regime}")

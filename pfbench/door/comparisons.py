@@ -26,7 +26,7 @@ _HEADS = (
     "ratio",
     "verdict",
     "track kept",
-    "coverage of 90 % regions",
+    "coverage of 90 % intervals",
     "ms/step",
 )
 

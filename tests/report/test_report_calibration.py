@@ -1,4 +1,4 @@
-"""Scores of the whole law in a report: in the right units, cut in time with the rest, honest about narrow and wide regions."""
+"""Scores of the whole law in a report: in the right units, cut in time with the rest, honest about narrow and wide intervals."""
 
 import numpy as np
 import pytest

@@ -122,7 +122,7 @@ def test_a_table_of_the_readme_is_the_opening_view(
     rows = pd.read_csv(study / "verdicts.csv").iloc[:4]
     # the world of this study states no divergence threshold, so that there is no share of tracks
     assert lines[0].startswith(
-        "| filter | error [m] | ratio to `ekf` | true values in 90 % regions |"
+        "| filter | error [m] | ratio to `ekf` | true values in 90 % intervals |"
     )
     assert rows["track"].isna().all()
     for line, row in zip(lines[2:], rows.to_dict("records"), strict=True):

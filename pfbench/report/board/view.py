@@ -22,7 +22,7 @@ from pfbench.stats.world_table import TRACK_SHARE
 
 BASE, MISSING, LOSES_TRACK = "baseline", "missing", "loses track"
 _SAME_LEVEL = 1e-6
-_LEVEL_OF_REGIONS = 0.9
+_INTERVAL_LEVEL = 0.9
 _MOST_WORDS = 55  # of the sentence of a view
 BoardRow = dict[str, Any]
 
@@ -205,8 +205,8 @@ def find_lost_conditions(runs: StudyRuns, alpha: float) -> Flags:
 
 
 def word_calibration(coverage: Array, alpha: float) -> list[str]:
-    """Return "too low" or "too high" where the mean coverage [F, N] of 90 % regions is shown to differ; else empty."""
-    estimates = [estimate_mean(row[~np.isnan(row)] - _LEVEL_OF_REGIONS) for row in coverage]
+    """Return "too low" or "too high" where the mean coverage [F, N] of 90 % intervals is shown to differ; else empty."""
+    estimates = [estimate_mean(row[~np.isnan(row)] - _INTERVAL_LEVEL) for row in coverage]
     tested = [np.isfinite(e.p) and e.df >= MIN_RUNS - 1 for e in estimates]
     p = holm([float(e.p) if yes else 1.0 for e, yes in zip(estimates, tested, strict=True)])
     return [

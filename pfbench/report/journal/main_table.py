@@ -396,7 +396,7 @@ def make_cost_table(pack: Pack, particles: Mapping[str, str]) -> LatexTable:
     runs = sum(int(cell["runs"]) for cell in pack["cells"])
     caption = (
         r"Cost and reliability over all conditions: particles \textit{N}, time per step of a batch of runs, share of runs "
-        rf"that keep track, lost runs of {runs}, coverage of 90\,\% regions. \textsuperscript{{*}}: proposed methods. "
+        rf"that keep track, lost runs of {runs}, coverage of 90\,\% intervals. \textsuperscript{{*}}: proposed methods. "
         + (_ROUNDS if has_rounds else "Times: one timing per job.")
     )
     return LatexTable("cost", caption, columns, [[_head_cell(text) for text in head]], groups)

@@ -268,7 +268,7 @@ CAPTIONS = {
         "Triangles lie beyond the axis, with their value."
     ),
     "calibration": (
-        r"Coverage of 50 and 90\,\% regions over all conditions (left), and mean NEES divided by its expectation (right). "
+        r"Coverage of 50 and 90\,\% intervals over all conditions (left), and mean NEES divided by its expectation (right). "
         "Dashed: nominal values."
     ),
 }

@@ -76,7 +76,7 @@ def plot_over_time(pack: Pack, setting: FigureSetting) -> Figure:
 
 
 def plot_calibration(pack: Pack, setting: FigureSetting) -> Figure:
-    """Plot the coverage of 50 and 90 % regions, and NEES relative to its expectation."""
+    """Plot the coverage of 50 and 90 % intervals, and NEES relative to its expectation."""
     looks, values = filters_by_key(pack), pack["calibration"].get((ALL, ALL), {})
     keys = [key for key in find_rows(pack) if key in values] or [
         key for key in looks if key in values

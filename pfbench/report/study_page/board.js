@@ -24,7 +24,7 @@ function heads() {
     { key: "bar", text: "Ratio", small: "log scale" },
     { key: "verdict", text: "Verdict", small: "jointly", value: (row) => row.rank },
     { key: "track", text: "Track kept", value: (row) => row.track },
-    { key: "calibration", text: "Coverage", small: "90 % regions", value: (row) => row.coverage },
+    { key: "calibration", text: "Coverage", small: "90 % intervals", value: (row) => row.coverage },
     { key: "ms", text: "ms/step", value: (row) => row.ms },
   ];
   return all.map((head) => ({
@@ -122,7 +122,7 @@ function details(row, span) {
     [`Against ${looks[state.baseline].name}`, row.p === null ? row.words : `${row.words}; p = ${short(row.p)} for all filters together`],
     ["Track kept", percent(row.track)],
     ["Lost runs", row.lost === null ? "–" : row.lost],
-    ["Coverage of 90 % regions", percent(row.coverage)],
+    ["Coverage of 90 % intervals", percent(row.coverage)],
     ["NEES per degree of freedom", short(row.nees)],
     ["ms per step", `${short(row.ms)} ${quartiles(row)}`],
     ...(row.cost > 0

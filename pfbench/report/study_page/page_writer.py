@@ -257,7 +257,7 @@ def _heads(baseline: str) -> list[dict[str, str]]:
     heads = [
         ("#", "number", "", "ascending"), ("Filter", "", "", ""), ("Error", "desk", "median", ""),
         (f"÷ {baseline}", "number", "with interval", ""), ("Verdict", "", "jointly", ""),
-        ("Track kept", "number", "", ""), ("Coverage", "desk", "90 % regions", ""),
+        ("Track kept", "number", "", ""), ("Coverage", "desk", "90 % intervals", ""),
         ("ms/step", "number desk", "", ""),
     ]  # fmt: skip
     return [dict(zip(("text", "style", "small", "sort"), head, strict=True)) for head in heads]

@@ -67,7 +67,7 @@ function drawCalibration(part) {
   const filters = order().filter((look) => shares[look.key]);
   const width = widthOf(part);
   const narrow = width < 640;
-  if (!filters.length) return void (part.innerHTML = '<p class="note">This view has no regions.</p>');
+  if (!filters.length) return void (part.innerHTML = '<p class="note">This view has no intervals.</p>');
   const [left, rowHeight] = nameColumn(filters, width, 11.5, 21);
   const [right, top] = [narrow ? 12 : 240, 24];
   const bottom = top + rowHeight * filters.length;
@@ -88,7 +88,7 @@ function drawCalibration(part) {
     const y = top + rowHeight * (k + 0.5);
     const { c50, c90, nees_ratio: nees } = shares[look.key];
     const word = rows[look.key].calibration ? `coverage ${rows[look.key].calibration}` : "";
-    const words = `${look.name}: the 50 % regions contain ${percent(c50)}, the 90 % regions ${percent(c90)}; NEES per degree of freedom ${short(nees)}${word && `; ${word}`}`;
+    const words = `${look.name}: the 50 % intervals contain ${percent(c50)}, the 90 % intervals ${percent(c90)}; NEES per degree of freedom ${short(nees)}${word && `; ${word}`}`;
     content += nameLabel(look, left - 8, y, left, 11.5, ' text-anchor="end"');
     if (c50 === null || c90 === null) return;
     content += `<g${spoken(words)}>${bar(x(c50), x(c90), y, 2, look, 0.5)}<circle class="c${look.index}" cx="${px(x(c50))}" cy="${px(y)}" r="3.4" fill="var(--paper)" stroke="var(--c)" stroke-width="1.6"/>${mark(look, x(c90), y, 4.5)}</g>`;
@@ -101,7 +101,7 @@ function drawCalibration(part) {
     width,
     bottom + 36,
     content,
-    `Calibration of ${filters.length} filters: share of true values in their 50 and 90 % regions.`,
+    `Calibration of ${filters.length} filters: share of true values in their 50 and 90 % intervals.`,
     "group",
   );
 }
