@@ -34,6 +34,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 # None: operators on the CPU, where they cost nothing, and torch operations on other devices
 _fused: ContextVar[bool | None] = ContextVar("fused", default=None)
 _graph: ContextVar[bool] = ContextVar("graph", default=False)
+_marking: ContextVar[bool] = ContextVar("marking", default=False)
+# What `sir_step` does after the particles have moved. In a graph these are torch operations, unless they are marked.
+_MARKED = ("log_normal", "sum_log_weights", "normalise_weights")
 _peek_transform = (
     torch._C._functorch.peek_interpreter_stack
 )  # None outside of torch.vmap and its like
@@ -57,6 +60,16 @@ def capture_graph(enabled: bool = True) -> Iterator[None]:
         yield
     finally:
         _graph.reset(token)
+
+
+@contextmanager
+def mark_operators() -> Iterator[None]:
+    """Record some operators that a CUDA device lacks as calls of their own, so that they can be fused with others."""
+    token = _marking.set(True)
+    try:
+        yield
+    finally:
+        _marking.reset(token)
 
 
 def is_capturing() -> bool:
@@ -97,6 +110,9 @@ def compilable(
     fits_graph = keep_in_graph if callable(keep_in_graph) else lambda *_: True
 
     compiled = cache(partial(_compile_by_torch, function))
+    name = operator.__name__ if operator is not None else ""
+    if name in _MARKED:
+        _operators.impl(name, function, "CUDA")  # a graph runs while it is recorded
 
     def check_and_run(*args: Any) -> Any:
         _check(operator, args)
@@ -117,6 +133,8 @@ def compilable(
         if not _graph.get():
             enabled = not _on_cuda(args) if _fused.get() is None else _fused.get()
             return (run_compiled if enabled else check_and_run)(*args)
+        if name in _MARKED and _marking.get() and _plain(args):
+            return getattr(torch.ops.pfbench, name).default(*args)
         if _on_cuda(args):
             return (_find_cuda_kernel(operator, args) or function)(*args)
         _check(operator, args)
@@ -272,6 +290,7 @@ gather_particles = _make_function("gather_particles")
 log_normal = _make_function("log_normal")
 propagate_affine = _make_function("propagate_affine")
 gather_propagate = _make_function("gather_propagate")
+sir_step = _make_function("sir_step")
 count_unique = _make_function("count_unique")
 sum_and_squares = _make_function("sum_and_squares")
 sum_log_weights = _make_function("sum_log_weights")
