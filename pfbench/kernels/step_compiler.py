@@ -304,7 +304,7 @@ def _find_source(node: Any, operator: Any) -> Any:
     """Return the call of `operator` that a node views as [R, N, ...]; None if it is another node."""
     aten, permutations = torch.ops.aten, 0
     copies = aten.alias.default, aten._to_copy.default
-    while isinstance(node, Node) and node.target is not operator:
+    while isinstance(node, Node) and node.target is not operator and node.args:
         source, *options = node.args
         if node.target is aten.permute.default and options == [[1, 2, 0]]:
             permutations += 1
@@ -313,7 +313,7 @@ def _find_source(node: Any, operator: Any) -> Any:
         ):
             return None
         node = source
-    return node if isinstance(node, Node) and permutations == 1 else None
+    return node if _get_target(node) is operator and permutations == 1 else None
 
 
 def _stack_by_component(tensors: Sequence[Tensor], dim: int = 0) -> Tensor:

@@ -314,10 +314,16 @@ def check_step(found: Any, step: Step, factor: float = 1.0) -> None:
 @pytest.mark.parametrize("dtype", REAL)
 @pytest.mark.parametrize("own", [(1, 1), (3, 3)])
 @pytest.mark.parametrize(("n", "d", "width"), MOVES)
-def test_a_step(loop: Loop, n: int, d: int, width: int, own: tuple[int, int], dtype: torch.dtype) -> None:
-    """All in one pass is what its parts are one after the other; also with slots that are not in use."""
+def test_a_step(
+    loop: Loop, n: int, d: int, width: int, own: tuple[int, int], dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All in one pass is what its parts are one after the other.
+
+    Also with slots that are not in use, and where a block takes one run after the other.
+    """
     step = make_step(n, d, width, own, dtype)
     check_step(loop("sir_step", *step), step)
+    monkeypatch.setattr(cuda, "_BLOCKS", 1)
     fewer = step._replace(n=torch.tensor([[n], [n - n // 3], [1]], dtype=dtype))
     check_step(loop("sir_step", *fewer), fewer)
 
@@ -409,6 +415,7 @@ def test_run_numbers_with_gaps_in_memory(loop: Loop) -> None:
 
 
 def test_operators_know_the_shape_of_what_they_make() -> None:
+    dispatch.prepare_compiler()
     with torch._subclasses.FakeTensorMode():
         first, ancestors = torch.zeros(5, 3, 8), torch.zeros(3, 6, dtype=torch.int64)
         args = (

@@ -256,7 +256,7 @@ template <typename T> __device__ double on_grid(T weight) { return trunc((double
 // Ancestors [R, N] by the positions (j + u) / n, and how many are distinct [R]. Marks where each particle's slots begin, and fills up from there. A particle of
 // weight 0 marks nothing. `marks` are [R, N] in global memory, where those of a run do not fit into the block's own (`inside`).
 template <typename T, typename A>
-__global__ void systematic(
+__global__ void __launch_bounds__(512, 3) systematic(
     A* out, long long* distinct, const T* a, const double* n, int n_stride, const double* u, int* marks, int inside, int R, int N) {
     extern __shared__ int own[];
     __shared__ double parts[32];
