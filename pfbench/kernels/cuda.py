@@ -75,7 +75,7 @@ _STATES = {
 }  # components whose sums fit the registers of a thread
 _BLOCK = 512
 _INDEX = {torch.int32: "int", torch.int64: "long long"}
-_PART = 128  # particles of a warp, of which `weighed` leaves one record
+_PART = 128  # particles of a warp; `weighed` writes one record for them
 _BLOCKS = 4096  # several times as many as a device runs at once
 
 
@@ -218,29 +218,27 @@ def _resample_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
     return _resample(a, n, u, torch.int64)[0]
 
 
-def _sir_step(
-    a: Tensor, n: Tensor, u: Tensor, phi: Tensor, x: Tensor, gain: Tensor, seed: Tensor, purpose: int, step: Tensor,
-    runs: Tensor, components: Tensor, y: Tensor, scale: Tensor, constant: Tensor
-) -> tuple[Tensor, ...]:  # fmt: skip
+def _sir_step(*args: Any) -> tuple[Tensor, ...]:
     """Take a step. Particles are read once, written once, and weighed and summed in between."""
+    a, n, u, phi, x, gain, seed, purpose, step, runs, components, y, scale, constant = args
     (d, rows, slots), width, real = x.shape, gain.shape[-1], _REAL[x.dtype]
     ancestors, distinct = _resample(a, n, u, torch.int32)
     out, log_w, w = x.new_empty(d, rows, slots), x.new_empty(rows, slots), x.new_empty(rows, slots)
-    parts = x.new_empty(rows, -(-slots // _PART), 2 * d + 3)
-    given = [part.to(x.dtype).contiguous() for part in (phi, gain, y, scale, constant, n)]
-    per_run = sum((len(part) > 1) << bit for bit, part in enumerate(given))
+    sums = x.new_empty(rows, -(-slots // _PART), 2 * d + 3)
+    numbers = [value.to(x.dtype).contiguous() for value in (phi, gain, y, scale, constant, n)]
+    per_run = sum((len(value) > 1) << bit for bit, value in enumerate(numbers))
     blocks = -(-slots // 512)
-    together = max(1, rows * blocks // _BLOCKS)  # runs that a block takes: it reads the matrices once
+    block_runs = max(1, rows * blocks // _BLOCKS)  # a block reads the matrices once for all of them
     launch_kernel(
-        f"weighed<{real}, {d}, {width}>", (blocks, min(_ROWS, -(-rows // together)), 1), 128, out, log_w, parts,
-        x.contiguous(), ancestors, *given[:2], runs.contiguous(), components.contiguous(), *given[2:], per_run,
+        f"weighed<{real}, {d}, {width}>", (blocks, min(_ROWS, -(-rows // block_runs)), 1), 128, out, log_w, sums,
+        x.contiguous(), ancestors, *numbers[:2], runs.contiguous(), components.contiguous(), *numbers[2:], per_run,
         int(seed), purpose, int(step), len(components), rows, slots, slots,
     )  # fmt: skip
     log_total, ess = x.new_empty(rows), x.new_empty(rows)
     mean, variance = x.new_empty(rows, d), x.new_empty(rows, d)
     launch_kernel(
         f"finished<{real}, {d}>", (-(-slots // 2048), min(_ROWS, rows), 1), 256, log_w, log_total, w, ess, mean, variance,
-        out, parts, parts.shape[1], rows, slots,
+        out, sums, sums.shape[1], rows, slots,
     )  # fmt: skip
     return out, log_w, log_total, w, ess, mean, variance, distinct
 
@@ -250,7 +248,11 @@ def can_take_step(x: Tensor, gain: Tensor) -> bool:
     if x.dtype not in _REAL or len(x) > min(31, _STATES[x.dtype]) or gain.shape[1] != len(x):
         return False
     real, d = _REAL[x.dtype], len(x)
-    kernels = f"weighed<{real}, {d}, {gain.shape[-1]}>", f"finished<{real}, {d}>", f"systematic<{real}, int>"
+    kernels = (
+        f"weighed<{real}, {d}, {gain.shape[-1]}>",
+        f"finished<{real}, {d}>",
+        f"systematic<{real}, int>",
+    )
     return all(_compiles(name) for name in kernels)
 
 

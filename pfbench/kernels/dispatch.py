@@ -110,9 +110,6 @@ def compilable(
     fits_graph = keep_in_graph if callable(keep_in_graph) else lambda *_: True
 
     compiled = cache(partial(_compile_by_torch, function))
-    name = operator.__name__ if operator is not None else ""
-    if name in _MARKED:
-        _operators.impl(name, function, "CUDA")  # a graph runs while it is recorded
 
     def check_and_run(*args: Any) -> Any:
         _check(operator, args)
@@ -133,15 +130,29 @@ def compilable(
         if not _graph.get():
             enabled = not _on_cuda(args) if _fused.get() is None else _fused.get()
             return (run_compiled if enabled else check_and_run)(*args)
-        if name in _MARKED and _marking.get() and _plain(args):
-            return getattr(torch.ops.pfbench, name).default(*args)
-        if _on_cuda(args):
-            return (_find_cuda_kernel(operator, args) or function)(*args)
+        if (mark := _find_mark(function, operator, args)) or _on_cuda(args):
+            return (mark or _find_cuda_kernel(operator, args) or function)(*args)
         _check(operator, args)
         # tangents do not pass an operator: a derivative through it would be zero
         return (in_graph if in_graph and _plain(args) and fits_graph(*args) else function)(*args)
 
     return cast(F, call)
+
+
+def _find_mark(
+    function: Callable[..., Any], operator: Callable[..., Any] | None, args: tuple[Any, ...]
+) -> Callable[..., Any] | None:
+    """Return the operator to record in place of a function, None if its operations are to be recorded."""
+    if operator is None or operator.__name__ not in _MARKED:
+        return None
+    return _make_mark(function, operator.__name__) if _marking.get() and _plain(args) else None
+
+
+@cache
+def _make_mark(function: Callable[..., Any], name: str) -> Callable[..., Any]:
+    """Return an operator that runs a function on a CUDA device, because a step runs while it is recorded."""
+    _operators.impl(name, function, "CUDA")
+    return cast(Callable[..., Any], getattr(torch.ops.pfbench, name).default)
 
 
 def _find_cuda_kernel(

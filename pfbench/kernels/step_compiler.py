@@ -87,11 +87,7 @@ def compile_function(
     decompositions = {torch.ops.aten.stack.default: _stack_by_component}
     trace = make_fx(function, decomposition_table=decompositions)
     on_cpu = not any(a.is_cuda for a in example)
-    graph = None if on_cpu else _trace_fused(trace, example)
-    graph = graph or trace(*example)
-    if not on_cpu:
-        _fuse_propagation(graph.graph)
-        graph.recompile()
+    graph = trace(*example) if on_cpu else _trace_for_device(trace, example)
     # On the CPU the calls of the kernels are compiled with them: from Python they take 50 % longer.
     shims = {"aot_inductor.custom_ops_to_c_shims": declare_shims()} if on_cpu else {}
     # The shapes are those of the example, so their checks are left out.
@@ -143,13 +139,14 @@ def _fuse_propagation(graph: Operations) -> None:
     graph.eliminate_dead_code()
 
 
-def _trace_fused(trace: Callable[..., GraphModule], example: list[Tensor]) -> GraphModule | None:
-    """Record a step of a SIR filter with one operator of a CUDA device; return None if it is another step."""
+def _trace_for_device(trace: Callable[..., GraphModule], example: list[Tensor]) -> GraphModule:
+    """Record a step with operators of a CUDA device: one for the whole step of a SIR filter, and one for propagation."""
     with mark_operators():
         graph = trace(*example)
     _fuse_propagation(graph.graph)
-    if not _fuse_steps(graph):
-        return None
+    if not _fuse_steps(graph):  # another step
+        graph = trace(*example)
+        _fuse_propagation(graph.graph)
     graph.recompile()
     return graph
 
@@ -163,65 +160,82 @@ def _fuse_steps(module: GraphModule) -> bool:
     """
     graph, ops = module.graph, torch.ops.pfbench
     marked = ops.log_normal.default, ops.sum_log_weights.default, ops.normalise_weights.default
-    for normalised in graph.find_nodes(op="call_function", target=marked[-1]):
-        found = _match_step(module, normalised)
-        if found is None:
+    for weights in graph.find_nodes(op="call_function", target=marked[-1]):
+        match = _match_step(module, weights)
+        if match is None:
             continue
-        arguments, moved, counts = found
-        results = _call_before(normalised, ops.sir_step.default, arguments, 8)
-        w = next((a for a in normalised.users if a.args[1] == 2), None)
+        propagation, counts, arguments = match
+        results = _call_before(weights, ops.sir_step.default, arguments, 8)
+        w = next((node for node in weights.users if node.args[1] == 2), None)
         moments = [
             node
             for node in (w.users if w is not None else ())
             if node.target is ops.weighted_moments.default
-            and _strip_permutations(node.args[0], (1, 2, 0)) is moved
+            and _strip_permutations(node.args[0], (1, 2, 0)) is propagation
         ]
-        for first, node in ((1, normalised), *((5, node) for node in moments)):
-            for part in list(node.users):
-                part.replace_all_uses_with(results[first + part.args[1]])
+        for first, node in ((1, weights), *((5, node) for node in moments)):
+            for result in list(node.users):
+                result.replace_all_uses_with(results[first + result.args[1]])
         for count in counts:
             count.replace_all_uses_with(results[7])
-        moved.replace_all_uses_with(results[0])
+        propagation.replace_all_uses_with(results[0])
         _move_behind(results)
         graph.eliminate_dead_code()
     return not any(node.target in marked for node in graph.nodes)
 
 
-def _match_step(module: GraphModule, normalised: Node) -> tuple[tuple[Any, ...], Node, list[Node]] | None:
-    """Return the arguments of `sir_step` for a step that ends with these weights, the move and the counts of ancestors.
+def _match_step(
+    module: GraphModule, weights: Node
+) -> tuple[Node, list[Node], tuple[Any, ...]] | None:
+    """Return propagation, counts of ancestors and arguments of `sir_step` for a step with these normalised weights.
 
     None if it is another step, or one that the kernel does not take.
     """
+    ops, measurement = torch.ops.pfbench, _match_measurement(module, weights.args[0])
+    if measurement is None:
+        return None
+    propagation, prior, measured = measurement
+    phi, x, ancestors, gain, *key = propagation.args
+    if _get_target(ancestors) is not ops.resample_systematic.default:
+        return None
+    a, n, u = ancestors.args
+    counts = [node for node in ancestors.users if node is not propagation]
+    arguments = a, n, u, phi, x, gain, *key, *measured
+    fits = (
+        all(node.target is ops.count_unique.default and node.args[1] is prior for node in counts)
+        and _is_equal_weight(prior, n)
+        and not _depend_on(arguments, propagation)
+        and cuda.can_take_step(x.meta["val"], gain.meta["val"])
+    )
+    return (propagation, counts, arguments) if fits else None
+
+
+def _match_measurement(module: GraphModule, total: Any) -> tuple[Any, Any, tuple[Any, ...]] | None:
+    """Return propagation, prior log weights, and components, measurements, scales and constants of log weights.
+
+    None unless they are a prior and a normal density of different components of propagated particles.
+    """
     aten, ops, target = torch.ops.aten, torch.ops.pfbench, _get_target
     views = aten.expand.default, aten.alias.default, aten.slice.Tensor
-    total = normalised.args[0]
     if target(total) is not ops.sum_log_weights.default:
         return None
     likelihood, prior, ratio = total.args
     likelihood, ratio = _strip(likelihood, views[:2]), _strip(ratio, views)
-    if target(likelihood) is not ops.log_normal.default or target(ratio) is not aten.zeros_like.default:
+    is_normal = target(likelihood) is ops.log_normal.default
+    if not is_normal or target(ratio) is not aten.zeros_like.default:
         return None
     y, mean, scale, constant = likelihood.args
-    chosen = _strip_permutations(mean, (1, 2, 0))
-    if target(chosen) is not aten.index_select.default or chosen.args[1] != 0:
+    selection = _strip_permutations(mean, (1, 2, 0))
+    if target(selection) is not aten.index_select.default or selection.args[1] != 0:
         return None
-    moved, components = _strip_permutations(chosen.args[0], (0, 1, 2)), chosen.args[2]
+    propagation = _strip_permutations(selection.args[0], (0, 1, 2))
+    components = selection.args[2]
     indices = getattr(module, str(components.target)) if components.op == "get_attr" else None
-    if target(moved) is not ops.gather_propagate.default or indices is None or len(indices.unique()) < len(indices):
+    if indices is None or len(indices.unique()) < len(indices):
         return None
-    phi, x, ancestors, gain, *key = moved.args
-    if target(ancestors) is not ops.resample_systematic.default:
+    if target(propagation) is not ops.gather_propagate.default:
         return None
-    a, n, u = ancestors.args
-    counts = [node for node in ancestors.users if node is not moved]
-    arguments = a, n, u, phi, x, gain, *key, components, y, scale, constant
-    fits = (
-        all(target(node) is ops.count_unique.default and node.args[1] is prior for node in counts)
-        and _is_equal_weight(prior, n)
-        and not _depend_on(arguments, moved)
-        and cuda.can_take_step(x.meta["val"], gain.meta["val"])
-    )
-    return (arguments, moved, counts) if fits else None
+    return propagation, prior, (components, y, scale, constant)
 
 
 def _get_target(node: Any) -> Any:
@@ -266,16 +280,17 @@ def _is_equal_weight(node: Any, n: Any) -> bool:
     )
 
 
-def _depend_on(arguments: Sequence[Any], node: Node) -> bool:
+def _depend_on(arguments: Sequence[Any], source: Node) -> bool:
     """Return whether one of some arguments is computed from a node."""
-    waiting, seen = [a for a in arguments if isinstance(a, Node)], set()
+    waiting: list[Node] = [a for a in arguments if isinstance(a, Node)]
+    visited: set[Node] = set()
     while waiting:
-        one = waiting.pop()
-        if one is node:
+        node = waiting.pop()
+        if node is source:
             return True
-        if one not in seen:
-            seen.add(one)
-            waiting += one.all_input_nodes
+        if node not in visited:
+            visited.add(node)
+            waiting += node.all_input_nodes
     return False
 
 

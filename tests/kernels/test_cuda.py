@@ -108,7 +108,10 @@ def loop(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Loo
 
         def on_device(name: str, *args: Any) -> Any:
             there = [a.cuda() if isinstance(a, Tensor) and a.dim() else a for a in args]
-            assert name in ("gather_propagate", "sir_step") or cuda.find_kernel(name, tuple(there)) is not None
+            assert (
+                name in ("gather_propagate", "sir_step")
+                or cuda.find_kernel(name, tuple(there)) is not None
+            )
             found = getattr(torch.ops.pfbench, name).default(*there)
             return found.cpu() if isinstance(found, Tensor) else [part.cpu() for part in found]
 
@@ -267,7 +270,10 @@ def make_step(n: int, d: int, width: int, own: tuple[int, int], dtype: torch.dty
     made, runs = PhiloxStream(4, torch.arange(3), dtype), 3
     components = torch.arange(0, d, 2).flip(0)
     phi, gain = made.normal("phi", d, d)[: own[0]], made.normal("gain", d, width)[: own[1]]
-    y, scale = made.normal("y", 1, len(components))[:, 0], 3.0 * made.uniform("s", 1, len(components))[:, 0]
+    y, scale = (
+        made.normal("y", 1, len(components))[:, 0],
+        3.0 * made.uniform("s", 1, len(components))[:, 0],
+    )
     scale[-1, 0] = 0.0
     _, a = cloud_of(runs, n, d, dtype)
     return Step(
@@ -280,16 +286,20 @@ def make_step(n: int, d: int, width: int, own: tuple[int, int], dtype: torch.dty
 
 def one_after_the_other(step: Step) -> list[Tensor]:
     """What `sir_step` stands for; moments in double precision."""
-    (d, runs, n), dtype = step.x.shape, step.x.dtype
+    (_, runs, n), dtype = step.x.shape, step.x.dtype
     ancestors = stages._eager_systematic(step.a, step.n, step.u)
-    draw = random_stream.draw_normals if dtype == torch.float32 else random_stream.draw_normals_float64
+    draw = (
+        random_stream.draw_normals if dtype == torch.float32 else random_stream.draw_normals_float64
+    )
     noise = draw(*step[6:10], step.gain.shape[-1], -(-n // 4))[..., :n].permute(1, 2, 0)
     parents = belief._select_components(step.x, ancestors).permute(1, 2, 0)
     x = linear_algebra._dense_affine(step.phi, parents, step.gain, noise)
     prior = torch.where(torch.arange(n) < step.n, -torch.log(step.n), -torch.inf).expand(runs, n)
     mean = x.permute(1, 2, 0)[..., step.components]
     likelihood = density._run_quadratic(step.y, mean, step.scale, step.constant)
-    weights = belief._separate_normalise(belief._separate_sum(likelihood, prior, torch.zeros(runs, 1)))
+    weights = belief._separate_normalise(
+        belief._separate_sum(likelihood, prior, torch.zeros(runs, 1))
+    )
     moments = belief._separate_moments(x.permute(1, 2, 0).double(), weights[2].double())
     return [x, *weights, *moments, belief._count_distinct(ancestors, prior)]
 
@@ -315,7 +325,13 @@ def check_step(found: Any, step: Step, factor: float = 1.0) -> None:
 @pytest.mark.parametrize("own", [(1, 1), (3, 3)])
 @pytest.mark.parametrize(("n", "d", "width"), MOVES)
 def test_a_step(
-    loop: Loop, n: int, d: int, width: int, own: tuple[int, int], dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
+    loop: Loop,
+    n: int,
+    d: int,
+    width: int,
+    own: tuple[int, int],
+    dtype: torch.dtype,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """All in one pass is what its parts are one after the other.
 
@@ -348,9 +364,13 @@ def test_a_step_far_from_the_origin_and_of_lost_runs(loop: Loop, dtype: torch.dt
     found, wanted = loop("sir_step", *lost), one_after_the_other(lost)
     assert (wanted[2] == -torch.inf).tolist() == [True, True, False]
     for k in (1, 2, 3, 4):
-        torch.testing.assert_close(found[k], wanted[k], rtol=1e3 * FINE[dtype], atol=1e3 * FINE[dtype])
+        torch.testing.assert_close(
+            found[k], wanted[k], rtol=1e3 * FINE[dtype], atol=1e3 * FINE[dtype]
+        )
     for k in (5, 6):
-        torch.testing.assert_close(found[k].double(), wanted[k], rtol=1e3 * FINE[dtype], atol=1e2 * FINE[dtype])
+        torch.testing.assert_close(
+            found[k].double(), wanted[k], rtol=1e3 * FINE[dtype], atol=1e2 * FINE[dtype]
+        )
 
 
 def test_a_nan_of_a_particle_reaches_the_mean_of_its_run_alone(loop: Loop) -> None:
@@ -360,17 +380,31 @@ def test_a_nan_of_a_particle_reaches_the_mean_of_its_run_alone(loop: Loop) -> No
     parent = int(stages._eager_systematic(step.a, step.n, step.u)[1, 300])
     x[0, 1, parent] = torch.nan
     found = loop("sir_step", *step._replace(x=x))
-    assert torch.isnan(found[5][1]).any() and torch.isfinite(found[5][[0, 2]]).all()
-    assert (found[3][1] == 0.0).any() and torch.isfinite(found[3]).all()
+    assert torch.isnan(found[5][1]).any()
+    assert torch.isfinite(found[5][[0, 2]]).all()
+    assert (found[3][1] == 0.0).any()
+    assert torch.isfinite(found[3]).all()
 
 
-def test_more_states_than_registers_hold_are_left_to_torch() -> None:
+def test_what_no_kernel_takes_is_left_to_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """More states than registers hold, other types, and kernels that do not compile."""
+
     def x(d: int, dtype: torch.dtype) -> Tensor:
         return torch.empty(100, 10, d, dtype=dtype)
 
     def taken(d: int, dtype: torch.dtype) -> bool:
         return cuda._ACCEPTS["propagate_affine"](torch.empty(1, d, d), x(d, dtype), None, None)
 
+    def step_taken(d: int, dtype: torch.dtype, rows: int) -> bool:
+        return cuda.can_take_step(torch.empty(d, 100, 10, dtype=dtype), torch.empty(1, rows, 2))
+
+    monkeypatch.setattr(cuda, "_compiles", lambda name: True)
+    assert [step_taken(d, torch.float32, d) for d in (31, 32)] == [True, False]
+    assert [step_taken(d, torch.float64, d) for d in (20, 21)] == [True, False]
+    assert not step_taken(4, torch.float32, 5)
+    assert not step_taken(4, torch.float16, 4)
+    monkeypatch.setattr(cuda, "_compiles", lambda name: "finished" not in name)
+    assert not step_taken(4, torch.float32, 4)
     assert [taken(d, torch.float32) for d in (32, 33)] == [True, False]
     assert [taken(d, torch.float64) for d in (20, 21)] == [True, False]
     assert not taken(2, torch.float16)
@@ -416,7 +450,8 @@ def test_run_numbers_with_gaps_in_memory(loop: Loop) -> None:
 
 def test_operators_know_the_shape_of_what_they_make() -> None:
     dispatch.prepare_compiler()
-    with torch._subclasses.FakeTensorMode():
+    step = make_step(8, 5, 2, (1, 3), torch.float32)
+    with torch._subclasses.FakeTensorMode() as mode:
         first, ancestors = torch.zeros(5, 3, 8), torch.zeros(3, 6, dtype=torch.int64)
         args = (
             torch.zeros(1, 5, 5),
@@ -429,3 +464,6 @@ def test_operators_know_the_shape_of_what_they_make() -> None:
             torch.arange(3),
         )
         assert dispatch.gather_propagate(*args).shape == (5, 3, 6)
+        fakes = [mode.from_tensor(a) if isinstance(a, Tensor) else a for a in step]
+        shapes = [tuple(part.shape) for part in dispatch.sir_step(*fakes)]
+        assert shapes == [(5, 3, 8), (3, 8), (3,), (3, 8), (3,), (3, 5), (3, 5), (3,)]

@@ -23,8 +23,8 @@ from pfbench.filter.health import HealthMonitor
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle import compiled_filter, step_store
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.particle_count import CountLimits, EssTargetCount
+from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.resampling import Stratified
 from pfbench.filter.particle.stages import EssResampler, Proposal, Systematic
 from pfbench.filter.particle.weights import LookAheadWeights, PowerLikelihoodUpdate
@@ -388,6 +388,18 @@ class Doubted(Picked):
         return independent_normal(picked.mean, scale.expand_as(picked.mean))
 
 
+class Tilted(EssResampler):
+    """Slots have different weights."""
+
+    is_exact = False
+
+    def __call__(self, *args: Any) -> Any:
+        resampled, mask = super().__call__(*args)
+        n = resampled.log_w.shape[1]
+        log_w = torch.log_softmax(torch.linspace(0.0, 1.0, n, dtype=torch.float64), 0)
+        return resampled._replace(log_w=log_w.expand_as(resampled.log_w).contiguous()), mask
+
+
 ALWAYS = EssResampler(Systematic(), 1.0)
 
 
@@ -400,6 +412,7 @@ ALWAYS = EssResampler(Systematic(), 1.0)
         (Picked((1, 1)), {}, False),
         (Doubted(), {}, False),
         (Picked(), {"resampler": EssResampler(Systematic(), 0.5)}, False),
+        (Picked(), {"resampler": Tilted(Systematic(), 1.0)}, False),
         (Picked(), {"resampler": EssResampler(Stratified(), 1.0)}, False),
         (Picked(), {"auxiliary_weights": LookAheadWeights()}, False),
         (Picked(), {"weight_update": PowerLikelihoodUpdate(2.0)}, False),
@@ -416,13 +429,23 @@ def test_a_step_is_one_operator_where_nothing_comes_between(
         runs: Tensor, components: Tensor, *measured: Tensor
     ) -> tuple[Tensor, ...]:  # fmt: skip
         ancestors = dispatch.resample_systematic(a, n, u)
-        noise = dispatch.philox_normals_float64(seed, purpose, step, runs, gain.shape[-1], -(-a.shape[1] // 4))
+        noise = dispatch.philox_normals_float64(
+            seed, purpose, step, runs, gain.shape[-1], -(-a.shape[1] // 4)
+        )
         parents = dispatch.gather_particles(x, ancestors).permute(1, 2, 0)
-        moved = dispatch.propagate_affine(phi, parents, gain, noise[..., : a.shape[1]].permute(1, 2, 0))
+        moved = dispatch.propagate_affine(
+            phi, parents, gain, noise[..., : a.shape[1]].permute(1, 2, 0)
+        )
         cloud, y = moved.permute(1, 2, 0), measured[0]
-        prior = torch.where(torch.arange(a.shape[1]) < n, -torch.log(n), -torch.inf).expand_as(a).contiguous()
+        prior = (
+            torch.where(torch.arange(a.shape[1]) < n, -torch.log(n), -torch.inf)
+            .expand_as(a)
+            .contiguous()
+        )
         likelihood = dispatch.log_normal(y, cloud[..., components], *measured[1:])
-        weights = dispatch.normalise_weights(dispatch.sum_log_weights(likelihood, prior, torch.zeros_like(prior)))
+        weights = dispatch.normalise_weights(
+            dispatch.sum_log_weights(likelihood, prior, torch.zeros_like(prior))
+        )
         moments = dispatch.weighted_moments(cloud, weights[2])
         return moved, *weights, *moments, dispatch.count_unique(ancestors, prior)
 
@@ -437,7 +460,13 @@ def test_a_step_is_one_operator_where_nothing_comes_between(
     assert ("pfbench.sir_step" in graph.code) == taken
     if not taken:
         return
-    gone = "normalise_weights", "weighted_moments", "count_unique", "gather_propagate", "resample_systematic"
+    gone = (
+        "normalise_weights",
+        "weighted_moments",
+        "count_unique",
+        "gather_propagate",
+        "resample_systematic",
+    )
     assert not [name for name in gone if name in graph.code]
     with torch.library._scoped_library("pfbench", "IMPL") as library:
         library.impl("sir_step", one_after_the_other, "CPU")
