@@ -74,6 +74,9 @@ _STATES = {
     torch.float64: 20,
 }  # components whose sums fit the registers of a thread
 _BLOCK = 512
+_INDEX = {torch.int32: "int", torch.int64: "long long"}
+_PART = 128  # particles of a warp; `weighed` writes one record for them
+_BLOCKS = 4096  # several times as many as a device runs at once
 
 
 @cache
@@ -83,10 +86,10 @@ def is_cuda_available() -> bool:
 
 
 @cache
-def _compiles() -> bool:
-    """Return whether torch compiles CUDA C++ here, which needs headers of a CUDA toolkit."""
+def _compiles(name: str = "uniforms") -> bool:
+    """Return whether torch compiles a kernel here, which needs headers of a CUDA toolkit."""
     try:
-        compile_kernel("uniforms", torch.cuda.current_device())
+        compile_kernel(name, torch.cuda.current_device())
     except Exception as error:  # torch raises many kinds
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         log.warning("CUDA kernels do not compile here (%s). Using torch's compiler", reason)
@@ -196,18 +199,61 @@ def _gather_propagate(
     return _affine(phi, x.contiguous(), gain, ancestors.shape[1], ancestors.contiguous(), key)
 
 
-def _resample_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
-    """Resample systematically."""
+def _resample(a: Tensor, n: Tensor, u: Tensor, index: torch.dtype) -> tuple[Tensor, Tensor]:
+    """Resample systematically. Returns ancestors [R, N] of a type and how many of them are distinct, int64 [R]."""
     runs, slots = a.shape
-    out = a.new_empty(runs, slots, dtype=torch.int64)
-    inside = 4 * slots <= _SHARED - 1024
+    out, distinct = a.new_empty(runs, slots, dtype=index), a.new_empty(runs, dtype=torch.int64)
+    inside = 4 * slots <= _SHARED - 2048
     blocks = min(runs, _ROWS)
     marks = out if inside else a.new_empty(blocks, slots, dtype=torch.int32)
     counts, uniforms = n.double().contiguous(), u.double().contiguous()
     args = a.contiguous(), counts, int(len(n) > 1), uniforms, marks, int(inside), runs, slots
-    name, shared = f"systematic<{_REAL[a.dtype]}>", 4 * slots if inside else 0
-    launch_kernel(name, (blocks, 1, 1), _BLOCK, out, *args, shared=shared)
-    return out
+    name, shared = f"systematic<{_REAL[a.dtype]}, {_INDEX[index]}>", 4 * slots if inside else 0
+    launch_kernel(name, (blocks, 1, 1), _BLOCK, out, distinct, *args, shared=shared)
+    return out, distinct
+
+
+def _resample_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
+    """Resample systematically."""
+    return _resample(a, n, u, torch.int64)[0]
+
+
+def _sir_step(*args: Any) -> tuple[Tensor, ...]:
+    """Take a step. Particles are read once, written once, and weighed and summed in between."""
+    a, n, u, phi, x, gain, seed, purpose, step, runs, components, y, scale, constant = args
+    (d, rows, slots), width, real = x.shape, gain.shape[-1], _REAL[x.dtype]
+    ancestors, distinct = _resample(a, n, u, torch.int32)
+    out, log_w, w = x.new_empty(d, rows, slots), x.new_empty(rows, slots), x.new_empty(rows, slots)
+    sums = x.new_empty(rows, -(-slots // _PART), 2 * d + 3)
+    numbers = [value.to(x.dtype).contiguous() for value in (phi, gain, y, scale, constant, n)]
+    per_run = sum((len(value) > 1) << bit for bit, value in enumerate(numbers))
+    blocks = -(-slots // 512)
+    block_runs = max(1, rows * blocks // _BLOCKS)  # a block reads the matrices once for all of them
+    launch_kernel(
+        f"weighed<{real}, {d}, {width}>", (blocks, min(_ROWS, -(-rows // block_runs)), 1), 128, out, log_w, sums,
+        x.contiguous(), ancestors, *numbers[:2], runs.contiguous(), components.contiguous(), *numbers[2:], per_run,
+        int(seed), purpose, int(step), len(components), rows, slots, slots,
+    )  # fmt: skip
+    log_total, ess = x.new_empty(rows), x.new_empty(rows)
+    mean, variance = x.new_empty(rows, d), x.new_empty(rows, d)
+    launch_kernel(
+        f"finished<{real}, {d}>", (-(-slots // 2048), min(_ROWS, rows), 1), 256, log_w, log_total, w, ess, mean, variance,
+        out, sums, sums.shape[1], rows, slots,
+    )  # fmt: skip
+    return out, log_w, log_total, w, ess, mean, variance, distinct
+
+
+def can_take_step(x: Tensor, gain: Tensor) -> bool:
+    """Return whether `sir_step` takes particles [D, R, N] with a noise gain [R or 1, D, W], and compiles for them."""
+    if x.dtype not in _REAL or len(x) > min(31, _STATES[x.dtype]) or gain.shape[1] != len(x):
+        return False
+    real, d = _REAL[x.dtype], len(x)
+    kernels = (
+        f"weighed<{real}, {d}, {gain.shape[-1]}>",
+        f"finished<{real}, {d}>",
+        f"systematic<{real}, int>",
+    )
+    return all(_compiles(name) for name in kernels)
 
 
 def _count_unique(ancestors: Tensor, log_w: Tensor) -> Tensor:
@@ -249,7 +295,7 @@ KERNELS: dict[str, Callable[..., Any]] = {
     kernel.__name__.removeprefix("_"): check_first(kernel)
     for kernel in (
         _philox_normals, _philox_normals_float64, _philox_uniforms, _gather_particles,
-        _propagate_affine, _gather_propagate, _resample_systematic, _count_unique, _weighted_moments,
+        _propagate_affine, _gather_propagate, _resample_systematic, _count_unique, _weighted_moments, _sir_step,
     )
 }  # fmt: skip
 """Operators of `pfbench.kernels.dispatch` on a CUDA device. They do not check values: the host would wait."""

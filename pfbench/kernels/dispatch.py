@@ -34,6 +34,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 # None: operators on the CPU, where they cost nothing, and torch operations on other devices
 _fused: ContextVar[bool | None] = ContextVar("fused", default=None)
 _graph: ContextVar[bool] = ContextVar("graph", default=False)
+_marking: ContextVar[bool] = ContextVar("marking", default=False)
+# What `sir_step` does after the particles have moved. In a graph these are torch operations, unless they are marked.
+_MARKED = ("log_normal", "sum_log_weights", "normalise_weights")
 _peek_transform = (
     torch._C._functorch.peek_interpreter_stack
 )  # None outside of torch.vmap and its like
@@ -57,6 +60,16 @@ def capture_graph(enabled: bool = True) -> Iterator[None]:
         yield
     finally:
         _graph.reset(token)
+
+
+@contextmanager
+def mark_operators() -> Iterator[None]:
+    """Record some operators that a CUDA device lacks as calls of their own, so that they can be fused with others."""
+    token = _marking.set(True)
+    try:
+        yield
+    finally:
+        _marking.reset(token)
 
 
 def is_capturing() -> bool:
@@ -117,13 +130,29 @@ def compilable(
         if not _graph.get():
             enabled = not _on_cuda(args) if _fused.get() is None else _fused.get()
             return (run_compiled if enabled else check_and_run)(*args)
-        if _on_cuda(args):
-            return (_find_cuda_kernel(operator, args) or function)(*args)
+        if (mark := _find_mark(function, operator, args)) or _on_cuda(args):
+            return (mark or _find_cuda_kernel(operator, args) or function)(*args)
         _check(operator, args)
         # tangents do not pass an operator: a derivative through it would be zero
         return (in_graph if in_graph and _plain(args) and fits_graph(*args) else function)(*args)
 
     return cast(F, call)
+
+
+def _find_mark(
+    function: Callable[..., Any], operator: Callable[..., Any] | None, args: tuple[Any, ...]
+) -> Callable[..., Any] | None:
+    """Return the operator to record in place of a function, None if its operations are to be recorded."""
+    if operator is None or operator.__name__ not in _MARKED:
+        return None
+    return _make_mark(function, operator.__name__) if _marking.get() and _plain(args) else None
+
+
+@cache
+def _make_mark(function: Callable[..., Any], name: str) -> Callable[..., Any]:
+    """Return an operator that runs a function on a CUDA device, because a step runs while it is recorded."""
+    _operators.impl(name, function, "CUDA")
+    return cast(Callable[..., Any], getattr(torch.ops.pfbench, name).default)
 
 
 def _find_cuda_kernel(
@@ -272,6 +301,7 @@ gather_particles = _make_function("gather_particles")
 log_normal = _make_function("log_normal")
 propagate_affine = _make_function("propagate_affine")
 gather_propagate = _make_function("gather_propagate")
+sir_step = _make_function("sir_step")
 count_unique = _make_function("count_unique")
 sum_and_squares = _make_function("sum_and_squares")
 sum_log_weights = _make_function("sum_log_weights")

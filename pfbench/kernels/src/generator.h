@@ -43,8 +43,22 @@ ON_DEVICE Words philox(word c0, word c1, word c2, word c3, word k0, word k1) {
 #ifdef __CUDACC__
 ON_DEVICE float add(float a, float b) { return __fadd_rn(a, b); }
 ON_DEVICE float mul(float a, float b) { return __fmul_rn(a, b); }
-ON_DEVICE float div(float a, float b) { return __fdiv_rn(a, b); }
-ON_DEVICE float root(float a) { return __fsqrt_rn(a); }
+// Quotient and root are those of __fdiv_rn and __fsqrt_rn, without their branch for arguments that never come here: the branches keep
+// the two numbers of a pair, and the pairs, from being made at the same time.
+ON_DEVICE float div(float a, float b) {  // b from 1.7 to 2.5, and a is 0 or at least 2^-24 times as large
+    float r;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(b));
+    r = __fmaf_rn(r, __fmaf_rn(-b, r, 1.0f), r);
+    const float q = __fmul_rn(a, r);
+    return __fmaf_rn(r, __fmaf_rn(-b, q, a), q);
+}
+ON_DEVICE float root(float a) {  // a is 0 or from 2^-24 to 2^6
+    float r;
+    asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(a));
+    r = fminf(r, 0x1p60f);  // of 0 it is infinite
+    const float s = __fmul_rn(a, r);
+    return __fmaf_rn(__fmaf_rn(-s, s, a), __fmul_rn(r, 0.5f), s);
+}
 ON_DEVICE double add(double a, double b) { return __dadd_rn(a, b); }
 ON_DEVICE double mul(double a, double b) { return __dmul_rn(a, b); }
 ON_DEVICE double div(double a, double b) { return __ddiv_rn(a, b); }

@@ -13,6 +13,7 @@ from compiled_cases import RUNS, STEPS, agree, compiler, record_of, run
 from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 
+from pfbench.core.density import independent_normal
 from pfbench.core.linear_algebra import affine_map
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
@@ -22,10 +23,13 @@ from pfbench.filter.health import HealthMonitor
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle import compiled_filter, step_store
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
+from pfbench.filter.particle.particle_count import CountLimits, EssTargetCount
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.stages import Proposal
+from pfbench.filter.particle.resampling import Stratified
+from pfbench.filter.particle.stages import EssResampler, Proposal, Systematic
+from pfbench.filter.particle.weights import LookAheadWeights, PowerLikelihoodUpdate
 from pfbench.job.scoring import LikelihoodCounter
-from pfbench.kernels import dispatch, step_compiler
+from pfbench.kernels import cuda, dispatch, step_compiler
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.model.textbook import UnivariateGrowth
@@ -354,6 +358,118 @@ def test_copies_noise_and_move_are_joined_where_nothing_comes_between(
     assert ("pfbench.philox_normals" in graph.code) == (not joined)
     with torch.library._scoped_library("pfbench", "IMPL") as library:
         library.impl("gather_propagate", driven, "CPU")
+        found = graph(*given)
+    for one, other in zip(found, wanted, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
+
+
+class Picked(Moved):
+    """Some of its components are measured."""
+
+    def __init__(self, indices: tuple[int, ...] = (1, 0)) -> None:
+        rows = torch.eye(2, dtype=torch.float64)[list(indices)].tolist()
+        super().__init__(
+            [[1.0, 0.5], [0.0, 0.9]], [[0.6, 0.1], [0.2, 0.5]], rows, [0.5] * len(rows), [0.3, -0.2], [1.5, 1.0]
+        )  # fmt: skip
+        self.register_buffer("indices", torch.tensor(indices))
+        self.register_buffer("scale", torch.linspace(0.4, 0.7, len(rows), dtype=torch.float64))
+
+    def observation(self, x: Tensor, u: Any) -> Any:
+        picked = x.permute(2, 0, 1).index_select(0, self.indices).permute(1, 2, 0)
+        return independent_normal(picked, self.scale)
+
+
+class Doubted(Picked):
+    """Its errors are as large as the mean of its particles says."""
+
+    def observation(self, x: Tensor, u: Any) -> Any:
+        picked = super().observation(x, u)
+        scale = 0.5 + x.mean(1, keepdim=True).abs()
+        return independent_normal(picked.mean, scale.expand_as(picked.mean))
+
+
+class Tilted(EssResampler):
+    """Slots have different weights."""
+
+    is_exact = False
+
+    def __call__(self, *args: Any) -> Any:
+        resampled, mask = super().__call__(*args)
+        n = resampled.log_w.shape[1]
+        log_w = torch.log_softmax(torch.linspace(0.0, 1.0, n, dtype=torch.float64), 0)
+        return resampled._replace(log_w=log_w.expand_as(resampled.log_w).contiguous()), mask
+
+
+ALWAYS = EssResampler(Systematic(), 1.0)
+
+
+@compiler
+@pytest.mark.parametrize(
+    ("model", "stages", "taken"),
+    [
+        (Picked(), {}, True),
+        (Picked((1,)), {}, True),
+        (Picked((1, 1)), {}, False),
+        (Doubted(), {}, False),
+        (Picked(), {"resampler": EssResampler(Systematic(), 0.5)}, False),
+        (Picked(), {"resampler": Tilted(Systematic(), 1.0)}, False),
+        (Picked(), {"resampler": EssResampler(Stratified(), 1.0)}, False),
+        (Picked(), {"auxiliary_weights": LookAheadWeights()}, False),
+        (Picked(), {"weight_update": PowerLikelihoodUpdate(2.0)}, False),
+        (Picked(), {"particle_count": EssTargetCount(100.0, CountLimits(4000, 4100, 4100))}, True),
+    ],
+)
+def test_a_step_is_one_operator_where_nothing_comes_between(
+    model: Any, stages: dict[str, Any], taken: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As for a CUDA device; here `one_after_the_other` is what it stands for. Other steps are left as they are."""
+
+    def one_after_the_other(
+        a: Tensor, n: Tensor, u: Tensor, phi: Tensor, x: Tensor, gain: Tensor, seed: Tensor, purpose: int, step: Tensor,
+        runs: Tensor, components: Tensor, *measured: Tensor
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        ancestors = dispatch.resample_systematic(a, n, u)
+        noise = dispatch.philox_normals_float64(
+            seed, purpose, step, runs, gain.shape[-1], -(-a.shape[1] // 4)
+        )
+        parents = dispatch.gather_particles(x, ancestors).permute(1, 2, 0)
+        moved = dispatch.propagate_affine(
+            phi, parents, gain, noise[..., : a.shape[1]].permute(1, 2, 0)
+        )
+        cloud, y = moved.permute(1, 2, 0), measured[0]
+        prior = (
+            torch.where(torch.arange(a.shape[1]) < n, -torch.log(n), -torch.inf)
+            .expand_as(a)
+            .contiguous()
+        )
+        likelihood = dispatch.log_normal(y, cloud[..., components], *measured[1:])
+        weights = dispatch.normalise_weights(
+            dispatch.sum_log_weights(likelihood, prior, torch.zeros_like(prior))
+        )
+        moments = dispatch.weighted_moments(cloud, weights[2])
+        return moved, *weights, *moments, dispatch.count_unique(ancestors, prior)
+
+    monkeypatch.setattr(cuda, "can_take_step", lambda *_: True)
+    method = ParticleFilter(4100, **{"resampler": ALWAYS, **stages})
+    with dispatch.mark_operators():
+        graph, given = as_graph(model, method)
+    wanted = graph(*given)
+    step_compiler._fuse_propagation(graph.graph)
+    assert step_compiler._fuse_steps(graph) == taken
+    graph.recompile()
+    assert ("pfbench.sir_step" in graph.code) == taken
+    if not taken:
+        return
+    gone = (
+        "normalise_weights",
+        "weighted_moments",
+        "count_unique",
+        "gather_propagate",
+        "resample_systematic",
+    )
+    assert not [name for name in gone if name in graph.code]
+    with torch.library._scoped_library("pfbench", "IMPL") as library:
+        library.impl("sir_step", one_after_the_other, "CPU")
         found = graph(*given)
     for one, other in zip(found, wanted, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=1e-12)
