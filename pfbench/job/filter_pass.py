@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from functools import cache
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -22,13 +22,14 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.memory import MemoryTrimmer, peak_above, start_peak_measurement
 from pfbench.job.plan import JobPlan
 from pfbench.job.scoring import LikelihoodCounter, ScoreRecorder
+from pfbench.job.step_builds import BUILD_SECONDS, are_builds_allowed, say_once, want_step
 from pfbench.kernels import dispatch
 from pfbench.kernels.cpp_library import is_library_loaded
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 
 if TYPE_CHECKING:
-    from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
+    from pfbench.filter.particle.compiled_filter import CompiledParticleFilter, StepParts
 
 log = logging.getLogger("pfbench")
 
@@ -38,7 +39,6 @@ _CUDA_NUMBERS = 5e8
 # stochastic volatility 0.5e-8, constant velocity in the plane 1.1e-8, 15 states nothing]
 _SAVED_PER_STEP = 3e-4  # s
 _SAVED_PER_PARTICLE = 0.6e-8  # s per particle and step
-_COMPILATION = 10.0  # s; 4 to 8 s of a step that is cached, 10 to 14 s of another one
 
 
 class TimedFilterPass(NamedTuple):
@@ -107,7 +107,8 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     compile_start = time.perf_counter()
     engine = choose_engine(engine, method, model, len(runs), steps)
     compile_seconds = time.perf_counter() - compile_start
-    step = _compile_step(engine, method, counter, clock, _may_take_stored_step(plan))
+    want = partial(_want_step, plan, len(runs), steps) if are_builds_allowed() else None
+    step = _compile_step(engine, method, counter, clock, _may_take_stored_step(plan), want)
     baseline = start_peak_measurement(device)
     start_time = clock()
     with dispatch.use_compiled(engine != "eager"):
@@ -176,8 +177,9 @@ def choose_engine(
     """Choose how the steps of a job are executed, and load the C++ operators.
 
     On the CPU `auto` takes the operators always, and compiles the step where that is predicted to save twice the
-    time that it takes. A smaller job takes a compiled step that is stored (`_compile_step`). On a CUDA device
-    it takes kernels for large jobs. Numbers of all engines agree to rounding; a result states its engine.
+    time that it takes. A smaller job takes a compiled step that is stored (`_compile_step`), or notes that it wanted
+    one (`step_builds`). On a CUDA device it takes kernels for large jobs. Numbers of all engines agree to rounding; a
+    result states its engine.
 
     Returns the engine: `eager` if the operators cannot be loaded.
     """
@@ -196,18 +198,25 @@ def choose_engine(
         return "compiled" if engine == "compiled" else "kernels"
     saved = 0.0
     if isinstance(method, ParticleFilter) and not method.obstacle:
-        saved = steps * (_SAVED_PER_STEP + _SAVED_PER_PARTICLE * runs * method.particles)
-    if saved < 2.0 * _COMPILATION:
-        _say_once("engine=auto: C++ operators")
+        saved = _predict_saving(steps, runs * method.particles)
+    if saved < 2.0 * BUILD_SECONDS:
+        say_once("engine=auto: C++ operators")
         return "kernels"
-    _say_once(f"engine=auto: the step is compiled, which saves about {saved:.0f} s")
+    say_once(f"engine=auto: the step is compiled, which saves about {saved:.0f} s")
     return "compiled"
 
 
-@cache
-def _say_once(line: str) -> None:
-    """Log a line, once in a process."""
-    log.info(line)
+def _predict_saving(steps: int, particles: int) -> float:
+    """Return what a compiled step saves, s. `particles` are those of all runs that are stepped together."""
+    return steps * (_SAVED_PER_STEP + _SAVED_PER_PARTICLE * particles)
+
+
+def _want_step(plan: JobPlan, runs: int, steps: int, name: str, parts: StepParts) -> None:
+    """Note that a job wanted the step of a batch of its runs."""
+    batch, particles = parts.belief.x.shape[:2]
+    is_last = batch < plan.choose_run_batch(plan.method, runs, is_compiled=True)
+    batches = 1 if is_last else runs // batch
+    want_step(name, batches * _predict_saving(steps, batch * particles), parts)
 
 
 def _count_numbers(method: Any, model: StateSpaceModel) -> int:
@@ -226,13 +235,15 @@ def _compile_step(
     counter: LikelihoodCounter,
     clock: Callable[[], float],
     may_load: bool,
+    want: Callable[[str, StepParts], None] | None = None,
 ) -> CompiledParticleFilter | None:
     """Return the filter with its step compiled as a whole, if requested and possible.
 
-    A job with `kernels` that may load stored steps compiles none.
+    A job with `kernels` that may load stored steps compiles none, and calls `want` for steps that are not stored.
     """
     is_step = isinstance(method, ParticleFilter) and not method.obstacle
-    takes_stored = engine == "kernels" and may_load and is_step and step_store.has_steps()
+    takes_stored = engine == "kernels" and may_load and is_step
+    takes_stored = takes_stored and (want is not None or step_store.has_steps())
     if engine != "compiled" and not takes_stored:
         return None
     if not is_step:
@@ -242,4 +253,5 @@ def _compile_step(
         return None
     from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 
-    return CompiledParticleFilter(method, counter, clock, builds=engine == "compiled")
+    builds = engine == "compiled"
+    return CompiledParticleFilter(method, counter, clock, builds, None if builds else want)

@@ -65,6 +65,8 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         counter: Counter of likelihood evaluations, which compiled steps cannot increment.
         clock: Clock that measures the time of compilation, s.
         builds: Whether a step that is not stored is compiled.
+        on_missing: Function that is called with the name of a step that is neither stored nor compiled, and with the
+            arguments of `compile_step`. None for no call.
         seconds: Time of compilation so far, s.
         graphs: Compiled step by kind of step; None if that kind runs uncompiled.
     """
@@ -73,6 +75,7 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     counter: CallCounter | None = None
     clock: Callable[[], float] = time.perf_counter
     builds: bool = True
+    on_missing: Callable[[str, StepParts], None] | None = None
     seconds: float = 0.0
     graphs: dict[Any, CompiledStep | None] = field(default_factory=dict)
 
@@ -205,9 +208,8 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         """Load or compile a step; log a warning and return None if that fails."""
         start_time = self.clock()
         try:
-            graph = compile_step(
-                self.method, model, belief, record, draws, self.counter, self.builds
-            )
+            parts = StepParts(self.method, model, belief, record, draws, self.counter)
+            graph = compile_step(parts, self.builds, self.on_missing)
         except Exception as error:  # torch raises many kinds
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             log.warning(
@@ -408,31 +410,45 @@ def _compute_nis_together(
     return [partial(select, index) for index in range(len(steps))]
 
 
+class StepParts(NamedTuple):
+    """All that a step consists of: filter, model, what it takes, and the counter of the model's evaluations."""
+
+    method: ParticleFilter
+    model: StateSpaceModel
+    belief: ParticleBelief
+    record: Record
+    draws: PhiloxStream
+    counter: CallCounter | None = None
+
+    def name(self) -> str | None:
+        """Return the name of the step in the store."""
+        arguments = self.belief, self.record, self.draws.dtype, self.draws.runs
+        return step_store.name_step((self.method, self.model), arguments, self.counter)
+
+
 def compile_step(
-    method: ParticleFilter,
-    model: StateSpaceModel,
-    belief: ParticleBelief,
-    record: Record,
-    draws: PhiloxStream,
-    counter: CallCounter | None = None,
+    parts: StepParts,
     builds: bool = True,
+    on_missing: Callable[[str, StepParts], None] | None = None,
 ) -> CompiledStep | None:
     """Load a filter's step from the store, or record and compile it.
 
     Its numbers are compared with those of the uncompiled step.
 
-    Returns the compiled step; None if it is not stored and `builds` is false.
+    Returns the compiled step. If it is not stored and `builds` is false, calls `on_missing` and returns None.
     """
+    method, model, belief, record, draws, counter = parts
     names: list[list[str]] = []
     make = partial(_make_tensor_function, method, model, belief, record, draws)
     state, inputs = _belief_to_storage(belief), [to_storage(a) for a in tensors_in(record)]
     shared = [torch.as_tensor(draws.seed), draws.runs]
     example = [*state, torch.as_tensor(draws.step), *inputs, *shared]
     name = None
-    if not example[0].is_cuda and (builds or step_store.has_steps()):
-        arguments = belief, record, draws.dtype, draws.runs
-        name = step_store.name_step((method, model), arguments, counter)
+    if not example[0].is_cuda and (builds or on_missing or step_store.has_steps()):
+        name = parts.name()
     if not builds and not (name and step_store.has_step(name)):
+        if on_missing and name:
+            on_missing(name, parts)
         return None
     with _keep_count(counter) as count:
         expected = make(names, record_step=False)(*example)

@@ -36,6 +36,8 @@ log = logging.getLogger("pfbench")
 _LIBRARY, _CONSTANTS, _RECORD = "step.so", "constants.pt", "step.json"
 _LARGEST = 500e6  # bytes of all steps
 _LONGEST_UNUSED = 90 * 86400.0  # s
+_LONGEST_WRITE = 3600.0  # s; an older temporary folder is of a process that was killed
+_NAME_LENGTH = 40
 _PLAIN = (
     type(None), bool, int, float, complex, str, bytes, range, slice, type(Path()), type(...),
     torch.dtype, torch.device, torch.Size, torch.layout,
@@ -72,7 +74,7 @@ def name_step(
     except (UnnamableError, OSError, SyntaxError, RecursionError) as error:
         log.debug("engine=compiled: this step is not stored (%s)", error)
         return None
-    return digest.sha256.hexdigest()[:40]
+    return digest.sha256.hexdigest()[:_NAME_LENGTH]
 
 
 @functools.cache
@@ -260,7 +262,10 @@ def has_steps() -> bool:
 
 def has_step(name: str) -> bool:
     """Return whether the store has a step of a name."""
-    return (_folder() / name).is_dir()
+    try:
+        return (_folder() / name).is_dir()
+    except OSError:
+        return False
 
 
 def load_step(name: str, example: list[Tensor]) -> NativeEntry | None:
@@ -315,6 +320,16 @@ def remove_step(name: str) -> None:
     shutil.rmtree(_folder() / name, ignore_errors=True)
 
 
+def workshop() -> Path:
+    """Return the folder where torch's compiler works for a build in the background."""
+    return code_folder() / "build"
+
+
+def clear_workshop() -> None:
+    """Remove the files of a build."""
+    shutil.rmtree(workshop(), ignore_errors=True)
+
+
 def _folder() -> Path:
     """Return the folder of compiled steps."""
     return code_folder() / "steps"
@@ -330,8 +345,9 @@ def _remove_old_steps() -> None:
     if not has_steps():
         return
     ages = {folder: folder.stat().st_mtime for folder in _folder().iterdir()}
-    size, oldest_allowed = 0, time.time() - _LONGEST_UNUSED
+    size, now = 0, time.time()
     for folder in sorted(ages, key=ages.__getitem__, reverse=True):
         size += sum(file.stat().st_size for file in folder.rglob("*"))
-        if size > _LARGEST or ages[folder] < oldest_allowed:
+        longest = _LONGEST_UNUSED if len(folder.name) == _NAME_LENGTH else _LONGEST_WRITE
+        if size > _LARGEST or now - ages[folder] > longest:
             shutil.rmtree(folder, ignore_errors=True)
