@@ -16,7 +16,7 @@ from tqdm import tqdm
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode
 from pfbench.filter.belief import StepInfo
-from pfbench.filter.loop import FilterResult, Watch, run_filter
+from pfbench.filter.loop import FilterResult, Watch, choose_run_batch, run_filter
 from pfbench.filter.particle import step_store
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.memory import MemoryTrimmer, peak_above, start_peak_measurement
@@ -35,7 +35,7 @@ log = logging.getLogger("pfbench")
 
 # normal numbers of a job: on a CUDA device compiling costs seconds and saves 15 ms per million [measured]
 _CUDA_NUMBERS = 5e8
-# a compiled step saves this in place of C++ operators [measured in float64: growth model 3e-4 and 0.3e-8,
+# a compiled step of a batch of runs saves this in place of C++ operators [measured in float64: growth model 3e-4 and 0.3e-8,
 # stochastic volatility 0.5e-8, constant velocity in the plane 1.1e-8, 15 states nothing]
 _SAVED_PER_STEP = 3e-4  # s
 _SAVED_PER_PARTICLE = 0.6e-8  # s per particle and step
@@ -198,7 +198,8 @@ def choose_engine(
         return "compiled" if engine == "compiled" else "kernels"
     saved = 0.0
     if isinstance(method, ParticleFilter) and not method.obstacle:
-        saved = _predict_saving(steps, runs * method.particles)
+        batch = choose_run_batch(runs, method.particles, model.chart.size, model.anchor.dtype)
+        saved = _predict_saving(steps, runs * method.particles, -(-runs // batch))
     if saved < 2.0 * BUILD_SECONDS:
         say_once("engine=auto: C++ operators")
         return "kernels"
@@ -206,9 +207,9 @@ def choose_engine(
     return "compiled"
 
 
-def _predict_saving(steps: int, particles: int) -> float:
-    """Return what a compiled step saves, s. `particles` are those of all runs that are stepped together."""
-    return steps * (_SAVED_PER_STEP + _SAVED_PER_PARTICLE * particles)
+def _predict_saving(steps: int, particles: int, batches: int) -> float:
+    """Return what a compiled step saves, s. `particles` are those of all runs, which are stepped in some batches."""
+    return steps * (_SAVED_PER_STEP * batches + _SAVED_PER_PARTICLE * particles)
 
 
 def _want_step(plan: JobPlan, runs: int, steps: int, name: str, parts: StepParts) -> None:
@@ -216,7 +217,7 @@ def _want_step(plan: JobPlan, runs: int, steps: int, name: str, parts: StepParts
     batch, particles = parts.belief.x.shape[:2]
     is_last = batch < plan.choose_run_batch(plan.method, runs, is_compiled=True)
     batches = 1 if is_last else runs // batch
-    want_step(name, batches * _predict_saving(steps, batch * particles), parts)
+    want_step(name, _predict_saving(steps, batches * batch * particles, batches), parts)
 
 
 def _count_numbers(method: Any, model: StateSpaceModel) -> int:

@@ -537,7 +537,7 @@ def test_auto_takes_the_operators_and_compiles_the_step_where_it_repays(
         assert choose("auto", large, model, 10, 400) == "compiled"
     assert [record.getMessage() for record in caplog.records] == [
         "engine=auto: C++ operators",
-        "engine=auto: the step is compiled, which saves about 24 s",
+        "engine=auto: the step is compiled, which saves about 25 s",
     ]
     assert choose("auto", gaussian, model, 10**4, 10**4) == "kernels"
     for engine in ("eager", "kernels", "compiled"):

@@ -60,7 +60,7 @@ def name_step(
 
     Args:
         constants: Objects that are constants of the step: filter and model. Values of tensors count.
-        arguments: Objects that the step takes: belief, record and draws. Only type, shape and strides of tensors count.
+        arguments: Objects that the step takes: belief, record and draws. Only type and shape of tensors count.
         uncounted: Object that the step does not depend on, such as a counter.
         library: Name of the library of operators, the one of this process by default.
     """
@@ -152,10 +152,14 @@ class _Digest:
             self.add_origin(base)
 
     def add_tensor(self, value: Tensor) -> None:
-        """Add type, shape and strides of a tensor, and its numbers if they are constants of the step."""
+        """Add type and shape of a tensor, and its strides and numbers if they are constants of the step.
+
+        A step takes its arguments in storage layout. Strides of a record depend on its length, so they do not count.
+        """
         a = value.detach()
-        self.text("tensor", a.dtype, tuple(a.shape), a.stride(), a.device, value.requires_grad)
+        self.text("tensor", a.dtype, tuple(a.shape), a.device, value.requires_grad)
         if self.has_values:
+            self.text(a.stride())
             flat = a.cpu().contiguous().reshape(-1).view(torch.uint8)
             self.sha256.update(flat.numpy().tobytes())
 
@@ -309,8 +313,11 @@ def save_step(name: str, entry: NativeEntry, outputs: int) -> None:
             content = {file: (folder / file).read_bytes() for file in (_LIBRARY, _CONSTANTS)}
             record = {"outputs": outputs, "digests": _hash(content)}
             (folder / _RECORD).write_text(json.dumps(record))
-            if not (_folder() / name).exists():  # another process may have been faster
+            try:
                 os.rename(folder, _folder() / name)
+            except OSError:
+                if not has_step(name):  # else another process was faster
+                    raise
     except (OSError, RuntimeError) as error:  # torch raises the latter on a full disk
         log.warning("engine=compiled: the step is not stored (%s)", error)
 
