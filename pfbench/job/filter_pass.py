@@ -107,8 +107,7 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     compile_start = time.perf_counter()
     engine = choose_engine(engine, method, model, len(runs), steps)
     compile_seconds = time.perf_counter() - compile_start
-    want = partial(_want_step, plan, len(runs), steps) if are_builds_allowed() else None
-    step = _compile_step(engine, method, counter, clock, _may_take_stored_step(plan), want)
+    step = _compile_step(engine, method, counter, clock, _make_wish(plan, len(runs), steps))
     baseline = start_peak_measurement(device)
     start_time = clock()
     with dispatch.use_compiled(engine != "eager"):
@@ -130,14 +129,16 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     return TimedFilterPass(model, estimate, recorder, seconds, cost)
 
 
-def _may_take_stored_step(plan: JobPlan) -> bool:
-    """Return whether a job that compiles no step may load one: by `auto`, in double precision.
+def _make_wish(plan: JobPlan, runs: int, steps: int) -> Callable[[str, StepParts], None] | None:
+    """Return the function that notes which step a job wanted. None for a job that may not load a stored step.
 
-    In single precision engines agree to Monte Carlo error only. Trials of times use kernels.
+    A job may by `auto`, in double precision. In single precision engines agree to Monte Carlo error only. Trials of
+    times use kernels.
     """
     values = plan.values
     is_auto = values["engine"] == "auto" and values["budget"] == store.SAME_N
-    return is_auto and plan.dtype == torch.float64
+    may_load = is_auto and plan.dtype == torch.float64
+    return partial(_want_step, plan, runs, steps) if may_load else None
 
 
 def _filter_episode(
@@ -235,16 +236,15 @@ def _compile_step(
     method: Any,
     counter: LikelihoodCounter,
     clock: Callable[[], float],
-    may_load: bool,
-    want: Callable[[str, StepParts], None] | None = None,
+    wish: Callable[[str, StepParts], None] | None,
 ) -> CompiledParticleFilter | None:
     """Return the filter with its step compiled as a whole, if requested and possible.
 
-    A job with `kernels` that may load stored steps compiles none, and calls `want` for steps that are not stored.
+    A job with `kernels` that may load stored steps compiles none, and calls `wish` for steps that are not stored.
     """
     is_step = isinstance(method, ParticleFilter) and not method.obstacle
-    takes_stored = engine == "kernels" and may_load and is_step
-    takes_stored = takes_stored and (want is not None or step_store.has_steps())
+    takes_stored = engine == "kernels" and wish is not None and is_step
+    takes_stored = takes_stored and (are_builds_allowed() or step_store.has_steps())
     if engine != "compiled" and not takes_stored:
         return None
     if not is_step:
@@ -254,5 +254,4 @@ def _compile_step(
         return None
     from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 
-    builds = engine == "compiled"
-    return CompiledParticleFilter(method, counter, clock, builds, None if builds else want)
+    return CompiledParticleFilter(method, counter, clock, wish if takes_stored else None)

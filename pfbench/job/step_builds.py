@@ -1,7 +1,7 @@
 """Builds of compiled steps in the background, of steps that jobs wanted often enough to repay them.
 
 A job that runs by `kernels` notes the step that it wanted, and the time that the step would save. Once the noted times
-reach those of a build, a process of low priority builds the step while the job goes on. The next job of this step loads it.
+reach those of a build, a process of low priority builds the step while the job continues. The next job of this step loads it.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def want_step(name: str, saving: float, parts: StepParts) -> None:
         saving: Time that the step would have saved, s.
         parts: Parts of the step.
     """
-    if saving < _LEAST_SAVING:
+    if saving < _LEAST_SAVING or not are_builds_allowed():
         return
     try:
         wish = _note(name, saving)
@@ -153,8 +153,8 @@ def _start_build(name: str, parts: StepParts) -> None:
         step_store.clear_workshop()  # of a build that was killed
         with tempfile.TemporaryFile() as request:  # without a name, so that nothing remains of it
             try:
-                for part in (sys.path, (name, torch.get_num_threads()), parts):
-                    pickle.dump(part, request)
+                for item in (sys.path, (name, torch.get_num_threads()), parts):
+                    pickle.dump(item, request)
             except (pickle.PicklingError, AttributeError, TypeError, RecursionError) as error:
                 _note(name, reason=f"another process cannot receive it: {error}"[:200])
                 return
@@ -211,13 +211,13 @@ def build_step() -> None:
     signal.alarm(_LONGEST_BUILD)
     _offer_to_be_killed()
     name, threads = pickle.load(sys.stdin.buffer)
-    said = _Said()
-    log.addHandler(said)
+    lines = _LastLine()
+    log.addHandler(lines)
     log.setLevel(logging.INFO)
     try:
         torch.set_num_threads(threads)
         _build(name, pickle.load(sys.stdin.buffer))
-        reason = "" if step_store.has_step(name) else said.last
+        reason = "" if step_store.has_step(name) else lines.last
     except Exception as error:  # torch raises many kinds
         reason = f"{type(error).__name__}: {error}".splitlines()[0][:200]
     step_store.clear_workshop()
@@ -236,7 +236,7 @@ def _build(name: str, parts: StepParts) -> None:
         compile_step(parts)
 
 
-class _Said(logging.Handler):
+class _LastLine(logging.Handler):
     """Handler of a log that keeps the last line."""
 
     last = "it is not stored"

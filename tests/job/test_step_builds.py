@@ -55,13 +55,13 @@ def wanted() -> tuple[str, StepParts]:
     return want()
 
 
-def want(builds: bool = False) -> Any:
+def want() -> Any:
     """Filter a record; return name and parts of the step if it is not stored, else the filter's step."""
     model, method = linear_walk(1.0, 0.3, 1.0), ParticleFilter(30)
     record, missing = record_of(model), []
     counter = LikelihoodCounter(model)
     step = CompiledParticleFilter(
-        method, counter, builds=builds, on_missing=lambda *step: missing.append(step)
+        method, counter, on_missing=lambda *missed: missing.append(missed)
     )
     agree(run(step, model, record), run(method, model, record))
     (graph,) = step.graphs.values()

@@ -64,9 +64,8 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         method: The filter. It runs uncompiled if it states an obstacle.
         counter: Counter of likelihood evaluations, which compiled steps cannot increment.
         clock: Clock that measures the time of compilation, s.
-        builds: Whether a step that is not stored is compiled.
-        on_missing: Function that is called with the name of a step that is neither stored nor compiled, and with the
-            arguments of `compile_step`. None for no call.
+        on_missing: Function that is called with name and parts of a step that is not stored, in place of compiling it. None
+            to compile it.
         seconds: Time of compilation so far, s.
         graphs: Compiled step by kind of step; None if that kind runs uncompiled.
     """
@@ -74,7 +73,6 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     method: ParticleFilter
     counter: CallCounter | None = None
     clock: Callable[[], float] = time.perf_counter
-    builds: bool = True
     on_missing: Callable[[str, StepParts], None] | None = None
     seconds: float = 0.0
     graphs: dict[Any, CompiledStep | None] = field(default_factory=dict)
@@ -209,7 +207,7 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         start_time = self.clock()
         try:
             parts = StepParts(self.method, model, belief, record, draws, self.counter)
-            graph = compile_step(parts, self.builds, self.on_missing)
+            graph = compile_step(parts, self.on_missing)
         except Exception as error:  # torch raises many kinds
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             log.warning(
@@ -427,15 +425,13 @@ class StepParts(NamedTuple):
 
 
 def compile_step(
-    parts: StepParts,
-    builds: bool = True,
-    on_missing: Callable[[str, StepParts], None] | None = None,
+    parts: StepParts, on_missing: Callable[[str, StepParts], None] | None = None
 ) -> CompiledStep | None:
     """Load a filter's step from the store, or record and compile it.
 
     Its numbers are compared with those of the uncompiled step.
 
-    Returns the compiled step. If it is not stored and `builds` is false, calls `on_missing` and returns None.
+    Returns the compiled step. If it is not stored and there is a function `on_missing`, calls that and returns None.
     """
     method, model, belief, record, draws, counter = parts
     names: list[list[str]] = []
@@ -443,11 +439,9 @@ def compile_step(
     state, inputs = _belief_to_storage(belief), [to_storage(a) for a in tensors_in(record)]
     shared = [torch.as_tensor(draws.seed), draws.runs]
     example = [*state, torch.as_tensor(draws.step), *inputs, *shared]
-    name = None
-    if not example[0].is_cuda and (builds or on_missing or step_store.has_steps()):
-        name = parts.name()
-    if not builds and not (name and step_store.has_step(name)):
-        if on_missing and name:
+    name = None if example[0].is_cuda else parts.name()
+    if on_missing and not (name and step_store.has_step(name)):
+        if name:
             on_missing(name, parts)
         return None
     with _keep_count(counter) as count:
@@ -455,10 +449,10 @@ def compile_step(
         evaluations = count()
         run, entry = None, _load_step(name, example, expected, len(state))
         is_stored = entry is not None
-        if not is_stored and builds:
+        if not is_stored and on_missing:
+            return None
+        if not is_stored:
             run, entry = _compile_and_store(name, make([]), example, expected, len(state))
-    if not is_stored and not builds:
-        return None
     memory, trace = names
     carried_shapes = [a.shape for a in expected[: len(state)]]
     keeps_shapes = len(memory) + _CARRIED == len(state) and carried_shapes == [
