@@ -14,7 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode
+from pfbench.core.record import Episode, Record
 from pfbench.filter.belief import StepInfo
 from pfbench.filter.loop import FilterResult, Watch, choose_run_batch, run_filter
 from pfbench.filter.particle import step_store
@@ -111,7 +111,7 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     baseline = start_peak_measurement(device)
     start_time = clock()
     with dispatch.use_compiled(engine != "eager"):
-        estimate = _filter_episode(plan, step or method, model, episode, runs, watch, label)
+        estimate = _filter_episode(plan, step, model, episode, runs, watch, label)
     step_compile_seconds = step.seconds if step else 0.0
     filter_seconds = clock() - start_time - recorder.seconds - step_compile_seconds
     seconds = {
@@ -141,18 +141,43 @@ def _make_wish(plan: JobPlan, runs: int, steps: int) -> Callable[[str, StepParts
     return partial(_want_step, plan, runs, steps) if may_load else None
 
 
+def _drop_missing_step(
+    plan: JobPlan,
+    step: CompiledParticleFilter | None,
+    model: StateSpaceModel,
+    record: Record,
+    draws: PhiloxStream,
+) -> CompiledParticleFilter | None:
+    """Return the filter with compiled steps; None if its step is not stored, and kernels take other batches of runs.
+
+    The store is asked by two steps of the first batch, whose results are not used: the larger batches of kernels are faster
+    without a compiled step.
+    """
+    runs = len(draws.runs)
+    batch = plan.choose_run_batch(plan.method, runs, is_compiled=True)
+    is_same = batch == plan.choose_run_batch(plan.method, runs)
+    if step is None or step.on_missing is None or is_same or record.feedback is not None:
+        return step
+    first = slice(0, batch)
+    with torch.no_grad(), step.keep_count():
+        beginning = record.select_runs(first).select_steps(slice(0, 2))
+        run_filter(step, model, beginning, draws.select_runs(first))
+    return step if step.is_active else None
+
+
 def _filter_episode(
     plan: JobPlan,
-    method: Any,
+    step: CompiledParticleFilter | None,
     model: StateSpaceModel,
     episode: Episode,
     runs: Tensor,
     watch: Watch,
     label: str,
 ) -> FilterResult:
-    """Run a filter over an episode, with a progress bar."""
+    """Run a filter over an episode, with compiled steps if there are, and with a progress bar."""
     device, trim = plan.values["device"], MemoryTrimmer()
     draws = PhiloxStream(plan.values["seed"], runs.to(device), plan.dtype)
+    method = _drop_missing_step(plan, step, model, episode.record, draws) or plan.method
     batch = plan.choose_run_batch(plan.method, len(runs), is_compiled=method is not plan.method)
 
     def tick() -> None:

@@ -15,11 +15,15 @@ from typing import Any
 
 import pytest
 from compiled_cases import agree, compiler, record_of, run
+from config_cases import truncated
 
+from pfbench.filter.loop import run_filter
 from pfbench.filter.particle import compiled_filter, step_store
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter, StepParts
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.job import compose, run as run_job, step_builds
+from pfbench.job import compose, filter_pass, run as run_job, step_builds
+from pfbench.job.config import resolve_config
+from pfbench.job.plan import build_plan
 from pfbench.job.scoring import LikelihoodCounter
 from pfbench.kernels.cpp_library import code_folder
 from pfbench.model.linear_gaussian import linear_walk
@@ -263,6 +267,27 @@ def test_a_job_notes_its_step_unless_the_switch_or_its_engine_says_no(
         run_job(settings(tmp_path, f"seed={seed}", "overwrite=true"))
     (wish,) = ledger(home).values()
     assert wish["saving"] == pytest.approx(2 * 100 * (3e-4 + 0.6e-8 * 150))
+
+
+@pytest.mark.parametrize("is_stored", [False, True])
+def test_a_job_without_its_step_takes_the_batches_of_kernels(
+    is_stored: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of a compiled step are smaller where the state has many components, and slower without it."""
+    passes: list[tuple[int, int | None]] = []
+
+    def spy(method: Any, model: Any, record: Any, draws: Any, *more: Any) -> Any:
+        passes.append((record.y.shape[1], more[-1] if more else None))
+        return run_filter(method, model, record, draws, *more)
+
+    monkeypatch.setattr(filter_pass, "run_filter", spy)
+    monkeypatch.setattr(CompiledParticleFilter, "is_active", is_stored)
+    words = ["scenario=flight_300s", "runs=4", "particles=8000", "engine=auto"]
+    plan = build_plan(resolve_config(settings(tmp_path, *words)))
+    episode = truncated(plan.draw_episode(plan.runs), 3)
+    result = filter_pass.pass_filter(plan, episode, plan.runs, "")
+    assert passes == [(2, None), (3, 2 if is_stored else 4)]
+    assert result.cost["likelihoods_per_step"] == 8000.0
 
 
 def test_a_command_ends_while_its_build_runs(tmp_path: Path) -> None:
