@@ -39,6 +39,7 @@ _CUDA_NUMBERS = 5e8
 # stochastic volatility 0.5e-8, constant velocity in the plane 1.1e-8, 15 states nothing]
 _SAVED_PER_STEP = 3e-4  # s
 _SAVED_PER_PARTICLE = 0.6e-8  # s per particle and step
+_MANY_COMPONENTS = 10  # of which it saves nothing per particle
 
 
 class TimedFilterPass(NamedTuple):
@@ -224,8 +225,7 @@ def choose_engine(
         return "compiled" if engine == "compiled" else "kernels"
     saved = 0.0
     if isinstance(method, ParticleFilter) and not method.obstacle:
-        batch = choose_run_batch(runs, method.particles, model.chart.size, model.anchor.dtype)
-        saved = _predict_saving(steps, runs * method.particles, -(-runs // batch))
+        saved = _predict_saving(method, model, runs, steps)
     if saved < 2.0 * BUILD_SECONDS:
         say_once("engine=auto: C++ operators")
         return "kernels"
@@ -233,17 +233,20 @@ def choose_engine(
     return "compiled"
 
 
-def _predict_saving(steps: int, particles: int, batches: int) -> float:
-    """Return what a compiled step saves, s. `particles` are those of all runs, which are stepped in some batches."""
-    return steps * (_SAVED_PER_STEP * batches + _SAVED_PER_PARTICLE * particles)
+def _predict_saving(method: ParticleFilter, model: StateSpaceModel, runs: int, steps: int) -> float:
+    """Return what a compiled step saves in place of kernels, s."""
+    dimension = model.chart.size
+    batches = -(-runs // choose_run_batch(runs, method.particles, dimension))
+    per_particle = _SAVED_PER_PARTICLE if dimension < _MANY_COMPONENTS else 0.0
+    return steps * (_SAVED_PER_STEP * batches + per_particle * runs * method.particles)
 
 
 def _want_step(plan: JobPlan, runs: int, steps: int, name: str, parts: StepParts) -> None:
     """Note that a job wanted the step of a batch of its runs."""
-    batch, particles = parts.belief.x.shape[:2]
+    batch = len(parts.belief.x)
     is_last = batch < plan.choose_run_batch(plan.method, runs, is_compiled=True)
-    batches = 1 if is_last else runs // batch
-    want_step(name, _predict_saving(steps, batches * batch * particles, batches), parts)
+    share = (batch if is_last else runs - runs % batch) / runs
+    want_step(name, share * _predict_saving(plan.method, parts.model, runs, steps), parts)
 
 
 def _count_numbers(method: Any, model: StateSpaceModel) -> int:

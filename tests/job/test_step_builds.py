@@ -288,6 +288,8 @@ def test_a_job_without_its_step_takes_the_batches_of_kernels(
     result = filter_pass.pass_filter(plan, episode, plan.runs, "")
     assert passes == [(2, None), (3, 2 if is_stored else 4)]
     assert result.cost["likelihoods_per_step"] == 8000.0
+    # 15 components: the overhead of calls alone, in one batch
+    assert filter_pass._predict_saving(plan.method, plan.model, 4, 1000) == pytest.approx(0.3)
 
 
 def test_a_command_ends_while_its_build_runs(tmp_path: Path) -> None:
