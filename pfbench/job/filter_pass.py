@@ -39,7 +39,7 @@ _CUDA_NUMBERS = 5e8
 # stochastic volatility 0.5e-8, constant velocity in the plane 1.1e-8, 15 states nothing]
 _SAVED_PER_STEP = 3e-4  # s
 _SAVED_PER_PARTICLE = 0.6e-8  # s per particle and step
-_MANY_COMPONENTS = 10  # of which it saves nothing per particle
+_MANY_COMPONENTS = 10  # with these a step saves nothing per particle
 
 
 class TimedFilterPass(NamedTuple):
