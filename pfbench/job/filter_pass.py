@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from functools import cache
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -14,31 +14,32 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode
+from pfbench.core.record import Episode, Record
 from pfbench.filter.belief import StepInfo
-from pfbench.filter.loop import FilterResult, Watch, run_filter
+from pfbench.filter.loop import FilterResult, Watch, choose_run_batch, run_filter
 from pfbench.filter.particle import step_store
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.memory import MemoryTrimmer, peak_above, start_peak_measurement
 from pfbench.job.plan import JobPlan
 from pfbench.job.scoring import LikelihoodCounter, ScoreRecorder
+from pfbench.job.step_builds import BUILD_SECONDS, are_builds_allowed, say_once, want_step
 from pfbench.kernels import dispatch
 from pfbench.kernels.cpp_library import is_library_loaded
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 
 if TYPE_CHECKING:
-    from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
+    from pfbench.filter.particle.compiled_filter import CompiledParticleFilter, StepParts
 
 log = logging.getLogger("pfbench")
 
 # normal numbers of a job: on a CUDA device compiling costs seconds and saves 15 ms per million [measured]
 _CUDA_NUMBERS = 5e8
-# a compiled step saves this in place of C++ operators [measured in float64: growth model 3e-4 and 0.3e-8,
+# a compiled step of a batch of runs saves this in place of C++ operators [measured in float64: growth model 3e-4 and 0.3e-8,
 # stochastic volatility 0.5e-8, constant velocity in the plane 1.1e-8, 15 states nothing]
 _SAVED_PER_STEP = 3e-4  # s
 _SAVED_PER_PARTICLE = 0.6e-8  # s per particle and step
-_COMPILATION = 10.0  # s; 4 to 8 s of a step that is cached, 10 to 14 s of another one
+_MANY_COMPONENTS = 10  # with these a step saves nothing per particle
 
 
 class TimedFilterPass(NamedTuple):
@@ -107,11 +108,11 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     compile_start = time.perf_counter()
     engine = choose_engine(engine, method, model, len(runs), steps)
     compile_seconds = time.perf_counter() - compile_start
-    step = _compile_step(engine, method, counter, clock, _may_take_stored_step(plan))
+    step = _compile_step(engine, method, counter, clock, _make_wish(plan, len(runs), steps))
     baseline = start_peak_measurement(device)
     start_time = clock()
     with dispatch.use_compiled(engine != "eager"):
-        estimate = _filter_episode(plan, step or method, model, episode, runs, watch, label)
+        estimate = _filter_episode(plan, step, model, episode, runs, watch, label)
     step_compile_seconds = step.seconds if step else 0.0
     filter_seconds = clock() - start_time - recorder.seconds - step_compile_seconds
     seconds = {
@@ -129,28 +130,55 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     return TimedFilterPass(model, estimate, recorder, seconds, cost)
 
 
-def _may_take_stored_step(plan: JobPlan) -> bool:
-    """Return whether a job that compiles no step may load one: by `auto`, in double precision.
+def _make_wish(plan: JobPlan, runs: int, steps: int) -> Callable[[str, StepParts], None] | None:
+    """Return the function that notes which step a job wanted. None for a job that may not load a stored step.
 
-    In single precision engines agree to Monte Carlo error only. Trials of times use kernels.
+    A job may by `auto`, in double precision. In single precision engines agree to Monte Carlo error only. Trials of
+    times use kernels.
     """
     values = plan.values
     is_auto = values["engine"] == "auto" and values["budget"] == store.SAME_N
-    return is_auto and plan.dtype == torch.float64
+    may_load = is_auto and plan.dtype == torch.float64
+    return partial(_want_step, plan, runs, steps) if may_load else None
+
+
+def _drop_missing_step(
+    plan: JobPlan,
+    step: CompiledParticleFilter | None,
+    model: StateSpaceModel,
+    record: Record,
+    draws: PhiloxStream,
+) -> CompiledParticleFilter | None:
+    """Return the filter with compiled steps; None if its step is not stored, and kernels take other batches of runs.
+
+    The store is asked by two steps of the first batch, whose results are not used: the larger batches of kernels are faster
+    without a compiled step.
+    """
+    runs = len(draws.runs)
+    batch = plan.choose_run_batch(plan.method, runs, is_compiled=True)
+    is_same = batch == plan.choose_run_batch(plan.method, runs)
+    if step is None or step.on_missing is None or is_same or record.feedback is not None:
+        return step
+    first = slice(0, batch)
+    with torch.no_grad(), step.keep_count():
+        beginning = record.select_runs(first).select_steps(slice(0, 2))
+        run_filter(step, model, beginning, draws.select_runs(first))
+    return step if step.is_active else None
 
 
 def _filter_episode(
     plan: JobPlan,
-    method: Any,
+    step: CompiledParticleFilter | None,
     model: StateSpaceModel,
     episode: Episode,
     runs: Tensor,
     watch: Watch,
     label: str,
 ) -> FilterResult:
-    """Run a filter over an episode, with a progress bar."""
+    """Run a filter over an episode, with compiled steps if there are, and with a progress bar."""
     device, trim = plan.values["device"], MemoryTrimmer()
     draws = PhiloxStream(plan.values["seed"], runs.to(device), plan.dtype)
+    method = _drop_missing_step(plan, step, model, episode.record, draws) or plan.method
     batch = plan.choose_run_batch(plan.method, len(runs), is_compiled=method is not plan.method)
 
     def tick() -> None:
@@ -176,8 +204,9 @@ def choose_engine(
     """Choose how the steps of a job are executed, and load the C++ operators.
 
     On the CPU `auto` takes the operators always, and compiles the step where that is predicted to save twice the
-    time that it takes. A smaller job takes a compiled step that is stored (`_compile_step`). On a CUDA device
-    it takes kernels for large jobs. Numbers of all engines agree to rounding; a result states its engine.
+    time that it takes. A smaller job takes a compiled step that is stored (`_compile_step`), or notes that it wanted
+    one (`step_builds`). On a CUDA device it takes kernels for large jobs. Numbers of all engines agree to rounding; a
+    result states its engine.
 
     Returns the engine: `eager` if the operators cannot be loaded.
     """
@@ -196,18 +225,28 @@ def choose_engine(
         return "compiled" if engine == "compiled" else "kernels"
     saved = 0.0
     if isinstance(method, ParticleFilter) and not method.obstacle:
-        saved = steps * (_SAVED_PER_STEP + _SAVED_PER_PARTICLE * runs * method.particles)
-    if saved < 2.0 * _COMPILATION:
-        _say_once("engine=auto: C++ operators")
+        saved = _predict_saving(method, model, runs, steps)
+    if saved < 2.0 * BUILD_SECONDS:
+        say_once("engine=auto: C++ operators")
         return "kernels"
-    _say_once(f"engine=auto: the step is compiled, which saves about {saved:.0f} s")
+    say_once(f"engine=auto: the step is compiled, which saves about {saved:.0f} s")
     return "compiled"
 
 
-@cache
-def _say_once(line: str) -> None:
-    """Log a line, once in a process."""
-    log.info(line)
+def _predict_saving(method: ParticleFilter, model: StateSpaceModel, runs: int, steps: int) -> float:
+    """Return what a compiled step saves in place of kernels, s."""
+    dimension = model.chart.size
+    batches = -(-runs // choose_run_batch(runs, method.particles, dimension))
+    per_particle = _SAVED_PER_PARTICLE if dimension < _MANY_COMPONENTS else 0.0
+    return steps * (_SAVED_PER_STEP * batches + per_particle * runs * method.particles)
+
+
+def _want_step(plan: JobPlan, runs: int, steps: int, name: str, parts: StepParts) -> None:
+    """Note that a job wanted the step of a batch of its runs."""
+    batch = len(parts.belief.x)
+    is_last = batch < plan.choose_run_batch(plan.method, runs, is_compiled=True)
+    share = (batch if is_last else runs - runs % batch) / runs
+    want_step(name, share * _predict_saving(plan.method, parts.model, runs, steps), parts)
 
 
 def _count_numbers(method: Any, model: StateSpaceModel) -> int:
@@ -225,14 +264,15 @@ def _compile_step(
     method: Any,
     counter: LikelihoodCounter,
     clock: Callable[[], float],
-    may_load: bool,
+    wish: Callable[[str, StepParts], None] | None,
 ) -> CompiledParticleFilter | None:
     """Return the filter with its step compiled as a whole, if requested and possible.
 
-    A job with `kernels` that may load stored steps compiles none.
+    A job with `kernels` that may load stored steps compiles none, and calls `wish` for steps that are not stored.
     """
     is_step = isinstance(method, ParticleFilter) and not method.obstacle
-    takes_stored = engine == "kernels" and may_load and is_step and step_store.has_steps()
+    takes_stored = engine == "kernels" and wish is not None and is_step
+    takes_stored = takes_stored and (are_builds_allowed() or step_store.has_steps())
     if engine != "compiled" and not takes_stored:
         return None
     if not is_step:
@@ -242,4 +282,4 @@ def _compile_step(
         return None
     from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 
-    return CompiledParticleFilter(method, counter, clock, builds=engine == "compiled")
+    return CompiledParticleFilter(method, counter, clock, wish if takes_stored else None)

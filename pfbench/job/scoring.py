@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import torch
@@ -54,12 +55,13 @@ class LikelihoodCounter:
         self.count = 0
         self._is_paused = False
         observation = model.observation
+        # a function that can be pickled: another process may compile the step of the model
+        model.observation = partial(self._observe, observation)  # type: ignore[method-assign]
 
-        def counted(x: Tensor, u: Any) -> Distribution:
-            self.count += 0 if self._is_paused else x.shape[0] * x.shape[1]
-            return observation(x, u)
-
-        model.observation = counted  # type: ignore[method-assign]
+    def _observe(self, observation: Callable[..., Distribution], x: Tensor, u: Any) -> Distribution:
+        """Count the evaluations of a call, and return its distribution."""
+        self.count += 0 if self._is_paused else x.shape[0] * x.shape[1]
+        return observation(x, u)
 
     @contextmanager
     def paused(self) -> Iterator[None]:

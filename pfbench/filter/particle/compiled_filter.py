@@ -64,7 +64,8 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         method: The filter. It runs uncompiled if it states an obstacle.
         counter: Counter of likelihood evaluations, which compiled steps cannot increment.
         clock: Clock that measures the time of compilation, s.
-        builds: Whether a step that is not stored is compiled.
+        on_missing: Function that is called with name and parts of a step that is not stored, in place of compiling it. None
+            to compile it.
         seconds: Time of compilation so far, s.
         graphs: Compiled step by kind of step; None if that kind runs uncompiled.
     """
@@ -72,7 +73,7 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     method: ParticleFilter
     counter: CallCounter | None = None
     clock: Callable[[], float] = time.perf_counter
-    builds: bool = True
+    on_missing: Callable[[str, StepParts], None] | None = None
     seconds: float = 0.0
     graphs: dict[Any, CompiledStep | None] = field(default_factory=dict)
 
@@ -90,6 +91,12 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     def is_active(self) -> bool:
         """True if a kind of step runs compiled."""
         return any(graph is not None for graph in self.graphs.values())
+
+    @contextmanager
+    def keep_count(self) -> Iterator[None]:
+        """Count no likelihood evaluations in this context."""
+        with _keep_count(self.counter):
+            yield
 
     @override
     def init(
@@ -205,9 +212,8 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         """Load or compile a step; log a warning and return None if that fails."""
         start_time = self.clock()
         try:
-            graph = compile_step(
-                self.method, model, belief, record, draws, self.counter, self.builds
-            )
+            parts = StepParts(self.method, model, belief, record, draws, self.counter)
+            graph = compile_step(parts, self.on_missing)
         except Exception as error:  # torch raises many kinds
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             log.warning(
@@ -408,41 +414,51 @@ def _compute_nis_together(
     return [partial(select, index) for index in range(len(steps))]
 
 
+class StepParts(NamedTuple):
+    """All that a step consists of: filter, model, what it takes, and the counter of the model's evaluations."""
+
+    method: ParticleFilter
+    model: StateSpaceModel
+    belief: ParticleBelief
+    record: Record
+    draws: PhiloxStream
+    counter: CallCounter | None = None
+
+    def name(self) -> str | None:
+        """Return the name of the step in the store."""
+        arguments = self.belief, self.record, self.draws.dtype, self.draws.runs
+        return step_store.name_step((self.method, self.model), arguments, self.counter)
+
+
 def compile_step(
-    method: ParticleFilter,
-    model: StateSpaceModel,
-    belief: ParticleBelief,
-    record: Record,
-    draws: PhiloxStream,
-    counter: CallCounter | None = None,
-    builds: bool = True,
+    parts: StepParts, on_missing: Callable[[str, StepParts], None] | None = None
 ) -> CompiledStep | None:
     """Load a filter's step from the store, or record and compile it.
 
     Its numbers are compared with those of the uncompiled step.
 
-    Returns the compiled step; None if it is not stored and `builds` is false.
+    Returns the compiled step. If it is not stored and there is a function `on_missing`, calls that and returns None.
     """
+    method, model, belief, record, draws, counter = parts
     names: list[list[str]] = []
     make = partial(_make_tensor_function, method, model, belief, record, draws)
     state, inputs = _belief_to_storage(belief), [to_storage(a) for a in tensors_in(record)]
     shared = [torch.as_tensor(draws.seed), draws.runs]
     example = [*state, torch.as_tensor(draws.step), *inputs, *shared]
-    name = None
-    if not example[0].is_cuda and (builds or step_store.has_steps()):
-        arguments = belief, record, draws.dtype, draws.runs
-        name = step_store.name_step((method, model), arguments, counter)
-    if not builds and not (name and step_store.has_step(name)):
+    name = None if example[0].is_cuda else parts.name()
+    if on_missing and not (name and step_store.has_step(name)):
+        if name:
+            on_missing(name, parts)
         return None
     with _keep_count(counter) as count:
         expected = make(names, record_step=False)(*example)
         evaluations = count()
         run, entry = None, _load_step(name, example, expected, len(state))
         is_stored = entry is not None
-        if not is_stored and builds:
+        if not is_stored and on_missing:
+            return None
+        if not is_stored:
             run, entry = _compile_and_store(name, make([]), example, expected, len(state))
-    if not is_stored and not builds:
-        return None
     memory, trace = names
     carried_shapes = [a.shape for a in expected[: len(state)]]
     keeps_shapes = len(memory) + _CARRIED == len(state) and carried_shapes == [

@@ -36,6 +36,8 @@ log = logging.getLogger("pfbench")
 _LIBRARY, _CONSTANTS, _RECORD = "step.so", "constants.pt", "step.json"
 _LARGEST = 500e6  # bytes of all steps
 _LONGEST_UNUSED = 90 * 86400.0  # s
+_LONGEST_WRITE = 3600.0  # s; an older temporary folder is of a process that was killed
+_NAME_LENGTH = 40
 _PLAIN = (
     type(None), bool, int, float, complex, str, bytes, range, slice, type(Path()), type(...),
     torch.dtype, torch.device, torch.Size, torch.layout,
@@ -58,7 +60,7 @@ def name_step(
 
     Args:
         constants: Objects that are constants of the step: filter and model. Values of tensors count.
-        arguments: Objects that the step takes: belief, record and draws. Only type, shape and strides of tensors count.
+        arguments: Objects that the step takes: belief, record and draws. Only type and shape of tensors count.
         uncounted: Object that the step does not depend on, such as a counter.
         library: Name of the library of operators, the one of this process by default.
     """
@@ -72,7 +74,7 @@ def name_step(
     except (UnnamableError, OSError, SyntaxError, RecursionError) as error:
         log.debug("engine=compiled: this step is not stored (%s)", error)
         return None
-    return digest.sha256.hexdigest()[:40]
+    return digest.sha256.hexdigest()[:_NAME_LENGTH]
 
 
 @functools.cache
@@ -150,10 +152,14 @@ class _Digest:
             self.add_origin(base)
 
     def add_tensor(self, value: Tensor) -> None:
-        """Add type, shape and strides of a tensor, and its numbers if they are constants of the step."""
+        """Add type and shape of a tensor, and its strides and numbers if they are constants of the step.
+
+        A step takes its arguments in storage layout. Strides of a record depend on its length, so they do not count.
+        """
         a = value.detach()
-        self.text("tensor", a.dtype, tuple(a.shape), a.stride(), a.device, value.requires_grad)
+        self.text("tensor", a.dtype, tuple(a.shape), a.device, value.requires_grad)
         if self.has_values:
+            self.text(a.stride())
             flat = a.cpu().contiguous().reshape(-1).view(torch.uint8)
             self.sha256.update(flat.numpy().tobytes())
 
@@ -260,7 +266,10 @@ def has_steps() -> bool:
 
 def has_step(name: str) -> bool:
     """Return whether the store has a step of a name."""
-    return (_folder() / name).is_dir()
+    try:
+        return (_folder() / name).is_dir()
+    except OSError:
+        return False
 
 
 def load_step(name: str, example: list[Tensor]) -> NativeEntry | None:
@@ -304,8 +313,11 @@ def save_step(name: str, entry: NativeEntry, outputs: int) -> None:
             content = {file: (folder / file).read_bytes() for file in (_LIBRARY, _CONSTANTS)}
             record = {"outputs": outputs, "digests": _hash(content)}
             (folder / _RECORD).write_text(json.dumps(record))
-            if not (_folder() / name).exists():  # another process may have been faster
+            try:
                 os.rename(folder, _folder() / name)
+            except OSError:
+                if not has_step(name):  # else another process was faster
+                    raise
     except (OSError, RuntimeError) as error:  # torch raises the latter on a full disk
         log.warning("engine=compiled: the step is not stored (%s)", error)
 
@@ -313,6 +325,16 @@ def save_step(name: str, entry: NativeEntry, outputs: int) -> None:
 def remove_step(name: str) -> None:
     """Remove a step from the store."""
     shutil.rmtree(_folder() / name, ignore_errors=True)
+
+
+def workshop() -> Path:
+    """Return the folder where torch's compiler works for a build in the background."""
+    return code_folder() / "build"
+
+
+def clear_workshop() -> None:
+    """Remove the files of a build."""
+    shutil.rmtree(workshop(), ignore_errors=True)
 
 
 def _folder() -> Path:
@@ -330,8 +352,9 @@ def _remove_old_steps() -> None:
     if not has_steps():
         return
     ages = {folder: folder.stat().st_mtime for folder in _folder().iterdir()}
-    size, oldest_allowed = 0, time.time() - _LONGEST_UNUSED
+    size, now = 0, time.time()
     for folder in sorted(ages, key=ages.__getitem__, reverse=True):
         size += sum(file.stat().st_size for file in folder.rglob("*"))
-        if size > _LARGEST or ages[folder] < oldest_allowed:
+        longest = _LONGEST_UNUSED if len(folder.name) == _NAME_LENGTH else _LONGEST_WRITE
+        if size > _LARGEST or now - ages[folder] > longest:
             shutil.rmtree(folder, ignore_errors=True)

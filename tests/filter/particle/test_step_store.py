@@ -9,6 +9,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -68,6 +69,16 @@ def test_equal_steps_have_one_name_whatever_their_numbers() -> None:
         counter.count = len(counted)
         counted.append(name(model=model, uncounted=counter))
     assert counted[0] == counted[1]
+
+
+def test_one_step_serves_records_of_any_length() -> None:
+    """A step of a record is a view of it, whose strides depend on its length."""
+    names = set()
+    for steps in (2, 9):
+        belief, record, *more = arguments()
+        y = torch.zeros(RUNS, steps, 1, dtype=torch.float64)[:, 1]
+        names.add(name(given=(belief, record._replace(y=y), *more)))
+    assert len(names) == 1
 
 
 def changed_threads() -> str:
@@ -192,7 +203,7 @@ def filtered(builds: bool = True, scale: float = 1.0) -> CompiledParticleFilter:
     """Filter a record with compiled steps, and compare each number with the uncompiled filter."""
     model, method = linear_walk(scale, 0.3, 1.0), ParticleFilter(30)
     record = record_of(model)
-    step = CompiledParticleFilter(method, builds=builds)
+    step = CompiledParticleFilter(method, on_missing=None if builds else lambda *_: None)
     agree(run(step, model, record), run(method, model, record))
     return step
 
@@ -276,23 +287,29 @@ class TestStored:
         assert "a stored step is removed (its numbers must be those of" in caplog.text
         assert not list(cache.iterdir())
 
-    def test_a_store_that_others_can_write_is_not_used(
-        self, filled: Path, refuse_compiler: None, caplog: pytest.LogCaptureFixture
-    ) -> None:
-        filled.chmod(0o777)
+    @pytest.mark.parametrize("fault", ["others can write it", "another user"])
+    def test_a_store_of_others_is_not_used(
+        self, fault: str, filled: Path, refuse_compiler: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:  # fmt: skip
+        if fault == "another user":
+            user = os.getuid()
+            monkeypatch.setattr(os, "getuid", lambda: user + 1)
+        else:
+            filled.chmod(0o777)
         assert stored_graph(filtered(builds=False)) is None
         assert "stored steps are not used" in caplog.text
         assert "others cannot write" in caplog.text
 
     def test_auto_takes_a_stored_step_and_compiles_none(self, cache: Path) -> None:
         method = ParticleFilter(30)
-        wrap = partial(filter_pass._compile_step, "kernels", method, None, None)
-        step = wrap(True)
-        assert step is not None
-        assert not step.builds
-        assert wrap(False) is None
+
+        def wrap(wish: Any) -> Any:
+            return filter_pass._compile_step("kernels", method, None, None, wish)
+
+        assert wrap(print).on_missing is print
+        assert wrap(None) is None
         shutil.rmtree(cache)
-        assert wrap(True) is None
+        assert wrap(print) is None  # builds in the background are switched off in tests
 
 
 @pytest.fixture
@@ -325,14 +342,38 @@ def test_a_full_or_read_only_disk_loses_nothing_but_the_store(
     assert not cache.exists() or not list(cache.iterdir())
 
 
+def test_a_limit_of_the_size_of_files_leaves_nothing_behind(
+    entry: Any, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A real limit of the system, which interrupts a write."""
+    resource = pytest.importorskip("resource")
+    Path(entry.library).write_bytes(bytes(5000))
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))
+    try:
+        step_store.save_step("a", entry, 3)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert "the step is not stored (" in caplog.text
+    assert not list(cache.iterdir())
+
+
+def test_what_a_killed_process_left_is_removed_an_hour_later(entry: Any, cache: Path) -> None:
+    for name, age in (("tmpnew", 60.0), ("tmpold", 4000.0), ("a" * 40, 4000.0)):
+        (cache / name).mkdir(parents=True)
+        os.utime(cache / name, 2 * (time.time() - age,))
+    step_store.save_step("b" * 40, entry, 3)
+    assert sorted(folder.name for folder in cache.iterdir()) == ["a" * 40, "b" * 40, "tmpnew"]
+
+
 def test_the_store_is_limited_in_size_and_age(
     entry: Any, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for age, name in enumerate("abcd"):
+    names = [40 * letter for letter in "abcde"]
+    for age, name in zip((0.0, 89.0, 89.5, 91.0), names, strict=False):
         step_store.save_step(name, entry, 3)
-        stamp = (cache / name).stat().st_mtime - 100.0 * age - 91 * 86400.0 * (name == "d")
-        os.utime(cache / name, (stamp, stamp))
-    size = sum(file.stat().st_size for file in (cache / "a").iterdir())
+        os.utime(cache / name, 2 * (time.time() - age * 86400.0,))
+    size = sum(file.stat().st_size for file in (cache / names[0]).iterdir())
     monkeypatch.setattr(step_store, "_LARGEST", 2.5 * size)
-    step_store.save_step("e", entry, 3)
-    assert sorted(folder.name for folder in cache.iterdir()) == ["a", "b", "e"]
+    step_store.save_step(names[4], entry, 3)
+    assert sorted(folder.name for folder in cache.iterdir()) == [names[0], names[1], names[4]]
