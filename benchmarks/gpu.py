@@ -182,7 +182,7 @@ class Pass:
 
     def __call__(self, seed: int) -> FilterResult:
         draws = PhiloxStream(seed, self.runs, self.record.y.dtype)
-        with dispatch.use_compiled(self.engine != "eager"), torch.no_grad():
+        with dispatch.use_kernels(self.engine != "eager"), torch.no_grad():
             return run_filter(self.method, self.model, self.record, draws, run_batch=self.block)
 
     @property
@@ -254,7 +254,7 @@ def moved(model: StateSpaceModel, record: Record, particles: int) -> Moved:
             Pass("eager", model, begun, particles, len(few.y))(0)
         counts.append(traffic.bytes)
     draws = PhiloxStream(0, torch.arange(len(few.y), device=few.y.device), few.y.dtype)
-    with dispatch.use_compiled(False), Traffic() as traffic:
+    with dispatch.use_kernels(False), Traffic() as traffic:
         draws.normal("counted", particles, model.noise_dim)
     each = len(few.y) * particles
     return Moved((counts[1] - counts[0]) / each, traffic.bytes / each)

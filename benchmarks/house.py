@@ -123,7 +123,7 @@ def of(method: Any, particles: int, work: Any, dtype: torch.dtype, engine: str) 
     block = choose_run_batch(len(runs), particles, model.chart.size, compiled_type)
 
     def run(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-        with dispatch.use_compiled(engine != "eager"), torch.no_grad():
+        with dispatch.use_kernels(engine != "eager"), torch.no_grad():
             estimate = run_filter(
                 method, model, record, PhiloxStream(seed, runs, dtype), run_batch=block
             )

@@ -159,7 +159,7 @@ def measure(stored: dict[str, Any], options: argparse.Namespace) -> dict[str, An
         for name, method in methods(options.particles).items()
         if name == FIRST or name not in (*slow, *stored["refused"])
     }
-    with dispatch.use_compiled(), torch.no_grad():
+    with dispatch.use_kernels(), torch.no_grad():
         refused = refusals(found, model, record)
         found = {name: method for name, method in found.items() if name not in refused}
         rows = rows_of(found, race(found, model, record, options.rounds))

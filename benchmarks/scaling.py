@@ -169,7 +169,7 @@ def main() -> None:
     chosen = parser.parse_args()
     torch.set_num_threads(1)
     process_memory.keep_freed_memory()
-    with dispatch.use_compiled(), torch.no_grad():
+    with dispatch.use_kernels(), torch.no_grad():
         found = against(chosen.rounds, chosen.scale)
         together, steps = batched(chosen.rounds), max(20, round(300 * chosen.scale))
         judged, scored = watched(chosen.rounds, 0, steps), watched(chosen.rounds, 10, steps)

@@ -32,7 +32,7 @@ def record_of(model: StateSpaceModel) -> Record:
 def run(
     method: Any, model: StateSpaceModel, record: Record, at_once: int | None = None
 ) -> FilterResult:
-    with dispatch.use_compiled(), torch.no_grad():
+    with dispatch.use_kernels(), torch.no_grad():
         return run_filter(
             method, model, record, PhiloxStream(1, torch.arange(RUNS)), run_batch=at_once
         )

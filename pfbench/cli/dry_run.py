@@ -155,7 +155,7 @@ def _time_filter(plan: JobPlan, episode: Episode) -> float:
     for _ in range(2):  # the first one also loads what the filter needs
         draws = PhiloxStream(plan.values["seed"], plan.runs, plan.dtype)
         begin = time.perf_counter()
-        with torch.no_grad(), dispatch.use_compiled(engine != "eager"):
+        with torch.no_grad(), dispatch.use_kernels(engine != "eager"):
             run_filter(
                 plan.method,
                 model,

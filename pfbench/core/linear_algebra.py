@@ -12,7 +12,7 @@ from torch.autograd import forward_ad
 from torch.distributions import Independent, MultivariateNormal, Normal
 
 from pfbench.kernels import dispatch
-from pfbench.kernels.dispatch import compilable, is_capturing, use_compiled
+from pfbench.kernels.dispatch import compilable, is_capturing, use_kernels
 
 # --------------------------------------------------------------------------------------------------
 # Batched square roots and densities of covariances, with a mask instead of exceptions.
@@ -126,7 +126,7 @@ def jacobian(f: Map, value: Tensor, d: int, subtract: Subtract = torch.subtract)
 def _backward(f: Map, value: Tensor, d: int, subtract: Subtract) -> Tensor | None:
     """Compute `slopes` in backward mode; None if a derivative is spoilt."""
     k = subtract(value, value).shape[-1]
-    with torch.enable_grad(), use_compiled(False):
+    with torch.enable_grad(), use_kernels(False):
         centre = value.new_zeros(len(value), k, d).requires_grad_()
         difference = subtract(f(centre), value)
         if not difference.requires_grad:  # the map does not depend on its argument

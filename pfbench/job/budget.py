@@ -249,7 +249,7 @@ def apply_budget(plan: JobPlan, episodes: EpisodeSource) -> tuple[JobPlan, Budge
     sir = ParticleFilter(values["particles"])
     engine = "kernels" if values["engine"] == "auto" else values["engine"]
     job_engine = choose_engine(engine, sir, model, len(plan.runs), steps)
-    with dispatch.use_compiled(job_engine != "eager"):
+    with dispatch.use_kernels(job_engine != "eager"):
         allocation = allocate_budget(values["budget"], plan.method, values["particles"], trial)
     log.info(
         "budget=%s: %d particles cost as much as %d of sir",

@@ -111,7 +111,7 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     step = _compile_step(engine, method, counter, clock, _make_wish(plan, len(runs), steps))
     baseline = start_peak_measurement(device)
     start_time = clock()
-    with dispatch.use_compiled(engine != "eager"):
+    with dispatch.use_kernels(engine != "eager"):
         estimate = _filter_episode(plan, step, model, episode, runs, watch, label)
     step_compile_seconds = step.seconds if step else 0.0
     filter_seconds = clock() - start_time - recorder.seconds - step_compile_seconds

@@ -233,7 +233,7 @@ def _build(name: str, parts: StepParts) -> None:
     if parts.name() != name:
         raise ValueError("its name must be the same in another process")
     load_library()
-    with torch.no_grad(), dispatch.use_compiled():
+    with torch.no_grad(), dispatch.use_kernels():
         compile_step(parts)
 
 

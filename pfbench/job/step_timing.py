@@ -59,7 +59,7 @@ class TimingTask:
         draws = PhiloxStream(values["seed"], numbers, self.plan.dtype)
         batch = self.plan.choose_run_batch(self.plan.method, runs)
         wall, cpu = time.perf_counter(), time.process_time()
-        with torch.no_grad(), dispatch.use_compiled(self.engine != "eager"):
+        with torch.no_grad(), dispatch.use_kernels(self.engine != "eager"):
             run_filter(self.method, self.model, self.record, draws, run_batch=batch)
             if values["device"] != "cpu":
                 torch.cuda.synchronize()

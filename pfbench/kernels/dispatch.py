@@ -23,7 +23,7 @@ from pfbench.kernels.manifest import Operator, check_arguments, read_operators
 # tensors. Each of its torch operations is a pass over all particles. The C++ operators make one pass. They
 # are the default on the CPU. On other devices they are compiled on request, which takes some seconds:
 #
-#     with dispatch.use_compiled():
+#     with dispatch.use_kernels():
 #         run_filter(...)
 #
 # In a compiled step (`pfbench.filter.particle.compiled_filter`) the hand-written kernels stay whole as operators.
@@ -43,7 +43,7 @@ _peek_transform = (
 
 
 @contextmanager
-def use_compiled(enabled: bool = True) -> Iterator[None]:
+def use_kernels(enabled: bool = True) -> Iterator[None]:
     """Run compilable functions by operators in this context, or in torch operations if `enabled` is False."""
     token = _fused.set(enabled)
     try:

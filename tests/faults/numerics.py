@@ -118,7 +118,7 @@ def try_case(name: str, case: Extreme, engine: str) -> list[Any]:
         if not isinstance(method, ParticleFilter) or method.history is not None:
             raise ValueError(f"{name} must be a particle filter without moves. Choose another one.")
         method = CompiledParticleFilter(method)
-    context = dispatch.use_compiled(engine != "eager")
+    context = dispatch.use_kernels(engine != "eager")
     try:
         with torch.no_grad(), context:
             model = case.build()

@@ -53,7 +53,7 @@ def run(method: Any, compiled: bool, batch: int | None = None) -> FilterResult:
         return {"first": deviations[:, 0, 0], "spread": deviations.square().sum((1, 2))}
 
     draws = PhiloxStream(5, torch.arange(RUNS))
-    with dispatch.use_compiled(compiled), torch.no_grad():
+    with dispatch.use_kernels(compiled), torch.no_grad():
         return run_filter(method, tracker(), Record(Y), draws, keep, run_batch=batch)
 
 
@@ -119,7 +119,7 @@ def test_a_recorded_step_computes_what_the_step_as_it_is_computes(
     if name in NAMES and refusal(name, model, record):
         pytest.skip("refuses this model")
     method, draws = small_method_of(name), PhiloxStream(5, torch.arange(len(record.y)))
-    with dispatch.use_compiled(), torch.no_grad():
+    with dispatch.use_kernels(), torch.no_grad():
         expected = run_filter(method, model, record, draws)
         with dispatch.capture_graph():
             recorded = run_filter(method, model, record, draws)
@@ -146,7 +146,7 @@ def test_a_filter_is_recorded_or_the_page_says_why_not(
     monkeypatch.setattr(compiled_filter, "compile_function", record_only)
     monkeypatch.setattr(step_store, "name_step", lambda *_: None)
     step, draws = CompiledParticleFilter(method), PhiloxStream(5, torch.arange(len(record.y)))
-    with dispatch.use_compiled(), torch.no_grad():
+    with dispatch.use_kernels(), torch.no_grad():
         compiled = run_filter(step, model, record, draws)
         assert_results_agree(compiled, run_filter(method, model, record, draws))
     assert step.is_active
@@ -177,7 +177,7 @@ def test_a_compiled_step_computes_what_the_step_as_it_is_computes(name: str) -> 
     )
     draws = PhiloxStream(5, torch.arange(len(record.y)))
     step = CompiledParticleFilter(method_of(name))
-    with dispatch.use_compiled(), torch.no_grad():
+    with dispatch.use_kernels(), torch.no_grad():
         assert_results_agree(
             run_filter(step, model, record, draws), run_filter(step.method, model, record, draws)
         )
@@ -209,7 +209,7 @@ def test_a_compiled_step_with_other_numbers_is_not_used(
     monkeypatch.setattr(compiled_filter, "compile_function", compile_wrongly)
     model, step = tracker().to(dtype), CompiledParticleFilter(method_of("sir"))
     draws = PhiloxStream(5, torch.arange(RUNS), dtype)
-    with dispatch.use_compiled(), torch.no_grad():
+    with dispatch.use_kernels(), torch.no_grad():
         result = run_filter(step, model, Record(Y.to(dtype)), draws)
         expected = run_filter(step.method, model, Record(Y.to(dtype)), draws)
     assert step.is_active == (fault == "none")

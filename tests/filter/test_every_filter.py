@@ -258,6 +258,14 @@ def rubbish(belief: ParticleBelief) -> ParticleBelief:
     return belief._replace(x=soiled(belief.x), window=window, memory=memory)
 
 
+def test_the_default_of_the_class_is_sir() -> None:
+    configured, default = method_of("sir"), ParticleFilter(100)
+    assert configured.resampler.ess_threshold == default.resampler.ess_threshold
+    for part in ("resampler", "proposal", "weight_update", "moves"):
+        assert type(getattr(configured, part)) is type(getattr(default, part))
+    assert type(configured.resampler.scheme) is type(default.resampler.scheme)
+
+
 def test_which_filters_say_that_they_are_exact() -> None:
     """Particle methods whose cloud tends to the posterior on any model; a Gaussian filter is so on linear ones alone."""
     assert {name for name in NAMES if method_of(name).is_exact} == set(EXACT)

@@ -220,7 +220,7 @@ def test_what_does_not_fit_is_refused_in_every_engine(case: str) -> None:
     model, record, draws, message = WRONG[case]
     for method in (ParticleFilter(20), GaussianFilter(CubaturePoints())):
         for compiled in (False, True):
-            with dispatch.use_compiled(compiled), pytest.raises(ValueError, match=message):
+            with dispatch.use_kernels(compiled), pytest.raises(ValueError, match=message):
                 run_filter(method, model, record, draws)
 
 

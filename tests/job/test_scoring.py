@@ -43,7 +43,7 @@ def law(runs: int = 3) -> tuple[Tensor, Tensor]:
 @pytest.fixture(params=[False, True], ids=["eager", "fused"])
 def both(request: pytest.FixtureRequest) -> Iterator[None]:
     """By the library, and by loops of the project's own."""
-    with dispatch.use_compiled(request.param):
+    with dispatch.use_kernels(request.param):
         yield
 
 
@@ -235,7 +235,7 @@ def test_a_group_of_a_covariance_is_cut_from_the_whole(
     )
     model: Any = SimpleNamespace(chart=chart)
     for laid in (x.contiguous(), x.permute(2, 0, 1).contiguous().permute(1, 2, 0)):
-        with dispatch.use_compiled(fused):
+        with dispatch.use_kernels(fused):
             info = summarise(model, ParticleBelief(laid, log_w, torch.zeros(3, dtype=x.dtype)), {})
             found = info.covariance_of(torch.tensor(parts))
         whole = info.covariance()

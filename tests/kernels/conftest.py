@@ -10,5 +10,5 @@ from pfbench.kernels import dispatch
 @pytest.fixture(autouse=True)
 def torch_operations() -> Iterator[None]:
     """Run compilable functions in torch operations unless a test asks for operators."""
-    with dispatch.use_compiled(False):
+    with dispatch.use_kernels(False):
         yield

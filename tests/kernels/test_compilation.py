@@ -49,13 +49,13 @@ def test_what_is_not_fused_runs_the_eager_form() -> None:
     seen: list[str] = []
     half = dispatch.compilable(lambda: seen.append("fused"), eager=lambda: seen.append("eager"))
     half()
-    with dispatch.use_compiled(False):
+    with dispatch.use_kernels(False):
         half()
     assert seen == ["eager", "eager"]
 
 
 def test_the_switch_is_put_back_after_an_error() -> None:
-    with pytest.raises(RuntimeError), dispatch.use_compiled():
+    with pytest.raises(RuntimeError), dispatch.use_kernels():
         raise RuntimeError
     assert not dispatch._fused.get()
 
@@ -102,7 +102,7 @@ def results(x: Tensor, z: Tensor) -> list[Any]:
 def test_fused_functions_agree_with_eager_ones(dtype: torch.dtype) -> None:
     x, z = DRAWS.normal("x", N, D).to(dtype), DRAWS.normal("w", N, 1)[..., 0].to(dtype)
     eager = results(x, z)
-    with dispatch.use_compiled():
+    with dispatch.use_kernels():
         fused = results(x, z)
     torch.testing.assert_close(fused, eager)
 
@@ -118,7 +118,7 @@ def test_a_filter_runs_alike_fused_and_eagerly() -> None:
         return run_filter(ParticleFilter(300), model, record, PhiloxStream(1, torch.arange(4)))
 
     eager = run()
-    with dispatch.use_compiled(), torch.no_grad():
+    with dispatch.use_kernels(), torch.no_grad():
         fused = run()
     assert torch.allclose(fused.log_evidence, eager.log_evidence, rtol=1e-9, atol=0.0)
     assert torch.allclose(fused.mean, eager.mean, rtol=1e-9, atol=1e-12)
@@ -431,7 +431,7 @@ def test_without_a_library_operators_run_in_torch_and_one_line_says_so(
     cpp_library.is_library_loaded.cache_clear()
     monkeypatch.setattr(cpp_library, "load_library", load)
     terms = torch.rand(3, 5)
-    with dispatch.use_compiled():
+    with dispatch.use_kernels():
         sums = [belief._totals(terms) for _ in range(2)]
     cpp_library.is_library_loaded.cache_clear()
     for total, square in sums:
@@ -477,7 +477,7 @@ def test_a_gradient_goes_round_the_loops_by_hand() -> None:
         DRAWS.normal("x", N, D).requires_grad_(),
         torch.softmax(DRAWS.normal("w", N, 1)[..., 0], -1),
     )
-    with dispatch.use_compiled():
+    with dispatch.use_kernels():
         belief._flat_moments(x, w)[0].sum().backward()
     torch.testing.assert_close(x.grad, w.unsqueeze(-1).expand_as(x))
 
@@ -558,7 +558,7 @@ def test_compiling_keeps_the_validation_of_distributions() -> None:
     before = torch.distributions.Distribution._validate_args
     model = linear_walk(1.0, 0.3, 1.0)
     record = Record(torch.zeros(2, 3, 1, dtype=torch.float64))
-    with dispatch.use_compiled():
+    with dispatch.use_kernels():
         run_filter(ParticleFilter(20), model, record, PhiloxStream(1, torch.arange(2)))
     dispatch._compile_by_torch(lambda a: a + 1.0)(torch.ones(2))
     assert torch.distributions.Distribution._validate_args == before

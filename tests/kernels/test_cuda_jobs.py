@@ -79,7 +79,7 @@ def on(
     draws: type[PhiloxStream] = PhiloxStream,
 ) -> FilterResult:
     model = model.to(device)
-    with torch.no_grad(), dispatch.use_compiled(fused):
+    with torch.no_grad(), dispatch.use_kernels(fused):
         return run_filter(
             method,
             model,

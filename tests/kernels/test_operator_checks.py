@@ -215,7 +215,7 @@ def test_a_wrong_call_has_one_message_in_eager_mode_and_in_cpp(name: str) -> Non
         assert message.startswith(f"ValueError: {name}"), message
         assert " must " in message
         assert refusal(getattr(dispatch, name), call) == message
-        with dispatch.use_compiled():
+        with dispatch.use_kernels():
             assert refusal(function, call) == message
 
 

@@ -123,7 +123,7 @@ def test_compiled_code_draws_the_bits_of_torch(dtype: torch.dtype) -> None:
         for threads in (1, 2):
             torch.set_num_threads(threads)
             try:
-                with dispatch.use_compiled():
+                with dispatch.use_kernels():
                     found = draw(step, n, w)
             finally:
                 torch.set_num_threads(1)

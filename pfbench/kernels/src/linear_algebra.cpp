@@ -1,6 +1,6 @@
 // Linear algebra of small matrices, those of many runs side by side: they are too small to be worked on one by one.
 //
-// Compiled as loops.cpp: NaN and infinity keep their meaning, and a run that has no result does no harm to its neighbours.
+// Compiled as particles.cpp: NaN and infinity keep their meaning, and a run that has no result does no harm to its neighbours.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

@@ -1,6 +1,6 @@
-// Scores of a cloud against the truth, which a report wants at some instants: see judge.py.
+// Scores of a cloud against the truth, which a report wants at some instants.
 //
-// Compiled as loops.cpp: NaN and infinity keep their meaning.
+// Compiled as particles.cpp: NaN and infinity keep their meaning.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

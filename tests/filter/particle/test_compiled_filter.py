@@ -217,7 +217,7 @@ def test_steps_taken_together_are_the_steps_taken_one_by_one(recorded: list[list
             }
 
     draws = PhiloxStream(1, torch.arange(RUNS))
-    with dispatch.use_compiled(), torch.no_grad():
+    with dispatch.use_kernels(), torch.no_grad():
         together, counted = run_filter(step, model, record, draws, watch), tally.count
         apart = run_filter(method, model, record, draws, watch)
     agree(together, apart)
@@ -246,7 +246,7 @@ def test_health_is_the_same_where_steps_are_taken_together(
 
     monkeypatch.setattr(loop, "HealthMonitor", Kept)
     method, draws = ParticleFilter(60), PhiloxStream(1, torch.arange(runs))
-    with dispatch.use_compiled(), torch.no_grad():
+    with dispatch.use_kernels(), torch.no_grad():
         for filtered in (CompiledParticleFilter(method), method):
             run_filter(filtered, Fragile(), record, draws)
     together, apart = kept

@@ -261,7 +261,7 @@ def test_a_stage_that_asks_for_too_many_particles_is_refused(compiled: bool) -> 
     for factor in (2.0, 0.0, -1.0, torch.nan):
         method = ParticleFilter(20, particle_count=TooMany(factor))
         with (
-            dispatch.use_compiled(compiled),
+            dispatch.use_kernels(compiled),
             pytest.raises(ValueError, match=r"from 1 to 20 slots"),
         ):
             run_filter(method, linear_walk(1.0, 0.3, 1.0), record, draws)

@@ -622,7 +622,7 @@ def test_distinct_particles_are_counted(
     different: list[list[int]] = []
     moves = (MetropolisHastings(NoiseFlowKernel(), mcmc_steps=2),) if moving else ()
     method = ParticleFilter(40, EssResampler(scheme), moves=moves, proposal=Counting(different))
-    with dispatch.use_compiled(fused):
+    with dispatch.use_kernels(fused):
         trace = run_filter(method, model, record, PhiloxStream(5, torch.arange(4))).trace
     assert bool(trace["resampled"].any())
     assert trace["unique" if moving else "ancestors"].T.tolist() == different
