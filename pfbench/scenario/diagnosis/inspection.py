@@ -88,15 +88,17 @@ class LogSource:
         (inertial, gnss, third), notes = self.corrections.correct_tables(inertial, gnss, truth or gnss)  # fmt: skip
         return (inertial, gnss, third if truth else None), notes
 
-    def check_reading(self, tables: LogTables, mended: tuple[str, ...], known: Diagnosed) -> str:
+    def check_reading(
+        self, tables: LogTables, mended: tuple[str, ...], diagnosis: Diagnosed
+    ) -> str:
         """Check corrected tables as a run does; return the message if they are refused."""
         inertial, gnss, truth = tables
         try:
             if truth:
-                log = check_tables((inertial, gnss, truth), mended, self.corrections, self.origin, self.limits, self.fix_codes, known)  # fmt: skip
+                log = check_tables((inertial, gnss, truth), mended, self.corrections, self.origin, self.limits, self.fix_codes, diagnosis)  # fmt: skip
             else:
                 check_corrections(self.corrections, has_positions=False)
-                log = check_aligned_tables(tables, mended, self.corrections, self.origin, self.fix_codes, known)  # fmt: skip
+                log = check_aligned_tables(tables, mended, self.corrections, self.origin, self.fix_codes, diagnosis)  # fmt: skip
         except ValueError as error:
             return str(error)
         announce_notes(self.folder, log.notes)

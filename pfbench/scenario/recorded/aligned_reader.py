@@ -70,7 +70,7 @@ def check_aligned_tables(
     mending: LogCorrections,
     origin: Sequence[float] | None = None,
     fix_codes: FixCodes = None,
-    known: Diagnosed | None = None,
+    diagnosis: Diagnosed | None = None,
 ) -> NavigationLog:
     """Check corrected tables of a log without a reference of the attitude; the arguments are those of `check_tables`.
 
@@ -89,7 +89,7 @@ def check_aligned_tables(
     check_overlap(inertial.name, sensors.time, gnss.name, fixes.time)
     gravity, gravity_notes = gravity_at(centre)
     raw = take_log((inertial, gnss, gnss), sensors, fixes, None, gravity)
-    diagnosed = diagnose(raw, has_own_fixes=True, known=known)
+    diagnosed = diagnose(raw, has_own_fixes=True, diagnosis=diagnosis)
     dropped = dict.fromkeys(note for table in (inertial, gnss) for note in table.notes)
     notes = (*dropped, *mended, *usable_notes, *notes, *gravity_notes, *diagnosed)
     reference = read_track(truth, centre) if truth else _join_fixes(fixes)

@@ -135,11 +135,11 @@ def check_tables(
     origin: Sequence[float] | None = None,
     limits: PlausibleLimits | None = None,
     fix_codes: FixCodes = None,
-    known: Diagnosed | None = None,
+    diagnosis: Diagnosed | None = None,
 ) -> NavigationLog:
     """Check corrected tables, and correct their fixes; the other arguments are those of `read_log`.
 
-    Returns the log. `mended` are the notes of the corrections, and `known` are findings of the same rows, which
+    Returns the log. `mended` are the notes of the corrections, and `diagnosis` are findings of the same rows, which
     are then not looked for again.
     """
     inertial, gnss, truth = tables
@@ -158,7 +158,7 @@ def check_tables(
     fixes, fix_notes = _compare_fixes(gnss, fixes, (truth, reference), limits or PlausibleLimits())
     dropped = dict.fromkeys(note for table in (inertial, gnss, truth) for note in table.notes)
     raw = take_log((inertial, gnss, truth), sensors, fixes, reference, gravity)
-    diagnosed = diagnose(raw, has_own_fixes=gnss.name != truth.name, known=known)
+    diagnosed = diagnose(raw, has_own_fixes=gnss.name != truth.name, diagnosis=diagnosis)
     notes = (*dropped, *mended, *mended_fixes, late, *usable_notes, *notes, *fix_notes)
     spans = ((inertial.name, sensors.time), (gnss.name, fixes.time), (truth.name, reference.time))
     notes = (*_leave_out_offsets(notes, diagnosed), *diagnosed, *compare_times(spans))
@@ -179,10 +179,12 @@ class Diagnosed(NamedTuple):
 
 
 def diagnose(
-    log: RawLog, *, has_own_fixes: bool, known: Diagnosed | None = None
+    log: RawLog, *, has_own_fixes: bool, diagnosis: Diagnosed | None = None
 ) -> tuple[str, ...]:
     """Return the findings of the quick checks as notes; raise those that refuse the log."""
-    findings = known.findings if known and known.has_rows_of(log) else run_checks(log)[0]
+    findings = (
+        diagnosis.findings if diagnosis and diagnosis.has_rows_of(log) else run_checks(log)[0]
+    )
     refused = [finding for finding in findings if finding.level == REFUSE]
     if refused:
         raise ValueError(

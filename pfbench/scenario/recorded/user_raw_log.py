@@ -18,7 +18,7 @@ from pfbench.files.reader_notes import announce_notes
 from pfbench.model.raw_gnss import RawGnss, RawGnssInputs, RawGnssTuning
 from pfbench.nav import earth
 from pfbench.nav.plausible_limits import PlausibleLimits
-from pfbench.noise.base import NoiseRegime, check_unit_process
+from pfbench.noise.base import NoiseRegime, check_unit_process, draw_added_errors
 from pfbench.scenario.base import Scenario
 from pfbench.scenario.recorded.aligned_reader import read_track
 from pfbench.scenario.recorded.corrections import LogCorrections
@@ -122,7 +122,9 @@ class UserRawLog(Scenario):
         draws, time = PhiloxStream(seed, runs), torch.from_numpy(grid[1:])
         check_unit_process(noise, time)
         y = torch.from_numpy(measurements[1:]).repeat(len(runs), 1, 1)
-        y += noise.draw_errors(draws.at_step(0), self.receiver.channels(len(gnss_log.names)), time)
+        y += draw_added_errors(
+            noise, draws.at_step(0), self.receiver.channels(len(gnss_log.names)), time
+        )
         inputs = RawGnssInputs(torch.from_numpy(np.diff(grid))[None], *make_sky_inputs(gnss_log))
         path = torch.from_numpy(motion[1:]).expand(len(runs), -1, -1)
         truth = {"position": path[..., 7:], "velocity": path[..., 4:7]}
