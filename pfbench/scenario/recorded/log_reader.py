@@ -172,7 +172,7 @@ class Diagnosed(NamedTuple):
     findings: Sequence[Finding]
 
     def has_rows_of(self, log: RawLog) -> bool:
-        """Whether another reading of the tables has the same samples and fixes."""
+        """Return whether another reading of the tables has the same samples and fixes."""
         pairs = zip(self.log.imu[:3] + self.log.fixes[:2], log.imu[:3] + log.fixes[:2], strict=True)
         same = all(np.array_equal(a, b) for a, b in pairs)
         return same and np.array_equal(self.log.reference.time, log.reference.time)
