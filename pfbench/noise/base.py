@@ -322,7 +322,7 @@ class GlintNoise(_ContaminatedNoise):
 
 @dataclass(frozen=True)
 class AddedErrors(_UnitProcess):
-    """Errors in metres beside the nominal ones, for records whose measurements have errors already.
+    """Errors in metres in addition to the nominal ones, for records whose measurements have errors already.
 
     Positions or, without positions, ranges get them; a scenario without both is refused. [ours]
 

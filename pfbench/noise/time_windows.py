@@ -265,7 +265,7 @@ class RandomOutage(LayeredRegime):
         base_regime: Errors of the other measurements.
 
     Raises:
-        ValueError: If the length is not positive, or there is no outage. On drawing, if the record is not longer.
+        ValueError: If the length is not positive, or the number is 0. On drawing, if the record is not longer.
     """
 
     duration_s: float = 30.0

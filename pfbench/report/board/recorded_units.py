@@ -75,7 +75,7 @@ def collect_record(
 
 
 def count_drives(meta: Mapping[str, Any]) -> int:
-    """Return the number of drives of a recorded scenario, of which run r uses drive r modulo this number."""
+    """Return the number of drives of a recorded scenario; run r uses drive r modulo this number."""
     return len(meta["config"]["scenario"].get("flights") or (1,))
 
 

@@ -210,7 +210,7 @@ class UserRawLog(Scenario):
 
     @property
     def _is_alone(self) -> bool:
-        """Return whether the log has no truth."""
+        """Return whether the log is without a truth."""
         return self.reference is None and self.standing is None
 
     def _solve_track(self, folder: Path, epochs: RawEpochs) -> tuple[ReferenceLog, Sequence[float]]:

@@ -507,5 +507,5 @@ def test_the_page_raw_ranges_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
             exec(compile(code, "raw_ranges.md", "exec"), {})
         else:
             block(code, tmp_path)
-    assert len(list(tmp_path.glob("results/*/*.npz"))) == 6
-    assert len(page.splitlines()) <= 75
+    assert len(list(tmp_path.glob("results/*/*.npz"))) == 4
+    assert len(page.splitlines()) <= 60
