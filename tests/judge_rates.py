@@ -21,16 +21,16 @@ from scipy.special import stdtr
 
 from pfbench.judge.judge_options import JudgeOptions
 from pfbench.judge.pair_verdicts import PairVerdict, judge_pairs
-from pfbench.judge.time_blocks import (
+from pfbench.results.store import JobResult
+from pfbench.stats.comparison import EQUALITY_MARGIN, MIN_RUNS
+from pfbench.stats.rank_tests import rank_sum_cdf, wilcoxon_signed_rank_rows
+from pfbench.stats.time_blocks import (
     BLOCKS,
     MIN_EFFECTIVE,
     block_losses,
     remove_drift,
     variance_ratio,
 )
-from pfbench.results.store import JobResult
-from pfbench.stats.comparison import EQUALITY_MARGIN, MIN_RUNS
-from pfbench.stats.rank_tests import rank_sum_cdf, wilcoxon_signed_rank_rows
 
 STEPS = 600
 CAP = 100.0

@@ -234,7 +234,7 @@ def test_every_regime_gives_errors(scenario: str, noise: str) -> None:
     regime, times = job.instantiate(cfg.noise), torch.arange(1.0, 201.0, dtype=torch.float64)
     errors = regime.draw_errors(
         PhiloxStream(SEED, RUNS),
-        MeasurementChannels.of_one_kind(torch.ones(3, dtype=torch.float64)),
+        MeasurementChannels(torch.ones(3, dtype=torch.float64), ("position",) * 3, (0, 0, 0)),
         times,
     )
     assert errors.shape == (2, 200, 3)

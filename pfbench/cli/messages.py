@@ -146,7 +146,8 @@ def _format_refusal(text: str, cause: BaseException, words: Sequence[str]) -> st
     keys = (word.lstrip("+").partition("=")[0] for word in words)
     same_name = [name for name in keys if name.endswith(f".{match[1]}")]
     full = min(same_name, key=lambda name: not name.startswith(key), default=f"{key}.{match[1]}")
-    return full + message[match.end() :]
+    rest = message[match.end() :].replace(f"Change {match[0]}.", f"Change {full}.")
+    return full + rest
 
 
 def _format_unknown_key(name: str, words: Sequence[str]) -> str:

@@ -12,6 +12,8 @@ import pandas as pd
 
 from pfbench.door.parts import format_html_table
 from pfbench.report.board import build_pack, build_run_table
+from pfbench.report.board.recorded_units import count_drives, describe_drives
+from pfbench.report.methods_text import is_recorded
 from pfbench.report.options import ReportOptions
 from pfbench.report.overview.tables import read_world_facts
 from pfbench.report.study_page.page_writer import describe_opening
@@ -83,9 +85,11 @@ class Comparison:
 
     Attributes:
         verdicts: Verdicts by the name of the condition, one family of tests.
+        reach: Of what the runs of recorded conditions are a sample; empty for simulated ones.
     """
 
     verdicts: Mapping[str, Verdict]
+    reach: str = ""
 
     @property
     def word(self) -> str:
@@ -117,11 +121,13 @@ class Comparison:
         return next(iter(self.verdicts.values()))
 
     def __repr__(self) -> str:
-        return "\n".join(f"{name}: {_format(v)}" for name, v in self.verdicts.items())
+        lines = (f"{name}: {_format(v)}" for name, v in self.verdicts.items())
+        return "\n".join(filter(None, (*lines, self.reach)))
 
     def _repr_html_(self) -> str:
         heads = ("condition", "verdict")
-        return format_html_table(heads, [(name, _format(v)) for name, v in self.verdicts.items()])
+        table = format_html_table(heads, [(name, _format(v)) for name, v in self.verdicts.items()])
+        return f"{table}<p>{html.escape(self.reach)}</p>" if self.reach else table
 
 
 def _format(verdict: Verdict) -> str:
@@ -157,7 +163,13 @@ def compare_in_conditions(conditions: Sequence[Condition], a: str, b: str) -> Co
         raise ValueError(
             f"{a} and {b} must have a condition in common, got none. Run both in one scenario."
         )
-    return Comparison({pair.world: pair.verdict for pair in compare_methods(worlds, (a, b))})
+    recorded = {c.scenario: c.jobs[0].meta for c in conditions if is_recorded(c.jobs[0].meta)}
+    drives = (describe_drives(name, count_drives(meta)) for name, meta in recorded.items())
+    reach = " ".join(
+        f"{text}. The page of the study has other stretches and drives." for text in drives
+    )
+    verdicts = {pair.world: pair.verdict for pair in compare_methods(worlds, (a, b))}
+    return Comparison(verdicts, reach)
 
 
 def _make_world(condition: Condition, name: str, pair: tuple[str, str]) -> World:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]  # of columns
 _SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 _COMMENT = "#%"
-_CONTROL = frozenset(map(chr, range(32))) - {"\t"}
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f]")
 
 
 class TableFile(NamedTuple):
@@ -58,16 +59,19 @@ def _read_csv(file: Path) -> TableFile:
             f"{file.name}: line 1 must have different names of columns, got {problem}. "
             "Rename or remove a column. In pandas, to_csv(index_label=NAME) names the index."
         )
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate([] if _is_regular(lines, len(names)) else lines, 1):
         fields = len(_split_fields(line)) if line.strip() else 0
         if fields != len(names) or line.count('"') % 2:
             raise ValueError(
                 f"{file.name}: line {number} must have {len(names)} fields separated by commas, "
                 f"got {fields} in {line[:80]!r}. {_field_remedy(lines, len(names))}"
             )
+    # bytes, since a text file in memory has four of them per character
+    content, count = io.BytesIO(("\n".join(lines) + "\n").encode()), len(lines)
+    del lines
     try:
         rows = pd.read_csv(
-            io.StringIO("\n".join(lines) + "\n"),
+            content,
             skip_blank_lines=False,
             skipinitialspace=True,
             index_col=False,
@@ -78,13 +82,18 @@ def _read_csv(file: Path) -> TableFile:
             f"{file.name} must be a table of numbers separated by commas, got an error of the "
             f"reader: {_first_line(error)}. Write the file again."
         ) from error
-    if len(rows) != len(lines) - 1:
+    if len(rows) != count - 1:
         raise ValueError(
             f"{file.name} must have one row in each line, got {len(rows)} rows in "
-            f"{len(lines) - 1} lines. Remove quotes and line breaks inside of fields."
+            f"{count - 1} lines. Remove quotes and line breaks inside of fields."
         )
     rows.columns = pd.Index(names)
     return TableFile(rows, {}, notes)
+
+
+def _is_regular(lines: Sequence[str], fields: int) -> bool:
+    """Return whether all lines have this many fields and none has quotes; False for one field, which can be blank."""
+    return fields > 1 and all(line.count(",") == fields - 1 and '"' not in line for line in lines)
 
 
 def _field_remedy(lines: Sequence[str], names: int) -> str:
@@ -168,17 +177,18 @@ def _whole_lines(file: Path) -> tuple[list[str], tuple[str, ...]]:
             f"{file.name}: line {position} must be text in UTF-8, got the byte "
             f"{content[error.start]:#04x}. {remedy}"
         ) from None
-    lines = text.replace("\r\n", "\n").split("\n")
-    is_old_mac = len(lines) == 1 and "\r" in text
-    for number, line in enumerate(lines, 1):
-        if not _CONTROL.isdisjoint(line):
-            remedy = (
-                _convert(file, "", "line ends") if is_old_mac else "Repair or remove this line."
-            )
-            raise ValueError(
-                f"{file.name}: line {number} must not contain control characters, "
-                f"got {line[:80]!r}. {remedy}"
-            )
+    del content
+    text = text.replace("\r\n", "\n")
+    lines = text.split("\n")
+    control = _CONTROL.search(text)
+    if control:
+        number = text.count("\n", 0, control.start()) + 1
+        is_old_mac = len(lines) == 1 and "\r" in text
+        remedy = _convert(file, "", "line ends") if is_old_mac else "Repair or remove this line."
+        raise ValueError(
+            f"{file.name}: line {number} must not contain control characters, "
+            f"got {lines[number - 1][:80]!r}. {remedy}"
+        )
     last = lines.pop()
     if not lines:
         raise ValueError(

@@ -10,19 +10,11 @@ import numpy as np
 
 from pfbench.judge.judge_options import JudgeOptions
 from pfbench.judge.sequence_results import SequenceResults
-from pfbench.judge.time_blocks import (
-    MIN_EFFECTIVE,
-    block_losses,
-    compare_blocks,
-    count_blocks,
-    remove_drift,
-)
 from pfbench.results.status import keeps_track
 from pfbench.stats.comparison import (
     EQUALITY_MARGIN,
     MIN_RUNS,
     NO_DECISION,
-    SAME_RUNS,
     Effect,
     Unit,
     Verdict,
@@ -31,7 +23,14 @@ from pfbench.stats.comparison import (
     decide,
 )
 from pfbench.stats.error_measures import Array, Flags, rmse_per_run
-from pfbench.stats.sentences import format_count, format_digits
+from pfbench.stats.sentences import format_count
+from pfbench.stats.time_blocks import (
+    block_losses,
+    compare_blocks,
+    count_blocks,
+    remove_drift,
+    withhold,
+)
 
 _LEAST_CAP = 100.0  # m, error of a lost run where the reference does not move [ours]
 
@@ -123,17 +122,9 @@ def cap_of(sequence: SequenceResults, options: JudgeOptions) -> float:
 
 def _withhold(sample: _Sample, verdict: Verdict, steady: Verdict) -> Verdict:
     """Return the verdict, undecided where the sample cannot carry its word."""
-    reason = sample.reason
-    if not reason and verdict.word not in (NO_DECISION, SAME_RUNS):
-        if sample.effective < min(MIN_EFFECTIVE, verdict.n):
-            count = f"{verdict.n} blocks that count as {format_digits(sample.effective, 2)} independent ones"
-            reason = f"errors vary slowly: {count}, {MIN_EFFECTIVE:g} are required"
-        elif steady.word != verdict.word:
-            reason = (
-                "the difference rests on the mean error and the drift of the run, which one record cannot "
-                "tell from those of another run"
-            )
-    return verdict._replace(word=NO_DECISION, reason=reason) if reason else verdict
+    if sample.reason:
+        return verdict._replace(word=NO_DECISION, reason=sample.reason)
+    return withhold(verdict, steady, sample.effective)
 
 
 def _draw_sample(

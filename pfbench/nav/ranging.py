@@ -51,7 +51,7 @@ class ReceiverClock:
     drift_walk: float = 0.03
 
     def __post_init__(self) -> None:
-        require_ranges("receiver.clock", self, **{item.name: "(0, inf]" for item in fields(self)})
+        require_ranges("clock", self, **{item.name: "(0, inf]" for item in fields(self)})
 
     def noise_gain(self, duration: Tensor) -> Tensor:
         """Compute the noise root of (bias, drift) over durations [...] s: [..., 2, 2].

@@ -1,6 +1,7 @@
 """Public names of `pfbench.noise` and the modules that define them."""
 
 from pfbench.noise.base import (
+    AddedErrors as AddedErrors,
     ErrorDistribution as ErrorDistribution,
     GlintNoise as GlintNoise,
     LaplaceNoise as LaplaceNoise,
@@ -18,5 +19,6 @@ from pfbench.noise.error_replay import ErrorReplay as ErrorReplay
 from pfbench.noise.time_windows import (
     BiasStep as BiasStep,
     MeasurementOutage as MeasurementOutage,
+    RandomOutage as RandomOutage,
     VarianceSurge as VarianceSurge,
 )

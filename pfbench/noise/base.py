@@ -103,6 +103,25 @@ def check_unit_process(noise: NoiseRegime, time: Tensor) -> None:
         )
 
 
+def draw_added_errors(
+    noise: NoiseRegime, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+) -> Tensor:
+    """Draw the errors that a regime adds to recorded measurements, whose standard deviations can be 0.
+
+    Returns errors, [R, T, Dy]. A regime that would change nothing is refused. Shapes: time [T].
+    """
+    errors = noise.draw_errors(draws, channels, time)
+    inner = getattr(noise, "regime", noise)  # a job wraps it
+    if isinstance(inner, NominalNoise | AddedErrors) or bool((errors != 0.0).any()):
+        return errors
+    sd = "position_sd=[1.5,1.5,3.0]" if "position" in channels.kind else "range_sd=1.0"
+    raise ValueError(
+        f"noise must change the measurements, got {type(inner).__name__} with errors of 0: it scales the standard "
+        f"deviations of scenario.receiver, which are 0, or acts outside of the record, {float(time[0]):g} to "
+        f"{float(time[-1]):g} s. Set scenario.receiver.{sd}, or noise=added_white, added_outliers or random_outage."
+    )
+
+
 def make_no_distribution_error(noise: str, reason: str) -> ValueError:
     """Make the error of a regime without a distribution per step."""
     return ValueError(
@@ -299,6 +318,59 @@ class GlintNoise(_ContaminatedNoise):
         outlier_mask = self._outlier_mask(draws, channels, time)
         spike = self.sd_factor * LaplaceNoise().draw_errors(draws, channels, time)
         return torch.where(outlier_mask, spike, NominalNoise().draw_errors(draws, channels, time))
+
+
+@dataclass(frozen=True)
+class AddedErrors(_UnitProcess):
+    """Errors in metres in addition to the nominal ones, for records whose measurements have errors already.
+
+    Positions or, without positions, ranges get them; a scenario without both is refused. [ours]
+
+    Attributes:
+        sd_m: Standard deviation of a white normal error, m.
+        probability: Probability of an outlier per epoch and source.
+        outlier_sd_m: Standard deviation of an outlier, m, in all components of the source.
+
+    Raises:
+        ValueError: If a number is negative, the probability is above 1, or nothing is added.
+    """
+
+    sd_m: float = 0.0
+    probability: float = 0.0
+    outlier_sd_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_ranges(
+            "noise", self, sd_m="[0, inf]", probability="[0, 1]", outlier_sd_m="[0, inf]"
+        )
+        if not (self.sd_m or self.probability * self.outlier_sd_m):
+            raise ValueError(
+                "noise must add errors, got sd_m, probability or outlier_sd_m of 0. Set noise.sd_m, or both others."
+            )
+
+    @override
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        kind = next((kind for kind in ("position", "range") if kind in channels.kind), None)
+        if kind is None:
+            raise ValueError(
+                "noise must add metres to positions or ranges, got a scenario without both. "
+                "Choose a regime in standard deviations, such as noise=outliers."
+            )
+        is_changed = torch.tensor([k == kind for k in channels.kind])
+        sources, source = torch.unique(torch.tensor(channels.source), return_inverse=True)
+        t, k = len(time), len(channels.sd)
+        is_outlier = draws.uniform("world.outliers", t, len(sources)) < self.probability
+        errors = self.sd_m * draws.normal("world.added", t, k)
+        errors = errors + is_outlier[..., source] * self.outlier_sd_m * draws.normal("world.tails", t, k)  # fmt: skip
+        return NominalNoise().draw_errors(draws, channels, time) + torch.where(is_changed, errors, 0.0)  # fmt: skip
+
+    @override
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        raise make_no_distribution_error(
+            noise="added errors", reason="those of the record beside them are unknown"
+        )
 
 
 # --------------------------------------------------------------------------------------------------

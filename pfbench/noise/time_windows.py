@@ -251,3 +251,49 @@ class MeasurementOutage(LayeredRegime):
     def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
         # NaN in the record shows the outage, so only visible components need a distribution
         return self.base_regime.error_distribution(channels, time)
+
+
+@dataclass(frozen=True)
+class RandomOutage(LayeredRegime):
+    """Outages at random times: all measurements are missing, in each run at times of its own.
+
+    One record then gives many runs. Outages of a run may overlap. [ours]
+
+    Attributes:
+        duration_s: Length of an outage, s.
+        count: Number of outages of a run.
+        base_regime: Errors of the other measurements.
+
+    Raises:
+        ValueError: If the length is not positive, or the number is 0. On drawing, if the record is not longer.
+    """
+
+    duration_s: float = 30.0
+    count: int = 1
+    base_regime: NoiseRegime = field(default_factory=NominalNoise)
+
+    def __post_init__(self) -> None:
+        require_ranges("noise", self, duration_s="(0, inf]", count="[1, inf]")
+
+    @override
+    def draw_errors(
+        self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
+    ) -> Tensor:
+        room = float(time[-1] - time[0]) - self.duration_s
+        if not room > 0.0:
+            raise ValueError(
+                f"noise.duration_s must be shorter than the record of {room + self.duration_s:g} s, "
+                f"got {self.duration_s:g}. Give a shorter outage."
+            )
+        start = time[0] + room * draws.uniform("world.outage", 1, self.count).to(
+            time
+        )  # [R, 1, count]
+        since = time[:, None] - start
+        is_missing = ((since >= 0.0) & (since < self.duration_s)).any(-1, keepdim=True)
+        return torch.where(
+            is_missing, torch.nan, self.base_regime.draw_errors(draws, channels, time)
+        )
+
+    @override
+    def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
+        return self.base_regime.error_distribution(channels, time)

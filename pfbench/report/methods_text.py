@@ -114,7 +114,7 @@ def collect_methods_facts(
         margin=margin,
         rounds=min(len(job.get(STEP_TIME, {}).get("rounds", ())) for job in jobs),
         software=_list_software(jobs),
-        is_recorded=any(_is_recorded(job) for job in jobs),
+        is_recorded=any(is_recorded(job) for job in jobs),
         has_threshold=any(divergence_threshold(job) is not None for job in jobs),
         is_complete=all(names == set.union(*labels) for names in labels),
         tuned=count_tuned(study_looks(conditions)),
@@ -144,7 +144,7 @@ def _list_software(jobs: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
     return {name: distinct_values(map(str, values)) for name, values in software.items()}
 
 
-def _is_recorded(meta: Mapping[str, Any]) -> bool:
+def is_recorded(meta: Mapping[str, Any]) -> bool:
     """Return whether the scenario of a job reads recorded data."""
     node = meta["config"].get("scenario")
     return isinstance(node, Mapping) and "root" in node

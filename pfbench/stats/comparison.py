@@ -33,7 +33,7 @@ from pfbench.stats.rank_tests import (
     wilcoxon_signed_rank_rows,
 )
 
-Unit = Literal["run", "block", "world"]
+Unit = Literal["run", "block", "drive", "world"]
 Word = Literal["better", "worse", "equal", "identical", "not decided"]
 BETTER_THAN: Final = "better"
 WORSE_THAN: Final = "worse"
@@ -58,7 +58,7 @@ class Effect(NamedTuple):
     Attributes:
         a: Name of the first filter.
         b: Name of the second filter.
-        unit: What was drawn independently: a run, a block of time or a world.
+        unit: What was drawn independently: a run, a block of time, a drive or a world.
         differences: Log ratios of their losses, [n]; negative where the first filter is better.
         p: p-value of the signed-rank test, two-sided; 1 without a difference.
         p_trimmed: p-value of the trimmed mean.

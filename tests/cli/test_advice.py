@@ -190,6 +190,22 @@ def test_text_in_place_of_a_number_is_refused_by_its_setting() -> None:
 
 
 @pytest.mark.parametrize(
+    ("scenario", "key"),
+    [
+        ("scenario=user_raw_log", "scenario.tuning.clock.drift_sd"),
+        ("scenario=anshun_fit", "scenario.receiver.clock.drift_sd"),
+    ],
+)
+def test_a_clock_is_refused_by_the_key_of_its_scenario(scenario: str, key: str) -> None:
+    words = [scenario, f"{key}=-1"]
+    own = ["scenario.folder=own", "data.root=."] if "user" in scenario else []
+    with pytest.raises(Exception, match="drift_sd must be positive, got -1") as caught:
+        job.build_plan(compose(["filter=ekf", *own, *words]))
+    message = messages.format_error(caught.value, words)
+    assert message == f"{key} must be positive, got -1. Change {key}."
+
+
+@pytest.mark.parametrize(
     ("text", "advice"),
     [
         ("LexerNoViableAltException: study=é\n  ^\nSee https://hydra.cc", "must be key=value. Quote"),

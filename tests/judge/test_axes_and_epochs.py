@@ -16,9 +16,9 @@ from pfbench.judge.formats import read_trajectories
 from pfbench.judge.judge_options import JudgeOptions, SourceOptions
 from pfbench.judge.judgement import judge_programs
 from pfbench.judge.reference_track import read_reference
-from pfbench.judge.time_blocks import block_losses, compare_blocks
 from pfbench.results.store import write_result
 from pfbench.stats.comparison import decide
+from pfbench.stats.time_blocks import block_losses, compare_blocks
 
 WRONG = {
     "swapped positions": ({"pn": "pe", "pe": "pn"}, [], "column pn .* times those of pe"),

@@ -10,14 +10,14 @@ import pytest
 from judge_rates import METHODS, ROWS, Row, alarms, draw_studies, judge_studies, judge_study
 from scipy.signal import lfilter
 
-from pfbench.judge.time_blocks import (
+from pfbench.stats.comparison import compare
+from pfbench.stats.time_blocks import (
     block_losses,
     compare_blocks,
     count_blocks,
     remove_drift,
     variance_ratio,
 )
-from pfbench.stats.comparison import compare
 
 
 def markov(rng: np.random.Generator, rho: float, n: int) -> np.ndarray:

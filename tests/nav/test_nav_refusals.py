@@ -60,7 +60,7 @@ REFUSED: dict[str, list[Refusal]] = {
         (r"receiver\.mask_deg must be in \[-90, 90\], got 91\.0", lambda: replace(RECEIVER, mask_deg=91.0)),
         (r"receiver\.satellites must .*got \['W01', 'W01'\]. Give each satellite once", lambda: replace(RECEIVER, satellites=["W01", "W01"])),
         (r"receiver\.satellites must .*got \[\]", lambda: replace(RECEIVER, satellites=[])),
-        (r"receiver\.clock\.drift_walk must be positive, got 0\.0", lambda: ReceiverClock(drift_walk=0.0)),
+        (r"clock\.drift_walk must be positive, got 0\.0", lambda: ReceiverClock(drift_walk=0.0)),
     ],
     "orbits": [
         ("validity must be positive, got 0", lambda: orbits(validity=0)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from scipy import stats
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import MeasurementChannels
 from pfbench.noise.base import (
+    AddedErrors,
     GlintNoise,
     LaplaceNoise,
     NoiseRegime,
@@ -22,11 +24,12 @@ from pfbench.noise.base import (
     OutlierNoise,
     StudentTNoise,
     check_unit_process,
+    draw_added_errors,
     process_variance_factors,
 )
 from pfbench.noise.correlated import GaussMarkovNoise, NonLineOfSightNoise
 from pfbench.noise.error_replay import ErrorReplay
-from pfbench.noise.time_windows import BiasStep, MeasurementOutage, VarianceSurge
+from pfbench.noise.time_windows import BiasStep, MeasurementOutage, RandomOutage, VarianceSurge
 
 SD = torch.tensor([2.0, 0.05, 30.0], dtype=torch.float64)
 TIME = torch.arange(0.0, 300.0, dtype=torch.float64)
@@ -47,6 +50,7 @@ REGIMES: list[NoiseRegime] = [
     NonLineOfSightNoise(),
     NonLineOfSightNoise(mean_dwell_s=10.0),
     BiasStep(onset_s=150.0),
+    RandomOutage(30.0, 2),
 ]
 every_regime = pytest.mark.parametrize("regime", REGIMES, ids=lambda r: type(r).__name__)
 # positions of one receiver, ranges of four satellites, and rates of two of them
@@ -485,3 +489,74 @@ def test_impossible_regimes_are_refused_by_name(
 ) -> None:
     with pytest.raises(ValueError, match=word):
         build()
+
+
+# --------------------------------------------------------------------------------------------------
+# Regimes for recorded measurements.
+
+
+def draw(regime: NoiseRegime, sd: float, channels: MeasurementChannels = MIXED, runs: int = 200) -> torch.Tensor:  # fmt: skip
+    channels = replace(channels, sd=sd * torch.ones_like(channels.sd))
+    return draw_added_errors(regime, PhiloxStream(2, torch.arange(runs)), channels, TIME)
+
+
+def test_random_outages_have_their_length_at_uniform_times() -> None:
+    silent = torch.isnan(errors(RandomOutage(30.0), torch.arange(2000)))
+    assert (silent == silent[..., :1]).all()
+    steps = silent[..., 0]
+    assert (steps.sum(1) == 30).all()
+    start = steps.int().argmax(1).double()
+    assert all(steps[k, int(s) : int(s) + 30].all() for k, s in enumerate(start))
+    # first steps from 0 s to 269 s: whole seconds after a uniform time
+    assert stats.kstest(start.numpy() / 269.0, "uniform").pvalue > 1e-3
+
+
+def test_added_errors_are_in_metres_of_positions_alone() -> None:
+    z = draw(AddedErrors(sd_m=2.0), 0.0)
+    assert (z[..., 3:] == 0.0).all()
+    assert within_chi_square(z[..., :3], 4.0)
+    hits = draw(AddedErrors(probability=0.1, outlier_sd_m=20.0), 0.0)[..., :3]
+    hit = hits != 0.0
+    assert (hit == hit[..., :1]).all()
+    share = hit[..., 0].double().mean().item()
+    assert abs(share - 0.1) < 4 * math.sqrt(0.09 / hit[..., 0].numel())
+    assert within_chi_square(hits[hit], 400.0)
+
+
+def test_added_errors_of_ranges_are_those_of_each_satellite() -> None:
+    ranges = MeasurementChannels(torch.ones(4, dtype=torch.float64), ("range",) * 4, (0, 1, 2, 3))
+    hit = draw(AddedErrors(probability=0.2, outlier_sd_m=20.0), 0.0, ranges) != 0.0
+    both = (hit[..., 0] & hit[..., 1]).double().mean().item()
+    assert abs(both - 0.04) < 4 * math.sqrt(0.04 * 0.96 / hit[..., 0].numel())
+
+
+@pytest.mark.parametrize(
+    "regime",
+    [OutlierNoise(), StudentTNoise(4), MeasurementOutage(((-50.0, -10.0),)), GaussMarkovNoise()],
+    ids=lambda r: type(r).__name__,
+)
+def test_a_regime_that_changes_nothing_of_a_record_is_refused(regime: NoiseRegime) -> None:
+    with pytest.raises(ValueError, match=r"noise must change the measurements, got \w+ with errors of 0.*position_sd=\[1\.5"):  # fmt: skip
+        draw(regime, 0.0)
+    assert draw(regime, 1.5).shape[-1] == 9
+
+
+def test_a_record_without_added_errors_stays_as_it_is() -> None:
+    assert (draw(NominalNoise(), 0.0) == 0.0).all()
+    assert torch.isnan(draw(RandomOutage(30.0), 0.0)).any()
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: AddedErrors(), "noise must add errors"),
+        (lambda: AddedErrors(sd_m=-1.0), "sd_m must be"),
+        (lambda: AddedErrors(sd_m=math.nan), "sd_m must be"),
+        (lambda: RandomOutage(0.0), "duration_s must be"),
+        (lambda: errors(RandomOutage(400.0)), "shorter than the record of 299 s"),
+        (lambda: errors(AddedErrors(sd_m=1.0)), "positions or ranges"),
+    ],
+)
+def test_wrong_regimes_for_records_are_refused(make: Callable[[], object], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        make()

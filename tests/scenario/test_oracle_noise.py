@@ -547,7 +547,11 @@ def composed(*words: str) -> Any:
 
 
 PRESETS = [file.stem for file in sorted((CONF / "noise").glob("*.yaml"))]
-CANNOT = {"gauss_markov", "replay", "nlos_persistent"}
+CANNOT = {"gauss_markov", "replay", "nlos_persistent", "added_outliers", "added_white"}
+
+
+def is_in_metres_of_nothing(scenario: str, noise: str) -> bool:
+    return noise.startswith("added") and scenario != "flight_500s"
 
 
 def run_condition(scenario: str, noise: str) -> list[FilterResult]:
@@ -556,6 +560,7 @@ def run_condition(scenario: str, noise: str) -> list[FilterResult]:
     A regime takes nothing from the scene, and is composed beside it.
     """
     windows = ["noise.windows_s=[[6.0,9.0]]"] if noise.endswith("outage") else []
+    windows = ["noise.duration_s=3.0"] if noise == "random_outage" else windows
     short = ["scenario.steps=20"] if scenario != "flight_500s" else []
     cfg = deepcopy(composed(f"scenario={scenario}", "particles=30", "data.root=null", *short))
     regime = composed(f"noise={noise}", "data.root=null", *windows).noise
@@ -565,6 +570,10 @@ def run_condition(scenario: str, noise: str) -> list[FilterResult]:
     witness, model = RecordingRegime(job.instantiate(regime)), job.instantiate(cfg.model)
     if noise == "replay":
         with pytest.raises(ValueError, match=r"data\.root is not set"):
+            job.instantiate(cfg.scenario).draw(witness, torch.arange(2), 1)
+        return []
+    if is_in_metres_of_nothing(scenario, noise):
+        with pytest.raises(ValueError, match="add metres to positions or ranges"):
             job.instantiate(cfg.scenario).draw(witness, torch.arange(2), 1)
         return []
     episode = job.instantiate(cfg.scenario).draw(witness, torch.arange(2), 1)
@@ -593,10 +602,11 @@ CONDITIONS = [(SCENES[(k + j) % 3], noise) for k, noise in enumerate(PRESETS) fo
 def test_every_regime_runs_told_and_untold_or_says_why_not(scenario: str, noise: str) -> None:
     results = run_condition(scenario, noise)
     is_refused = noise in CANNOT or (noise, scenario) == ("nlos", "flight_500s")
-    assert len(results) == (0 if noise == "replay" else 1 if is_refused else 2)
+    is_nothing = noise == "replay" or is_in_metres_of_nothing(scenario, noise)
+    assert len(results) == (0 if is_nothing else 1 if is_refused else 2)
     if len(results) == 2:  # the weights differ unless the regime has the distribution of the model
         is_equal = torch.equal(results[0].mean, results[1].mean)
-        assert is_equal == (noise in ("nominal", "outage"))
+        assert is_equal == (noise in ("nominal", "outage", "random_outage"))
 
 
 def test_the_switch_reaches_the_result(tmp_path: Path) -> None:

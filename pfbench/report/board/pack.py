@@ -34,6 +34,12 @@ from pfbench.report.board.entries import (
     name_regimes,
     regime_entries,
 )
+from pfbench.report.board.recorded_units import (
+    RecordedCondition,
+    collect_record,
+    decide_records,
+    describe_reach,
+)
 from pfbench.report.board.study_views import (
     build_views,
     decide_planned,
@@ -89,6 +95,7 @@ def build_pack(
         list_failures(conditions[0].jobs[0].path.parent),
         " ".join(filter(None, (conditions[0].older, data.warning))),
         " ".join(filter(None, (describe_uncommitted(conditions), _describe_differing(conditions)))),
+        data.records,
     )
     decided = decide_parts(table, facts)
     cells = cell_entries(table)
@@ -143,6 +150,7 @@ class StudyData(NamedTuple):
         notes: Notes on the filters.
         times: Times in rounds by label, of each condition; without filters that were not measured.
         warning: Sentences on a truth that is measured, and on runs that are not independent; empty for none.
+        records: Recorded conditions with the losses of their blocks of time.
     """
 
     table: pd.DataFrame
@@ -152,21 +160,24 @@ class StudyData(NamedTuple):
     notes: MethodNotes
     times: dict[CellKey, dict[str, StepTimes]]
     warning: str = ""
+    records: Sequence[RecordedCondition] = ()
 
 
 def read_study(
     conditions: Sequence[Condition], options: ReportOptions, *, has_metrics: bool = False
 ) -> StudyData:
     """Read the results of a study, one condition at a time."""
-    rows, metrics, notes = [], [], MethodNotes()
+    rows, metrics, records, notes = [], [], [], MethodNotes()
     data = StudyData(pd.DataFrame(), pd.DataFrame(), {}, {}, notes, {})
     start, converged = options.start_time_s, options.convergence_threshold
     most = count_carried_runs(max(len(c.jobs) for c in conditions), len(conditions))
     for condition, regime in zip(conditions, name_regimes(conditions), strict=True):
         results = {job.label: job.load() for job in condition.jobs}
+        late = {label: drop_before(result, start) for label, result in results.items()}
+        records.append(collect_record((condition.scenario, regime, condition.noise), late))
         parts = [
-            job_rows((condition, regime, label), drop_before(result, start), options.metric)
-            for label, result in results.items()
+            job_rows((condition, regime, label), result, options.metric)
+            for label, result in late.items()
         ]  # fmt: skip
         rows += parts
         for job in condition.jobs:
@@ -186,7 +197,10 @@ def read_study(
     long_rows = pd.concat(metrics, ignore_index=True) if metrics else data.metrics
     return _leave_out_copies(
         data._replace(
-            table=join_rows(rows, options.metric), metrics=long_rows, warning=notes.describe_truth()
+            table=join_rows(rows, options.metric),
+            metrics=long_rows,
+            warning=notes.describe_truth(),
+            records=[record for record in records if record],
         )
     )
 
@@ -224,6 +238,7 @@ class StudyFacts(NamedTuple):
         failures: Jobs that failed.
         warning: Sentence on runs that are not independent; empty if none is shown.
         differing: Sentence on conditions whose jobs differ in their data; empty without any.
+        records: Recorded conditions with the losses of their blocks of time.
     """
 
     looks: Mapping[str, MethodLook]
@@ -234,6 +249,7 @@ class StudyFacts(NamedTuple):
     failures: Sequence[Any] = ()
     warning: str = ""
     differing: str = ""
+    records: Sequence[RecordedCondition] = ()
 
     def to_entries(self) -> dict[str, Any]:
         """Return plain values, from which `from_pack` restores the facts."""
@@ -248,6 +264,7 @@ class StudyFacts(NamedTuple):
             ],
             "warning": self.warning,
             "differing": self.differing,
+            "records": list(self.records),
         }  # fmt: skip
 
     @classmethod
@@ -282,6 +299,7 @@ class StudyFacts(NamedTuple):
             pack["failures"],
             facts["warning"],
             facts["differing"],
+            tuple(facts.get("records", ())),
         )
 
 
@@ -301,7 +319,10 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
     groups = table.groupby(["scenario", "regime"])[["unit", "group"]].first()
     views = build_views(runs, groups, names, options, facts.times)
     planned = decide_planned(runs, looks, options)
-    for view in views.values():
+    recorded = decide_records(facts.records, runs, baselines, options)
+    for key, view in views.items():
+        reach = describe_reach(recorded, (key.world, key.regime), worlds)
+        view["sentence"] = " ".join(filter(None, (view["sentence"], reach)))
         view["small_print"] = " ".join(filter(None, (view["small_print"], facts.differing)))
     first = next(iter(views.values()))["rows"]
     return {
@@ -313,6 +334,7 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
         "baselines": baselines,
         "views": views,
         "planned": planned_entries(planned, runs, looks, worlds, options),
+        "recorded": recorded,
         "world_orders": order_worlds(runs, views, looks, options),
         "warnings": [
             text for text in (_count_failures(len(facts.failures)), facts.warning) if text

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
+from pfbench.report.board.recorded_units import describe_records, list_questions
 from pfbench.report.methods_text import write_methods
 from pfbench.report.papers.figures import list_page_figures
 from pfbench.report.writers import template_environment
@@ -28,6 +29,7 @@ _HERE = Path(__file__).parent
 _SCRIPTS = ("kit", "state", "board", "cost", "pairs", "worlds", "time", "runs", "main")
 _OPTIONAL = (
     "paper_figures", "failures", "definitions", "filter_notes", "choices", "warnings", "world_orders", "world_picture",
+    "recorded",
 )  # fmt: skip
 _STATIC = (
     *_OPTIONAL,
@@ -39,7 +41,7 @@ _STATIC = (
 )  # not read by the script
 _COLOUR = re.compile(r"#[0-9a-fA-F]{6}")
 _SECTIONS = (
-    ("paper_figures", "figures", "Figures of the paper"), ("planned", "planned", "Compared in advance"), ("cells", "worlds", "Scenarios"), ("curves", "time", "Over time"),
+    ("paper_figures", "figures", "Figures of the paper"), ("planned", "planned", "Compared in advance"), ("recorded", "recorded", "Recorded data"), ("cells", "worlds", "Scenarios"), ("curves", "time", "Over time"),
     ("calibration", "calibration", "Calibration"), ("runs", "runs", "Single runs"), ("sweeps", "sweeps", "Dose and response"),
     ("cells", "table", "Table"), ("methods", "methods", "Methods"), ("downloads", "downloads", "Downloads"),
 )  # fmt: skip
@@ -93,6 +95,8 @@ def _describe_page(pack: Mapping[str, Any]) -> dict[str, Any]:
         "pack": pack,
         "opening": describe_opening(pack),
         "planned": describe_pairs(pack),
+        "records": describe_records(pack),
+        "questions": list(list_questions(pack)),
         "level": _format_level(pack),
         "choices": pack["choices"],
         "figures": list_page_figures(pack["study"], pack["paper_figures"]),

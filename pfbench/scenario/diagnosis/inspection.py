@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from pfbench.files.reader_notes import announce_notes
 from pfbench.nav import earth
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.scenario.diagnosis.checks import WITHOUT_REFERENCE, run_checks
 from pfbench.scenario.diagnosis.finding import REFUSE, Finding, LogDiagnosis, merge_settings
 from pfbench.scenario.diagnosis.raw_log import RawImu, RawLog, take_log, take_rows
 from pfbench.scenario.diagnosis.sensor_grade import measure_noise
-from pfbench.scenario.recorded.aligned_reader import read_aligned_log
+from pfbench.scenario.recorded.aligned_reader import check_aligned_tables, check_corrections
 from pfbench.scenario.recorded.corrections import LogCorrections
 from pfbench.scenario.recorded.fix_codes import FixCodes, select_usable
 from pfbench.scenario.recorded.log_frames import (
@@ -27,7 +28,7 @@ from pfbench.scenario.recorded.log_frames import (
     gravity_at,
     quaternion_of_angles,
 )
-from pfbench.scenario.recorded.log_reader import read_log
+from pfbench.scenario.recorded.log_reader import Diagnosed, check_tables
 from pfbench.scenario.recorded.log_tables import (
     Array,
     GnssLog,
@@ -44,6 +45,7 @@ from pfbench.scenario.recorded.log_tables import (
 _FORCE, _RATE, _ANGLES = ("fx", "fy", "fz"), ("wx", "wy", "wz"), ("roll", "pitch", "yaw")
 _ROUNDS = 3  # of checks with the settings found so far
 READER_CHECK = "reading"  # check of what the reader refuses itself
+LogTables = tuple[LogTable, LogTable, LogTable | None]  # IMU, fixes and, if there is one, reference
 
 
 @dataclass(frozen=True)
@@ -70,27 +72,36 @@ class LogSource:
     fix_codes: FixCodes = None
     corrections: LogCorrections = field(default_factory=LogCorrections)
 
-    def read(self) -> RawLog:
-        """Read the tables with the corrections, without a check of their contents."""
+    def read_tables(self) -> LogTables:
+        """Read the tables, without a check of their contents."""
         names, select = self.files, {"path": self.path, "imu": self.imu}
         inertial, gnss, *truth = (
             read_table(self.folder, name, select, self.limits)
             for name in (names.imu, names.gnss, names.reference)
             if name is not None
         )
-        tables, _ = self.corrections.correct_tables(inertial, gnss, *(truth or [gnss]))
-        return take_tables(tables if truth else (*tables[:2], None), self)
+        return inertial, gnss, truth[0] if truth else None
 
-    def check_reading(self) -> str:
-        """Read the log as a run does; return the message if it is refused."""
-        read = read_log if self.files.reference else read_aligned_log
+    def correct(self, tables: LogTables) -> tuple[LogTables, tuple[str, ...]]:
+        """Return the tables with the corrections, without a check of their contents, and notes."""
+        inertial, gnss, truth = tables
+        (inertial, gnss, third), notes = self.corrections.correct_tables(inertial, gnss, truth or gnss)  # fmt: skip
+        return (inertial, gnss, third if truth else None), notes
+
+    def check_reading(
+        self, tables: LogTables, mended: tuple[str, ...], diagnosis: Diagnosed
+    ) -> str:
+        """Check corrected tables as a run does; return the message if they are refused."""
+        inertial, gnss, truth = tables
         try:
-            read(
-                self.folder, self.files, self.path, self.imu, self.origin, self.limits, self.fix_codes,
-                self.corrections,
-            )  # fmt: skip
+            if truth:
+                log = check_tables((inertial, gnss, truth), mended, self.corrections, self.origin, self.limits, self.fix_codes, diagnosis)  # fmt: skip
+            else:
+                check_corrections(self.corrections, has_positions=False)
+                log = check_aligned_tables(tables, mended, self.corrections, self.origin, self.fix_codes, diagnosis)  # fmt: skip
         except ValueError as error:
             return str(error)
+        announce_notes(self.folder, log.notes)
         return ""
 
     def with_settings(self, settings: Mapping[str, Any]) -> LogSource:
@@ -126,11 +137,12 @@ def inspect_log(
     if not list_tables(str(folder), "", (usual.reference,)):
         usual = LogFiles(reference=None)
     source = LogSource(Path(folder), files or usual, limits=limits, **options)
-    findings, facts = _inspect(source)
+    tables = source.read_tables()
+    findings, facts = _inspect(source, tables)
     settings = merge_settings(finding.settings for finding in findings)
     checks = [finding.check for finding in findings if not finding.settings]
     for _ in range(_ROUNDS if settings else 0):
-        remaining, _ = _inspect(source.with_settings(settings))
+        remaining, _ = _inspect(source.with_settings(settings), tables)
         checks = [finding.check for finding in remaining]
         more = merge_settings([settings, *(finding.settings for finding in remaining)])
         if more == settings:
@@ -139,16 +151,17 @@ def inspect_log(
     return LogDiagnosis(tuple(findings), facts, settings, tuple(checks))
 
 
-def _inspect(source: LogSource) -> tuple[list[Finding], dict[str, Any]]:
-    """Run all checks, and read the log as a run does."""
-    log = source.read()
+def _inspect(source: LogSource, tables: LogTables) -> tuple[list[Finding], dict[str, Any]]:
+    """Run all checks, and those of a run's reading."""
+    tables, mended_notes = source.correct(tables)
+    log = take_tables(tables, source)
     findings, facts, mended = run_checks(log)
     if len(log.reference.time):
         measure_noise(mended, facts)
     else:
         facts["checks without a reference"] = list(WITHOUT_REFERENCE)
     if not any(finding.level == REFUSE for finding in findings):
-        message = source.check_reading()
+        message = source.check_reading(tables, mended_notes, Diagnosed(log, tuple(findings)))
         if message:
             findings.append(
                 Finding(READER_CHECK, REFUSE, 1.0, 0.0, "refusals", message.rstrip("."))

@@ -143,7 +143,9 @@ def dcm_of(angles: Array) -> Array:
 
 
 def interpolate_columns(at: Array, time: Array, values: Array) -> Array:
-    """Interpolate columns linearly.
+    """Interpolate columns linearly, with the first and the last row outside of them.
+
+    The rows are found once for all columns: `numpy.interp` copies each column, an hour of samples for a few nodes.
 
     Args:
         at: Times, [m].
@@ -153,4 +155,10 @@ def interpolate_columns(at: Array, time: Array, values: Array) -> Array:
     Returns:
         Values, [m, k].
     """
-    return np.stack([np.interp(at, time, column) for column in values.T], -1)
+    inside = (at >= time[0]) & (at < time[-1])
+    out = np.where((at < time[0])[:, None], values[0], values[-1])
+    out[np.isnan(at)] = np.nan
+    row = np.searchsorted(time, at[inside], side="right") - 1
+    slope = (values[row + 1] - values[row]) / (time[row + 1] - time[row])[:, None]
+    out[inside] = slope * (at[inside] - time[row])[:, None] + values[row]
+    return out

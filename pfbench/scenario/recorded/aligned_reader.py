@@ -15,7 +15,12 @@ from pfbench.scenario.recorded.corrections import LogCorrections
 from pfbench.scenario.recorded.fix_codes import FixCodes, select_usable
 from pfbench.scenario.recorded.log_checks import check_overlap
 from pfbench.scenario.recorded.log_frames import find_origin, gravity_at, read_positions
-from pfbench.scenario.recorded.log_reader import diagnose, read_fixes, read_samples
+from pfbench.scenario.recorded.log_reader import (
+    Diagnosed,
+    diagnose,
+    read_fixes,
+    read_samples,
+)
 from pfbench.scenario.recorded.log_tables import (
     Array,
     GnssLog,
@@ -47,12 +52,31 @@ def read_aligned_log(
 
     Returns the log. Its reference is without attitude, and without a reference it is the track of the fixes.
     """
-    mending, select = corrections or LogCorrections(), {"path": path, "imu": imu}
+    mending = corrections or LogCorrections()
     check_corrections(mending, files.reference is not None)
+    select = {"path": path, "imu": imu}
     inertial, gnss = (read_table(folder, name, select, limits) for name in (files.imu, files.gnss))  # fmt: skip
-    truth = read_table(folder, files.reference, select, limits) if files.reference else None  # fmt: skip
-    (inertial, gnss, third), mended = mending.correct_tables(inertial, gnss, truth or gnss)  # fmt: skip
-    truth = third if truth else None
+    truth = read_table(folder, files.reference, select, limits) if files.reference else None
+    (inertial, gnss, third), mended = mending.correct_tables(inertial, gnss, truth or gnss)
+    tables = (inertial, gnss, third if truth else None)
+    log = check_aligned_tables(tables, mended, mending, origin, fix_codes)
+    announce_notes(folder, log.notes)
+    return log
+
+
+def check_aligned_tables(
+    tables: tuple[LogTable, LogTable, LogTable | None],
+    mended: tuple[str, ...],
+    mending: LogCorrections,
+    origin: Sequence[float] | None = None,
+    fix_codes: FixCodes = None,
+    diagnosis: Diagnosed | None = None,
+) -> NavigationLog:
+    """Check corrected tables of a log without a reference of the attitude; the arguments are those of `check_tables`.
+
+    Returns the log.
+    """
+    inertial, gnss, truth = tables
     sensors, notes = read_samples(inertial)
     check_level(sensors.force, inertial.name)
     centre = find_origin(origin, gnss, truth or gnss)
@@ -64,10 +88,10 @@ def read_aligned_log(
         mended = (*mended, f"{gnss.name}: {list(position)} m North, East, Down subtracted from the fixes")  # fmt: skip
     check_overlap(inertial.name, sensors.time, gnss.name, fixes.time)
     gravity, gravity_notes = gravity_at(centre)
-    diagnosed = diagnose(take_log((inertial, gnss, gnss), sensors, fixes, None, gravity), has_own_fixes=True)  # fmt: skip
+    raw = take_log((inertial, gnss, gnss), sensors, fixes, None, gravity)
+    diagnosed = diagnose(raw, has_own_fixes=True, diagnosis=diagnosis)
     dropped = dict.fromkeys(note for table in (inertial, gnss) for note in table.notes)
     notes = (*dropped, *mended, *usable_notes, *notes, *gravity_notes, *diagnosed)
-    announce_notes(folder, notes)
     reference = read_track(truth, centre) if truth else _join_fixes(fixes)
     return NavigationLog(sensors, fixes, reference, gravity, notes, centre)
 

@@ -62,14 +62,14 @@ def find_imu_offset(imu: ImuLog, reference: ReferenceLog) -> ClockOffset | None:
     step = np.diff(time)
     short = step < max(1.6 * _WINDOW, 2.5 * float(np.median(step))) if len(step) else step > 0.0
     summed = np.cumsum(0.5 * np.diff(imu.time)[:, None] * (imu.rate[1:] + imu.rate[:-1]), axis=0)
-    angle = np.vstack([np.zeros(3), summed])
+    columns = np.ascontiguousarray(np.vstack([np.zeros(3), summed]).T)  # numpy.interp copies others
 
     def unexplained(lag: float) -> tuple[float, int]:
         at = time + lag
         used = short & (at[:-1] >= imu.time[0]) & (at[1:] <= imu.time[-1])
         if used.sum() < max(_FEWEST, _LEAST_SHARE * short.sum()):
             return 1.0, 0
-        turned = np.diff(np.stack([np.interp(at, imu.time, a) for a in angle.T], -1), axis=0)
+        turned = np.diff(np.stack([np.interp(at, imu.time, a) for a in columns], -1), axis=0)
         x, y = true[used] - true[used].mean(0), turned[used] - turned[used].mean(0)
         square = float((x * x).sum() * (y * y).sum())
         if not square > 0.0:

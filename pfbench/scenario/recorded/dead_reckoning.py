@@ -12,16 +12,28 @@ from pfbench.nav.strapdown import rotate
 from pfbench.scenario.recorded.log_tables import Array, ImuLog
 from pfbench.scenario.recorded.time_grid import list_pieces
 
+_BLOCK = 300  # windows that are integrated at once, so that memory does not grow with the log
+
 
 def integrate_windows(imu: ImuLog, time: Array) -> tuple[Tensor, Tensor]:
     """Integrate the samples in each window.
 
-    Neighbouring pieces of a window are joined in pairs until one is begin, so that memory grows with
+    Neighbouring pieces of a window are joined in pairs until one is left, so that memory grows with
     the samples alone. `preintegrate` joins them in the order of time and gives the same to rounding.
 
     Returns rotation from the body at the end of each window to that at its start, quaternion,
     [n, 4]. Velocity increment in body axes at the start, without gravity, m/s, [n, 3].
     """
+    parts = [_integrate_block(imu, time[i : i + _BLOCK + 1]) for i in range(0, len(time) - 1, _BLOCK)]  # fmt: skip
+    rotation, velocity = zip(*parts, strict=True)
+    return torch.cat(rotation), torch.cat(velocity)
+
+
+def _integrate_block(imu: ImuLog, time: Array) -> tuple[Tensor, Tensor]:
+    """Integrate the samples in each of some neighbouring windows."""
+    first, last = np.searchsorted(imu.time, time[[0, -1]])
+    near = slice(max(0, int(first) - 1), int(last) + 1)
+    imu = ImuLog(imu.time[near], imu.force[near], imu.rate[near])
     window, spans, mean = list_pieces(imu, time)
     force, rate = torch.from_numpy(mean).split(3, -1)
     dt = torch.from_numpy(spans)[:, None]

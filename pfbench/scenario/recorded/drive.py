@@ -18,7 +18,12 @@ from pfbench.model.strapdown import INSTRUMENT_CHANNELS
 from pfbench.model.strapdown_tuning import AidedTuning, StrapdownTuning
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.nav.strapdown import PreintegratedImu
-from pfbench.noise.base import NoiseRegime, NominalNoise, check_unit_process
+from pfbench.noise.base import (
+    NoiseRegime,
+    NominalNoise,
+    check_unit_process,
+    draw_added_errors,
+)
 from pfbench.scenario.base import Scenario, check_added_sd, check_duration
 from pfbench.scenario.recorded.fix_codes import FixCodes, check_fix_codes
 from pfbench.scenario.recorded.log_reader import read_log
@@ -347,10 +352,9 @@ class RecordedAidedFlight(Scenario):
         observed = torch.where(fix_mask[:, None], readings, torch.nan).expand(len(runs), -1, -1)
         y = torch.cat([episode.record.y, observed], -1)
         check_unit_process(noise, episode.time)
-        y[:, fix_mask] += noise.draw_errors(
-            draws.at_step(0),
-            self.instruments.make_measurements(flight.receiver.channels),
-            episode.time[fix_mask],
+        channels = self.instruments.make_measurements(flight.receiver.channels)
+        y[:, fix_mask] += draw_added_errors(
+            noise, draws.at_step(0), channels, episode.time[fix_mask]
         )
         bias = self.tuning.bias_sd * draws.at_step(0).normal("world.bias", 1, 4)[:, 0]
         start = torch.cat(

@@ -19,6 +19,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 from pfbench.files.reader_notes import announce_notes
 from pfbench.nav.plausible_limits import PlausibleLimits
 from pfbench.scenario.diagnosis.checks import run_checks
-from pfbench.scenario.diagnosis.finding import REFUSE
+from pfbench.scenario.diagnosis.finding import REFUSE, Finding
 from pfbench.scenario.diagnosis.raw_log import RawLog, take_log
 from pfbench.scenario.recorded.clock_offsets import find_fix_offset, find_imu_offset
 from pfbench.scenario.recorded.corrections import LogCorrections
@@ -102,14 +103,46 @@ def read_log(
     Raises:
         ValueError: If a check or the diagnosis refuses the log. The message names file, column, row, value and remedy.
     """
-    names, limits = files or LogFiles(), limits or PlausibleLimits()
-    select = {"path": path, "imu": imu}
-    inertial, gnss, truth = (
-        read_table(Path(folder), name, select, limits)
-        for name in (names.imu, names.gnss, names.reference)
-    )
+    tables = read_tables(folder, files or LogFiles(), path, imu, limits)
     mending = corrections or LogCorrections()
-    (inertial, gnss, truth), mended = mending.correct_tables(inertial, gnss, truth)
+    log = check_tables(*mending.correct_tables(*tables), mending, origin, limits, fix_codes)
+    announce_notes(folder, log.notes)
+    return log
+
+
+def read_tables(
+    folder: str | Path,
+    files: LogFiles,
+    path: int | None = None,
+    imu: int | None = None,
+    limits: PlausibleLimits | None = None,
+) -> tuple[LogTable, LogTable, LogTable]:
+    """Read the tables of IMU, fixes and reference without a check of their contents; the arguments are those of `read_log`.
+
+    Returns the tables.
+    """
+    inertial, gnss, truth = (
+        read_table(Path(folder), name, {"path": path, "imu": imu}, limits)
+        for name in (files.imu, files.gnss, files.reference)
+    )
+    return inertial, gnss, truth
+
+
+def check_tables(
+    tables: tuple[LogTable, LogTable, LogTable],
+    mended: tuple[str, ...],
+    mending: LogCorrections,
+    origin: Sequence[float] | None = None,
+    limits: PlausibleLimits | None = None,
+    fix_codes: FixCodes = None,
+    diagnosis: Diagnosed | None = None,
+) -> NavigationLog:
+    """Check corrected tables, and correct their fixes; the other arguments are those of `read_log`.
+
+    Returns the log. `mended` are the notes of the corrections, and `diagnosis` are findings of the same rows, which
+    are then not looked for again.
+    """
+    inertial, gnss, truth = tables
     sensors, notes = read_samples(inertial)
     centre = find_origin(origin, gnss, truth)
     usable, usable_notes = select_usable(gnss, fix_codes)
@@ -122,22 +155,36 @@ def read_log(
     notes += (*gravity_notes, *compare_reference(truth, reference))
     with _explain(late):
         notes += compare_inertial(truth, sensors, reference, gravity)
-    fixes, fix_notes = _compare_fixes(gnss, fixes, (truth, reference), limits)
+    fixes, fix_notes = _compare_fixes(gnss, fixes, (truth, reference), limits or PlausibleLimits())
     dropped = dict.fromkeys(note for table in (inertial, gnss, truth) for note in table.notes)
-    diagnosed = diagnose(
-        take_log((inertial, gnss, truth), sensors, fixes, reference, gravity),
-        has_own_fixes=gnss.name != truth.name,
-    )
+    raw = take_log((inertial, gnss, truth), sensors, fixes, reference, gravity)
+    diagnosed = diagnose(raw, has_own_fixes=gnss.name != truth.name, diagnosis=diagnosis)
     notes = (*dropped, *mended, *mended_fixes, late, *usable_notes, *notes, *fix_notes)
     spans = ((inertial.name, sensors.time), (gnss.name, fixes.time), (truth.name, reference.time))
     notes = (*_leave_out_offsets(notes, diagnosed), *diagnosed, *compare_times(spans))
-    announce_notes(folder, notes)
     return NavigationLog(sensors, fixes, reference, gravity, notes, centre)
 
 
-def diagnose(log: RawLog, *, has_own_fixes: bool) -> tuple[str, ...]:
+class Diagnosed(NamedTuple):
+    """A log and what its checks found."""
+
+    log: RawLog
+    findings: Sequence[Finding]
+
+    def has_rows_of(self, log: RawLog) -> bool:
+        """Return whether another reading of the tables has the same samples and fixes."""
+        pairs = zip(self.log.imu[:3] + self.log.fixes[:2], log.imu[:3] + log.fixes[:2], strict=True)
+        same = all(np.array_equal(a, b) for a, b in pairs)
+        return same and np.array_equal(self.log.reference.time, log.reference.time)
+
+
+def diagnose(
+    log: RawLog, *, has_own_fixes: bool, diagnosis: Diagnosed | None = None
+) -> tuple[str, ...]:
     """Return the findings of the quick checks as notes; raise those that refuse the log."""
-    findings, _, _ = run_checks(log)
+    findings = (
+        diagnosis.findings if diagnosis and diagnosis.has_rows_of(log) else run_checks(log)[0]
+    )
     refused = [finding for finding in findings if finding.level == REFUSE]
     if refused:
         raise ValueError(

@@ -22,7 +22,7 @@ from pfbench.model.strapdown_tuning import TightTuning
 from pfbench.nav import earth
 from pfbench.nav.orbits import LIGHT
 from pfbench.nav.plausible_limits import PlausibleLimits
-from pfbench.noise.base import NoiseRegime, NominalNoise, check_unit_process
+from pfbench.noise.base import NoiseRegime, NominalNoise, check_unit_process, draw_added_errors
 from pfbench.scenario.base import Scenario, check_added_sd, check_duration
 from pfbench.scenario.recorded.fix_codes import FixCodes, check_fix_codes
 from pfbench.scenario.recorded.log_agreement import (
@@ -424,8 +424,9 @@ class RecordedWalk(Scenario):
         )
         check_unit_process(noise, motion.time)
         # errors are drawn per epoch, so that they do not depend on the filter step
-        y[:, fix_mask] += noise.draw_errors(
-            draws.at_step(0), self.receiver.channels(len(gnss_log.names)), motion.time[fix_mask]
+        channels = self.receiver.channels(len(gnss_log.names))
+        y[:, fix_mask] += draw_added_errors(
+            noise, draws.at_step(0), channels, motion.time[fix_mask]
         )
         record = Record(
             y,

@@ -22,7 +22,7 @@ from pfbench.core.record import Episode, MeasurementChannels, Record, fix_channe
 from pfbench.model.strapdown import FIX_CHANNELS, StrapdownTotal
 from pfbench.model.strapdown_tuning import StrapdownTuning
 from pfbench.nav.strapdown import PreintegratedImu, preintegrate
-from pfbench.noise.base import NoiseRegime, check_unit_process
+from pfbench.noise.base import NoiseRegime, check_unit_process, draw_added_errors
 from pfbench.scenario.base import check_duration
 from pfbench.scenario.recorded.log_tables import Array, ImuLog, NavigationLog, ReferenceLog
 
@@ -312,7 +312,7 @@ def assemble(
     y = _pad([leg.fixes for leg in legs], np.nan)[log_index][..., : len(sd)]
     # errors are drawn per fix, so that they do not depend on the filter step
     check_unit_process(noise, t)
-    y[:, fix_mask] += noise.draw_errors(draws.at_step(0), receiver.channels, t[fix_mask])
+    y[:, fix_mask] += draw_added_errors(noise, draws.at_step(0), receiver.channels, t[fix_mask])
     start, spread = _draw_start(legs, log_index, tuning, draws)
     record = Record(y, _preintegrate_logs(legs, log_index, tuning), start, spread)
     groups = {"attitude": truth[..., :4], "velocity": truth[..., 4:7], "position": truth[..., 7:]}

@@ -22,7 +22,7 @@ from pfbench.model.urban_gnss import NormalRangeError, UrbanGnss, UrbanInputs, U
 from pfbench.nav import earth
 from pfbench.nav.orbits import LIGHT, azimuth_elevation
 from pfbench.nav.plausible_limits import PlausibleLimits
-from pfbench.noise.base import NoiseRegime, check_unit_process
+from pfbench.noise.base import NoiseRegime, check_unit_process, draw_added_errors
 from pfbench.scenario.base import Scenario, check_added_sd, check_duration
 from pfbench.scenario.recorded.log_agreement import (
     check_orbits,
@@ -138,7 +138,7 @@ class UrbanDrive(Scenario):
         sd = torch.full((satellites,), self.receiver.range_sd, dtype=torch.float64)
         channels = MeasurementChannels(sd, ("range",) * satellites, tuple(range(satellites)))
         check_unit_process(noise, time)
-        y[:, epochs] += noise.draw_errors(draws.at_step(0), channels, time[epochs])
+        y[:, epochs] += draw_added_errors(noise, draws.at_step(0), channels, time[epochs])
         record = Record(y, inputs, self._draw_start(drive, draws))
         track = torch.cat([truth["position"], truth["height"]], -1)
         notes = (f"clock: nominal drift {self.receiver.clock_drift} m/s subtracted", *drive.notes)

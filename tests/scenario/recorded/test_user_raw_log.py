@@ -113,6 +113,84 @@ def test_a_filter_is_consistent_on_ranges_with_the_stated_errors(tmp_path: Path)
     assert float(error.square().sum(-1).mean().sqrt()) < 1.0
 
 
+# a log that moves without a reference
+
+NOISE = ("scenario.tuning.range.stated_sd_factor=0", "scenario.tuning.rate.stated_sd_factor=0", "scenario.tuning.rate.floor_sd=0.1")  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A drive of two minutes with ranges of 1 m, and no place in the header; its truth is beside the folder."""
+    folder = tmp_path_factory.mktemp("alone")
+    raw_log.write_raw_log(folder / "drive", 120.0, 1.0)
+    (folder / "drive" / "reference.csv").rename(folder / "truth.csv")
+    return folder
+
+
+def test_point_solutions_have_the_stated_errors(alone: Path) -> None:
+    """Mean squared errors over the stated variances are 1 within four standard errors, by component, also of the place."""
+    scenario, _ = scene(alone, "user_raw_log", "scenario.reference=null", *NOISE)
+    _, grid, _, points = scenario._read()
+    _, centre = scenario._read_truth(alone / "drive", scenario.rinex.read_epochs(alone / "drive"))
+    at = torch.tensor([centre[0] * DEGREE, centre[1] * DEGREE, centre[2]], dtype=torch.float64)
+    truth = pd.read_csv(alone / "truth.csv")
+    place = torch.from_numpy(truth[["lat_deg", "lon_deg", "h_m"]].to_numpy() * [DEGREE, DEGREE, 1.0])  # fmt: skip
+    true = np.stack([np.interp(grid, truth["t"], p) for p in earth.local_enu(place, at).numpy().T], -1)  # fmt: skip
+    assert np.linalg.norm(true[0]) < 15.0  # the origin is the first solution
+    off = points.position - true
+    square = (off - off.mean(0)) ** 2 / points.position_sd**2
+    np.testing.assert_allclose(square.mean(0), 1.0, atol=4.0 * (2.0 / len(grid)) ** 0.5)
+    speed = np.hypot(truth["vn"], truth["ve"])
+    difference = np.hypot(*points.velocity[:, :2].T) - np.interp(grid, truth["t"], speed)
+    assert np.sqrt((difference**2).mean()) < 0.3
+
+
+def test_each_epoch_is_held_out_once_and_is_the_only_truth(alone: Path) -> None:
+    scenario, _ = scene(alone, "user_raw_log", "scenario.reference=null")
+    episode = scenario.draw(NominalNoise(), torch.arange(5), 1)
+    held = torch.isfinite(episode.truth["position"]).all(-1)
+    assert (held.sum(0) == 1).all()
+    assert torch.isnan(episode.record.y[held]).all()
+    assert torch.isfinite(episode.record.y[~held]).any(-1).all()
+    assert set(episode.truth) == {"position"}
+    assert episode.measured_truth is not None
+    assert episode.measured_truth.name == "held-out point solutions"
+    start = episode.record.start
+    assert start is not None
+    assert torch.equal(start, start[:1].expand_as(start))
+
+
+def test_a_log_without_a_reference_names_the_key_that_gives_an_answer(
+    alone: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(alone)
+    words = ["run", f"data.root={alone}", "scenario=user_raw_log", "scenario.folder=drive", "filter=ekf", "runs=5", "study=alone"]  # fmt: skip
+    refused = pfbench(*words, home=alone)
+    assert refused.code == 2
+    remedy = re.search(r"Without one set (scenario\.reference=null)", refused.err)
+    assert remedy, refused.err
+    answered = pfbench(*words, remedy[1], home=alone)
+    assert answered.code == 0, answered.err
+    assert "5 of 5 runs valid" in answered.out
+    report = pfbench("report", "study=alone", home=alone)
+    assert report.code == 0, report.err
+    text = (alone / "reports" / "alone" / "report.md").read_text()
+    assert (
+        "Errors are distances to held-out point solutions, which have errors of their own." in text
+    )
+
+
+def test_a_log_with_too_few_satellites_is_refused(alone: Path) -> None:
+    scenario, _ = scene(
+        alone, "user_raw_log", "scenario.reference=null", "scenario.receiver.mask_deg=60"
+    )
+    with pytest.raises(
+        ValueError,
+        match=r"have 2 epochs whose satellites show a position, got \d+\. Use a longer log",
+    ):
+        scenario.draw(NominalNoise(), RUNS, 1)
+
+
 # an existing data set, whose satellites another program computed
 
 

@@ -23,8 +23,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pfbench.stats.comparison import Effect, bound_losses, compare
+from pfbench.stats.comparison import (
+    NO_DECISION,
+    SAME_RUNS,
+    Effect,
+    Verdict,
+    bound_losses,
+    compare,
+)
 from pfbench.stats.error_measures import Array
+from pfbench.stats.sentences import format_digits
 
 BLOCKS = 30  # of all sequences together [ours]
 MIN_EFFECTIVE = 7.0  # independent blocks that a decision needs [ours]
@@ -84,6 +92,28 @@ def compare_blocks(a: tuple[str, Array], b: tuple[str, Array]) -> BlockEffect:
     ratio, location = float(variance_ratio(d)), effect.location
     spread = location + math.sqrt(ratio) * (d - location)
     return BlockEffect(compare((a[0], b[1] + spread), b, "block"), len(d) / ratio)
+
+
+def withhold(verdict: Verdict, steady: Verdict, effective: float) -> Verdict:
+    """Return the verdict on blocks, undecided where one record cannot carry its word.
+
+    Args:
+        verdict: Verdict on the errors.
+        steady: Verdict without the mean error and the drift of each run.
+        effective: Number of independent blocks.
+    """
+    reason = ""
+    if verdict.word in (NO_DECISION, SAME_RUNS):
+        return verdict
+    if effective < min(MIN_EFFECTIVE, verdict.n):
+        count = f"{verdict.n} blocks that count as {format_digits(effective, 2)} independent ones"
+        reason = f"errors vary slowly: {count}, {MIN_EFFECTIVE:g} are required"
+    elif steady.word != verdict.word:
+        reason = (
+            "the difference rests on the mean error and the drift of the run, which one record cannot "
+            "tell from those of another run"
+        )
+    return verdict._replace(word=NO_DECISION, reason=reason) if reason else verdict
 
 
 def variance_ratio(d: Array) -> Array:
