@@ -246,7 +246,9 @@ def _words(d: np.ndarray, ratio: np.ndarray, margin: float = EQUALITY_MARGIN) ->
     h, ordered = n - 2 * cut, np.sort(d, axis=1)
     trimmed = ordered[:, cut : n - cut].mean(axis=1)
     winsorised = np.clip(d, ordered[:, [cut]], ordered[:, [n - cut - 1]])
-    t = trimmed / np.sqrt(n * winsorised.var(axis=1) / (h * (h - 1)))
+    error = np.sqrt(n * winsorised.var(axis=1) / (h * (h - 1)))
+    with np.errstate(divide="ignore", invalid="ignore"):  # equal differences, as of lost epochs
+        t = np.where((error == 0.0) & (trimmed == 0.0), 0.0, trimmed / error)
     equal = (np.minimum(low, np.where(p < 0.05, low, 0)) > -margin) & (np.maximum(high, np.where(p < 0.05, high, 0)) < margin)  # fmt: skip
     agree = (p < 0.05) & (2 * stdtr(h - 1, -np.abs(t)) < 0.05)
     sign = np.where(agree & ~equal & (trimmed * location[:, 0] > 0), np.sign(location[:, 0]), 0)  # fmt: skip
