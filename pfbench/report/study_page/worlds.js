@@ -76,7 +76,7 @@ function drawCalibration(part) {
   for (const share of [0.5, 0.9])
     content +=
       line(x(share), top, x(share), bottom, ' class="rule"') +
-      label(Math.min(x(share), width - textWidth("90 % region", 11) / 2), top - 8, `${100 * share} % region`, ' class="axis" text-anchor="middle"');
+      label(Math.min(x(share), width - textWidth("90 % interval", 11) / 2), top - 8, `${100 * share} % interval`, ' class="axis" text-anchor="middle"');
   content += label(
     (left + width - right) / 2,
     bottom + 30,
