@@ -77,10 +77,17 @@ def write(
     """Writes the result of one filter; the worlds depend on noise and seed alone, so that runs are paired."""
     settings = {
         "filter": {"name": method.name, "particles": method.particles, **(config or {})},
-        "noise": noise,
+        "noise": {"name": noise},
     }
     name = compute_config_key(
-        {**settings, "seed": seed, "runs": runs, "steps": steps, "versions": versions["commit"]}
+        {
+            **settings,
+            "noise": noise,
+            "seed": seed,
+            "runs": runs,
+            "steps": steps,
+            "versions": versions["commit"],
+        }
     )
     arrays = _arrays(method, noise, runs, steps, seed, name)
     meta = {

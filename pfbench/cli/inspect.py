@@ -67,7 +67,7 @@ def _split_folder(words: Sequence[str]) -> tuple[Path, dict[str, str]]:
     folders = [word for word in words if "=" not in word]
     values: dict[str, str] = {}
     for word in words:
-        key, equals, value = word.partition("=")
+        key, equals, value = word.removeprefix("scenario.").partition("=")  # as remedies name them
         if not equals:
             continue
         if key not in _KEYS or not value or key in values:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -63,13 +64,13 @@ def collect_record(
     first = next(iter(results.values()))
     if not is_recorded(first.meta):
         return None
-    scenario = first.meta["config"]["scenario"]
-    drives = count_drives(first.meta)
+    config, drives = first.meta["config"], count_drives(first.meta)
     errors = {label: _scaled_errors(result) for label, result in results.items()}
     numbers = np.arange(len(first.data["lost"])) + int(first.meta.get("first_run", 0))
     world, regime, noise = origin
     return {
-        "world": world, "regime": regime, "noise": noise, "added": _describe_added(scenario), "drives": drives,
+        "world": world, "regime": regime, "noise": noise, "added": _describe_added(config["scenario"]),
+        "simulated": _describe_regime(config["noise"]), "drives": len(np.unique(numbers % drives)), "recorded": drives,
         "runs": len(numbers), **_list_losses(errors, np.asarray(first.data["time"], float), numbers % drives),
     }  # fmt: skip
 
@@ -92,6 +93,16 @@ def _describe_added(scenario: Mapping[str, Any]) -> str:
     sds = {name: np.atleast_1d(receiver[name]) for name in _ADDED if receiver.get(name)}
     return "; ".join(
         f"{name} {', '.join(f'{v:g}' for v in sd)}" for name, sd in sds.items() if sd.any()
+    )
+
+
+def _describe_regime(noise: Mapping[str, Any]) -> str:
+    """Name the numbers of a noise regime that are not 0."""
+    values = {name: value for name, value in noise.items() if name != "paper" and not name.startswith("_") and value}  # fmt: skip
+    return "; ".join(
+        f"{name} {', '.join(f'{v:g}' for v in np.atleast_1d(value))}"
+        for name, value in values.items()
+        if np.issubdtype(np.asarray(value).dtype, np.number)
     )
 
 
@@ -176,11 +187,11 @@ def decide_records(
         pairs = [(label, base) for label in labels if label != base]
         conditions = runs.conditions
         mask = ((conditions["scenario"] == record["world"]) & (conditions["regime"] == record["regime"])).to_numpy()  # fmt: skip
-        if not pairs or not mask.any():
+        if not mask.any():
             continue
         verdicts = _decide_units(record, runs.select(mask), losses[:, mask], pairs, options)
         decided.append({
-            **{key: record[key] for key in ("world", "regime", "noise", "added", "seconds", "drives", "runs")},
+            **{key: record[key] for key in ("world", "regime", "noise", "added", "simulated", "seconds", "drives", "runs")},
             "baseline": base,
             "rows": [{"filter": label, **{unit: v[k] for unit, v in verdicts.items()}} for k, (label, _) in enumerate(pairs)],
         })  # fmt: skip
@@ -197,10 +208,15 @@ def _decide_units(
     """Decide the pairs of one condition by each unit, each a family."""
     margin, alpha = math.log1p(options.equivalence_margin), options.alpha
     starts = decide(compare_filters(cell, losses, pairs), margin, alpha)
-    units = {"starts": [_to_entry(v) for v in starts]}
+    units = {
+        "starts": [
+            _to_entry(v._replace(reason=_count_lost(cell, pair)) if v.word == SAME_RUNS else v)
+            for v, pair in zip(starts, pairs, strict=True)
+        ]
+    }  # both at the bound of a lost run are equal, too
     units["blocks"] = _decide_blocks(record, cell, pairs, (margin, alpha))
     if record["drives"] > 1:
-        effects = [_compare_drives(record["drives"], cell, losses, pair) for pair in pairs]
+        effects = [_compare_drives(record["recorded"], cell, losses, pair) for pair in pairs]
         units["drives"] = [_to_entry(v) for v in decide(effects, margin, alpha)]
     return units
 
@@ -291,12 +307,9 @@ def describe_reach(
             continue
         name, drives = worlds[world].name if world in worlds else world, records[0]["drives"]
         unit, by = ("blocks", "blocks of time, for other stretches") if drives == 1 else ("drives", "drives, for other drives")  # fmt: skip
-        words = [row[unit]["word"] for record in records for row in record["rows"]]
-        words = [word for word in words if word != SAME_RUNS]
-        count = f"{sum(word != NO_DECISION for word in words)} of {format_count(len(words), 'comparison')}"
-        decided_by = (
-            f" By {by}, {count} {'is' if len(words) == 1 else 'are'} decided." if words else ""
-        )
+        words = Counter(row[unit]["word"] for record in records for row in record["rows"])
+        texts = [f"{n} {'is' if n == 1 else 'are'} {word}" for word, n in words.items()]
+        decided_by = f" By {by}, {', '.join(texts)}." if texts else ""
         sentences.append(f"{describe_drives(name, drives)}.{decided_by}")
     return " ".join(sentences)
 
@@ -333,12 +346,10 @@ def describe_records(pack: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def _describe_source(record: Mapping[str, Any], words: str) -> str:
     """Say what is recorded and what is simulated."""
-    added = f" ({record['added']})" if record["added"] else ""
-    source = "Measurements as recorded"
-    if record["noise"] != "nominal":
-        source = f"Measurements: recorded, plus simulated {words}{added}"
-    elif added:
-        source = f"Measurements: recorded, plus simulated white errors{added}"
+    parts = [(words, record["simulated"])] if record["noise"] != "nominal" else []
+    parts += [("white errors", record["added"])] if record["added"] else []
+    texts = [f"{name} ({numbers})" if numbers else name for name, numbers in parts]
+    source = f"Measurements: recorded, plus simulated {' and '.join(texts)}" if texts else "Measurements as recorded"  # fmt: skip
     drives = "One drive" if record["drives"] == 1 else f"{record['drives']} drives"
     return f"{source}. {drives} of {format_digits(record['seconds'])} s, {format_count(record['runs'], 'run')}."
 
@@ -350,11 +361,14 @@ def _describe_verdict(entry: Mapping[str, Any] | None, unit: str) -> str:
     count = format_count(entry["n"], {"starts": "run", "blocks": "block", "drives": "drive"}[unit])
     if unit == "blocks":
         count += f", as {format_digits(entry['effective'], 2)} independent"
-    if entry["word"] == SAME_RUNS or entry["ratio"] is None:
-        return f"{entry['word']} ({count})"
-    p = "" if entry["p"] is None else f"p = {format_digits(entry['p'], 2)}, "
     reason = f": {entry['reason']}" if entry["reason"] else ""
-    return f"{entry['word']} ({p}ratio {format_digits(entry['ratio'])}, {count}){reason}"
+    if entry["word"] == SAME_RUNS or entry["ratio"] is None:
+        return f"{entry['word']} ({count}){reason}"
+    p = "" if entry["p"] is None else f"p = {format_digits(entry['p'], 2)}, "
+    ratio = f"ratio {format_digits(entry['ratio'])}"
+    if entry["low"] is not None and entry["high"] is not None:
+        ratio += f" [{format_digits(entry['low'])}, {format_digits(entry['high'])}]"
+    return f"{entry['word']} ({p}{ratio}, {count}){reason}"
 
 
 def list_questions(pack: Mapping[str, Any]) -> Iterator[str]:
