@@ -28,8 +28,8 @@ readings of its paper. A claim without runs is open, with the price of its runs.
   pfbench claims run C001-7              one claim; 001 is all claims of a paper
   pfbench claims run 002 readings=each hours=2
   pfbench claims run dry=true            the plan only
-  pfbench claims verify                  computes 20 stored cells again, and all words. Runs must be equal,
-                                         those of a swarm, which amplifies rounding, agree in the mean
+  pfbench claims verify                  computes 20 stored cells again, and all words. Runs must be equal;
+                                         those of particles, which may amplify rounding, agree in the mean
 
   hours=H                    starts no job after this time; repeat the command to resume
   workers=2                  processes, at most two

@@ -289,7 +289,7 @@ def test_an_error_of_a_form_that_does_not_refuse_is_a_fault(tmp_path: Path) -> N
     assert ClaimRuns.read(tmp_path, tmp_path / "none").records == []
 
 
-def test_runs_of_a_swarm_agree_if_their_mean_difference_is_within_its_error() -> None:
+def test_runs_of_particles_agree_if_their_mean_difference_is_within_its_error() -> None:
     g = np.random.default_rng(1)
     shifts = [0.0, 0.3]  # beside a spread of 0.1
     passed = [
