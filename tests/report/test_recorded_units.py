@@ -168,6 +168,14 @@ def test_no_word_of_one_record_stands_without_its_reach(tmp_path: Path) -> None:
     assert '<section id="recorded">' in html
 
 
+def test_drives_without_a_run_do_not_count(tmp_path: Path) -> None:
+    results = recorded_study(tmp_path / "results", {"flights": list(range(RUNS + 8))})
+    page = write_report("own", results, tmp_path / "reports")
+    text = (page.parent / "report.md").read_text()
+    assert f"flight is {RUNS} recorded drives" in text
+    assert f"{RUNS + 8} drives" not in text
+
+
 def test_a_stored_page_is_decided_again_with_its_blocks(tmp_path: Path) -> None:
     page = write_report("own", recorded_study(tmp_path / "results", {}), tmp_path / "reports")
     before = (page.parent / "report.md").read_text()
