@@ -1,14 +1,17 @@
-"""Put newer jobs into a published study: `python experiments/analyses/merge_study.py FOLDER STUDY ...`.
+"""Add newer cells to a published study: `python experiments/analyses/merge_study.py FOLDER STUDY ...`.
 
-FOLDER/STUDY is a report of some jobs of the study on the same runs, written by `pfbench report reports_dir=FOLDER`.
-A filter that was tuned anew, or that the published study lacks, is taken from it. All other filters of it are a check:
-their errors must be those of the published study. The page is then decided again from all runs.
+A cell is a filter in a condition. FOLDER/STUDY is a report of some jobs of the study on the same runs, written by
+`pfbench report reports_dir=FOLDER`. Cells that the published study lacks are added. All others are a check: their errors
+must be those of the published study, and each condition needs one. The page is then decided again from all runs.
+
+A filter with several numbers of particles has its number in its name in all conditions, as in a report of all jobs.
 """
 
 from __future__ import annotations
 
+import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,135 +28,301 @@ from pfbench.report import (
     read_stored_study,
     rebuild_page,
 )
+from pfbench.results.conditions import parse_label
+from pfbench.results.looks import find_looks
+from pfbench.stats.study_runs import natural_sort_key
 
 REPORTS = Path(__file__).parents[2] / "reports"
-RUN = ["scenario", "regime", "seed", "run"]
+CONDITION = ["scenario", "regime"]
+RUN = [*CONDITION, "filter", "seed", "run"]
 TOLERANCE = 1e-5  # relative, of errors that are stored in single precision
+_COUNTS = ("runs", "lost", "diverged", "collapsed", "severely_overconfident")
+_NUMBER = ("particles", "budget")  # settings of a label that a number of particles replaces
 Pack = dict[str, Any]
 
 
-def find_new_filters(published: Pack, newer: Pack) -> list[str]:
-    """List the filters of a newer report that a published study lacks or has with other tuned parameters.
+def name_by_number(tables: Sequence[pd.DataFrame]) -> list[dict[str, str]]:
+    """Name the filters of reports of one study by their numbers of particles, where a filter has several.
 
     Args:
-        published: Data of the published page.
-        newer: Data of the newer page.
-    """
-    tuning = {look["key"]: look["tuning"] for look in published["facts"]["looks"]}
-    looks = newer["facts"]["looks"]
-    return [look["key"] for look in looks if tuning.get(look["key"]) != look["tuning"]]
+        tables: Runs of the reports.
 
-
-def merge_runs(published: pd.DataFrame, newer: pd.DataFrame, labels: Sequence[str]) -> pd.DataFrame:
-    """Replace the runs of some filters, and check that those of all others are the same.
-
-    Args:
-        published: Runs of the published study.
-        newer: Runs of the newer report.
-        labels: Filters to replace.
+    Returns:
+        New labels by the labels of each report.
 
     Raises:
-        ValueError: If the newer report has no other filter, or one whose errors differ.
+        ValueError: If a label of a report stands for several numbers of particles that need names of their own.
     """
-    other = newer[~newer["filter"].isin(labels)]
-    pairs = other.merge(published, on=[*RUN, "filter"], suffixes=("", "_published"))
-    errors, expected = pairs["rmse"].to_numpy(), pairs["rmse_published"].to_numpy()
-    if not len(other) or len(pairs) < len(other):
+    numbers: dict[str, set[float]] = {}
+    found = []
+    for table in tables:
+        counts: dict[str, set[float]] = {}
+        for label, rows in table.groupby(table["filter"].astype(str)):
+            counts[str(label)] = set(rows["particles"].dropna())
+            name, settings = parse_label(str(label))
+            if settings.get("budget") != "time" and set(settings) <= set(_NUMBER):
+                numbers.setdefault(name, set()).update(counts[str(label)])
+        found.append(counts)
+    return [
+        {label: _name_by_number(label, some, numbers) for label, some in counts.items()}
+        for counts in found
+    ]
+
+
+def _name_by_number(label: str, counts: set[float], numbers: Mapping[str, set[float]]) -> str:
+    """Return the new label of a filter that has some numbers of particles in a report."""
+    name, settings = parse_label(label)
+    if settings.get("budget") == "time" or not set(settings) <= set(_NUMBER):
+        return label
+    if len(numbers[name]) <= 1:
+        return name
+    if len(counts) != 1:
         raise ValueError(
-            "the newer report must have a filter of the published study on the same runs, got none for "
-            f"{len(other) - len(pairs)} of {len(other)} runs. Run one, for instance ekf, in it."
+            f"{label} must have one number of particles in each report, got {sorted(counts)}. "
+            "Write a report of the jobs of each number."
         )
-    if not np.allclose(errors, expected, rtol=TOLERANCE, atol=0.0, equal_nan=True):
-        raise ValueError(
-            f"errors of {', '.join(sorted(set(pairs['filter'])))} must be those of the published study, got "
-            "others. The data have changed: run the whole study again."
-        )
-    is_old, is_new = (table["filter"].isin(labels) for table in (published, newer))
-    lacking = len(published[is_old].merge(newer[is_new], on=[*RUN, "filter"])) - is_old.sum()
-    if lacking:
-        raise ValueError(
-            f"the newer report must have all runs of {', '.join(labels)} that the published study has, got "
-            f"{-lacking} missing. Run their jobs."
-        )
-    return pd.concat([published[~is_old], _keep_times(published, newer[is_new])], ignore_index=True)
+    return f"{name}[particles={int(*counts)}]"
 
 
-def _keep_times(published: pd.DataFrame, newer: pd.DataFrame) -> pd.DataFrame:
-    """Give runs the published time per step of their filter, whose operations do not depend on its parameters.
-
-    Timings of one study are then of one time and machine. A filter that the study lacks keeps its own.
-    """
-    keys = [*RUN, "filter"]
-    times = newer[keys].merge(published[[*keys, "ms"]], on=keys, how="left")["ms"]
-    return newer.assign(ms=times.fillna(pd.Series(newer["ms"].to_numpy())).to_numpy())
-
-
-def merge_packs(published: Pack, newer: Pack, labels: Sequence[str], runs: pd.DataFrame) -> Pack:
-    """Merge what a page has beside its decisions: looks, curves, notes and provenance.
+def merge_runs(published: pd.DataFrame, newer: pd.DataFrame) -> pd.DataFrame:
+    """Add the cells that a published study lacks, and check those that both have.
 
     Args:
-        published: Data of the published page.
-        newer: Data of the newer page.
-        labels: Filters to replace.
-        runs: Runs of the merged study.
+        published: Runs of the published study, with the labels of `name_by_number`.
+        newer: Runs of the newer report, with the same.
+
+    Raises:
+        ValueError: If a condition of the newer report has no cell of the published study, or one whose errors differ.
     """
-    pack = {**published, "generated": newer["generated"], "curves": {}, "cells": cell_entries(runs)}
-    for key, curve in published["curves"].items():
-        added = newer["curves"].get(key, {"t": curve["t"], "filters": {}})
-        if added["t"] != curve["t"]:
+    cell = [*CONDITION, "filter"]
+    rows = newer.merge(published[cell].drop_duplicates(), on=cell, how="left", indicator="place")
+    common, added = rows[rows["place"] == "both"], rows[rows["place"] == "left_only"]
+    pairs = common.merge(published, on=RUN, suffixes=("", "_published"))
+    runs = [
+        set(_list_runs(table))
+        for table in (newer, published.merge(newer[CONDITION].drop_duplicates()))
+    ]
+    lacking = set(_list_conditions(added)) - set(_list_conditions(pairs))
+    if lacking or len(pairs) < len(common) or runs[0] != runs[1]:
+        raise ValueError(
+            "each condition of the newer report must have a filter of the published study on the same runs, got "
+            f"{len(runs[0] ^ runs[1])} other runs and {len(lacking)} conditions without one. Run ekf in each of them."
+        )
+    errors, expected = pairs["rmse"].to_numpy(), pairs["rmse_published"].to_numpy()
+    differs = ~np.isclose(errors, expected, rtol=TOLERANCE, atol=0.0, equal_nan=True)
+    if differs.any():
+        raise ValueError(
+            f"errors of {', '.join(sorted(set(pairs['filter'][differs].astype(str))))} must be those of the published "
+            "study, got others. The data have changed: run the whole study again."
+        )
+    return pd.concat([published, added[list(newer.columns)]], ignore_index=True)
+
+
+def _list_conditions(table: pd.DataFrame) -> list[tuple[Any, ...]]:
+    """List the conditions of runs."""
+    return [tuple(row) for row in table[CONDITION].drop_duplicates().to_numpy()]
+
+
+def _list_runs(table: pd.DataFrame) -> list[tuple[Any, ...]]:
+    """List the runs of a study, without their filters."""
+    return [tuple(row) for row in table[[*CONDITION, "seed", "run"]].drop_duplicates().to_numpy()]
+
+
+def select_added_notes(
+    notes: Sequence[Mapping[str, Any]], published: pd.DataFrame, newer: pd.DataFrame
+) -> list[Mapping[str, Any]]:
+    """Select the notes on filters whose cells are all new.
+
+    Args:
+        notes: Notes of the newer report.
+        published: Runs of the published study.
+        newer: Runs of the newer report.
+
+    Raises:
+        ValueError: If some cells of a filter are new and others a check, whose notes would count twice.
+    """
+    known = set(map(tuple, published[[*CONDITION, "filter"]].drop_duplicates().to_numpy()))
+    selected = []
+    for note in notes:
+        cells = newer[newer["filter"] == note["filter"]][[*CONDITION, "filter"]].drop_duplicates()
+        new = [tuple(cell) not in known for cell in cells.to_numpy()]
+        if any(new) and not all(new):
+            raise ValueError(
+                f"{note['filter']} must be new in all conditions of the report or in none, got {sum(new)} of "
+                f"{len(new)}. Write a report of the others."
+            )
+        selected += [note] * all(new)
+    return selected
+
+
+def rename_pack(pack: Pack, names: Mapping[str, str]) -> Pack:
+    """Give the filters of a page new labels; several old labels may have the same one."""
+    looks: dict[str, Pack] = {}
+    for look in pack["facts"]["looks"]:
+        key = names[look["key"]]
+        other = looks.get(key, {**look, "tuning": "", "tuned_on": ""})
+        texts = {
+            name: join_texts([other[name], look[name]], r"(?<=\)), ")
+            for name in ("tuning", "tuned_on")
+        }
+        looks[key] = {**other, **texts, "key": key}
+    by_name = {look["name"]: names[look["key"]] for look in pack["facts"]["looks"]}
+    return {
+        **pack,
+        "facts": {**pack["facts"], "looks": list(looks.values())},
+        "curves": {
+            key: {**curve, "filters": {names[k]: v for k, v in curve["filters"].items()}}
+            for key, curve in pack["curves"].items()
+        },
+        "filter_notes": add_notes({**n, "filter": names[n["filter"]]} for n in pack["filter_notes"]),
+        "choices": {
+            entry["text"]: _read_names(entry["filters"], by_name) for entry in pack["choices"]
+        },
+        "methods": {
+            **pack["methods"],
+            "particles": _join_lists([{names[k]: v} for k, v in pack["methods"]["particles"].items()]),
+        },
+    }  # fmt: skip
+
+
+def _read_names(text: str, labels: Mapping[str, str]) -> set[str]:
+    """Return the labels of filters whose names are in a list of a page."""
+    if text == "all filters":
+        return set(labels.values())
+    return {labels[name] for name in re.split(r", (?![^\[]*\])", text)}
+
+
+def add_notes(notes: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Add the counts of notes on the same filter."""
+    added: dict[str, dict[str, Any]] = {}
+    for note in notes:
+        old = added.get(note["filter"])
+        if old is None:
+            added[note["filter"]] = dict(note)
+            continue
+        counts = {name: _add(old[name], note[name]) for name in _COUNTS}
+        bounded = {old["has_bounded_weights"], note["has_bounded_weights"]}
+        added[note["filter"]] = {
+            **old,
+            **counts,
+            "particles": join_texts([old["particles"], note["particles"]], " or "),
+            "is_exact": old["is_exact"] and note["is_exact"],
+            "has_bounded_weights": None if None in bounded else all(bounded),
+        }
+    return list(added.values())
+
+
+def _add(first: int | None, second: int | None) -> int | None:
+    """Add two counts; one that does not exist is left out."""
+    numbers = [number for number in (first, second) if number is not None]
+    return sum(numbers) if numbers else None
+
+
+def join_texts(texts: Sequence[str], separator: str) -> str:
+    """Join lists in words, each entry once; the separator is a pattern that ends with what is written."""
+    parts = [part for text in texts if text for part in re.split(separator, text)]
+    return separator.rpartition(")")[2].join(dict.fromkeys(parts))
+
+
+def _join_lists(tables: Sequence[Mapping[str, Sequence[Any]]]) -> dict[str, list[Any]]:
+    """Join lists by name, each entry once."""
+    joined: dict[str, list[Any]] = {}
+    for table in tables:
+        for name, values in table.items():
+            known = joined.setdefault(name, [])
+            known += [value for value in values if value not in known]
+    return joined
+
+
+def merge_packs(published: Pack, newer: Pack, runs: pd.DataFrame) -> Pack:
+    """Merge what a page has beside its decisions: looks, curves, notes, failures and provenance.
+
+    Args:
+        published: Data of the published page, of `rename_pack`.
+        newer: Data of the newer page, of `rename_pack`.
+        runs: Runs of the merged study.
+
+    Raises:
+        ValueError: If curves of a condition have other times, or a page has times per step in rounds.
+    """
+    if published["facts"]["times"] or newer["facts"]["times"]:
+        raise ValueError(
+            "a page to merge must have one time per job, got rounds of `pfbench cost`. Run it after all jobs."
+        )
+    looks = {look["key"]: look for look in (*newer["facts"]["looks"], *published["facts"]["looks"])}
+    for look in newer["facts"]["looks"]:
+        texts = [looks[look["key"]]["tuning"], look["tuning"]]
+        looks[look["key"]] = {**looks[look["key"]], "tuning": join_texts(texts, r"(?<=\)), ")}
+    curves = dict(published["curves"])
+    for key, added in newer["curves"].items():
+        if added["t"] != curves[key]["t"]:
             raise ValueError(
                 f"curves of {key} must have the same times in both reports, got others."
             )
-        new = {label: added["filters"][label] for label in labels if label in added["filters"]}
-        pack["curves"][key] = {**curve, "filters": {**curve["filters"], **new}}
-    looks = _replace(published["facts"]["looks"], newer["facts"]["looks"], "key", labels)
-    pack["facts"] = {**published["facts"], "looks": sorted(looks, key=lambda look: look["key"])}
-    pack["filter_notes"] = _replace(
-        published["filter_notes"], newer["filter_notes"], "filter", labels
-    )
+        filters = {**added["filters"], **curves[key]["filters"]}
+        curves[key] = {
+            **curves[key],
+            "filters": {label: filters[label] for label in sorted(filters)},
+        }
     stored = dict(newer["provenance"])
-    pack["provenance"] = [
-        [name, _join(value, stored.get(name, ""))] for name, value in published["provenance"]
-    ]
+    generated = {
+        name: join_texts([published["generated"][name], newer["generated"][name]], ", ")
+        for name in published["generated"]
+    }
+    facts = {
+        **published["facts"],
+        "looks": [looks[label] for label in sorted(looks, key=natural_sort_key)],
+    }
+    pack = {
+        **published,
+        "generated": {**generated, "date": newer["generated"]["date"]},
+        "curves": curves,
+        "cells": cell_entries(runs),
+        "facts": facts,
+        "failures": list(
+            {e["key"]: e for e in (*published["failures"], *newer["failures"])}.values()
+        ),
+        "provenance": [
+            [name, join_texts([value, stored.get(name, "")], ", ")]
+            for name, value in published["provenance"]
+        ],
+        "choices": _name_choices(published["choices"], newer["choices"], list(looks)),
+    }
     pack["methods"] = _merge_methods(published["methods"], newer["methods"], pack, runs)
     return pack
 
 
-def _replace(
-    old: Sequence[Mapping[str, Any]],
-    new: Sequence[Mapping[str, Any]],
-    key: str,
-    labels: Sequence[str],
-) -> list[Mapping[str, Any]]:
-    """Replace the entries of some filters."""
-    return [e for e in old if e[key] not in labels] + [e for e in new if e[key] in labels]
-
-
-def _join(old: str, new: str) -> str:
-    """Join two lists of values, each once."""
-    return ", ".join(dict.fromkeys(filter(None, [*old.split(", "), *new.split(", ")])))
+def _name_choices(
+    old: Mapping[str, set[str]], new: Mapping[str, set[str]], labels: Sequence[str]
+) -> list[dict[str, str]]:
+    """Return the entries of the modelling choices, with the present names of filters."""
+    names = {label: look.name for label, look in find_looks(sorted(labels)).items()}
+    entries = []
+    for text in sorted({*old, *new}):
+        members = old.get(text, set()) | new.get(text, set())
+        listed = ", ".join(names[label] for label in names if label in members)
+        entries.append({
+            "text": text, "filters": "all filters" if members == set(labels) else listed
+        })  # fmt: skip
+    return entries
 
 
 def _merge_methods(old: Pack, new: Pack, pack: Pack, runs: pd.DataFrame) -> Pack:
     """Merge the facts of the methods paragraph."""
     looks = StudyFacts.from_pack(pack).looks
-    conditions = runs.groupby(["scenario", "regime"])["filter"].nunique()
-    software = {
-        name: list(dict.fromkeys([*old["software"].get(name, ()), *values]))
-        for name, values in new["software"].items()
-    }
+    conditions = runs.groupby(CONDITION)["filter"].nunique()
     return {
         **old,
         "filters": len(looks),
-        "particles": {**old["particles"], **new["particles"]},
-        "software": software,
+        "particles": _join_lists([old["particles"], new["particles"]]),
+        "software": _join_lists([old["software"], new["software"]]),
         "tuned": count_tuned(looks),
         "is_complete": bool((conditions == len(looks)).all()),
     }
 
 
 def merge_study(study: str, folder: Path, reports: Path = REPORTS) -> list[str]:
-    """Merge a newer report into a published study and write its page again.
+    """Add the cells of a newer report to a published study and write its page again.
 
     Args:
         study: Name of the study.
@@ -161,17 +330,26 @@ def merge_study(study: str, folder: Path, reports: Path = REPORTS) -> list[str]:
         reports: Folder of published reports.
 
     Returns:
-        Filters that were replaced or added.
+        Added cells as "scenario / filter".
     """
+    stored = [read_stored_study(place / study) for place in (reports, folder)]
+    names = name_by_number([table for _, table in stored])
     (published, old), (newer, new) = (
-        read_stored_study(place / study) for place in (reports, folder)
+        (rename_pack(pack, labels), table.assign(filter=table["filter"].astype(str).map(labels)))
+        for (pack, table), labels in zip(stored, names, strict=True)
     )
-    labels = find_new_filters(published, newer)
-    runs = merge_runs(old, new, labels)
+    runs = merge_runs(old, new)
+    cells = [
+        set(map(tuple, table[["scenario", "filter"]].drop_duplicates().to_numpy()))
+        for table in (old, new)
+    ]
+    added = select_added_notes(newer["filter_notes"], old, new)
+    pack = merge_packs(published, newer, runs)
+    pack["filter_notes"] = add_notes([*published["filter_notes"], *added])
     with RecordedFolder(reports / study, is_complete=False) as target:
-        target.write(RUNS_FILE, format_runs(runs, merge_packs(published, newer, labels, runs)))
+        target.write(RUNS_FILE, format_runs(runs, pack))
     rebuild_page(reports / study)
-    return labels
+    return [" / ".join(cell) for cell in sorted(cells[1] - cells[0])]
 
 
 if __name__ == "__main__":

@@ -101,18 +101,23 @@ def load_conditions(
     items = [(path, join_metadata([meta for _, meta in group])) for path, group in groups.items()]
     items.sort(key=lambda item: (_condition_key(item[1]), *_job_order(item[1])))
     items = add_step_times(items, Path(results) / study)
-    conditions = []
+    settings: dict[str, list[str]] = {}
+    separated = []
     for key, group in groupby(items, key=lambda item: _condition_key(item[1])):
         members = list(group)
         separate = list_data_settings([meta for _, meta in members]) if same_data else []
         if not allow_mixed_versions:
             _check_condition(members, separate)
         for names, items_of_data in _separate_data(members, separate):
-            jobs = [
-                job._replace(parts=tuple(path for path, _ in groups[job.path]))
-                for job in _label_jobs(items_of_data)
-            ]
-            conditions.append(Condition(*names, key[2], tuple(jobs), sentence))
+            separated.append((names, key[2], items_of_data))
+            _add_label_settings(settings, items_of_data)
+    conditions = []
+    for names, model, items_of_data in separated:
+        jobs = [
+            job._replace(parts=tuple(path for path, _ in groups[job.path]))
+            for job in _label_jobs(items_of_data, settings)
+        ]
+        conditions.append(Condition(*names, model, tuple(jobs), sentence))
     return conditions
 
 
@@ -175,13 +180,36 @@ def _job_order(meta: Mapping[str, Any]) -> tuple[Any, ...]:
     return meta["label"], meta["seed"], meta["key"]
 
 
-def _label_jobs(items: Sequence[_Described]) -> tuple[JobFile, ...]:
-    """Give each job of a condition a label of its own."""
-    names = [str(meta["label"]) for _, meta in items]
-    jobs = []
-    for (path, meta), name in zip(items, names, strict=True):
-        twins = [twin for (_, twin), label in zip(items, names, strict=True) if label == name]
-        jobs.append(JobFile(path, make_distinct_label(meta, twins), meta))
+def _group_by_label(items: Sequence[_Described]) -> dict[str, list[Mapping[str, Any]]]:
+    """Group the metadata of jobs by their filter."""
+    twins: dict[str, list[Mapping[str, Any]]] = {}
+    for _, meta in items:
+        twins.setdefault(str(meta["label"]), []).append(meta)
+    return twins
+
+
+def _add_label_settings(settings: dict[str, list[str]], items: Sequence[_Described]) -> None:
+    """Add the settings in which the jobs of each filter differ in a condition: its label has them in all conditions."""
+    for label, twins in _group_by_label(items).items():
+        names = settings.setdefault(label, [])
+        names += [name for name in find_label_settings(twins) if name not in names]
+
+
+def _label_jobs(
+    items: Sequence[_Described], settings: Mapping[str, Sequence[str]] | None = None
+) -> tuple[JobFile, ...]:
+    """Give each job of a condition a label of its own, with the settings that its label has in others."""
+    twins, settings = _group_by_label(items), settings or {}
+    jobs = [
+        JobFile(
+            path,
+            make_distinct_label(
+                meta, twins[str(meta["label"])], settings.get(str(meta["label"]), ())
+            ),
+            meta,
+        )
+        for path, meta in items
+    ]
     return tuple(sorted(jobs, key=lambda job: natural_sort_key(job.label)))
 
 
@@ -252,14 +280,33 @@ def parse_label(label: str) -> tuple[str, dict[str, str]]:
     return name, {key: value for key, _, value in (pair.partition("=") for pair in pairs)}
 
 
-def make_distinct_label(meta: Mapping[str, Any], twins: Sequence[Mapping[str, Any]]) -> str:
+def make_distinct_label(
+    meta: Mapping[str, Any], twins: Sequence[Mapping[str, Any]], settings: Sequence[str] = ()
+) -> str:
     """Extend a label by the settings in which jobs of that label differ.
+
+    An equal number of particles is the usual budget, and is not named.
+
+    Args:
+        meta: Metadata of the job.
+        twins: Metadata of all jobs of its label in the condition, with its own.
+        settings: Settings that its label has in other conditions of the study.
+    """
+    names = list(dict.fromkeys([*find_label_settings(twins), *settings]))
+    if not names:
+        return str(meta["label"]) if len(twins) == 1 else f"{meta['label']}[{meta['key']}]"
+    if meta["config"].get("budget", store.SAME_N) == store.SAME_N:
+        names = [name for name in names if name != "budget"]
+    text = _format_settings(meta, names, "filter.")
+    return f"{meta['label']}[{text}]" if text else str(meta["label"])
+
+
+def find_label_settings(twins: Sequence[Mapping[str, Any]]) -> list[str]:
+    """List the settings in which jobs of a label differ, from their metadata.
 
     Settings of the filter alone are used if they suffice, and the budget: a job at equal time has another number of
     particles than its settings say.
     """
-    if len(twins) == 1:
-        return str(meta["label"])
     flat = [flatten_settings(twin["config"]) for twin in twins]
     names = [name for name in list_differing(flat) if not name.startswith(_WORDS)]
     if "filter.particles" in names and "particles" in names:  # from which it is taken
@@ -267,8 +314,7 @@ def make_distinct_label(meta: Mapping[str, Any], twins: Sequence[Mapping[str, An
     of_filter = [name for name in names if name.startswith("filter.")]
     if len({tuple(repr(config.get(name)) for name in of_filter) for config in flat}) == len(flat):
         names = [*(name for name in names if name == "budget"), *of_filter]
-    text = _format_settings(meta, names, "filter.")
-    return f"{meta['label']}[{text or meta['key']}]"
+    return names
 
 
 def list_data_settings(metadata: Sequence[Mapping[str, Any]]) -> list[str]:

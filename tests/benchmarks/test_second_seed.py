@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -122,67 +121,134 @@ def test_tier_b_of_each_world_is_tuned_on_it() -> None:
         tuned_worlds.read_tuning("moon", "moon")
 
 
-# newer jobs of a published study
+# newer cells of a published study
 
 
 @pytest.fixture
 def folders(tmp_path: Path) -> tuple[Path, Path]:
-    """A published study, and a newer report of two of its filters, one with another tuning and other errors."""
+    """A published study without one filter, and a newer report with the runs of that filter and of the control."""
     for name in ("published", "newer"):
         (tmp_path / name / "robust_canyon").mkdir(parents=True)
-        shutil.copy(
-            ROOT / "reports" / "robust_canyon" / RUNS_FILE, tmp_path / name / "robust_canyon"
-        )
-    folder = tmp_path / "newer" / "robust_canyon"
-    pack, runs = read_stored_study(folder)
-    runs = runs[runs["filter"].isin(["ekf", "gate_tuned"])]
-    runs.loc[runs["filter"] == "gate_tuned", "rmse"] *= 0.5
-    runs["ms"] *= 9.0  # on a busy machine
-    pack["facts"]["looks"] = [
-        {**look, "tuning": "recorded_berlin (new)" if look["key"] == "gate_tuned" else look["tuning"]}
-        for look in pack["facts"]["looks"] if look["key"] in ("ekf", "gate_tuned")
-    ]  # fmt: skip
-    (folder / RUNS_FILE).write_bytes(format_runs(runs, pack))
+    pack, runs = read_stored_study(ROOT / "reports" / "robust_canyon")
+    labels = set(runs["filter"])
+    write_part(tmp_path / "published", pack, runs, labels - {"gate_tuned"})
+    write_part(tmp_path / "newer", pack, runs, {"ekf", "gate_tuned"})
     return tmp_path / "published", tmp_path / "newer"
 
 
-def test_newer_jobs_replace_a_filter_and_the_page_is_decided_again(
-    folders: tuple[Path, Path],
-) -> None:
+def write_part(reports: Path, pack: Any, runs: pd.DataFrame, labels: set[str]) -> None:
+    """Write the runs of some filters as a report."""
+    rows = runs[runs["filter"].isin(labels)]
+    facts = {
+        **pack["facts"],
+        "looks": [look for look in pack["facts"]["looks"] if look["key"] in labels],
+    }
+    curves = {
+        key: {**curve, "filters": {k: v for k, v in curve["filters"].items() if k in labels}}
+        for key, curve in pack["curves"].items()
+    }
+    notes = [note for note in pack["filter_notes"] if note["filter"] in labels]
+    names = {look["name"] for look in facts["looks"]}
+    choices = []
+    for entry in pack["choices"]:
+        listed = [name for name in entry["filters"].split(", ") if name in names]
+        if entry["filters"] == "all filters" or listed:
+            filters = "all filters" if entry["filters"] == "all filters" else ", ".join(listed)
+            choices.append({**entry, "filters": filters})
+    numbers = {k: v for k, v in pack["methods"]["particles"].items() if k in labels}
+    part = {
+        **pack, "facts": facts, "curves": curves, "filter_notes": notes, "choices": choices,
+        "methods": {**pack["methods"], "particles": numbers},
+    }  # fmt: skip
+    (reports / "robust_canyon" / RUNS_FILE).write_bytes(format_runs(rows, part))
+
+
+def test_added_cells_give_the_page_of_all_jobs(folders: tuple[Path, Path]) -> None:
+    """A study of which one filter was left out, and came later, has the runs, looks, notes and words of the whole."""
     published, newer = folders
-    before = pd.read_parquet(published / "robust_canyon" / "runs.parquet")
-    assert merge_study.merge_study("robust_canyon", newer, published) == ["gate_tuned"]
-    after = pd.read_parquet(published / "robust_canyon" / "runs.parquet")
+    added = merge_study.merge_study("robust_canyon", newer, published)
+    assert {cell.partition(" / ")[2] for cell in added} == {"gate_tuned"}
+    whole, expected = read_stored_study(ROOT / "reports" / "robust_canyon")
+    pack, runs = read_stored_study(published / "robust_canyon")
     keys = ["scenario", "regime", "filter", "run"]
-    pairs = before.merge(after, on=keys)
-    ratio = (pairs["rmse_y"] / pairs["rmse_x"]).to_numpy()
-    expected = np.where(pairs["filter"] == "gate_tuned", 0.5, 1.0)
-    assert len(pairs) == len(before) == len(after)
-    np.testing.assert_allclose(ratio, expected)
-    np.testing.assert_array_equal(pairs["ms_x"], pairs["ms_y"])
-    pack = read_stored_study(published / "robust_canyon").pack
-    assert next(iter(pack["views"].values()))["rows"][0]["filter"] == "gate_tuned"
-    assert pack["methods"]["tuned"]["recorded_berlin (new)"] == 1
-    page = (published / "robust_canyon" / "report.md").read_text()
-    assert "recorded_berlin (new)" in page
+    pairs = expected.merge(runs, on=keys, suffixes=("", "_merged"))
+    assert len(pairs) == len(expected) == len(runs)
+    for name in ("rmse", "ms", "keeps_track"):
+        np.testing.assert_array_equal(pairs[name], pairs[f"{name}_merged"])
+    assert sorted(n["filter"] for n in pack["filter_notes"]) == sorted(
+        n["filter"] for n in whole["filter_notes"]
+    )
+    by_name = {note["filter"]: note for note in whole["filter_notes"]}
+    assert all(note == by_name[note["filter"]] for note in pack["filter_notes"])
+    assert pack["methods"]["tuned"] == whole["methods"]["tuned"]
+    assert {c["text"]: sorted(c["filters"].split(", ")) for c in pack["choices"]} == {
+        c["text"]: sorted(c["filters"].split(", ")) for c in whole["choices"]
+    }
+    for key, curve in whole["curves"].items():
+        assert pack["curves"][key]["filters"] == curve["filters"]
+    for key, view in whole["views"].items():
+        rows = {row["filter"]: row for row in pack["views"][key]["rows"]}
+        assert [rows[row["filter"]] for row in view["rows"]] == view["rows"]
 
 
 def test_other_data_are_refused(folders: tuple[Path, Path]) -> None:
     published, newer = folders
-    path = newer / "robust_canyon" / RUNS_FILE
-    pack, runs = read_stored_study(path.parent)
+    pack, runs = read_stored_study(newer / "robust_canyon")
 
     def write(table: pd.DataFrame) -> None:
-        looks = [look for look in pack["facts"]["looks"] if look["key"] in set(table["filter"])]
-        path.write_bytes(format_runs(table, {**pack, "facts": {**pack["facts"], "looks": looks}}))
+        write_part(newer, pack, table, set(table["filter"]))
 
     is_control = runs["filter"] == "ekf"
     write(runs.assign(rmse=np.where(is_control, 1.01, 1.0) * runs["rmse"]))
     with pytest.raises(ValueError, match=r"errors of ekf must be those of the published study"):
         merge_study.merge_study("robust_canyon", newer, published)
     write(runs[~is_control])
-    with pytest.raises(ValueError, match=r"must have a filter of the published study on the same"):
+    with pytest.raises(ValueError, match=r"got 0 other runs and \d+ conditions without one"):
         merge_study.merge_study("robust_canyon", newer, published)
-    write(runs[is_control | (runs["run"] < 40)])
-    with pytest.raises(ValueError, match=r"all runs of gate_tuned .* got 10 missing"):
+    write(runs[runs["run"] < 40])
+    with pytest.raises(ValueError, match=r"the same runs, got \d+ other runs"):
         merge_study.merge_study("robust_canyon", newer, published)
+
+
+def test_a_filter_with_several_numbers_of_particles_has_them_in_its_name() -> None:
+    """In one condition SIR ran with 100 particles, in another with both, at equal time with 63."""
+
+    def table(rows: list[tuple[str, str, float]]) -> pd.DataFrame:
+        return pd.DataFrame(rows, columns=["scenario", "filter", "particles"])
+
+    first = table([
+        ("a", "sir", 100), ("b", "sir[budget=particles,particles=100]", 100), ("a", "swarm", 20),
+        ("b", "sir[budget=time,particles=1000]", 63), ("a", "ekf", np.nan), ("b", "gpf[k=2]", 100),
+    ])  # fmt: skip
+    second = table([("a", "sir", 1000), ("a", "ekf", np.nan)])
+    old, new = merge_study.name_by_number([first, second])
+    assert old == {
+        "sir": "sir[particles=100]", "sir[budget=particles,particles=100]": "sir[particles=100]", "swarm": "swarm",
+        "sir[budget=time,particles=1000]": "sir[budget=time,particles=1000]", "ekf": "ekf", "gpf[k=2]": "gpf[k=2]",
+    }  # fmt: skip
+    assert new == {"sir": "sir[particles=1000]", "ekf": "ekf"}
+    mixed = table([("a", "sir", 1000), ("b", "sir", 5000)])
+    with pytest.raises(ValueError, match=r"sir must have one number of particles in each report"):
+        merge_study.name_by_number([first, mixed])
+
+
+def test_notes_of_one_filter_add_up_and_none_counts_twice() -> None:
+    counts = {"lost": 1, "diverged": None, "collapsed": 0, "severely_overconfident": 2}
+    note = {
+        "filter": "sir",
+        "particles": "100",
+        "is_exact": True,
+        "has_bounded_weights": True,
+        "runs": 20,
+        **counts,
+    }
+    other = {**note, "particles": "1000", "has_bounded_weights": None, "diverged": 3}
+    (added,) = merge_study.add_notes([note, other])
+    assert added["particles"] == "100 or 1000"
+    assert (added["runs"], added["lost"], added["diverged"]) == (40, 2, 3)
+    assert added["has_bounded_weights"] is None
+    cells = pd.DataFrame({"scenario": ["a", "b"], "regime": "nominal", "filter": "sir"})
+    assert merge_study.select_added_notes([note], cells, cells) == []
+    assert merge_study.select_added_notes([note], cells[:0], cells) == [note]
+    with pytest.raises(ValueError, match=r"sir must be new in all conditions .*, got 1 of 2"):
+        merge_study.select_added_notes([note], cells[:1], cells)

@@ -333,16 +333,17 @@ def test_a_method_with_another_number_of_particles_than_its_table_is_named(
 
 
 def test_a_job_at_equal_time_has_its_budget_in_its_label() -> None:
-    """Its number of particles follows from the time: 63 where its settings say 1000."""
+    """Its number of particles follows from the time: 63 where its settings say 1000. Equal numbers are usual."""
     config = {
         "particles": {"budget": "particles", "particles": 100, "filter": {"particles": 100}},
         "time": {"budget": "time", "particles": 1000, "filter": {"particles": 1000}},
     }
     metas = [{"label": "cpso_escape", "key": k, "config": c} for k, c in config.items()]
     labels = [make_distinct_label(meta, metas) for meta in metas]
-    assert labels == [
-        "cpso_escape[budget=particles,particles=100]", "cpso_escape[budget=time,particles=1000]",
-    ]  # fmt: skip
+    assert labels == ["cpso_escape[particles=100]", "cpso_escape[budget=time,particles=1000]"]
+    config["particles"]["particles"] = config["particles"]["filter"]["particles"] = 1000
+    labels = [make_distinct_label(meta, metas) for meta in metas]
+    assert labels == ["cpso_escape", "cpso_escape[budget=time]"]
 
 
 @pytest.mark.parametrize("kind", ["heat map", "matrices"])
@@ -508,7 +509,7 @@ def tabs(table: pd.DataFrame, parts: dict[str, PartName]) -> dict[TabKey, Overvi
     """Two numbers of particles; at equal time with twice the errors of the larger one; three forms as printed."""
     particle = ["mcmc_rpf", "qmc_polymerised", "cpso_escape", "dmc_reconstructed", "sir", "rpf"]
     swept = table[table["filter"].isin(particle)]
-    names = {"few": "[budget=particles,particles=100]", "many": "[budget=particles,particles=1000]"}
+    names = {"few": "[particles=100]", "many": "[particles=1000]"}
     kinds = [
         swept.assign(filter=swept["filter"] + names["few"], particles=100),
         swept.assign(filter=swept["filter"] + names["many"], particles=1000),

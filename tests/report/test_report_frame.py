@@ -125,6 +125,20 @@ def test_labels_name_only_what_differs(tmp_path):
     ]
 
 
+def test_a_filter_has_the_same_name_in_all_conditions(tmp_path):
+    """One noise regime has SIR with two numbers of particles, the other with one of them."""
+    for noise, numbers in (("surge", (100, 400)), ("nominal", (100,))):
+        for particles in numbers:
+            method = synthetic.Method("sir", 1.0, 1.0, particles)
+            synthetic.write(tmp_path / "demo", method, noise=noise, **SMALL)
+        synthetic.write(tmp_path / "demo", synthetic.Method("ekf", 1.0), noise=noise, **SMALL)
+    found = conditions.load_conditions("demo", tmp_path)
+    assert {cell.noise: [job.label for job in cell.jobs] for cell in found} == {
+        "nominal": ["ekf", "sir[particles=100]"],
+        "surge": ["ekf", "sir[particles=100]", "sir[particles=400]"],
+    }
+
+
 def test_noise_regimes_are_cells(tmp_path):
     for noise in ("surge", "nominal"):
         synthetic.write(tmp_path / "demo", synthetic.Method("ekf", 1.0), noise=noise, **SMALL)
