@@ -87,7 +87,7 @@ def compile_function(
     decompositions = {torch.ops.aten.stack.default: _stack_by_component}
     trace = make_fx(function, decomposition_table=decompositions)
     on_cpu = not any(a.is_cuda for a in example)
-    graph = trace(*example) if on_cpu else _trace_for_device(trace, example)
+    graph = _trace_for_host(trace, example) if on_cpu else _trace_for_device(trace, example)
     # On the CPU the calls of the kernels are compiled with them: from Python they take 50 % longer.
     shims = {"aot_inductor.custom_ops_to_c_shims": declare_shims()} if on_cpu else {}
     # The shapes are those of the example, so their checks are left out.
@@ -112,7 +112,7 @@ def compile_function(
 
 
 def _fuse_propagation(graph: Operations) -> None:
-    """Fuse the copy of parents, their noise and `affine` into one operator of a CUDA device.
+    """Fuse the copy of parents, their noise and `propagate_affine` into one operator.
 
     The operator draws noise of the type of the particles.
     """
@@ -137,6 +137,14 @@ def _fuse_propagation(graph: Operations) -> None:
             )
         node.replace_all_uses_with(fused)
     graph.eliminate_dead_code()
+
+
+def _trace_for_host(trace: Callable[..., GraphModule], example: list[Tensor]) -> GraphModule:
+    """Record a step with one operator for propagation."""
+    graph = trace(*example)
+    _fuse_propagation(graph.graph)
+    graph.recompile()
+    return graph
 
 
 def _trace_for_device(trace: Callable[..., GraphModule], example: list[Tensor]) -> GraphModule:

@@ -472,6 +472,30 @@ def test_a_loop_by_hand_moves_by_the_coefficients_that_are_not_zero(
 
 
 @compiler
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("particles", [1, 5, 63, 64, 200])
+def test_one_operator_moves_parents_as_its_parts_do_one_after_the_other(
+    dtype: torch.dtype, particles: int
+) -> None:
+    """Bit by bit: also with noise that no component takes, another number of particles, and one that is lost."""
+    slots = 77
+    x = DRAWS.normal("x", slots, D).to(dtype).permute(2, 0, 1).contiguous()
+    x[2, 1, 5] = torch.nan
+    phi, gain = DRAWS.normal("phi", D, D).to(dtype), DRAWS.normal("gain", D, 4).to(dtype)
+    phi[:, 3], gain[1], gain[:, :, 2] = 0.0, 0.0, 0.0
+    ancestors = (DRAWS.uniform("a", particles, 1)[..., 0] * slots).long()
+    key = torch.tensor(4), 99, torch.tensor(3), torch.tensor([7, 0, 12])
+    draw = dispatch.philox_normals if dtype == torch.float32 else dispatch.philox_normals_float64
+    for a, b in ((phi, gain), (phi[:1], gain[:1]), (phi[:1], gain), (phi, gain[:1])):
+        noise = draw(*key, 4, -(-particles // 4))[..., :particles].permute(1, 2, 0)
+        parents = dispatch.gather_particles(x, ancestors).permute(1, 2, 0)
+        expected = dispatch.propagate_affine(a, parents, b, noise)
+        moved = dispatch.gather_propagate(a, x, ancestors, b, *key)
+        assert moved.dtype == dtype
+        torch.testing.assert_close(moved, expected, rtol=0.0, atol=0.0, equal_nan=True)
+
+
+@compiler
 def test_a_gradient_goes_round_the_loops_by_hand() -> None:
     x, w = (
         DRAWS.normal("x", N, D).requires_grad_(),

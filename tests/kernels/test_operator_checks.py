@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import random_calls
 import torch
+from torch import Tensor
 
 from pfbench.core import density, linear_algebra, random_stream
 from pfbench.filter import belief
@@ -87,6 +88,21 @@ def test_wrong_values_are_refused() -> None:
             call()
 
 
+def gather_and_propagate(*args: Any) -> Tensor:
+    """The parts of `gather_propagate`, by torch functions: a recorded step alone has it."""
+    check_arguments("gather_propagate", args)
+    phi, x, ancestors, gain, *key = args
+    draw = (
+        random_stream.draw_normals
+        if x.dtype == torch.float32
+        else random_stream.draw_normals_float64
+    )
+    wanted = ancestors.shape[1]
+    noise = draw(*key, gain.shape[-1], -(-wanted // 4))[..., :wanted].permute(1, 2, 0)
+    parents = belief._gather_components(x, ancestors).permute(1, 2, 0)
+    return linear_algebra._affine(phi, parents, gain, noise.to(x.dtype))
+
+
 def eager_function(name: str) -> Callable[..., Any]:
     """The function that pfbench calls for an operator."""
     return {
@@ -97,6 +113,7 @@ def eager_function(name: str) -> Callable[..., Any]:
         "gather_particles": belief._gather_components,
         "log_normal": density._quadratic,
         "propagate_affine": linear_algebra._affine,
+        "gather_propagate": gather_and_propagate,
         "count_unique": belief.count_distinct_ancestors,
         "sum_and_squares": belief._totals,
         "sum_log_weights": belief._add_terms,

@@ -74,6 +74,20 @@ Tensor propagate_affine(const Tensor& phi, const Tensor& x, const Tensor& gain, 
     return operators::propagate_affine(phi, x, gain, w);
 }
 
+Tensor gather_propagate(const Tensor& phi, const Tensor& x, const Tensor& ancestors, const Tensor& gain, const Tensor& seed, int64_t purpose, const Tensor& step, const Tensor& runs) {
+    ArgumentCheck check("gather_propagate");
+    check.real("phi", phi, "rDD");
+    check.real("x", x, "DRN");
+    check.int64("ancestors", ancestors, "RM");
+    check.real("gain", gain, "rDW");
+    check.int64("seed", seed, "");
+    check.integer("purpose", purpose);
+    check.int64("step", step, "");
+    check.int64("runs", runs, "R");
+    check.range("ancestors", ancestors, 1, 'N', 1);
+    return operators::gather_propagate(phi, x, ancestors, gain, seed, purpose, step, runs);
+}
+
 Tensor count_unique(const Tensor& ancestors, const Tensor& log_w) {
     ArgumentCheck check("count_unique");
     check.int64("ancestors", ancestors, "RN");
@@ -170,6 +184,7 @@ const pfbench::Registration registration(
     pfbench::entry<&gather_particles>("gather_particles"),
     pfbench::entry<&log_normal>("log_normal"),
     pfbench::entry<&propagate_affine>("propagate_affine"),
+    pfbench::entry<&gather_propagate>("gather_propagate"),
     pfbench::entry<&count_unique>("count_unique"),
     pfbench::entry<&sum_and_squares>("sum_and_squares"),
     pfbench::entry<&sum_log_weights>("sum_log_weights"),
@@ -210,6 +225,10 @@ DIRECT_CALL aoti_torch_cpu_log_normal(AtenTensorHandle y, AtenTensorHandle mean,
 
 DIRECT_CALL aoti_torch_cpu_propagate_affine(AtenTensorHandle phi, AtenTensorHandle x, AtenTensorHandle gain, AtenTensorHandle w, AtenTensorHandle* result_0) {
     return call_directly<&propagate_affine>({result_0}, phi, x, gain, w);
+}
+
+DIRECT_CALL aoti_torch_cpu_gather_propagate(AtenTensorHandle phi, AtenTensorHandle x, AtenTensorHandle ancestors, AtenTensorHandle gain, AtenTensorHandle seed, int64_t purpose, AtenTensorHandle step, AtenTensorHandle runs, AtenTensorHandle* result_0) {
+    return call_directly<&gather_propagate>({result_0}, phi, x, ancestors, gain, seed, purpose, step, runs);
 }
 
 DIRECT_CALL aoti_torch_cpu_count_unique(AtenTensorHandle ancestors, AtenTensorHandle log_w, AtenTensorHandle* result_0) {

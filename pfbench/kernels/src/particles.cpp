@@ -13,8 +13,8 @@
 #include "operators.h"
 
 // of random_normal.cpp
-extern "C" void normals_float(float*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t);
-extern "C" void normals_double(double*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t);
+extern "C" void normals_float(float*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t);
+extern "C" void normals_double(double*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t);
 extern "C" void uniforms(double*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t);
 // of resampling.cpp
 extern "C" void systematic_float(int64_t*, const float*, const double*, const double*, int64_t, int64_t);
@@ -28,20 +28,33 @@ inline void systematic(int64_t* ancestor, const double* weight, const double* n,
     systematic_double(ancestor, weight, n, u, runs, slots);
 }
 
+// Rows of components of one run, `plane` numbers apart.
 template <class T>
-void copied(T* out, const T* x, const int64_t* ancestor, int64_t components, int64_t runs, int64_t slots, int64_t wanted) {
-    const auto one = [&](int64_t row, const auto* from) {
-        for (int64_t j = 0; j < wanted; ++j) out[row * wanted + j] = x[row * slots + from[j]];
-    };
+struct Rows {
+    T* from;
+    int64_t plane;
+};
+
+// Copies the parents of one run, out [D, M] by planes of x and of out.
+template <class T>
+void parents(Rows<T> out, Rows<const T> x, const int64_t* ancestor, int64_t components, int64_t wanted, std::vector<int32_t>& from) {
     if (components == 1) {
-        for (int64_t r = 0; r < runs; ++r) one(r, ancestor + r * wanted);
+        for (int64_t j = 0; j < wanted; ++j) out.from[j] = x.from[ancestor[j]];
         return;
     }
-    std::vector<int32_t> from(wanted);  // half as long
-    for (int64_t r = 0; r < runs; ++r) {
-        for (int64_t j = 0; j < wanted; ++j) from[j] = static_cast<int32_t>(ancestor[r * wanted + j]);
-        for (int64_t d = 0; d < components; ++d) one(d * runs + r, from.data());
+    for (int64_t j = 0; j < wanted; ++j) from[j] = static_cast<int32_t>(ancestor[j]);  // half as long
+    for (int64_t d = 0; d < components; ++d) {
+        const T* row = x.from + d * x.plane;
+        T* to = out.from + d * out.plane;
+        for (int64_t j = 0; j < wanted; ++j) to[j] = row[from[j]];
     }
+}
+
+template <class T>
+void copied(T* out, const T* x, const int64_t* ancestor, int64_t components, int64_t runs, int64_t slots, int64_t wanted) {
+    std::vector<int32_t> from(components == 1 ? 0 : wanted);
+    for (int64_t r = 0; r < runs; ++r)
+        parents<T>({out + r * wanted, runs * wanted}, {x + r * slots, runs * slots}, ancestor + r * wanted, components, wanted, from);
 }
 
 // -1/2 sum ((y - mean) scale)^2 - constant; y, scale and constant are of a run, mean [R, N, K] lies as its strides say.
@@ -94,33 +107,73 @@ void summed(T* out, const Term<T>* terms, const std::vector<int64_t>& last, int6
 
 // out = phi x + gain w of each particle, by the coefficients that are not zero: in error models of an INS three in four are.
 template <class T>
-void affine(T* out, const T* phi, const T* x, const T* gain, const T* w, int64_t one_phi, int64_t one_gain, int64_t runs,
-            int64_t particles, int64_t rows, int64_t states, int64_t noises) {
-    constexpr int64_t WIDE = REGISTER / sizeof(T);
-    std::vector<Term<T>> terms(rows * (states + noises));
-    std::vector<int64_t> last(rows);
-    const int64_t plane = runs * particles;
-    for (int64_t r = 0; r < runs; ++r) {
-        const T* a = phi + (one_phi ? 0 : r * rows * states);
-        const T* b = gain + (one_gain ? 0 : r * rows * noises);
-        T* to = out + r * particles;
+class Affine {
+  public:
+    Affine(int64_t rows, int64_t states, int64_t noises)
+        : states_(states), noises_(noises), terms_(rows * (states + noises)), last_(rows) {}
+
+    void apply(Rows<T> out, const T* phi, Rows<const T> x, const T* gain, Rows<const T> w, int64_t particles) {
+        constexpr int64_t WIDE = REGISTER / sizeof(T);
+        const int64_t rows = last_.size();
         int64_t count = 0;
         for (int64_t d = 0; d < rows; ++d) {
-            for (int64_t k = 0; k < states; ++k)
-                if (const T c = a[d * states + k]; c != 0) terms[count++] = {x + k * plane + r * particles, c};
-            for (int64_t k = 0; k < noises; ++k)
-                if (const T c = b[d * noises + k]; c != 0) terms[count++] = {w + k * plane + r * particles, c};
-            last[d] = count;
+            for (int64_t k = 0; k < states_; ++k)
+                if (const T c = phi[d * states_ + k]; c != 0) terms_[count++] = {x.from + k * x.plane, c};
+            for (int64_t k = 0; k < noises_; ++k)
+                if (const T c = gain[d * noises_ + k]; c != 0) terms_[count++] = {w.from + k * w.plane, c};
+            last_[d] = count;
         }
-        if (particles >= 8 * WIDE) summed<T, 8>(to, terms.data(), last, plane, particles);
-        else if (particles >= 4 * WIDE) summed<T, 4>(to, terms.data(), last, plane, particles);
-        else if (particles >= WIDE) summed<T, 1>(to, terms.data(), last, plane, particles);
+        if (particles >= 8 * WIDE) summed<T, 8>(out.from, terms_.data(), last_, out.plane, particles);
+        else if (particles >= 4 * WIDE) summed<T, 4>(out.from, terms_.data(), last_, out.plane, particles);
+        else if (particles >= WIDE) summed<T, 1>(out.from, terms_.data(), last_, out.plane, particles);
         else
             for (int64_t d = 0, t = 0; d < rows; ++d) {
-                for (int64_t at = 0; at < particles; ++at) to[d * plane + at] = 0;
-                for (; t < last[d]; ++t)
-                    for (int64_t at = 0; at < particles; ++at) to[d * plane + at] += terms[t].by * terms[t].from[at];
+                T* to = out.from + d * out.plane;
+                for (int64_t at = 0; at < particles; ++at) to[at] = 0;
+                for (; t < last_[d]; ++t)
+                    for (int64_t at = 0; at < particles; ++at) to[at] += terms_[t].by * terms_[t].from[at];
             }
+    }
+
+  private:
+    int64_t states_, noises_;
+    std::vector<Term<T>> terms_;
+    std::vector<int64_t> last_;
+};
+
+template <class T>
+void affine(T* out, const T* phi, const T* x, const T* gain, const T* w, int64_t one_phi, int64_t one_gain, int64_t runs,
+            int64_t particles, int64_t rows, int64_t states, int64_t noises) {
+    Affine<T> move(rows, states, noises);
+    const int64_t plane = runs * particles;
+    for (int64_t r = 0; r < runs; ++r) {
+        const int64_t first = r * particles;
+        move.apply({out + first, plane}, phi + (one_phi ? 0 : r * rows * states), {x + first, plane},
+                   gain + (one_gain ? 0 : r * rows * noises), {w + first, plane}, particles);
+    }
+}
+
+// The parents of a run, their noise and the result of `affine` follow each other: both inputs stay in the second-level cache. Noise
+// that no component takes is not drawn.
+template <class T>
+void moved(T* out, void (*draw)(T*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t), const T* phi,
+           const T* x, const int64_t* ancestor, const T* gain, const int64_t* run, int64_t one_phi, int64_t one_gain, int64_t runs,
+           int64_t particles, int64_t wanted, int64_t states, int64_t noises, int64_t step, int64_t seed, int64_t purpose) {
+    const int64_t quarters = (wanted + 3) / 4;
+    thread_local std::vector<T> room;  // a fresh one would be cleared at each call
+    if (const size_t size = states * wanted + noises * 4 * quarters; room.size() < size) room.resize(size);
+    T *const parent = room.data(), *const noise = parent + states * wanted;
+    std::vector<int32_t> from(states == 1 ? 0 : wanted);
+    Affine<T> move(states, states, noises);
+    for (int64_t r = 0; r < runs; ++r) {
+        const T *a = phi + (one_phi ? 0 : r * states * states), *b = gain + (one_gain ? 0 : r * states * noises);
+        parents<T>({parent, wanted}, {x + r * particles, runs * particles}, ancestor + r * wanted, states, wanted, from);
+        for (int64_t k = 0; k < noises; ++k) {
+            bool taken = false;
+            for (int64_t d = 0; d < states; ++d) taken |= b[d * noises + k] != 0;
+            if (taken) draw(noise + k * 4 * quarters, run + r, 1, k, 1, quarters, step, seed, purpose);
+        }
+        move.apply({out + r * wanted, runs * wanted}, a, {parent, wanted}, b, {noise, 4 * quarters}, wanted);
     }
 }
 
@@ -269,12 +322,12 @@ void moments(T* mean, T* variance, const T* x, const T* weight, int64_t componen
 constexpr std::array<int64_t, 3> COMPONENTS_FIRST = {2, 0, 1};
 
 template <class T>
-Tensor drawn(void (*draw)(T*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t), const Tensor& seed, int64_t purpose,
-             const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {
+Tensor drawn(void (*draw)(T*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t), const Tensor& seed,
+             int64_t purpose, const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {
     require(components * runs.size(0) < MAX_SIZE && quarters < MAX_SIZE, "philox: more than 2^30 numbers of a kind");
     const Tensor out = fresh<T>({components, runs.size(0), 4 * quarters});
     const Packed<int64_t> run(runs);
-    draw(numbers<T>(out), run.data, runs.size(0), components, quarters, *numbers<int64_t>(step), *numbers<int64_t>(seed), purpose);
+    draw(numbers<T>(out), run.data, runs.size(0), 0, components, quarters, *numbers<int64_t>(step), *numbers<int64_t>(seed), purpose);
     return out;
 }
 }  // namespace
@@ -288,7 +341,9 @@ Tensor operators::philox_normals_float64(const Tensor& seed, int64_t purpose, co
 }
 
 Tensor operators::philox_uniforms(const Tensor& seed, int64_t purpose, const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {
-    return drawn(uniforms, seed, purpose, step, runs, components, quarters);
+    return drawn<double>([](double* out, const int64_t* run, int64_t many, int64_t, int64_t wanted, int64_t each, int64_t at, int64_t by,
+                            int64_t kind) { uniforms(out, run, many, wanted, each, at, by, kind); },
+                         seed, purpose, step, runs, components, quarters);
 }
 
 Tensor operators::resample_systematic(const Tensor& a, const Tensor& n, const Tensor& u) {
@@ -347,6 +402,25 @@ Tensor operators::propagate_affine(const Tensor& phi, const Tensor& x, const Ten
         if (quiet<T>(w)) work(nullptr, nullptr, 0);
         else work(Packed<T>(gain).data, Packed<T>(w, COMPONENTS_FIRST).data, gain.size(2));
         return out;
+    });
+}
+
+Tensor operators::gather_propagate(const Tensor& phi, const Tensor& x, const Tensor& ancestors, const Tensor& gain, const Tensor& seed,
+                                   int64_t purpose, const Tensor& step, const Tensor& runs) {
+    const int64_t states = x.size(0), rows = x.size(1), wanted = ancestors.size(1);
+    require(gain.size(2) * rows < MAX_SIZE && wanted < MAX_SIZE, "gather_propagate: more than 2^30 numbers of a kind");
+    const Packed<int64_t> from(ancestors), run(runs);
+    const auto work = [&](auto like, auto draw) {
+        using T = decltype(like);
+        const Tensor out = fresh<T>({states, rows, wanted});
+        moved(numbers<T>(out), draw, Packed<T>(phi).data, Packed<T>(x).data, from.data, Packed<T>(gain).data, run.data,
+              phi.size(0) == 1, gain.size(0) == 1, rows, x.size(2), wanted, states, gain.size(2), *numbers<int64_t>(step),
+              *numbers<int64_t>(seed), purpose);
+        return out;
+    };
+    return by_type(x, [&](auto like) {
+        if constexpr (sizeof(like) == 8) return work(like, normals_double);
+        else return work(like, normals_float);
     });
 }
 

@@ -72,12 +72,12 @@ void pairs(const Block& high, const Block& low, int radial, int n, double* first
         generator::normal_pair(generator::unit(a[i], c[i]), generator::half_turns(b[i], d[i]), first[i], second[i]);
 }
 
-// Fills out [W, R, 4 Q] of runs [R], W components and Q quarters: by work(high words, low words, n, first of n numbers).
+// Fills out [W, R, 4 Q] of runs [R], W components from `first` on and Q quarters: by work(high words, low words, n, first of n numbers).
 template <bool LOW_WORDS, class T, class F>
-void fill(T* out, const int64_t* run, int64_t runs, int64_t components, int64_t quarters, int64_t step, int64_t seed, int64_t purpose,
-          F work) {
+void fill(T* out, const int64_t* run, int64_t runs, int64_t first, int64_t components, int64_t quarters, int64_t step, int64_t seed,
+          int64_t purpose, F work) {
     alignas(64) Block high, low;
-    for (int64_t w = 0; w < components; ++w)
+    for (int64_t w = first; w < first + components; ++w)
         for (int64_t r = 0; r < runs; ++r, out += 4 * quarters)
             for (int64_t q = 0; q < quarters; q += BLOCK) {
                 const int n = static_cast<int>(quarters - q < BLOCK ? quarters - q : BLOCK);
@@ -92,28 +92,29 @@ void fill(T* out, const int64_t* run, int64_t runs, int64_t components, int64_t 
 }
 
 template <class T>
-void normals(T* out, const int64_t* run, int64_t runs, int64_t components, int64_t quarters, int64_t step, int64_t seed, int64_t purpose) {
-    fill<sizeof(T) == 8>(out, run, runs, components, quarters, step, seed, purpose, [&](const Block& high, const Block& low, int n, T* to) {
+void normals(T* out, const int64_t* run, int64_t runs, int64_t first, int64_t components, int64_t quarters, int64_t step, int64_t seed,
+             int64_t purpose) {
+    fill<sizeof(T) == 8>(out, run, runs, first, components, quarters, step, seed, purpose, [&](const Block& high, const Block& low, int n, T* to) {
         pairs(high, low, 0, n, to, to + quarters);
         pairs(high, low, 2, n, to + 2 * quarters, to + 3 * quarters);
     });
 }
 }  // namespace
 
-extern "C" void normals_float(float* out, const int64_t* run, int64_t runs, int64_t components, int64_t quarters, int64_t step,
-                              int64_t seed, int64_t purpose) {
-    normals(out, run, runs, components, quarters, step, seed, purpose);
+extern "C" void normals_float(float* out, const int64_t* run, int64_t runs, int64_t first, int64_t components, int64_t quarters,
+                              int64_t step, int64_t seed, int64_t purpose) {
+    normals(out, run, runs, first, components, quarters, step, seed, purpose);
 }
 
-extern "C" void normals_double(double* out, const int64_t* run, int64_t runs, int64_t components, int64_t quarters, int64_t step,
-                               int64_t seed, int64_t purpose) {
-    normals(out, run, runs, components, quarters, step, seed, purpose);
+extern "C" void normals_double(double* out, const int64_t* run, int64_t runs, int64_t first, int64_t components, int64_t quarters,
+                               int64_t step, int64_t seed, int64_t purpose) {
+    normals(out, run, runs, first, components, quarters, step, seed, purpose);
 }
 
 // On (0, 1): odd multiples of 2^-53.
 extern "C" void uniforms(double* out, const int64_t* run, int64_t runs, int64_t components, int64_t quarters, int64_t step, int64_t seed,
                          int64_t purpose) {
-    fill<true>(out, run, runs, components, quarters, step, seed, purpose, [&](const Block& high, const Block& low, int n, double* to) {
+    fill<true>(out, run, runs, 0, components, quarters, step, seed, purpose, [&](const Block& high, const Block& low, int n, double* to) {
         for (int k = 0; k < 4; ++k)
             for (int i = 0; i < n; ++i) to[k * quarters + i] = generator::unit(high[k][i], low[k][i]);
     });
