@@ -28,16 +28,13 @@ from pfbench.report import (
     read_stored_study,
     rebuild_page,
 )
-from pfbench.results.conditions import parse_label
-from pfbench.results.looks import find_looks
-from pfbench.stats.study_runs import natural_sort_key
 
 REPORTS = Path(__file__).parents[2] / "reports"
 CONDITION = ["scenario", "regime"]
 RUN = [*CONDITION, "filter", "seed", "run"]
 TOLERANCE = 1e-5  # relative, of errors that are stored in single precision
 _COUNTS = ("runs", "lost", "diverged", "collapsed", "severely_overconfident")
-_NUMBER = ("particles", "budget")  # settings of a label that a number of particles replaces
+_NUMBER = {"particles", "budget"}  # settings of a label that a number of particles replaces
 Pack = dict[str, Any]
 
 
@@ -59,8 +56,7 @@ def name_by_number(tables: Sequence[pd.DataFrame]) -> list[dict[str, str]]:
         counts: dict[str, set[float]] = {}
         for label, rows in table.groupby(table["filter"].astype(str)):
             counts[str(label)] = set(rows["particles"].dropna())
-            name, settings = parse_label(str(label))
-            if settings.get("budget") != "time" and set(settings) <= set(_NUMBER):
+            if name := find_numbered_name(str(label)):
                 numbers.setdefault(name, set()).update(counts[str(label)])
         found.append(counts)
     return [
@@ -69,10 +65,17 @@ def name_by_number(tables: Sequence[pd.DataFrame]) -> list[dict[str, str]]:
     ]
 
 
+def find_numbered_name(label: str) -> str:
+    """Return the name of a filter without its number of particles; empty at equal time, or with other settings."""
+    name, _, text = label.partition("[")
+    is_numbered = set(re.findall(r"([\w.]+)=", text)) <= _NUMBER and "budget=time" not in text
+    return name if is_numbered else ""
+
+
 def _name_by_number(label: str, counts: set[float], numbers: Mapping[str, set[float]]) -> str:
     """Return the new label of a filter that has some numbers of particles in a report."""
-    name, settings = parse_label(label)
-    if settings.get("budget") == "time" or not set(settings) <= set(_NUMBER):
+    name = find_numbered_name(label)
+    if not name:
         return label
     if len(numbers[name]) <= 1:
         return name
@@ -271,7 +274,7 @@ def merge_packs(published: Pack, newer: Pack, runs: pd.DataFrame) -> Pack:
     }
     facts = {
         **published["facts"],
-        "looks": [looks[label] for label in sorted(looks, key=natural_sort_key)],
+        "looks": [looks[label] for label in sorted(looks)],
     }
     pack = {
         **published,
@@ -286,25 +289,22 @@ def merge_packs(published: Pack, newer: Pack, runs: pd.DataFrame) -> Pack:
             [name, join_texts([value, stored.get(name, "")], ", ")]
             for name, value in published["provenance"]
         ],
-        "choices": _name_choices(published["choices"], newer["choices"], list(looks)),
+        "choices": {**published["choices"], **newer["choices"]},
     }
+    present = StudyFacts.from_pack(pack).looks
+    pack["choices"] = [
+        _name_choice(text, [p["choices"].get(text, set()) for p in (published, newer)], present)
+        for text in sorted(pack["choices"])
+    ]
     pack["methods"] = _merge_methods(published["methods"], newer["methods"], pack, runs)
     return pack
 
 
-def _name_choices(
-    old: Mapping[str, set[str]], new: Mapping[str, set[str]], labels: Sequence[str]
-) -> list[dict[str, str]]:
-    """Return the entries of the modelling choices, with the present names of filters."""
-    names = {label: look.name for label, look in find_looks(sorted(labels)).items()}
-    entries = []
-    for text in sorted({*old, *new}):
-        members = old.get(text, set()) | new.get(text, set())
-        listed = ", ".join(names[label] for label in names if label in members)
-        entries.append({
-            "text": text, "filters": "all filters" if members == set(labels) else listed
-        })  # fmt: skip
-    return entries
+def _name_choice(text: str, labels: Sequence[set[str]], looks: Mapping[str, Any]) -> dict[str, str]:
+    """Return the entry of a modelling choice, with the present names of its filters."""
+    members = set().union(*labels)
+    names = ", ".join(look.name for label, look in looks.items() if label in members)
+    return {"text": text, "filters": "all filters" if members == set(looks) else names}
 
 
 def _merge_methods(old: Pack, new: Pack, pack: Pack, runs: pd.DataFrame) -> Pack:

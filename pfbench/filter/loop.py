@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import copy_context
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -210,6 +213,7 @@ def run_filter(
     watch: Watch | None = None,
     on_step: Callable[[], object] | None = None,
     run_batch: int | None = None,
+    threads: int = 1,
 ) -> FilterResult:
     """Run a filter over a record, all runs as one batch.
 
@@ -225,6 +229,8 @@ def run_filter(
         on_step: Function called after each step, such as a progress bar.
         run_batch: Runs that a step takes together, one batch after the other. None takes all. The
             result agrees to rounding (`choose_run_batch`). With feedback all runs form one batch.
+        threads: Batches of runs that are stepped at the same time, if the filter is a `MultiStepFilter`. Others step
+            one batch after the other. The result does not depend on it.
 
     Returns:
         Means, variances, evidence and diagnostics.
@@ -246,10 +252,13 @@ def run_filter(
     passes = [FilterPass(method, model, *batch, feedback) for batch in batches]
     selection = KeptSteps(monitor.visited, all_steps=watch is not None)
     blocks: list[StepBlock] = []
-    for block in _join_passes([run.iterate_blocks(selection) for run in passes], monitor.steps):
-        blocks.append(_watch_block(block, watch, on_step))
-        if not monitor.visited.isdisjoint(block.infos):
-            monitor.check(model, prepared, block.beliefs, block.infos)
+    iterators = [run.iterate_blocks(selection) for run in passes]
+    several = min(threads, len(passes)) if isinstance(method, MultiStepFilter) else 1
+    with _advance_in_threads(several) as advance:
+        for block in _join_passes(iterators, monitor.steps, advance):
+            blocks.append(_watch_block(block, watch, on_step))
+            if not monitor.visited.isdisjoint(block.infos):
+                monitor.check(model, prepared, block.beliefs, block.infos)
     mean, variance, log_evidence = (
         torch.cat(parts, 1) for parts in zip(*(block[1:4] for block in blocks), strict=True)
     )
@@ -352,7 +361,11 @@ _MANY_COMPONENTS = 10
 
 
 def choose_run_batch(
-    runs: int, particles: int, dimension: int, compiled_type: torch.dtype | None = None
+    runs: int,
+    particles: int,
+    dimension: int,
+    compiled_type: torch.dtype | None = None,
+    threads: int = 1,
 ) -> int:
     """Choose how many runs a step takes together on the CPU.
 
@@ -368,12 +381,15 @@ def choose_run_batch(
     of a compiled step. [Measured: 15-state INS, 500 particles, float64, 40 steps: batches of 100 and
     25 runs took 360 and 306 ms.]
 
+    With several threads the number of batches is a multiple of theirs, so that all have work.
+
     Returns runs per batch.
     """
     numbers = _BATCH_NUMBERS
     if compiled_type is not None and dimension >= _MANY_COMPONENTS:
         numbers = min(numbers, _COMPILED_BYTES // compiled_type.itemsize)
-    return -(-runs // max(1, round(runs * particles * dimension / numbers)))
+    batches = max(1, round(runs * particles * dimension / numbers))
+    return -(-runs // (-(-batches // threads) * threads))
 
 
 def _split_runs(
@@ -390,14 +406,37 @@ def _split_runs(
     return [(record.select_runs(batch), draws.select_runs(batch)) for batch in batches]
 
 
+_Advance = Callable[[Sequence[Iterator[StepBlock]]], "list[StepBlock | None]"]
+
+
+@contextmanager
+def _advance_in_threads(threads: int) -> Iterator[_Advance]:
+    """Yield a function that returns the next block of each pass, None at its end, by several threads at a time."""
+    if threads == 1:
+        yield lambda passes: [next(run, None) for run in passes]
+        return
+    has_gradients = torch.is_grad_enabled()
+
+    def advance_one(run: Iterator[StepBlock]) -> StepBlock | None:
+        with torch.set_grad_enabled(has_gradients):  # of a thread, as context variables are
+            return next(run, None)
+
+    def advance(passes: Sequence[Iterator[StepBlock]]) -> list[StepBlock | None]:
+        jobs = [pool.submit(copy_context().run, advance_one, run) for run in passes]
+        return [job.result() for job in jobs]
+
+    with ThreadPoolExecutor(threads) as pool:
+        yield advance
+
+
 def _join_passes(
-    passes: Sequence[Iterator[StepBlock]], checked: frozenset[int]
+    passes: Sequence[Iterator[StepBlock]], checked: frozenset[int], advance: _Advance
 ) -> Iterator[StepBlock]:
     """Join the blocks of several batches of runs, cut where one of them ends.
 
     The NIS of the checked steps is computed once, for the health and for scores.
     """
-    for blocks in _align_blocks(passes):
+    for blocks in _align_blocks(passes, advance):
         block = blocks[0] if len(blocks) == 1 else _join_blocks(blocks)
         infos = {
             t: with_cached_nis(info) if t in checked else info for t, info in block.infos.items()
@@ -405,9 +444,11 @@ def _join_passes(
         yield block._replace(infos=infos)
 
 
-def _align_blocks(passes: Sequence[Iterator[StepBlock]]) -> Iterator[list[StepBlock]]:
+def _align_blocks(
+    passes: Sequence[Iterator[StepBlock]], advance: _Advance
+) -> Iterator[list[StepBlock]]:
     """Iterate over blocks of the same steps of each pass."""
-    blocks = [next(run, None) for run in passes]
+    blocks = advance(passes)
     while not any(block is None for block in blocks):
         present = [block for block in blocks if block is not None]
         sizes = [block.mean.shape[1] for block in present]
@@ -416,9 +457,10 @@ def _align_blocks(passes: Sequence[Iterator[StepBlock]]) -> Iterator[list[StepBl
             block if n == size else block.select(slice(size))
             for block, n in zip(present, sizes, strict=True)
         ]
+        ended = iter(advance([run for run, n in zip(passes, sizes, strict=True) if n == size]))
         blocks = [
-            next(run, None) if n == size else block.select(slice(size, None))
-            for run, block, n in zip(passes, present, sizes, strict=True)
+            next(ended) if n == size else block.select(slice(size, None))
+            for block, n in zip(present, sizes, strict=True)
         ]
 
 

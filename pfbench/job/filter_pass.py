@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -108,10 +109,10 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     compile_start = time.perf_counter()
     engine = choose_engine(engine, method, model, len(runs), steps)
     compile_seconds = time.perf_counter() - compile_start
-    step = _compile_step(engine, method, counter, clock, _make_wish(plan, len(runs), steps))
-    baseline = start_peak_measurement(device)
-    start_time = clock()
-    with dispatch.use_kernels(engine != "eager"):
+    with _use_threads_for_runs(plan, engine), dispatch.use_kernels(engine != "eager"):
+        step = _compile_step(engine, method, counter, clock, _make_wish(plan, len(runs), steps))
+        baseline = start_peak_measurement(device)
+        start_time = clock()
         estimate = _filter_episode(plan, step, model, episode, runs, watch, label)
     step_compile_seconds = step.seconds if step else 0.0
     filter_seconds = clock() - start_time - recorder.seconds - step_compile_seconds
@@ -128,6 +129,24 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
         "likelihoods_per_step": counter.count / (len(runs) * steps),
     }
     return TimedFilterPass(model, estimate, recorder, seconds, cost)
+
+
+@contextmanager
+def _use_threads_for_runs(plan: JobPlan, engine: str) -> Iterator[None]:
+    """Give torch one thread in the pass of a particle filter by C++ operators, which take no more.
+
+    Threads of torch would wait for each other at every small operation. Batches of runs have the threads of the job.
+    """
+    threads = torch.get_num_threads()
+    is_alone = plan.values["device"] == "cpu" and engine != "eager"
+    if threads == 1 or not is_alone or not isinstance(plan.method, ParticleFilter):
+        yield
+        return
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _make_wish(plan: JobPlan, runs: int, steps: int) -> Callable[[str, StepParts], None] | None:
@@ -192,7 +211,8 @@ def _filter_episode(
             leave=False,
         ) as bar,
     ):  # fmt: skip
-        estimate = run_filter(method, model, episode.record, draws, watch, tick, batch)
+        threads = plan.values["threads"] if device == "cpu" else 1
+        estimate = run_filter(method, model, episode.record, draws, watch, tick, batch, threads)
         if device != "cpu":
             torch.cuda.synchronize()
     return estimate

@@ -96,6 +96,8 @@ class JobPlan:
     def choose_run_batch(self, method: Any, runs: int, is_compiled: bool = False) -> int:
         """Choose how many runs are stepped together. On a GPU all runs are.
 
+        Batches of a compiled step are shared among the threads of the job.
+
         Args:
             method: Filter.
             runs: Number of runs.
@@ -103,8 +105,9 @@ class JobPlan:
         """
         if self.values["device"] != "cpu" or not isinstance(method, ParticleFilter):
             return runs
-        compiled_type = self.dtype if is_compiled else None
-        return choose_run_batch(runs, method.particles, self.model.chart.size, compiled_type)
+        compiled_type, threads = (self.dtype, self.values["threads"]) if is_compiled else (None, 1)
+        size = self.model.chart.size
+        return choose_run_batch(runs, method.particles, size, compiled_type, threads)
 
     def choose_timer(self) -> Callable[[], float]:
         """Choose processor time for one CPU thread, which other programs do not affect.

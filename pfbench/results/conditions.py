@@ -101,6 +101,21 @@ def load_conditions(
     items = [(path, join_metadata([meta for _, meta in group])) for path, group in groups.items()]
     items.sort(key=lambda item: (_condition_key(item[1]), *_job_order(item[1])))
     items = add_step_times(items, Path(results) / study)
+    separated, settings = _separate_conditions(items, same_data, allow_mixed_versions)
+    conditions = []
+    for names, model, items_of_data in separated:
+        jobs = [
+            job._replace(parts=tuple(path for path, _ in groups[job.path]))
+            for job in _label_jobs(items_of_data, settings)
+        ]
+        conditions.append(Condition(*names, model, tuple(jobs), sentence))
+    return conditions
+
+
+def _separate_conditions(
+    items: Sequence[_Described], same_data: bool, allow_mixed_versions: bool
+) -> tuple[list[tuple[tuple[str, str], str, list[_Described]]], dict[str, list[str]]]:
+    """Group jobs by the names of scenario and noise and by model, and list the settings in the labels of each filter."""
     settings: dict[str, list[str]] = {}
     separated = []
     for key, group in groupby(items, key=lambda item: _condition_key(item[1])):
@@ -111,14 +126,7 @@ def load_conditions(
         for names, items_of_data in _separate_data(members, separate):
             separated.append((names, key[2], items_of_data))
             _add_label_settings(settings, items_of_data)
-    conditions = []
-    for names, model, items_of_data in separated:
-        jobs = [
-            job._replace(parts=tuple(path for path, _ in groups[job.path]))
-            for job in _label_jobs(items_of_data, settings)
-        ]
-        conditions.append(Condition(*names, model, tuple(jobs), sentence))
-    return conditions
+    return separated, settings
 
 
 def _check_condition(items: Sequence[_Described], separate: Sequence[str]) -> None:

@@ -130,6 +130,14 @@ def test_compiled_steps_of_many_components_take_batches_by_bytes(
     assert choose_run_batch(100, 500, dimension, dtype) == size
 
 
+@pytest.mark.parametrize(
+    ("runs", "threads", "size"), [(100, 2, 50), (300, 2, 75), (300, 3, 50), (1, 4, 1)]
+)
+def test_all_threads_have_batches_of_runs(runs: int, threads: int, size: int) -> None:
+    """One thread takes 100 runs of 500 particles of 15 numbers at once, and 300 runs in four batches."""
+    assert choose_run_batch(runs, 500, 15, threads=threads) == size
+
+
 @every_method
 def test_the_evidence_is_additive(method: ParticleFilter | GaussianFilter) -> None:
     """Unseen steps at the end add nothing to it."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -47,6 +48,10 @@ from pfbench.kernels.step_compiler import (
 from pfbench.model.base import StateSpaceModel
 
 log = logging.getLogger("pfbench")
+
+
+# batches of runs in other threads share model and filter, which may remember what they computed
+_ONE_AT_A_TIME = threading.RLock()
 
 
 @dataclass(eq=False)
@@ -138,7 +143,9 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         selection: KeptSteps,
     ) -> tuple[StepBlock, ParticleBelief, int]:
         stream = draws.at_step(t + 1)
-        return self._take_steps(model.at_step(t), belief, record, t, stream, limit, selection)
+        with _ONE_AT_A_TIME:
+            model = model.at_step(t)
+        return self._take_steps(model, belief, record, t, stream, limit, selection)
 
     def _take_steps(
         self,
@@ -152,7 +159,8 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     ) -> tuple[StepBlock, ParticleBelief, int]:
         """Take steps of a record from `t` on. `model` and `draws` belong to the first of them."""
         step_record = record.at_step(t)
-        graph = self._graph(model, belief, step_record, draws)
+        with _ONE_AT_A_TIME:
+            graph = self._graph(model, belief, step_record, draws)
         if graph is not None and isinstance(draws, PhiloxStream) and limit:
             steps = min(limit, graph.choose_steps(selection), record.y.shape[1] - t)
             rows = selection.select_rows(t, steps)
@@ -160,11 +168,13 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
             outcome = graph.run_steps(belief, block_record, draws, rows)
             count = outcome.mean.shape[1]
             if self.counter:
-                self.counter.count += count * graph.evaluations
+                with _ONE_AT_A_TIME:
+                    self.counter.count += count * graph.evaluations
             if count:
                 block = self._make_block(model, block_record, t, outcome, selection)
                 return block, outcome.last, 2 * steps if count == steps else 0
-        belief, info = self.method.step(model, belief, step_record, draws)
+        with _ONE_AT_A_TIME:
+            belief, info = self.method.step(model, belief, step_record, draws)
         return StepBlock.of_step(t, belief, info), belief, 1 if graph is not None else limit
 
     def _make_block(

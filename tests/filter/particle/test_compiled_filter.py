@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +164,39 @@ def test_blocks_of_runs_share_a_graph_where_they_are_alike(monkeypatch: pytest.M
     assert len(recorded) == 1
     agree(run(step, model, record, at_once=3), run(method, model, record))
     assert len(recorded) == 3  # of two, of three, of one
+
+
+def test_batches_of_runs_take_their_steps_at_the_same_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two of them meet at each call of recorded steps, without gradients, with the same numbers and counts."""
+    monkeypatch.setattr(
+        compiled_filter,
+        "compile_function",
+        lambda step, example: (lambda given: step(*given), None),
+    )
+    model, meeting = walk(), threading.Barrier(2, timeout=20)
+    run_steps = compiled_filter.CompiledStep.run_steps
+
+    def meet(self: Any, *args: Any) -> Any:
+        meeting.wait()
+        assert not torch.is_grad_enabled()
+        return run_steps(self, *args)
+
+    record, counts, found = record_of(model), [], []
+    pairs = record.select_runs(slice(0, 4))
+    for threads in (1, 2):
+        counter = LikelihoodCounter(model)
+        step = CompiledParticleFilter(ParticleFilter(50), counter)
+        draws = PhiloxStream(1, torch.arange(4))
+        if threads == 2:
+            monkeypatch.setattr(compiled_filter.CompiledStep, "run_steps", meet)
+        with torch.no_grad():
+            found.append(run_filter(step, model, pairs, draws, run_batch=2, threads=threads))
+        counts.append(counter.count)
+        assert len(step.graphs) == 1
+    assert counts[0] == counts[1] > 0
+    torch.testing.assert_close(
+        found[1]._asdict(), found[0]._asdict(), rtol=0, atol=0, equal_nan=True
+    )
 
 
 @pytest.fixture
@@ -507,3 +541,11 @@ def test_a_job_says_that_its_step_was_compiled(tmp_path: Path) -> None:
     assert whole.meta["likelihoods_per_step"] == loops.meta["likelihoods_per_step"] == 200.0
     for name in ("error", "sd", "log_evidence", "nees"):
         assert np.allclose(whole.data[name], loops.data[name], rtol=1e-5, atol=1e-6), name
+    assert pfbench(*walk, "engine=compiled", "threads=2", home=tmp_path).code == 0
+    assert torch.get_num_threads() == 2  # again; its pass had one
+    torch.set_num_threads(1)
+    (file,) = (tmp_path / "results" / "adhoc").glob("*.npz")
+    assert store.read_result(file).meta["engine"] == "compiled"
+    for name in ("error", "sd", "log_evidence", "nees"):
+        shared = store.read_result(file).data[name]
+        assert np.allclose(shared, whole.data[name], rtol=1e-12, atol=1e-12), name
