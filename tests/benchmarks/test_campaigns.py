@@ -27,15 +27,19 @@ def result(cpu: list[float]) -> Result:
     return Result(np.array(cpu), np.array(cpu), qualities, {}, 0.0)
 
 
-def test_goals_are_judged_by_default_settings_and_the_faster_form_of_each_library() -> None:
+def test_goals_are_judged_by_default_settings_with_a_stored_step_and_the_faster_form_of_each_library() -> (
+    None
+):
     found = {
-        campaigns.DEFAULT: result([4e3, 5e3, 6e3]), campaigns.FLOAT32: result([2e3, 2e3, 2e3]),
+        campaigns.DEFAULT: result([7e3, 7e3, 7e3]), campaigns.STORED: result([4e3, 5e3, 6e3]),
+        campaigns.FLOAT32: result([2e3, 2e3, 2e3]),
         campaigns.PARTICLES: result([14e3, 17.5e3, 21e3]), campaigns.COUNT: result([40e3] * 3),
         campaigns.RUN_BY_RUN: result([10e3, 12.5e3, 15e3]),
     }  # fmt: skip
     rows, missed = campaigns.verdicts(STUDY, found)
-    label = campaigns.DEFAULT.label
+    default, label = campaigns.DEFAULT.label, campaigns.STORED.label
     assert rows == [
+        f"| six campaigns of W4 | {default} | particles float32 | 2.50 (2.25-2.75) | - | - |",
         f"| six campaigns of W4 | {label} | particles float32 | 3.50 (3.50-3.50) | 2, met | 3, met |",
         f"| six campaigns of W4 | {label} | JAX, run by run | 2.50 (2.50-2.50) | 3, missed | 4, missed |",
     ]
@@ -44,6 +48,7 @@ def test_goals_are_judged_by_default_settings_and_the_faster_form_of_each_librar
     start = f"| {label} | 5 (4.5-5.5) | 5 | 2.50 (2.50-2.50) |"
     assert any(line.startswith(start) for line in lines)
     assert lines[-1] == "All contestants agree."
+    assert f"Not timed: {campaigns.DEFAULT32.label}." in lines
 
 
 def test_the_least_time_is_the_start_and_the_fused_loop(tmp_path: Path) -> None:
