@@ -9,6 +9,7 @@ A filter with several numbers of particles has its number in its name in all con
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -246,7 +247,7 @@ def merge_packs(published: Pack, newer: Pack, runs: pd.DataFrame) -> Pack:
         runs: Runs of the merged study.
 
     Raises:
-        ValueError: If curves of a condition have other times, or a page has times per step in rounds.
+        ValueError: If a page has times per step in rounds.
     """
     if published["facts"]["times"] or newer["facts"]["times"]:
         raise ValueError(
@@ -258,15 +259,13 @@ def merge_packs(published: Pack, newer: Pack, runs: pd.DataFrame) -> Pack:
         looks[look["key"]] = {**looks[look["key"]], "tuning": join_texts(texts, r"(?<=\)), ")}
     curves = dict(published["curves"])
     for key, added in newer["curves"].items():
-        if added["t"] != curves[key]["t"]:
-            raise ValueError(
-                f"curves of {key} must have the same times in both reports, got others."
-            )
-        filters = {**added["filters"], **curves[key]["filters"]}
-        curves[key] = {
-            **curves[key],
-            "filters": {label: filters[label] for label in sorted(filters)},
+        own = curves[key]["filters"]
+        new = {
+            label: interpolate_curve(curve, added["t"], curves[key]["t"])
+            for label, curve in added["filters"].items()
+            if label not in own
         }
+        curves[key] = {**curves[key], "filters": dict(sorted({**own, **new}.items()))}
     stored = dict(newer["provenance"])
     generated = {
         name: join_texts([published["generated"][name], newer["generated"][name]], ", ")
@@ -298,6 +297,24 @@ def merge_packs(published: Pack, newer: Pack, runs: pd.DataFrame) -> Pack:
     ]
     pack["methods"] = _merge_methods(published["methods"], newer["methods"], pack, runs)
     return pack
+
+
+def interpolate_curve(
+    curve: Mapping[str, Sequence[float | None]], times: Sequence[float], wanted: Sequence[float]
+) -> dict[str, list[float | None]]:
+    """Interpolate quantiles of the error to the instants of another page, which has fewer. None is a lost error.
+
+    Args:
+        curve: Quantiles by name, at each of the times.
+        times: Instants of the curve, s.
+        wanted: Instants of the other page, s.
+    """
+    found = {}
+    for name, values in curve.items():
+        numbers = [math.nan if value is None else value for value in values]
+        at = np.interp(wanted, times, numbers)
+        found[name] = [None if math.isnan(value) else float(f"{value:.4g}") for value in at]
+    return found
 
 
 def _name_choice(text: str, labels: Sequence[set[str]], looks: Mapping[str, Any]) -> dict[str, str]:

@@ -252,3 +252,9 @@ def test_notes_of_one_filter_add_up_and_none_counts_twice() -> None:
     assert merge_study.select_added_notes([note], cells[:0], cells) == [note]
     with pytest.raises(ValueError, match=r"sir must be new in all conditions .*, got 1 of 2"):
         merge_study.select_added_notes([note], cells[:1], cells)
+
+
+def test_curves_of_a_finer_page_are_read_at_the_instants_of_the_published_one() -> None:
+    curve = {"median": [1.0, 2.0, None, 8.0], "q10": [0.0, 1.0, 2.0, 3.0]}
+    found = merge_study.interpolate_curve(curve, [0.0, 10.0, 20.0, 30.0], [0.0, 5.0, 15.0, 30.0])
+    assert found == {"median": [1.0, 1.5, None, 8.0], "q10": [0.0, 0.5, 1.5, 3.0]}

@@ -549,6 +549,22 @@ def test_filters_at_equal_time_and_as_printed_have_tables_of_their_own(
     assert ratios["passive_1", "sir"] == plain["passive_1", "sir"]
 
 
+def test_a_method_that_sets_its_number_itself_is_once_in_the_table_of_equal_time(
+    table: pd.DataFrame, parts: dict[str, PartName], overview: Overview
+) -> None:
+    """Its job without a budget has no number in its label, as a Kalman filter has none."""
+    timed = ["mcmc_rpf", "qmc_polymerised", "dmc_reconstructed", "cofm_amssrcpf"]
+    rows = table[table["filter"].isin(timed)]
+    rows = rows.assign(
+        filter=rows["filter"] + "[budget=time,particles=1000]", rmse=3 * rows["rmse"]
+    )
+    both = pd.concat([table[~table["filter"].isin(timed[:3])], rows])
+    found = build_overviews(both, find_looks(sorted(both["filter"].unique())), parts)[EQUAL_TIME]
+    ratios = {c.filter: c.verdict.ratio for c in found.cells if c.world == "azimuth"}
+    plain = {c.filter: c.verdict.ratio for c in overview.cells if c.world == "azimuth"}
+    assert ratios["cofm_amssrcpf"] == pytest.approx(3 * plain["cofm_amssrcpf"], rel=0.1)
+
+
 def test_a_world_with_one_number_of_particles_stands_in_its_table(
     table: pd.DataFrame, parts: dict[str, PartName], tabs: dict[TabKey, Overview]
 ) -> None:

@@ -243,10 +243,12 @@ def build_overviews(
     overviews = {}
     for key in levels or [0]:
         labels = [label for label in looks if label not in timed and _level(label) in (None, key)]
-        tab = _build_tab(table, looks, parts, labels if levels else list(looks))
+        alone = labels if levels else [label for label in looks if label not in timed]
+        tab = _build_tab(table, looks, parts, alone)
         overviews[key] = _count_other_numbers(tab, table[table["filter"].isin(labels)], int(key))
     if sum(is_method(looks[label]) for label in timed) >= FEWEST_METHODS:
-        fixed = [label for label in looks if _level(label) is None]
+        names = {name_without_level(label) for label in timed}
+        fixed = [label for label in looks if _level(label) is None and label not in names]
         overviews[EQUAL_TIME] = _build_tab(table, looks, parts, [*timed, *fixed])
     if len(printed) >= FEWEST_METHODS:
         number = table.loc[table["filter"].isin(printed), "particles"].dropna().median()
