@@ -265,7 +265,7 @@ class RandomOutage(LayeredRegime):
         base_regime: Errors of the other measurements.
 
     Raises:
-        ValueError: If the length is not positive, or the number is 0. On drawing, if the record is not longer.
+        ValueError: If the length is not positive, or the number is 0. On drawing, if the record is not longer than all outages.
     """
 
     duration_s: float = 30.0
@@ -279,12 +279,13 @@ class RandomOutage(LayeredRegime):
     def draw_errors(
         self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
     ) -> Tensor:
-        room = float(time[-1] - time[0]) - self.duration_s
-        if not room > 0.0:
+        length = float(time[-1] - time[0])
+        if not self.count * self.duration_s < length:
             raise ValueError(
-                f"noise.duration_s must be shorter than the record of {room + self.duration_s:g} s, "
-                f"got {self.duration_s:g}. Give a shorter outage."
+                f"noise.count={self.count} outages must be shorter than the record of {length:g} s together, got "
+                f"noise.duration_s={self.duration_s:g}. Give less than {length / self.count:g} s."
             )
+        room = length - self.duration_s
         start = time[0] + room * draws.uniform("world.outage", 1, self.count).to(
             time
         )  # [R, 1, count]

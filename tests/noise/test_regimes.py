@@ -554,6 +554,7 @@ def test_a_record_without_added_errors_stays_as_it_is() -> None:
         (lambda: AddedErrors(sd_m=math.nan), "sd_m must be"),
         (lambda: RandomOutage(0.0), "duration_s must be"),
         (lambda: errors(RandomOutage(400.0)), "shorter than the record of 299 s"),
+        (lambda: errors(RandomOutage(100.0, 3)), r"count=3 outages .* Give less than 99\.6\d* s"),
         (lambda: errors(AddedErrors(sd_m=1.0)), "positions or ranges"),
     ],
 )

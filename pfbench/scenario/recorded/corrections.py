@@ -82,6 +82,8 @@ class LogCorrections:
     lever_arm: Vector = None
 
     def __post_init__(self) -> None:
+        for key in ("times", "scale", "bias", "shift_s", "mounting", "level_axes"):
+            _check_mapping(key, getattr(self, key) or {}, "by name")
         for key, allowed in (
             ("times", _TABLES), ("scale", _TABLES), ("bias", _TABLES), ("shift_s", _TABLES),
             ("mounting", tuple(_SENSORS)), ("level_axes", tuple(_LEVEL)),
@@ -336,7 +338,15 @@ def _check_vector(key: str, value: Vector) -> None:
         )
 
 
+def _check_mapping(key: str, values: Any, kind: str) -> None:
+    if not isinstance(values, Mapping):
+        raise ValueError(
+            f"scenario.corrections.{key} must be values {kind}, got {values}. Set {{NAME: {values}}}."
+        )
+
+
 def _check_columns(key: str, values: Mapping[str, float]) -> None:
+    _check_mapping(key, values, "by column")
     for column, value in values.items():
         if not (isinstance(value, int | float) and np.isfinite(value)) or (
             key.startswith("scale") and value == 0

@@ -176,6 +176,8 @@ BAD_CORRECTIONS: dict[str, tuple[dict[str, object], str]] = {
     "drop": ({"drop": ["fixes"]}, r"corrections\.drop must be of spikes"),
     "gaps": ({"gaps": "cut"}, r"corrections\.gaps must be of refuse, longest"),
     "arm": ({"lever_arm": [1.0]}, r"corrections\.lever_arm must be 3 finite numbers"),
+    "number": ({"scale": 1.1}, r"corrections\.scale must be values by name, got 1\.1\. Set \{NAME: 1\.1\}"),
+    "column": ({"bias": {"imu": 0.1}}, r"corrections\.bias\.imu must be values by column, got 0\.1"),
     "factor": ({"scale": {"imu": {"fx": 0.0}}}, r"corrections\.scale\.imu\.fx must be a finite number"),
     "shift": ({"shift_s": {"imu": [[1.0, 0.0], [0.0, 1.0]]}}, r"shift_s\.imu must have increasing times"),
     "nodes": ({"shift_s": {"imu": [[1.0]]}}, r"shift_s\.imu must be a number in s, or nodes"),
