@@ -153,7 +153,9 @@ def _list_timings(plan: ClaimPlan, runs: ClaimRuns) -> Iterator[Task]:
             start += size
             name = name_timing(pair[0], pair[-1])
             if c.a.measure.metric == TIMING and not runs.find(name):
-                price = _ROUNDS * _ROUND_S * size * 3
+                # 20 rounds of at least 20 steps take about as long as the job itself
+                jobs = [estimate_seconds(plan.claim.paper, cell, runs) for cell in set(pair)]
+                price = _ROUNDS * _ROUND_S * size * 3 + 2.0 * batch.runs * sum(jobs)
                 yield Task(plan.claim.paper, name, batch, {}, pair, price)
 
 

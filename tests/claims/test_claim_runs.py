@@ -319,6 +319,17 @@ def test_words_of_the_command_are_checked(monkeypatch: pytest.MonkeyPatch) -> No
     command.check_committed(True)
 
 
+def test_the_price_of_times_has_the_runs_of_the_filters_that_are_timed() -> None:
+    """Each is run once, and takes as long again to be timed in turn; rounds of quick filters have a least time."""
+    plans, empty = [PLANS["C001-8"]], ClaimRuns([])
+    (price,) = price_claims(plans, empty, decide_claims(plans, empty))
+    timed = [task for task in price.tasks if task.timed]
+    assert timed
+    for task in timed:
+        jobs = [claim_runs.estimate_seconds("001", cell, empty) for cell in set(task.timed)]
+        assert task.seconds > 2.0 * task.batch.runs * sum(jobs) > 0.0
+
+
 def test_a_dry_run_prints_prices_and_runs_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
     places = [f"results_dir={tmp_path}", f"reports_dir={tmp_path}"]
     command.report_claims(["run", "C001-7", "dry=true", *places])
