@@ -36,6 +36,9 @@ RUN = [*CONDITION, "filter", "seed", "run"]
 TOLERANCE = 1e-5  # relative, of errors that are stored in single precision
 _COUNTS = ("runs", "lost", "diverged", "collapsed", "severely_overconfident")
 _NUMBER = {"particles", "budget"}  # settings of a label that a number of particles replaces
+_WORLD = re.compile(
+    r"(?<=\)), "
+)  # between worlds of a tuning, each of which ends with its settings in brackets
 Pack = dict[str, Any]
 
 
@@ -165,10 +168,7 @@ def rename_pack(pack: Pack, names: Mapping[str, str]) -> Pack:
     for look in pack["facts"]["looks"]:
         key = names[look["key"]]
         other = looks.get(key, {**look, "tuning": "", "tuned_on": ""})
-        texts = {
-            name: join_texts([other[name], look[name]], r"(?<=\)), ")
-            for name in ("tuning", "tuned_on")
-        }
+        texts = {name: join_tunings([other[name], look[name]]) for name in ("tuning", "tuned_on")}
         looks[key] = {**other, **texts, "key": key}
     by_name = {look["name"]: names[look["key"]] for look in pack["facts"]["looks"]}
     return {
@@ -223,9 +223,14 @@ def _add(first: int | None, second: int | None) -> int | None:
 
 
 def join_texts(texts: Sequence[str], separator: str) -> str:
-    """Join lists in words, each entry once; the separator is a pattern that ends with what is written."""
-    parts = [part for text in texts if text for part in re.split(separator, text)]
-    return separator.rpartition(")")[2].join(dict.fromkeys(parts))
+    """Join lists in words, each entry once."""
+    parts = [part for text in texts if text for part in text.split(separator)]
+    return separator.join(dict.fromkeys(parts))
+
+
+def join_tunings(texts: Sequence[str]) -> str:
+    """Join lists of worlds on which a filter was tuned, in one order: equal lists are told once on a page."""
+    return ", ".join(sorted({world for text in texts if text for world in _WORLD.split(text)}))
 
 
 def _join_lists(tables: Sequence[Mapping[str, Sequence[Any]]]) -> dict[str, list[Any]]:
@@ -256,7 +261,7 @@ def merge_packs(published: Pack, newer: Pack, runs: pd.DataFrame) -> Pack:
     looks = {look["key"]: look for look in (*newer["facts"]["looks"], *published["facts"]["looks"])}
     for look in newer["facts"]["looks"]:
         texts = [looks[look["key"]]["tuning"], look["tuning"]]
-        looks[look["key"]] = {**looks[look["key"]], "tuning": join_texts(texts, r"(?<=\)), ")}
+        looks[look["key"]] = {**looks[look["key"]], "tuning": join_tunings(texts)}
     curves = dict(published["curves"])
     for key, added in newer["curves"].items():
         own = curves[key]["filters"]

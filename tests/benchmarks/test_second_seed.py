@@ -258,3 +258,12 @@ def test_curves_of_a_finer_page_are_read_at_the_instants_of_the_published_one() 
     curve = {"median": [1.0, 2.0, None, 8.0], "q10": [0.0, 1.0, 2.0, 3.0]}
     found = merge_study.interpolate_curve(curve, [0.0, 10.0, 20.0, 30.0], [0.0, 5.0, 15.0, 30.0])
     assert found == {"median": [1.0, 1.5, None, 8.0], "q10": [0.0, 0.5, 1.5, 3.0]}
+
+
+def test_worlds_of_a_tuning_are_told_in_one_order() -> None:
+    a, b = "a (model m, seed 1; noise: n, o)", "b (model m, seed 2; noise: n)"
+    joined = [
+        merge_study.join_tunings(texts)
+        for texts in ([a, b], [b, a], [f"{b}, {a}", a], [f"{a}, {b}", ""])
+    ]
+    assert joined == [f"{a}, {b}"] * 4

@@ -332,6 +332,17 @@ def test_a_method_with_another_number_of_particles_than_its_table_is_named(
     assert f"1000 particles (its own number: {name} 200)" in describe_setting(overviews[1000], 1000)
 
 
+def test_a_method_that_ran_in_few_worlds_is_named(overview: Overview) -> None:
+    """One missing world is a dash in the heat map; with more, the first lines say it."""
+    assert " of them" not in describe_setting(overview)
+    worlds = [world.key for world in overview.worlds]
+    for number, said in ((len(worlds) - 1, False), (1, True)):
+        lacking = worlds[number:]
+        cells = [c for c in overview.cells if c.filter != "mcmc_rpf" or c.world not in lacking]
+        text = describe_setting(overview._replace(cells=cells))
+        assert (f"MCMC-RPF ran in {number} of them." in text) == said
+
+
 def test_a_job_at_equal_time_has_its_budget_in_its_label() -> None:
     """Its number of particles follows from the time: 63 where its settings say 1000. Equal numbers are usual."""
     config = {

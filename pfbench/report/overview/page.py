@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -184,8 +185,8 @@ def describe_setting(overview: Overview, level: TabKey = 0) -> str:
     runs = sorted({world.runs for world in overview.worlds})
     counts = f"{runs[0]}" if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
     return (
-        f"{len(overview.worlds)} worlds, {counts} paired runs each{f', {level} particles' if level else ''}{_name_numbers(overview)}. An error counts up to the track limit of its "
-        f"world, which a lost run has. {_describe_reference(overview)} Conventional are all filters but the proposed ones"
+        f"{len(overview.worlds)} worlds, {counts} paired runs each{f', {level} particles' if level else ''}{_name_numbers(overview)}.{_name_absent(overview)} An error counts up to the "
+        f"track limit of its world, which a lost run has. {_describe_reference(overview)} Conventional are all filters but the proposed ones"
         f"{', a bank of EKFs among them' if 'ekf_bank' in overview.conventional else ''}."
     )
 
@@ -195,6 +196,18 @@ def _name_numbers(overview: Overview) -> str:
     labels = [label for label in overview.methods if label in overview.numbers]
     some = [f"{overview.names[label]} {overview.numbers[label]:.0f}" for label in labels]
     return f" (its own number: {', '.join(some)})" if some else ""
+
+
+def _name_absent(overview: Overview) -> str:
+    """Name the methods that lack more than one world, with the number of those in which they ran."""
+    counts = Counter(cell.filter for cell in overview.cells)
+    worlds = len(overview.worlds)
+    some = [
+        f"{overview.names[method]} ran in {counts[method]} of them"
+        for method in overview.methods
+        if counts[method] < worlds - 1
+    ]
+    return f" {'; '.join(some)}." if some else ""
 
 
 def _describe_reference(overview: Overview) -> str:
