@@ -107,12 +107,14 @@ class MeanRanks(NamedTuple):
         p: p-value of Friedman's test in the form of Iman and Davenport.
         critical_difference: Difference of mean ranks that Nemenyi's test can show.
         reason: Why there are none; empty otherwise.
+        worlds: Number of worlds that have all methods.
     """
 
     means: Mapping[str, float]
     p: float
     critical_difference: float
     reason: str = ""
+    worlds: int = 0
 
 
 def build_world(
@@ -220,7 +222,7 @@ def rank_methods(worlds: Sequence[World], methods: Sequence[str]) -> MeanRanks:
     studentized = float(scipy.stats.studentized_range.ppf(1 - ALPHA, k, np.inf))
     difference = studentized / math.sqrt(2) * math.sqrt(k * (k + 1) / (6 * count))
     means = dict(zip(methods, map(float, ranks.mean(axis=0)), strict=True))
-    return MeanRanks(means, p, difference)
+    return MeanRanks(means, p, difference, worlds=count)
 
 
 def count_wins(pairs: Sequence[WorldPair], worlds: Sequence[str]) -> Counter[tuple[str, str]]:

@@ -71,6 +71,11 @@ MATRIX_FORMATS = (
 )
 
 
+def fold_name(name: str, longest: int = 16) -> str:
+    """Return a long name of a filter with its form in a second line."""
+    return name.replace(" (", "\n(") if len(name) > longest else name
+
+
 def palette() -> Colormap:
     """Return the colours from better to worse."""
     import seaborn  # takes a second
@@ -87,7 +92,7 @@ def draw_heat_map(overview: Overview, size: Format) -> Figure:
     Colour marks what is decided, a grey ground a filter that loses track, = equality within 5 %.
     """
     columns = list(overview.methods) if size.name else [*overview.methods, *overview.conventional]
-    names = [overview.names[label] for label in columns]
+    names = [fold_name(overview.names[label]) for label in columns]
     table = {(cell.world, cell.filter): cell for cell in overview.cells}
     groups = group_worlds(overview)
     foot = size.row * (1 if size.width > 600 else 2)
@@ -112,7 +117,7 @@ def draw_heat_map(overview: Overview, size: Format) -> Figure:
 def draw_matrices(overview: Overview, size: Format) -> Figure:
     """Draw in how many worlds the method of a row is better and worse than that of a column, by group of worlds."""
     methods = overview.methods
-    names = [overview.names[method] for method in methods]
+    names = [fold_name(overview.names[method]) for method in methods]
     groups = group_worlds(overview)
     with matplotlib.rc_context({**RC, "font.size": size.font, "axes.grid": False}):
         rows = [(f"{title} ({len(worlds)})", len(methods)) for title, worlds in groups]

@@ -86,9 +86,12 @@ def render_overview(
 
 
 def choose_level(overviews: Mapping[TabKey, Overview]) -> TabKey:
-    """Return the number of particles that opens the page: the middle one of those with the most worlds."""
-    worlds = {key: len(overview.worlds) for key, overview in _select_levels(overviews).items()}
-    levels = [key for key, count in worlds.items() if count == max(worlds.values())]
+    """Return the number of particles that opens the page: that with the most results of the methods, else the middle one."""
+    cells = {
+        key: sum(cell.filter in overview.methods for cell in overview.cells)
+        for key, overview in _select_levels(overviews).items()
+    }
+    levels = [key for key, count in cells.items() if count == max(cells.values())]
     return levels[len(levels) // 2]
 
 
@@ -159,15 +162,17 @@ def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> 
         first += " At equal time none is."
     cells = [cell for cell in overview.cells if cell.filter in overview.methods]
     words = ["lost" if cell.loses_track else cell.verdict.word for cell in cells]
+    single = sum(winner.wins for winner in overview.kalman_winners)
+    better_than_each = f" ({single} against all of them)" if single else ""
     counts = [
-        f"better in {words.count('better')} of {len(cells)} cells",
+        f"better in {words.count('better')} of {len(cells)} cells{better_than_each}",
         f"equal in {words.count('equal') + words.count('identical')}",
         f"not decided in {words.count('not decided')}",
         f"worse in {words.count('worse')}",
     ]
-    lost = f" In {words.count('lost')} they lose track." if "lost" in words else ""
+    lost = f" In {words.count('lost')} cells they lose track." if "lost" in words else ""
     return (
-        f"{first} Against the best Kalman filter of each world they are {', '.join(counts)}.{lost}"
+        f"{first} Against each world's best Kalman filter they are {', '.join(counts)}.{lost}"
     )
 
 
@@ -211,19 +216,18 @@ def _name_absent(overview: Overview) -> str:
 
 
 def _describe_reference(overview: Overview) -> str:
-    """Say how the best Kalman filter was chosen, where it is not the best in these runs, and what each one beats."""
+    """Say how the best Kalman filter was chosen, and where it is not the best in these runs."""
     better = [
         f"{overview.names[world.outdone.b]} in {world.name} (the chosen one has {world.outdone.ratio:.2f} times its error)"
         for world in overview.worlds
         if world.outdone
     ]
-    wins = sum(winner.wins for winner in overview.kalman_winners)
     text = "The best Kalman filter of a world was chosen on another seed, tuned ones among the candidates"
     blocks = [read_paper_block("filter", parse_label(method)[0]) for method in overview.methods]
     text += "." if any(block.get("tuning") for block in blocks) else "; the methods are not tuned."
     if better:
         text += f" In these runs another one is better: {', '.join(better)}."
-    return f"{text} Better than every single Kalman filter: in {wins} of {len(overview.kalman_winners)} cells."
+    return text
 
 
 def spell_number(number: int) -> str:
