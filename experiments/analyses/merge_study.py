@@ -170,7 +170,7 @@ def rename_pack(pack: Pack, names: Mapping[str, str]) -> Pack:
         other = looks.get(key, {**look, "tuning": "", "tuned_on": ""})
         texts = {name: join_tunings([other[name], look[name]]) for name in ("tuning", "tuned_on")}
         looks[key] = {**other, **texts, "key": key}
-    by_name = {look["name"]: names[look["key"]] for look in pack["facts"]["looks"]}
+    by_name = {look.name: names[label] for label, look in StudyFacts.from_pack(pack).looks.items()}
     return {
         **pack,
         "facts": {**pack["facts"], "looks": list(looks.values())},

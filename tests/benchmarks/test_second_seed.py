@@ -267,3 +267,15 @@ def test_worlds_of_a_tuning_are_told_in_one_order() -> None:
         for texts in ([a, b], [b, a], [f"{b}, {a}", a], [f"{a}, {b}", ""])
     ]
     assert joined == [f"{a}, {b}"] * 4
+
+
+def test_choices_name_filters_as_the_page_does() -> None:
+    """A page writes present names: those that it stores with its looks may be of an earlier set of filters."""
+    pack, _ = read_stored_study(ROOT / "reports" / "robust_canyon")
+    labels = [look["key"] for look in pack["facts"]["looks"]]
+    names = dict(zip(labels, labels, strict=True))
+    earlier = [{**look, "name": "earlier"} for look in pack["facts"]["looks"]]
+    stale = {**pack, "facts": {**pack["facts"], "looks": earlier}}
+    expected = merge_study.rename_pack(pack, names)["choices"]
+    assert merge_study.rename_pack(stale, names)["choices"] == expected
+    assert any(expected.values())
