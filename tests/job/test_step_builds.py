@@ -277,7 +277,7 @@ def test_a_job_without_its_step_takes_the_batches_of_kernels(
     passes: list[tuple[int, int | None]] = []
 
     def spy(method: Any, model: Any, record: Any, draws: Any, *more: Any) -> Any:
-        passes.append((record.y.shape[1], more[-1] if more else None))
+        passes.append((record.y.shape[1], more[2] if more else None))
         return run_filter(method, model, record, draws, *more)
 
     monkeypatch.setattr(filter_pass, "run_filter", spy)

@@ -89,7 +89,7 @@ def test_a_changed_number_is_found_with_its_time(home: Path, tmp_path: Path) -> 
         (("study=wlaks", "run=12", "filter=ekf"), "got wlaks. Similar: walks."),
         (("study=walks", "run=14", "filter=ekf", "noise=nominal"), "10 to 13, got 14"),
         (("study=walks", "run=x", "filter=ekf"), "run must be a whole number of at least 0, got x"),
-        (("study=walks", "run=12", "filter=ukf"), "Choose from ekf, sir, sir[particles=30], sir["),
+        (("study=walks", "run=12", "filter=ukf"), "Choose from ekf, sir[particles=30], sir["),
         (
             ("study=walks", "run=12", "filter=ekf"),
             "noise must be set, since ekf has results in 2 conditions. Add noise",
