@@ -171,9 +171,7 @@ def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> 
         f"worse in {words.count('worse')}",
     ]
     lost = f" In {words.count('lost')} cells they lose track." if "lost" in words else ""
-    return (
-        f"{first} Against each world's best Kalman filter they are {', '.join(counts)}.{lost}"
-    )
+    return f"{first} Against each world's best Kalman filter they are {', '.join(counts)}.{lost}"
 
 
 def _name_winners(overview: Overview, most: int = 2) -> str:
