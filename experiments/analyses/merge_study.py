@@ -36,9 +36,7 @@ RUN = [*CONDITION, "filter", "seed", "run"]
 TOLERANCE = 1e-5  # relative, of errors that are stored in single precision
 _COUNTS = ("runs", "lost", "diverged", "collapsed", "severely_overconfident")
 _NUMBER = {"particles", "budget"}  # settings of a label that a number of particles replaces
-_WORLD = re.compile(
-    r"(?<=\)), "
-)  # between worlds of a tuning, each of which ends with its settings in brackets
+_WORLD = re.compile(r"(?<=\)), ")  # worlds of a tuning end with their settings in brackets
 Pack = dict[str, Any]
 
 
