@@ -24,6 +24,7 @@ from pfbench.report.papers.figures import list_paper_pages
 from pfbench.report.study_page.page_writer import describe_page_knobs
 from pfbench.report.writers import format_csv, format_with_interval, template_environment
 from pfbench.results.conditions import parse_label
+from pfbench.results.looks import find_looks
 from pfbench.results.paper_block import read_paper_block
 from pfbench.stats.world_table import WorldResult
 
@@ -63,8 +64,11 @@ def render_overview(
         "headline": word_headline(overview, overviews.get(EQUAL_TIME)),
         "setting": describe_setting(overview, level),
         "has_printed": PRINTED in overviews,
+        "has_stars": any(winner.wins for item in overviews.values() for winner in item.winners),
+        "failures": describe_failures(pack, overview),
         "foreign_knobs": describe_page_knobs(pack) if "worlds" in pack else "",
         "ratios": list_ratios(overview),
+        "format_error": figures.format_reference_error,
         "filters": [overview.names[label] for label in (*overview.methods, *overview.conventional)],
         "stories": [tell_story(overview, m, _summary(m)) for m in overview.methods],
         "count": spell_number(len(overview.methods)),
@@ -104,7 +108,11 @@ def _name_tab(key: TabKey, overview: Overview) -> str:
     """Name tables below the first ones."""
     if key == EQUAL_TIME:
         return "All particle filters with the time of a step of SIR with 1000 particles"
-    return "The methods as printed" if key == PRINTED else f"{key} particles"
+    if key != PRINTED:
+        return f"{key} particles"
+    numbers = {round(overview.numbers[m]) for m in overview.methods if m in overview.numbers}
+    ends = " to ".join(map(str, sorted({min(numbers), max(numbers)}))) if numbers else ""
+    return f"The methods as printed{f', {ends} particles' if ends else ''}"
 
 
 def _suffix(key: TabKey) -> str:
@@ -231,6 +239,21 @@ def _describe_reference(overview: Overview) -> str:
 def spell_number(number: int) -> str:
     """Return a small number in letters."""
     return _NUMBERS[number] if number < len(_NUMBERS) else str(number)
+
+
+def describe_failures(pack: Mapping[str, Any], overview: Overview) -> list[str]:
+    """Describe the jobs that failed, those of a filter with one reason in a sentence."""
+    worlds = {world.key: world.name for world in overview.worlds}
+    places: dict[tuple[str, str], dict[str, None]] = {}
+    for failure in pack.get("failures", ()):
+        world, label = (str(failure["choices"][key]) for key in ("scenario", "filter"))
+        reason = str(failure["message"]).partition(": ")[2].partition(", got ")[0]
+        places.setdefault((label, reason), {})[worlds.get(world, world)] = None
+    looks = find_looks([label for label, _ in places])
+    return [
+        f"{looks[label].name} in {'; '.join(some)}{f', since {reason}' if reason else ''}"
+        for (label, reason), some in places.items()
+    ]
 
 
 def list_ratios(overview: Overview) -> list[tuple[WorldRow, list[str]]]:

@@ -88,7 +88,7 @@ class Overview(NamedTuple):
         times: Median time of a step [ms] by world and filter.
         left_out: Worlds that are not on the page, with the reason.
         kalman_winners: Methods that are better than each single Kalman filter of a world.
-        numbers: Number of particles of the filters that have another one than their table.
+        numbers: Number of particles of the filters that have another one than the title of their table states.
     """
 
     worlds: tuple[WorldRow, ...]
@@ -245,7 +245,7 @@ def build_overviews(
         labels = [label for label in looks if label not in timed and _level(label) in (None, key)]
         alone = labels if levels else [label for label in looks if label not in timed]
         tab = _build_tab(table, looks, parts, alone)
-        overviews[key] = _count_other_numbers(tab, table[table["filter"].isin(labels)], int(key))
+        overviews[key] = _count_particles(tab, table, labels, int(key)) if key else tab
     if sum(is_method(looks[label]) for label in timed) >= FEWEST_METHODS:
         names = {name_without_level(label) for label in timed}
         fixed = [label for label in looks if _level(label) is None and label not in names]
@@ -254,13 +254,17 @@ def build_overviews(
         number = table.loc[table["filter"].isin(printed), "particles"].dropna().median()
         same = [label for label in looks if label not in timed and _level(label) in (None, number)]
         others = [label for label in same if not is_method(looks[label])]
-        overviews[PRINTED] = _build_tab(table, looks, parts, others, is_printed)
+        tab = _build_tab(table, looks, parts, others, is_printed)
+        overviews[PRINTED] = _count_particles(tab, table, others)
     return overviews
 
 
-def _count_other_numbers(tab: Overview, rows: pd.DataFrame, level: int) -> Overview:
-    """Count the particles of the filters that have another number than their table, since they set it themselves."""
-    if not level or "particles" not in rows:
+def _count_particles(
+    tab: Overview, table: pd.DataFrame, labels: Sequence[str], level: int = 0
+) -> Overview:
+    """Count the particles of the filters of a tab that have another number than `level`."""
+    rows = table[table["filter"].isin(labels)]
+    if "particles" not in rows:
         return tab
     names = rows["filter"].astype(str).map(name_without_level)
     counts = rows.groupby(names)["particles"].median().dropna()
