@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import override
 
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.moves.metropolis import McmcKernel, Move
@@ -19,16 +20,18 @@ def moving(*moves: Move, n: int = 40, threshold: float = 1.0) -> ParticleFilter:
 
 
 @dataclasses.dataclass(frozen=True)
-class Always:
+class Always(McmcKernel):
     """Accepts whatever is proposed."""
 
     kernel: McmcKernel
     is_exact = False
 
     @property
+    @override
     def required_history(self) -> Any:
         return self.kernel.required_history
 
+    @override
     def propose(
         self, model: Any, belief: ParticleBelief, draws: Any
     ) -> tuple[ParticleBelief, Tensor]:

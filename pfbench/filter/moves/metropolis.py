@@ -278,6 +278,33 @@ class McmcKernel(Protocol):
             Proposed particles and log Metropolis-Hastings ratio [R, N]. NaN is never accepted.
         """
 
+    def shorten(self, model: StateSpaceModel, belief: ParticleBelief) -> ParticleBelief:
+        """Return the particles without the part of their history that follows from the rest.
+
+        The steps of a sweep then neither propose nor select it, and `complete` restores it after the last one.
+        """
+        return belief
+
+    def complete(
+        self,
+        model: StateSpaceModel,
+        moved: ParticleBelief,
+        before: ParticleBelief,
+        accepted: Tensor,
+    ) -> ParticleBelief:
+        """Return moved particles with the whole history again.
+
+        Args:
+            model: State-space model of the step.
+            moved: Shortened particles after the last step.
+            before: Whole particles before the first step.
+            accepted: Mask of particles that moved, [R, N].
+
+        Returns:
+            Particles with the history that their steps would have had without `shorten`.
+        """
+        return moved
+
 
 @dataclass(frozen=True)
 class MetropolisHastings(Move):
@@ -314,18 +341,24 @@ class MetropolisHastings(Move):
         rate = torch.zeros_like(belief.log_w[:, 0])
         if self.mcmc_steps == 0:
             return belief, rate
+        short = self.kernel.shorten(model, belief)
         if belief.x.is_cuda:  # a mask is cheaper than waiting for the number of runs
-            moved_belief, accepted = self._sweep(model, belief, draws)
+            swept, accepted = self._sweep(model, short, draws)
             rate = torch.where(resampled, self._rate(accepted, belief.log_w), rate)
-            return _replace_runs(belief, moved_belief, None, resampled), rate
+            moved = _replace_runs(short, swept, None, resampled)
+            accepted = accepted * resampled.unsqueeze(1)
+            return self.kernel.complete(model, moved, belief, accepted > 0.0), rate
         rows = resampled.nonzero().squeeze(1)
         if len(rows) == 0:
             return belief, rate
-        moved_belief, accepted = self._sweep(
-            model, _select_runs(belief, rows), select_runs(draws, rows)
-        )
-        rate = rate.index_copy(0, rows, self._rate(accepted, moved_belief.log_w))
-        return _replace_runs(belief, moved_belief, rows, resampled), rate
+        selected = _select_runs(short, rows)
+        swept, some = self._sweep(model, selected, select_runs(draws, rows))
+        rate = rate.index_copy(0, rows, self._rate(some, swept.log_w))
+        unchanged = {k for k, a in selected.window.items() if swept.window[k] is a}
+        window = swept.window | {k: short.window[k] for k in unchanged}
+        moved = _replace_runs(short, swept._replace(window=window), rows, resampled)
+        accepted = torch.zeros_like(belief.log_w).index_copy(0, rows, some)
+        return self.kernel.complete(model, moved, belief, accepted > 0.0), rate
 
     def _sweep(
         self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
@@ -425,7 +458,11 @@ def _replace_runs(
             return old
         if rows is None:
             return _where(resampled.unsqueeze(1), new, old)
-        return new if len(rows) == len(old) else old.index_copy(0, rows, new)
+        if len(rows) == len(old):
+            return new
+        last = (*range(2, old.dim()), 0, 1)  # order in memory
+        back = (old.dim() - 2, old.dim() - 1, *range(old.dim() - 2))
+        return old.permute(last).index_copy(old.dim() - 2, rows, new.permute(last)).permute(back)
 
     window = {name: replace(old, moved_belief.window[name]) for name, old in belief.window.items()}
     ancestors = None

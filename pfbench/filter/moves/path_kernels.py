@@ -17,6 +17,7 @@ from pfbench.filter.belief import ParticleBelief, normalise_log_weights, weighte
 from pfbench.filter.exactness import is_every_part_exact
 from pfbench.filter.linearisation import (
     derivative,
+    linearised_innovation,
     mask_covariance,
     measurement_jacobian,
     transition_jacobian,
@@ -205,7 +206,8 @@ class NoiseFlowKernel(McmcKernel):
 
     While t <= L the start is x_0 and its distribution is exact. Later it is the normal
     distribution with the filter's moments at t - L. The target is then that of a fixed-lag
-    smoother, so `is_exact` is False. The cost is L model steps.
+    smoother, so `is_exact` is False. The cost is L model steps, of a linear model L for all steps of
+    a sweep together.
 
     Attributes:
         lag: L. The window may be longer for another kernel. The flow then starts where the
@@ -242,13 +244,61 @@ class NoiseFlowKernel(McmcKernel):
         start, centre = window["states"][:, :, 0], window["mean"][:, :, 0]
         step, xi = self.random_walk(model, belief, start, draws), chart.subtract(start, centre)
         proposed_start = start + step if chart.flat else chart.add(centre, xi + step)
-        noise = self._refresh_noise(model, window["noise"], draws)
-        states, log_like = propagate_path(model, proposed_start, noise, belief.past)
         root = factor(window["covariance"][:, 0, 0])[0]
         before, after = (compute_half_square(whiten(a, root)) for a in (xi, xi + step))
+        if "score" in window:
+            change = step @ window["information"][:, 0]
+            log_alpha = before - after + (step * (window["score"] - 0.5 * change)).sum(-1)
+            new_window = {"states": proposed_start.unsqueeze(2), "score": window["score"] - change}
+            return belief._replace(window=window | new_window), log_alpha
+        noise = self._refresh_noise(model, window["noise"], draws)
+        states, log_like = propagate_path(model, proposed_start, noise, belief.past)
         log_alpha = before - after + (log_like - window["log_like"]).sum(-1)
         new_window = {"states": states, "log_like": log_like, "noise": noise}
         return belief._replace(x=states[:, :, -1], window=window | new_window), log_alpha
+
+    @override
+    def shorten(self, model: StateSpaceModel, belief: ParticleBelief) -> ParticleBelief:
+        """Return the particles of a linear model with the start and what its likelihood requires.
+
+        Under fixed noises the log likelihood of the path is then quadratic in the start, with the gradient
+        `score` [R, N, d] and the curvature `information` [R, 1, d, d]. A step of a sweep costs no model step.
+        """
+        is_quadratic = model.linear and model.chart.flat and self.noise_refresh == 0.0
+        if not (is_quadratic and belief.past):
+            return belief
+        window, states = belief.window, belief.window["states"]
+        score, information = measure_start(model, states, belief.past)
+        window = {
+            "states": states[:, :, :1],
+            "mean": window["mean"],
+            "covariance": window["covariance"],
+            "score": score,
+            "information": information.unsqueeze(1),
+        }
+        return belief._replace(window=window)
+
+    @override
+    def complete(
+        self,
+        model: StateSpaceModel,
+        moved: ParticleBelief,
+        before: ParticleBelief,
+        accepted: Tensor,
+    ) -> ParticleBelief:
+        """Return moved particles with the paths that follow from their starts."""
+        if "score" not in moved.window:
+            return moved
+        window, states, values = before.window, [], []
+        x = moved.window["states"][:, :, 0]
+        for j, record in enumerate(before.past):
+            if j > 0:
+                x = model.propagate(x, record.u, window["noise"][:, :, j - 1])
+            value = model.log_likelihood(record.y, x, record.u)
+            states.append(torch.where(accepted.unsqueeze(2), x, window["states"][:, :, j]))
+            values.append(torch.where(accepted, value, window["log_like"][:, :, j]))
+        whole = {"states": stack_history(states), "log_like": stack_history(values)}
+        return moved._replace(x=states[-1], window=window | whole)
 
     def _refresh_noise(self, model: StateSpaceModel, w: Tensor, draws: RandomStream) -> Tensor:
         """Mix the noises [R, N, K, W] with new ones."""
@@ -286,6 +336,29 @@ def propagate_path(
         states.append(x)
         values.append(model.log_likelihood(record.y, x, record.u))
     return stack_history(states), stack_history(values)
+
+
+def measure_start(
+    model: StateSpaceModel, states: Tensor, past: tuple[Record, ...]
+) -> tuple[Tensor, Tensor]:
+    """Compute gradient and curvature of the log likelihood of paths in their start, of a linear model.
+
+    Returns gradient [R, N, d] and curvature [R, d, d]. Shapes: states [R, N, K+1, D].
+    """
+    d = model.chart.dimension
+    gradient = torch.zeros_like(states[:, :, 0])
+    curvature = states.new_zeros(states.shape[0], d, d)
+    jacobian = torch.eye(d, dtype=states.dtype, device=states.device).expand_as(curvature)
+    for j, record in enumerate(past):
+        x = states[:, :, j]
+        if j > 0:
+            jacobian = transition_jacobian(model, x[:, :1], record.u)[:, 0] @ jacobian
+        h = measurement_jacobian(model, x[:, :1], record)[:, 0] @ jacobian
+        noise = distribution_covariance(model.observation(x[:, :1], record.u))[:, 0]
+        weight = torch.linalg.solve_ex(mask_covariance(noise, ~torch.isnan(record.y)), h)[0]
+        gradient = gradient + linearised_innovation(model, x, record) @ weight
+        curvature = curvature + h.mT @ weight
+    return gradient, curvature
 
 
 @dataclass(frozen=True)

@@ -289,7 +289,7 @@ def no_likelihood(old: Terms, new: Terms) -> Tensor:
 
 
 @dataclasses.dataclass(frozen=True)
-class Broken:
+class Broken(McmcKernel):
     """A kernel whose log ratio lacks something."""
 
     kernel: McmcKernel
@@ -308,7 +308,7 @@ class Broken:
 
 
 @dataclasses.dataclass(frozen=True)
-class OldParent:
+class OldParent(McmcKernel):
     """The child is weighed with the parent that it had before the block was drawn anew."""
 
     walk: RandomWalk
@@ -330,7 +330,7 @@ class OldParent:
 
 
 @dataclasses.dataclass(frozen=True)
-class NoRatio:
+class NoRatio(McmcKernel):
     """Smoothed without its ratio."""
 
     child: bool
@@ -497,7 +497,14 @@ class PriorSized(RandomWalk):
 
 
 @dataclasses.dataclass(frozen=True)
-class Unprincipled(NoiseFlowKernel):
+class Whole(NoiseFlowKernel):
+    """Computes the path of every proposal, also of a linear model."""
+
+    def shorten(self, model: StateSpaceModel, belief: ParticleBelief) -> ParticleBelief:
+        return belief
+
+
+class Unprincipled(Whole):
     """Flow without the ratio of the priors."""
 
     def propose(
@@ -722,7 +729,7 @@ def test_a_step_of_nothing_is_always_accepted_and_changes_nothing(
 
 
 @dataclasses.dataclass(frozen=True)
-class Same:
+class Same(McmcKernel):
     """Draws the same block again."""
 
     is_exact = True
@@ -825,6 +832,29 @@ def test_what_is_carried_agrees_with_itself(model: StateSpaceModel) -> None:
         assert torch.allclose(log_like, window["log_like"], rtol=1e-4, atol=1e-4)
         assert torch.all(window["log_like"][:, :, 0] == 0)
         assert bool(torch.isnan(cloud.past[0].y).all())
+
+
+TURNING = LinearGaussian(
+    [[0.9, 0.3, 0.0], [-0.3, 0.9, 0.1], [0.0, 0.0, 0.95]], [[0.3, 0.0], [0.1, 0.2], [0.0, 0.4]],
+    [[1.0, 0.0, 0.5], [0.0, 1.0, 0.0]], [0.7, 0.4], [0.0, 1.0, 0.0], [1.0, 2.0, 0.5],
+)  # fmt: skip
+
+
+def test_a_quadratic_likelihood_moves_as_whole_paths_do() -> None:
+    """With missing measurements, a sliding window and runs that are not resampled."""
+    y = measurements(TURNING, 5, 9)
+    y[0, 2:5, 0], y[3, 4], y[1, 6, 1] = torch.nan, torch.nan, torch.nan
+    clouds = [
+        history(moving(MetropolisHastings(kernel(4), 3), n=60, threshold=0.8), TURNING, y)
+        for kernel in (Whole, NoiseFlowKernel)
+    ]
+    for whole, short in zip(*clouds, strict=True):
+        assert whole.window.keys() == short.window.keys()
+        for name, a in whole.window.items():
+            assert torch.allclose(a, short.window[name], rtol=1e-9, atol=1e-9), name
+        assert torch.equal(short.window["states"][:, :, -1], short.x)
+    still = history(moving(n=60, threshold=0.8), TURNING, y)[-1]
+    assert not torch.allclose(still.x, clouds[1][-1].x)
 
 
 def test_the_past_is_what_happened() -> None:
@@ -1042,7 +1072,7 @@ def test_a_singular_transition_is_refused_in_words(kernel: McmcKernel) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class Silent:
+class Silent(McmcKernel):
     """A proposal that does not tell its noise."""
 
     is_exact = True
