@@ -9,8 +9,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import random_calls
+import scipy
 import torch
 from torch import Tensor
 
@@ -18,6 +20,7 @@ from pfbench.core import density, linear_algebra, random_stream
 from pfbench.filter import belief
 from pfbench.filter.gaussian import kalman_update, linearisation_rules
 from pfbench.filter.particle import stages
+from pfbench.filter.proposed import swarm_weighting
 from pfbench.job import scoring
 from pfbench.kernels import (
     cpp_library,
@@ -118,6 +121,7 @@ def eager_function(name: str) -> Callable[..., Any]:
         "sum_and_squares": belief._totals,
         "sum_log_weights": belief._add_terms,
         "normalise_weights": belief.normalise_updated_weights,
+        "log_mixture": swarm_weighting.log_mixture,
         "weighted_moments": belief._flat_moments,
         "cholesky_factor": linear_algebra.factor,
         "kalman_update": kalman_update._updated,
@@ -203,6 +207,34 @@ def test_the_sum_of_log_weights_has_no_nan(dtype: torch.dtype) -> None:
         full = dispatch.sum_log_weights(terms, a.expand_as(terms), b.expand_as(terms))
         assert torch.equal(dispatch.sum_log_weights(terms, a, b), full)
         assert torch.equal(belief._separate_sum(terms, a, b), full)
+
+
+@compiler
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("size", [(1, 1, 1, 1), (3, 7, 5, 2), (2, 9, 33, 6)])
+def test_a_mixture_of_kernels_is_that_of_scipy(
+    size: tuple[int, int, int, int], dtype: torch.dtype
+) -> None:
+    """Also with a kernel of no weight, far from all kernels, where each density is 0, and in any memory layout."""
+    runs, points, kernels, width = size
+    rng = np.random.default_rng(5)
+    a, centres = rng.normal(size=(runs, points, width)), rng.normal(size=(runs, kernels, width))
+    a[0, 0] += 300.0
+    log_w = rng.normal(size=(runs, kernels))
+    log_w[0, 1:2] = -np.inf
+    square = ((a[:, :, None] - centres[:, None]) ** 2).sum(-1)
+    expected = scipy.special.logsumexp(log_w[:, None] - 0.5 * square, -1)
+    made = [torch.as_tensor(value, dtype=dtype) for value in (a, centres, log_w)]
+    laid = [value.mT.contiguous().mT for value in made[:2]]
+    accuracy = 3e-5 if dtype == torch.float32 else 1e-13
+    for points_of, centres_of in (made[:2], laid):
+        value = dispatch.log_mixture(points_of, centres_of, made[2]).double().numpy()
+        assert np.allclose(value, expected, rtol=accuracy, atol=accuracy)
+    made[1][0, 0, 0] = torch.nan
+    assert torch.isnan(dispatch.log_mixture(*made)[0]).all()
+    assert torch.isinf(
+        dispatch.log_mixture(*made[:2], torch.full_like(made[2], -torch.inf))[1:]
+    ).all()
 
 
 def refusal(call: Callable[..., Any], arguments: list[Any]) -> str:

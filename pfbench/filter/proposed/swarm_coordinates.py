@@ -108,7 +108,10 @@ class ObservedComponents(SwarmCoordinates):
                 -1, index, eye.expand_as(covariance)
             )
         return SwarmFrame(
-            q, covariance, index, lambda new_q: chart.add(mean, c + (new_q - q) @ direction)
+            q,
+            covariance,
+            index,
+            lambda new_q: chart.add(mean, torch.baddbmm(c, new_q - q, direction)),
         )
 
 

@@ -198,6 +198,7 @@ def select_swarm_by_run(active: Tensor, new: SwarmState, old: SwarmState) -> Swa
 _QUARTERS = 4  # 0, 1/4, 1/2, 3/4 and 1 lead to a fixed point
 _SEED_MARGIN = 1e-3
 _STUCK = 1e-12  # distance from 0, 3/4 and 1, which rounding can reach
+_IN_CACHE, _IN_CACHE_CUDA = 2**14, 2**27  # sequences that are iterated together
 _BURN_IN = 50  # iterations to the invariant distribution, each halves the difference
 
 
@@ -220,10 +221,13 @@ def logistic_map(z: Tensor, spare: Tensor) -> Tensor:
 def iterate_logistic(u: Tensor) -> Tensor:
     """Map uniforms on (0, 1) to chaotic values after the burn-in."""
     first = safe_seeds(u)
-    z = first
-    for _ in range(_BURN_IN):
-        z = logistic_map(z, first)
-    return z
+    parts = []
+    for seeds in first.flatten().split(_IN_CACHE_CUDA if u.is_cuda else _IN_CACHE):
+        z = seeds
+        for _ in range(_BURN_IN):
+            z = logistic_map(z, seeds)
+        parts.append(z)
+    return torch.cat(parts).view_as(first)
 
 
 def follow_logistic(u: Tensor, n: int, d: int) -> Tensor:

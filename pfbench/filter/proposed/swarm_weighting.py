@@ -20,6 +20,8 @@ from pfbench.filter.particle.proposals import choose_defensive_particles
 from pfbench.filter.particle.regularised_resampling import GaussianSmoothing
 from pfbench.filter.proposed.swarm_coordinates import SwarmFrame, bounded_root
 from pfbench.filter.whitening import compute_half_square, whiten
+from pfbench.kernels import dispatch
+from pfbench.kernels.dispatch import compilable
 
 # distances per batch: on a CPU they stay in its cache, which is ten times as fast
 _PAIRS, _PAIRS_CUDA = 2**17, 2**27
@@ -159,13 +161,13 @@ class MixtureWeighting(SwarmWeighting):
         a = centres + h.unsqueeze(-1) * draws.normal("swarm.kernel", n, k)
         a = torch.where(defensive.mask.unsqueeze(-1), predicted, a)
         scaled, scaled_centres = a / h.unsqueeze(-1), centres / h.unsqueeze(-1)
-        log_g = _kernels(scaled, scaled_centres, torch.log_softmax(log_w, 1)) - k * torch.log(h)
+        log_g = log_mixture(scaled, scaled_centres, torch.log_softmax(log_w, 1)) - k * torch.log(h)
         log_p = -compute_half_square(a)
         log_ratio = log_p - defensive.log_mixture(log_p, log_g)
         return torch.where(defensive.mask.unsqueeze(-1), frame.q, a @ root.mT), log_ratio
 
 
-def _kernels(a: Tensor, centres: Tensor, log_w: Tensor) -> Tensor:
+def _log_sum_of_kernels(a: Tensor, centres: Tensor, log_w: Tensor) -> Tensor:
     """Compute log sum_j w_j exp(-|a - m_j|^2 / 2) [R, N], in batches of pairs."""
     rows = max(1, (_PAIRS_CUDA if a.is_cuda else _PAIRS) // (centres.shape[0] * centres.shape[1]))
     offset = (log_w - 0.5 * centres.square().sum(-1)).unsqueeze(1)
@@ -173,3 +175,6 @@ def _kernels(a: Tensor, centres: Tensor, log_w: Tensor) -> Tensor:
         torch.baddbmm(offset, rows_of_a, centres.mT).logsumexp(-1) for rows_of_a in a.split(rows, 1)
     ]
     return torch.cat(batches, 1) - 0.5 * a.square().sum(-1)
+
+
+log_mixture = compilable(_log_sum_of_kernels, operator=dispatch.log_mixture)

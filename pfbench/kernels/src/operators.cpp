@@ -116,6 +116,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> normalise_weights(const Tensor& log_w
     return operators::normalise_weights(log_w);
 }
 
+Tensor log_mixture(const Tensor& a, const Tensor& centres, const Tensor& log_w) {
+    ArgumentCheck check("log_mixture");
+    check.real("a", a, "RNK");
+    check.real("centres", centres, "RMK", "M");
+    check.real("log_w", log_w, "RM");
+    return operators::log_mixture(a, centres, log_w);
+}
+
 std::tuple<Tensor, Tensor> weighted_moments(const Tensor& x, const Tensor& w) {
     ArgumentCheck check("weighted_moments");
     check.real("x", x, "RND");
@@ -189,6 +197,7 @@ const pfbench::Registration registration(
     pfbench::entry<&sum_and_squares>("sum_and_squares"),
     pfbench::entry<&sum_log_weights>("sum_log_weights"),
     pfbench::entry<&normalise_weights>("normalise_weights"),
+    pfbench::entry<&log_mixture>("log_mixture"),
     pfbench::entry<&weighted_moments>("weighted_moments"),
     pfbench::entry<&cholesky_factor>("cholesky_factor"),
     pfbench::entry<&kalman_update>("kalman_update"),
@@ -245,6 +254,10 @@ DIRECT_CALL aoti_torch_cpu_sum_log_weights(AtenTensorHandle log_likelihood, Aten
 
 DIRECT_CALL aoti_torch_cpu_normalise_weights(AtenTensorHandle log_w, AtenTensorHandle* result_0, AtenTensorHandle* result_1, AtenTensorHandle* result_2, AtenTensorHandle* result_3) {
     return call_directly<&normalise_weights>({result_0, result_1, result_2, result_3}, log_w);
+}
+
+DIRECT_CALL aoti_torch_cpu_log_mixture(AtenTensorHandle a, AtenTensorHandle centres, AtenTensorHandle log_w, AtenTensorHandle* result_0) {
+    return call_directly<&log_mixture>({result_0}, a, centres, log_w);
 }
 
 DIRECT_CALL aoti_torch_cpu_weighted_moments(AtenTensorHandle x, AtenTensorHandle w, AtenTensorHandle* result_0, AtenTensorHandle* result_1) {

@@ -16,6 +16,7 @@ Tensor count_unique(const Tensor& ancestors, const Tensor& log_w);
 std::tuple<Tensor, Tensor> sum_and_squares(const Tensor& terms);
 Tensor sum_log_weights(const Tensor& log_likelihood, const Tensor& log_w, const Tensor& log_ratio);
 std::tuple<Tensor, Tensor, Tensor, Tensor> normalise_weights(const Tensor& log_w);
+Tensor log_mixture(const Tensor& a, const Tensor& centres, const Tensor& log_w);
 std::tuple<Tensor, Tensor> weighted_moments(const Tensor& x, const Tensor& w);
 std::tuple<Tensor, Tensor> cholesky_factor(const Tensor& covariance);
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor> kalman_update(const Tensor& m, const Tensor& r, const Tensor& omega);

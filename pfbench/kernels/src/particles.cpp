@@ -319,7 +319,6 @@ void moments(T* mean, T* variance, const T* x, const T* weight, int64_t componen
         }
 }
 
-constexpr std::array<int64_t, 3> COMPONENTS_FIRST = {2, 0, 1};
 
 template <class T>
 Tensor drawn(void (*draw)(T*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t), const Tensor& seed,

@@ -83,6 +83,8 @@ class Packed {
     Packed(const Packed&) = delete;
 };
 
+constexpr std::array<int64_t, 3> COMPONENTS_FIRST = {2, 0, 1};
+
 // A few numbers of any type, [R or 1, K or 1] or [R or 1], as [R, K] of another.
 template <class T>
 std::vector<T> few(const Tensor& a, int64_t rows, int64_t columns = 1) {

@@ -1,10 +1,11 @@
-// Normalisation of log weights: one exponential per particle and three passes over the particles of a run.
+// Normalisation of log weights: one exponential per particle and three passes over the particles of a run. Mixtures of Gaussian kernels.
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
 #include <limits>
 #include <tuple>
+#include <vector>
 
 #include "operators.h"
 
@@ -107,6 +108,63 @@ void normalise(T* log_w, T* log_total, T* w, T* ess, const T* from, int64_t slot
     }
 }
 
+// The mixture of the kernels of a run, with its centres component by component. A few points share what they read of a centre.
+template <class T>
+class Mixture {
+    typedef T Lanes __attribute__((vector_size(REGISTER), aligned(sizeof(T)), may_alias));
+    static constexpr int64_t WIDE = REGISTER / sizeof(T), FEW = 4;
+    const int64_t components, count, padded;
+    std::vector<T> centre, log_weight, term;
+
+  public:
+    Mixture(int64_t components, int64_t count)
+        : components(components), count(count), padded((count + WIDE - 1) / WIDE * WIDE), centre(components * padded),
+          log_weight(padded, -std::numeric_limits<T>::infinity()), term(FEW * padded) {}
+
+    void set(const T* centres, int64_t plane, const T* log_w) {
+        for (int64_t k = 0; k < components; ++k) std::copy_n(centres + k * plane, count, centre.data() + k * padded);
+        std::copy_n(log_w, count, log_weight.data());
+    }
+
+    void evaluate(T* out, const T* a, int64_t plane, int64_t points) {
+        for (int64_t first = 0; first < points; first += FEW) {
+            const int64_t here = std::min(FEW, points - first);
+            const T* point[FEW];
+            for (int64_t f = 0; f < FEW; ++f) point[f] = a + first + std::min(f, here - 1);
+            for (int64_t j = 0; j < padded; j += WIDE) {
+                Lanes square[FEW] = {};
+                for (int64_t k = 0; k < components; ++k) {
+                    const Lanes at = *reinterpret_cast<const Lanes*>(centre.data() + k * padded + j);
+                    for (int64_t f = 0; f < FEW; ++f) {
+                        const Lanes apart = at - point[f][k * plane];
+                        square[f] += apart * apart;
+                    }
+                }
+                const Lanes weight = *reinterpret_cast<const Lanes*>(log_weight.data() + j);
+                for (int64_t f = 0; f < FEW; ++f) *reinterpret_cast<Lanes*>(term.data() + f * padded + j) = weight - T(0.5) * square[f];
+            }
+            for (int64_t f = 0; f < here; ++f) out[first + f] = log_sum(term.data() + f * padded);
+        }
+    }
+
+  private:
+    T log_sum(T* terms) const {
+        constexpr T INFINITE = std::numeric_limits<T>::infinity();
+        T top = -INFINITE;
+        int32_t wrong = 0;
+#pragma omp simd reduction(max : top) reduction(| : wrong)
+        for (int64_t i = 0; i < padded; ++i) {
+            top = terms[i] > top ? terms[i] : top;
+            wrong |= terms[i] != terms[i];
+        }
+        if (wrong) return std::numeric_limits<T>::quiet_NaN();
+        if (!std::isfinite(top)) return top;
+#pragma omp simd
+        for (int64_t i = 0; i < padded; ++i) terms[i] = exponential(terms[i] - top);
+        return top + std::log(totals(terms, padded).first);
+    }
+};
+
 // A column [R, 1] that holds for all slots, or numbers [R, N], in rows.
 template <class T>
 struct Rows {
@@ -149,5 +207,20 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> operators::normalise_weights(const Te
             normalise(numbers<T>(log_out) + r * slots, numbers<T>(log_total) + r, numbers<T>(w) + r * slots, numbers<T>(ess) + r,
                       from.data + r * slots, slots);
         return std::make_tuple(log_out, log_total, w, ess);
+    });
+}
+
+Tensor operators::log_mixture(const Tensor& a, const Tensor& centres, const Tensor& log_w) {
+    const int64_t runs = a.size(0), points = a.size(1), components = a.size(2), count = centres.size(1);
+    return by_type(a, [&](auto like) {
+        using T = decltype(like);
+        const Tensor out = fresh<T>({runs, points});
+        const Packed<T> at(a, COMPONENTS_FIRST), centre(centres, COMPONENTS_FIRST), weight(log_w);
+        Mixture<T> mixture(components, count);
+        for (int64_t r = 0; r < runs; ++r) {
+            mixture.set(centre.data + r * count, runs * count, weight.data + r * count);
+            mixture.evaluate(numbers<T>(out) + r * points, at.data + r * points, runs * points, points);
+        }
+        return out;
     });
 }
