@@ -121,7 +121,7 @@ def eager_function(name: str) -> Callable[..., Any]:
         "sum_and_squares": belief._totals,
         "sum_log_weights": belief._add_terms,
         "normalise_weights": belief.normalise_updated_weights,
-        "log_mixture": swarm_weighting.log_mixture,
+        "log_mixture": swarm_weighting._mixture,
         "weighted_moments": belief._flat_moments,
         "cholesky_factor": linear_algebra.factor,
         "kalman_update": kalman_update._updated,

@@ -625,13 +625,23 @@ def test_the_first_sentence_says_what_holds_at_equal_time(tabs: dict[TabKey, Ove
 
 
 def test_the_page_shows_all_tables(tabs: dict[TabKey, Overview]) -> None:
-    pack = {"study": "s", "title": "T", "generated": {"version": "0", "commit": "abc", "date": ""}}
+    pack = {
+        "study": "s", "title": "T", "generated": {"version": "0", "commit": "abc", "date": ""},
+        "failures": [
+            {"choices": {"scenario": world, "filter": "sir"}, "message": "ValueError: x must be 1, got 2. Set 1."}
+            for world in ("azimuth", "elsewhere", "azimuth")
+        ],
+    }  # fmt: skip
     files = render_overview(tabs, pack)
     page = files["index.html"]
+    assert "<li>SIR in azimuth; elsewhere, since x must be 1</li>" in page
+    assert "Not on this page: SIR in azimuth; elsewhere, since x must be 1" in files["report.md"]
+    has_star = any(winner.wins for tab in tabs.values() for winner in tab.winners)
+    assert ("☆" in page) == has_star
     assert "How many particles are enough?" in page
     assert "paired runs each, 1000 particles" in page
     assert "<summary>100 particles</summary>" in page
-    assert "<summary>The methods as printed</summary>" in page
+    assert "<summary>The methods as printed, 100 particles</summary>" in page
     assert len(files["error_by_time.svg"]) < 60_000
     cells = pd.read_csv(io.StringIO(files["cells.csv"]))
     assert set(cells["table"]) == {"100", "1000", EQUAL_TIME, PRINTED}

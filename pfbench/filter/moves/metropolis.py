@@ -282,13 +282,20 @@ class McmcKernel(Protocol):
         """Return the particles without the part of their history that follows from the rest.
 
         The steps of a sweep then neither propose nor select it, and `complete` restores it after the last one.
+
+        Args:
+            model: State-space model of the step.
+            belief: Particles with their history.
+
+        Returns:
+            Particles that `propose` accepts.
         """
         return belief
 
     def complete(
         self,
         model: StateSpaceModel,
-        moved: ParticleBelief,
+        short: ParticleBelief,
         before: ParticleBelief,
         accepted: Tensor,
     ) -> ParticleBelief:
@@ -296,14 +303,14 @@ class McmcKernel(Protocol):
 
         Args:
             model: State-space model of the step.
-            moved: Shortened particles after the last step.
+            short: Shortened particles after the last step.
             before: Whole particles before the first step.
             accepted: Mask of particles that moved, [R, N].
 
         Returns:
             Particles with the history that their steps would have had without `shorten`.
         """
-        return moved
+        return short
 
 
 @dataclass(frozen=True)
@@ -341,24 +348,25 @@ class MetropolisHastings(Move):
         rate = torch.zeros_like(belief.log_w[:, 0])
         if self.mcmc_steps == 0:
             return belief, rate
-        short = self.kernel.shorten(model, belief)
         if belief.x.is_cuda:  # a mask is cheaper than waiting for the number of runs
+            short = self.kernel.shorten(model, belief)
             swept, accepted = self._sweep(model, short, draws)
             rate = torch.where(resampled, self._rate(accepted, belief.log_w), rate)
-            moved = _replace_runs(short, swept, None, resampled)
+            short = _replace_runs(short, swept, None, resampled)
             accepted = accepted * resampled.unsqueeze(1)
-            return self.kernel.complete(model, moved, belief, accepted > 0.0), rate
+            return self.kernel.complete(model, short, belief, accepted > 0.0), rate
         rows = resampled.nonzero().squeeze(1)
         if len(rows) == 0:
             return belief, rate
+        short = self.kernel.shorten(model, belief)
         selected = _select_runs(short, rows)
-        swept, some = self._sweep(model, selected, select_runs(draws, rows))
-        rate = rate.index_copy(0, rows, self._rate(some, swept.log_w))
+        swept, count = self._sweep(model, selected, select_runs(draws, rows))
+        rate = rate.index_copy(0, rows, self._rate(count, swept.log_w))
         unchanged = {k for k, a in selected.window.items() if swept.window[k] is a}
         window = swept.window | {k: short.window[k] for k in unchanged}
-        moved = _replace_runs(short, swept._replace(window=window), rows, resampled)
-        accepted = torch.zeros_like(belief.log_w).index_copy(0, rows, some)
-        return self.kernel.complete(model, moved, belief, accepted > 0.0), rate
+        short = _replace_runs(short, swept._replace(window=window), rows, resampled)
+        accepted = torch.zeros_like(belief.log_w).index_copy(0, rows, count)
+        return self.kernel.complete(model, short, belief, accepted > 0.0), rate
 
     def _sweep(
         self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream

@@ -282,23 +282,23 @@ class NoiseFlowKernel(McmcKernel):
     def complete(
         self,
         model: StateSpaceModel,
-        moved: ParticleBelief,
+        short: ParticleBelief,
         before: ParticleBelief,
         accepted: Tensor,
     ) -> ParticleBelief:
         """Return moved particles with the paths that follow from their starts."""
-        if "score" not in moved.window:
-            return moved
+        if "score" not in short.window:
+            return short
         window, states, values = before.window, [], []
-        x = moved.window["states"][:, :, 0]
+        x = short.window["states"][:, :, 0]
         for j, record in enumerate(before.past):
             if j > 0:
                 x = model.propagate(x, record.u, window["noise"][:, :, j - 1])
             value = model.log_likelihood(record.y, x, record.u)
             states.append(torch.where(accepted.unsqueeze(2), x, window["states"][:, :, j]))
             values.append(torch.where(accepted, value, window["log_like"][:, :, j]))
-        whole = {"states": stack_history(states), "log_like": stack_history(values)}
-        return moved._replace(x=states[-1], window=window | whole)
+        additions = {"states": stack_history(states), "log_like": stack_history(values)}
+        return short._replace(x=states[-1], window=window | additions)
 
     def _refresh_noise(self, model: StateSpaceModel, w: Tensor, draws: RandomStream) -> Tensor:
         """Mix the noises [R, N, K, W] with new ones."""

@@ -161,7 +161,7 @@ class MixtureWeighting(SwarmWeighting):
         a = centres + h.unsqueeze(-1) * draws.normal("swarm.kernel", n, k)
         a = torch.where(defensive.mask.unsqueeze(-1), predicted, a)
         scaled, scaled_centres = a / h.unsqueeze(-1), centres / h.unsqueeze(-1)
-        log_g = log_mixture(scaled, scaled_centres, torch.log_softmax(log_w, 1)) - k * torch.log(h)
+        log_g = _mixture(scaled, scaled_centres, torch.log_softmax(log_w, 1)) - k * torch.log(h)
         log_p = -compute_half_square(a)
         log_ratio = log_p - defensive.log_mixture(log_p, log_g)
         return torch.where(defensive.mask.unsqueeze(-1), frame.q, a @ root.mT), log_ratio
@@ -177,4 +177,4 @@ def _log_sum_of_kernels(a: Tensor, centres: Tensor, log_w: Tensor) -> Tensor:
     return torch.cat(batches, 1) - 0.5 * a.square().sum(-1)
 
 
-log_mixture = compilable(_log_sum_of_kernels, operator=dispatch.log_mixture)
+_mixture = compilable(_log_sum_of_kernels, operator=dispatch.log_mixture)
