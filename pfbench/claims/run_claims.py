@@ -93,12 +93,16 @@ Decisions = Mapping[tuple[str, str, str], ClaimDecision]
 def price_claims(
     plans: Sequence[ClaimPlan], runs: ClaimRuns, decisions: Decisions
 ) -> list[ClaimPrice]:
-    """Price the next stage of each claim that runs can still decide, the cheapest first."""
+    """Price the next stage of each claim that runs can still decide, the cheapest first.
+
+    Jobs that may refuse are the first of a claim: they take seconds, and one that refuses in all readings decides it.
+    """
     prices = []
     for plan in plans:
         mine = [decided for (claim, _, _), decided in decisions.items() if claim == plan.claim.id]
         for stage in (SCREEN, CENTRE, MOVER):
-            tasks = tuple(_list_missing(plan, stage, runs, mine))
+            missing = _list_missing(plan, stage, runs, mine)
+            tasks = tuple(sorted(missing, key=lambda task: not may_refuse(task)))
             if tasks and (stage == SCREEN or any(d.word in (OPEN, DEPENDS) for d in mine)):
                 prices.append(ClaimPrice(plan, stage, tasks))
                 break
