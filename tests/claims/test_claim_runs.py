@@ -45,6 +45,7 @@ from pfbench.claims.run_claims import (
     draw_records,
     find_measures,
     list_words,
+    may_refuse,
     merge_tasks,
     price_claims,
     run_claim_task,
@@ -225,6 +226,15 @@ def test_the_cheapest_undecided_claim_is_first_and_a_decided_one_is_not_run() ->
     tasks = merge_tasks([*prices[0].tasks, *prices[0].tasks], list(PLANS.values()))
     assert len(tasks) == len(prices[0].tasks)
     assert len(tasks[0].measures) > 1  # the quantities of all claims of the cell
+
+
+def test_the_jobs_of_a_form_that_may_refuse_are_the_first_of_a_claim() -> None:
+    """They take seconds; in between, those of the other filters would be run before the claim is decided."""
+    plans, empty = [PLANS["C000-1"]], ClaimRuns([])
+    (price,) = price_claims(plans, empty, decide_claims(plans, empty))
+    refusing = [may_refuse(task) for task in price.tasks]
+    assert 3 < sum(refusing) < len(refusing)
+    assert refusing == sorted(refusing, reverse=True)
 
 
 def test_cells_are_verified_by_a_seed_at_least_three_a_paper() -> None:
