@@ -262,8 +262,9 @@ def test_sentences_are_short_and_state_numbers_of_the_tables(overview: Overview)
     words = ["lost" if c.loses_track else c.verdict.word for c in cells_of]
     single = sum(winner.wins for winner in overview.kalman_winners)
     assert f"better in {words.count('better')} of {len(words)} cells" in headline
-    assert (f"({single} against all of them)" in headline) == (single > 0)
-    counts = re.findall(r"(?i)\bin (\d+)", headline.split("they are", 1)[1])
+    assert (f"(in {single} than all single ones)" in headline) == (single > 0)
+    against_best = re.sub(r"\(.*?\)", "", headline.split("Kalman filter:", 1)[1])
+    counts = re.findall(r"\bin (\d+)", against_best)
     assert sum(map(int, counts)) == len(words)
     cells = list_verdicts(overview).set_index(["world", "filter"])
     for method in overview.methods:

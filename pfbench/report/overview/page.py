@@ -171,15 +171,15 @@ def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> 
     cells = [cell for cell in overview.cells if cell.filter in overview.methods]
     words = ["lost" if cell.loses_track else cell.verdict.word for cell in cells]
     single = sum(winner.wins for winner in overview.kalman_winners)
-    better_than_each = f" ({single} against all of them)" if single else ""
+    better_than_each = f" (in {single} than all single ones)" if single else ""
     counts = [
         f"better in {words.count('better')} of {len(cells)} cells{better_than_each}",
         f"equal in {words.count('equal') + words.count('identical')}",
         f"not decided in {words.count('not decided')}",
         f"worse in {words.count('worse')}",
     ]
-    lost = f" In {words.count('lost')} cells they lose track." if "lost" in words else ""
-    return f"{first} Against each world's best Kalman filter they are {', '.join(counts)}.{lost}"
+    lost = f" Lost in {words.count('lost')}." if "lost" in words else ""
+    return f"{first} Against each world's best Kalman filter: {', '.join(counts)}.{lost}"
 
 
 def _name_winners(overview: Overview, most: int = 2) -> str:
@@ -196,8 +196,8 @@ def describe_setting(overview: Overview, level: TabKey = 0) -> str:
     runs = sorted({world.runs for world in overview.worlds})
     counts = f"{runs[0]}" if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
     return (
-        f"{len(overview.worlds)} worlds, {counts} paired runs each{f', {level} particles' if level else ''}{_name_numbers(overview)}.{_name_absent(overview)} An error counts up to the "
-        f"track limit of its world, which a lost run has. {_describe_reference(overview)} Conventional are all filters but the proposed ones"
+        f"{len(overview.worlds)} worlds, {counts} paired runs each{f', {level} particles' if level else ''}{_name_numbers(overview)}.{_name_absent(overview)} An error above the "
+        f"track limit of its world counts as that limit, as a lost run does. {_describe_reference(overview)} Conventional are all filters but the proposed ones"
         f"{', a bank of EKFs among them' if 'ekf_bank' in overview.conventional else ''}."
     )
 
