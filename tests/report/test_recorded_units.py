@@ -190,7 +190,7 @@ def test_simulated_data_have_no_such_section(tmp_path: Path) -> None:
 
 
 def test_the_source_names_numbers_of_its_regime_and_of_the_receiver() -> None:
-    noise = {"_target_": "a.B", "sd_m": 7.0, "probability": 0.0, "bias_m": [1.0, 2.0], "paper": {"words": "white errors"}}  # fmt: skip
+    noise = {"_target_": "a.B", "sd_m": 7.0, "probability": 0.0, "bias_m": [1.0, 2.0], "windows_s": [[5.0, 9.0]], "paper": {"words": "white errors"}}  # fmt: skip
     record = {"noise": "added_white", "simulated": _describe_regime(noise), "added": "range_sd 1", "drives": 2, "seconds": 10.0, "runs": 2}  # fmt: skip
     text = _describe_source(record, "outages")
-    assert text == "Measurements: recorded, plus simulated outages (sd_m 7; bias_m 1, 2) and white errors (range_sd 1). 2 drives of 10 s, 2 runs."  # fmt: skip
+    assert text == "Measurements: recorded, plus simulated outages (sd_m 7; bias_m 1, 2; windows_s 5, 9) and white errors (range_sd 1). 2 drives of 10 s, 2 runs."  # fmt: skip

@@ -100,7 +100,7 @@ def _describe_regime(noise: Mapping[str, Any]) -> str:
     """Name the numbers of a noise regime that are not 0."""
     values = {name: value for name, value in noise.items() if name != "paper" and not name.startswith("_") and value}  # fmt: skip
     return "; ".join(
-        f"{name} {', '.join(f'{v:g}' for v in np.atleast_1d(value))}"
+        f"{name} {', '.join(f'{v:g}' for v in np.ravel(value))}"
         for name, value in values.items()
         if np.issubdtype(np.asarray(value).dtype, np.number)
     )
