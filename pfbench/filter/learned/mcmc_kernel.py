@@ -15,7 +15,7 @@ from pfbench.filter.learned.differentiable_resampling import sample_from
 from pfbench.filter.learned.networks import CheckpointSpec, build_networks
 from pfbench.filter.learned.proposal import NetworkFactory
 from pfbench.filter.linearisation import unwrap_independent
-from pfbench.filter.moves.metropolis import StateHistory, concatenate_histories
+from pfbench.filter.moves.metropolis import McmcKernel, StateHistory, concatenate_histories
 from pfbench.filter.moves.path_kernels import propagate_path
 from pfbench.filter.particle.proposals import log_standard_normal
 from pfbench.model.base import StateSpaceModel
@@ -23,7 +23,7 @@ from pfbench.model.base import StateSpaceModel
 _LIMIT = 10.0
 
 
-class LearnedRandomWalk(nn.Module):
+class LearnedRandomWalk(nn.Module, McmcKernel):
     """Random walk of the last `lag` noises with a learned distribution of the step.
 
     The noises move by h delta, and the path from the state before them follows [after Song et al.

@@ -306,20 +306,25 @@ def describe_reach(
         if not records:
             continue
         name, drives = worlds[world].name if world in worlds else world, records[0]["drives"]
-        unit, by = ("blocks", "blocks of time, for other stretches") if drives == 1 else ("drives", "drives, for other drives")  # fmt: skip
+        unit, by = ("blocks", "blocks of time") if drives == 1 else ("drives", "drives")  # fmt: skip
         words = Counter(row[unit]["word"] for record in records for row in record["rows"])
-        texts = [f"{n} {'is' if n == 1 else 'are'} {word}" for word, n in words.items()]
-        decided_by = f" By {by}, {', '.join(texts)}." if texts else ""
-        sentences.append(f"{describe_drives(name, drives)}.{decided_by}")
+        texts = [f"{n} {word}" for word, n in words.items()]
+        kind = _count_recorded(drives)
+        where = f"On {kind}" if len(worlds) == 1 else f"{name}, {kind}"
+        decided_by = f"; by {by} {', '.join(texts)}" if texts else ""
+        sentences.append(f"{where}{decided_by}.")
     return " ".join(sentences)
 
 
 def describe_drives(name: str, drives: int) -> str:
     """Say of what the runs of recorded drives are a sample."""
-    kind, on = (
-        ("one recorded drive", "it") if drives == 1 else (f"{drives} recorded drives", "them")
-    )
-    return f"{name} is {kind}: these words are about other starts and random numbers on {on}"
+    on = "it" if drives == 1 else "them"
+    return f"{name} is {_count_recorded(drives)}: these words are about other starts and random numbers on {on}"
+
+
+def _count_recorded(drives: int) -> str:
+    """Count recorded drives in words."""
+    return "one recorded drive" if drives == 1 else f"{drives} recorded drives"
 
 
 def describe_records(pack: Mapping[str, Any]) -> list[dict[str, Any]]:
