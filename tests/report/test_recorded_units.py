@@ -168,7 +168,7 @@ def test_drives_without_a_run_do_not_count(tmp_path: Path) -> None:
     results = recorded_study(tmp_path / "results", {"flights": list(range(RUNS + 8))})
     page = write_report("own", results, tmp_path / "reports")
     text = (page.parent / "report.md").read_text()
-    assert f"flight is {RUNS} recorded drives" in text
+    assert f"On {RUNS} recorded drives" in text
     assert f"{RUNS + 8} drives" not in text
 
 
