@@ -268,7 +268,7 @@ class NoiseFlowKernel(McmcKernel):
         if not (is_quadratic and belief.past):
             return belief
         window, states = belief.window, belief.window["states"]
-        score, information = measure_start(model, states, belief.past)
+        score, information = _measure_start(model, states, belief.past)
         window = {
             "states": states[:, :, :1],
             "mean": window["mean"],
@@ -338,7 +338,7 @@ def propagate_path(
     return stack_history(states), stack_history(values)
 
 
-def measure_start(
+def _measure_start(
     model: StateSpaceModel, states: Tensor, past: tuple[Record, ...]
 ) -> tuple[Tensor, Tensor]:
     """Compute gradient and curvature of the log likelihood of paths in their start, of a linear model.

@@ -319,7 +319,6 @@ void moments(T* mean, T* variance, const T* x, const T* weight, int64_t componen
         }
 }
 
-
 template <class T>
 Tensor drawn(void (*draw)(T*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t), const Tensor& seed,
              int64_t purpose, const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {

@@ -306,7 +306,7 @@ def describe_reach(
         if not records:
             continue
         name, drives = worlds[world].name if world in worlds else world, records[0]["drives"]
-        unit, by = ("blocks", "blocks of time") if drives == 1 else ("drives", "drives")  # fmt: skip
+        unit, by = ("blocks", "blocks of time") if drives == 1 else ("drives", "drives")
         words = Counter(row[unit]["word"] for record in records for row in record["rows"])
         texts = [f"{n} {word}" for word, n in words.items()]
         kind = _count_recorded(drives)
