@@ -37,6 +37,7 @@ from pfbench.report.overview.tables import (
     central_rows,
     has_overview,
     list_levels,
+    list_rivals,
     name_without_level,
     read_world_facts,
     tell_story,
@@ -49,6 +50,7 @@ from pfbench.stats.world_table import (
     World,
     build_world,
     compare_methods,
+    count_wins,
     decide_cells,
     find_winners,
     rank_methods,
@@ -273,6 +275,41 @@ def test_sentences_are_short_and_state_numbers_of_the_tables(overview: Overview)
             r"(\w+) \((\d+\.\d+)\)", f"{story['wins']}; {story['loses']}"
         ):
             assert f"{cells.loc[(world, method), 'ratio']:.2f}" == ratio
+        of_method = [c for c in overview.cells if c.filter == method]
+        parts = [story[key] for key in ("wins", "equal", "open", "loses")]
+        for world in overview.worlds:
+            assert sum(world.name in text for text in parts) == sum(
+                cell.world == world.key for cell in of_method
+            )
+
+
+def test_wins_over_some_kalman_filters_alone_have_a_dagger(overview: Overview) -> None:
+    """A dagger is what separates the two counts of the headline."""
+    winners = [w._replace(wins=k == 0) for k, w in enumerate(overview.kalman_winners)]
+    cells = [
+        c._replace(verdict=c.verdict._replace(word="better"), loses_track=False)
+        for c in overview.cells
+    ]
+    page = overview._replace(cells=cells, kalman_winners=winners)
+    wins = [tell_story(page, method, "")["wins"] for method in page.methods]
+    count = sum(cell.filter in page.methods for cell in cells)
+    assert sum(text.count("†") for text in wins) == count - 1
+    world = {w.key: w.name for w in page.worlds}[winners[0].world]
+    of_winner = wins[page.methods.index(winners[0].filter)]
+    assert re.search(rf"{re.escape(world)} \(\d+\.\d+\)", of_winner)
+
+
+def test_rivals_name_the_worlds_behind_the_counts_of_the_matrices(overview: Overview) -> None:
+    rows = list_rivals(overview)
+    count = len(overview.methods)
+    assert len(rows) == count * (count - 1) // 2
+    labels = {name: label for label, name in overview.names.items()}
+    wins = count_wins(overview.pairs, [world.key for world in overview.worlds])
+    for first, second, better, worse in rows:
+        a, b = labels[first], labels[second]
+        assert len([w for w in better.split("; ") if w]) == wins[a, b]
+        assert len([w for w in worse.split("; ") if w]) == wins[b, a]
+    assert any(better for _, _, better, _ in rows) or any(worse for *_, worse in rows)
 
 
 def test_a_win_against_kalman_filters_is_one_against_each_of_them(

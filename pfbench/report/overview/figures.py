@@ -142,16 +142,17 @@ def draw_doses(
 ) -> Figure:
     """Draw the error of methods and conventional filters against the number of particles, or the time of a step.
 
-    A panel is a world. Points have the simultaneous intervals of the heat map; those of neighbours are moved apart.
+    A panel is a world, at most three in a row. Points have the simultaneous intervals of the heat map; those of neighbours are moved apart.
     """
-    columns = 1 if size.name else max(len(worlds), 1)
+    columns = 1 if size.name else max(1, min(len(worlds), 3))
     rows = -(-len(worlds) // columns)
     shape = (size.width / _DPI, rows * (250 if size.name else 300) / _DPI)
     with matplotlib.rc_context({**RC, "font.size": size.font}):
         figure = Figure(figsize=shape, dpi=_DPI, layout="constrained")
-        for axes, world in zip(
-            np.ravel(figure.subplots(rows, columns, squeeze=False)), worlds, strict=False
-        ):
+        panels = np.ravel(figure.subplots(rows, columns, squeeze=False))
+        for empty in panels[len(worlds) :]:
+            empty.remove()
+        for axes, world in zip(panels, worlds, strict=False):
             for label in (*_first(overviews).methods, *_first(overviews).conventional):
                 _draw_dose(axes, dose_points(overviews, world, label, axis), label, overviews)
             axes.set(xscale="log", yscale="log", title=world.name)

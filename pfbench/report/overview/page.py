@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import itertools
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,6 +19,7 @@ from pfbench.report.overview.tables import (
     Overview,
     TabKey,
     WorldRow,
+    list_rivals,
     tell_story,
 )
 from pfbench.report.papers.figures import list_paper_pages
@@ -71,6 +73,7 @@ def render_overview(
         "format_error": figures.format_reference_error,
         "filters": [overview.names[label] for label in (*overview.methods, *overview.conventional)],
         "stories": [tell_story(overview, m, _summary(m)) for m in overview.methods],
+        "rivals": list_rivals(overview),
         "count": spell_number(len(overview.methods)),
         "pictures": {name: Markup(_data_address(text)) for name, text in pictures.items()},
         "decided": sum(pair.verdict.word in ("better", "worse") for pair in overview.pairs),
@@ -131,23 +134,19 @@ def draw_pictures(overviews: Mapping[TabKey, Overview]) -> dict[str, str]:
         for size in figures.MATRIX_FORMATS:
             pictures[f"matrices{suffix}{size.name}"] = figures.draw_matrices(overview, size)
     if len(levels) > 1:
-        worlds = select_dose_worlds(overviews[first])
-        for axis in ("particles", "time"):
-            for size in figures.DOSE_FORMATS:
-                pictures[f"error_by_{axis}{size.name}"] = figures.draw_doses(
-                    levels, worlds, axis, size
-                )
+        worlds = order_dose_worlds(overviews[first])
+        for axis, size in itertools.product(("particles", "time"), figures.DOSE_FORMATS):
+            for suffix, some in (("", worlds[:2]), ("_others", worlds[2:])):
+                if some:
+                    figure = figures.draw_doses(levels, some, axis, size)
+                    pictures[f"error_by_{axis}{suffix}{size.name}"] = figure
     return {name: figures.to_svg(figure) for name, figure in pictures.items()}
 
 
-def select_dose_worlds(overview: Overview, most: int = 2) -> list[WorldRow]:
-    """Select the worlds in which the most methods are better than the reference; those that it does not fit first."""
-    wins = {
-        world.key: sum(c.verdict.word == "better" for c in overview.cells if c.world == world.key)
-        for world in overview.worlds
-    }
-    order = sorted(overview.worlds, key=lambda w: (w.kalman_fits is not False, -wins[w.key]))
-    return order[:most]
+def order_dose_worlds(overview: Overview) -> list[WorldRow]:
+    """Order worlds by the methods that are better than the reference; those that it does not fit first."""
+    wins = Counter(cell.world for cell in overview.cells if cell.verdict.word == "better")
+    return sorted(overview.worlds, key=lambda w: (w.kalman_fits is not False, -wins[w.key]))
 
 
 def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> str:

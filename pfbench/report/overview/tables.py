@@ -385,28 +385,53 @@ def _list_times(table: pd.DataFrame, worlds: Sequence[str]) -> dict[tuple[str, s
 
 
 def tell_story(overview: Overview, method: str, summary: str) -> dict[str, str]:
-    """Return what a method is, where it wins and loses, and the time of its step, with numbers from the tables."""
+    """Return what a method is, where it wins and loses, and the time of its step, with numbers from the tables.
+
+    A win that is not shown against every single Kalman filter has a dagger.
+    """
     cells = [cell for cell in overview.cells if cell.filter == method]
     names = {world.key: world.name for world in overview.worlds}
-    lost = [names[c.world] for c in cells if c.loses_track]
-    by_word: dict[str, list[WorldResult]] = {word: [] for word in _WORDS}
-    for cell in cells:
-        if not cell.loses_track:
-            by_word[cell.verdict.word].append(cell)
-    better = sorted(by_word["better"], key=lambda c: c.verdict.ratio)
-    worse = sorted(by_word["worse"], key=lambda c: -c.verdict.ratio)
-    losses = [_join([f"{names[c.world]} ({c.verdict.ratio:.2f})" for c in worse])]
-    losses += [f"Loses track: {_join(lost)}"] * bool(lost)
+    over_all = {w.world for w in overview.kalman_winners if w.wins and w.filter == method}
+    by_word: dict[str, list[WorldResult]] = {word: [] for word in (*_WORDS, "lost")}
+    for cell in sorted(cells, key=lambda c: abs(math.log(c.verdict.ratio)), reverse=True):
+        by_word["lost" if cell.loses_track else cell.verdict.word].append(cell)
+
+    def join(*words: str, dagger: Collection[str] = ()) -> str:
+        """Join the worlds of some words, with the ratios of those that are not near 1."""
+        return "; ".join(
+            names[cell.world]
+            + (
+                f" ({cell.verdict.ratio:.2f}{'†' if cell.world in dagger else ''})"
+                * (word in ("better", "worse"))
+            )
+            for word in words
+            for cell in by_word[word]
+        )
+
+    losses = [join("worse"), f"Loses track: {join('lost')}" if by_word["lost"] else ""]
     return {
         "name": overview.names[method],
         "is": summary,
-        "wins": _join([f"{names[c.world]} ({c.verdict.ratio:.2f})" for c in better])
-        or "None shown.",
-        "equal": _join([names[c.world] for c in (*by_word["equal"], *by_word["identical"])]) or "–",
-        "open": _join([names[c.world] for c in by_word["not decided"]]) or "–",
+        "wins": join("better", dagger=names.keys() - over_all) or "None shown.",
+        "equal": join("equal", "identical") or "–",
+        "open": join("not decided") or "–",
         "loses": ". ".join(filter(None, losses)) or "None shown.",
         "time": format_times(overview, method),
     }
+
+
+def list_rivals(overview: Overview) -> list[tuple[str, str, str, str]]:
+    """List each pair of methods with the worlds in which the first is better, and those in which the second is."""
+    names = {world.key: world.name for world in overview.worlds}
+    rows: dict[tuple[str, str], dict[str, list[str]]] = {}
+    for pair in overview.pairs:
+        worlds = rows.setdefault((pair.verdict.a, pair.verdict.b), {"better": [], "worse": []})
+        if pair.verdict.word in worlds:
+            worlds[pair.verdict.word].append(names[pair.world])
+    return [
+        (overview.names[a], overview.names[b], "; ".join(w["better"]), "; ".join(w["worse"]))
+        for (a, b), w in rows.items()
+    ]
 
 
 def format_times(overview: Overview, method: str) -> str:
@@ -427,9 +452,3 @@ def format_times(overview: Overview, method: str) -> str:
 def format_factor(value: float) -> str:
     """Format a factor with two digits."""
     return f"{value:.0f}" if value >= 9.95 else f"{value:.2g}"
-
-
-def _join(items: Sequence[str], most: int = 3) -> str:
-    """Join items, and count those after the first ones."""
-    more = len(items) - most
-    return "; ".join(items[:most]) + (f" and {more} more" if more > 0 else "")
