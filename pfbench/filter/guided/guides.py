@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
+from torch.distributions import Distribution, MultivariateNormal, Normal
 from typing_extensions import override
 
 from pfbench.core.density import StandardNormal, dense_normal, independent_normal
@@ -322,9 +322,18 @@ class _ParticlesAsRuns(ModelWrapper):
     def observation(self, x: Tensor, u: Any) -> Distribution:
         distribution = self.model.observation(self._joined(x), u)
         mean = distribution.mean.reshape(*x.shape[:2], -1)
-        if isinstance(distribution, torch.distributions.MultivariateNormal):
-            return dense_normal(mean, distribution.scale_tril.reshape(*mean.shape, -1))
-        return independent_normal(mean, distribution.stddev.reshape(mean.shape))
+        if isinstance(distribution, MultivariateNormal):
+            return dense_normal(mean, self._separate(distribution.scale_tril, x.shape[1]))
+        normal = unwrap_independent(distribution)
+        sd = normal.scale if isinstance(normal, Normal) else distribution.stddev
+        return independent_normal(mean, self._separate(sd, x.shape[1]))
+
+    def _separate(self, scale: Tensor, points: int) -> Tensor:
+        """Return scales [R, N P, ...] as [R N, P, ...]; one that a run shares stays one in memory, and is averaged by nobody."""
+        if scale.stride(1) == 0:
+            shape = (self.runs * self.n, points, *scale.shape[2:])
+            return scale[:, :1].repeat_interleave(self.n, 0).expand(shape)
+        return scale.reshape(self.runs * self.n, points, *scale.shape[2:])
 
     def _joined(self, a: Tensor) -> Tensor:
         return a.reshape(self.runs, -1, a.shape[-1])

@@ -677,6 +677,38 @@ def test_a_guide_for_each_particle_gives_the_kalman_filter_on_a_linear_model(nam
     assert abs(float(ratio.mean()) - 1.0) < 4.0 * float(ratio.std()) / math.sqrt(runs)
 
 
+class Receivers(LinearGaussian):
+    """The walk, measured by a receiver of its own in each run: standard deviations [R, 1]."""
+
+    def __init__(self, sd: Tensor, is_dense: bool) -> None:
+        super().__init__([[1.0]], [[1.0]], [[1.0]], [1.0], [0.0], [1.0])
+        self.sd, self.is_dense = sd, is_dense
+
+    def observation(self, x: Tensor, u: Any) -> Any:
+        mean = x @ self.h.mT
+        sd = self.sd.unsqueeze(1)  # of all particles of a run
+        if self.is_dense:
+            return MultivariateNormal(mean, scale_tril=sd.unsqueeze(-1).expand(*mean.shape, 1))
+        return Independent(Normal(mean, sd.expand_as(mean)), 1)
+
+
+@pytest.mark.filterwarnings("ignore:ParticleGuideProposal")
+@pytest.mark.parametrize("is_dense", [False, True])
+def test_guides_of_the_particles_of_a_run_have_the_noise_of_that_run(is_dense: bool) -> None:
+    """Runs with receivers of their own are those of each receiver alone."""
+    method = ParticleFilter(20, proposal=ParticleGuideProposal(CKF))
+    sd, y = torch.tensor([[0.3], [1.0], [4.0]], dtype=WALK_Y.dtype), WALK_Y[:6].expand(3, -1, -1)
+    together = run_filter(
+        method, Receivers(sd, is_dense), Record(y), PhiloxStream(1, torch.arange(3), y.dtype)
+    )
+    for k in range(3):
+        stream = PhiloxStream(1, torch.tensor([k]), y.dtype)
+        alone = run_filter(method, Receivers(sd[k : k + 1], is_dense), Record(y[:1]), stream)
+        torch.testing.assert_close(together.mean[k], alone.mean[0], rtol=1e-10, atol=1e-12)
+        assert float(together.variance[k, -1]) > 0.0
+    assert not torch.allclose(together.mean[0], together.mean[2], rtol=0.1)
+
+
 def test_a_guide_for_each_particle_is_told_to_be_dear() -> None:
     with pytest.warns(UserWarning, match="N times the cost of SharedGuideProposal"):
         filter_record(
