@@ -340,6 +340,19 @@ def test_the_price_of_times_has_the_runs_of_the_filters_that_are_timed() -> None
         assert task.seconds > 2.0 * task.batch.runs * sum(jobs) > 0.0
 
 
+def test_filters_that_take_hours_are_timed_in_fewer_runs() -> None:
+    """A timing takes five minutes, or three runs; quick filters are timed in all runs of the screen."""
+    plans, empty = [PLANS["002-28"]], ClaimRuns([])
+    (price,) = price_claims(plans, empty, decide_claims(plans, empty))
+    counts = {task.timed: task.batch.runs for task in price.tasks if task.timed}
+    each = {pair: n for pair, n in counts.items() if any("_each" in word for word in sum(pair, ()))}
+    assert each
+    assert max(each.values()) < 10
+    assert min(each.values()) >= 3
+    assert {n for pair, n in counts.items() if pair not in each} == {50}
+    assert max(task.seconds for task in price.tasks if task.timed in each) < 400.0
+
+
 def test_a_dry_run_prints_prices_and_runs_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
     places = [f"results_dir={tmp_path}", f"reports_dir={tmp_path}"]
     command.report_claims(["run", "C001-7", "dry=true", *places])
