@@ -23,6 +23,8 @@ from pfbench.report.overview.page import (
     choose_level,
     count_better_worlds,
     describe_setting,
+    describe_times,
+    list_notes,
     list_verdicts,
     render_overview,
     word_headline,
@@ -36,12 +38,14 @@ from pfbench.report.overview.tables import (
     build_overviews,
     central_rows,
     has_overview,
+    is_worse,
     list_levels,
     list_rivals,
     name_without_level,
     read_world_facts,
     tell_story,
 )
+from pfbench.report.overview.world_notes import count_recorded_drives, list_world_notes
 from pfbench.results.conditions import make_distinct_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.stats.world_table import (
@@ -350,6 +354,85 @@ def test_a_win_against_kalman_filters_is_one_against_each_of_them(
     assert not any(won for won, _ in count_better_worlds({0: changed}).values())
 
 
+def test_losses_against_an_untuned_filter_are_those_of_scipy(
+    table: pd.DataFrame, overview: Overview
+) -> None:
+    """The cells that are worse than a tuned reference, and than the plain UKF too, by both tests with Holm's correction."""
+    pairs = [
+        (world.key, cell.filter) for world in overview.worlds for cell in overview.cells
+        if is_worse(cell, world.key) and cell.filter in overview.methods
+    ]  # fmt: skip
+    differences = [losses(table, world, m) - losses(table, world, "ukf") for world, m in pairs]
+    plain = [k for k, d in enumerate(differences) if overview.names["ukf"] != {w.key: w for w in overview.worlds}[pairs[k][0]].reference]  # fmt: skip
+    signed = adjust([stats.wilcoxon(differences[k]).pvalue for k in plain])
+    trimmed = adjust([trimmed_p(differences[k]) for k in plain])
+    expected = {pairs[k] for k in range(len(pairs)) if k not in plain}
+    for k, p, q in zip(plain, signed, trimmed, strict=True):
+        middle = np.median(np.add.outer(differences[k], differences[k])[np.tril_indices(len(differences[k]))]) / 2  # fmt: skip
+        if p < 0.05 and q < 0.05 and middle > math.log(1.05):
+            expected.add(pairs[k])
+    found = {(w.key, m) for w in overview.worlds for m in w.plain_losses or ()}
+    assert found == expected
+    assert 0 < len(found) < len(pairs)
+    text = f"Of the {len(pairs)} worse cells, {len(found)} are worse also than the UKF, which is not tuned either."
+    assert text in describe_setting(overview)
+
+
+def trimmed_p(d: np.ndarray) -> float:
+    """t test of the mean without a fifth at each end [Tukey and McLaughlin 1963]."""
+    cut = int(0.2 * len(d))
+    middle = np.sort(d)[cut : len(d) - cut]
+    spread = np.clip(d, middle[0], middle[-1]).std(ddof=1)
+    t = middle.mean() / (spread / (1 - 2 * cut / len(d)) / math.sqrt(len(d)))
+    return float(2 * stats.t.sf(abs(t), len(middle) - 1))
+
+
+def test_worlds_have_notes_on_what_their_numbers_mean(
+    table: pd.DataFrame, looks: dict[str, MethodLook], parts: dict[str, PartName], overview: Overview
+) -> None:  # fmt: skip
+    """An idle reference, one that loses track, and recordings; no note where there is nothing to know."""
+    assert not list_notes(overview)
+    facts = read_world_facts("azimuth", MODELS["azimuth"])
+    assert facts is not None
+    of_reference = (table["scenario"] == "azimuth") & (table["filter"] == facts.reference)
+    idle = table[of_reference].assign(filter="dead_reckoning")
+    weak = pd.concat([table, idle])
+    names = find_looks(sorted(weak["filter"].unique()))
+    says_nothing = "the best Kalman filter is not shown to be better than dead reckoning"
+    assert list_notes(build_overview(weak, names, parts)) == [("azimuth", says_nothing)]
+    worse = np.random.default_rng(1).uniform(1.5, 3.0, len(weak))
+    able = weak.assign(rmse=weak["rmse"] * np.where(weak["filter"] == "dead_reckoning", worse, 1.0))
+    assert list_notes(build_overview(able, names, parts)) == []
+    runs = table.loc[of_reference, "run"]
+    few = runs[: int(0.4 * len(runs))]
+    keeps = able["keeps_track"] & ~(
+        (able["scenario"] == "azimuth")
+        & (able["filter"] == facts.reference)
+        & able["run"].isin(few)
+    )
+    ((_, text),) = list_notes(build_overview(able.assign(keeps_track=keeps), names, parts))
+    assert f"keeps track in {100 * (1 - len(few) / len(runs)):.0f} % of runs" in text
+
+
+def test_recordings_are_counted_by_the_files_of_their_scenarios() -> None:
+    counts = {
+        "recorded_quad_flights": 20, "recorded_canyon": 1, "recorded_car_drive": 1, "pendulum": 0,
+        "a_scenario_of_another_folder": 0,
+    }  # fmt: skip
+    assert {key: count_recorded_drives(key) for key in counts} == counts
+    frame = pd.DataFrame({"scenario": "recorded_quad_flights", "filter": "ekf", "run": range(9), "rmse": 1.0, "keeps_track": True, "lost": False, "seed": 1})  # fmt: skip
+    world = build_world(frame, "ekf", 10.0)
+    (same,) = list_world_notes([world], {world.name: False})[world.name]
+    assert (
+        same
+        == "the best Kalman filter was tuned on the same 20 recordings, with other random numbers"
+    )
+    drive = world._replace(name="recorded_canyon")
+    single, part = list_world_notes([drive], {drive.name: True})[drive.name]
+    assert single.startswith("one recording: ")
+    assert part == "the best Kalman filter was tuned on a part of it"
+
+
 def test_a_method_with_another_number_of_particles_than_its_table_is_named(
     table: pd.DataFrame, looks: dict[str, MethodLook], parts: dict[str, PartName]
 ) -> None:
@@ -432,7 +515,10 @@ def test_a_tuning_of_the_current_folder_states_its_world(
     file.write_text(
         "world: {scenario: mine, model: own}\nbest: ukf\nkalman_fits: false\nfit: {cap: 7}"
     )
-    assert read_world_facts("mine", "own") == ("ukf", False, 7.0)
+    assert read_world_facts("mine", "own") == ("ukf", False, 7.0, False)
+    part = file.read_text().replace("own}", "own, settings: [scenario.end_s=150]}")
+    file.write_text(part + "\n")
+    assert read_world_facts("mine", "own") == ("ukf", False, 7.0, True)
 
 
 def test_a_study_without_references_keeps_its_first_page(
@@ -602,6 +688,17 @@ def test_filters_at_equal_time_and_as_printed_have_tables_of_their_own(
     ratios = {(c.world, c.filter): c.verdict.ratio for c in printed.cells}
     assert ratios["passive_1", "cpso_escape_printed"] == plain["passive_1", "cpso_escape"]
     assert ratios["passive_1", "sir"] == plain["passive_1", "sir"]
+
+
+def test_filters_that_take_longer_than_the_equal_time_are_named(tabs: dict[TabKey, Overview]) -> None:  # fmt: skip
+    """A filter cannot have less than its fewest particles."""
+    tab = tabs[EQUAL_TIME]
+    worlds = {world.key: world.name for world in tab.worlds}
+    even = dict.fromkeys(tab.times, 2.0)
+    assert describe_times(tab._replace(times=even)) == ""
+    key = next(key for key in even if key[1] == "mcmc_rpf")
+    text = describe_times(tab._replace(times={**even, key: 13.4}))
+    assert text.endswith(f"{tab.names['mcmc_rpf']} 6.7 times ({worlds[key[0]]}).")
 
 
 def test_a_method_that_sets_its_number_itself_is_once_in_the_table_of_equal_time(

@@ -16,9 +16,11 @@ from pfbench.report.overview import figures
 from pfbench.report.overview.tables import (
     EQUAL_TIME,
     PRINTED,
+    SIR,
     Overview,
     TabKey,
     WorldRow,
+    is_worse,
     list_rivals,
     tell_story,
 )
@@ -28,6 +30,7 @@ from pfbench.report.writers import format_csv, format_with_interval, template_en
 from pfbench.results.conditions import parse_label
 from pfbench.results.looks import find_looks
 from pfbench.results.paper_block import read_paper_block
+from pfbench.stats.comparison import TRIM_SHARE
 from pfbench.stats.world_table import WorldResult
 
 BOARD_PAGE = "worlds.html"  # the page of each world, which is the first page of other studies
@@ -68,6 +71,10 @@ def render_overview(
         "has_printed": PRINTED in overviews,
         "has_stars": any(winner.wins for item in overviews.values() for winner in item.winners),
         "failures": describe_failures(pack, overview),
+        "notes": list_notes(overview),
+        "times_note": describe_times(overviews[EQUAL_TIME]) if EQUAL_TIME in overviews else "",
+        "conventional": ", ".join(overview.names[label] for label in overview.conventional),
+        "trim": f"{100 * TRIM_SHARE:.0f} %",
         "foreign_knobs": describe_page_knobs(pack) if "worlds" in pack else "",
         "ratios": list_ratios(overview),
         "format_error": figures.format_reference_error,
@@ -110,7 +117,7 @@ def _select_levels(overviews: Mapping[TabKey, Overview]) -> dict[int, Overview]:
 def _name_tab(key: TabKey, overview: Overview) -> str:
     """Name tables below the first ones."""
     if key == EQUAL_TIME:
-        return "All particle filters with the time of a step of SIR with 1000 particles"
+        return "All particle filters with about the time of a step of SIR with 1000 particles"
     if key != PRINTED:
         return f"{key} particles"
     numbers = {round(overview.numbers[m]) for m in overview.methods if m in overview.numbers}
@@ -191,13 +198,12 @@ def _name_winners(overview: Overview, most: int = 2) -> str:
 
 
 def describe_setting(overview: Overview, level: TabKey = 0) -> str:
-    """Describe worlds, runs, number of particles and losses in a line."""
+    """Describe worlds, runs, number of particles, reference and losses in a few sentences."""
     runs = sorted({world.runs for world in overview.worlds})
     counts = f"{runs[0]}" if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
     return (
-        f"{len(overview.worlds)} worlds, {counts} paired runs each{f', {level} particles' if level else ''}{_name_numbers(overview)}.{_name_absent(overview)} An error above the "
-        f"track limit of its world counts as that limit, as a lost run does. {_describe_reference(overview)} Conventional are all filters but the proposed ones"
-        f"{', a bank of EKFs among them' if 'ekf_bank' in overview.conventional else ''}."
+        f"{len(overview.worlds)} worlds, {counts} paired runs each{f', {level} particles' if level else ''}{_name_numbers(overview)}.{_name_absent(overview)} "
+        f"{_describe_reference(overview)} A run that loses track, or has an error above the limit of its world, counts as that limit."
     )
 
 
@@ -229,10 +235,51 @@ def _describe_reference(overview: Overview) -> str:
     ]
     text = "The best Kalman filter of a world was chosen on another seed, tuned ones among the candidates"
     blocks = [read_paper_block("filter", parse_label(method)[0]) for method in overview.methods]
-    text += "." if any(block.get("tuning") for block in blocks) else "; the methods are not tuned."
+    if any(block.get("tuning") for block in blocks):
+        text += "."
+    else:
+        text += f"; the methods are not tuned{_count_plain_losses(overview)}."
     if better:
         text += f" In these runs another one is better: {', '.join(better)}."
     return text
+
+
+def _count_plain_losses(overview: Overview) -> str:
+    """Say how many of the worse cells remain against a Kalman filter that is not tuned either; empty without it."""
+    worse = sum(
+        is_worse(cell, world.key) and cell.filter in overview.methods
+        for cell in overview.cells
+        for world in overview.worlds
+    )
+    lost = [world.plain_losses for world in overview.worlds]
+    count = sum(len(some) for some in lost if some is not None)
+    if not worse or None in lost:
+        return ""
+    return f". Of the {worse} worse cells, {count} are worse also than the UKF, which is not tuned either"
+
+
+def list_notes(overview: Overview) -> list[tuple[str, str]]:
+    """List the worlds with what must be known before their numbers are quoted."""
+    return [(world.name, "; ".join(world.notes)) for world in overview.worlds if world.notes]
+
+
+def describe_times(overview: Overview, most: float = 1.5) -> str:
+    """Say which filters take longer than SIR in a table of equal time, since they have as few particles as they can."""
+    times, slow = overview.times, []
+    for label in (*overview.methods, *overview.conventional):
+        ratios = {
+            world.name: times[world.key, label] / times[world.key, SIR]
+            for world in overview.worlds
+            if {(world.key, label), (world.key, SIR)} <= times.keys()
+        }
+        worst = max(ratios, key=lambda name: ratios[name], default="")
+        if worst and ratios[worst] > most:
+            slow.append(f"{overview.names[label]} {ratios[worst]:.1f} times ({worst})")
+    return (
+        f"With its fewest particles a filter may still take longer: {', '.join(slow)}."
+        if slow
+        else ""
+    )
 
 
 def spell_number(number: int) -> str:

@@ -16,6 +16,7 @@ import pandas as pd
 import yaml
 
 from pfbench.files import limits
+from pfbench.report.overview.world_notes import find_plain_losses, list_world_notes
 from pfbench.results.conditions import parse_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.results.paper_block import conf_dir, read_paper_block
@@ -37,7 +38,8 @@ from pfbench.stats.world_table import (
 
 FEWEST_METHODS, FEWEST_WORLDS = 3, 2  # from which a study has this page
 CENTRAL = "nominal"  # regime of the page, if a world has several
-CONVENTIONAL = ("sir", "rpf", "rpf_tuned", "ekf_bank")  # that stand next to the methods
+SIR = "sir"
+CONVENTIONAL = (SIR, "rpf", "rpf_tuned", "ekf_bank")  # that stand next to the methods
 TabKey = int | str  # a number of particles, 0 for a study of one number, or one of the two below
 EQUAL_TIME, PRINTED = "equal time", "as printed"
 _TUNING_BYTES = 1_000_000
@@ -59,6 +61,8 @@ class WorldRow(NamedTuple):
         words: What the world is, in a line.
         limit: Largest error that counts.
         outdone: Verdict on the reference against the best other single Kalman filter, if that is better in these runs.
+        notes: What must be known before a number of the world is quoted.
+        plain_losses: Methods that are worse than the reference and than the UKF, which is not tuned; None without a UKF.
     """
 
     key: str
@@ -71,6 +75,8 @@ class WorldRow(NamedTuple):
     words: str = ""
     limit: float = math.nan
     outdone: Verdict | None = None
+    notes: tuple[str, ...] = ()
+    plain_losses: tuple[str, ...] | None = None
 
 
 class Overview(NamedTuple):
@@ -112,11 +118,13 @@ class WorldFacts(NamedTuple):
         reference: Best conventional filter.
         kalman_fits: Whether Kalman filters fit the world; None if it is not known.
         cap: Largest error that counts; NaN if it is not stated.
+        has_part: Whether the tuning had settings of the scenario of its own, such as a part of a recording.
     """
 
     reference: str
     kalman_fits: bool | None
     cap: float
+    has_part: bool = False
 
 
 def read_world_facts(scenario: str, model: str) -> WorldFacts | None:
@@ -133,7 +141,12 @@ def read_world_facts(scenario: str, model: str) -> WorldFacts | None:
                 continue
             if content.get("best"):
                 cap = float((content.get("fit") or {}).get("cap", math.nan))
-                facts = WorldFacts(str(content["best"]), content.get("kalman_fits"), cap)
+                facts = WorldFacts(
+                    str(content["best"]),
+                    content.get("kalman_fits"),
+                    cap,
+                    bool(world.get("settings")),
+                )
                 candidates.append((world.get("regimes") != [CENTRAL], facts))
     return min(candidates, key=lambda item: item[0])[1] if candidates else None
 
@@ -186,14 +199,16 @@ def build_overview(
     conventional = tuple(
         by_name[name] for name in CONVENTIONAL if name in by_name and name not in methods
     )
-    worlds, rows, left_out = [], [], {}
+    worlds, rows, left_out, has_part = [], [], {}, {}
     for key, group in table.groupby("scenario", observed=True, sort=False):
         try:
-            world = _build_world(central_rows(group), parts[str(key)], by_name)
+            facts = _read_facts(central_rows(group), parts[str(key)])
+            world = _build_world(central_rows(group), parts[str(key)], facts, by_name)
         except ValueError as error:
             left_out[parts[str(key)].name] = str(error)
             continue
         worlds.append(world)
+        has_part[world.name] = facts.has_part
         rows.append(_describe_world(world, parts[str(key)], looks))
     order = sorted(range(len(worlds)), key=lambda k: worlds[k].kalman_fits is False)
     worlds, rows = [worlds[k] for k in order], [rows[k] for k in order]
@@ -203,14 +218,31 @@ def build_overview(
         for v in baselines
         if looks[v].family == "kalman" and parse_label(v)[0] not in CONVENTIONAL
     ]
-    outdone = _find_outdone(worlds, single)
+    cells = decide_cells(worlds, [*methods, *conventional])
+    worse = {
+        world.name: [c.filter for c in cells if is_worse(c, world.name) and c.filter in methods]
+        for world in worlds
+    }
+    outdone, notes = _find_outdone(worlds, single), list_world_notes(worlds, has_part)
+    plain_losses = find_plain_losses(worlds, worse)
+    rows = [
+        row._replace(
+            outdone=outdone.get(row.key),
+            notes=notes[row.key],
+            plain_losses=plain_losses.get(row.key),
+        )
+        for row in rows
+    ]
     return Overview(
-        tuple(row._replace(outdone=outdone.get(row.key)) for row in rows), methods, conventional, {label: look.name for label, look in looks.items()},
-        decide_cells(worlds, [*methods, *conventional]), compare_methods(worlds, methods),
-        find_winners(worlds, methods, baselines), rank_methods(worlds, methods),
-        _list_times(table, [row.key for row in rows]), left_out,
-        find_winners(worlds, methods, single),
+        tuple(rows), methods, conventional, {label: look.name for label, look in looks.items()},
+        cells, compare_methods(worlds, methods), find_winners(worlds, methods, baselines), rank_methods(worlds, methods),
+        _list_times(table, [row.key for row in rows]), left_out, find_winners(worlds, methods, single),
     )  # fmt: skip
+
+
+def is_worse(cell: WorldResult, world: str) -> bool:
+    """Return whether a filter is worse than the reference of a world, and does not lose track."""
+    return cell.world == world and cell.verdict.word == "worse" and not cell.loses_track
 
 
 def _find_outdone(worlds: Sequence[World], single: Sequence[str]) -> dict[str, Verdict]:
@@ -353,8 +385,8 @@ def central_rows(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows["regime"] == (CENTRAL if CENTRAL in regimes else next(iter(regimes)))]
 
 
-def _build_world(rows: pd.DataFrame, name: PartName, labels: Mapping[str, str]) -> World:
-    """Build a world with the reference and the cap that its tuning states."""
+def _read_facts(rows: pd.DataFrame, name: PartName) -> WorldFacts:
+    """Read the facts that the tuning of a world states."""
     models = rows["model"].unique() if "model" in rows else [""]
     facts = read_world_facts(name.key, str(models[0]))
     if facts is None:
@@ -362,6 +394,13 @@ def _build_world(rows: pd.DataFrame, name: PartName, labels: Mapping[str, str]) 
             f"{name.key} must have a tuning that states its best conventional filter, got none. "
             f"Run pfbench tune scenario={name.key} model={models[0]}."
         )
+    return facts
+
+
+def _build_world(
+    rows: pd.DataFrame, name: PartName, facts: WorldFacts, labels: Mapping[str, str]
+) -> World:
+    """Build a world with the reference and the cap that its tuning states."""
     cap = name.limit if name.limit else facts.cap
     return build_world(
         rows, labels.get(facts.reference, facts.reference), float(cap), facts.kalman_fits
@@ -435,7 +474,10 @@ def list_rivals(overview: Overview) -> list[tuple[str, str, str, str]]:
 
 
 def format_times(overview: Overview, method: str) -> str:
-    """Return median and range over worlds of the time of a step, relative to that of the reference of the world."""
+    """Return median and range over worlds of the time of a step, relative to that of the reference of the world.
+
+    The median relative to SIR with as many particles follows, if SIR is in the study.
+    """
     labels = {name: label for label, name in overview.names.items()}
     ratios = [
         overview.times[world.key, method] / overview.times[world.key, labels[world.reference]]
@@ -446,7 +488,13 @@ def format_times(overview: Overview, method: str) -> str:
     if not finite:
         return "–"
     middle, low, high = (format_factor(f(finite)) for f in (np.median, min, max))
-    return middle if low == high else f"{middle} ({low} to {high})"
+    text = middle if low == high else f"{middle} ({low} to {high})"
+    against_sir = [
+        overview.times[world.key, method] / overview.times[world.key, SIR]
+        for world in overview.worlds
+        if {(world.key, method), (world.key, SIR)} <= overview.times.keys()
+    ]
+    return f"{text}; {format_factor(float(np.median(against_sir)))} of SIR" if against_sir else text
 
 
 def format_factor(value: float) -> str:
