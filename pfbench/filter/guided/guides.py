@@ -329,7 +329,7 @@ class _ParticlesAsRuns(ModelWrapper):
         return independent_normal(mean, self._separate(sd, x.shape[1]))
 
     def _separate(self, scale: Tensor, points: int) -> Tensor:
-        """Return scales [R, N P, ...] as [R N, P, ...]; one that a run shares stays one in memory, and is averaged by nobody."""
+        """Return scales [R, N P, ...] as [R N, P, ...]; one that a run shares is stored once."""
         if scale.stride(1) == 0:
             shape = (self.runs * self.n, points, *scale.shape[2:])
             return scale[:, :1].repeat_interleave(self.n, 0).expand(shape)
