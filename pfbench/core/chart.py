@@ -56,10 +56,21 @@ class ChartBlock(ABC):
         """
         return d[..., :0]
 
+    def log_volume(self, d: Tensor) -> Tensor:
+        """Return the log of the volume of states per volume of differences at d, [...].
+
+        The measure of states is invariant: it is the same seen from any state. Shapes: d [..., dimension].
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no volume element.")
+
 
 @dataclass(frozen=True)
 class EuclideanBlock(ChartBlock):
     """Real numbers."""
+
+    @override
+    def log_volume(self, d: Tensor) -> Tensor:
+        return torch.zeros_like(d[..., 0])
 
     @override
     def add(self, x: Tensor, d: Tensor) -> Tensor:
@@ -86,6 +97,10 @@ class AngleBlock(ChartBlock):
     def rotation_angles(self, d: Tensor) -> Tensor:
         return d.abs()
 
+    @override
+    def log_volume(self, d: Tensor) -> Tensor:
+        return torch.zeros_like(d[..., 0])
+
 
 @dataclass(frozen=True)
 class QuaternionBlock(ChartBlock):
@@ -111,6 +126,11 @@ class QuaternionBlock(ChartBlock):
     @override
     def rotation_angles(self, d: Tensor) -> Tensor:
         return d.norm(dim=-1, keepdim=True)
+
+    @override
+    def log_volume(self, d: Tensor) -> Tensor:
+        """Return log (2 sin(a / 2) / a)^2 with the angle a: that of rotations by their vectors."""
+        return 2.0 * torch.log(torch.sinc(d.norm(dim=-1) / (2.0 * torch.pi)))
 
 
 @dataclass(frozen=True)
@@ -181,6 +201,21 @@ class Chart:
         """
         ds = d.split([b.dimension for b in self.blocks], -1)
         return torch.cat([b.rotation_angles(p) for b, p in zip(self.blocks, ds, strict=True)], -1)
+
+    def log_volume(self, d: Tensor) -> Tensor:
+        """Compute the log of the volume of states per volume of differences.
+
+        Args:
+            d: Differences from any state, [..., d].
+
+        Returns:
+            Log volumes, [...]; 0 everywhere for a flat chart.
+        """
+        ds = d.split([b.dimension for b in self.blocks], -1)
+        return sum(
+            (b.log_volume(p) for b, p in zip(self.blocks, ds, strict=True)),
+            torch.zeros_like(d[..., 0]),
+        )
 
     def mean(self, x: Tensor, w: Tensor, passes: int = 3) -> Tensor:
         """Compute a weighted mean.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from pyro import distributions as pyro
@@ -17,7 +17,10 @@ from torch.distributions import (
     Normal,
     biject_to,
 )
+from torch.distributions.constraints import Constraint
+from typing_extensions import override
 
+from pfbench.core.chart import Chart
 from pfbench.core.linear_algebra import gaussian_log_density
 from pfbench.kernels import dispatch
 from pfbench.kernels.dispatch import compilable
@@ -208,3 +211,50 @@ def dense_normal(mean: Tensor, factor: Tensor) -> pyro.MultivariateNormal:
     normal._unbroadcasted_scale_tril = factor
     Distribution.__init__(normal, batch, mean.shape[-1:], validate_args=False)
     return normal
+
+
+class ChartNormal(Distribution):
+    """Normal distribution in a chart: x = mean (+) L z, z ~ N(0, I).
+
+    The density is relative to the invariant measure of states, so that densities about different means can be
+    compared. On a flat chart it is that of `MultivariateNormal`.
+
+    Attributes:
+        chart: Chart of the states.
+        loc: Mean states, [..., D].
+        scale_tril: Factors L, [..., d, d], broadcast against the means.
+    """
+
+    arg_constraints: ClassVar[dict[str, Constraint]] = {}
+
+    def __init__(self, chart: Chart, mean: Tensor, factor: Tensor) -> None:
+        self.chart, self.loc, self.scale_tril = chart, mean, factor
+        super().__init__(mean.shape[:-1], mean.shape[-1:], validate_args=False)
+
+    @property
+    @override
+    def mean(self) -> Tensor:
+        return self.loc
+
+    @property
+    @override
+    def mode(self) -> Tensor:
+        return self.loc
+
+    @property
+    def covariance_matrix(self) -> Tensor:
+        """Covariance of the differences from the mean, [..., d, d]."""
+        return self.scale_tril @ self.scale_tril.mT
+
+    @override
+    def rsample(self, sample_shape: Any = ()) -> Tensor:
+        shape = (*sample_shape, *self.batch_shape, self.chart.dimension, 1)
+        z = torch.randn(shape, dtype=self.loc.dtype, device=self.loc.device)
+        step = (self.scale_tril @ z).squeeze(-1)
+        return self.chart.add(self.loc.expand(*step.shape[:-1], -1), step)
+
+    @override
+    def log_prob(self, value: Tensor) -> Tensor:
+        d = self.chart.subtract(value, self.loc)
+        normal = dense_normal(torch.zeros_like(d), self.scale_tril)
+        return normal.log_prob(d) - self.chart.log_volume(d)

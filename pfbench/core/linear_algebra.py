@@ -44,10 +44,10 @@ factor = compilable(_factor, operator=dispatch.cholesky_factor, use_torch_compil
 
 
 def distribution_covariance(distribution: Any) -> Tensor:
-    """Return the covariance [..., k, k] of a multivariate normal or an independent distribution."""
+    """Return the covariance [..., k, k] of a multivariate normal or an independent distribution, or of differences in a chart."""
     covariance: Tensor = (
         distribution.covariance_matrix
-        if isinstance(distribution, MultivariateNormal)
+        if hasattr(distribution, "covariance_matrix")
         else torch.diag_embed(distribution.variance)
     )
     return covariance

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
-from pfbench.core.density import dense_normal, independent_normal, normal_batch
+from pfbench.core.density import ChartNormal, dense_normal, independent_normal, normal_batch
 from pfbench.core.linear_algebra import affine_map, factor
 from pfbench.core.record import Record, describe_misfit
 from pfbench.model.base import StateSpaceModel
@@ -101,13 +101,15 @@ class InsErrorModel(StateSpaceModel):
 
 
 def additive_transition(model: StateSpaceModel, x: Tensor, u: Any) -> Distribution:
-    """Return the transition distribution for additive noise of full rank with a triangular gain.
+    """Return the transition distribution for noise of full rank in the chart with a triangular gain.
 
     Returns distribution with batch [R, N], event [D]. Shapes: x [R, N, D].
     """
     mean = model.propagate(x, u, x.new_zeros(*x.shape[:2], model.noise_dim))
     root = model.noise_gain(u)
     assert root is not None
+    if not model.chart.flat:
+        return ChartNormal(model.chart, mean, root.unsqueeze(1))
     return dense_normal(mean, root.unsqueeze(1))
 
 

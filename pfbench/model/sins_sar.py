@@ -16,6 +16,7 @@ from pfbench.model.ins_gnss import (
     BIASES,
     NAVIGATION,
     InsErrorModel,
+    additive_transition,
     inflate_noise,
     name_ins_components,
 )
@@ -102,7 +103,7 @@ class SinsSar(InsErrorModel):
         rotate_noise_by_error: Whether accelerometer noise is rotated by the attitude error of each
             state, as in the continuous G(x). Otherwise, as printed (G(t)), the noise is additive in
             the chart.
-        inflation: Additional process noise, or None.
+        inflation: Additional process noise, or None. With it the transition has a density.
 
     Raises:
         ValueError: If a sensor is without a constant bias or has a Markov part, the receiver measures
@@ -212,6 +213,10 @@ class SinsSar(InsErrorModel):
     @override
     def noise_gain(self, u: SarStep) -> Tensor | None:
         return None if self.rotate_noise_by_error else u.gain
+
+    @override
+    def transition(self, x: Tensor, u: SarStep) -> Distribution | None:
+        return None if self.inflation is None else additive_transition(self, x, u)
 
     @override
     def observation(self, x: Tensor, u: SarStep) -> Distribution:

@@ -75,8 +75,8 @@ class ModelBatch(ModelWrapper):
 
     @override
     def transition(self, x: Tensor, u: Any) -> Distribution | None:
-        if self.model.transition(x, u) is None:
-            return None
+        if not self.model.chart.flat or self.model.transition(x, u) is None:
+            return None  # the parameters of a distribution in a chart are no tensors alone
         return self._map_distribution(lambda model, x, u: model.transition(x, u), x, u)
 
     @override

@@ -9,11 +9,12 @@ import pytest
 import torch
 from pyro import distributions as dist
 from scipy import stats
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
-from pfbench.core.chart import wrap_angle
-from pfbench.core.density import has_finite_moments, normal_batch
+from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock, wrap_angle
+from pfbench.core.density import ChartNormal, has_finite_moments, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.gaussian.ensemble_kalman import EnsembleKalmanFilter
@@ -244,3 +245,37 @@ def test_moments_are_undefined_only_where_the_parameters_are_finite() -> None:
         Independent(dist.StudentT(f64(2.0), loc, f64(1.0), validate_args=False), 1)
     )
     assert has_finite_moments(normal_mixture(f64([[0.0, 1.0]])))
+
+
+@pytest.mark.parametrize("sd", [0.2, 0.5])
+def test_normal_densities_of_rotations_integrate_to_one(sd: float) -> None:
+    """Over uniform rotations of scipy, about any mean; the volume of all rotations is 8 pi^2 in units of small vectors."""
+    count = 200_000
+    xyzw = Rotation.random(count, random_state=np.random.default_rng(1)).as_quat()
+    q = f64(xyzw[:, [3, 0, 1, 2]])
+    factor = torch.linalg.cholesky(sd**2 * (torch.eye(3) + 0.3).double())
+    mean = f64([0.5, 0.5, -0.5, 0.5])
+    density = ChartNormal(Chart((QuaternionBlock(),)), mean.expand(count, -1), factor)
+    values = 8.0 * np.pi**2 * torch.exp(density.log_prob(q)).numpy()
+    assert abs(values.mean() - 1.0) < 4.5 * values.std() / np.sqrt(count)
+    assert values.std() / np.sqrt(count) < 0.03
+
+
+def test_normal_density_in_a_flat_chart_is_that_of_scipy() -> None:
+    factor = torch.tril(torch.arange(1.0, 10.0).reshape(3, 3).double())
+    mean, x = f64([1.0, -2.0, 0.5]), f64([[0.3, 1.0, 2.0], [4.0, 0.0, -1.0]])
+    density = ChartNormal(Chart((EuclideanBlock(3),)), mean.expand(2, -1), factor)
+    expected = stats.multivariate_normal(mean.numpy(), (factor @ factor.mT).numpy()).logpdf(x)
+    np.testing.assert_allclose(density.log_prob(x), expected, rtol=1e-12)
+
+
+def test_draws_in_a_chart_have_its_mean_and_covariance() -> None:
+    chart, count = Chart((EuclideanBlock(1), QuaternionBlock())), 100_000
+    factor = 0.2 * torch.tril(torch.ones(4, 4)).double()
+    density = ChartNormal(chart, f64([3.0, 0.6, 0.0, 0.8, 0.0]).expand(count, -1), factor)
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        d = chart.subtract(density.sample(), density.mean).numpy()
+    covariance = density.covariance_matrix.numpy()
+    assert (np.abs(d.mean(0)) < 4.5 * np.sqrt(np.diag(covariance) / count)).all()
+    np.testing.assert_allclose(np.cov(d.T), covariance, atol=0.003)

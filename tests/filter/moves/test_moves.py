@@ -19,6 +19,7 @@ from torch.distributions import Distribution, Independent, Laplace
 
 from pfbench import job
 from pfbench.core.chart import Chart, QuaternionBlock
+from pfbench.core.density import ChartNormal, independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
@@ -586,6 +587,103 @@ def test_flow_keeps_the_prior_of_an_inertial_navigation(larger: float) -> None:
     assert geweke(model, NoiseFlowKernel(3, walk), lambda j: record.at_step(j).u, 300, 8, 3) > 1e-4
     if larger == 1.0:  # the others' steps are too short to drift far
         assert geweke(model, Unprincipled(3, walk), lambda j: record.at_step(j).u, 300, 8, 3) < 1e-4
+
+
+class Spin(StateSpaceModel):
+    """A rotation that turns by 0.7 rad in each step; its measurements have no likelihood where they are missing."""
+
+    names, units, groups = ("x", "y", "z"), ("rad",) * 3, {"attitude": (0, 1, 2)}
+    noise_dim = 3
+
+    def __init__(self, sd: float = 0.7) -> None:
+        super().__init__()
+        self.sd = sd
+        self.register_buffer("axes", torch.eye(3, dtype=torch.float64))
+
+    @property
+    def chart(self) -> Chart:
+        return Chart((QuaternionBlock(),))
+
+    @property
+    def origin(self) -> Tensor:
+        return torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+
+    def initial(self, runs: int) -> Distribution:
+        return normal_batch(runs, torch.full((3,), 0.3, dtype=torch.float64))
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return self.chart.add(x, self.sd * w)
+
+    def transition(self, x: Tensor, u: Any) -> Distribution:
+        return ChartNormal(self.chart, x, (self.sd * self.axes).expand(*x.shape[:2], 3, 3))
+
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        return independent_normal(x[..., :1], torch.ones(1, dtype=x.dtype))
+
+
+@pytest.mark.parametrize("endpoint", [False, True])
+def test_segments_of_rotations_have_the_density_of_the_path(endpoint: bool) -> None:
+    """Without measurements one drawn state is exact: the ratio is that of the child given the fixed state.
+
+    Given the child, the block has p(block) p(child | block) / p(child) of a normal chain, which rotations are to second
+    order. So its acceptance is compared for small turns alone.
+    """
+    model, n = Spin(0.02 if endpoint else 0.7), 400
+    kernel = PathBlockKernel(1, SmoothedSegment(endpoint), Steady(size=model.sd))
+    missing = Record(torch.full((1, 1), math.nan, dtype=torch.float64), ())
+    cloud = ParticleFilter(n).init(model, 1, one())
+    cloud = kernel.required_history.start(model, cloud, model.origin[None], torch.eye(3)[None])
+    for j in range(2):
+        w = one(2 + j).normal("w", n, 3)
+        moved_cloud = cloud._replace(x=model.propagate(cloud.x, (), w))
+        cloud = kernel.required_history.append(model, cloud, moved_cloud, w, missing)
+    proposed, log_alpha = kernel.propose(model, cloud, one(9))
+    old, new = (c.window["states"][0] for c in (cloud, proposed))
+    if endpoint:
+        variance = 2.0 * model.sd**2
+        lengths = [model.chart.subtract(x[:, 2], x[:, 0]).square().sum(-1) for x in (old, new)]
+        expected = (lengths[0] - lengths[1]) / (2.0 * variance)
+        assert torch.allclose(log_alpha[0], expected, atol=0.02)
+        return
+    inside = [model.chart.subtract(x[:, 1], x[:, 0]).norm(dim=-1) for x in (old, new)]
+    children = [model.transition(x[None, :, 1], ()).log_prob(x[None, :, 2])[0] for x in (old, new)]
+    near = (inside[0] < 2.5) & (inside[1] < 2.5)  # beyond half a turn a drawn vector is another one
+    assert torch.allclose(log_alpha[0][near], (children[1] - children[0])[near], atol=1e-9)
+    turned = [model.chart.log_volume(model.chart.subtract(x[:, 1], x[:, 0])) for x in (old, new)]
+    assert (turned[0] - turned[1])[near].abs().max() > 0.1  # what a flat density would lack
+
+
+def test_an_inertial_model_with_noise_in_all_states_has_its_density() -> None:
+    """log p(x'|x) of SINS/SAR is that of the noise that led there, less the volume of its quaternion."""
+    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
+        cfg = compose(
+            "config",
+            [
+                "scenario=sar_flight",
+                "episode_cache_dir=null",
+                "scenario.trajectory.duration_s=6",
+                "reading/paper_000=noise_10",
+            ],
+        )
+    model = job.instantiate(cfg.model)
+    episode = job.instantiate(cfg.scenario).draw(NominalNoise(), torch.arange(2), 1)
+    record = model.prepare(episode.record).at_step(2)
+    x = ParticleFilter(50).init(model, 2, one(1, 2)).x
+    w = one(2, 2).normal("w", 50, model.noise_dim)
+    after = model.propagate(x, record.u, w)
+    root = model.noise_gain(record.u)
+    step = (root.unsqueeze(1) @ w.unsqueeze(-1)).squeeze(-1)
+    expected = (
+        stats.norm.logpdf(w.numpy()).sum(-1)
+        - np.linalg.slogdet(root.numpy())[1][:, None]
+        - model.chart.log_volume(step).numpy()
+    )
+    found = model.transition(x, record.u).log_prob(after)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    rate = moving(MetropolisHastings(PathBlockKernel(3, SmoothedSegment(), RandomWalk(0.5))), n=100)
+    estimate = run_filter(rate, model, model.prepare(episode.record), one(3, 2))
+    assert not bool(estimate.lost.any())
+    assert float(estimate.trace["accepted_0"][:, 1:].mean()) > 0.02
 
 
 # whole filters
