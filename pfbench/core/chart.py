@@ -61,7 +61,7 @@ class ChartBlock(ABC):
 
         The measure of states is invariant: it is the same seen from any state. Shapes: d [..., dimension].
         """
-        raise NotImplementedError(f"{type(self).__name__} has no volume element.")
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ class ModelBatch(ModelWrapper):
     @override
     def transition(self, x: Tensor, u: Any) -> Distribution | None:
         if not self.model.chart.flat or self.model.transition(x, u) is None:
-            return None  # the parameters of a distribution in a chart are no tensors alone
+            return None  # a distribution in a chart is not built of tensors alone
         return self._map_distribution(lambda model, x, u: model.transition(x, u), x, u)
 
     @override
