@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import hashlib
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,10 +24,11 @@ from pfbench.claims.claim_lines import (
     read_paper_settings,
     read_readings,
 )
-from pfbench.claims.measures import Measure
+from pfbench.claims.measures import METRIC_WORDS, OFF_TRACK, Measure
 from pfbench.claims.words import (
     CANNOT_RUN,
     NOT_COUNTED,
+    VACUOUS,
     ClaimDecision,
     ClaimSample,
     ReadingDot,
@@ -256,6 +258,8 @@ def make_dots(
         pairs = [_join_pair(plan, reading, window, c, runs) for c in comparisons]
         if CANNOT_RUN in pairs:
             dots[name] = ReadingDot(factor, state=CANNOT_RUN)
+        elif VACUOUS in pairs:
+            dots[name] = ReadingDot(factor, state=VACUOUS)
         else:
             matches = [pair for pair in pairs if isinstance(pair, ClaimSample)]
             dots[name] = ReadingDot(factor, matches if len(matches) == len(pairs) else ())
@@ -273,7 +277,10 @@ def _name_factor(plan: ClaimPlan, reading: str, window: str) -> str:
 def _join_pair(
     plan: ClaimPlan, reading: str, window: str, c: LineComparison, runs: ClaimRuns
 ) -> ClaimSample | str | None:
-    """Join the runs of both sides; `CANNOT_RUN` if a job fails, None without runs."""
+    """Join the runs of both sides, None without runs.
+
+    `CANNOT_RUN` if a job fails, `VACUOUS` if losses of track are compared and no run of either side has one.
+    """
     sides = [side for side in (c.a, c.b) if side.filter]
     measured = [_measure_side(plan, reading, window, side) for side in sides]
     if any(record.failed for cell, _ in measured for record in runs.find(cell)):
@@ -290,9 +297,36 @@ def _join_pair(
     matches = iter([_select(s, common) for s in present])
     n = len(common)
     a, b = (next(matches) if side.filter else (np.full(n, side.number), np.zeros(n, bool)) for side in (c.a, c.b))  # fmt: skip
+    if c.a.measure.metric == OFF_TRACK and max(a[0].max(initial=1.0), b[0].max(initial=1.0)) <= 1.0:
+        return VACUOUS
     first = read_paper_settings()[plan.claim.paper]["runs"][SCREEN]
     early = common - SEEDS[0] * 2**32 < first
-    return ClaimSample(c.kind, a[0], b[0], a[1], b[1], early, c.printed)
+    return ClaimSample(c.kind, a[0], b[0], a[1], b[1], early, c.printed, describe_sides(c))
+
+
+def describe_sides(c: LineComparison) -> str:
+    """Describe a comparison for a reader: what is divided by what, its components and its time."""
+    filtered = [side for side in (c.a, c.b) if side.filter]
+    quantities = [describe_quantity(side.measure) for side in filtered]
+    is_common = len(set(quantities)) == 1
+    names = [
+        " ".join([side.filter, *side.words]) if side.filter else f"{side.number:g}"
+        for side in (c.a, c.b)
+    ]
+    if not is_common:
+        names = [f"{name} ({text})" for name, text in zip(names, quantities, strict=True)]
+    metric = c.a.measure.metric
+    words = [METRIC_WORDS.get(metric, metric.replace("_", " ")), *quantities[: int(is_common)]]
+    return f"{' '.join(filter(None, words))}, {names[0]} / {names[1]}"
+
+
+def describe_quantity(measure: Measure) -> str:
+    """Describe components and time of a quantity."""
+    of = measure.component.replace("_", " ") if measure.component != "norm" else measure.group
+    ends = [f"from {measure.start:g} s"] * (measure.start > 0)
+    ends += [f"to {measure.end:g} s"] * math.isfinite(measure.end)
+    bound = f"below {measure.settled:g}" if math.isfinite(measure.settled) else ""
+    return " ".join(filter(None, [f"of {of}" if of else "", bound, *ends]))
 
 
 def _select(series: Series, runs: np.ndarray) -> tuple[Array, np.ndarray]:
@@ -313,7 +347,8 @@ def _join_times(cells: Sequence[Cell], c: LineComparison, runs: ClaimRuns) -> Cl
         for k, side in enumerate((c.a, c.b))
     )
     lost = np.zeros(n, bool)
-    return ClaimSample(c.kind, a, b, lost, lost, np.arange(n) < n // 3, c.printed)
+    early = np.arange(n) < n // 3
+    return ClaimSample(c.kind, a, b, lost, lost, early, c.printed, describe_sides(c))
 
 
 def decide_claims(

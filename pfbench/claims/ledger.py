@@ -128,7 +128,9 @@ def describe_tip(line: ClaimWord) -> str:
         return ""
     kind = line.plan.claim.kind
     bound = find_tipping_bound(kind, decision.low, decision.high)
-    return f"true with every bound of the ratio above {bound:.3g}; the bound is {KINDS[kind][0]:g}"
+    return (
+        f"it would be true if ratios up to {bound:.3g} counted; they count up to {KINDS[kind][0]:g}"
+    )
 
 
 def describe_turns(line: ClaimWord) -> list[str]:

@@ -18,6 +18,14 @@ _OF_GROUPS = {
     *("mean_abs", "settled", "growth", "sd"),
 }
 
+OFF_TRACK = "off_track"
+METRIC_WORDS = {
+    "rmse": "RMS error", "max_error": "largest error", "mean_abs": "mean size of the error", "settled": "time until the error stays",
+    "growth": "growth of the error", "remaining": "share of the first error that remains", "sd": "standard deviation that the filter states",
+    "nees": "NEES", "crps": "CRPS", "ess": "effective number", "unique": "distinct particles", "accepted": "acceptance rate",
+    "seconds_per_step": "time per step", OFF_TRACK: "loss of track, 1 without and 2 with it",
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Measure:
@@ -54,7 +62,7 @@ def measure_runs(result: store.JobResult, measure: Measure) -> np.ndarray:
     Returns value of each run, [R]. It is positive, and infinite or NaN where the run is lost.
     """
     complete, lost = result, np.asarray(result.data["lost"], dtype=bool)
-    if measure.metric == "off_track":
+    if measure.metric == OFF_TRACK:
         return np.where(status.keeps_track(result.data, result.meta), 1.0, 2.0)
     result = _drop_after(drop_before(result, measure.start), measure.end)
     if measure.metric == "remaining":

@@ -38,6 +38,7 @@ from pfbench.report.writers import render_template
 COMPARISON = "all_seven"  # study that compares the methods with the Kalman filters of each world
 RULES = (
     "Confirmed or refuted: the same outcome in all readings that can run, at 2.5 % for all claims of a paper.",
+    "A claim of better is false in a reading if the ratio is shown to be above 0.99: no improvement of 1 %.",
     "Depends: outcomes of both kinds, after correction over claims times readings.",
     "Untestable: circular, vacuous, lost, or no reading can run. Open: none of these.",
     "As published is the printed form. A fitted reading is shown and does not count.",
@@ -144,7 +145,7 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
         "repaired_measured": _format_measured(repaired),
         "size": line.size,
         "kind": describe_kind(line.plan),
-        "figure": f"{claim.figure}: {claim.a}" + (f" against {', '.join(claim.b)}" if claim.b else ""),
+        "figure": f"{claim.figure}: {claim.a}" + (f" and {', '.join(claim.b)}" if claim.b else ""),
         "printed": claim.printed,
         "measured": measured,
         "border": describe_tip(line),
@@ -163,11 +164,13 @@ def _format_measured(decision: ClaimDecision | None) -> str:
         return ""
     numbers = (decision.ratio, decision.low, decision.high)
     ratio, low, high = (_format_number(value) for value in numbers)
-    return f"ratio {ratio} [{low}, {high}], {decision.runs} runs; smaller in {decision.order:.0%} of them"
+    return f"{decision.sides} = {ratio} [{low}, {high}], {decision.runs} runs; smaller in {decision.order:.0%} of them"
 
 
 def _format_number(value: float) -> str:
-    """Format a ratio without an exponent."""
+    """Format a ratio without an exponent, with more digits near 1."""
+    if 0.995 < value < 1.005:
+        return f"{value:.5f}".rstrip("0").rstrip(".")
     if value == 0 or 1e-3 <= abs(value) < 1e4:
         return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
     return "below 0.001" if abs(value) < 1 else "above 10 000"
@@ -203,6 +206,7 @@ def make_seven(
         {
             "name": entry["name"],
             "claim": entry["claim"],
+            "paper": words[entry["claim"]].plan.claim.paper,
             "published": _say_fate(words[entry["claim"]], words[entry["claim"]].label),
             "repaired": _say_fate(
                 words[entry["claim"]], words[entry["claim"]].repaired or "no repair"

@@ -55,6 +55,7 @@ class ClaimSample(NamedTuple):
         lost_b: Runs that b lost, [n].
         early: Runs of the first look, [n].
         printed: Printed ratio of the kind "size".
+        sides: What is divided by what, for a reader.
     """
 
     kind: str
@@ -64,6 +65,7 @@ class ClaimSample(NamedTuple):
     lost_b: Flags
     early: Flags
     printed: float = math.nan
+    sides: str = ""
 
     def select(self, mask: Flags) -> ClaimSample:
         """Select runs, [n]."""
@@ -99,6 +101,7 @@ class ClaimDecision(NamedTuple):
         high: Upper end.
         runs: Runs of that comparison.
         order: Share of its runs in which a is smaller.
+        sides: What is divided by what in that comparison.
     """
 
     word: str
@@ -109,6 +112,7 @@ class ClaimDecision(NamedTuple):
     high: float = math.nan
     runs: int = 0
     order: float = math.nan
+    sides: str = ""
 
 
 class _Evidence(NamedTuple):
@@ -319,17 +323,23 @@ def _find_factors(dots: Mapping[str, ReadingDot], outcomes: Mapping[str, str]) -
     return tuple(dict.fromkeys(name for name in names if name != "none"))
 
 
-def _describe_central(dot: ReadingDot) -> tuple[float, float, float, int, float]:
-    """Describe the comparison of a reading that is closest to turn the claim: ratio, interval, runs and order."""
+_Description = tuple[float, float, float, int, float, str]
+
+
+def _describe_central(dot: ReadingDot) -> _Description:
+    """Describe the comparison of a reading that is closest to turn the claim: ratio, interval, runs, order and sides."""
     options = [_describe(c) for c in dot.comparisons if len(c.a)]
-    return max(options, key=lambda row: row[0])[1] if options else (math.nan,) * 3 + (0, math.nan)
+    if not options:
+        return (math.nan, math.nan, math.nan, 0, math.nan, "")
+    return max(options, key=lambda row: row[0])[1]
 
 
-def _describe(c: ClaimSample) -> tuple[float, tuple[float, float, float, int, float]]:
-    """Return how close a comparison is to its border, and ratio, interval, runs and share of runs with a smaller."""
+def _describe(c: ClaimSample) -> tuple[float, _Description]:
+    """Return how close a comparison is to its border, and ratio, interval, runs, share of runs with a smaller, and sides."""
     effect = compare_to_border(c, 0.0)
     location, low, high = effect.estimate(ALPHA)
     true_low, true_high = find_borders(c.kind, c.printed)[0]
     nearness = max(location - true_high, true_low - location)
     order = float((effect.differences < 0).mean())
-    return nearness, (math.exp(location), math.exp(low), math.exp(high), len(effect.differences), order)  # fmt: skip
+    count = len(effect.differences)
+    return nearness, (math.exp(location), math.exp(low), math.exp(high), count, order, c.sides)

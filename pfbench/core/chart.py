@@ -211,6 +211,8 @@ class Chart:
         Returns:
             Log volumes, [...]; 0 everywhere for a flat chart.
         """
+        if self.flat:
+            return torch.zeros_like(d[..., 0])
         ds = d.split([b.dimension for b in self.blocks], -1)
         return sum(
             (b.log_volume(p) for b, p in zip(self.blocks, ds, strict=True)),

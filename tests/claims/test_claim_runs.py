@@ -33,6 +33,7 @@ from pfbench.claims.claim_runs import (
     ClaimRuns,
     StoredValues,
     decide_claims,
+    describe_sides,
     list_batches,
     list_claim_cells,
     write_values,
@@ -57,6 +58,38 @@ from pfbench.job.inputs import find_inputs
 
 PLANS = {plan.claim.id: plan for plan in read_plans()}
 PAPERS = ("000", "001", "002", "003", "004")
+
+
+def test_a_ratio_says_what_is_divided_by_what() -> None:
+    """Of the comparison that is decided: where a larger figure is claimed, the rival stands first."""
+    sides = {
+        claim: {describe_sides(c) for part in PLANS[claim].parts.values() for c in part}
+        for claim in ("C000-7", "002-17", "003-C6", "003-C7", "002-12")
+    }
+    assert "acceptance rate, mcmc_tail / mcmc_rpf_printed" in sides["C000-7"]
+    assert (
+        "largest error of position N from 500 s, cofm_amssrcpf_printed / fmcpf" in sides["002-17"]
+    )
+    assert "RMS error of attitude N from 110 s, dmc_reconstructed_printed / ukf" in sides["003-C6"]
+    assert "mean size of the error of attitude E from 110 s, dmc_reconstructed_printed / 22" in sides["003-C7"]  # fmt: skip
+    assert "mean size of the error of attitude E from 110 s, ukf / dmc_reconstructed_printed" in sides["003-C7"]  # fmt: skip
+    (largest,) = (text for text in sides["002-12"] if text.startswith("largest"))
+    assert largest.endswith("cpf (of position N from 500 s to 570 s) / cpf (of position U from 500 s to 570 s)")  # fmt: skip
+
+
+def test_losses_of_track_that_nobody_has_decide_nothing() -> None:
+    plan = PLANS["004-C15"]
+
+    def decide_by(lost: float) -> set[str]:
+        records = [
+            StoredValues(cell, 2001, 0, 30, "k", "c", 1.0, "", (0,) * 30, {name: [1.0, lost] * 15 for name in measures})
+            for cell, measures in list_claim_cells(plan).items()
+        ]  # fmt: skip
+        decisions = decide_claims([plan], ClaimRuns(records))
+        return {decided.word for decided in decisions.values()}
+
+    assert decide_by(1.0) == {"untestable"}
+    assert "untestable" not in decide_by(2.0)
 
 
 # what decides a claim

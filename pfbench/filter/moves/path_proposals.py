@@ -197,9 +197,8 @@ class SmoothedSegment(SegmentProposal):
             next_old = chart.subtract(block[:, :, j], steps[j].x)
             next_new = m_new + batch_product(root, z)
             z_old = _whiten(root, next_old - m_old)
-            ratio = ratio + torch.where(ok, 0.5 * (z * z - z_old * z_old).sum(-1), torch.nan)
-            if not chart.flat:
-                ratio = ratio + chart.log_volume(next_new) - chart.log_volume(next_old)
+            normal = torch.where(ok, 0.5 * (z * z - z_old * z_old).sum(-1), torch.nan)
+            ratio = ratio + normal + chart.log_volume(next_new) - chart.log_volume(next_old)
             states.append(chart.add(steps[j].x, next_new))
         return stack_history(states[::-1]), ratio
 
