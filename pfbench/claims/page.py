@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -96,6 +97,7 @@ def make_context(
             "name": settings["name"],
             "sentence": _say_paper(settings["sentence"], counts[paper]),
             "rows": [row for row in rows if row["paper"] == paper],
+            "proofs": re.findall(r"P\d+", settings["sentence"]),
         }
         for paper, settings in read_paper_settings().items()
     ]
@@ -155,6 +157,7 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
         "mark": claim.mark,
         "choices": list_choices(line.plan),
         "price": _format_price(price) if price else "",
+        "has_runs": bool(line.plan.parts),
     }  # fmt: skip
 
 
@@ -187,14 +190,21 @@ def _make_dots(line: ClaimWord) -> list[dict[str, str]]:
     """Make the dots of a claim: a reading each, with outcome and text."""
     if line.decision is None:
         return []
-    readings = read_readings(line.plan.claim.paper)
     return [
         {
             "outcome": outcome.replace(" ", "-"),
-            "text": f"{readings[name].text.rstrip('.') if name in readings else name}: {outcome}",
+            "text": f"{_name_dot(line, name)}: {outcome}",
         }
         for name, outcome in line.decision.outcomes.items()
     ]
+
+
+def _name_dot(line: ClaimWord, name: str) -> str:
+    """Name a reading, a window of time or a world of this project."""
+    if line.plan.toy:
+        return f"World of this project, {' '.join(line.plan.toy)}"
+    readings = read_readings(line.plan.claim.paper)
+    return readings[name].text.rstrip(".") if name in readings else name
 
 
 def make_seven(
