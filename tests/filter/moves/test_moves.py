@@ -522,18 +522,22 @@ def test_flow_keeps_the_prior_of_a_pendulum(refresh: float) -> None:
     assert geweke(model, Unprincipled(5, PriorSized(0.7), refresh), lambda j: (), 600, 15) < 1e-4
 
 
+class Rotating(StateSpaceModel):
+    """A model whose states are rotations."""
+
+    @property
+    def chart(self) -> Chart:
+        return Chart((QuaternionBlock(),))
+
+    @property
+    def origin(self) -> Tensor:
+        return torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+
+
 def test_flow_steps_in_the_coordinates_in_which_its_start_is_normal() -> None:
     """Attitudes of a radian: steps about each start instead would need the volume element of the chart."""
 
-    class Turned(LinearGaussian):
-        @property
-        def chart(self) -> Chart:
-            return Chart((QuaternionBlock(),))
-
-        @property
-        def origin(self) -> Tensor:
-            return torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
-
+    class Turned(Rotating, LinearGaussian):
         def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
             return self.chart.add(x, 0.3 * w)
 
@@ -589,7 +593,7 @@ def test_flow_keeps_the_prior_of_an_inertial_navigation(larger: float) -> None:
         assert geweke(model, Unprincipled(3, walk), lambda j: record.at_step(j).u, 300, 8, 3) < 1e-4
 
 
-class Spin(StateSpaceModel):
+class Spin(Rotating):
     """A rotation that turns by 0.7 rad in each step; its measurements have no likelihood where they are missing."""
 
     names, units, groups = ("x", "y", "z"), ("rad",) * 3, {"attitude": (0, 1, 2)}
@@ -599,14 +603,6 @@ class Spin(StateSpaceModel):
         super().__init__()
         self.sd = sd
         self.register_buffer("axes", torch.eye(3, dtype=torch.float64))
-
-    @property
-    def chart(self) -> Chart:
-        return Chart((QuaternionBlock(),))
-
-    @property
-    def origin(self) -> Tensor:
-        return torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
 
     def initial(self, runs: int) -> Distribution:
         return normal_batch(runs, torch.full((3,), 0.3, dtype=torch.float64))
