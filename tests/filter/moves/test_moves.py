@@ -13,6 +13,7 @@ import torch
 from filter_laws import check_lost_alone, check_own
 from hydra import compose, initialize_config_dir
 from move_cases import Always, moving
+from particle_cases import CASES
 from scipy import stats
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Laplace
@@ -617,15 +618,16 @@ class Spin(Rotating):
         return independent_normal(x[..., :1], torch.ones(1, dtype=x.dtype))
 
 
+@pytest.mark.parametrize("shares", [False, True])
 @pytest.mark.parametrize("endpoint", [False, True])
-def test_segments_of_rotations_have_the_density_of_the_path(endpoint: bool) -> None:
+def test_segments_of_rotations_have_the_density_of_the_path(endpoint: bool, shares: bool) -> None:
     """Without measurements one drawn state is exact: the ratio is that of the child given the fixed state.
 
     Given the child, the block has p(block) p(child | block) / p(child) of a normal chain, which rotations are to second
     order. So its acceptance is compared for small turns alone.
     """
     model, n = Spin(0.02 if endpoint else 0.7), 400
-    kernel = PathBlockKernel(1, SmoothedSegment(endpoint), Steady(size=model.sd))
+    kernel = PathBlockKernel(1, SmoothedSegment(endpoint, shares), Steady(size=model.sd))
     missing = Record(torch.full((1, 1), math.nan, dtype=torch.float64), ())
     cloud = ParticleFilter(n).init(model, 1, one())
     cloud = kernel.required_history.start(model, cloud, model.origin[None], torch.eye(3)[None])
@@ -698,6 +700,15 @@ EXACT: dict[str, McmcKernel] = {
 @pytest.mark.parametrize("name", EXACT)
 def test_filters_with_moves_are_unbiased(name: str) -> None:
     check_evidence(moving(MetropolisHastings(EXACT[name]), n=25), WALK, WALK_Y, runs=1000)
+
+
+@pytest.mark.parametrize("name", ["growth", "volatility"])
+def test_segments_with_shared_slopes_are_unbiased_on_nonlinear_models(name: str) -> None:
+    """The slopes of the mean of the fixed states are a poor fit there, and the ratio must make up for it."""
+    model, y, exact = CASES[name]()
+    segment = SmoothedSegment(shares_slopes=True)
+    move = MetropolisHastings(PathBlockKernel(2, segment, Steady()))
+    check_evidence(moving(move, n=25), model, y, exact, runs=1000)
 
 
 def test_so_they_are_where_the_start_is_measured() -> None:
