@@ -297,7 +297,7 @@ def _join_pair(
     matches = iter([_select(s, common) for s in present])
     n = len(common)
     a, b = (next(matches) if side.filter else (np.full(n, side.number), np.zeros(n, bool)) for side in (c.a, c.b))  # fmt: skip
-    if c.a.measure.metric == OFF_TRACK and max(a[0].max(initial=1.0), b[0].max(initial=1.0)) <= 1.0:
+    if c.a.measure.metric == OFF_TRACK and n and max(a[0].max(), b[0].max()) <= 1.0:
         return VACUOUS
     first = read_paper_settings()[plan.claim.paper]["runs"][SCREEN]
     early = common - SEEDS[0] * 2**32 < first

@@ -132,7 +132,7 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
     price = prices.get(claim.id, 0.0)
     reason = f"{line.reason}, price {_format_price(price)}" if price and line.state == NOT_RUN else line.reason  # fmt: skip
     statement = f"{line.label}: {reason}" if reason else line.label
-    measured = _format_measured(decision)
+    measured = _format_measured(line, decision)
     repaired = decisions.get((claim.id, REPAIRED, "direction"))
     return {
         "id": claim.id,
@@ -144,7 +144,7 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
         "said": statement,
         "tip": f"{claim.id}: {statement}. “{claim.words}” {measured}".strip(),
         "repaired": line.repaired,
-        "repaired_measured": _format_measured(repaired),
+        "repaired_measured": _format_measured(line, repaired),
         "size": line.size,
         "kind": describe_kind(line.plan),
         "figure": f"{claim.figure}: {claim.a}" + (f" and {', '.join(claim.b)}" if claim.b else ""),
@@ -161,13 +161,15 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
     }  # fmt: skip
 
 
-def _format_measured(decision: ClaimDecision | None) -> str:
-    """Format the ratio of the central reading with its interval."""
+def _format_measured(line: ClaimWord, decision: ClaimDecision | None) -> str:
+    """Format the ratio of a decision with its interval, and name its reading if it is not the central one."""
     if decision is None or not decision.runs:
         return ""
     numbers = (decision.ratio, decision.low, decision.high)
     ratio, low, high = (_format_number(value) for value in numbers)
-    return f"{decision.sides} = {ratio} [{low}, {high}], {decision.runs} runs; smaller in {decision.order:.0%} of them"
+    first = next(iter(decision.outcomes))
+    where = "" if decision.reading == first else f" ({_name_dot(line, decision.reading)})"
+    return f"{decision.sides} = {ratio} [{low}, {high}], {decision.runs} runs; smaller in {decision.order:.0%} of them{where}"
 
 
 def _format_number(value: float) -> str:

@@ -96,12 +96,14 @@ class ClaimDecision(NamedTuple):
         word: One of `WORDS`.
         factors: Factors on which it depends.
         outcomes: Outcome by reading.
-        ratio: Ratio of a to b in the central reading, of the comparison that is closest to turn the claim.
+        ratio: Ratio of a to b in the central reading, of the comparison that is closest to turn the claim. If that
+            reading cannot run, in the first one that can.
         low: Lower end of its interval.
         high: Upper end.
         runs: Runs of that comparison.
         order: Share of its runs in which a is smaller.
         sides: What is divided by what in that comparison.
+        reading: Reading of the ratio.
     """
 
     word: str
@@ -113,6 +115,7 @@ class ClaimDecision(NamedTuple):
     runs: int = 0
     order: float = math.nan
     sides: str = ""
+    reading: str = ""
 
 
 class _Evidence(NamedTuple):
@@ -291,7 +294,7 @@ def _conclude(
     counted = [reading for reading, dot in dots.items() if is_counted(dot)]
     if len(decided) == 1:  # what holds in all readings holds in each of them
         outcomes |= dict.fromkeys(counted, next(iter(decided)))
-    central = _describe_central(next(iter(dots.values()), ReadingDot("none")))
+    central = _describe_first(dots)
     if not counted:
         return ClaimDecision(UNTESTABLE, (), outcomes, *central)
     if len(decided) == 1:
@@ -326,12 +329,18 @@ def _find_factors(dots: Mapping[str, ReadingDot], outcomes: Mapping[str, str]) -
 _Description = tuple[float, float, float, int, float, str]
 
 
-def _describe_central(dot: ReadingDot) -> _Description:
-    """Describe the comparison of a reading that is closest to turn the claim: ratio, interval, runs, order and sides."""
-    options = [_describe(c) for c in dot.comparisons if len(c.a)]
-    if not options:
-        return (math.nan, math.nan, math.nan, 0, math.nan, "")
-    return max(options, key=lambda row: row[0])[1]
+def _describe_first(dots: Mapping[str, ReadingDot]) -> tuple[*_Description, str]:
+    """Describe the comparison that is closest to turn the claim, in the central reading or the first that can run.
+
+    Returns ratio, interval, runs, order, sides and reading.
+    """
+    for reading, dot in dots.items():
+        options = [_describe(c) for c in dot.comparisons if len(c.a)]
+        if options:
+            return *max(options, key=lambda row: row[0])[1], reading
+        if dot.state != CANNOT_RUN:
+            break
+    return math.nan, math.nan, math.nan, 0, math.nan, "", ""
 
 
 def _describe(c: ClaimSample) -> tuple[float, _Description]:

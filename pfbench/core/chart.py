@@ -56,12 +56,12 @@ class ChartBlock(ABC):
         """
         return d[..., :0]
 
+    @abstractmethod
     def log_volume(self, d: Tensor) -> Tensor:
         """Return the log of the volume of states per volume of differences at d, [...].
 
         The measure of states is invariant: it is the same seen from any state. Shapes: d [..., dimension].
         """
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -129,8 +129,7 @@ class QuaternionBlock(ChartBlock):
 
     @override
     def log_volume(self, d: Tensor) -> Tensor:
-        """Return log (2 sin(a / 2) / a)^2 with the angle a: that of rotations by their vectors."""
-        return 2.0 * torch.log(torch.sinc(d.norm(dim=-1) / (2.0 * torch.pi)))
+        return _log_turn_volume(d)
 
 
 @dataclass(frozen=True)
@@ -240,6 +239,11 @@ class Chart:
         for _ in range(passes):
             m = self.add(m, (w.unsqueeze(-1) * self.subtract(x, m)).sum(-2, keepdim=True))
         return m.squeeze(-2)
+
+
+def _log_turn_volume(r: Tensor) -> Tensor:
+    """Return log (2 sin(a / 2) / a)^2 of rotation vectors [..., 3] with the angle a: det of their left Jacobian."""
+    return 2.0 * torch.log(torch.sinc(r.norm(dim=-1) / (2.0 * torch.pi)))
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
@@ -368,6 +372,11 @@ class LieGroupBlock(ChartBlock):
     @override
     def rotation_angles(self, d: Tensor) -> Tensor:
         return d[..., :3].norm(dim=-1, keepdim=True)
+
+    @override
+    def log_volume(self, d: Tensor) -> Tensor:
+        """Return that of the rotation, once for itself and once for each vector, which J(phi) turns."""
+        return self.dimension // 3 * _log_turn_volume(d[..., :3])
 
 
 def _vectors(a: Tensor) -> Tensor:

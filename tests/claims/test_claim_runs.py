@@ -39,7 +39,7 @@ from pfbench.claims.claim_runs import (
     write_values,
 )
 from pfbench.claims.ledger import compare_versions, conclude
-from pfbench.claims.page import write_claims
+from pfbench.claims.page import _format_measured, write_claims
 from pfbench.claims.run_claims import (
     Task,
     _has_equal_mean,
@@ -75,6 +75,23 @@ def test_a_ratio_says_what_is_divided_by_what() -> None:
     assert "mean size of the error of attitude E from 110 s, ukf / dmc_reconstructed_printed" in sides["003-C7"]  # fmt: skip
     (largest,) = (text for text in sides["002-12"] if text.startswith("largest"))
     assert largest.endswith("cpf (of position N from 500 s to 570 s) / cpf (of position U from 500 s to 570 s)")  # fmt: skip
+
+
+def test_a_claim_whose_central_reading_cannot_run_has_the_numbers_of_one_that_can() -> None:
+    """And says which one."""
+    plan = PLANS["C000-1"]
+    records = []
+    for cell, measures in list_claim_cells(plan).items():
+        can_run = "mcmc_rpf_printed" not in " ".join(cell) or "noise_1" in " ".join(cell)
+        values = {name: [1.0 + 0.01 * k for k in range(20)] for name in measures}
+        failed = "" if can_run else "ValueError: a density"
+        row = (cell, 2001, 0, 20, "k", "c", 1.0, failed, (0,) * 20, values if can_run else {})
+        records.append(StoredValues(*row))
+    decisions = decide_claims([plan], ClaimRuns(records))
+    decided = decisions["C000-1", "published", "direction"]
+    assert next(iter(decided.outcomes.values())) == "cannot run"
+    assert (decided.reading, decided.ratio, decided.runs) == ("noise_1", 1.0, 20)
+    assert "Process noise of 1 %" in _format_measured(conclude(plan, decisions), decided)
 
 
 def test_losses_of_track_that_nobody_has_decide_nothing() -> None:

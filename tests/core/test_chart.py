@@ -8,7 +8,15 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
-from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, QuaternionBlock, wrap_angle
+from pfbench.core.chart import (
+    AngleBlock,
+    Chart,
+    ChartBlock,
+    EuclideanBlock,
+    LieGroupBlock,
+    QuaternionBlock,
+    wrap_angle,
+)
 from pfbench.core.random_stream import PhiloxStream
 
 MIXED = Chart((EuclideanBlock(2), QuaternionBlock(), AngleBlock(1), EuclideanBlock(1)))
@@ -108,3 +116,30 @@ def test_plain_numbers_take_the_plain_path() -> None:
     # a curved chart without curvature in its data averages like a plain one
     curved = Chart((EuclideanBlock(4), AngleBlock(1)))
     assert torch.allclose(curved.mean(0.1 * x, w), (w.unsqueeze(-1) * 0.1 * x).sum(1), atol=1e-14)
+
+
+BLOCKS = [
+    EuclideanBlock(2), AngleBlock(1), QuaternionBlock(),
+    *(LieGroupBlock(size, side) for size in (4, 7, 10) for side in ("left", "right")),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("block", BLOCKS, ids=str)
+def test_volumes_are_those_of_small_boxes_of_differences(block: ChartBlock) -> None:
+    """By derivatives: a rotation moves by the vector of a small turn, all else by its numbers."""
+    has_turn = block.size != block.dimension
+
+    def move(d: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        after = block.add(x, d)
+        if not has_turn:
+            return after
+        turn = QuaternionBlock().subtract(after[:4], y[:4])
+        return torch.cat([turn, after[4:]])
+
+    for k in range(3):
+        x = normal(1, 3, block.size)[0, k]
+        if has_turn:
+            x = torch.cat([x[:4] / x[:4].norm(), x[4:]])
+        d = 0.6 * normal(1, 3, block.dimension, purpose="d")[0, k]
+        slopes = torch.func.jacfwd(move)(d, x, block.add(x, d))
+        assert float(block.log_volume(d)) == pytest.approx(float(torch.linalg.slogdet(slopes)[1]), abs=1e-7)  # fmt: skip

@@ -360,7 +360,7 @@ def test_losses_against_an_untuned_filter_are_those_of_scipy(
     """The cells that are worse than a tuned reference, and than the plain UKF too, by both tests with Holm's correction."""
     pairs = [
         (world.key, cell.filter) for world in overview.worlds for cell in overview.cells
-        if is_worse(cell, world.key) and cell.filter in overview.methods
+        if cell.world == world.key and is_worse(cell) and cell.filter in overview.methods
     ]  # fmt: skip
     differences = [losses(table, world, m) - losses(table, world, "ukf") for world, m in pairs]
     plain = [k for k, d in enumerate(differences) if overview.names["ukf"] != {w.key: w for w in overview.worlds}[pairs[k][0]].reference]  # fmt: skip
@@ -414,12 +414,19 @@ def test_worlds_have_notes_on_what_their_numbers_mean(
     assert f"keeps track in {100 * (1 - len(few) / len(runs)):.0f} % of runs" in text
 
 
-def test_recordings_are_counted_by_the_files_of_their_scenarios() -> None:
+def test_recordings_are_counted_by_the_files_of_their_scenarios(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     counts = {
         "recorded_quad_flights": 20, "recorded_canyon": 1, "recorded_car_drive": 1, "pendulum": 0,
         "a_scenario_of_another_folder": 0,
     }  # fmt: skip
     assert {key: count_recorded_drives(key) for key in counts} == counts
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "conf" / "scenario").mkdir(parents=True)
+    own = tmp_path / "conf" / "scenario" / "a_scenario_of_another_folder.yaml"
+    own.write_text("defaults: [recorded_quad_flights, _self_]\nflights: [1, 2]\n")
+    assert count_recorded_drives(own.stem) == 2
     frame = pd.DataFrame({"scenario": "recorded_quad_flights", "filter": "ekf", "run": range(9), "rmse": 1.0, "keeps_track": True, "lost": False, "seed": 1})  # fmt: skip
     world = build_world(frame, "ekf", 10.0)
     (same,) = list_world_notes([world], {world.name: False})[world.name]

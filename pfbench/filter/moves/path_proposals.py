@@ -163,12 +163,13 @@ class SmoothedSegment(SegmentProposal):
     Forward filtering, backward sampling. The linearisation is about the noise-free path from the
     fixed state, so both directions use the same one. On a linear model without the child this is
     the local resampling of [Yan et al. 2016]. Given the child it is a bridge [ours], which raises
-    the acceptance rate. The ratio is always included, so nonlinear models are exact too.
+    the acceptance rate. The ratio is always included, so nonlinear models are exact too. Rotations are, as long
+    as no draw turns by more than half a turn from the noise-free path, where two vectors are one rotation.
 
     Attributes:
         condition_on_endpoint: Condition also on the child x_t.
-        shares_slopes: Use the slopes at the mean of the fixed states for all particles of a run. The cost falls by
-            the number of states. The move does not change the fixed states, so the ratio remains exact. A strongly
+        shares_slopes: Use the slopes at the mean of the fixed states for all particles of a run, which need be
+            computed once. The move does not change the fixed states, so the ratio remains exact. A strongly
             nonlinear model accepts fewer proposals.
     """
 

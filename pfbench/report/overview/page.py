@@ -246,11 +246,7 @@ def _describe_reference(overview: Overview) -> str:
 
 def _count_plain_losses(overview: Overview) -> str:
     """Say how many of the worse cells remain against a Kalman filter that is not tuned either; empty without it."""
-    worse = sum(
-        is_worse(cell, world.key) and cell.filter in overview.methods
-        for cell in overview.cells
-        for world in overview.worlds
-    )
+    worse = sum(is_worse(cell) and cell.filter in overview.methods for cell in overview.cells)
     lost = [world.plain_losses for world in overview.worlds]
     count = sum(len(some) for some in lost if some is not None)
     if not worse or None in lost:
@@ -264,7 +260,7 @@ def list_notes(overview: Overview) -> list[tuple[str, str]]:
 
 
 def describe_times(overview: Overview, most: float = 1.5) -> str:
-    """Say which filters take longer than SIR in a table of equal time, since they have as few particles as they can."""
+    """Say which filters take longer than SIR in a table of equal time: with few particles times are hard to meet."""
     times, slow = overview.times, []
     for label in (*overview.methods, *overview.conventional):
         ratios = {
@@ -275,11 +271,7 @@ def describe_times(overview: Overview, most: float = 1.5) -> str:
         worst = max(ratios, key=lambda name: ratios[name], default="")
         if worst and ratios[worst] > most:
             slow.append(f"{overview.names[label]} {ratios[worst]:.1f} times ({worst})")
-    return (
-        f"With its fewest particles a filter may still take longer: {', '.join(slow)}."
-        if slow
-        else ""
-    )
+    return f"More than {most:g} times the step of SIR: {', '.join(slow)}." if slow else ""
 
 
 def spell_number(number: int) -> str:

@@ -220,7 +220,9 @@ def build_overview(
     ]
     cells = decide_cells(worlds, [*methods, *conventional])
     worse = {
-        world.name: [c.filter for c in cells if is_worse(c, world.name) and c.filter in methods]
+        world.name: [
+            c.filter for c in cells if c.world == world.name and c.filter in methods and is_worse(c)
+        ]
         for world in worlds
     }
     outdone, notes = _find_outdone(worlds, single), list_world_notes(worlds, has_part)
@@ -240,9 +242,9 @@ def build_overview(
     )  # fmt: skip
 
 
-def is_worse(cell: WorldResult, world: str) -> bool:
-    """Return whether a filter is worse than the reference of a world, and does not lose track."""
-    return cell.world == world and cell.verdict.word == "worse" and not cell.loses_track
+def is_worse(cell: WorldResult) -> bool:
+    """Return whether a filter is worse than the reference of its world, and does not lose track."""
+    return cell.verdict.word == "worse" and not cell.loses_track
 
 
 def _find_outdone(worlds: Sequence[World], single: Sequence[str]) -> dict[str, Verdict]:

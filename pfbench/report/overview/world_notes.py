@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +34,8 @@ def list_world_notes(
         if drives and tuned_on_part[world.name]:
             texts.append("the best Kalman filter was tuned on a part of it")
         elif drives:
-            texts.append(
-                f"the best Kalman filter was tuned on the same {drives} recordings, with other random numbers"
-            )
+            same = "it" if drives == 1 else f"the same {drives} recordings"
+            texts.append(f"the best Kalman filter was tuned on {same}, with other random numbers")
         if world.name in idle:
             texts.append("the best Kalman filter is not shown to be better than dead reckoning")
         share = float(world.keeps_track[world.reference].mean())
@@ -89,18 +87,19 @@ def _is_dead_reckoning(label: str) -> bool:
 
 def count_recorded_drives(scenario: str) -> int:
     """Count the recorded drives of a scenario by its file; 0 for simulated data or without a file."""
-    node = _read_scenario(conf_dir() / "scenario" / f"{scenario}.yaml")
+    node = _read_scenario(scenario)
     return len(node.get("flights") or (1,)) if "root" in node else 0
 
 
-@cache
-def _read_scenario(path: Path) -> Mapping[str, Any]:
-    """Read the file of a scenario with those of the same folder on which it is based."""
-    if not path.is_file():
-        return {}
-    content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    bases = [name for name in content.get("defaults", ()) if isinstance(name, str) and name != "_self_"]  # fmt: skip
-    values: dict[str, Any] = {}
-    for name in bases:
-        values |= _read_scenario(path.parent / f"{name}.yaml")
-    return values | content
+def _read_scenario(name: str) -> dict[str, Any]:
+    """Read the file of a scenario, in pfbench or in `conf` of the current folder, with those on which it is based."""
+    for folder in (conf_dir(), Path("conf")):
+        path = folder / "scenario" / f"{name}.yaml"
+        if path.is_file():
+            content = yaml.safe_load(path.read_text(encoding="utf-8"))
+            bases = [base for base in content.get("defaults", ()) if isinstance(base, str)]
+            values: dict[str, Any] = {}
+            for base in bases:
+                values |= {} if base == "_self_" else _read_scenario(base)
+            return values | content
+    return {}

@@ -568,20 +568,18 @@ def test_flow_steps_in_the_coordinates_in_which_its_start_is_normal() -> None:
     assert before.norm(dim=-1).mean() > 1.0
 
 
+def compose_flight(word: str) -> Any:
+    """Six seconds of SINS/SAR."""
+    words = ["scenario=sar_flight", "episode_cache_dir=null", "scenario.trajectory.duration_s=6"]
+    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
+        return compose("config", [*words, word])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("larger", [1.0, 50.0])
 def test_flow_keeps_the_prior_of_an_inertial_navigation(larger: float) -> None:
     """With quaternions, misalignments as printed and of a degree."""
-    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
-        cfg = compose(
-            "config",
-            [
-                "scenario=sar_flight",
-                "episode_cache_dir=null",
-                "scenario.trajectory.duration_s=6",
-                "scenario.imu_rate_hz=20",
-            ],
-        )
+    cfg = compose_flight("scenario.imu_rate_hz=20")
     cfg.scenario.initial_errors.attitude_arcmin = [larger * 1.2, larger * 1.2, larger * 1.5]
     episode, model = (
         job.instantiate(cfg.scenario).draw(NominalNoise(), torch.arange(1), 1),
@@ -653,16 +651,7 @@ def test_segments_of_rotations_have_the_density_of_the_path(endpoint: bool, shar
 
 def test_an_inertial_model_with_noise_in_all_states_has_its_density() -> None:
     """log p(x'|x) of SINS/SAR is that of the noise that led there, less the volume of its quaternion."""
-    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
-        cfg = compose(
-            "config",
-            [
-                "scenario=sar_flight",
-                "episode_cache_dir=null",
-                "scenario.trajectory.duration_s=6",
-                "reading/paper_000=noise_10",
-            ],
-        )
+    cfg = compose_flight("reading/paper_000=noise_10")
     model = job.instantiate(cfg.model)
     episode = job.instantiate(cfg.scenario).draw(NominalNoise(), torch.arange(2), 1)
     record = model.prepare(episode.record).at_step(2)
