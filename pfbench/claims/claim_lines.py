@@ -31,7 +31,7 @@ _KEYS = {
 }
 _SIDE_KEYS = {"metric": "metric", "group": "group", "component": "component", "from": "start", "to": "end", "settled": "settled"}  # fmt: skip
 _LISTS = ("a", "b", "group", "component", "metric", "settled", "worlds")
-_ENTRY_KEYS = {*_SIDE_KEYS, *(f"b_{key}" for key in _SIDE_KEYS), *_LISTS, "printed", "level", "form", "pairs", "rows"}  # fmt: skip
+_ENTRY_KEYS = {*_SIDE_KEYS, *(f"b_{key}" for key in _SIDE_KEYS), *_LISTS, "printed", "level", "form", "pairs", "rows", "kind", "within"}  # fmt: skip
 
 
 class Side(NamedTuple):
@@ -54,10 +54,10 @@ class LineComparison(NamedTuple):
     """Comparison of a claim in which a is the smaller side.
 
     Attributes:
-        kind: Kind: better, much better, same or number.
+        kind: Kind: better, much better, same, level, size or within.
         a: Smaller side.
         b: Larger side.
-        printed: Printed ratio, of the kind "size".
+        printed: Printed ratio of the kind "size", or largest one of the kind "within".
     """
 
     kind: str
@@ -109,6 +109,13 @@ class ClaimPlan(NamedTuple):
     proved: str = ""
     but: tuple[str, ...] = ()
 
+    @property
+    def has_other_kind(self) -> bool:
+        """Return whether a comparison has another kind than the claim."""
+        expected = {self.claim.kind, "better"} if self.claim.kind == "number" else {self.claim.kind}
+        kinds = {c.kind for parts in self.parts.values() for c in parts}
+        return not kinds <= expected | {"level", "size"}
+
 
 @cache
 def read_paper_settings() -> Mapping[str, Mapping[str, Any]]:
@@ -120,6 +127,13 @@ def read_paper_settings() -> Mapping[str, Mapping[str, Any]]:
 def read_seven() -> Sequence[Mapping[str, str]]:
     """Read the seven methods: name, filter, the claim that it beats its own baseline, and a description."""
     return yaml.safe_load(_DATA.read_text(encoding="utf-8"))["seven"]
+
+
+@cache
+def read_amendments() -> tuple[str, Sequence[Mapping[str, Any]]]:
+    """Read the commit that fixed the claims, and what was corrected since: claims, what, and the word before."""
+    content = yaml.safe_load(_DATA.read_text(encoding="utf-8"))
+    return content["fixed_in"], content["amended"]
 
 
 @cache
@@ -211,7 +225,10 @@ def _parse_comparison(
     if row.get("level"):
         yield SIZE_PART, LineComparison("level", a, b)
         return
-    kind = "better" if claim.kind == "number" else claim.kind
+    if "within" in row:
+        yield DIRECTION_PART, LineComparison("within", a, b, float(row["within"]))
+        return
+    kind = row.get("kind", "better" if claim.kind == "number" else claim.kind)
     yield DIRECTION_PART, LineComparison(kind, a, b)
     if "printed" in row:
         yield SIZE_PART, LineComparison("size", a, b, float(row["printed"]))

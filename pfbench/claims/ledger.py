@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -40,6 +41,7 @@ _KIND_TEXTS = {
     "much better": "a figure at least a fifth smaller",
     "same": "figures within 10 %",
     "number": "a printed number",
+    "within": "a figure of at most {printed:g} times the other one",
 }
 
 
@@ -127,6 +129,8 @@ def describe_tip(line: ClaimWord) -> str:
     ):
         return ""
     kind = line.plan.claim.kind
+    if line.plan.has_other_kind:
+        return ""
     bound = find_tipping_bound(kind, decision.low, decision.high)
     return (
         f"it would be true if ratios up to {bound:.3g} counted; they count up to {KINDS[kind][0]:g}"
@@ -149,7 +153,11 @@ def describe_turns(line: ClaimWord) -> list[str]:
 
 def describe_kind(plan: ClaimPlan) -> str:
     """Describe what a claim must show."""
-    return _KIND_TEXTS[plan.claim.kind]
+    if not plan.has_other_kind:
+        return _KIND_TEXTS[plan.claim.kind]
+    comparisons = [c for parts in plan.parts.values() for c in parts]
+    texts = (_KIND_TEXTS[c.kind].format(printed=c.printed) for c in comparisons)
+    return "; ".join(dict.fromkeys(texts))
 
 
 def list_choices(plan: ClaimPlan) -> list[str]:
@@ -173,12 +181,14 @@ class OldClaim(NamedTuple):
         verdict: Verdict of version 1.
         word: Word now.
         turned: What turned: "yes", "no", "open now" or "was open".
+        reason: Its reason, or the outcomes of its readings.
     """
 
     id: str
     verdict: str
     word: str
     turned: str
+    reason: str
 
 
 _AGREES = {"reproduced": CONFIRMED, "reproduced only as printed": CONFIRMED, "not reproduced": REFUTED, "reproduced only as repaired": REFUTED}  # fmt: skip
@@ -189,9 +199,23 @@ def compare_versions(lines: Sequence[ClaimWord]) -> list[OldClaim]:
     old: Mapping[str, str] = yaml.safe_load(_OLD.read_text(encoding="utf-8"))
     words = {line.plan.claim.id: line for line in lines}
     return [
-        OldClaim(name, verdict, words[name].label, _compare_word(verdict, words[name].word))
+        OldClaim(
+            name,
+            verdict,
+            words[name].label,
+            _compare_word(verdict, words[name].word),
+            _count_outcomes(words[name]),
+        )
         for name, verdict in old.items()
     ]
+
+
+def _count_outcomes(line: ClaimWord) -> str:
+    """Count the outcomes of the readings, or give the reason of a word without them."""
+    if line.reason or line.decision is None:
+        return line.reason
+    counts = Counter(line.decision.outcomes.values())
+    return ", ".join(f"{outcome} in {n}" for outcome, n in counts.most_common())
 
 
 def _compare_word(verdict: str, word: str) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 from pfbench.claims.claim_lines import (
     REPAIRED,
     ClaimPlan,
+    read_amendments,
     read_paper_settings,
     read_plans,
     read_proofs,
@@ -103,8 +104,11 @@ def make_context(
     ]
     total = {state: sum(count[state] for count in counts.values()) for state in (*WORDS, NOT_RUN)}
     commits = sorted({record.commit or "not stored" for record in runs.records})
+    first_commit, amendments = read_amendments()
     return {
         "papers": papers,
+        "first_commit": first_commit,
+        "amendments": amendments,
         "seven": make_seven(lines, worlds),
         "compared": bool(worlds),
         "total": total,

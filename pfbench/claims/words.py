@@ -48,13 +48,13 @@ class ClaimSample(NamedTuple):
     """Values of two filters, or of a filter and a bound, in the same runs of a reading.
 
     Attributes:
-        kind: One of `KINDS`, or "level" or "size".
+        kind: One of `KINDS`, or "level", "size" or "within".
         a: Values of a, [n], positive.
         b: Values of b, [n].
         lost_a: Runs that a lost, [n]. They have the largest value of both.
         lost_b: Runs that b lost, [n].
         early: Runs of the first look, [n].
-        printed: Printed ratio of the kind "size".
+        printed: Printed ratio of the kind "size", or largest one of the kind "within".
         sides: What is divided by what, for a reader.
     """
 
@@ -140,6 +140,8 @@ def find_borders(kind: str, printed: float = math.nan) -> tuple[_Region, _Region
     if kind == "size":
         ends = sorted(math.log(printed) * factor for factor in (SIZE_BOUND, 1 / SIZE_BOUND))
         return (ends[0], ends[1]), (ends[0], ends[1])
+    if kind == "within":
+        return ((-math.inf, math.log(printed)),) * 2
     if kind in ("same", "level"):
         width = math.log(LEVEL_BOUND if kind == "level" else KINDS["same"][0])
         return (-width, width), (-width, width)

@@ -21,6 +21,7 @@ from pfbench.claims.claim_lines import (
     COLUMNS,
     list_dots,
     make_cell,
+    read_amendments,
     read_paper_settings,
     read_plans,
     read_readings,
@@ -38,7 +39,7 @@ from pfbench.claims.claim_runs import (
     list_claim_cells,
     write_values,
 )
-from pfbench.claims.ledger import compare_versions, conclude
+from pfbench.claims.ledger import compare_versions, conclude, describe_kind
 from pfbench.claims.page import _format_measured, write_claims
 from pfbench.claims.run_claims import (
     Task,
@@ -433,7 +434,7 @@ def test_the_page_says_what_is_not_run_and_at_what_price(tmp_path: Path) -> None
     shown = {word: text.count(f'class="square {word}"') + text.count(f'class="square {word} far"') for word in (*WORDS, "not-run")}  # fmt: skip
     counts = {word.replace(" ", "-"): int(n) for n, word in re.findall(r"</i>(\d+) ([a-z ]+)</span>", text)}  # fmt: skip
     assert shown == {word: 2 * n + 1 for word, n in counts.items()}
-    assert counts["not-run"] > counts["open"] > 0
+    assert counts["not-run"] > counts["open"] == 1  # C001-11, whose measure is not built
     assert re.search(r"C001-5: open: not run, price \d+ (s|min)", text)
     assert "Nothing has run yet" in text
     first = text[text.index("<main>") : text.index("<details")]
@@ -455,6 +456,30 @@ def test_the_table_of_version_1_has_all_71_claims() -> None:
     assert turned["002-01"] == "no"
     assert turned["002-25"] == "was open"
     assert turned["C000-1"] == "open now"
+    reasons = {row.id: row.reason for row in old}
+    assert reasons["002-25"].startswith("circular")
+    assert "not run" in reasons["C000-1"]
+
+
+def test_what_a_claim_must_show_is_that_of_its_comparisons() -> None:
+    """Three satellites: at most twice the error with eight, and less than with none."""
+    assert describe_kind(PLANS["002-40"]) == (
+        "a figure of at most 2 times the other one; a smaller figure than the other one"
+    )
+    assert (
+        describe_kind(PLANS["002-38"]) == "figures within 10 %; a smaller figure than the other one"
+    )
+    assert describe_kind(PLANS["002-18"]) == "a printed number"
+    c = next(iter(PLANS["002-40"].parts.values()))[0]
+    assert (c.kind, c.printed, c.a.measure.end) == ("within", 2.0, 660.0)
+
+
+def test_corrections_after_the_first_runs_are_on_the_page(tmp_path: Path) -> None:
+    _, amendments = read_amendments()
+    assert {name for row in amendments for name in row["claims"]} <= set(PLANS)
+    page = write_claims(tmp_path, tmp_path / "out")
+    for text in (page.read_text(), (page.parent / "report.md").read_text()):
+        assert all(row["what"] in text and row["before"] in text for row in amendments)
 
 
 def test_a_sentence_of_a_paper_names_proofs_of_that_paper() -> None:

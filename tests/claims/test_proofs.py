@@ -113,6 +113,10 @@ def test_p8_the_printed_error_is_50_percent_whatever_is_estimated() -> None:
     estimates = np.array([[160e3, 160e3], [0.0, 0.0], [-1e6, 1e6], [1e6, 1e6], [-1e6, -1e6]])
     err = 100 * ((true**2 - estimates) ** 2).sum(1) / (true**2).sum() ** 2
     assert np.abs(err - 50.0).max() < 0.01
+    true_km = true / 1e3
+    near = true_km + np.array([[0.0, 0.0], [50.0, 50.0], [-50.0, -50.0], [50.0, -50.0]])
+    err_km = 100 * ((true_km**2 - near) ** 2).sum(1) / (true_km**2).sum() ** 2
+    assert 49.15 < err_km.min() < err_km.max() < 49.6
 
 
 @pytest.mark.parametrize("m", [5, 10, 20, 40])
@@ -125,6 +129,14 @@ def test_p9_the_printed_generator_divides_the_covariance(m: int) -> None:
     second = half**2 / 3 + 1 / m**2
     assert second == pytest.approx(1 / m)
     assert half**2 / 3 * m == pytest.approx((m - 1) / m)
+    g = np.random.default_rng(m)
+    centres = g.normal(0.0, 2.0, 20_000 // m)[:, None]
+    sample = centres + g.normal(size=(len(centres), m))
+    means = sample.mean(1, keepdims=True)
+    u = g.uniform(1 / m - half, 1 / m + half, sample.shape)
+    moved = means + u * (sample - means)
+    inside = (sample - means).var()
+    assert sample.var() - moved.var() == pytest.approx((1 - 1 / m) * inside, abs=0.1)
 
 
 def test_p10_the_printed_shift_widens_the_cloud() -> None:

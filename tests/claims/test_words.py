@@ -65,6 +65,8 @@ def decide_single(*comparisons: ClaimSample) -> ClaimDecision:
         ("size", 0.95, 0.5, REFUTED),
         ("size", 0.1, 0.5, REFUTED),
         ("level", 1.6, math.nan, REFUTED),
+        ("within", 1.5, 2.0, CONFIRMED),
+        ("within", 2.5, 2.0, REFUTED),
     ],
 )
 def test_a_planted_effect_gives_its_word(

@@ -104,10 +104,12 @@ class InertiaVelocity(VelocityUpdate):
         social_coefficient: c2.
         escape_coefficient: Coefficient of escape. 0 gives the plain swarm.
         printed_iterations: Largest number of iterations in eq. 35 as printed. None for its meaning.
+        escape_schedule: "cosine", or "linear" from 0 to the same end, the schedule that eq. 35
+            replaces.
 
     Raises:
-        ValueError: If the inertia weight is outside [0, 1), a coefficient is negative, or the number
-            of iterations is below 1.
+        ValueError: If the inertia weight is outside [0, 1), a coefficient is negative, the number of
+            iterations is below 1, or the schedule is another or linear as printed.
     """
 
     inertia_weight: float = 0.8
@@ -115,12 +117,19 @@ class InertiaVelocity(VelocityUpdate):
     social_coefficient: float = 1.2
     escape_coefficient: float = 0.0
     printed_iterations: int | None = None
+    escape_schedule: str = "cosine"
 
     def __post_init__(self) -> None:
         if self.printed_iterations is not None and self.printed_iterations < 1:
             raise ValueError(
                 "proposal.velocity.printed_iterations must be at least 1, got "
                 f"{self.printed_iterations}. Use null for the meaning of eq. 35."
+            )
+        schedules = ("cosine", "linear") if self.printed_iterations is None else ("cosine",)
+        if self.escape_schedule not in schedules:
+            raise ValueError(
+                "proposal.velocity.escape_schedule must be cosine or, without printed_iterations, "
+                f"linear, got {self.escape_schedule!r}. Set printed_iterations=null, or cosine."
             )
         require_ranges(
             "proposal.velocity",
@@ -134,6 +143,8 @@ class InertiaVelocity(VelocityUpdate):
     def compute_escape_factor(self, phase: float) -> float:
         """Return c3 = c4 for a phase from 0 to 1."""
         total = self.printed_iterations
+        if self.escape_schedule == "linear":
+            return self.escape_coefficient * 2.0 * phase
         if total is None:
             return self.escape_coefficient * (1.0 - math.cos(math.pi * phase))
         return self.escape_coefficient * (1.0 - math.cos(math.pi * round(phase * total)) / total)

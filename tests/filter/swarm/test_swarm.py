@@ -241,6 +241,10 @@ def test_the_escape_factor_rises_from_0_to_twice_its_amplitude() -> None:
     assert values[75] == pytest.approx(0.12)
     assert values[-1] == pytest.approx(0.24)
     assert (np.diff(values) > 0).all()
+    linear = dataclasses.replace(ESCAPE, escape_schedule="linear")
+    assert [linear.compute_escape_factor(i / 4) for i in range(5)] == pytest.approx(
+        [0.0, 0.06, 0.12, 0.18, 0.24]
+    )
 
 
 def still(flock_q: Tensor, **parts: Tensor) -> SwarmState:
@@ -787,6 +791,11 @@ def test_bad_choices_are_told() -> None:
             (
                 "printed_iterations must be at least 1.* Use null",
                 lambda: InertiaVelocity(printed_iterations=0),
+            ),
+            ("escape_schedule", lambda: InertiaVelocity(escape_schedule="square")),
+            (
+                "escape_schedule must be cosine or, without printed_iterations",
+                lambda: InertiaVelocity(printed_iterations=150, escape_schedule="linear"),
             ),
             ("beta", lambda: ChaoticPerturbation(0.0)),
             ("max_velocity_sd", lambda: SwarmLimits(max_velocity_sd=0.0)),
