@@ -28,8 +28,9 @@ readings of its paper. A claim without runs is open, with the price of its runs.
   pfbench claims run C001-7              one claim; 001 is all claims of a paper
   pfbench claims run 002 readings=each hours=2
   pfbench claims run dry=true            the plan only
-  pfbench claims verify                  computes 20 stored cells again, and all words. Runs must be equal;
-                                         those of particles, which may amplify rounding, agree in the mean
+  pfbench claims verify                  computes 20 stored cells again, and all words, in about five minutes.
+                                         Runs must be equal; those of particles, which may amplify rounding,
+                                         agree in the mean. Cells of more than 3 s a run are not drawn
 
   hours=H                    starts no job after this time; repeat the command to resume
   workers=2                  processes, at most two
@@ -258,7 +259,7 @@ def verify_claims(words: Sequence[str]) -> None:
         draw_records,
         find_measures,
         read_words,
-        verify_record,
+        verify_records,
     )
     from pfbench.cli.compose import split_words
 
@@ -274,11 +275,10 @@ def verify_claims(words: Sequence[str]) -> None:
         f"verify: seed={seed}, {len(drawn_records)} of {len(runs.records)} stored jobs", flush=True
     )
     faults = 0
-    for record in drawn_records:
-        check = verify_record(record, measures.get(record.cell, {}), places["results_dir"])
+    for check in verify_records(drawn_records, measures, places["results_dir"]):
         faults += bool(check.fault)
         word = "differs" if check.fault else "equal" if check.is_equal else "agrees"
-        print(f"{word:8} {check.runs:4} runs  {' '.join(record.cell)}  {check.fault}", flush=True)
+        print(f"{word:8} {check.runs:4} runs  {' '.join(check.record.cell)}  {check.fault}", flush=True)
     stated = read_words(Path(places["reports_dir"]) / CLAIMS_STUDY)
     again = describe_words(decide_claims(plans, runs))
     turned = [name for name, word in stated.items() if again.get(name) != word]

@@ -290,13 +290,15 @@ def test_the_jobs_of_a_form_that_may_refuse_are_the_first_of_a_claim() -> None:
 
 def test_cells_are_verified_by_a_seed_at_least_three_a_paper() -> None:
     cells = [(f"reading/{paper}=central", f"filter=f{k}") for paper in PAPERS for k in range(9)]
-    runs = ClaimRuns([store(cell, Batch(2001, 0, 1), {}) for cell in cells])
+    runs = ClaimRuns([store(cell, Batch(2001, 0, 1), {}, seconds=1.0) for cell in cells])
     drawn = draw_records(runs, 5)
     assert drawn == draw_records(runs, 5)
     assert drawn != draw_records(runs, 6)
     assert len(drawn) == 20
     for paper in PAPERS:
         assert sum(r.cell[0].startswith(f"reading/{paper}") for r in drawn) >= 3
+    long = [store(cell, Batch(2001, 0, 1), {}, seconds=100.0) for cell in cells[:8]]
+    assert draw_records(ClaimRuns(long), 5) == []
 
 
 # runs: a cheap claim in seconds
@@ -327,6 +329,8 @@ def test_a_cheap_claim_is_run_decided_verified_and_shown(tmp_path: Path) -> None
         assert set(record.values) == set(task.measures)
     measures = find_measures(list(PLANS.values()))
     assert verify_record(records[0], measures[records[0].cell], results).fault == ""
+    former = replace(records[0], values={**records[0].values, "a former quantity": [1.0] * 12})
+    assert verify_record(former, measures[records[0].cell], results).fault == ""
     name = next(iter(records[0].values))
     planted = replace(records[0], values={name: [2 * v for v in records[0].values[name]]})
     assert "stored" in verify_record(planted, measures[records[0].cell], results).fault

@@ -105,11 +105,11 @@ class InertiaVelocity(VelocityUpdate):
         escape_coefficient: Coefficient of escape. 0 gives the plain swarm.
         printed_iterations: Largest number of iterations in eq. 35 as printed. None for its meaning.
         escape_schedule: "cosine", or "linear" from 0 to the same end, the schedule that eq. 35
-            replaces.
+            replaces, whatever `printed_iterations` is.
 
     Raises:
         ValueError: If the inertia weight is outside [0, 1), a coefficient is negative, the number of
-            iterations is below 1, or the schedule is another or linear as printed.
+            iterations is below 1, or the schedule is another.
     """
 
     inertia_weight: float = 0.8
@@ -125,11 +125,10 @@ class InertiaVelocity(VelocityUpdate):
                 "proposal.velocity.printed_iterations must be at least 1, got "
                 f"{self.printed_iterations}. Use null for the meaning of eq. 35."
             )
-        schedules = ("cosine", "linear") if self.printed_iterations is None else ("cosine",)
-        if self.escape_schedule not in schedules:
+        if self.escape_schedule not in ("cosine", "linear"):
             raise ValueError(
-                "proposal.velocity.escape_schedule must be cosine or, without printed_iterations, "
-                f"linear, got {self.escape_schedule!r}. Set printed_iterations=null, or cosine."
+                "proposal.velocity.escape_schedule must be cosine or linear, got "
+                f"{self.escape_schedule!r}. Use cosine for eq. 35."
             )
         require_ranges(
             "proposal.velocity",

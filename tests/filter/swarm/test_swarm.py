@@ -793,10 +793,6 @@ def test_bad_choices_are_told() -> None:
                 lambda: InertiaVelocity(printed_iterations=0),
             ),
             ("escape_schedule", lambda: InertiaVelocity(escape_schedule="square")),
-            (
-                "escape_schedule must be cosine or, without printed_iterations",
-                lambda: InertiaVelocity(printed_iterations=150, escape_schedule="linear"),
-            ),
             ("beta", lambda: ChaoticPerturbation(0.0)),
             ("max_velocity_sd", lambda: SwarmLimits(max_velocity_sd=0.0)),
             ("max_distance_sd", lambda: SwarmLimits(max_distance_sd=-1.0)),
