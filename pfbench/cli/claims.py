@@ -278,7 +278,10 @@ def verify_claims(words: Sequence[str]) -> None:
     for check in verify_records(drawn_records, measures, places["results_dir"]):
         faults += bool(check.fault)
         word = "differs" if check.fault else "equal" if check.is_equal else "agrees"
-        print(f"{word:8} {check.runs:4} runs  {' '.join(check.record.cell)}  {check.fault}", flush=True)
+        print(
+            f"{word:8} {check.runs:4} runs  {' '.join(check.record.cell)}  {check.fault}",
+            flush=True,
+        )
     stated = read_words(Path(places["reports_dir"]) / CLAIMS_STUDY)
     again = describe_words(decide_claims(plans, runs))
     turned = [name for name, word in stated.items() if again.get(name) != word]
