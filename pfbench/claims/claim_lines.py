@@ -130,6 +130,12 @@ def read_seven() -> Sequence[Mapping[str, str]]:
 
 
 @cache
+def read_setting_texts() -> Mapping[str, str]:
+    """Read the words of sides as a reader sees them."""
+    return yaml.safe_load(_DATA.read_text(encoding="utf-8"))["settings"]
+
+
+@cache
 def read_amendments() -> tuple[str, Sequence[Mapping[str, Any]]]:
     """Read the commit that fixed the claims, and what was corrected since: claims, what, and the word before."""
     content = yaml.safe_load(_DATA.read_text(encoding="utf-8"))

@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +24,7 @@ from pfbench.claims.claim_lines import (
     make_cell,
     read_paper_settings,
     read_readings,
+    read_setting_texts,
 )
 from pfbench.claims.measures import METRIC_WORDS, OFF_TRACK, Measure
 from pfbench.claims.words import (
@@ -35,6 +37,7 @@ from pfbench.claims.words import (
     decide_paper,
 )
 from pfbench.files.atomic_write import write_atomically
+from pfbench.results.paper_block import read_paper_block
 from pfbench.stats.error_measures import Array
 
 CLAIMS_STUDY = "claims_2"  # folder of the jobs
@@ -192,8 +195,13 @@ def _read_values(path: Path) -> Iterator[StoredValues]:
 
 
 def _make_record(content: Mapping[str, Any]) -> StoredValues:
-    """Make the values of a job from those of a file."""
-    return StoredValues(**{**content, "cell": tuple(content["cell"]), "lost": tuple(content["lost"])})  # fmt: skip
+    """Make the values of a job from those of a file, to nine digits, so that published values are not longer."""
+    values = {
+        name: [float(f"{value:.9g}") for value in column]
+        for name, column in content["values"].items()
+    }
+    changes = {"cell": tuple(content["cell"]), "lost": tuple(content["lost"]), "values": values}
+    return StoredValues(**{**content, **changes})
 
 
 # --------------------------------------------------------------------------------------------------
@@ -308,9 +316,11 @@ def describe_sides(c: LineComparison) -> str:
     """Describe a comparison for a reader: what is divided by what, its components and its time."""
     filtered = [side for side in (c.a, c.b) if side.filter]
     quantities = [describe_quantity(side.measure) for side in filtered]
-    is_common = len(set(quantities)) == 1
+    is_common, texts = len(set(quantities)) == 1, read_setting_texts()
     names = [
-        " ".join([side.filter, *side.words]) if side.filter else f"{side.number:g}"
+        " ".join([_name_filter(side.filter), *(texts[word] for word in side.words)])
+        if side.filter
+        else f"{side.number:g}"
         for side in (c.a, c.b)
     ]
     if not is_common:
@@ -318,6 +328,12 @@ def describe_sides(c: LineComparison) -> str:
     metric = c.a.measure.metric
     words = [METRIC_WORDS.get(metric, metric.replace("_", " ")), *quantities[: int(is_common)]]
     return f"{' '.join(filter(None, words))}, {names[0]} / {names[1]}"
+
+
+@cache
+def _name_filter(key: str) -> str:
+    """Name a filter as in the tables of reports."""
+    return str(read_paper_block("filter", key)["name"])
 
 
 def describe_quantity(measure: Measure) -> str:
