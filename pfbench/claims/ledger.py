@@ -211,11 +211,11 @@ def compare_versions(lines: Sequence[ClaimWord]) -> list[OldClaim]:
 
 
 def _count_outcomes(line: ClaimWord) -> str:
-    """Count the outcomes of the readings, or give the reason of a word without them."""
-    if line.reason or line.decision is None:
-        return line.reason
-    counts = Counter(line.decision.outcomes.values())
-    return ", ".join(f"{outcome} in {n}" for outcome, n in counts.most_common())
+    """Count the outcomes of the readings after the reason of a word that has one."""
+    counts = Counter(line.decision.outcomes.values() if line.decision else ())
+    outcomes = [f"{outcome} in {n}" for outcome, n in counts.most_common()]
+    reason = "" if line.reason.endswith(NOT_RUN) else line.reason
+    return ", ".join(filter(None, [reason, *outcomes]))
 
 
 def _compare_word(verdict: str, word: str) -> str:

@@ -20,7 +20,13 @@ from pfbench.claims.claim_lines import (
     read_readings,
     read_seven,
 )
-from pfbench.claims.claim_runs import CLAIMS_STUDY, PUBLISHED_VALUES, ClaimRuns, decide_claims
+from pfbench.claims.claim_runs import (
+    CLAIMS_STUDY,
+    PUBLISHED_VALUES,
+    Cell,
+    ClaimRuns,
+    decide_claims,
+)
 from pfbench.claims.ledger import (
     ClaimWord,
     compare_versions,
@@ -31,7 +37,7 @@ from pfbench.claims.ledger import (
     describe_turns,
     list_choices,
 )
-from pfbench.claims.run_claims import Decisions, describe_words, price_claims
+from pfbench.claims.run_claims import Decisions, Task, describe_words, price_claims
 from pfbench.claims.words import NOT_RUN, OPEN, WORDS, ClaimDecision
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import RUNS_FILE, count_better_worlds, find_overviews, read_stored_study
@@ -89,7 +95,7 @@ def make_context(
     lines = [conclude(plan, decisions) for plan in plans]
     missing = price_claims(plans, runs, decisions)
     prices = {price.plan.claim.id: price.seconds for price in missing}
-    tasks = {(task.cell, task.batch): task.seconds for price in missing for task in price.tasks}
+    tasks = {(t.cell, t.batch): t for price in missing for t in price.tasks}
     rows = [make_row(line, decisions, prices) for line in lines]
     counts = count_by_paper(lines)
     papers = [
@@ -118,10 +124,30 @@ def make_context(
         "n": len(lines),
         "jobs": len(runs.records),
         "hours": sum(record.seconds for record in runs.records) / 3600,
-        "missing": sum(tasks.values()) / 3600,
+        "missing": sum(task.seconds for task in tasks.values()) / 3600,
+        "prices": _list_spent(runs, list(tasks.values())),
         "commits": commits,
         "dirty": sum(record.commit.endswith("-dirty") for record in runs.records),
     }
+
+
+def _list_spent(runs: ClaimRuns, tasks: Sequence[Task]) -> list[dict[str, Any]]:
+    """List jobs and hours spent and missing of each paper; worlds of this project are those of no paper."""
+
+    def find_paper(cell: Cell) -> str:
+        return next((word[8:11] for word in cell if word.startswith("reading/")), "others")
+
+    papers = sorted({find_paper(record.cell) for record in runs.records} | {task.paper for task in tasks})  # fmt: skip
+    return [
+        {
+            "paper": paper,
+            "jobs": sum(find_paper(record.cell) == paper for record in runs.records),
+            "spent": sum(r.seconds for r in runs.records if find_paper(r.cell) == paper) / 3600,
+            "missing_jobs": sum(find_paper(task.cell) == paper for task in tasks),
+            "missing": sum(t.seconds for t in tasks if find_paper(t.cell) == paper) / 3600,
+        }
+        for paper in papers
+    ]
 
 
 def _say_paper(sentence: str, counts: Mapping[str, int]) -> str:
