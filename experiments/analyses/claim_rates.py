@@ -2,7 +2,7 @@
 
 A ledger has claims of one paper, each with readings whose runs share a world. At the edge of true the median ratio
 is that at which the claim ceases to be true, so that each "confirmed" is an error; at the edge of false so is each
-"refuted". 1000 ledgers take some minutes:
+"refuted". 1000 ledgers take some minutes, and are written for the page of the claims:
 
     python experiments/analyses/claim_rates.py 1000
 """
@@ -11,12 +11,15 @@ from __future__ import annotations
 
 import math
 import sys
+from pathlib import Path
 
 import numpy as np
+import yaml
 
 from pfbench.claims import KINDS, ClaimDecision, ClaimSample, ReadingDot, decide_paper
 
 LEVEL = 0.025  # of each error
+RATES = Path(__file__).resolve().parents[2] / "pfbench" / "claims" / "error_rates.yaml"
 KINDS_IN_TURN = ("better", "much better")
 
 
@@ -64,12 +67,17 @@ def allow(ledgers: int) -> float:
     return LEVEL + 2 * math.sqrt(LEVEL * (1 - LEVEL) / ledgers)
 
 
-if __name__ == "__main__":
-    number = int(sys.argv[1]) if len(sys.argv) > 1 else 1000
+def write_rates(ledgers: int) -> None:
+    """Measure the rates with all of the settings, print them, and write them for the page of the claims."""
+    rows = []
     for readings, lost in ((1, 0.0), (1, 0.1), (2, 0.0)):
-        rates = measure_rates(number, 1, readings=readings, lost=lost)
-        print(
-            f"{number} ledgers, {readings} readings, {lost:.0%} lost: false confirmed {rates[0]:.3f}, "
-            f"false refuted {rates[1]:.3f}, at most {allow(number):.3f}",
-            flush=True,
-        )
+        confirmed, refuted = measure_rates(ledgers, 1, readings=readings, lost=lost)
+        rows.append({"readings": readings, "lost": lost, "false_confirmed": confirmed, "false_refuted": refuted})  # fmt: skip
+        print(f"{ledgers} ledgers, {rows[-1]}, at most {allow(ledgers):.3f}", flush=True)
+    head = "# Written by experiments/analyses/claim_rates.py: shares of simulated papers with a false word.\n"
+    text = yaml.safe_dump({"ledgers": ledgers, "rates": rows}, sort_keys=False)
+    RATES.write_text(head + text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    write_rates(int(sys.argv[1]) if len(sys.argv) > 1 else 1000)

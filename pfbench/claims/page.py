@@ -10,6 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from pfbench.claims.claim_lines import (
     REPAIRED,
     ClaimPlan,
@@ -43,6 +45,7 @@ from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import RUNS_FILE, count_better_worlds, find_overviews, read_stored_study
 from pfbench.report.writers import render_template
 
+_RATES = Path(__file__).with_name("error_rates.yaml")
 COMPARISON = "all_seven"  # study that compares the methods with the Kalman filters of each world
 RULES = (
     "Confirmed or refuted: the same outcome in all readings that can run, at 2.5 % for all claims of a paper.",
@@ -118,7 +121,7 @@ def make_context(
         "seven": make_seven(lines, worlds),
         "compared": bool(worlds),
         "total": total,
-        "rules": RULES,
+        "rules": (*RULES, _say_error_rates()),
         "proofs": read_proofs(),
         "old": compare_versions(lines),
         "n": len(lines),
@@ -129,6 +132,18 @@ def make_context(
         "commits": commits,
         "dirty": sum(record.commit.endswith("-dirty") for record in runs.records),
     }
+
+
+def _say_error_rates() -> str:
+    """Say how often simulated papers, whose claims are at a border, have a false word."""
+    stored = yaml.safe_load(_RATES.read_text(encoding="utf-8"))
+    confirmed, refuted = (
+        max(row[name] for row in stored["rates"]) for name in ("false_confirmed", "false_refuted")
+    )
+    return (
+        f"In {stored['ledgers']} simulated papers with all claims at a border, at most {confirmed:.1%} have a false "
+        f"confirmed, and {refuted:.1%} a false refuted."
+    )
 
 
 def _list_spent(runs: ClaimRuns, tasks: Sequence[Task]) -> list[dict[str, Any]]:

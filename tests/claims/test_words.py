@@ -8,8 +8,10 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+import yaml
 from checkout import ROOT
 
+from pfbench.claims.page import _say_error_rates
 from pfbench.claims.words import (
     CANNOT_RUN,
     CONFIRMED,
@@ -202,6 +204,14 @@ def test_error_rates_of_the_words() -> None:
     """False words in 30 ledgers at the edges; the script measures 1000."""
     for rate in RATES.measure_rates(30, 11, claims=4):
         assert rate <= RATES.allow(30)
+
+
+def test_the_rates_of_the_page_keep_the_level() -> None:
+    stored = yaml.safe_load(RATES.RATES.read_text())
+    assert stored["ledgers"] >= 1000
+    for row in stored["rates"]:
+        assert max(row["false_confirmed"], row["false_refuted"]) <= RATES.allow(stored["ledgers"])
+    assert "at most 1.4% have a false confirmed, and 1.9% a false refuted" in _say_error_rates()
 
 
 @pytest.mark.slow
