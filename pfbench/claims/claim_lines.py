@@ -76,6 +76,7 @@ class Reading(NamedTuple):
         why: Reason.
         text: First line of the file.
         filters: Filters that it sets; None if it sets the world, so that it concerns all of them.
+        claims: Claims that it is for, of a pair of levels that both turn them.
     """
 
     name: str
@@ -84,6 +85,7 @@ class Reading(NamedTuple):
     reason: str
     text: str
     filters: tuple[str, ...] | None
+    claims: tuple[str, ...] = ()
 
 
 class ClaimPlan(NamedTuple):
@@ -156,7 +158,8 @@ def read_readings(paper: str) -> Mapping[str, Reading]:
         filters = None if sets_world else tuple(stated.get("filters", ()))
         line = next(row for row in text.splitlines() if row.startswith("# ") and "@" not in row)
         row = (stated["factor"], stated["class"], stated["why"], line.removeprefix("# "))
-        entries_read[path.stem] = Reading(path.stem, *row, filters)
+        claims = tuple(stated.get("claims", ()))
+        entries_read[path.stem] = Reading(path.stem, *row, filters, claims)
     return {CENTRAL_READING: entries_read[CENTRAL_READING], **entries_read}
 
 
@@ -274,7 +277,11 @@ def list_dots(plan: ClaimPlan) -> dict[str, tuple[str, str]]:
         return {CENTRAL_READING: (CENTRAL_READING, "")}
     first = next(iter(plan.windows), "")
     readings = read_readings(plan.claim.paper).values()
-    names = [CENTRAL_READING, *(r.name for r in readings if r.factor in plan.claim.factors)]
+    names = [
+        CENTRAL_READING,
+        *(r.name for r in readings if r.factor in plan.claim.factors),
+        *(r.name for r in readings if plan.claim.id in r.claims),
+    ]
     others = {f"window {name}": (CENTRAL_READING, name) for name in list(plan.windows)[1:]}
     return {name: (name, first) for name in names} | others
 

@@ -38,6 +38,7 @@ WORDS = (CONFIRMED, REFUTED, DEPENDS, UNTESTABLE, OPEN)
 TRUE, FALSE, UNDECIDED = "true", "false", "open"
 NOT_RUN, CANNOT_RUN, VACUOUS, NOT_COUNTED = "not run", "cannot run", "vacuous", "not counted"
 
+PAIR = "pair"  # factor of two levels together, each of which turns a claim alone
 LOOKS = (0.01, 0.04)  # error rates of both sides at the first look and at all runs; half on a side
 LEVEL_BOUND = 1.2  # a printed level holds within 20 %
 SIZE_BOUND = 2.0  # a printed ratio holds within this factor of its logarithm
@@ -325,7 +326,7 @@ def _find_factors(dots: Mapping[str, ReadingDot], outcomes: Mapping[str, str]) -
     central = next(iter(outcomes.values()))
     turned = {TRUE: (FALSE,), FALSE: (TRUE,)}.get(central, (TRUE, FALSE))
     names = (dot.factor for reading, dot in dots.items() if outcomes[reading] in turned)
-    return tuple(dict.fromkeys(name for name in names if name != "none"))
+    return tuple(dict.fromkeys(name for name in names if name not in ("none", PAIR)))
 
 
 _Description = tuple[float, float, float, int, float, str]

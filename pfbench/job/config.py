@@ -438,11 +438,11 @@ def expand_filter_sets(words: Sequence[str]) -> list[str]:
 # Readings of the papers: Hydra groups whose files set the world of a paper and, by name, its filters.
 #
 # A word `reading/001=NAME` chooses conf/reading/paper_001/NAME.yaml: a group of Hydra must not begin with a digit. A file has the package `_global_`. It sets the world by plain keys. Under `reading.NNN` it states `factor`, `class`
-# (one of `CLASSES`), `why`, and `filters`: settings of named filters, since a job has one of them.
+# (one of `CLASSES`), `why`, and `filters`: settings of named filters, since a job has one of them. `claims` are those that a pair of levels is for.
 
 READING = "reading"
 CLASSES = ("printed", "cited", "ours", "fitted")
-_STATED = {"factor", "class", "why", "filters", "cites", "completions"}
+_STATED = {"factor", "class", "why", "filters", "cites", "completions", "claims"}
 
 
 def name_readings(words: Sequence[str]) -> list[str]:
@@ -471,7 +471,7 @@ def check_reading(paper: str, stated: Any) -> None:
     key = f"{READING}.{paper}"
     if not isinstance(stated, Mapping) or not {"factor", "class", "why"} <= set(stated) <= _STATED:
         raise ValueError(
-            f"{key} must state factor, class and why, perhaps filters, cites and completions, got {stated!r:.120}. "
+            f"{key} must state factor, class and why, perhaps filters, cites, completions and claims, got {stated!r:.120}. "
             "Correct the file."
         )
     if stated["class"] not in CLASSES:

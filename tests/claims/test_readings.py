@@ -118,6 +118,31 @@ def test_a_reading_sets_the_world_and_the_named_filter_alone() -> None:
     assert chosen["particles"] == 50
 
 
+def flatten(values: Mapping[str, Any], path: str = "") -> dict[str, Any]:
+    """Map the dotted keys of a job to their values, without those that are null."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        inner = f"{path}.{key}".lstrip(".")
+        flat |= flatten(value, inner) if isinstance(value, Mapping) and value else {inner: value}
+    return {key: value for key, value in flat.items() if value is not None}
+
+
+@pytest.mark.parametrize(("paper", "name"), [key for key in FILES if "_and_" in key[1]])
+def test_a_pair_of_levels_is_both_and_nothing_else(paper: str, name: str) -> None:
+    method = {"003": "dmc_reconstructed_printed", "004": "cpso_pf"}[paper]
+    method = "cpso_escape_printed" if "004-C1" in STATED[paper, name]["claims"] else method
+    central, first, second, pair = (
+        flatten(compose(paper, one, f"filter={method}"))
+        for one in ("central", *name.split("_and_"), name)
+    )
+    changed = [
+        {key: one[key] for key in one if one[key] != central.get(key)} for one in (first, second)
+    ]
+    assert all(changed)
+    assert not changed[0].keys() & changed[1].keys()
+    assert pair == central | changed[0] | changed[1]
+
+
 def test_a_number_of_a_paper_is_a_group() -> None:
     words = ["reading/001=a", "+reading/002=glob(*)", "study=reading/003=x", "filter=sir"]
     assert name_readings(words) == [

@@ -106,6 +106,18 @@ def test_a_word_needs_all_readings_and_depends_names_the_factor() -> None:
     assert missing["claim"].outcomes == {"central": TRUE, "speed": NOT_RUN}
 
 
+def test_a_pair_of_levels_names_no_factor() -> None:
+    """It shows whether both together turn the claim as each alone does."""
+    dots = {
+        "central": ReadingDot("none", (draw(1.5, n=300),)),
+        "low": ReadingDot("limit", (draw(0.5, n=300),)),
+        "low_and_fine": ReadingDot("pair", (draw(0.5, n=300),)),
+    }
+    found = decide_paper({"claim": dots})["claim"]
+    assert (found.word, found.factors) == (DEPENDS, ("limit",))
+    assert found.outcomes["low_and_fine"] == TRUE
+
+
 def test_readings_without_information_do_not_count() -> None:
     better = draw(0.6)
     same = draw(1.0, "same", n=40)
