@@ -38,7 +38,7 @@ WORDS = (CONFIRMED, REFUTED, DEPENDS, UNTESTABLE, OPEN)
 TRUE, FALSE, UNDECIDED = "true", "false", "open"
 NOT_RUN, CANNOT_RUN, VACUOUS, NOT_COUNTED = "not run", "cannot run", "vacuous", "not counted"
 
-PAIR = "pair"  # factor of two levels together, each of which turns a claim alone
+PAIR = "pair"  # factor of two levels together that turn a claim alone
 LOOKS = (0.01, 0.04)  # error rates of both sides at the first look and at all runs; half on a side
 LEVEL_BOUND = 1.2  # a printed level holds within 20 %
 SIZE_BOUND = 2.0  # a printed ratio holds within this factor of its logarithm
