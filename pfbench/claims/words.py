@@ -159,7 +159,8 @@ def decide_paper(claims: Mapping[str, Mapping[str, ReadingDot]]) -> dict[str, Cl
     Returns:
         Decision by claim.
     """
-    looks = [_decide_look(claims, is_early, alpha) for is_early, alpha in ((True, LOOKS[0]), (False, LOOKS[1]))]  # fmt: skip
+    weighed: dict[tuple[str, str, str], _Evidence] = {}
+    looks = [_decide_look(claims, is_early, alpha, weighed) for is_early, alpha in ((True, LOOKS[0]), (False, LOOKS[1]))]  # fmt: skip
     return {
         name: _conclude(dots, [(look[0][name], look[1][name]) for look in looks])
         for name, dots in claims.items()
@@ -170,19 +171,30 @@ _Look = tuple[dict[str, set[str]], dict[str, dict[str, set[str]]]]
 
 
 def _decide_look(
-    claims: Mapping[str, Mapping[str, ReadingDot]], is_early: bool, alpha: float
+    claims: Mapping[str, Mapping[str, ReadingDot]],
+    is_early: bool,
+    alpha: float,
+    weighed: dict[tuple[str, str, str], _Evidence],
 ) -> _Look:
-    """Decide all claims and all readings at a look; returns the outcomes shown by claim, and by claim and reading."""
+    """Decide all claims and all readings at a look; returns the outcomes shown by claim, and by claim and reading.
+
+    Evidence of readings whose runs are all of the first look is stored in `weighed`, and not computed twice.
+    """
     decided: dict[str, set[str]] = {name: set() for name in claims}
     dots_shown: dict[str, dict[str, set[str]]] = {
         name: {reading: set() for reading in dots} for name, dots in claims.items()
     }
     for outcome in (TRUE, FALSE):
         dots = {
-            (name, reading): _weigh(dot, outcome, is_early)
+            (name, reading): weighed.get((outcome, name, reading)) or _weigh(dot, outcome, is_early)
             for name, readings in claims.items()
             for reading, dot in readings.items()
             if is_counted(dot)
+        }
+        weighed |= {
+            (outcome, *key): item
+            for key, item in dots.items()
+            if all(c.early.all() for c in claims[key[0]][key[1]].comparisons)
         }
         everywhere = {name: _hold_everywhere([e for (n, _), e in dots.items() if n == name]) for name in claims}  # fmt: skip
         for name in _select_decided(everywhere, alpha):
