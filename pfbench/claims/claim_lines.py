@@ -27,7 +27,7 @@ DIRECTION_PART, SIZE_PART = "direction", "size"
 TIMING = "seconds_per_step"
 METHOD = "method"
 _KEYS = {
-    *("compare", "windows", "toy", "method", "word", "why", "proved"),
+    *("compare", "windows", "toy", "method", "word", "why", "proved", "without"),
 }
 _SIDE_KEYS = {"metric": "metric", "group": "group", "component": "component", "from": "start", "to": "end", "settled": "settled"}  # fmt: skip
 _LISTS = ("a", "b", "group", "component", "metric", "settled", "worlds")
@@ -100,6 +100,7 @@ class ClaimPlan(NamedTuple):
         why: Reason of that word.
         proved: Outcome of a proof in all readings but those of `but`; empty without.
         but: Factors whose readings run although there is a proof.
+        without: Readings in which a is b, which say nothing.
     """
 
     claim: PrintedClaim
@@ -110,6 +111,7 @@ class ClaimPlan(NamedTuple):
     reason: str = ""
     proved: str = ""
     but: tuple[str, ...] = ()
+    without: tuple[str, ...] = ()
 
     @property
     def has_other_kind(self) -> bool:
@@ -190,7 +192,7 @@ def _parse_plan(path: Path, claim: PrintedClaim, entry: Mapping[str, Any]) -> Cl
     forms = entry.get("method", read_paper_settings()[claim.paper]["method"])
     has_forms = METHOD in str(rows) or "form" in str(rows)
     parts: dict[tuple[str, str], tuple[LineComparison, ...]] = {}
-    for column in COLUMNS if has_forms else (PUBLISHED,):
+    for column in forms if has_forms else (PUBLISHED,):
         entries_read = [
             item for row in rows if row.get("form", column) == column
             for item in _expand(claim, row, forms[column])
@@ -201,7 +203,8 @@ def _parse_plan(path: Path, claim: PrintedClaim, entry: Mapping[str, Any]) -> Cl
     windows = {name: (float(a), float(b)) for name, (a, b) in entry.get("windows", {}).items()}
     proved = entry.get("proved", {"outcome": "", "but": ()})
     texts = (tuple(entry.get("toy", ())), entry.get("word", ""), entry.get("why", ""))
-    return ClaimPlan(claim, parts, windows, *texts, proved["outcome"], tuple(proved["but"]))
+    but, without = tuple(proved["but"]), tuple(entry.get("without", ()))
+    return ClaimPlan(claim, parts, windows, *texts, proved["outcome"], but, without)
 
 
 def _expand(
@@ -279,7 +282,11 @@ def list_dots(plan: ClaimPlan) -> dict[str, tuple[str, str]]:
     readings = read_readings(plan.claim.paper).values()
     names = [
         CENTRAL_READING,
-        *(r.name for r in readings if r.factor in plan.claim.factors),
+        *(
+            r.name
+            for r in readings
+            if r.factor in plan.claim.factors and r.name not in plan.without
+        ),
         *(r.name for r in readings if plan.claim.id in r.claims),
     ]
     others = {f"window {name}": (CENTRAL_READING, name) for name in list(plan.windows)[1:]}
@@ -309,7 +316,7 @@ def apply_window(measure: Measure, window: tuple[float, float] | None) -> Measur
 
 
 # --------------------------------------------------------------------------------------------------
-# Proofs on the papers, read from proofs.yaml: statements without runs, margins or choices of this project.
+# Proofs on the papers, read from proofs.yaml: statements without runs and margins, each with its premise.
 
 _PROOFS = Path(__file__).with_name("proofs.yaml")
 

@@ -115,7 +115,10 @@ def _explain(plan: ClaimPlan, decision: ClaimDecision) -> str:
     if decision.word == OPEN and missing:
         has_runs = decision.runs or UNDECIDED in outcomes
         return f"{missing} of {len(outcomes)} readings not run" if has_runs else NOT_RUN
-    return f"proof {plan.claim.proof}" if plan.proved and not decision.runs else ""
+    if plan.proved:
+        return f"proof {plan.claim.proof}"
+    is_small = decision.word == CONFIRMED and KINDS["better"][1] < decision.low < decision.high < 1
+    return "by less than 1 %" if is_small else ""
 
 
 def describe_tip(line: ClaimWord) -> str:

@@ -198,10 +198,16 @@ def _decide_look(
         }
         everywhere = {name: _hold_everywhere([e for (n, _), e in dots.items() if n == name]) for name in claims}  # fmt: skip
         for name in _select_decided(everywhere, alpha):
-            decided[name].add(outcome)
+            _add_outcome(decided[name], outcome)
         for name, reading in _select_decided(dots, alpha):
-            dots_shown[name][reading].add(outcome)
+            _add_outcome(dots_shown[name][reading], outcome)
     return decided, dots_shown
+
+
+def _add_outcome(decided: set[str], outcome: str) -> None:
+    """Add an outcome of a look. Better by less than 1 % is true, and not false as well."""
+    if TRUE not in decided:
+        decided.add(outcome)
 
 
 def is_counted(dot: ReadingDot) -> bool:
@@ -345,7 +351,9 @@ _Description = tuple[float, float, float, int, float, str]
 
 
 def _describe_first(dots: Mapping[str, ReadingDot]) -> tuple[*_Description, str]:
-    """Describe the comparison that is closest to turn the claim, in the central reading or the first that can run.
+    """Describe the comparison that decides, in the central reading or the first that runs.
+
+    It is the one that is shown to be beyond a border of true by most, else the one that is closest to turn the claim.
 
     Returns ratio, interval, runs, order, sides and reading.
     """
@@ -353,17 +361,18 @@ def _describe_first(dots: Mapping[str, ReadingDot]) -> tuple[*_Description, str]
         options = [_describe(c) for c in dot.comparisons if len(c.a)]
         if options:
             return *max(options, key=lambda row: row[0])[1], reading
-        if dot.state != CANNOT_RUN:
+        if not dot.state:
             break
     return math.nan, math.nan, math.nan, 0, math.nan, "", ""
 
 
-def _describe(c: ClaimSample) -> tuple[float, _Description]:
-    """Return how close a comparison is to its border, and ratio, interval, runs, share of runs with a smaller, and sides."""
+def _describe(c: ClaimSample) -> tuple[tuple[bool, float], _Description]:
+    """Return how far a comparison is beyond its border, and ratio, interval, runs, share of runs with a smaller, and sides."""
     effect = compare_to_border(c, 0.0)
     location, low, high = effect.estimate(ALPHA)
     true_low, true_high = find_borders(c.kind, c.printed)[0]
-    nearness = max(location - true_high, true_low - location)
+    excess = max(low - true_high, true_low - high)
+    nearness = (excess > 0, excess if excess > 0 else max(high - true_high, true_low - low))
     order = float((effect.differences < 0).mean())
     count = len(effect.differences)
     return nearness, (math.exp(location), math.exp(low), math.exp(high), count, order, c.sides)

@@ -78,6 +78,22 @@ def test_a_planted_effect_gives_its_word(
     assert words == [word] * 5
 
 
+def test_better_by_less_than_a_percent_is_true() -> None:
+    """Below 1, although above 0.99: true at each look, and not both."""
+    pair = draw(1.0, n=300)
+    near = 0.995 * np.exp(0.005 * np.random.default_rng(2).standard_normal(300))
+    found = decide_single(pair._replace(a=near * pair.b))
+    assert 0.99 < found.low < found.high < 1.0
+    assert (found.word, found.outcomes) == (CONFIRMED, {"central": TRUE})
+
+
+def test_the_comparison_that_decides_is_described() -> None:
+    """A false one with a narrow interval, and not one with a larger ratio that decides nothing."""
+    clear, wide = draw(1.5, n=400), draw(2.0, n=8, seed=3)
+    found = decide_single(clear, wide)
+    assert (found.word, found.runs) == (REFUTED, 400)
+
+
 def test_equality_needs_runs_enough() -> None:
     assert decide_single(draw(1.0, "same", n=60)).word == OPEN
     assert decide_single(draw(1.0, "same", n=1500)).word == CONFIRMED
