@@ -107,11 +107,11 @@ function drawSweeps(part) {
 }
 function drawSweep(panel, sweep) {
   const width = widthOf(panel);
-  const height = 260;
   const title = wrap(`${named(data.worlds, sweep.world)}${sweep.regime ? `, ${named(data.regimes, sweep.regime)}` : ""}`, width, 12, true);
   const ends = sweep.lines.map((item) => ({ ...looks[item.filter], name: item.name }));
   const [right, gap] = nameColumn(ends, width, 11, 13);
   const [left, top, bottom] = [48, 11 + 13 * title.length, 38];
+  const height = Math.max(260, top + bottom + gap * sweep.lines.length); // a name needs a line of its own
   const points = sweep.lines.flatMap((line) => line.points).filter((point) => point.value > 0);
   if (!points.length) return;
   const xs = points.map((point) => point.x);

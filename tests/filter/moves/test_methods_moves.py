@@ -101,7 +101,7 @@ def test_filters_whose_moves_are_right_are_the_kalman_filter_with_noise(q: float
 
 
 @dataclass(frozen=True)
-class Partial:
+class Partial(McmcKernel):
     """A kernel that accepts by the likelihoods alone, or by all but these."""
 
     kernel: McmcKernel
