@@ -116,7 +116,7 @@ def _explain(plan: ClaimPlan, decision: ClaimDecision) -> str:
         has_runs = decision.runs or UNDECIDED in outcomes
         return f"{missing} of {len(outcomes)} readings not run" if has_runs else NOT_RUN
     if plan.proved:
-        return f"proof {plan.claim.proof}"
+        return f"proof {plan.claim.proof} in all readings but {', '.join(plan.but)}"
     is_small = decision.word == CONFIRMED and KINDS["better"][1] < decision.low < decision.high < 1
     return "by less than 1 %" if is_small else ""
 

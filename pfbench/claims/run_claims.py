@@ -307,11 +307,19 @@ class Check(NamedTuple):
     is_equal: bool = True
 
 
-def draw_records(runs: ClaimRuns, seed: int) -> list[StoredValues]:
-    """Draw 20 stored jobs, at least three of each paper that has them, of those whose runs are not too long."""
+def draw_records(
+    runs: ClaimRuns, seed: int, measures: Mapping[Cell, Mapping[str, Measure]]
+) -> list[StoredValues]:
+    """Draw 20 stored jobs, at least three of each paper that has them.
+
+    They are those that a claim uses and whose runs are not too long.
+    """
     draws = random.Random(seed)
     longest = _LONGEST_S / _PARTICLE_RUNS
-    jobs = [r for r in runs.records if r.key and r.seconds / r.runs <= longest]
+    jobs = [
+        r for r in runs.records
+        if r.key and r.seconds / r.runs <= longest and r.values.keys() & measures.get(r.cell, {}).keys()
+    ]  # fmt: skip
     papers: dict[str, list[StoredValues]] = {}
     for record in jobs:
         papers.setdefault(record.cell[0].partition("=")[0], []).append(record)

@@ -270,7 +270,7 @@ def verify_claims(words: Sequence[str]) -> None:
         ClaimRuns.read(Path(places["results_dir"]), Path(places["reports_dir"])),
         find_measures(plans),
     )
-    drawn_records = draw_records(runs, seed)
+    drawn_records = draw_records(runs, seed, measures)
     print(
         f"verify: seed={seed}, {len(drawn_records)} of {len(runs.records)} stored jobs", flush=True
     )

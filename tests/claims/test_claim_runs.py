@@ -42,6 +42,7 @@ from pfbench.claims.claim_runs import (
     write_values,
 )
 from pfbench.claims.ledger import compare_versions, conclude, describe_kind
+from pfbench.claims.measures import Measure
 from pfbench.claims.page import _format_measured, write_claims
 from pfbench.claims.run_claims import (
     Task,
@@ -300,15 +301,20 @@ def test_the_jobs_of_a_form_that_may_refuse_are_the_first_of_a_claim() -> None:
 
 def test_cells_are_verified_by_a_seed_at_least_three_a_paper() -> None:
     cells = [(f"reading/{paper}=central", f"filter=f{k}") for paper in PAPERS for k in range(9)]
-    runs = ClaimRuns([store(cell, Batch(2001, 0, 1), {}, seconds=1.0) for cell in cells])
-    drawn = draw_records(runs, 5)
-    assert drawn == draw_records(runs, 5)
-    assert drawn != draw_records(runs, 6)
+    measures = {cell: {"x": Measure("rmse")} for cell in cells}
+    values = {"x": [1.0]}
+    runs = ClaimRuns([store(cell, Batch(2001, 0, 1), values, seconds=1.0) for cell in cells])
+    drawn = draw_records(runs, 5, measures)
+    assert drawn == draw_records(runs, 5, measures)
+    assert drawn != draw_records(runs, 6, measures)
     assert len(drawn) == 20
     for paper in PAPERS:
         assert sum(r.cell[0].startswith(f"reading/{paper}") for r in drawn) >= 3
-    long = [store(cell, Batch(2001, 0, 1), {}, seconds=100.0) for cell in cells[:8]]
-    assert draw_records(ClaimRuns(long), 5) == []
+    long = [store(cell, Batch(2001, 0, 1), values, seconds=100.0) for cell in cells[:8]]
+    assert draw_records(ClaimRuns(long), 5, measures) == []
+    assert (
+        draw_records(runs, 5, {}) == []
+    )  # jobs that no claim uses any more would be equal to anything
 
 
 # published runs

@@ -239,7 +239,8 @@ def test_the_rates_of_the_page_keep_the_level() -> None:
     assert stored["ledgers"] >= 1000
     for row in stored["rates"]:
         assert max(row["false_confirmed"], row["false_refuted"]) <= RATES.allow(stored["ledgers"])
-    assert "at most 1.4% have a false confirmed, and 1.9% a false refuted" in _say_error_rates()
+    worst = max(row["false_refuted"] for row in stored["rates"])
+    assert f"{worst:.1%} a false refuted" in _say_error_rates()
 
 
 @pytest.mark.slow
