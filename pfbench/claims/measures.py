@@ -19,11 +19,13 @@ _OF_GROUPS = {
 }
 
 OFF_TRACK = "off_track"
+MOVED = "moved_cloud"  # of particles, which no result stores
 METRIC_WORDS = {
     "rmse": "RMS error", "max_error": "largest error", "mean_abs": "mean size of the error", "settled": "time until the error stays",
     "growth": "growth of the error", "remaining": "share of the first error that remains", "sd": "standard deviation that the filter states",
     "nees": "NEES", "crps": "CRPS", "ess": "effective number", "unique": "distinct particles", "accepted": "acceptance rate",
     "seconds_per_step": "time per step", OFF_TRACK: "loss of track, 1 without and 2 with it",
+    MOVED: "likelihood of the cloud before its move over that after it",
 }  # fmt: skip
 
 

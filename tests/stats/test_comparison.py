@@ -37,6 +37,9 @@ def test_p_values_and_intervals_are_those_of_scipy(n: int) -> None:
     assert effect.p == pytest.approx(stats.wilcoxon(d).pvalue, rel=1e-9 if n <= 50 else 2e-2)
     i, j = np.triu_indices(n)
     assert effect.location == np.median((d[i] + d[j]) / 2)
+    for shift in (-effect.location - 1e-9, -effect.location + 1e-9, 0.0):
+        moved_effect = effect._replace(differences=d + shift)
+        assert moved_effect.is_smaller == (moved_effect.location < 0)
     _, low, high = effect.estimate(0.05)
     for end, side in ((low, -1), (high, 1)):  # inversion of the test: just inside and just outside
         inside, outside = (stats.wilcoxon(d - end + s * 1e-9).pvalue for s in (side, -side))
