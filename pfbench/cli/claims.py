@@ -90,16 +90,14 @@ class RunRequest(NamedTuple):
 def run_claims(words: Sequence[str]) -> None:
     """Run the cheapest undecided claims first, stage by stage."""
     request = read_request(words)
-    begin, faults, stages = time.monotonic(), 0, 0
+    begin, faults = time.monotonic(), 0
     while prices := list_prices(request):
-        if not stages:
-            print_plan(prices)
+        print_plan(prices)
         remaining = request.seconds - (time.monotonic() - begin)
         if request.is_dry or remaining <= 0 or faults:
             break
         check_committed(request.is_uncommitted)
         faults += run_stage([p for p in prices if p.stage == prices[0].stage], request, remaining)
-        stages += 1
     if not request.is_dry:
         print_words(request)
     if faults:
