@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -214,20 +215,22 @@ def _format_measured(line: ClaimWord, decision: ClaimDecision | None) -> str:
     """Format the ratio of a decision with its interval, and name its reading if it is not the central one."""
     if decision is None or not decision.runs:
         return ""
-    numbers = (decision.ratio, decision.low, decision.high)
-    ratio, low, high = (_format_number(value) for value in numbers)
+    numbers = format_interval(decision.ratio, decision.low, decision.high)
     first = next(iter(decision.outcomes))
     where = "" if decision.reading == first else f" ({_name_dot(line, decision.reading)})"
-    return f"{decision.sides} = {ratio} [{low}, {high}], {decision.runs} runs; smaller in {decision.order:.0%} of them{where}"
+    return f"{decision.sides} = {numbers}, {decision.runs} runs; smaller in {decision.order:.0%} of them{where}"
 
 
-def _format_number(value: float) -> str:
-    """Format a ratio without an exponent, with more digits near 1."""
-    if 0.995 < value < 1.005:
-        return f"{value:.5f}".rstrip("0").rstrip(".")
-    if value == 0 or 1e-3 <= abs(value) < 1e4:
-        return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
-    return "below 0.001" if abs(value) < 1 else "above 10 000"
+def format_interval(value: float, low: float, high: float) -> str:
+    """Format a ratio and its interval without an exponent, with the decimals that two digits of its width need."""
+    width, least = min(high, 1e4) - low, max(low, 1e-3)
+    decimals = 1 - math.floor(math.log10(width)) if width > 0 else 2
+    decimals = min(max(decimals, -math.floor(math.log10(least)), 0), 5)
+    ratio, first, last = (
+        "above 10 000" if x >= 1e4 else "below 0.001" if 0 < x < 1e-3 else f"{x:.{decimals}f}"
+        for x in (value, low, high)
+    )
+    return f"{ratio} [{first}, {last}]"
 
 
 def _format_price(seconds: float) -> str:

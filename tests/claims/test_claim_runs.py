@@ -43,7 +43,7 @@ from pfbench.claims.claim_runs import (
 )
 from pfbench.claims.ledger import compare_versions, conclude, describe_kind
 from pfbench.claims.measures import Measure
-from pfbench.claims.page import _format_measured, write_claims
+from pfbench.claims.page import _format_measured, format_interval, write_claims
 from pfbench.claims.run_claims import (
     Task,
     _has_equal_mean,
@@ -103,6 +103,24 @@ def test_a_claim_whose_central_reading_cannot_run_has_the_numbers_of_one_that_ca
     assert next(iter(decided.outcomes.values())) == "cannot run"
     assert (decided.reading, decided.ratio, decided.runs) == ("noise_1", 1.0, 20)
     assert "Process noise of 1 %" in _format_measured(conclude(plan, decisions), decided)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "text"),
+    [
+        ((1.0, 0.976, 1.012), "1.000 [0.976, 1.012]"),
+        ((1.00275, 0.99765, 1.0201), "1.003 [0.998, 1.020]"),
+        ((0.9962, 0.99604, 0.99634), "0.99620 [0.99604, 0.99634]"),
+        ((395.2, 324.1, 492.0), "395 [324, 492]"),
+        ((0.0273, 0.0203, 0.09), "0.027 [0.020, 0.090]"),
+        ((0.00342, 0.0021, 0.5), "0.003 [0.002, 0.500]"),
+        ((1.0, 1.0, 1.0), "1.00 [1.00, 1.00]"),
+        ((23.4, 2.1, math.inf), "23 [2, above 10 000]"),
+        ((2e-5, 1e-6, 0.5), "below 0.001 [below 0.001, 0.500]"),
+    ],
+)
+def test_a_ratio_and_its_interval_have_the_decimals_that_their_width_needs(numbers: tuple[float, float, float], text: str) -> None:  # fmt: skip
+    assert format_interval(*numbers) == text
 
 
 def test_losses_of_track_that_nobody_has_decide_nothing() -> None:
