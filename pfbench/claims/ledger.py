@@ -117,8 +117,16 @@ def _explain(plan: ClaimPlan, decision: ClaimDecision) -> str:
         return f"{missing} of {len(outcomes)} readings not run" if has_runs else NOT_RUN
     if plan.proved:
         return f"proof {plan.claim.proof} in all readings but {', '.join(plan.but)}"
-    is_small = decision.word == CONFIRMED and KINDS["better"][1] < decision.low < decision.high < 1
-    return "by less than 1 %" if is_small else ""
+    if decision.word == CONFIRMED and KINDS["better"][1] < decision.low < decision.high < 1:
+        return "by less than 1 %"
+    if (
+        decision.word == REFUTED
+        and not plan.has_other_kind
+        and plan.claim.kind == "much better"
+        and decision.high < 1
+    ):
+        return f"smaller by {100 * (1 - decision.ratio):.0f} %, and much is {100 * (1 - KINDS['much better'][0]):.0f} % or more"
+    return ""
 
 
 def describe_tip(line: ClaimWord) -> str:

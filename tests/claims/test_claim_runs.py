@@ -123,6 +123,25 @@ def test_a_ratio_and_its_interval_have_the_decimals_that_their_width_needs(numbe
     assert format_interval(*numbers) == text
 
 
+def test_a_refuted_claim_says_by_how_much_it_is_better_if_it_is() -> None:
+    """Of "significantly enhances": 4 % in all runs are not a fifth."""
+    plan = PLANS["002-31"]
+
+    def explain(ratio: float) -> str:
+        noise = np.random.default_rng(3).normal(1.0, 0.01, 50)
+        records = []
+        for cell, measures in list_claim_cells(plan).items():
+            factor = 1.0 if "tempering.strength=0.0" in " ".join(cell) else ratio
+            values = {name: list(factor * noise) for name in measures}
+            row = (cell, 2001, 0, 50, "k", "c", 1.0, "", (0,) * 50, values)
+            records.append(StoredValues(*row))
+        line = conclude(plan, decide_claims([plan], ClaimRuns(records)))
+        return f"{line.word}: {line.reason}"
+
+    assert explain(0.96) == "refuted: smaller by 4 %, and much is 20 % or more"
+    assert explain(1.04) == "refuted: "
+
+
 def test_losses_of_track_that_nobody_has_decide_nothing() -> None:
     plan = PLANS["004-C15"]
 
