@@ -147,6 +147,12 @@ def read_amendments() -> tuple[str, Sequence[Mapping[str, Any]]]:
 
 
 @cache
+def read_objections() -> Sequence[Mapping[str, Any]]:
+    """Read objections that runs do not settle: claims, and what is disputed."""
+    return yaml.safe_load(_DATA.read_text(encoding="utf-8"))["disputed"]
+
+
+@cache
 def read_readings(paper: str) -> Mapping[str, Reading]:
     """Read the readings of a paper by name, the central one first."""
     entries_read = {}

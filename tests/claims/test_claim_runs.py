@@ -23,6 +23,7 @@ from pfbench.claims.claim_lines import (
     list_dots,
     make_cell,
     read_amendments,
+    read_objections,
     read_paper_settings,
     read_plans,
     read_readings,
@@ -549,6 +550,13 @@ def test_the_page_says_what_is_not_run_and_at_what_price(tmp_path: Path) -> None
     words = json.loads((page.parent / "words.json").read_text())
     assert set(words.values()) <= set(WORDS)
     assert (page.parent / "report.md").read_text().count("C000-1") > 1
+
+
+def test_an_objection_stands_at_its_claims_and_in_the_list(tmp_path: Path) -> None:
+    text = write_claims(tmp_path, tmp_path / "out").read_text()
+    for row in read_objections():
+        assert set(row["claims"]) <= set(PLANS)
+        assert text.count(row["what"].replace("'", "&#39;")) == len(row["claims"]) + 1
 
 
 def test_the_table_of_version_1_has_all_71_claims() -> None:
