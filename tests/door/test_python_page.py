@@ -45,6 +45,8 @@ def test_the_examples_of_the_page_run_as_a_script(tmp_path: Path) -> None:
         "first",
         "settings",
         "mine",
+        "public",
+        "beside",
         "room",
     }
     assert (tmp_path / "time.png").stat().st_size > 5000
