@@ -34,6 +34,7 @@ MIN_PARTICLES = 10  # smallest number; a filter that costs more is reported as s
 _TOLERANCE = 0.03  # relative cost; times of the same job scatter by more [ours]
 _MAX_TRIALS = 8
 _TRIAL_STEPS = 40
+_TRIAL_RUN_STEPS = 10 * _TRIAL_STEPS  # of all runs together, whose likelihoods are counted
 
 
 class BudgetAllocation(NamedTuple):
@@ -86,8 +87,12 @@ class CostTrial:
         return min(self._run(method, record) for _ in range(2)) / record.y.shape[1]
 
     def likelihoods(self, method: Any) -> float:
-        """Count the likelihood evaluations per step and run, the mean over two runs."""
-        record = first_steps(self.record.select_runs(slice(0, 2)), 5 * _TRIAL_STEPS)
+        """Count the likelihood evaluations per step and run, the mean over at least two runs.
+
+        Moves follow a resampling, which not every step has: short records need more runs.
+        """
+        record = first_steps(self.record, 5 * _TRIAL_STEPS)
+        record = record.select_runs(slice(0, -(-_TRIAL_RUN_STEPS // record.y.shape[1])))
         before = self.counter.count
         self._run(method, record)
         return (self.counter.count - before) / record.y[..., 0].numel()
