@@ -334,7 +334,7 @@ def test_the_page_use_your_data_runs(
     said = capsys.readouterr().out
     assert "3000 samples, 30 fixes" in said
     assert "got rates wx, wy, wz of 57.3 times" in said
-    assert len(list(tmp_path.glob("results/*/*.npz"))) == 3
+    assert len(list(tmp_path.glob("results/*/*.npz"))) == 4
     assert (tmp_path / "track.gpx").read_text().count("<trk>") == 2
     assert "refuse axes" in said
     assert (tmp_path / "reports" / "inspect_my_log" / "scenario" / "suggested.yaml").is_file()
