@@ -26,9 +26,11 @@ from pfbench.claims.run_claims import Decisions
 from pfbench.claims.words import (
     CONFIRMED,
     DEPENDS,
+    FALSE,
     NOT_RUN,
     OPEN,
     REFUTED,
+    TRUE,
     UNDECIDED,
     WORDS,
     ClaimDecision,
@@ -117,7 +119,16 @@ def _explain(plan: ClaimPlan, decision: ClaimDecision) -> str:
         return f"{missing} of {len(outcomes)} readings not run" if has_runs else NOT_RUN
     if plan.proved:
         return f"proof {plan.claim.proof} in all readings but {', '.join(plan.but)}"
-    if decision.word == CONFIRMED and KINDS["better"][1] < decision.low < decision.high < 1:
+    if decision.word == DEPENDS:
+        return f"true in {outcomes.count(TRUE)} readings, false in {outcomes.count(FALSE)}"
+    if decision.word == OPEN and len(outcomes) > 1:
+        return f"in {outcomes.count(UNDECIDED)} of {len(outcomes)} readings"
+    is_same = plan.claim.kind == "same"
+    if (
+        decision.word == CONFIRMED
+        and not is_same
+        and KINDS["better"][1] < decision.low < decision.high < 1
+    ):
         return "by less than 1 %"
     if (
         decision.word == REFUTED
@@ -143,6 +154,8 @@ def describe_tip(line: ClaimWord) -> str:
     if line.plan.has_other_kind:
         return ""
     bound = find_tipping_bound(kind, decision.low, decision.high)
+    if bound <= KINDS[kind][0]:  # true in the reading that is shown
+        return ""
     return (
         f"it would be true if ratios up to {bound:.3g} counted; they count up to {KINDS[kind][0]:g}"
     )

@@ -51,7 +51,7 @@ _RATES = Path(__file__).with_name("error_rates.yaml")
 COMPARISON = "all_seven"  # study that compares the methods with the Kalman filters of each world
 RULES = (
     "Confirmed or refuted: the same outcome in all readings that can run, at 2.5 % for all claims of a paper.",
-    "Better is true below a ratio of 1, by however little. It is false above 0.99: no improvement of 1 %.",
+    "Better is true below a ratio of 1, by however little. If that is not shown, it is false above 0.99.",
     "Much better: a ratio below 0.8. The same: from 1/1.1 to 1.1. A level: within 20 %. At most twice: below 2.",
     "A printed ratio has another line, its size: half to twice its logarithm.",
     "Of several comparisons all must hold. The ratio shown is the one that decides, or else the closest to a border.",

@@ -128,11 +128,12 @@ def test_a_refuted_claim_says_by_how_much_it_is_better_if_it_is() -> None:
     """Of "significantly enhances": 4 % in all runs are not a fifth."""
     plan = PLANS["002-31"]
 
-    def explain(ratio: float) -> str:
+    def explain(ratio: float, **other: float) -> str:
         noise = np.random.default_rng(3).normal(1.0, 0.01, 50)
         records = []
         for cell, measures in list_claim_cells(plan).items():
-            factor = 1.0 if "tempering.strength=0.0" in " ".join(cell) else ratio
+            turned = [value for name, value in other.items() if cell[0].endswith(name)]
+            factor = 1.0 if "tempering.strength=0.0" in " ".join(cell) else [*turned, ratio][0]
             values = {name: list(factor * noise) for name in measures}
             row = (cell, 2001, 0, 50, "k", "c", 1.0, "", (0,) * 50, values)
             records.append(StoredValues(*row))
@@ -141,6 +142,8 @@ def test_a_refuted_claim_says_by_how_much_it_is_better_if_it_is() -> None:
 
     assert explain(0.96) == "refuted: smaller by 4 %, and much is 20 % or more"
     assert explain(1.04) == "refuted: "
+    assert explain(0.7, raised_10=0.96) == "depends: true in 8 readings, false in 1"
+    assert explain(0.7, raised_10=0.8) == "open: in 1 of 9 readings"
 
 
 def test_losses_of_track_that_nobody_has_decide_nothing() -> None:
