@@ -53,8 +53,9 @@ class ClaimWord(NamedTuple):
     Attributes:
         plan: Claim and what decides it.
         word: Word as published.
-        why: Reason in words; empty for a word that runs give.
+        reason: Reason in words; empty for a word that runs give.
         repaired: Word for our repair; empty if the claim is about no repaired form.
+        repaired_reason: Its reason.
         size: Word on the printed number; empty if the claim has a direction only, or a number only.
         factors: Factors on which it depends.
         decision: Decision by runs; None for a word without.
@@ -64,6 +65,7 @@ class ClaimWord(NamedTuple):
     word: str
     reason: str
     repaired: str
+    repaired_reason: str
     size: str
     factors: tuple[str, ...]
     decision: ClaimDecision | None
@@ -82,7 +84,7 @@ class ClaimWord(NamedTuple):
 def conclude(plan: ClaimPlan, decisions: Decisions) -> ClaimWord:
     """Conclude on a claim from its decisions, or from what decides it without runs."""
     if plan.word:
-        return ClaimWord(plan, plan.word, plan.reason, "", "", (), None)
+        return ClaimWord(plan, plan.word, plan.reason, "", "", "", (), None)
     by_part = {
         (column, portion): decisions[plan.claim.id, column, portion]
         for column, portion in plan.parts
@@ -97,6 +99,7 @@ def conclude(plan: ClaimPlan, decisions: Decisions) -> ClaimWord:
         published.word,
         _explain(plan, published),
         repaired.word if repaired else "",
+        _explain(plan, repaired) if repaired else "",
         size.word if size is not None and has_both else "",
         published.factors,
         published,

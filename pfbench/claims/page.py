@@ -196,6 +196,7 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
         "said": statement,
         "tip": f"{claim.id}: {statement}. “{claim.words}” {measured}".strip(),
         "repaired": line.repaired,
+        "repaired_reason": line.repaired_reason,
         "repaired_measured": _format_measured(line, repaired),
         "size": line.size,
         "kind": describe_kind(line.plan),
