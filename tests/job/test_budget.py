@@ -114,6 +114,17 @@ def test_sir_itself_has_what_was_asked_for_and_a_variant_is_tried() -> None:
     ).particles == pytest.approx(333, rel=0.03)
 
 
+@pytest.mark.parametrize(("steps", "expected"), [(12, (34, 12)), (150, (3, 150)), (400, (2, 200))])
+def test_likelihoods_of_a_short_record_are_counted_in_more_runs(steps: int, expected: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    """At least 400 steps of all runs together: only some of them are resampled, and moved."""
+    model = linear_walk(1.0, 0.3, 1.0)
+    record = ModelSimulation(model, steps).draw(NominalNoise(), torch.arange(50), 1).record
+    shapes: list[tuple[int, int]] = []
+    monkeypatch.setattr(budget.CostTrial, "_run", lambda self, method, part: shapes.append(tuple(part.y.shape[:2])))  # fmt: skip
+    budget.CostTrial(model, record, lambda: 0.0, 1, LikelihoodCounter(model), lambda method: 2).likelihoods(None)  # fmt: skip
+    assert shapes == [expected]
+
+
 def test_filters_of_a_study_evaluate_the_likelihood_equally_often(tmp_path: Path) -> None:
     found = metas(
         tmp_path, "-m", *WALK, "particles=1000", "filter=sir,apf,pso_pf,mcmc_rpf,ekf,cofm_amssrcpf"
