@@ -36,6 +36,7 @@ from pfbench.claims.words import (
     ClaimDecision,
 )
 from pfbench.results.paper_block import conf_dir
+from pfbench.stats.sentences import format_count
 
 _OLD = Path(__file__).with_name("ledger_1.yaml")
 _KIND_TEXTS = {
@@ -123,7 +124,7 @@ def _explain(plan: ClaimPlan, decision: ClaimDecision) -> str:
     if plan.proved:
         return f"proof {plan.claim.proof} in all readings but {', '.join(plan.but)}"
     if decision.word == DEPENDS:
-        return f"true in {outcomes.count(TRUE)} readings, false in {outcomes.count(FALSE)}"
+        return f"true in {format_count(outcomes.count(TRUE), 'reading')}, false in {outcomes.count(FALSE)}"
     if decision.word == OPEN and len(outcomes) > 1:
         return f"in {outcomes.count(UNDECIDED)} of {len(outcomes)} readings"
     is_same = plan.claim.kind == "same"
