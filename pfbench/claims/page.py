@@ -219,13 +219,13 @@ def _format_measured(line: ClaimWord, decision: ClaimDecision | None) -> str:
     """Format the ratio of a decision with its interval, and name its reading if it is not the central one."""
     if decision is None or not decision.runs:
         return ""
-    numbers = format_claim_ratio(decision.ratio, decision.low, decision.high)
+    numbers = _format_ratio(decision.ratio, decision.low, decision.high)
     first = next(iter(decision.outcomes))
     where = "" if decision.reading == first else f" ({_name_dot(line, decision.reading)})"
     return f"{decision.sides} = {numbers}, {decision.runs} runs; smaller in {decision.order:.0%} of them{where}"
 
 
-def format_claim_ratio(value: float, low: float, high: float) -> str:
+def _format_ratio(value: float, low: float, high: float) -> str:
     """Format a ratio and its interval without an exponent, with the decimals that two digits of its width need."""
     width, least = min(high, 1e4) - low, max(low, 1e-3)
     decimals = 1 - math.floor(math.log10(width)) if width > 0 else 2

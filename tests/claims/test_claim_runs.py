@@ -44,7 +44,7 @@ from pfbench.claims.claim_runs import (
 )
 from pfbench.claims.ledger import compare_versions, conclude, describe_kind
 from pfbench.claims.measures import Measure
-from pfbench.claims.page import _format_measured, format_claim_ratio, write_claims
+from pfbench.claims.page import _format_measured, _format_ratio, write_claims
 from pfbench.claims.run_claims import (
     Task,
     _has_equal_mean,
@@ -121,7 +121,7 @@ def test_a_claim_whose_central_reading_cannot_run_has_the_numbers_of_one_that_ca
     ],
 )
 def test_a_ratio_and_its_interval_have_the_decimals_that_their_width_needs(numbers: tuple[float, float, float], text: str) -> None:  # fmt: skip
-    assert format_claim_ratio(*numbers) == text
+    assert _format_ratio(*numbers) == text
 
 
 def test_a_refuted_claim_says_by_how_much_it_is_better_if_it_is() -> None:

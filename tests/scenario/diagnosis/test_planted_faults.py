@@ -40,14 +40,16 @@ PAIRS = [
     ("quad 17", "imu gap 0.5 s", "lever arm 1.6 m"),
 ]
 LOGS = tuple(SHARED)
-# What is said beside the fault that is named, whose remedy mends all. After a jump of the clock, a log whose turns repeat
-# agrees with the reference at the offset of another turn, too.
+# What is said beside the fault that is named. After a jump of the clock, a log whose turns repeat agrees with the reference
+# at the offset of another turn, too.
 BESIDE = {
     ("quad 2", "imu clock jump 1 s"): {"gyro bias", "imu clock"},
     ("quad 17", "imu clock jump 1 s"): {"imu clock"},
     ("quad 17", "reference ENU"): {"fix axes"},
     ("wing", "fixes frozen 3 s"): {"fix outliers"},
 }
+# Its remedy exchanges North and East and leaves the vertical, so that the fixes seem to be upside down: a fault of the check.
+HALF_MENDED = {("quad 17", "reference ENU")}
 
 
 @cache
@@ -78,6 +80,8 @@ def check_remedies(log: str, fault: str) -> None:
             continue
         after = checks_of(spoilt, dict(finding.settings))
         assert finding.check not in after
+        if finding.check == FAULTS[fault].named and (log, fault) not in HALF_MENDED:
+            assert not after & beside
         assert after <= {other.check for other in before} | own(log)
 
 

@@ -145,8 +145,8 @@ def test_residuals_at_the_truth_have_the_stated_law(scenario: str) -> None:
         return
     seen = [
         k for k in range(z.shape[-1]) if not torch.isnan(z[..., k]).all()
-    ]  # a satellite may not rise in a minute, and a car may not stop
-    assert len(seen) >= min(z.shape[-1], 3)
+    ]  # a satellite may not rise in a minute
+    assert len(seen) > z.shape[-1] / 2
     told = {f"component {k}": out_of_law(z[..., k : k + 1]) for k in seen} | {
         "all together": out_of_law(z)
     }
