@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import importlib
-import json
 import re
 import subprocess
 import sys
@@ -13,10 +12,10 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-import house_figures
+import house_budget
 import pytest
 from checkout import ROOT
-from house_figures import tree_of
+from house_budget import tree_of
 
 PACKAGE = ROOT / "pfbench"
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -225,31 +224,34 @@ def test_functions_are_short() -> None:
     assert functions == {}
 
 
-def check_figures(figures: house_figures.Figures) -> None:
-    """Compare with the stored figures: none rises, and a fall is stored before the next rise."""
-    stored = json.loads(house_figures.STORED.read_text())["figures"]
-    command = "python tests/house_figures.py --store"
-    assert house_figures.list_rises(figures, stored) == [], (
-        f"name what they bought: {command} --capability NAME"
-    )
-    fallen = [name for name, value in figures.items() if value < 0.98 * stored[name]]
-    assert fallen == [], f"store them: {command}"
+def test_the_budget_of_the_house() -> None:
+    used, ceilings = house_budget.measure(), house_budget.read_ceilings()
+    assert house_budget.list_excesses(used, ceilings) == []
+    one = {"statements": {**used["statements"], "filter": ceilings["statements"]["filter"] + 1}}
+    assert len(house_budget.list_excesses(one, ceilings)) == 1
+    new = {"statements": {"new_room": 1}}
+    assert house_budget.list_excesses(new, ceilings) == ["statements, new_room: 1 of 0"]
 
 
-def test_the_figures_of_the_house_only_fall() -> None:
-    figures = house_figures.measure()
-    check_figures(figures)
-    more = {**figures, "statements of filter": int(1.02 * figures["statements of filter"])}
-    with pytest.raises(AssertionError, match="name what they bought"):
-        check_figures(more)
+def test_no_sum_of_ceilings_rises() -> None:
+    text = house_budget.BUDGET.read_text()
+    assert [house_budget.list_raised_sums(text, old) for old in house_budget.read_earlier()] == [
+        [] for _ in house_budget.read_earlier()
+    ]
+    old = 'ruler = 1\n[statements]\n"a" = 5\n"b" = 5\n'
+    moved, more = old.replace('"a" = 5', '"a" = 4'), old.replace('"b" = 5', '"b" = 6')
+    assert house_budget.list_raised_sums(moved.replace('"b" = 5', '"b" = 6'), old) == []
+    assert house_budget.list_raised_sums(more, old) == ["statements: 10 -> 11"]
+    assert house_budget.list_raised_sums(more.replace("ruler = 1", "ruler = 2"), old) == []
 
 
 @pytest.mark.slow
-def test_a_step_a_run_and_a_report_enter_few_modules() -> None:
-    check_figures(house_figures.measure_reading())
+def test_a_step_a_run_and_a_report_enter_few_functions() -> None:
+    used = house_budget.measure_reading()
+    assert house_budget.list_excesses(used, house_budget.read_ceilings()) == []
 
 
-def test_the_counts_of_the_house_are_of_statements_and_names() -> None:
+def test_the_counts_of_the_house_are_of_statements() -> None:
     source = '''"""Text."""
 from typing import NamedTuple
 A, _B = 1, 2
@@ -259,14 +261,10 @@ class C(NamedTuple):
 def f(): return A
 '''
     tree = ast.parse(source)
-    assert house_figures.count_statements(tree) == 7
-    assert house_figures.public_names(tree) == 3
-    assert house_figures.long_records(tree) == 0
+    assert house_budget.count_statements(tree) == 7
+    assert house_budget.long_records(tree) == 0
     fields = "".join(f"    x{k}: int\n" for k in range(13))
-    assert house_figures.long_records(ast.parse(f"class C(NamedTuple):\n{fields}")) == 1
-    imports = "from pfbench import a\ndef f():\n    from pfbench.b import c"
-    known = {"pfbench", "pfbench.a", "pfbench.b", "pfbench.d"}
-    assert house_figures.list_imports(ast.parse(imports), known) == {"pfbench.a", "pfbench.b"}
+    assert house_budget.long_records(ast.parse(f"class C(NamedTuple):\n{fields}")) == 1
 
 
 def test_the_command_line_imports_lazily() -> None:
