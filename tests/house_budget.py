@@ -181,7 +181,8 @@ def write_ceilings(ceilings: dict[str, Table]) -> None:
     """Write the ceilings below the head of the file."""
     head = BUDGET.read_text().partition("\n[")[0]
     tables = [
-        f"\n[{table if table.isalpha() else repr(table)}]\n" + "".join(f'"{name}" = {value}\n' for name, value in values.items())
+        f"\n[{table if table.isalpha() else repr(table)}]\n"
+        + "".join(f'"{name}" = {value}\n' for name, value in values.items())
         for table, values in ceilings.items()
     ]
     BUDGET.write_text(head.rstrip() + "\n" + "".join(tables))

@@ -14,13 +14,12 @@ import yaml
 
 from pfbench.claims.claim_list import PrintedClaim, read_printed_claims
 from pfbench.claims.measures import Measure
-from pfbench.results.paper_block import conf_dir
+from pfbench.job.readings import CENTRAL_READING, read_reading_table
 
 # --------------------------------------------------------------------------------------------------
 # Lines of each claim: comparisons of filters in the readings of its paper, read from claim_lines.yaml.
 
 _DATA = Path(__file__).with_name("claim_lines.yaml")
-CENTRAL_READING = "central"
 PUBLISHED, REPAIRED = "published", "repaired"
 COLUMNS = (PUBLISHED, REPAIRED)
 DIRECTION_PART, SIZE_PART = "direction", "size"
@@ -156,18 +155,11 @@ def read_objections() -> Sequence[Mapping[str, Any]]:
 def read_readings(paper: str) -> Mapping[str, Reading]:
     """Read the readings of a paper by name, the central one first."""
     entries_read = {}
-    for path in sorted((conf_dir() / "reading" / f"paper_{paper}").glob("*.yaml")):
-        text = path.read_text(encoding="utf-8")
-        content = yaml.safe_load(text)
-        stated = content["reading"][paper]
-        sets_world = (
-            path.stem == CENTRAL_READING or len(content) > 2 or len(content["defaults"]) > 2
-        )
-        filters = None if sets_world else tuple(stated.get("filters", ()))
-        line = next(row for row in text.splitlines() if row.startswith("# ") and "@" not in row)
-        row = (stated["factor"], stated["class"], stated["why"], line.removeprefix("# "))
-        claims = tuple(stated.get("claims", ()))
-        entries_read[path.stem] = Reading(path.stem, *row, filters, claims)
+    for name, row in sorted(read_reading_table(paper).items()):
+        sets_world = name == CENTRAL_READING or row.get("use") or row.get("set")
+        filters = None if sets_world else tuple(row["filters"])
+        texts = (row["factor"], row["class"], row["why"], row["text"])
+        entries_read[name] = Reading(name, *texts, filters, tuple(row.get("claims", ())))
     return {CENTRAL_READING: entries_read[CENTRAL_READING], **entries_read}
 
 

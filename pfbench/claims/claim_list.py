@@ -111,8 +111,3 @@ def find_tipping_bound(kind: str, low: float, high: float) -> float:
         high: Upper end.
     """
     return math.exp(max(abs(math.log(low)), abs(math.log(high)))) if kind == "same" else high
-
-
-def compute_size_share(measured: float, printed: float) -> float:
-    """Compute the share of a printed ratio that a measured one has, in logs: 1 for equal, 0 for no effect."""
-    return math.log(measured) / math.log(printed)

@@ -35,7 +35,7 @@ from pfbench.claims.words import (
     WORDS,
     ClaimDecision,
 )
-from pfbench.results.paper_block import conf_dir
+from pfbench.job.readings import CENTRAL_READING, read_reading_table
 from pfbench.stats.sentences import format_count
 
 _OLD = Path(__file__).with_name("ledger_1.yaml")
@@ -193,9 +193,9 @@ def list_choices(plan: ClaimPlan) -> list[str]:
     paper = plan.claim.paper
     if plan.toy:
         return ["a world of this project: " + ", ".join(plan.toy)]
-    path = conf_dir() / "reading" / f"paper_{paper}" / "central.yaml"
-    stated = yaml.safe_load(path.read_text(encoding="utf-8"))["reading"][paper]
-    completed = [entry["why"] for entry in stated.get("completions", ())]
+    completed = [
+        entry["why"] for entry in read_reading_table(paper)[CENTRAL_READING].get("completions", ())
+    ]
     names = [name for name, _ in list_dots(plan).values() if name in read_readings(paper)]
     ours = [read_readings(paper)[name] for name in dict.fromkeys(names)]
     return [*completed, *(f"{r.text} {r.reason}" for r in ours if r.grade in ("ours", "fitted"))]

@@ -77,7 +77,7 @@ Python: import pfbench, then pfbench.run("growth", ["sir", "ekf"]); your own fil
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line."""
     words = list(sys.argv[1:] if argv is None else argv)
-    before = os.environ.get(ENVIRONMENT), sys.argv
+    trusted, arguments = os.environ.get(ENVIRONMENT), sys.argv
     with lasting_outputs() as output, stopped_by_signals():
         try:
             _dispatch(words)
@@ -90,20 +90,15 @@ def main(argv: Sequence[str] | None = None) -> None:
             raise SystemExit(128 + number) from None
         finally:
             stop_workers()  # they keep the environment of this command
-            _restore(*before)
+            # the next command of this process trusts nothing by this one
+            os.environ.pop(ENVIRONMENT, None)
+            os.environ.update({ENVIRONMENT: trusted} if trusted is not None else {})
+            sys.argv = arguments
         output.flush()
         if output.error and not isinstance(output.error, BrokenPipeError):
             reason = f"{output.error.strerror}. Direct it to another file"
             print(f"\nerror: the output must be writable, got {reason}", file=sys.stderr)
             raise SystemExit(1)
-
-
-def _restore(packages: str | None, arguments: list[str]) -> None:
-    """Restore what a command sets for its processes: the next one of this process trusts nothing by it."""
-    sys.argv = arguments
-    os.environ.pop(ENVIRONMENT, None)
-    if packages is not None:
-        os.environ[ENVIRONMENT] = packages
 
 
 def _dispatch(words: Sequence[str]) -> None:

@@ -108,12 +108,6 @@ def check_zip(path: Path) -> None:
     check_inflated(path, size)
 
 
-def read_gzip(path: Path) -> bytes:
-    """Read a gzip file, which does not state its size, up to the limit."""
-    check_is_file(path, TABLE_BYTES)
-    return inflate(path, path.read_bytes())
-
-
 def inflate(path: Path, content: bytes) -> bytes:
     """Inflate gzip content of a file, which does not state its size, up to the limit of the file."""
     most = _most_inflated(path)

@@ -264,15 +264,6 @@ def with_cached_nis(info: StepInfo) -> StepInfo:
     return info if info.nis is None else info._replace(nis=compute_once(info.nis))
 
 
-def count_health(health: Tensor) -> dict[str, int]:
-    """Count the runs of each health.
-
-    Returns number of runs by name, zeros included. Shapes: health [R].
-    """
-    counts = torch.bincount(health.long(), minlength=len(HEALTH)).tolist()
-    return dict(zip(HEALTH, counts, strict=True))
-
-
 def _in_majority(mask: Tensor, valid: Tensor) -> Tensor:
     """Return the runs [R] in which more than half of the valid steps [C, R] are marked."""
     return 2 * (mask & valid).sum(0) > valid.sum(0)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from pfbench.files import limits
+from pfbench.job.readings import make_reading, read_reading_table
 from pfbench.job.trust import (
     UntrustedConfigError,
     check_configuration,
@@ -202,54 +203,84 @@ def _take_knobs(tree: Any, choices: Mapping[str, str], trusted: Sequence[str]) -
 
 def list_groups() -> dict[str, list[Path]]:
     """List the files of each configuration group and of the group `experiment`."""
-    folders = [path for path in sorted(conf_dir().iterdir()) if any(path.glob("*.yaml"))]
+    folders = [
+        path
+        for path in sorted(conf_dir().iterdir())
+        if any(path.glob("*.yaml")) and path.name != READING
+    ]
     groups = {folder.name: sorted(folder.glob("*.yaml")) for folder in folders}
     return groups | {"experiment": sorted(experiments_dir().glob("*.yaml"))}
 
 
-class _ExperimentNodes(dict[str, Any]):
-    """Experiments in Hydra's store by file name, loaded when Hydra asks for one.
+@dataclass(eq=False)
+class _LazyGroup(dict[str, Any]):
+    """Group in Hydra's store whose nodes are made when Hydra asks for one: all of them take as long as composing.
 
-    Loading all of them takes as long as composing. Hydra copies the store for each composition and the
-    chosen node once more.
+    Hydra copies the store for each composition and the chosen node once more.
     """
 
-    loaded: ClassVar[dict[tuple[Path, int], Any]] = {}  # by path and time of change
+    list_names: Callable[[], list[str]]
+    make: Callable[[str], Any]
+
+    def __contains__(self, name: object) -> bool:
+        return name != "None.yaml" and name in self.list_names()  # `null` of a defaults list
+
+    def keys(self) -> Any:
+        return self.list_names()
 
     def __getitem__(self, name: str) -> Any:
-        from hydra.core.config_store import ConfigNode
+        return self.make(name)
 
-        path: Path = super().__getitem__(name)
-        version = path, path.stat().st_mtime_ns
-        if version not in self.loaded:
-            node = _load_experiment(path)
-            self.loaded[version] = ConfigNode(
-                name=name, node=node, group="experiment", package="_global_",
-                provider="pfbench.experiments",
-            )  # fmt: skip
-        return self.loaded[version]
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> _ExperimentNodes:
+    def __deepcopy__(self, memo: dict[int, Any]) -> _LazyGroup:
         return self
 
 
 def register_experiments() -> None:
-    """Register experiments/NAME.yaml with Hydra as the group `experiment`; the folder lies outside conf/."""
+    """Register experiments/NAME.yaml with Hydra as the group `experiment`, and the readings as groups of their papers."""
     from hydra.core.config_store import ConfigStore
 
-    paths = {path.name: path for path in experiments_dir().glob("*.yaml")}
-    ConfigStore.instance().repo["experiment"] = _ExperimentNodes(paths)
+    repo = ConfigStore.instance().repo
+    repo["experiment"] = _LazyGroup(
+        lambda: [path.name for path in experiments_dir().glob("*.yaml")], _make_experiment
+    )
+    repo[READING] = {
+        path.stem: _LazyGroup(partial(_list_readings, path.stem), partial(_make_reading, path.stem))
+        for path in (conf_dir() / READING).glob("*.yaml")
+    }
 
 
-def _load_experiment(path: Path) -> Any:
-    """Load an experiment, with the filters of named sets in its sweep."""
+def _make_experiment(name: str) -> Any:
+    """Load an experiment, again if its file changed."""
+    path = experiments_dir() / name
+    return _load_experiment(path, path.stat().st_mtime_ns)
+
+
+def _list_readings(group: str) -> list[str]:
+    """List the files that the readings of a paper stand for."""
+    return [f"{name}.yaml" for name in read_reading_table(group[-3:])]
+
+
+@cache
+def _make_reading(group: str, name: str) -> Any:
+    """Make the node of a reading from its row."""
+    from hydra.core.config_store import ConfigNode
+    from omegaconf import OmegaConf
+
+    content = OmegaConf.create(make_reading(group[-3:], name.removesuffix(".yaml")))
+    return ConfigNode(name, content, f"{READING}/{group}", "_global_", "pfbench.readings")
+
+
+@cache
+def _load_experiment(path: Path, changed_ns: int) -> Any:
+    """Load an experiment in its state at a time, with the filters of named sets in its sweep."""
+    from hydra.core.config_store import ConfigNode
     from omegaconf import OmegaConf
 
     node = OmegaConf.load(path)
     params = OmegaConf.select(node, "hydra.sweeper.params")
     if params is not None and "filter" in params:
         params["filter"] = expand_filter_names(str(params["filter"]))
-    return node
+    return ConfigNode(path.name, node, "experiment", "_global_", "pfbench.experiments")
 
 
 def _move_hydra_node(composed: DictConfig) -> None:
@@ -437,8 +468,7 @@ def expand_filter_sets(words: Sequence[str]) -> list[str]:
 # --------------------------------------------------------------------------------------------------
 # Readings of the papers: Hydra groups whose files set the world of a paper and, by name, its filters.
 #
-# A word `reading/001=NAME` chooses conf/reading/paper_001/NAME.yaml: a group of Hydra must not begin with a digit. A file has the package `_global_`. It sets the world by plain keys. Under `reading.NNN` it states `factor`, `class`
-# (one of `CLASSES`), `why`, and `filters`: settings of named filters, since a job has one of them. `claims` are those that a pair of levels is for.
+# A word `reading/001=NAME` chooses the row NAME of conf/reading/paper_001.yaml: a group of Hydra must not begin with a digit.
 
 READING = "reading"
 CLASSES = ("printed", "cited", "ours", "fitted")

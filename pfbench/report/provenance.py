@@ -107,20 +107,6 @@ def training_cost(conditions: Sequence[Condition]) -> list[tuple[str, str]]:
     return list(dict.fromkeys(rows))
 
 
-def modelling_choices(conditions: Sequence[Condition]) -> list[tuple[str, str]]:
-    """List the modelling choices of the jobs, each with its filters."""
-    labels_by_choice: dict[str, list[str]] = {}
-    for cell in conditions:
-        for job in cell.jobs:
-            for text in job.meta.get("modelling_choices", ()):
-                labels_by_choice.setdefault(text, []).append(job.label)
-    all_labels = {job.label for cell in conditions for job in cell.jobs}
-    return [
-        (text, "all" if set(labels) == all_labels else ", ".join(distinct_values(labels)))
-        for text, labels in sorted(labels_by_choice.items())
-    ]
-
-
 def format_bibtex(conditions: Sequence[Condition]) -> str:
     """Format a BibTeX entry, of a type that all styles know, with the versions and the year of the results."""
     metadata = [job.meta for cell in conditions for job in cell.jobs]

@@ -93,12 +93,6 @@ class Effect(NamedTuple):
         low, *middle, high = _select_means(self.differences, ranks)
         return (middle[0] + middle[1]) / 2, low if k else -math.inf, high if k else math.inf
 
-    def trimmed_interval(self, alpha: float) -> tuple[float, float]:
-        """Return the interval of the log ratio that belongs to the trimmed mean."""
-        value, error, df = _trimmed_mean(self.differences)
-        width = scipy.special.stdtrit(df, 1 - alpha / 2) * error
-        return value - width, value + width
-
 
 class Verdict(NamedTuple):
     """Verdict on a pair, with one interval: the simultaneous one of its family.

@@ -12,11 +12,6 @@ def format_count(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def format_percent(share: float) -> str:
-    """Format a share in percent, without the sign."""
-    return f"{100 * share:.3g}"
-
-
 def format_digits(value: float, digits: int = 3) -> str:
     """Format a number with significant digits, without an exponent below 1e6."""
     if not math.isfinite(value):

@@ -7,7 +7,6 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -57,22 +56,6 @@ def required_runs(
     z = float(-scipy.special.ndtri(alpha / 2))
     of_t_test = ((z + scipy.special.ndtri(power)) / effect) ** 2 + z**2 / 2
     return float(max(math.ceil(of_t_test / efficiency), min_pairs(alpha)))
-
-
-def required_runs_proportion(
-    proportion: float, limit: float, alpha: float = 0.05, power: float = POWER
-) -> float:
-    """Compute the runs required to show on which side of a limit a probability lies.
-
-    Normal approximation with a continuity correction [Fleiss, Levin, Paik 2003].
-    """
-    if proportion == limit:
-        return math.inf
-    at_limit, at_value = (math.sqrt(p * (1 - p)) for p in (limit, proportion))
-    spread = -scipy.special.ndtri(alpha) * at_limit + scipy.special.ndtri(power) * at_value
-    distance = abs(proportion - limit)
-    smooth = (spread / distance) ** 2
-    return float(math.ceil(smooth / 4 * (1 + math.sqrt(1 + 2 / (smooth * distance))) ** 2))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -142,26 +125,6 @@ def detectable_score(df: float, alpha: float, power: float = POWER) -> float:
     return high
 
 
-def required_worlds(
-    effect: float, comparisons: int = 1, alpha: float = 0.05, power: float = POWER
-) -> float:
-    """Compute the worlds required to show an effect in a new world."""
-    level = alpha / comparisons
-    return _least(lambda w: t_test_power(effect * math.sqrt(w), w - 1, level) >= power, 2, effect)
-
-
-def required_runs_per_condition(
-    effect: float, comparisons: int = 1, alpha: float = 0.05, power: float = POWER
-) -> float:
-    """Compute the runs required to show an effect in the worlds of a study."""
-    level = alpha / comparisons
-    return _least(
-        lambda n: t_test_power(effect * math.sqrt(n), middle_runs(n) - 1, level) >= power,
-        MIN_RUNS,
-        effect,
-    )
-
-
 def middle_runs(runs: int) -> int:
     """Return the number of runs that remain after trimming."""
     return runs - 2 * math.floor(TRIM_SHARE * runs + 1e-9)
@@ -210,22 +173,6 @@ def detectable_effects(
             new * math.hypot(over_runs, world_sd / math.sqrt(worlds)),
         ]
     return DetectableEffects(*effects)
-
-
-def _least(is_enough: Callable[[int], bool], start: int, effect: float) -> float:
-    """Return the least number from a start that is enough, by doubling and bisection."""
-    if not effect or not math.isfinite(effect):
-        return math.inf if not effect else float(start)
-    high = start
-    while not is_enough(high):
-        if high > _MOST:
-            return math.inf
-        high *= 2
-    low = max(start, high // 2)
-    while low < high:
-        middle = (low + high) // 2
-        low, high = (low, middle) if is_enough(middle) else (middle + 1, high)
-    return float(low)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -15,21 +15,17 @@ from config_cases import GROUPS
 from pfbench.claims.claim_lines import read_proofs
 from pfbench.claims.claim_list import (
     KINDS,
-    compute_size_share,
     find_tipping_bound,
     read_printed_claims,
 )
+from pfbench.job.readings import read_reading_table
 
 CLAIMS = read_printed_claims()
-READINGS = ROOT / "conf" / "reading"
 
 
 @cache
 def list_factors(paper: str) -> set[str]:
-    files = sorted((READINGS / f"paper_{paper}").glob("*.yaml"))
-    return {yaml.safe_load(file.read_text())["reading"][paper]["factor"] for file in files} - {
-        "none"
-    }
+    return {row["factor"] for row in read_reading_table(paper).values()} - {"none"}
 
 
 def test_there_are_88_claims_and_those_of_the_first_ledger_are_among_them() -> None:
@@ -93,8 +89,5 @@ def test_where_a_decision_turns() -> None:
     assert find_tipping_bound("better", 0.85, 0.93) == 0.93
     assert find_tipping_bound("same", 0.8, 1.1) == pytest.approx(1.25)
     assert find_tipping_bound("same", 0.95, 1.2) == pytest.approx(1.2)
-    assert compute_size_share(0.45, 0.45) == 1.0
-    assert compute_size_share(0.9, 0.81) == pytest.approx(0.5)
-    assert compute_size_share(1.0, 0.45) == 0.0
     assert all(0 < false <= true for true, false in KINDS.values())
     assert math.isclose(KINDS["much better"][0], 0.8)

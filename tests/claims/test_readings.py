@@ -7,20 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
-from checkout import ROOT
 from command_line import pfbench
 from config_cases import GROUPS
 
 from pfbench import job
 from pfbench.job.config import CLASSES, check_reading, name_readings
+from pfbench.job.readings import make_reading, read_reading_table
 from pfbench.job.trust import UntrustedConfigError
 
-FOLDER = ROOT / "conf" / "reading"
 PAPERS = ("000", "001", "002", "003", "004")
-FILES = {(path.parent.name[-3:], path.stem): path for path in sorted(FOLDER.rglob("*.yaml"))}
+ROWS = [(paper, name) for paper in PAPERS for name in read_reading_table(paper)]
 STATED: dict[tuple[str, str], dict[str, Any]] = {
-    key: yaml.safe_load(path.read_text())["reading"][key[0]] for key, path in FILES.items()
+    key: make_reading(*key)["reading"][key[0]] for key in ROWS
 }
 NOT_OF_THE_WORLD = ("paper", "cache_dir")
 
@@ -57,8 +55,8 @@ def compose(paper: str, name: str, *words: str) -> dict[str, Any]:
 
 
 def test_each_paper_has_a_central_reading_and_levels_of_its_factors() -> None:
-    assert {paper for paper, _ in FILES} == set(PAPERS)
-    assert len(FILES) >= 100
+    assert {paper for paper, _ in ROWS} == set(PAPERS)
+    assert len(ROWS) >= 100
     for paper in PAPERS:
         assert STATED[paper, "central"]["factor"] == "none"
     for (paper, name), stated in STATED.items():
@@ -67,7 +65,7 @@ def test_each_paper_has_a_central_reading_and_levels_of_its_factors() -> None:
         assert len(stated["why"].split()) > 1, (paper, name)
         assert (stated["factor"] == "none") == (name == "central")
         assert set(stated.get("filters") or {}) <= set(GROUPS["filter"]), (paper, name)
-        assert name == "central" or "  - central\n" in FILES[paper, name].read_text()
+        assert name == "central" or make_reading(paper, name)["defaults"][0] == "central"
 
 
 def test_a_level_that_is_fitted_is_not_central() -> None:
@@ -92,7 +90,7 @@ def test_no_value_of_a_central_world_is_silent(paper: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("paper", "name"), FILES)
+@pytest.mark.parametrize(("paper", "name"), ROWS)
 def test_each_reading_builds_its_world_and_the_filters_that_it_sets(paper: str, name: str) -> None:
     for method in list(STATED[paper, name].get("filters") or {"sir": {}})[:2]:
         values = compose(paper, name, f"filter={method}")
@@ -127,7 +125,7 @@ def flatten(values: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     return {key: value for key, value in flat.items() if value is not None}
 
 
-@pytest.mark.parametrize(("paper", "name"), [key for key in FILES if "_and_" in key[1]])
+@pytest.mark.parametrize(("paper", "name"), [key for key in ROWS if "_and_" in key[1]])
 def test_a_pair_of_levels_is_both_and_nothing_else(paper: str, name: str) -> None:
     method = {"003": "dmc_reconstructed_printed", "004": "cpso_pf"}[paper]
     method = "cpso_escape_printed" if "004-C1" in STATED[paper, name]["claims"] else method
@@ -203,5 +201,5 @@ def test_a_glob_launches_all_readings_of_a_paper(tmp_path: Path) -> None:
     words = ("scenario.steps=2", "runs=2", "particles=20", "filter=sir", "study=all")
     said = pfbench("run", "-m", "reading/001=glob(*)", *words, home=tmp_path)
     assert said.code == 0, said.err
-    wanted = {name for paper, name in FILES if paper == "001"}
+    wanted = {name for paper, name in ROWS if paper == "001"}
     assert count_launched(f"{said.out}\n{said.err}".splitlines(), "001") == wanted

@@ -18,7 +18,7 @@ from pfbench.filter import (
     Systematic,
     TaylorLinearisation,
 )
-from pfbench.filter.health import HEALTH, HealthMonitor, count_health, fit_pareto_k
+from pfbench.filter.health import HEALTH, HealthMonitor, fit_pareto_k
 from pfbench.filter.loop import FilterPass, FilterResult, prepare_record, run_filter
 from pfbench.model import LinearGaussian, UnivariateGrowth, linear_walk
 from pfbench.noise import NominalNoise
@@ -29,6 +29,12 @@ from pfbench.scenario import ModelSimulation
 RUNS, STEPS = 200, 60
 KALMAN = GaussianFilter(TaylorLinearisation())
 PARTICLES = ParticleFilter(300, EssResampler(Systematic(), 0.5))
+
+
+def count_health(health):
+    """Count the runs [R] of each health."""
+    counts = torch.bincount(health.long(), minlength=len(HEALTH)).tolist()
+    return dict(zip(HEALTH, counts, strict=True))
 
 
 def walk(noise: float = 0.3, sd: float = 1.0) -> LinearGaussian:

@@ -43,22 +43,6 @@ def test_the_runs_needed_find_the_effect_as_often_as_said(effect):
     assert study_size.compute_power(effect, n, 0.05) == pytest.approx(found, abs=0.05)
 
 
-@pytest.mark.parametrize(
-    ("share", "limit", "alpha"), [(0.15, 0.05, 0.05), (0.7, 0.5, 0.01), (0.3, 0.5, 0.025)]
-)
-def test_the_runs_of_a_share_find_it_as_often_as_said(share, limit, alpha):
-    def exact(n):
-        """Power of the exact binomial test."""
-        if share > limit:
-            return stats.binom.sf(stats.binom.isf(alpha, n, limit), n, share)
-        return stats.binom.cdf(stats.binom.ppf(alpha, n, limit) - 1, n, share)
-
-    n = int(study_size.required_runs_proportion(share, limit, alpha))
-    # the exact test is cautious, and its power goes up and down with n
-    assert np.mean([exact(k) for k in range(n - 5, n + 6)]) == pytest.approx(0.8, abs=0.06)
-    assert study_size.required_runs_proportion(limit, limit) == np.inf
-
-
 @pytest.mark.parametrize("n", [5, 9, 13, 14, 50, 51, 100])
 @pytest.mark.parametrize("digits", [0, 1, 9])  # with many ties and zeros, with some, with none
 def test_the_signed_rank_test_is_scipys(n, digits):

@@ -260,11 +260,6 @@ def describe_view(
     return next((text for text in texts if len(text.split()) <= _MOST_WORDS), head)
 
 
-def _show_ratio(row: BoardRow) -> str:
-    """Format the ratio of a row with its interval."""
-    return format_with_interval(row["ratio"], row["ratio_low"], row["ratio_high"])
-
-
 def _describe_proposed(
     others: Sequence[BoardRow], better: Sequence[BoardRow], looks: Mapping[str, MethodLook]
 ) -> list[str]:

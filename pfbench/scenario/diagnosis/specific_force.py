@@ -374,9 +374,3 @@ def _find_rate_scales(measured: Array, true: Array, window: float) -> Iterator[t
         error = np.sqrt(inverse[j, j] * rest[:, j].var() * (1.0 + memory) / (1.0 - memory))
         if motion[j] > _LEAST_RATE and error < _SCALE_ERROR:
             yield axis, float(fit[j, j]), float(error)
-
-
-def find_rate_noise(aligned: Alignment) -> Array:
-    """Return the noise of the rate while moving, from windows, rad/s/sqrt(Hz), [3]."""
-    measured, true, window, _ = _compare_turns(aligned)
-    return np.asarray((measured - true).std(0) / np.sqrt(window))
