@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
 import re
@@ -20,7 +21,9 @@ from notebook_cells import MODEL, PROPOSAL, Notebook
 
 import pfbench
 from pfbench.cli.compose import plan_study
+from pfbench.door import own_source
 from pfbench.job import IGNORED_IN_KEY, job_key
+from pfbench.job.trust import FOLDERS
 from pfbench.report.overview.tables import read_world_facts
 from pfbench.results import main_component_group, store
 from pfbench.stats.comparison import EQUALITY_MARGIN, bound_losses, compare, decide
@@ -420,3 +423,19 @@ def test_the_door_is_light() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["[]", "[]"]
+
+
+def test_an_own_module_imports_public_names_from_their_door() -> None:
+    """The module of a private file would change the key of an own class whenever files move."""
+    homes = {}
+    for folder in (*FOLDERS, "job", "testing", "judge"):
+        door = importlib.import_module(f"pfbench.{folder}")
+        for name in door.__all__:
+            value = getattr(door, name)
+            if str(getattr(value, "__module__", "")).startswith("pfbench.") and (
+                getattr(value, "__qualname__", None) == name
+            ):
+                homes[f"{folder}.{name}"] = own_source._find_home(value)
+    assert len(homes) > 300
+    wrong = {name: home for name, home in homes.items() if home != f"pfbench.{name.split('.')[0]}"}
+    assert wrong == {}
