@@ -14,8 +14,8 @@ from omegaconf import DictConfig
 
 from pfbench import job
 from pfbench.core.record import Episode, Record, map_inputs
+from pfbench.logs.sky.raw_log import write_raw_log
 from pfbench.noise.base import NominalNoise
-from pfbench.testing.raw_log import write_raw_log
 
 CONF = job.conf_dir()
 

@@ -8,8 +8,8 @@ from datetime import datetime, timedelta
 import numpy as np
 import pandas as pd
 
+from pfbench.logs.sky.ephemeris import GM_GPS
 from pfbench.nav import earth
-from pfbench.nav.ephemeris import GM_GPS
 
 # one eccentric and one nearly circular satellite, every parameter at work. deltan, Omegadot, cu and cr are fitted to
 # the gravity of an oblate Earth, as those of broadcast orbits are

@@ -48,7 +48,7 @@ def write(table: pd.DataFrame, path: Path) -> Path:
 
 def geodetic(table: pd.DataFrame) -> np.ndarray:
     """Latitude, longitude, height by inversion of the local frame, from first-order steps."""
-    from pfbench.judge.trajectory_table import to_north_east_down
+    from pfbench.logs.judge.trajectory_table import to_north_east_down
 
     target = table[["pn", "pe", "pd"]].to_numpy()
     guess = np.tile(np.array(ORIGIN), (len(target), 1))

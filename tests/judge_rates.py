@@ -19,8 +19,8 @@ from scipy.fft import dct
 from scipy.signal import lfilter
 from scipy.special import stdtr
 
-from pfbench.judge.judge_options import JudgeOptions
-from pfbench.judge.pair_verdicts import PairVerdict, judge_pairs
+from pfbench.logs.judge.judge_options import JudgeOptions
+from pfbench.logs.judge.pair_verdicts import PairVerdict, judge_pairs
 from pfbench.results.store import JobResult
 from pfbench.stats.comparison import EQUALITY_MARGIN, MIN_RUNS
 from pfbench.stats.rank_tests import rank_sum_cdf, wilcoxon_signed_rank_rows
@@ -35,7 +35,7 @@ from pfbench.stats.time_blocks import (
 STEPS = 600
 CAP = 100.0
 CHUNK = 100  # studies at once
-RESIDUALS = Path(__file__).parent / "judge/car_drive/residuals.csv"
+RESIDUALS = Path(__file__).parent / "logs/judge/car_drive/residuals.csv"
 Draw = Callable[[np.random.Generator, tuple[int, int]], np.ndarray]  # [P, K] to [P, K, STEPS]
 
 # --------------------------------------------------------------------------------------------------

@@ -11,10 +11,10 @@ import pandas as pd
 from recorded_data import DATA
 from scipy.spatial.transform import Rotation
 
-from pfbench.scenario.diagnosis.checks import run_checks
-from pfbench.scenario.diagnosis.finding import Finding
-from pfbench.scenario.diagnosis.inspection import LogSource, take_tables
-from pfbench.scenario.recorded.log_tables import LogTable
+from pfbench.logs.doctor.checks import run_checks
+from pfbench.logs.doctor.finding import Finding
+from pfbench.logs.doctor.inspection import LogSource, take_tables
+from pfbench.logs.worlds.log_tables import LogTable
 
 Tables = dict[str, pd.DataFrame]
 FORCE, RATE = ["fx", "fy", "fz"], ["wx", "wy", "wz"]

@@ -51,6 +51,7 @@ COMMANDS = {
     "check": ("check_installation", "compose all configurations and print versions"),
     "completion": ("print_completion", "print the completion of words for a shell"),
 }
+_OF_LOGS = ("data", "estimate", "import", "inspect", "judge")  # in pfbench/logs/cli
 _COMPOSING = (
     "run",
     "tune",
@@ -122,7 +123,8 @@ def _dispatch(words: Sequence[str]) -> None:
 
 def open_module(command: str) -> Any:
     """Import the module of a command; `import` is a word of Python and no name of a module."""
-    return import_module(f"pfbench.cli.{'own_files' if command == 'import' else command}")
+    folder = "logs.cli" if command in _OF_LOGS else "cli"
+    return import_module(f"pfbench.{folder}.{'own_files' if command == 'import' else command}")
 
 
 def _run_command(command: str, options: Sequence[str]) -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pfbench.files.atomic_write import write_atomically
-from pfbench.job.trust import WRITTEN, split_trust
+from pfbench.job.trust import FOLDERS, WRITTEN, split_trust
 
 _MAIN = "__main__"
 _CONSTANTS = (bool, int, float, complex, str, bytes, type(None))
@@ -260,13 +260,14 @@ def _is_of_module(value: object) -> bool:
 
 
 def _find_home(value: Any) -> str:
-    """Return the module from which a class or function is imported: of pfbench its folder."""
-    folder = ".".join(str(value.__module__).split(".")[:2])
-    is_public = (
-        folder.startswith("pfbench.")
-        and getattr(import_module(folder), value.__qualname__, None) is value
-    )
-    return folder if is_public else str(value.__module__)
+    """Return the module from which a class or function is imported: of pfbench the folder whose door has it."""
+    module = str(value.__module__)
+    room = module.split(".")[1] if module.startswith("pfbench.") else ""
+    doors = {"": (), "logs": (*FOLDERS, "job", "testing", "judge")}.get(room, (room,))
+    for door in doors:  # the wing of logs has none of its own
+        if getattr(import_module(f"pfbench.{door}"), value.__qualname__, None) is value:
+            return f"pfbench.{door}"
+    return module
 
 
 def _is_constant(value: object) -> bool:

@@ -28,7 +28,7 @@ from pfbench.job.scoring import (
     ScoreRecorder as ScoreRecorder,
 )
 from pfbench.job.settings import IGNORED_IN_KEY as IGNORED_IN_KEY, job_key as job_key
-from pfbench.job.track_estimate import (
+from pfbench.logs.track_estimate import (
     FilterAnswer as FilterAnswer,
     MotionEstimate as MotionEstimate,
     TrackEstimate as TrackEstimate,

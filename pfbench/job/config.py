@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 
-# --------------------------------------------------------------------------------------------------
-# Configuration of a job, composed from conf/ and experiments/ and resolved.
-#
 # This module imports Hydra only on use and never imports torch, so that the command line starts fast.
 
 CHOICES = ("scenario", "noise", "filter", "model")  # groups that name a job

@@ -31,9 +31,6 @@ from pfbench.job.trust import hash_package
 from pfbench.model.base import StateSpaceModel
 from pfbench.scenario.base import RecordingRegime, Scenario
 
-# --------------------------------------------------------------------------------------------------
-# Plan of a job: a checked configuration and its objects, each built once.
-
 
 @dataclass(frozen=True, eq=False)
 class JobPlan:

@@ -38,9 +38,6 @@ from pfbench.results.plotting import (
 from pfbench.results.status import count_statuses, divergence_threshold
 from pfbench.results.store import DATA_FOLDERS, Inputs
 
-# --------------------------------------------------------------------------------------------------
-# Computation of one stored run with scores at all steps.
-
 _ENGINES = ("kernels", "compiled")  # engines that a job may have used; the others are eager
 
 

@@ -1,4 +1,4 @@
 """Public names of `pfbench.judge` and the modules that define them."""
 
-from pfbench.judge.judgement import judge_programs as judge_programs
-from pfbench.judge.pair_sentences import describe_judgement as describe_judgement
+from pfbench.logs.judge.judgement import judge_programs as judge_programs
+from pfbench.logs.judge.pair_sentences import describe_judgement as describe_judgement

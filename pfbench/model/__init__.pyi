@@ -4,6 +4,11 @@ from pfbench.core.density import (
     independent_normal as independent_normal,
     normal_batch as normal_batch,
 )
+from pfbench.logs.sky.raw_gnss import (
+    RawGnss as RawGnss,
+    RawGnssInputs as RawGnssInputs,
+    RawGnssTuning as RawGnssTuning,
+)
 from pfbench.model.azimuth import (
     Discretisation as Discretisation,
     ErrorEquations as ErrorEquations,
@@ -34,11 +39,6 @@ from pfbench.model.passive_location import (
     PassiveLocation as PassiveLocation,
     PlatformInputs as PlatformInputs,
     compute_level_attitude as compute_level_attitude,
-)
-from pfbench.model.raw_gnss import (
-    RawGnss as RawGnss,
-    RawGnssInputs as RawGnssInputs,
-    RawGnssTuning as RawGnssTuning,
 )
 from pfbench.model.sins_sar import SinsSar as SinsSar
 from pfbench.model.strapdown import (

@@ -1,5 +1,7 @@
 """Public names of `pfbench.nav` and the modules that define them."""
 
+from pfbench.logs.sky.broadcast_orbits import BroadcastConstellation as BroadcastConstellation
+from pfbench.logs.sky.plausible_limits import PlausibleLimits as PlausibleLimits
 from pfbench.nav.aiding import (
     AidingSensor as AidingSensor,
     AlignmentErrors as AlignmentErrors,
@@ -7,7 +9,6 @@ from pfbench.nav.aiding import (
     ProcessNoiseInflation as ProcessNoiseInflation,
     SarSensor as SarSensor,
 )
-from pfbench.nav.broadcast_orbits import BroadcastConstellation as BroadcastConstellation
 from pfbench.nav.imu_errors import ImuErrors as ImuErrors
 from pfbench.nav.manoeuvres import (
     CosineRamp as CosineRamp,
@@ -23,7 +24,6 @@ from pfbench.nav.orbits import (
     Constellation as Constellation,
     WalkerConstellation as WalkerConstellation,
 )
-from pfbench.nav.plausible_limits import PlausibleLimits as PlausibleLimits
 from pfbench.nav.ranging import RangingReceiver as RangingReceiver, ReceiverClock as ReceiverClock
 from pfbench.nav.trajectory import (
     TrajectorySource as TrajectorySource,

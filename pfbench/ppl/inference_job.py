@@ -27,7 +27,6 @@ from pfbench.ppl.particle_mcmc import pmmh
 from pfbench.ppl.pyro_program import program
 from pfbench.results.store import compute_config_key, extend_key
 
-METHODS = ("nuts", "svi", "pmmh", "smc2")
 _BY_GRADIENT = ("nuts", "svi")
 _Z_95 = 1.6448536269514722  # 95 % quantile of the standard normal distribution
 _KEYS = ("model", "scenario", "noise", "filter", "infer", "seed", "runs", "first_run")

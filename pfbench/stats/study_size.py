@@ -1,8 +1,4 @@
-"""Runs and worlds that a study requires, and differences that a planned study can show.
-
-References:
-    J. L. Hodges and E. L. Lehmann (1956), The efficiency of some nonparametric competitors of the t-test.
-"""
+"""Runs and worlds that a study requires, and differences that a planned study can show."""
 
 from __future__ import annotations
 
@@ -15,47 +11,7 @@ import scipy  # scipy.special is imported at its first use, which takes a tenth 
 
 from pfbench.stats.comparison import MIN_RUNS, TRIM_SHARE
 
-# --------------------------------------------------------------------------------------------------
-# Sample sizes: power of the paired signed-rank test, runs required, smallest detectable effect.
-#
-# Effects are differences of log losses of two filters on the same runs, in standard deviations of the
-# difference. For normal differences the signed-rank test of n pairs equals the t test of 3 n / pi
-# pairs, and for any distribution at least of 0.864 n [Hodges, Lehmann 1956]. The t test is counted by
-# the closed form of Guenther 1981.
-
-EFFICIENCY = 3 / math.pi
 POWER = 0.8
-
-
-def min_pairs(alpha: float) -> int:
-    """Return the pairs below which the two-sided signed-rank test cannot reach p <= alpha.
-
-    If all signs are equal, p = 2^(1 - n).
-    """
-    return math.ceil(1 + math.log2(1 / alpha) - 1e-9)
-
-
-def compute_power(
-    effect: float, pairs: int, alpha: float = 0.05, efficiency: float = EFFICIENCY
-) -> float:
-    """Compute the probability that the two-sided paired signed-rank test shows an effect."""
-    z = float(-scipy.special.ndtri(alpha / 2))
-    if pairs < min_pairs(alpha):
-        return 0.0
-    return float(
-        scipy.special.ndtr(abs(effect) * math.sqrt(max(efficiency * pairs - z**2 / 2, 0.0)) - z)
-    )
-
-
-def required_runs(
-    effect: float, alpha: float = 0.05, power: float = POWER, efficiency: float = EFFICIENCY
-) -> float:
-    """Compute the runs required to show an effect; infinite for no effect."""
-    if effect == 0:
-        return math.inf
-    z = float(-scipy.special.ndtri(alpha / 2))
-    of_t_test = ((z + scipy.special.ndtri(power)) / effect) ** 2 + z**2 / 2
-    return float(max(math.ceil(of_t_test / efficiency), min_pairs(alpha)))
 
 
 # --------------------------------------------------------------------------------------------------

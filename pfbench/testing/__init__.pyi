@@ -1,5 +1,6 @@
 """Public names of `pfbench.testing` and the modules that define them."""
 
+from pfbench.logs.sky.raw_log import write_raw_log as write_raw_log
 from pfbench.testing.filters import (
     check_bounded_weights as check_bounded_weights,
     check_causality as check_causality,
@@ -18,7 +19,6 @@ from pfbench.testing.moves import (
     check_move as check_move,
     simulate_path_posterior as simulate_path_posterior,
 )
-from pfbench.testing.raw_log import write_raw_log as write_raw_log
 from pfbench.testing.reference import (
     FilterMoments as FilterMoments,
     KalmanResult as KalmanResult,

@@ -1,4 +1,4 @@
-"""Damaged logs of recorded flights: the mutations of tests/scenario/recorded/mutations.py."""
+"""Damaged logs of recorded flights: the mutations of tests/logs/worlds/mutations.py."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ REASONS = {  # why a file alone does not show a change of a column in all rows, 
 
 def load_mutations() -> ModuleType:
     """Import the module of the mutations, which lies beside the tests of the readers."""
-    folder = str(TESTS / "scenario" / "recorded")
+    folder = str(TESTS / "logs" / "worlds")
     if folder not in sys.path:
         sys.path.append(folder)
     return importlib.import_module("mutations")

@@ -20,9 +20,9 @@ from pyarrow import parquet
 from pfbench.files import limits
 from pfbench.files.table_file import read_table_file
 from pfbench.filter.learned.checkpoint import read_checkpoint
-from pfbench.judge.formats import read_trajectories
-from pfbench.judge.judge_options import SourceOptions
-from pfbench.nav.ephemeris import read_rinex
+from pfbench.logs.judge.formats import read_trajectories
+from pfbench.logs.judge.judge_options import SourceOptions
+from pfbench.logs.sky.ephemeris import read_rinex
 from pfbench.report import RUNS_FILE, read_stored_study
 from pfbench.results.store import read_metadata, read_result
 from pfbench.scenario.simulated import _read

@@ -11,9 +11,9 @@ import torch
 from ephemeris_cases import EPHEMERIDES, later_by_two_hours
 from recorded_data import DATA
 
+from pfbench.logs.sky.broadcast_orbits import BroadcastConstellation
+from pfbench.logs.sky.ephemeris_checks import J2, compute_gravity
 from pfbench.nav import earth
-from pfbench.nav.broadcast_orbits import BroadcastConstellation
-from pfbench.nav.ephemeris_checks import J2, compute_gravity
 
 
 def three(first: pd.DataFrame = EPHEMERIDES) -> pd.DataFrame:

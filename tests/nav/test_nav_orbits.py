@@ -16,9 +16,9 @@ from recorded_data import DATA, recorded
 from refusals import check_refused
 from torch import Tensor
 
+from pfbench.logs.sky.broadcast_orbits import BroadcastConstellation
+from pfbench.logs.sky.ephemeris import GM_GPS, WEEK, read_rinex
 from pfbench.nav import earth
-from pfbench.nav.broadcast_orbits import BroadcastConstellation
-from pfbench.nav.ephemeris import GM_GPS, WEEK, read_rinex
 from pfbench.nav.orbits import (
     GPS_OMEGA,
     LIGHT,

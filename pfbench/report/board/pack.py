@@ -68,9 +68,6 @@ from pfbench.results.store import JobResult, list_failures
 from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
 from pfbench.stats.study_runs import StudyRuns, arrange_runs
 
-# --------------------------------------------------------------------------------------------------
-# Data of the page and of the paper of a study: one dictionary, all numbers decided here.
-
 
 def build_pack(
     study: str,

@@ -49,9 +49,6 @@ from pfbench.stats.study_runs import (
     share_conditions,
 )
 
-# --------------------------------------------------------------------------------------------------
-# All views of a study: metric, world, regime and baseline, each with its sentence and its rows.
-
 
 class Selection(NamedTuple):
     """Conditions of a scope, and what is said of them whatever the metric.

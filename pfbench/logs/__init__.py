@@ -1,0 +1,1 @@
+"""Own logs and recorded worlds: reading, diagnosis, answers, and the judge of other programs' trajectories."""

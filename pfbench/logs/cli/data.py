@@ -1,0 +1,94 @@
+"""Command `pfbench data`: the recorded data sets, and which of them a folder has."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+
+from pfbench.files.atomic_write import hash_file
+
+HELP = """\
+pfbench data [FOLDER]
+
+List the recorded data sets with source, licence and size, and check a folder by the checksums of their files.
+Without FOLDER that of the environment variable PFBENCH_DATA is checked, or none.
+
+  pfbench data
+  pfbench data ~/navigation_data
+
+A whole data set may be missing: its scenarios are then refused. A file that is missing from a data set, or that
+differs, is an error. Page: docs/data_sets.md"""
+
+_LIST = Path(__file__).parents[1] / "worlds" / "data_sets.yaml"
+
+
+class SetState(NamedTuple):
+    """State of a data set in a folder: its name, its state in a word, and its files that are missing or differ."""
+
+    name: str
+    word: str
+    missing: tuple[str, ...] = ()
+    changed: tuple[str, ...] = ()
+
+
+def read_data_sets() -> dict[str, dict[str, Any]]:
+    """Read the list of data sets by name: about, source, commit, folder, licence, and files with bytes and SHA-256."""
+    content: dict[str, dict[str, Any]] = yaml.safe_load(_LIST.read_text(encoding="utf-8"))
+    return content
+
+
+def check_data_set(name: str, files: Mapping[str, Mapping[str, Any]], root: Path) -> SetState:
+    """Check the files of a data set in a folder of data sets."""
+    folder = root / name
+    if not folder.is_dir():
+        return SetState(name, "missing")
+    missing = tuple(file for file in files if not (folder / file).is_file())
+    changed = tuple(
+        file
+        for file, facts in files.items()
+        if file not in missing and not facts["sha256"].startswith(hash_file(folder / file))
+    )
+    word = "incomplete" if missing else "differs" if changed else "complete"
+    return SetState(name, word, missing, changed)
+
+
+def list_data(words: Sequence[str]) -> None:
+    """Print the data sets, and check a folder."""
+    if len(words) > 1 or any("=" in word for word in words):
+        raise ValueError(
+            f"pfbench data must receive one folder, got {' '.join(words)}. Use: pfbench data FOLDER"
+        )
+    folder = words[0] if words else os.environ.get("PFBENCH_DATA", "")
+    root = Path(folder).expanduser()
+    if folder and not root.is_dir():
+        raise ValueError(
+            f"FOLDER must be a folder, got {folder}. Name the one that holds the data sets: pfbench data FOLDER"
+        )
+    sets = read_data_sets()
+    states = {name: check_data_set(name, facts["files"], root) for name, facts in sets.items()} if folder else {}  # fmt: skip
+    for name, facts in sets.items():
+        size = sum(file["bytes"] for file in facts["files"].values()) / 1e6
+        word = states[name].word if folder else ""
+        print(f"{name:16} {word:11}{size:5.1f} MB  {facts['licence']:18} {facts['about']}")
+        print(f"{'':16} {'':11}{facts['source']} {facts['commit'][:10]}, {facts['folder']}")
+    if not folder:
+        print("\nCheck a folder: pfbench data FOLDER. Use it: export PFBENCH_DATA=FOLDER")
+        return
+    _refuse_damage(list(states.values()), folder)
+    count = sum(state.word == "complete" for state in states.values())
+    print(f"\n{count} of {len(states)} data sets are complete in {folder}. Use them: export PFBENCH_DATA={folder}")  # fmt: skip
+
+
+def _refuse_damage(states: Sequence[SetState], folder: str) -> None:
+    """Raise ValueError for data sets with files that are missing or differ."""
+    faults = [f"{state.name}/{file} is missing" for state in states for file in state.missing]
+    faults += [f"{state.name}/{file} differs" for state in states for file in state.changed]
+    if faults:
+        raise ValueError(
+            f"data sets must have all their files unchanged, got {folder} where {'; '.join(faults)}. "
+            "Copy these files again, or remove the folder of the data set."
+        )

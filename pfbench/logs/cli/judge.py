@@ -1,0 +1,198 @@
+"""Command `pfbench judge`: trajectories of other programs under the metrics of a study."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any
+
+from pfbench.cli.messages import suggest_similar
+
+if TYPE_CHECKING:
+    from pfbench.logs.judge.judge_options import SourceOptions
+
+HELP = """\
+pfbench judge reference=FILE NAME=FILE NAME=FILE ... [key=value ...]
+
+Compare trajectories of any programs with a reference and with each other, and write a report.
+
+  pfbench judge reference=truth.csv mine=a.csv theirs=b.tum theirs.frame=enu
+  pfbench judge reference=truth/{sequence}.csv 'mine=mine/{sequence}_{run}.csv' 'theirs=theirs/{sequence}.nav'
+
+Formats, found by content: CSV and .parquet with the columns t, pn, pe, pd (or lat_deg, lon_deg, h_m), optional
+vn, ve, vd, roll, pitch, yaw, sd_pn, ..., cov_nn, ...; TUM; NMEA; KF-GINS; .npz of pfbench.
+
+  study=NAME             name of the report (judge)        reports_dir=FOLDER   folder of reports (reports)
+  from=S to=S every=S    scored time and distance of epochs
+  tolerance=S            largest difference of common epochs (0.01)
+  holes=skip             leave out long gaps of the reference; largest_gap=S sets their length
+  coverage=SHARE         least share of the time that a run covers (0.9)
+  limit=M                position error above which a run diverges
+  align=offset|yaw       remove a motion from positions (none)
+  origin=LAT,LON,H       origin of local positions, deg, deg, m
+  block=S                length of the blocks of time (30 blocks)
+  baseline=NAME          compare all with one program (all pairs)
+  alpha=0.05 margin=0.05 level of the tests, margin of equality
+  NAME.frame=enu|ned     axes of a TUM file                NAME.shift=S   time added to a clock
+  NAME.columns=t:time,pn:north,...   names of columns      NAME.sd=FILE   deviations of KF-GINS
+  NAME.scale=t:0.001,yaw:0.0174533   factors of columns    NAME.format=table|tum|kf_gins|nmea|result"""
+
+_RENAMED = {"from": "start", "to": "end"}  # words of the command line that Python reserves
+_OTHER_PAGES = ("claims", "datasheets")  # folders of reports
+_LONGEST_NAME = 100
+_NAME = re.compile(r"[A-Za-z][\w+-]*")
+_PAIR = re.compile(
+    r'\s*(?P<name>\w+)\s*:\s*(?:"(?P<quoted>(?:[^"]|"")+)"|(?P<plain>[^,"\s](?:[^,]*[^,\s])?))\s*(?:,|$)'
+)
+
+
+def judge_trajectories(words: Sequence[str]) -> None:
+    """Compare programs and write the report."""
+    values = _split(words)
+    options, sources, programs = _sort_words(values)
+    from pfbench.logs.judge.judgement import judge_programs
+    from pfbench.logs.judge.page import describe_material, describe_notes, write_judgement
+    from pfbench.logs.judge.pair_sentences import describe_judgement
+
+    reference, study = programs.pop("reference"), str(values.get("study", "judge"))
+    if not re.fullmatch(r"[\w+.-]*\w[\w+.-]*", study) or len(study) > _LONGEST_NAME:
+        raise ValueError(
+            f"study must be letters, digits, _, -, + or ., at most {_LONGEST_NAME}, got {study[:150]}. Change study=NAME."
+        )
+    if study in _OTHER_PAGES:
+        raise ValueError(
+            f"study must not be {' or '.join(_OTHER_PAGES)}, got {study}. These folders hold other pages. Change study=NAME."
+        )
+    judgement = judge_programs(reference, programs, options, sources)
+    page = write_judgement(judgement, values.get("reports_dir", "reports"), study, options)
+    print(describe_material(judgement))
+    for sentence in (*describe_notes(judgement, options), *describe_judgement(judgement)):
+        print(f"- {sentence}")
+    print(f"report: {page.resolve()}")
+
+
+def _split(words: Sequence[str]) -> dict[str, str]:
+    """Return the values by key; a key occurs once."""
+    values: dict[str, str] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals or not value or key in values:
+            raise ValueError(
+                f"words must be key=value, each key once, got {word}. See pfbench judge --help."
+            )
+        values[key] = value
+    return values
+
+
+def _sort_words(
+    values: Mapping[str, str],
+) -> tuple[Any, dict[str, SourceOptions], dict[str, str]]:
+    """Return options, options of sources, and patterns of the reference and the programs."""
+    from pfbench.logs.judge.judge_options import JudgeOptions, SourceOptions, name_program
+
+    types = {field.name: field.default for field in fields(JudgeOptions)}
+    keys = {new: old for old, new in _RENAMED.items()}
+    option_keys = [keys.get(name, name) for name in types]
+    options: dict[str, Any] = {}
+    sources: dict[str, dict[str, Any]] = {}
+    programs: dict[str, str] = {}
+    for key, value in values.items():
+        name, dot, option = key.partition(".")
+        if key in option_keys:
+            field = _RENAMED.get(key, key)
+            options[field] = _convert(key, value, types[field])
+        elif dot:
+            sources.setdefault(name, {})[option] = _convert_source(key, option, value)
+        elif key not in ("study", "reports_dir"):
+            programs[key] = value
+    _check_programs(programs, sources, [*option_keys, "study", "reports_dir"])
+    of_programs = {}
+    for name, values_of_program in sources.items():
+        with name_program(name):
+            of_programs[name] = SourceOptions(**values_of_program)
+    return JudgeOptions(**options), of_programs, programs
+
+
+def _check_programs(
+    programs: Mapping[str, str], sources: Mapping[str, Any], option_keys: Sequence[str]
+) -> None:
+    """Check that the reference and a program are present, and that all names are valid."""
+    missing = "reference" if "reference" not in programs else "a program"
+    if "reference" not in programs or len(programs) < 2:
+        raise ValueError(
+            f"judge needs a reference and programs, got no {missing.removeprefix('a ')}. "
+            "Use: pfbench judge reference=truth.csv mine=a.csv theirs=b.csv"
+        )
+    for name, pattern in programs.items():
+        is_path = "." in pattern or "/" in pattern or os.path.isfile(pattern)
+        if is_path and not _NAME.fullmatch(name):
+            raise ValueError(
+                f"names of programs must be letters, digits, _, + and -, with a letter first, got {name!r}. "
+                f"Rename the program: {re.sub(r'[^A-Za-z0-9_+-]+', '_', name).strip('_') or 'mine'}={pattern}"
+            )
+        if not is_path:
+            raise ValueError(
+                f"{name} must be a program with a file, got {name}={pattern}."
+                f"{suggest_similar(name, option_keys)} See pfbench judge --help."
+            )
+    for name in sources:
+        if name not in programs:
+            raise ValueError(
+                f"{name} must be a program with a file, got options without one. Add {name}=FILE."
+            )
+
+
+def _convert(key: str, value: str, default: Any) -> Any:
+    """Convert the text of an option to the type of its default."""
+    if isinstance(default, str):
+        return value
+    try:
+        numbers = tuple(float(text) for text in value.strip("[]()").split(","))
+    except ValueError:
+        numbers = ()
+    if (
+        not numbers
+        or (isinstance(default, float) and len(numbers) > 1)
+        or any(n != n for n in numbers)
+    ):
+        raise ValueError(f"{key} must be a number, got {value}. Change {key}=...")
+    return numbers[0] if isinstance(default, float) else numbers
+
+
+def _convert_source(key: str, option: str, value: str) -> Any:
+    """Convert the text of an option of a program."""
+    if option == "shift":
+        return _convert(key, value, 0.0)
+    if option == "columns":
+        return _split_pairs(key, value, "NAME:NAME_IN_FILE", "t:time,pn:north")
+    if option == "scale":
+        factors = _split_pairs(key, value, "NAME:FACTOR", "t:0.001")
+        return {name: _convert(key, text, 0.0) for name, text in factors.items()}
+    if option not in ("frame", "format", "sd"):
+        raise ValueError(
+            f"{key} must be an option of a program, got {option}. Choose from frame, format, shift, columns, "
+            "scale, sd."
+        )
+    return value
+
+
+def _split_pairs(key: str, value: str, form: str, example: str) -> dict[str, str]:
+    """Return what follows the colon by name; quotes enclose a text with commas, brackets are its own."""
+    for first, last in ("{}", "[]"):  # of the list as a whole, since no name of pfbench starts so
+        if value.startswith(first) and value.endswith(last):
+            value = value[1:-1]
+    pairs: dict[str, str] = {}
+    start = 0
+    while start < len(value):
+        match = _PAIR.match(value, start)
+        if not match or match["name"] in pairs:
+            raise ValueError(
+                f"{key} must be {form},..., each name once, got {value}. Use {example}, and quotes around "
+                "a name with commas."
+            )
+        quoted = match["quoted"]
+        pairs[match["name"]] = match["plain"] if quoted is None else quoted.replace('""', '"')
+        start = match.end()
+    return pairs

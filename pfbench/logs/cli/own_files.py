@@ -1,0 +1,90 @@
+"""Command `pfbench import`: files of other programs as the tables of an own log, and its inspection."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+HELP = """\
+pfbench import FOLDER imu=FILE gnss=FILE [reference=FILE] [NAME.key=value ...]
+
+Write the tables imu, gnss and, if there is one, reference of an own log to a new folder, and inspect it.
+
+  pfbench import my_log imu=imu.csv gnss=rover.pos reference=truth.tum reference.frame=enu
+  pfbench import my_log imu=raw.csv imu.columns=t:time,fx:ax,fy:ay,fz:az,wx:gx,wy:gy,wz:gz imu.time=ms ...
+
+Formats, found by content: tables with names; TUM, KF-GINS (result, IMU increments, fixes), NMEA, RTKLIB .pos, EuRoC,
+KITTI (the folder of a drive for each of the three).
+
+  NAME.format=table|tum|kf_gins|nmea|rtklib|euroc|kitti
+  NAME.columns=t:time,...   name of pfbench:name in the file
+  NAME.time=s|ms|us|ns      unit of the time of a table
+  NAME.repeats=first        keep the first row of each time
+  NAME.frame=enu|ned        axes of a TUM file
+  reports_dir=FOLDER        folder of reports (reports)
+
+Exit codes: those of pfbench inspect"""
+
+_TABLES = ("imu", "gnss", "reference")
+_KEYS = ("format", "frame", "time", "repeats", "columns")
+
+
+def import_log(words: Sequence[str]) -> None:
+    """Import a log, and inspect it."""
+    folder, files, options, others = _split_words(words)
+    if folder.exists():
+        raise ValueError(
+            f"{folder} must be a new folder, got one that exists. Choose another name, or remove it."
+        )
+    from pfbench.logs.cli.inspect import inspect_folder
+    from pfbench.logs.judge.own_log import ImportOptions, import_table, write_log
+
+    readers = {role: ImportOptions(**options.get(role, {})) for role in files}
+    tables = {role: import_table(role, Path(files[role]), readers[role]) for role in files}
+    write_log(folder, tables)
+    for role, table in tables.items():
+        notes = "".join(f"; {note}" for note in table.notes)
+        print(f"{role}: {len(table.rows)} rows from {files[role]}{notes}")
+    inspect_folder([str(folder), *others])
+
+
+def _split_words(
+    words: Sequence[str],
+) -> tuple[Path, dict[str, str], dict[str, dict[str, Any]], list[str]]:
+    """Return the folder, the files, the options of each table, and the words of the inspection."""
+    files: dict[str, str] = {}
+    options: dict[str, dict[str, Any]] = {}
+    folders, others = [], []
+    for word in words:
+        key, equals, value = word.partition("=")
+        role, _, name = key.partition(".")
+        if not equals:
+            folders.append(word)
+        elif key in _TABLES:
+            files[key] = value
+        elif role in _TABLES and name in _KEYS:
+            field = "layout" if name == "format" else name
+            options.setdefault(role, {})[field] = _split_columns(key, value) if name == "columns" else value  # fmt: skip
+        elif key in ("reports_dir", "fix_codes", "origin"):
+            others.append(word)
+        else:
+            raise ValueError(
+                f"words must be FOLDER, imu=, gnss=, reference= and NAME.key=value, got {word}. "
+                "See pfbench import --help."
+            )
+    missing = [role for role in _TABLES[:2] if role not in files]
+    if len(folders) != 1 or missing:
+        raise ValueError(
+            f"import needs a new folder and the files of imu and gnss, got no "
+            f"{', '.join(missing) or 'folder'}. Use: pfbench import my_log imu=a.csv gnss=b.csv reference=c.csv"
+        )
+    return Path(folders[0]), files, options, others
+
+
+def _split_columns(key: str, value: str) -> dict[str, str]:
+    """Return the names in the file by name of pfbench."""
+    pairs = [pair.partition(":") for pair in value.strip("{}").split(",")]
+    if not all(colon and name.strip() and text.strip() for name, colon, text in pairs):
+        raise ValueError(f"{key} must be NAME:NAME_IN_FILE,..., got {value}. Use t:time,fx:ax.")
+    return {name.strip(): text.strip() for name, _, text in pairs}

@@ -1,0 +1,309 @@
+"""Alignment of IMU and reference by their turns: unit of the attitude, time offset, its drift, unit and axes of the rate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pfbench.files.table_file import Array
+from pfbench.logs.doctor.axis_orders import BODY_ORDERS
+from pfbench.logs.doctor.finding import (
+    REFUSE,
+    WARN,
+    Finding,
+    Picture,
+    describe_change,
+    thin_curve,
+)
+from pfbench.logs.doctor.raw_log import RawLog, dcm_of, interpolate_columns
+from pfbench.logs.doctor.thresholds import REFUSED_OFFSET, limit_of
+from pfbench.logs.doctor.turn_search import (
+    FEWEST_TURNS,
+    TURN_WINDOW,
+    TurnSearch,
+    select_nodes,
+    turns_between,
+)
+
+_DEGREE = np.pi / 180.0
+_GAIN = 0.15  # of the score by another unit
+_CERTAIN = 0.9  # score at which no other unit is tried, and that of a piece of the log
+_PIECE, _FEWEST_PIECES, _MOST_PIECES = 15.0, 3, 8  # s, and number of pieces for the drift
+_LEAST_TURN = 0.03  # rad; RMS turn of a piece that shows an offset
+_STRAIGHT = 0.35  # part of the spread that a drift may leave
+_UNITS = {
+    "": (1.0, 1.0, 1.0),
+    "roll, pitch, yaw": (_DEGREE, _DEGREE, _DEGREE),
+    "yaw": (1.0, 1.0, _DEGREE),
+}
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """IMU and reference on one clock.
+
+    Attributes:
+        log: Log with the attitude and the rate in their units.
+        offset: Delay of the IMU, s.
+        dcm: Rotations of the reference, [k, 3, 3].
+        nodes: Rows of the reference between windows, [m + 1].
+        search: Turns of the IMU.
+        pair: Turns of reference and IMU without their means, [p, 3].
+        used: Windows of the pair, [m].
+        rate_axes: Axes of the gyroscope that fit best.
+        rate_ratio: Residual of the recorded axes over that of the best ones.
+    """
+
+    log: RawLog
+    offset: float
+    dcm: Array
+    nodes: NDArray[np.intp]
+    search: TurnSearch
+    pair: tuple[Array, Array]
+    used: NDArray[np.bool_]
+    rate_axes: Array
+    rate_ratio: float
+
+    def over(self, log: RawLog) -> Alignment:
+        """Return the alignment of the same log with other velocities."""
+        return replace(self, log=log)
+
+
+def align_clocks(log: RawLog, facts: dict[str, Any]) -> tuple[Alignment | None, list[Finding]]:
+    """Align the IMU with the reference.
+
+    Returns the alignment, None without common motion, and findings.
+    """
+    nodes = select_nodes(log.reference.time, TURN_WINDOW)
+    if len(nodes) <= FEWEST_TURNS:
+        return None, []
+    search = TurnSearch.over(log.imu, log.reference.time[nodes])
+    unit, offset, score = _find_unit(log, search, nodes)
+    facts.update({"imu offset [s]": offset, "score of turns": score})
+    log, findings = _convert_attitude(log, unit, score)
+    dcm = dcm_of(log.reference.angles)
+    turns = turns_between(dcm, nodes)
+    pair = search.pairs(turns, offset)
+    if score < limit_of("common motion"):
+        strangers = [_describe_strangers(log, search, turns, score)]
+        return None, [*findings, *(strangers if _has_turns(search, turns) else [])]
+    if pair is None:
+        return None, findings
+    findings += _describe_offset(log, search, turns, (offset, score), facts)
+    aligned = Alignment(log, offset, dcm, nodes, search, pair[:2], pair[2], np.eye(3), 1.0)
+    aligned, more = _convert_rate(aligned, facts)
+    return _fit_rate_axes(aligned), [*findings, *more]
+
+
+def _convert_rate(aligned: Alignment, facts: dict[str, Any]) -> tuple[Alignment, list[Finding]]:
+    """Convert the rate to the unit of the reference, and name another unit."""
+    (true, measured), log = aligned.pair, aligned.log
+    ratio = float(np.sqrt((measured**2).sum() / max(float((true**2).sum()), 1e-300)))
+    facts["rate over that of the reference"] = ratio
+    if 1.0 / limit_of("unit of rate") < ratio < limit_of("unit of rate"):
+        return aligned, []
+    factor = _DEGREE if 40.0 < ratio < 80.0 else 1.0 / ratio
+    converted = replace(
+        aligned,
+        log=log._replace(imu=log.imu._replace(rate=log.imu.rate * factor)),
+        search=replace(aligned.search, angle=aligned.search.angle * factor),
+        pair=(true, factor * measured),
+    )
+    return converted, [_describe_rate_unit(log, aligned.pair, ratio)]
+
+
+def _fit_rate_axes(aligned: Alignment) -> Alignment:
+    """Find the axes of the rate that fit best."""
+    true, measured = aligned.pair
+    residuals = [float(((measured - true @ m.T) ** 2).sum()) for m in BODY_ORDERS]
+    best = int(np.argmin(residuals))
+    ratio = residuals[0] / max(residuals[best], 1e-300)
+    return replace(aligned, rate_axes=BODY_ORDERS[best], rate_ratio=ratio)
+
+
+def _has_turns(search: TurnSearch, turns: Array) -> bool:
+    """Return whether the reference or the IMU turns enough to be compared."""
+    measured = np.diff(interpolate_columns(search.nodes, search.time, search.angle), axis=0)
+    size = (np.square(a - a.mean(0)).sum(1).mean() for a in (turns, measured))
+    return max(size) > _LEAST_TURN**2
+
+
+def _find_unit(
+    log: RawLog, search: TurnSearch, nodes: NDArray[np.intp]
+) -> tuple[str, float, float]:
+    """Return the columns in degrees, '' for none, with the offset and the score of their turns.
+
+    A yaw within a turn is in radians: a short log without turns can agree with any unit.
+    """
+    results = []
+    is_within_a_turn = float(np.abs(log.reference.angles[:, 2]).max()) <= 2.0 * np.pi
+    for unit, factor in _UNITS.items():
+        offset, score = search.find(turns_between(dcm_of(log.reference.angles * factor), nodes))
+        results.append((unit, offset, score))
+        if not unit and (score > _CERTAIN or is_within_a_turn):
+            break
+    best = max(results, key=lambda result: result[2])
+    return best if best[2] > results[0][2] + _GAIN else results[0]
+
+
+def _convert_attitude(log: RawLog, unit: str, score: float) -> tuple[RawLog, list[Finding]]:
+    """Convert the attitude to radians, and name the columns in degrees."""
+    if not unit:
+        return log, []
+    columns = unit.split(", ")
+    reference = log.reference
+    finding = Finding(
+        "unit of attitude", REFUSE, score, _CERTAIN, "score",
+        f"{log.names[2]}: {unit} {'is' if len(columns) == 1 else 'are'} in degrees: turns then agree with the IMU "
+        f"to a score of {score:.3f}",
+        f"Multiply by {_DEGREE:.10f}, or set scenario.corrections.scale",
+        {"corrections": {"scale": {"reference": dict.fromkeys(columns, _DEGREE)}}},
+        picture=Picture("t [s]", "yaw as recorded", (thin_curve("yaw", reference.time, reference.angles[:, 2]),)),
+    )  # fmt: skip
+    return log._replace(reference=reference._replace(angles=reference.angles * _UNITS[unit])), [
+        finding
+    ]
+
+
+def _turn_picture(log: RawLog, search: TurnSearch, turns: Array, offset: float) -> Picture:
+    """Draw the turn rates of both about the axis that turns most."""
+    step = np.diff(search.nodes)
+    axis = int(np.argmax(np.square(turns).sum(0)))
+    at = search.nodes + offset
+    measured = np.diff(interpolate_columns(at, search.time, search.angle), axis=0)
+    middle = 0.5 * (search.nodes[1:] + search.nodes[:-1])
+    return Picture(
+        "t [s]", f"turn rate about {'xyz'[axis]} [rad/s]",
+        (
+            thin_curve(log.names[2], middle, turns[:, axis] / step),
+            thin_curve(log.names[0], middle, measured[:, axis] / step),
+        ),
+    )  # fmt: skip
+
+
+def _describe_strangers(log: RawLog, search: TurnSearch, turns: Array, score: float) -> Finding:
+    return Finding(
+        "common motion", REFUSE, score, limit_of("common motion"), "score",
+        f"{log.names[0]} and {log.names[2]} show no common turn at any offset up to 25 s: the best score is {score:.2f}",
+        "Check that both tables are of one drive, and that the clocks differ by less than 25 s",
+        explanations=("another clock", "a wrong attitude", "a log without turns"),
+        picture=_turn_picture(log, search, turns, 0.0),
+    )  # fmt: skip
+
+
+def _describe_rate_unit(log: RawLog, pair: tuple[Array, Array], ratio: float) -> Finding:
+    is_degrees = 40.0 < ratio < 80.0
+    factor = _DEGREE if is_degrees else 1.0 / ratio
+    true, measured = pair
+    axis, rows = int(np.argmax(np.square(true).sum(0))), np.arange(len(true))
+    unit = "they are in deg/s" if is_degrees else "they have another unit"
+    return Finding(
+        "unit of rate", REFUSE, ratio, limit_of("unit of rate"), "times the reference",
+        f"{log.names[0]}: wx, wy, wz are {ratio:.3g} times the turns of the reference: {unit}",
+        f"Multiply by {factor:.10g}, or set scenario.corrections.scale",
+        {"corrections": {"scale": {"imu": dict.fromkeys(("wx", "wy", "wz"), factor)}}},
+        picture=Picture("window", f"turn about {'xyz'[axis]}", (
+            thin_curve(log.names[2], rows, true[:, axis]), thin_curve(log.names[0], rows, measured[:, axis]),
+        )),
+    )  # fmt: skip
+
+
+def _describe_offset(
+    log: RawLog,
+    search: TurnSearch,
+    turns: Array,
+    at: tuple[float, float],
+    facts: dict[str, Any],
+) -> Iterator[Finding]:
+    """Describe the offset of the clock, and how it moves."""
+    offset, score = at
+    pieces = _offsets_of_pieces(search, turns, offset)
+    spread = float(np.ptp(pieces[:, 1])) if len(pieces) > 1 else 0.0
+    facts["imu offset spread [s]"] = spread
+    half = 0.5 * float(np.median(np.diff(log.imu.time)))  # of a sample: slower samples show less
+    name, moves = log.names[0], spread > max(limit_of("imu clock drift"), half)
+    step = _find_step(log, search, turns, offset) if moves else None
+    shift: Any = round(offset, 4)
+    if moves:
+        line = np.polyfit(pieces[:, 0], pieces[:, 1], 1)
+        rest = float(np.abs(pieces[:, 1] - np.polyval(line, pieces[:, 0])).max())
+        is_drift = step is None and len(pieces) > 2 and rest < _STRAIGHT * spread
+        ends = (float(log.imu.time[0]), float(log.imu.time[-1]))
+        shift = step or [[round(t, 3), round(float(np.polyval(line, t)), 4)] for t in ends]
+        kind = f"a drift of {line[0] * 1e6:.0f} ppm" if is_drift else "a slip of the clock"
+        where = f" by {step[1][1] - step[0][1]:+.3f} s at t = {step[0][0]:.3f}" if step else ""
+        yield Finding(
+            "imu clock drift", WARN, spread, limit_of("imu clock drift"), "s",
+            f"{name}: the time offset against {log.names[2]} moves by {spread:.3f} s: {kind}{where}",
+            "Correct t, or set scenario.corrections.shift_s.imu to the nodes [t, offset]",
+            {"corrections": {"shift_s": {"imu": shift}}} if step or is_drift else {},
+            picture=Picture("t [s]", "offset [s]", (("offset of pieces", pieces[:, 0], pieces[:, 1]),)),
+        )  # fmt: skip
+        shift = shift if step or is_drift else round(offset, 4)
+    if abs(offset) > max(limit_of("imu clock"), half):
+        late = "late" if offset > 0.0 else "early"
+        yield Finding(
+            "imu clock", REFUSE if abs(offset) > REFUSED_OFFSET else WARN, offset, limit_of("imu clock"), "s",
+            f"{name}: t is {abs(offset):.3f} s {late} against {log.names[2]}: turns agree to a score of {score:.3f}, and "
+            f"{search.score(turns, 0.0):.3f} without the offset",
+            f"{describe_change(offset)}, or set +scenario.corrections.shift_s.imu={offset:.3f}",
+            {"corrections": {"shift_s": {"imu": shift}}},
+            ("a delay of the IMU", f"a delay of {log.names[2]} of the other sign"),
+            _turn_picture(log, search, turns, 0.0),
+        )  # fmt: skip
+
+
+def _offsets_of_pieces(search: TurnSearch, turns: Array, offset: float) -> Array:
+    """Return middle and offset of the pieces of the log that turn enough, [q, 2]."""
+    first, last = search.nodes[0], search.nodes[-1]
+    count = int(np.clip((last - first) / _PIECE, _FEWEST_PIECES, _MOST_PIECES))
+    edges = np.linspace(first, last, count + 1)
+    pieces = []
+    for a, b in pairwise(edges):
+        stretch = (search.nodes[:-1] >= a) & (search.nodes[1:] <= b)
+        if (stretch & search.usable).sum() < FEWEST_TURNS:
+            continue
+        turn = turns[stretch] - turns[stretch].mean(0)
+        if np.sqrt(np.square(turn).sum(1).mean()) < _LEAST_TURN:
+            continue
+        lag, score = search.find(turns, offset, stretch)
+        if score > _CERTAIN:
+            pieces.append((0.5 * (a + b), lag))
+    return np.array(pieces).reshape(-1, 2)
+
+
+def _find_step(log: RawLog, search: TurnSearch, turns: Array, offset: float) -> list[list[float]] | None:  # fmt: skip
+    """Find a jump of the clock: a long interval of the IMU whose excess is that of the offsets around it."""
+    time = log.imu.time
+    interval = np.diff(time)
+    typical = float(np.median(interval))
+    i = int(interval.argmax())
+    excess = float(interval[i]) - typical
+    if excess < limit_of("imu clock drift"):
+        return None
+    lags = []
+    for stretch in (search.nodes[1:] + offset < time[i], search.nodes[:-1] + offset > time[i + 1]):
+        if (stretch & search.usable).sum() < FEWEST_TURNS:
+            return None
+        lag, score = _find_near(search, turns, offset, stretch)
+        if score < _CERTAIN:
+            return None
+        lags.append(lag)
+    before, after = lags
+    if abs(after - before - excess) > max(0.02, 0.2 * excess):
+        return None
+    return [[round(float(time[i]), 6), round(before, 4)], [round(float(time[i + 1]), 6), round(before + excess, 4)]]  # fmt: skip
+
+
+def _find_near(
+    search: TurnSearch, turns: Array, offset: float, stretch: NDArray[np.bool_]
+) -> tuple[float, float]:
+    """Find the offset and the score of a stretch of the log within 1.5 s."""
+    grid = offset + np.arange(-1.5, 1.51, 0.1)
+    scores = [search.score(turns, float(a), stretch) for a in grid]
+    return search.find(turns, float(grid[int(np.argmax(scores))]), stretch)

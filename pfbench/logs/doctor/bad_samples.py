@@ -1,0 +1,152 @@
+"""Samples of the IMU that cannot be measurements: absurd values, single spikes, and values that do not change."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pfbench.files.table_file import Array
+from pfbench.logs.doctor.finding import TELL, WARN, Finding, Picture, thin_curve
+from pfbench.logs.doctor.raw_log import RawImu, RawLog
+from pfbench.logs.doctor.thresholds import SPIKE_DEVIATIONS, limit_of
+
+_COLUMNS = ("fx", "fy", "fz", "wx", "wy", "wz")
+_BLOCK = 50  # differences of a local level
+_FEWEST = 50  # differences
+_LARGEST = (320.0, 70.0)  # m/s^2 and rad/s: absurd, ten times what platforms reach
+_OF_USUAL = 10.0  # times the value that 99 % of the samples do not reach
+
+
+class BadSamples(NamedTuple):
+    """Wrong samples of a column.
+
+    Attributes:
+        absurd: Rows that no sensor can measure.
+        spikes: Rows that jump there and back.
+        ratio: Largest jump there and back, in local levels.
+    """
+
+    absurd: NDArray[np.intp]
+    spikes: NDArray[np.intp]
+    ratio: float
+
+
+def find_bad_samples(values: Array, is_force: bool) -> BadSamples:
+    """Find the wrong samples of a column.
+
+    Args:
+        values: Samples, [n].
+        is_force: Whether the column is a specific force.
+
+    Returns:
+        Rows of the wrong samples.
+    """
+    finite = np.isfinite(values)
+    usual = float(np.percentile(np.abs(values[finite]), 99.0)) if finite.any() else 0.0
+    limit = max(_LARGEST[0] if is_force else _LARGEST[1], _OF_USUAL * usual)  # also in other units
+    is_absurd = ~finite | (np.abs(np.where(finite, values, 0.0)) > limit)
+    absurd = np.flatnonzero(is_absurd)
+    if len(absurd) > 0.5 * len(values):  # another unit
+        return BadSamples(np.flatnonzero(~finite), np.array([], np.intp), 0.0)
+    rows = np.arange(len(values))
+    mended = np.interp(rows, rows[~is_absurd], values[~is_absurd])
+    spikes, ratio = _find_spikes(mended)
+    return BadSamples(absurd, spikes, ratio)
+
+
+def _find_spikes(values: Array) -> tuple[NDArray[np.intp], float]:
+    """Find single samples that jump there and back, by two statistics: the local level and the second differences."""
+    step = np.diff(values)
+    size, n = np.abs(step), len(step)
+    if n < _FEWEST:
+        return np.array([], np.intp), 0.0
+    blocks = -(-n // _BLOCK)
+    padded = np.full(blocks * _BLOCK, np.nan)
+    padded[:n] = size
+    level = np.nanmedian(padded.reshape(blocks, _BLOCK), 1)
+    level = np.maximum.reduce([np.r_[level[:1], level[:-1]], level, np.r_[level[1:], level[-1:]]])
+    floor = 0.25 * np.median(size) + 1e-4 * np.percentile(size, 90) + 1e-12
+    level = np.repeat(level, _BLOCK)[:n] + floor
+    is_back = step[1:] * step[:-1] < 0.0
+    ratio = np.where(is_back, np.minimum(size[1:], size[:-1]) / level[1:], 0.0)
+    second = np.abs(np.diff(step))
+    deviation = 1.4826 * np.median(second) + 1e-12
+    is_spike = (ratio > limit_of("spikes")) & (second > SPIKE_DEVIATIONS * deviation)
+    return np.flatnonzero(is_spike) + 1, float(ratio.max())
+
+
+def find_stuck(imu: RawImu) -> tuple[int, int]:
+    """Return the first and the last row of the longest stretch of equal samples."""
+    samples = np.hstack([imu.force, imu.rate])
+    is_equal = (np.diff(samples, axis=0) == 0.0).all(1)
+    edges = np.flatnonzero(np.diff(np.r_[False, is_equal, False].astype(int)))
+    starts, ends = edges[::2], edges[1::2]
+    if not len(starts):
+        return 0, 0
+    i = int(np.argmax(ends - starts))
+    return int(starts[i]), int(ends[i])
+
+
+def check_samples(log: RawLog, facts: dict[str, Any]) -> tuple[RawLog, list[Finding]]:
+    """Check the samples, and replace the wrong ones by a line between their neighbours.
+
+    Returns the log, and findings.
+    """
+    imu, findings = log.imu, list(_check_stuck(log, facts))
+    samples = np.hstack([imu.force, imu.rate])
+    is_bad, ratios = np.zeros(len(imu.time), bool), {"force": 0.0, "rate": 0.0}
+    for k, column in enumerate(_COLUMNS):
+        bad = find_bad_samples(samples[:, k], k < 3)
+        kind = "force" if k < 3 else "rate"
+        ratios[kind] = max(ratios[kind], bad.ratio)
+        findings += _describe_bad(log, column, samples[:, k], bad)
+        is_bad[bad.absurd] = is_bad[bad.spikes] = True
+    facts["spike of force"], facts["spike of rate"] = ratios["force"], ratios["rate"]
+    keep = np.flatnonzero(~is_bad)
+    if is_bad.any() and keep.size:
+        samples = np.stack([np.interp(imu.time, imu.time[keep], s[keep]) for s in samples.T], -1)
+    return log._replace(imu=imu._replace(force=samples[:, :3], rate=samples[:, 3:])), findings
+
+
+def _check_stuck(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
+    """Check for samples that do not change."""
+    imu = log.imu
+    first, last = find_stuck(imu)
+    duration = float(imu.time[last] - imu.time[first])
+    facts["stuck"] = duration
+    if duration > limit_of("stuck samples"):
+        around = slice(max(0, 2 * first - last), 2 * last - first)
+        yield Finding(
+            "stuck samples", WARN, duration, limit_of("stuck samples"), "s",
+            f"{log.names[0]}: all samples are equal for {duration:.2f} s, from {log.row(0, first)} "
+            f"(t = {imu.time[first]:.3f}) on",
+            "Leave these rows out with the part before or after them, or set scenario.corrections.drop=[stuck] "
+            "and scenario.corrections.gaps=longest",
+            {"corrections": {"drop": ["stuck"], "gaps": "longest"}},
+            picture=Picture("t [s]", "fx [m/s^2]", (thin_curve("fx", imu.time[around], imu.force[around, 0]),),
+                            (float(imu.time[first]), float(imu.time[last]))),
+        )  # fmt: skip
+
+
+def _describe_bad(log: RawLog, column: str, values: Array, bad: BadSamples) -> Iterator[Finding]:
+    """Describe the wrong samples of a column."""
+    sizes = {"absurd samples": float(len(bad.absurd)), "spikes": bad.ratio}
+    for check, rows in (("absurd samples", bad.absurd), ("spikes", bad.spikes)):
+        if not len(rows):
+            continue
+        i = int(rows[0])
+        near = slice(max(0, i - _BLOCK), i + _BLOCK)
+        size = f", the largest {bad.ratio:.0f} times the local level" if check == "spikes" else ""
+        yield Finding(
+            check, TELL, sizes[check], limit_of(check), "times the level" if size else "rows",
+            f"{log.names[0]}: column {column} has {len(rows)} {check if size else 'absurd samples'}{size}, the first "
+            f"{values[i]:g} in {log.row(0, i)} (t = {log.imu.time[i]:.3f})",
+            "Correct these rows, or set scenario.corrections.drop=[spikes], which replaces them by a line between "
+            "their neighbours",
+            {"corrections": {"drop": ["spikes"]}},
+            picture=Picture("t [s]", column, (thin_curve(column, log.imu.time[near], values[near]),),
+                            (float(log.imu.time[i]),)),
+        )  # fmt: skip

@@ -1,0 +1,164 @@
+"""Tables of a log as recorded, before any check refuses them: forward-right-down axes and North-East-Down frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from pfbench.files.table_file import Array
+from pfbench.logs.worlds.log_tables import (
+    GnssLog,
+    ImuLog,
+    LogTable,
+    ReferenceLog,
+    swap_frd_rfu,
+)
+
+Rows = NDArray[np.intp]
+
+
+class RawImu(NamedTuple):
+    """IMU samples: times, s, [n], specific force, m/s^2, and angular rate, rad/s, [n, 3]."""
+
+    time: Array
+    force: Array
+    rate: Array
+    rows: Rows
+
+
+class RawFixes(NamedTuple):
+    """Fixes: times, s, [m], and positions, m, [m, 3]."""
+
+    time: Array
+    position: Array
+    rows: Rows
+
+
+class RawReference(NamedTuple):
+    """Reference: times, s, [k], roll, pitch, yaw, rad, velocities, m/s, and positions, m, [k, 3]."""
+
+    time: Array
+    angles: Array
+    velocity: Array
+    position: Array
+    rows: Rows
+
+
+class RawLog(NamedTuple):
+    """Log before its checks.
+
+    Attributes:
+        imu: IMU samples.
+        fixes: Fixes to use.
+        reference: Reference motion.
+        gravity: Gravity, m/s^2.
+        names: Names of the three tables.
+        describe_row: Position of a row in the file of each table.
+        codes: Number of fixes by code, if the column `fix` is not stated by `fix_codes`.
+    """
+
+    imu: RawImu
+    fixes: RawFixes
+    reference: RawReference
+    gravity: float
+    names: tuple[str, str, str]
+    describe_row: tuple[Callable[[int], str], ...]
+    codes: Array | None = None
+
+    def row(self, table: int, i: int) -> str:
+        """Describe the position of row i of table 0 (imu), 1 (gnss) or 2 (reference)."""
+        parts: tuple[RawImu | RawFixes | RawReference, ...] = (
+            self.imu,
+            self.fixes,
+            self.reference,
+        )
+        return self.describe_row[table](int(parts[table].rows[i]))
+
+
+def take_rows(columns: Iterable[Any], rows: Any) -> Iterator[Any]:
+    """Yield the columns of a table at some rows, in the given order.
+
+    Args:
+        columns: Arrays with an entry per row.
+        rows: Indices or a mask.
+
+    Yields:
+        Arrays.
+    """
+    for column in columns:
+        yield column[rows]
+
+
+def take_log(
+    tables: tuple[LogTable, LogTable, LogTable],
+    imu: ImuLog,
+    fixes: GnssLog,
+    reference: ReferenceLog | None,
+    gravity: float,
+) -> RawLog:
+    """Return what a reader has read in the axes of the tables; without a reference its table is empty."""
+    usable = np.flatnonzero(np.isfinite(fixes.position).all(1))
+    return RawLog(
+        RawImu(imu.time, swap_frd_rfu(imu.force), swap_frd_rfu(imu.rate), np.arange(len(imu.time))),
+        RawFixes(fixes.time[usable], swap_frd_rfu(fixes.position[usable]), usable),
+        _take_reference(reference) if reference else _NO_REFERENCE,
+        gravity,
+        (tables[0].name, tables[1].name, tables[2].name),
+        (tables[0].row, tables[1].row, tables[2].row),
+    )
+
+
+_NO_ROWS = np.empty((0, 3))
+_NO_REFERENCE = RawReference(np.empty(0), _NO_ROWS, _NO_ROWS, _NO_ROWS, np.empty(0, np.intp))
+
+
+def _take_reference(reference: ReferenceLog) -> RawReference:
+    """Return a reference in the axes of the tables."""
+    q = reference.attitude[:, [1, 2, 3, 0]]
+    axes = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # of both frames
+    return RawReference(
+        reference.time,
+        euler_of(axes @ Rotation.from_quat(q).as_matrix() @ axes),
+        swap_frd_rfu(reference.velocity),
+        swap_frd_rfu(reference.position),
+        np.arange(len(reference.time)),
+    )
+
+
+def euler_of(dcm: Array) -> Array:
+    """Return roll, pitch, yaw, rad, [k, 3], of rotations from the body to the level frame, [k, 3, 3]."""
+    pitch = -np.arcsin(np.clip(dcm[:, 2, 0], -1.0, 1.0))
+    roll = np.arctan2(dcm[:, 2, 1], dcm[:, 2, 2])
+    yaw = np.arctan2(dcm[:, 1, 0], dcm[:, 0, 0])
+    return np.stack([roll, pitch, yaw], -1)
+
+
+def dcm_of(angles: Array) -> Array:
+    """Return rotations from the body to the level frame, [k, 3, 3], of roll, pitch, yaw, rad, [k, 3]."""
+    return Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix()
+
+
+def interpolate_columns(at: Array, time: Array, values: Array) -> Array:
+    """Interpolate columns linearly, with the first and the last row outside of them.
+
+    The rows are found once for all columns: `numpy.interp` copies each column, an hour of samples for a few nodes.
+
+    Args:
+        at: Times, [m].
+        time: Times of the rows, [n].
+        values: Rows, [n, k].
+
+    Returns:
+        Values, [m, k].
+    """
+    inside = (at >= time[0]) & (at < time[-1])
+    out = np.where((at < time[0])[:, None], values[0], values[-1])
+    out[np.isnan(at)] = np.nan
+    row = np.searchsorted(time, at[inside], side="right") - 1
+    slope = (values[row + 1] - values[row]) / (time[row + 1] - time[row])[:, None]
+    out[inside] = slope * (at[inside] - time[row])[:, None] + values[row]
+    return out

@@ -1,0 +1,78 @@
+"""Check of the reference alone: positions must change as velocities say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pfbench.files.table_file import Array
+from pfbench.logs.doctor.axis_orders import BODY_ORDERS, name_axes
+from pfbench.logs.doctor.finding import REFUSE, Finding, Picture, thin_curve
+from pfbench.logs.doctor.raw_log import RawLog
+from pfbench.logs.doctor.thresholds import limit_of
+from pfbench.logs.doctor.turn_search import integrate, select_nodes
+
+_LONGEST = 1.8  # s of a window
+_FEWEST = 5  # windows
+_LEAST_MOTION = 0.3  # m per window on an axis that is judged
+_SLOPES, _CORRELATION = (0.8, 1.25), 0.8
+_EXPLAINED = 0.3  # part of the residual that other axes may leave
+_UNITS = {"km/h": 3.6, "knots": 1.943844, "cm/s": 100.0, "mm/s": 1000.0, "ft/s": 3.28084}
+_UNIT_ERROR = 0.03  # relative
+
+
+def check_reference(log: RawLog, facts: dict[str, Any]) -> tuple[RawLog, list[Finding]]:
+    """Check velocities against positions.
+
+    Returns the log with velocities that agree, and findings.
+    """
+    reference = log.reference
+    time, nodes = reference.time, select_nodes(reference.time, 1.0)
+    good = np.diff(time[nodes]) < _LONGEST
+    expected = np.diff(integrate(time, reference.velocity)[nodes], axis=0)[good]
+    change = np.diff(reference.position[nodes], axis=0)[good]
+    if len(expected) < _FEWEST:
+        return log, []
+    moves = np.sqrt(np.square(expected).mean(0)) > _LEAST_MOTION
+    square, both = np.square(expected).sum(0), (expected * change).sum(0)
+    slope = both / np.maximum(square, 1e-9)
+    correlation = both / np.maximum(np.sqrt(square * np.square(change).sum(0)), 1e-9)
+    facts["slope of position and velocity"] = slope[moves].round(3).tolist()
+    bad = moves & ((slope < _SLOPES[0]) | (slope > _SLOPES[1]) | (correlation < _CORRELATION))
+    if not bad.any():
+        return log, []
+    text, corrections, velocity = _explain(log, expected, change, slope[moves])
+    axis = int(np.argmax(np.where(bad, np.sqrt(square), -1.0)))
+    seconds = time[nodes][:-1][good]
+    finding = Finding(
+        "reference velocity", REFUSE, float(np.abs(slope[bad] - 1.0).max()), limit_of("reference velocity"), "1",
+        f"{log.names[2]}: positions do not change as velocities say, by factors of {slope.round(3).tolist()} "
+        f"North, East, Down: {text}",
+        "Correct the columns" + (f", or set scenario.corrections: {corrections}" if corrections else ""),
+        {"corrections": corrections} if corrections else {},
+        picture=Picture("t [s]", f"motion {('North', 'East', 'Down')[axis]} per second [m]", (
+            thin_curve("position", seconds, change[:, axis]), thin_curve("velocity", seconds, expected[:, axis]),
+        )),
+    )  # fmt: skip
+    return log._replace(reference=reference._replace(velocity=velocity)), [finding]
+
+
+def _explain(
+    log: RawLog, expected: Array, change: Array, slope: Array
+) -> tuple[str, dict[str, Any], Array]:
+    """Return what is wrong, the settings that mend it, and the mended velocities."""
+    reference = log.reference
+    costs = [float(np.square(change - expected @ m.T).sum()) for m in BODY_ORDERS]
+    best = BODY_ORDERS[int(np.argmin(costs))]
+    if min(costs) < _EXPLAINED * costs[0] and not np.array_equal(best, np.eye(3)):
+        names = name_axes(best, is_level=True)
+        text = f"the velocities North, East, Down are the columns {', '.join(names)}"
+        corrections = {"level_axes": {"reference_velocity": names}}
+        return text, corrections, reference.velocity @ best.T
+    for unit, factor in _UNITS.items():
+        if (np.abs(slope * factor - 1.0) < _UNIT_ERROR).all():
+            scale = {"reference": dict.fromkeys(("vn", "ve", "vd"), 1.0 / factor)}
+            return f"velocities are in {unit}", {"scale": scale}, reference.velocity / factor
+    derived = np.gradient(reference.position, reference.time, axis=0)
+    return "the unit of velocity or position, or another order", {}, derived

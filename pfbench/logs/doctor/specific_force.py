@@ -1,0 +1,376 @@
+"""Checks of force and rate against the reference: axes and conventions, biases and scales."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pfbench.files.table_file import Array
+from pfbench.logs.doctor.alignment import Alignment
+from pfbench.logs.doctor.axis_orders import (
+    BODY_ORDERS,
+    CONVENTIONS,
+    LEVEL_ORDERS,
+    convert_angles,
+    name_axes,
+)
+from pfbench.logs.doctor.finding import REFUSE, WARN, Finding, Picture, thin_curve
+from pfbench.logs.doctor.force_windows import (
+    ForceFit,
+    ForceWindows,
+    fit_force,
+    integrate_force,
+)
+from pfbench.logs.doctor.raw_log import RawLog, dcm_of, interpolate_columns
+from pfbench.logs.doctor.thresholds import (
+    CLEAR_AXES,
+    LEAST_ACCELERATION,
+    STANDARD_ERRORS,
+    limit_of,
+)
+from pfbench.logs.doctor.turn_search import TurnSearch, turns_between
+
+_EQUAL = 1.3  # times the least residual: explanations that fit as well
+_BLOCKS = 10  # of windows, whose differences give a standard error
+_DOWN = np.array([0.0, 0.0, 1.0])
+_FEWEST = 20  # windows for scales
+_LEAST_RATE, _SCALE_ERROR = 0.05, 0.02  # rad/s and 1: motion and accuracy that show a scale
+_SCALE_ERRORS = 6.0
+
+
+class Cause(NamedTuple):
+    """Explanation of axes that disagree.
+
+    Attributes:
+        text: What is wrong.
+        corrections: Settings that mend it.
+        log: The log as mended.
+    """
+
+    text: str
+    corrections: dict[str, Any]
+    log: RawLog
+
+
+@dataclass(frozen=True)
+class ForceState:
+    """Residuals of the recorded axes and of the best ones.
+
+    Attributes:
+        aligned: Alignment by turns.
+        windows: Windows of the force.
+        fit: Fit of the recorded axes.
+        body: Cost and matrix of the best body axes of the force.
+        level: Cost and matrix of the best level axes.
+        conventions: Rate residual, force cost and name of each convention of the attitude.
+    """
+
+    aligned: Alignment
+    windows: ForceWindows
+    fit: ForceFit
+    body: tuple[float, Array]
+    level: tuple[float, Array]
+    conventions: tuple[tuple[float, float, str], ...] = ()
+
+    @property
+    def least(self) -> float:
+        """Least cost of any explanation."""
+        return min(self.body[0], self.level[0], *(cost for _, cost, _ in self.conventions))
+
+
+def check_force_and_rate(aligned: Alignment, facts: dict[str, Any]) -> tuple[RawLog, list[Finding]]:
+    """Check axes, biases and scales.
+
+    Returns the log with the axes of the likeliest explanation, and findings.
+    """
+    windows = integrate_force(aligned.log, aligned.dcm, aligned.offset)
+    if windows is None:
+        return aligned.log, []
+    state = _try_axes(aligned, windows)
+    horizontal = float(np.sqrt(np.square(windows.change[:, :2]).mean()))
+    ratio = state.fit.cost / max(state.least, 1e-12)
+    errors = _compare_blocks(state)
+    facts.update(
+        {
+            "rate axes": aligned.rate_ratio,
+            "force axes": ratio,
+            "force axes [standard errors]": errors,
+            "horizontal acceleration [m/s^2]": horizontal,
+        }
+    )
+    is_rate = aligned.rate_ratio > limit_of("axes")
+    is_clear = errors > STANDARD_ERRORS or ratio > CLEAR_AXES
+    is_force = ratio > limit_of("axes") and horizontal > LEAST_ACCELERATION and is_clear
+    if is_rate or is_force:
+        finding, log = _describe_axes(state, is_rate, max(ratio, aligned.rate_ratio))
+        return log, [finding]
+    return aligned.log, [
+        *_check_force_errors(state, facts),
+        *_check_rate_errors(aligned, facts),
+    ]
+
+
+def _try_axes(aligned: Alignment, windows: ForceWindows) -> ForceState:
+    """Fit the force with all orders of axes, and with other conventions if the recorded axes do not fit."""
+    fit = fit_force(windows)
+    body = min(((fit_force(windows, m).cost, m) for m in BODY_ORDERS), key=lambda pair: pair[0])
+    level = min(
+        ((fit_force(windows, level=m).cost, m) for m in LEVEL_ORDERS), key=lambda pair: pair[0]
+    )
+    state = ForceState(aligned, windows, fit, body, level)
+    if max(fit.cost / max(state.least, 1e-12), aligned.rate_ratio) <= limit_of("axes"):
+        return state
+    conventions = []
+    true, measured = aligned.pair
+    least = max(float(((measured - true @ aligned.rate_axes.T) ** 2).sum()), 1e-300)
+    for name in CONVENTIONS:
+        dcm = dcm_of(convert_angles(name, aligned.log.reference.angles))
+        turns = turns_between(dcm, aligned.nodes)[aligned.used]
+        rest = float(((measured - turns + turns.mean(0)) ** 2).sum()) / least
+        fitted = integrate_force(aligned.log, dcm, aligned.offset)
+        if fitted is not None:
+            conventions.append((rest, fit_force(fitted).cost, name))
+    return replace(state, conventions=tuple(sorted(conventions, key=lambda c: c[1])))
+
+
+def _compare_blocks(state: ForceState) -> float:
+    """Return by how many standard errors the recorded axes fit worse than the best orders, by blocks of time."""
+    if state.body[0] <= state.level[0]:
+        best = fit_force(state.windows, state.body[1])
+    else:
+        best = fit_force(state.windows, level=state.level[1])
+    both = state.fit.keep & best.keep
+    if both.sum() < 4:
+        return np.inf
+    count = min(_BLOCKS, int(both.sum()) // 2)
+    plain, least = (
+        [
+            block.mean()
+            for block in np.array_split(np.square(f.residual[both[f.keep]]).sum(1), count)
+        ]
+        for f in (state.fit, best)
+    )
+    ratio = np.log(np.maximum(plain, 1e-12) / np.maximum(least, 1e-12))
+    return float(ratio.mean()) / max(float(ratio.std(ddof=1)) / np.sqrt(count), 1e-12)
+
+
+# --------------------------------------------------------------------------------------------------
+# Explanations of axes that disagree.
+
+
+def _describe_axes(state: ForceState, is_rate: bool, ratio: float) -> tuple[Finding, RawLog]:
+    """Describe axes that disagree, with all explanations that fit as well as the best."""
+    aligned = state.aligned
+    causes = list(_list_causes(state, is_rate))
+    best = f"the best axes of the rate are {_join(aligned.rate_axes.T)}, of the force {_join(state.body[1])}"
+    remedy = (
+        f"Set scenario.corrections: {causes[0].corrections}"
+        if causes
+        else f"No single change explains both: {best}. Check the axes of both tables"
+    )
+    finding = Finding(
+        "axes", REFUSE, ratio, limit_of("axes"), "times the least residual",
+        f"{aligned.log.names[0]} and {aligned.log.names[2]}: axes disagree, residuals of the rate are "
+        f"{aligned.rate_ratio:.1f} and of the force {state.fit.cost / max(state.least, 1e-12):.1f} times those of the best axes",
+        remedy, {"corrections": causes[0].corrections} if causes else {},
+        tuple(cause.text for cause in causes), _force_picture(state.windows),
+    )  # fmt: skip
+    return finding, causes[0].log if causes else aligned.log
+
+
+def _list_causes(state: ForceState, is_rate: bool) -> Iterator[Cause]:
+    """Yield the explanations, simple ones first."""
+    log, limit = state.aligned.log, _EQUAL * state.least
+    imu = log.imu
+    for rest, cost, name in state.conventions:
+        if rest < _EQUAL and cost < limit:
+            yield _convention_cause(log, name)
+    axes = _find_mounting(state)
+    if is_rate and fit_force(state.windows, axes).cost < limit:
+        mended = imu._replace(force=imu.force @ axes.T, rate=imu.rate @ axes.T)
+        text = f"{log.names[0]}: forward, right, down are the axes {_join(axes)}"
+        yield Cause(text, {"mounting": {"imu": name_axes(axes)}}, log._replace(imu=mended))
+    if is_rate and state.fit.cost < limit:
+        axes = state.aligned.rate_axes.T
+        mended = imu._replace(rate=imu.rate @ axes.T)
+        text = f"{log.names[0]}: wx, wy, wz alone have other axes, {_join(axes)}"
+        yield Cause(text, {"mounting": {"gyroscope": name_axes(axes)}}, log._replace(imu=mended))
+    if is_rate:
+        return
+    if state.level[0] < limit and not np.array_equal(state.level[1], np.eye(3)):
+        yield _level_cause(log, state.level[1])
+    if state.body[0] < limit and not np.array_equal(state.body[1], np.eye(3)):
+        mended = imu._replace(force=imu.force @ state.body[1].T)
+        text = f"{log.names[0]}: fx, fy, fz alone have other axes, {_join(state.body[1])}"
+        corrections = {"mounting": {"accelerometer": name_axes(state.body[1])}}
+        yield Cause(text, corrections, log._replace(imu=mended))
+
+
+def _convention_cause(log: RawLog, name: str) -> Cause:
+    """Explain by the convention of the attitude."""
+    angles = convert_angles(name, log.reference.angles)
+    mended = log._replace(reference=log.reference._replace(angles=angles))
+    return Cause(f"{log.names[2]}: {CONVENTIONS[name][0]}", {"attitude": name}, mended)
+
+
+def _find_mounting(state: ForceState) -> Array:
+    """Return the body axes, to the true ones, that fit the force best among those that fit the rate."""
+    true, measured = state.aligned.pair
+    residuals = np.array([float(((measured - true @ m.T) ** 2).sum()) for m in BODY_ORDERS])
+    accepted = np.flatnonzero(residuals < _EQUAL * residuals.min())
+    axes = (BODY_ORDERS[i].T for i in accepted)
+    return min(axes, key=lambda matrix: fit_force(state.windows, matrix).cost)
+
+
+def _level_cause(log: RawLog, level: Array) -> Cause:
+    """Explain by the level frame of the reference."""
+    names = name_axes(level, is_level=True)
+    enu = " (East, North, Up under the names of North, East, Down)" if names == ["e", "n", "-d"] else ""  # fmt: skip
+    reference = log.reference
+    mended = reference._replace(
+        velocity=reference.velocity @ level.T, position=reference.position @ level.T
+    )
+    return Cause(
+        f"{log.names[2]}: North, East, Down are the axes {', '.join(names)}{enu}",
+        {"level_axes": {"reference": names}},
+        log._replace(reference=mended),
+    )
+
+
+def _join(axes: Array) -> str:
+    return f"[{', '.join(name_axes(axes))}]"
+
+
+def _force_picture(windows: ForceWindows) -> Picture:
+    """Draw the horizontal acceleration that the force gives, and that of the reference."""
+    predicted = np.einsum("nijj->ni", windows.products)
+    axis = int(np.argmax(np.square(windows.change[:, :2]).mean(0)))
+    curves = (("reference", windows.change), ("imu", predicted))
+    return Picture(
+        "t [s]",
+        f"acceleration {('North', 'East')[axis]} [m/s^2]",
+        tuple(thin_curve(label, windows.time, values[:, axis]) for label, values in curves),
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Biases and scales.
+
+
+def _memory(residual: Array) -> float:
+    """Return the mean correlation of neighbouring residuals, 0 to 0.98. Shapes: residual [n, k]."""
+    deviation = residual - residual.mean(0)
+    square = np.square(deviation).sum(0)
+    pairs = (deviation[1:] * deviation[:-1]).sum(0) / np.maximum(square, 1e-300)
+    return float(np.clip(pairs, 0.0, 0.98).mean())
+
+
+def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Finding]:
+    """Check scale and bias of the force."""
+    windows, fit, name = state.windows, state.fit, state.aligned.log.names[0]
+    measured = np.linalg.norm(np.einsum("nijj->ni", windows.products), axis=1)
+    needed = np.linalg.norm(windows.change - windows.gravity * _DOWN, axis=1)
+    scale = float(np.median(measured / np.maximum(needed, 1e-9)))
+    bias, memory = -fit.bias, _memory(fit.residual)
+    a = windows.rotation[fit.keep].reshape(-1, 3)
+    variance = np.diag(np.linalg.inv(a.T @ a + 1e-9 * np.eye(3))) * fit.residual.var()
+    error = np.sqrt(variance * (1.0 + memory) / (1.0 - memory))
+    facts.update({"force scale": scale, "accelerometer bias [m/s^2]": bias.round(3).tolist()})
+    if abs(scale - 1.0) > limit_of("force scale"):
+        yield Finding(
+            "force scale", WARN, scale - 1.0, limit_of("force scale"), "1",
+            f"{name}: fx, fy, fz are {scale:.3f} times the force that {state.aligned.log.names[2]} and gravity need",
+            "Set scenario.corrections.scale, or correct the scale factor",
+            {"corrections": {"scale": {"imu": dict.fromkeys(("fx", "fy", "fz"), round(1.0 / scale, 5))}}},
+            ("a scale factor", "another gravity", f"an accelerometer bias of {bias.round(2).tolist()} m/s^2"),
+            _force_picture(windows),
+        )  # fmt: skip
+    elif (
+        np.linalg.norm(bias) > limit_of("accelerometer bias")
+        and (np.abs(bias) > STANDARD_ERRORS * error).any()
+    ):
+        yield Finding(
+            "accelerometer bias", WARN, float(np.linalg.norm(bias)), limit_of("accelerometer bias"), "m/s^2",
+            f"{name}: accelerometer bias {bias.round(2).tolist()} m/s^2, forward, right, down, within "
+            f"{(2.0 * error).round(2).tolist()}",
+            "Set scenario.corrections.bias, or the nominal bias scenario.tuning.accelerometer_bias",
+            {"corrections": {"bias": {"imu": _by_column("f", bias)}}},
+            ("a bias", "an attitude of the sensor that differs from that of the reference"), _force_picture(windows),
+        )  # fmt: skip
+
+
+def _by_column(letter: str, values: Array) -> dict[str, float]:
+    return {f"{letter}{axis}": round(float(v), 5) for axis, v in zip("xyz", values, strict=True)}
+
+
+def _check_rate_errors(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Finding]:
+    """Check bias and scale of the rate by the turns of windows, to second order."""
+    measured, true, window, time = _compare_turns(aligned)
+    if len(measured) <= _FEWEST:
+        return
+    name = aligned.log.names[0]
+    rates = np.rad2deg((measured - true) / window)
+    bias = np.median(rates, 0)
+    facts["gyro bias [deg/s]"] = bias.round(4).tolist()
+    axis = int(np.argmax(np.abs(bias)))
+    picture = Picture(
+        "t [s]", f"rate of imu minus reference about {'xyz'[axis]} [deg/s]",
+        (thin_curve("difference", time, rates[:, axis]),),
+    )  # fmt: skip
+    if abs(bias[axis]) > limit_of("gyro bias"):
+        yield Finding(
+            "gyro bias", WARN, float(bias[axis]), limit_of("gyro bias"), "deg/s",
+            f"{name}: gyro bias {bias.round(2).tolist()} deg/s, forward, right, down",
+            "Set scenario.corrections.bias, or the nominal bias scenario.tuning.gyro_bias_deg_s",
+            {"corrections": {"bias": {"imu": _by_column("w", np.deg2rad(bias))}}}, picture=picture,
+        )  # fmt: skip
+    scales = list(_find_rate_scales(measured, true, window))
+    facts["gyro scale"] = {f"w{axis}": round(scale, 4) for axis, scale, _ in scales}
+    wrong = [
+        (axis, scale, error)
+        for axis, scale, error in scales
+        if abs(scale - 1.0) > max(limit_of("gyro scale"), _SCALE_ERRORS * error)
+    ]
+    if wrong:
+        axis_name, scale, error = max(wrong, key=lambda entry: abs(entry[1] - 1.0))
+        texts = ", ".join(f"w{a} {s:.3f}" for a, s, _ in wrong)
+        yield Finding(
+            "gyro scale", WARN, scale - 1.0, limit_of("gyro scale"), "1",
+            f"{name}: scale factors against {aligned.log.names[2]}: {texts}, within {2.0 * error:.3f}",
+            "Set scenario.corrections.scale, or correct the scale factors",
+            {"corrections": {"scale": {"imu": {f"w{a}": round(1.0 / s, 5) for a, s, _ in wrong}}}},
+            ("scale factors of the gyroscope", "a reference that smooths its turns"),
+            Picture(f"turn of the reference about {axis_name} [rad]", "turn of the imu [rad]",
+                    (thin_curve("windows", true[:, "xyz".index(axis_name)], measured[:, "xyz".index(axis_name)]),)),
+        )  # fmt: skip
+
+
+def _compare_turns(aligned: Alignment) -> tuple[Array, Array, float, Array]:
+    """Return turns of the IMU, with coning to second order, and of the reference, rad, [p, 3], window, s, and times."""
+    search: TurnSearch = aligned.search
+    at = search.nodes + aligned.offset
+    used = (at[:-1] >= search.time[0]) & (at[1:] <= search.time[-1]) & search.usable
+    middle = 0.5 * (search.angle[1:] + search.angle[:-1])
+    cone = np.vstack([np.zeros(3), np.cumsum(np.cross(middle, np.diff(search.angle, axis=0)), 0)])
+    angle, sums = (interpolate_columns(at, search.time, a) for a in (search.angle, cone))
+    step = np.diff(angle, axis=0)
+    measured = step + 0.5 * (np.diff(sums, axis=0) - np.cross(angle[:-1], step))
+    true = turns_between(aligned.dcm, aligned.nodes)
+    return measured[used], true[used], float(np.median(np.diff(at))), search.nodes[:-1][used]
+
+
+def _find_rate_scales(measured: Array, true: Array, window: float) -> Iterator[tuple[str, float, float]]:  # fmt: skip
+    """Yield axis, scale and standard error where the motion shows a scale."""
+    a = np.column_stack([true, np.ones(len(true))])
+    fit = np.linalg.lstsq(a, measured, rcond=None)[0]
+    rest = measured - a @ fit
+    inverse = np.linalg.pinv(a.T @ a)
+    motion = np.sqrt(np.square(true - true.mean(0)).mean(0)) / window
+    for j, axis in enumerate("xyz"):
+        memory = min(_memory(rest[:, j : j + 1]), 0.95)
+        error = np.sqrt(inverse[j, j] * rest[:, j].var() * (1.0 + memory) / (1.0 - memory))
+        if motion[j] > _LEAST_RATE and error < _SCALE_ERROR:
+            yield axis, float(fit[j, j]), float(error)

@@ -1,0 +1,1 @@
+"""Judge: trajectories of other programs against a reference. `pfbench.judge` is its door."""

@@ -1,0 +1,108 @@
+"""Options of the command `judge`: sources of the trajectories and rules of the comparison."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from pfbench.core.parameter_checks import require, require_range, require_ranges
+from pfbench.logs.judge.trajectory_table import ALL_COLUMNS
+
+FRAMES = ("", "ned", "enu")
+FORMATS = ("", "table", "tum", "kf_gins", "nmea", "result")
+ALIGNMENTS = ("none", "offset", "yaw")
+_LARGEST_TIME = 1e10  # s, above the GPS and Unix times of this century
+_ORIGIN_LIMITS = (90.0, 360.0, 1e5)  # deg, deg, m
+HOLES = ("refuse", "skip")
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """Options of one program, `NAME.key=value` on the command line.
+
+    Attributes:
+        frame: Axes of a TUM file, "ned" or "enu".
+        shift: Time added to the clock of the file, s.
+        columns: Name in a CSV file by name of pfbench.
+        scale: Factor by name of pfbench, for a column in another unit; before `shift`.
+        format: One of `FORMATS`; empty to find it from the content.
+        sd: Pattern of the KF-GINS file of standard deviations; empty for none.
+    """
+
+    frame: str = ""
+    shift: float = 0.0
+    columns: Mapping[str, str] = field(default_factory=dict)
+    scale: Mapping[str, float] = field(default_factory=dict)
+    format: str = ""
+    sd: str = ""
+
+    def __post_init__(self) -> None:
+        require_range("NAME.shift", self.shift, f"[-{_LARGEST_TIME:g}, {_LARGEST_TIME:g}]")
+        require(self.frame in FRAMES, "NAME.frame", "be ned or enu", self.frame)
+        formats = f"be {', '.join(FORMATS[1:])}"
+        require(self.format in FORMATS, "NAME.format", formats, self.format)
+        for name, factor in self.scale.items():
+            is_factor = math.isfinite(factor) and factor != 0
+            require(is_factor, "NAME.scale", "be finite and not 0", factor)
+            require(name in ALL_COLUMNS, "NAME.scale", f"be of {', '.join(ALL_COLUMNS)}", name)
+
+
+@dataclass(frozen=True)
+class JudgeOptions:
+    """Rules of the comparison.
+
+    Attributes:
+        start: First scored time on the clock of the reference, s. Key `from`.
+        end: Last scored time, s. Key `to`.
+        every: Least time between two scored epochs, s.
+        tolerance: Largest difference of two epochs that count as common, s.
+        largest_gap: Longest time between two rows of the reference, s; 0 for the larger of 1 s and
+            2.5 steps.
+        holes: "refuse" or "skip": epochs in longer gaps of the reference.
+        coverage: Least share of the time that a run must cover, else it is lost.
+        limit: Position error above which a run diverges and no error counts more, m; 0 for none.
+        align: "none", "offset" or "yaw": motion that is removed from positions.
+        origin: Latitude, longitude (deg) and height (m) of the local frame; empty for that of the
+            reference.
+        block: Length of the blocks of time, s; 0 for 30 blocks.
+        baseline: Program that all others are compared with; empty for all pairs.
+        alpha: Error of a family of tests.
+        margin: Relative difference of errors within which programs are equal.
+    """
+
+    start: float = -math.inf
+    end: float = math.inf
+    every: float = 0.0
+    tolerance: float = 0.01
+    largest_gap: float = 0.0
+    holes: str = "refuse"
+    coverage: float = 0.9
+    limit: float = 0.0
+    align: str = "none"
+    origin: Sequence[float] = ()
+    block: float = 0.0
+    baseline: str = ""
+    alpha: float = 0.05
+    margin: float = 0.05
+
+    def __post_init__(self) -> None:
+        least = ("every", "largest_gap", "limit", "block")
+        rules = {**dict.fromkeys(least, "[0, inf]"), "tolerance": "(0, inf)", "coverage": "(0, 1]"}
+        require_ranges("", self, **rules, margin="[1e-6, 1e6]", alpha="[1e-9, 1)")
+        require(self.start < self.end, "from", "be before to", f"{self.start} and {self.end}")
+        require(self.holes in HOLES, "holes", f"be {' or '.join(HOLES)}", self.holes)
+        require(self.align in ALIGNMENTS, "align", f"be {' or '.join(ALIGNMENTS)}", self.align)
+        require(len(self.origin) in (0, 3), "origin", "be lat_deg,lon_deg,h_m", list(self.origin))
+        for value, limit in zip(self.origin, _ORIGIN_LIMITS, strict=False):
+            require_range("origin", value, f"[-{limit:g}, {limit:g}]")
+
+
+@contextmanager
+def name_program(program: str) -> Iterator[None]:
+    """Write the name of the program in the messages of readers, which call it NAME."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(str(error).replace("NAME.", f"{program}.")) from error

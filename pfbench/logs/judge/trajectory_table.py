@@ -1,0 +1,318 @@
+"""Trajectory of a program as a table, and the checks that every reader shares."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, QUANTITIES
+from pfbench.stats.error_measures import Array
+
+LOCAL = ("pn", "pe", "pd")
+GEODETIC = ("lat_deg", "lon_deg", "h_m")
+VELOCITY_COLUMNS = ("vn", "ve", "vd")
+ATTITUDE_COLUMNS = ("roll", "pitch", "yaw")
+POSITION_SD = ("sd_pn", "sd_pe", "sd_pd")
+VELOCITY_SD = ("sd_vn", "sd_ve", "sd_vd")
+ATTITUDE_SD = ("sd_roll", "sd_pitch", "sd_yaw")
+COVARIANCE_COLUMNS = (
+    "cov_nn",
+    "cov_ne",
+    "cov_nd",
+    "cov_ee",
+    "cov_ed",
+    "cov_dd",
+)  # of the position, m^2
+COLUMN_GROUPS = (
+    LOCAL,
+    GEODETIC,
+    VELOCITY_COLUMNS,
+    ATTITUDE_COLUMNS,
+    POSITION_SD,
+    VELOCITY_SD,
+    ATTITUDE_SD,
+    COVARIANCE_COLUMNS,
+)
+SD_GROUPS = (POSITION_SD, VELOCITY_SD, ATTITUDE_SD)
+ALL_COLUMNS = ("t", *(name for group in COLUMN_GROUPS for name in group))
+_COUNTERS = (604800.0, 86400.0, 3600.0)  # s: week, day and hour, after which counters start again
+_BITS_32 = tuple(2.0**32 * unit for unit in (1.0, 1e-3, 1e-6, 1e-9))
+_PERIODS = (*(unit * s for unit in (1.0, 1e3, 1e6, 1e9) for s in _COUNTERS), *_BITS_32)
+_SEAM_STEPS, _SEAM_SHARE = 20, 1e-3  # longest gap where a counter starts again: steps, share of it
+_CHECK_ORDER = "Check the unit and the order of the columns."
+_DEGREES = {np.pi / 180: "degrees"}
+_UNITS = {  # factors that bring values into the range of a quantity
+    "latitude": {1e-7: "1e-7 deg"},
+    "longitude": {1e-7: "1e-7 deg"},
+    "height": {1e-3: "mm"},
+    "velocity": {1e-2: "cm/s", 1e-3: "mm/s"},
+    "roll": _DEGREES,
+    "pitch": _DEGREES,
+    "yaw": _DEGREES,
+}
+_MOSTLY = 0.1  # share of the rows that are not removed for a column
+_LEAST_RUN = 10  # rows
+_SD_COLUMNS = {name for group in SD_GROUPS for name in group}
+
+
+@dataclass(frozen=True)
+class TrajectoryTable:
+    """Trajectory of one run of a program.
+
+    Attributes:
+        file: Name of the file, for messages.
+        time: Time, [T], s, increasing.
+        values: Columns by name, [T] each: groups of `COLUMN_GROUPS` in m, deg (latitude, longitude), m/s
+            and rad.
+        lines: Line of each row in the file, [T].
+        notes: Notes of the reader.
+        run: Number of the run within the file.
+        origin: Latitude, longitude, height of the local frame if the file states it; deg, deg, m.
+        angle_unit: Unit of roll, pitch and yaw in the file, for messages.
+        frame: Axes that the option of a TUM file states, "enu" or "ned"; empty for others.
+        truth: Truth of a result of pfbench in the frame of its positions, [T, 3], m.
+    """
+
+    file: str
+    time: Array
+    values: Mapping[str, Array]
+    lines: np.ndarray
+    notes: tuple[str, ...] = ()
+    run: int = 0
+    origin: tuple[float, ...] = ()
+    angle_unit: str = "rad"
+    frame: str = ""
+    truth: Array | None = None
+
+    def select(self, group: tuple[str, ...]) -> Array:
+        """Return the columns of a group, [T, K]."""
+        return np.stack([self.values[name] for name in group], axis=-1)
+
+    def has(self, group: tuple[str, ...]) -> bool:
+        """Return whether a group of columns is present."""
+        return group[0] in self.values
+
+    def scale_columns(self, factors: Mapping[str, float]) -> TrajectoryTable:
+        """Return the table with columns, or t, multiplied by factors."""
+        values = {name: value * factors.get(name, 1.0) for name, value in self.values.items()}
+        return replace(self, time=self.time * factors.get("t", 1.0), values=values)
+
+    def keep_rows(self, mask: np.ndarray) -> TrajectoryTable:
+        """Return the rows of a mask [T]."""
+        values = {name: value[mask] for name, value in self.values.items()}
+        truth = None if self.truth is None else self.truth[mask]
+        return replace(
+            self, time=self.time[mask], values=values, lines=self.lines[mask], truth=truth
+        )
+
+
+def check_trajectory(table: TrajectoryTable) -> TrajectoryTable:
+    """Check groups, numbers, order of time and plausible ranges.
+
+    Returns the table.
+    """
+    if len(table.time) < 2:
+        raise ValueError(
+            f"{table.file} must have at least 2 rows, got {len(table.time)}. Write the file again."
+        )
+    for group in COLUMN_GROUPS:
+        present = [name for name in group if name in table.values]
+        if present and len(present) < len(group) and present != ["vn", "ve"]:
+            missing = ", ".join(name for name in group if name not in table.values)
+            raise ValueError(
+                f"{table.file}: columns {', '.join(group)} must be complete, got {', '.join(present)} "
+                f"without {missing}. Add the missing columns or rename all of the group."
+            )
+    if not (table.has(LOCAL) or table.has(GEODETIC)):
+        raise ValueError(
+            f"{table.file} must have the position columns pn, pe, pd or lat_deg, lon_deg, h_m, got "
+            f"{', '.join(table.values) or 'none'}. Rename columns with NAME.columns=pn:north,..."
+        )
+    for name, value in (("t", table.time), *table.values.items()):
+        _check_finite(table, name, value)
+    _check_order(table)
+    for name, value in table.values.items():
+        _check_range(table, name, value)
+    _check_covariance(table)
+    return table
+
+
+def _place(table: TrajectoryTable, row: int, name: str) -> str:
+    return f"{table.file}: line {table.lines[row]}, column {name}"
+
+
+def _check_finite(table: TrajectoryTable, name: str, value: Array) -> None:
+    bad = ~np.isfinite(value)
+    if bad.any():
+        row = int(bad.argmax())
+        remedy = "Remove these rows or repair the column."
+        if bad.mean() > _MOSTLY:
+            needed = name in ("t", *LOCAL, *GEODETIC)
+            remedy = (
+                "Repair the column." if needed else "Remove or rename the columns of its group."
+            )
+        raise ValueError(
+            f"{_place(table, row, name)} must be a finite number, got {value[row]} (in "
+            f"{int(bad.sum())} of {len(value)} rows). {remedy}"
+        )
+
+
+def _check_order(table: TrajectoryTable) -> None:
+    rows = np.flatnonzero(np.diff(table.time) <= 0) + 1
+    if not len(rows):
+        return
+    row = int(rows[0])
+    raise ValueError(
+        f"{_place(table, row, 't')} must be later than the row before, got {table.time[row]:.12g} after "
+        f"{table.time[row - 1]:.12g} ({len(rows)} such rows). {_order_remedy(table, rows)}"
+    )
+
+
+def _order_remedy(table: TrajectoryTable, rows: np.ndarray) -> str:
+    """Return a remedy that was tried for times that do not increase after some rows."""
+    lines = ", ".join(str(table.lines[row]) for row in rows[:5]) + (
+        ", ..." if len(rows) > 5 else ""
+    )
+    step = np.diff(table.time)
+    usual = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
+    if (step[rows - 1] == 0).all():
+        if all((v[rows] == v[rows - 1]).all() for v in table.values.values()):
+            return f"Remove the repeated rows: line {lines}."
+        return (
+            "If column t has lost digits, write more of them, else remove the rows that repeat a time: line "
+            f"{lines}."
+        )
+    for period in _PERIODS:
+        seam = max(_SEAM_STEPS * usual, _SEAM_SHARE * period)
+        before, after = table.time[rows - 1], table.time[rows]
+        if ((after >= 0) & (before <= period) & (after - before + period > 0)).all() and (
+            after - before + period <= seam
+        ).all():
+            again = ", and once more from each further line" if len(rows) > 1 else ""
+            return (
+                f"The counter starts again after {period:.10g}: add {period:.10g} to column t from line "
+                f"{lines}{again}."
+            )
+    starts = np.concatenate([[0], rows, [len(table.time)]])
+    if (np.diff(starts) >= _LEAST_RUN).all() and (table.time[rows] <= table.time[0] + usual).all():
+        return f"The file has {len(rows) + 1} runs: write one file for each, split before line {lines}."
+    order = np.argsort(table.time, kind="stable")
+    if _path_length(table, order) <= _path_length(table, np.arange(len(order))):
+        return "Sort the rows by t, and remove repetitions."
+    return "Sorted by t, the positions would jump: repair the clock that wrote column t."
+
+
+def _path_length(table: TrajectoryTable, order: np.ndarray) -> float:
+    """Return the sum of the steps of the position in an order of the rows."""
+    position = table.select(LOCAL if table.has(LOCAL) else GEODETIC)[order]
+    return float(np.linalg.norm(np.diff(position, axis=0), axis=1).sum())
+
+
+def _check_range(table: TrajectoryTable, name: str, value: Array) -> None:
+    for least, largest, unit, hint in _ranges(name):
+        bad = (value < least) | (value > largest)
+        if bad.any():
+            row = int(bad.argmax())
+            limits = (
+                f"from {least:g} to {largest:g} {unit}" if unit else f"above 0, at most {largest:g}"
+            )
+            raise ValueError(
+                f"{_place(table, row, name)} must be {limits}, got "
+                f"{value[row]:.10g}. {_unit_remedy(name, value, hint)}"
+            )
+
+
+def _unit_remedy(name: str, value: Array, hint: str) -> str:
+    """Return the options for factors of units that bring all values into their range."""
+    units = {
+        unit: factor
+        for factor, unit in _UNITS.get(LIMIT_COLUMNS.get(name, ""), {}).items()
+        for least, largest, _, _ in _ranges(name)
+        if least <= (factor * value).min() and (factor * value).max() <= largest
+    }
+    options = [f"if in {unit}, set NAME.scale={name}:{f:.8g}" for unit, f in units.items()]
+    return f"I{'; '.join(options)[1:]}." if options else hint or _CHECK_ORDER
+
+
+def _ranges(name: str) -> Iterator[tuple[float, float, str, str]]:
+    if name in _SD_COLUMNS or name in ("cov_nn", "cov_ee", "cov_dd"):
+        yield np.nextafter(0.0, 1.0), 1e12, "", "Remove the uncertainty columns or repair them."
+    elif name in LIMIT_COLUMNS:
+        quantity = QUANTITIES[LIMIT_COLUMNS[name]]
+        yield quantity.least, quantity.largest, quantity.unit, ""
+
+
+def _check_covariance(table: TrajectoryTable) -> None:
+    if not table.has(COVARIANCE_COLUMNS):
+        return
+    least = np.linalg.eigvalsh(covariance_matrices(table.select(COVARIANCE_COLUMNS)))[:, 0]
+    if (least <= 0).any():
+        row = int((least <= 0).argmax())
+        raise ValueError(
+            f"{_place(table, row, 'cov_nn ... cov_dd')} must be a positive definite matrix, got the "
+            f"least eigenvalue {least[row]:.3g} m^2. Repair the columns or remove them."
+        )
+
+
+def covariance_matrices(entries: Array) -> Array:
+    """Return matrices [T, 3, 3] from the columns `COVARIANCE_COLUMNS`, [T, 6]."""
+    upper = entries[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
+    return upper.reshape(-1, 3, 3)
+
+
+# --------------------------------------------------------------------------------------------------
+# Positions on the WGS-84 ellipsoid in a local frame, and Euler angles, with numpy alone.
+
+SEMI_MAJOR = 6378137.0  # m
+ECCENTRICITY_2 = (2 - 1 / 298.257223563) / 298.257223563
+
+
+def to_north_east_down(geodetic: Array, origin: Array) -> Array:
+    """Convert geodetic positions to the tangent frame of an origin.
+
+    Returns north, East, Down, [T, 3], m. Shapes: geodetic [T, 3].
+    """
+    lat, lon = np.radians(origin[:2])
+    sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
+    turn = np.array(
+        [
+            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
+            [-sin_lon, cos_lon, 0.0],
+            [-cos_lat * cos_lon, -cos_lat * sin_lon, -sin_lat],
+        ]
+    )
+    return (_earth_fixed(geodetic) - _earth_fixed(origin)) @ turn.T
+
+
+def _earth_fixed(geodetic: Array) -> Array:
+    """Convert latitude, longitude (deg) and height (m) to Earth-centred coordinates, m."""
+    lat, lon = np.radians(geodetic[..., 0]), np.radians(geodetic[..., 1])
+    h = geodetic[..., 2]
+    normal = SEMI_MAJOR / np.sqrt(1 - ECCENTRICITY_2 * np.sin(lat) ** 2)
+    x, y = (normal + h) * np.cos(lat) * np.cos(lon), (normal + h) * np.cos(lat) * np.sin(lon)
+    return np.stack([x, y, (normal * (1 - ECCENTRICITY_2) + h) * np.sin(lat)], axis=-1)
+
+
+def rotation_from_quaternion(q: Array) -> Array:
+    """Return the rotation matrices [T, 3, 3] of unit quaternions (x, y, z, w), [T, 4]."""
+    x, y, z, w = (q / np.linalg.norm(q, axis=-1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def euler_angles(rotation: Array) -> Array:
+    """Return roll, pitch, yaw [T, 3] in rad of rotations [T, 3, 3] from body to North, East, Down."""
+    roll = np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2])
+    pitch = -np.arcsin(np.clip(rotation[:, 2, 0], -1.0, 1.0))
+    return np.stack([roll, pitch, np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])], axis=-1)
+
+
+def wrap_to_half_turn(angle: Array) -> Array:
+    """Return angles in rad within half a turn of 0."""
+    return (angle + np.pi) % (2 * np.pi) - np.pi

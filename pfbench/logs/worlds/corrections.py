@@ -1,0 +1,405 @@
+"""Corrections of an own log that its reader applies and says: clocks, units, axes, biases, lever arm, wrong rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from pfbench.files.table_file import Array
+from pfbench.logs.doctor.axis_orders import CONVENTIONS, convert_angles, parse_axes
+from pfbench.logs.doctor.bad_samples import find_bad_samples, find_stuck
+from pfbench.logs.doctor.fix_checks import find_frozen, find_jumps
+from pfbench.logs.doctor.raw_log import RawImu
+from pfbench.logs.worlds.imu_gaps import CUT, cut_longest
+from pfbench.logs.worlds.log_tables import (
+    GnssLog,
+    LogTable,
+    ReferenceLog,
+    convert_column,
+    swap_frd_rfu,
+)
+from pfbench.logs.worlds.time_grid import interpolate
+from pfbench.nav.strapdown import rotate
+
+Tables = dict[str, LogTable]
+Vector = Sequence[float] | None
+_TABLES = ("imu", "gnss", "reference")
+_FORCE, _RATE, _ANGLES = ("fx", "fy", "fz"), ("wx", "wy", "wz"), ("roll", "pitch", "yaw")
+_POSITION, _VELOCITIES = ("pn", "pe", "pd"), (("vn", "ve", "vd"), ("vn_d", "ve_d", "vd_d"))
+_SENSORS = {"imu": (_FORCE, _RATE), "accelerometer": (_FORCE,), "gyroscope": (_RATE,)}
+_LEVEL = {
+    "gnss": ("gnss", (_POSITION, *_VELOCITIES)),
+    "reference": ("reference", (_POSITION, *_VELOCITIES)),
+    "reference_velocity": ("reference", _VELOCITIES),
+}
+_DROPS = ("spikes", "stuck", "outliers", "frozen")
+_TIMES = ("sort", "even")
+_LONG_STEP = 0.1  # s; even times do not cross longer intervals
+_EVEN_ROWS = 101  # of a local line
+
+
+@dataclass(frozen=True)
+class LogCorrections:
+    """Corrections of the tables, in the order of the attributes. The tables are imu, gnss and reference.
+
+    Attributes:
+        times: By table: sort (by t, with the first row of each time) or even (evenly spaced, too).
+        scale: Factors by table and column.
+        mounting: By imu, accelerometer or gyroscope: the recorded axes that are forward, right, down, such as
+            [x, -y, -z]. Three numbers are the angles of the sensor in the body, roll, pitch, yaw, deg.
+        level_axes: By gnss, reference or reference_velocity: the recorded axes that are North, East, Down, such as
+            [e, n, -d].
+        attitude: Convention of the recorded attitude, such as yaw_from_east. None for that of the tables.
+        bias: Values that are subtracted, by table and column.
+        shift_s: Delay of the clock by table, s, which is subtracted from t. Nodes [t, delay] for one that changes.
+        drop: Wrong rows that are left out: spikes, stuck, outliers, frozen.
+        gaps: refuse, or longest for the longest part between gaps of the IMU.
+        offset_m: Constant shift of the fixes that is subtracted, North, East, Down, m. None for zero.
+        lever_arm: Antenna from the IMU, forward, right, down, m. None for zero. The fixes are moved to the
+            IMU with the attitude of the reference.
+
+    Raises:
+        ValueError: If a correction is not one of these. The message names key, value and remedy.
+    """
+
+    times: Mapping[str, str] = field(default_factory=dict)
+    scale: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    mounting: Mapping[str, Sequence[str | float]] = field(default_factory=dict)
+    level_axes: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    attitude: str | None = None
+    bias: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    shift_s: Mapping[str, float | Sequence[Sequence[float]]] = field(default_factory=dict)
+    drop: Sequence[str] = ()
+    gaps: str = "refuse"
+    offset_m: Vector = None
+    lever_arm: Vector = None
+
+    def __post_init__(self) -> None:
+        for key in ("times", "scale", "bias", "shift_s", "mounting", "level_axes"):
+            _check_mapping(key, getattr(self, key) or {}, "by name")
+        for key, allowed in (
+            ("times", _TABLES), ("scale", _TABLES), ("bias", _TABLES), ("shift_s", _TABLES),
+            ("mounting", tuple(_SENSORS)), ("level_axes", tuple(_LEVEL)),
+        ):  # fmt: skip
+            _check_names(key, getattr(self, key) or {}, allowed)
+        _check_names("drop", self.drop or (), _DROPS)
+        for value in (self.times or {}).values():
+            _check_names("times", (value,), _TIMES)
+        _check_names("gaps", (self.gaps,), CUT)
+        if self.attitude is not None:
+            _check_names("attitude", (self.attitude,), tuple(CONVENTIONS))
+        for sensor, axes in (self.mounting or {}).items():
+            _mounting_matrix(sensor, axes)
+        for frame, axes in (self.level_axes or {}).items():
+            _level_matrix(frame, axes)
+        for key in ("offset_m", "lever_arm"):
+            _check_vector(key, getattr(self, key))
+        for key in ("scale", "bias"):
+            for table, values in (getattr(self, key) or {}).items():
+                _check_columns(f"{key}.{table}", values)
+        for table, shift in (self.shift_s or {}).items():
+            _nodes_of(table, shift)
+
+    @property
+    def is_empty(self) -> bool:
+        """True if nothing is corrected."""
+        return not any(getattr(self, f.name) not in ("refuse", None) and getattr(self, f.name) for f in fields(self))  # fmt: skip
+
+    def correct_tables(self, inertial: LogTable, gnss: LogTable, truth: LogTable) -> tuple[tuple[LogTable, LogTable, LogTable], tuple[str, ...]]:  # fmt: skip
+        """Correct the tables as recorded.
+
+        Args:
+            inertial: IMU table.
+            gnss: Table of fixes.
+            truth: Reference table.
+
+        Returns:
+            Corrected tables, and a note for each correction.
+        """
+        tables = {"imu": inertial, "gnss": gnss, "reference": truth}
+        notes: list[str] = []
+        if self.is_empty:
+            return (inertial, gnss, truth), ()
+        for name, order in (self.times or {}).items():
+            tables[name] = _sort(tables[name], notes)
+            if order == "even":
+                tables[name] = _even(tables[name], notes)
+        self._correct_columns(tables, notes)
+        for name, shift in (self.shift_s or {}).items():
+            tables[name] = _shift(tables[name], *_nodes_of(name, shift), notes)
+        if {"spikes", "stuck"} & set(self.drop or ()):
+            tables["imu"] = _drop_samples(tables["imu"], self.drop, notes)
+        if self.gaps == "longest":
+            tables["imu"], note = cut_longest(tables["imu"], convert_column(tables["imu"], "t"))
+            notes += note
+        return (tables["imu"], tables["gnss"], tables["reference"]), tuple(notes)
+
+    def _correct_columns(self, tables: Tables, notes: list[str]) -> None:
+        """Apply factors, axes, convention and biases to the columns."""
+        for name, factors in (self.scale or {}).items():
+            for column, factor in factors.items():
+                tables[name] = _apply(tables[name], (column,), lambda v, a=factor: a * v)
+            notes.append(f"{tables[name].name}: columns multiplied by {dict(factors)}")
+        for sensor, axes in (self.mounting or {}).items():
+            matrix = _mounting_matrix(sensor, axes)
+            for columns in _SENSORS[sensor]:
+                tables["imu"] = _apply(tables["imu"], columns, lambda v, a=matrix: v @ a.T)
+            notes.append(
+                f"{tables['imu'].name}: forward, right, down of the {sensor} are {list(axes)} of the table"
+            )
+        for frame, axes in (self.level_axes or {}).items():
+            name, groups = _LEVEL[frame]
+            matrix, tables[name] = _level_matrix(frame, axes), _require_local(tables[name], frame)
+            for columns in groups:
+                if tables[name].has(columns):
+                    tables[name] = _apply(tables[name], columns, lambda v, a=matrix: v @ a.T)
+            notes.append(
+                f"{tables[name].name}: North, East, Down of the {frame} are {list(axes)} of the table"
+            )
+        if self.attitude is not None:
+            name = self.attitude
+            tables["reference"] = _apply(
+                tables["reference"], _ANGLES, lambda v: convert_angles(name, v)
+            )
+            notes.append(
+                f"{tables['reference'].name}: attitude converted, since {CONVENTIONS[name][0]}"
+            )
+        for name, values in (self.bias or {}).items():
+            for column, value in values.items():
+                tables[name] = _apply(tables[name], (column,), lambda v, b=value: v - b)
+            notes.append(f"{tables[name].name}: {dict(values)} subtracted")
+
+    def correct_fixes(self, fixes: GnssLog, reference: ReferenceLog, name: str) -> tuple[GnssLog, tuple[str, ...]]:  # fmt: skip
+        """Correct the fixes with the reference.
+
+        Args:
+            fixes: Fixes.
+            reference: Reference.
+            name: Name of the table of fixes.
+
+        Returns:
+            Fixes, and notes.
+        """
+        position, notes = fixes.position.copy(), []
+        if self.offset_m is not None:
+            position -= swap_frd_rfu(np.array(self.offset_m, float))
+            notes.append(
+                f"{name}: {list(self.offset_m)} m North, East, Down subtracted from the fixes"
+            )
+        if self.lever_arm is not None:
+            lever = torch.from_numpy(swap_frd_rfu(np.array(self.lever_arm, float)))
+            q = torch.from_numpy(interpolate(reference, fixes.time)[:, :4])
+            position -= rotate(q, lever.expand(len(q), 3)).numpy()
+            notes.append(
+                f"{name}: fixes moved to the IMU by the lever arm {list(self.lever_arm)} m, with the attitude of the reference"
+            )
+        velocity = fixes.velocity.copy()
+        for kind in ("outliers", "frozen"):
+            if kind in (self.drop or ()):
+                mask = _wrong_fixes(fixes._replace(position=position), reference, kind)
+                position[mask] = velocity[mask] = np.nan
+                notes.append(f"{name}: {int(mask.sum())} fixes dropped as {kind}")
+        return GnssLog(fixes.time, position, velocity), tuple(notes)
+
+
+def _wrong_fixes(fixes: GnssLog, reference: ReferenceLog, kind: str) -> NDArray[np.bool_]:
+    """Find outliers or frozen fixes, [m]."""
+    rows = np.flatnonzero(np.isfinite(fixes.position).all(1))
+    time, position = fixes.time[rows], fixes.position[rows]
+    true = np.stack([np.interp(time, reference.time, p) for p in reference.position.T], -1)
+    if kind == "outliers":
+        inside = (time >= reference.time[0]) & (time <= reference.time[-1])
+        wrong = find_jumps(position - true, inside).mask
+    else:
+        wrong = find_frozen(position, np.linalg.norm(np.diff(true, axis=0), axis=1))
+    mask = np.zeros(len(fixes.time), bool)
+    mask[rows[wrong]] = True
+    return mask
+
+
+# --------------------------------------------------------------------------------------------------
+# Changes of a table.
+
+
+def _apply(table: LogTable, columns: Sequence[str], change: Any) -> LogTable:
+    """Replace columns by a function of their numbers [n, k]."""
+    missing = [column for column in columns if column not in table.rows]
+    if missing:
+        raise ValueError(
+            f"scenario.corrections must name columns of {table.name}, got {missing[0]}. "
+            f"It has {', '.join(map(str, table.rows.columns))}."
+        )
+    values = change(np.stack([convert_column(table, column) for column in columns], -1))
+    rows = table.rows.assign(**dict(zip(columns, np.asarray(values).T, strict=True)))
+    return table._replace(rows=rows)
+
+
+def _require_local(table: LogTable, frame: str) -> LogTable:
+    """Return a table with local positions."""
+    if not table.has(_POSITION) and frame != "reference_velocity":
+        raise ValueError(
+            f"scenario.corrections.level_axes.{frame} needs columns pn, pe, pd in {table.name}, which has "
+            "lat_deg, lon_deg. Exchange these columns in the file."
+        )
+    return table
+
+
+def _sort(table: LogTable, notes: list[str]) -> LogTable:
+    """Sort by t, and keep the first row of each time."""
+    _, keep = np.unique(convert_column(table, "t"), return_index=True)
+    removed = len(table.rows) - len(keep)
+    if removed or (np.diff(keep) < 0).any():
+        notes.append(f"{table.name}: sorted by t, {removed} rows with a repeated time left out")
+    return table._replace(rows=table.rows.iloc[keep].reset_index(drop=True))
+
+
+def _even(table: LogTable, notes: list[str]) -> LogTable:
+    """Replace t by lines of the row number over about a hundred rows; they do not cross long intervals."""
+    time = convert_column(table, "t")
+    step = np.diff(time)
+    borders = np.flatnonzero(step > max(_LONG_STEP, 10.0 * float(np.median(step)))) + 1
+    even = np.concatenate([_smooth_times(stretch) for stretch in np.split(time, borders)])
+    notes.append(
+        f"{table.name}: t replaced by evenly spaced times, at most {np.abs(even - time).max():.3g} s away"
+    )
+    return table._replace(rows=table.rows.assign(t=even))
+
+
+def _smooth_times(time: Array) -> Array:
+    """Return the values of local lines at their middles, and of those at both ends, s, [n]."""
+    size = min(_EVEN_ROWS, len(time) - 1 + len(time) % 2)
+    if size < 3:
+        return time
+    half, rows = size // 2, np.arange(size)
+    middle = np.convolve(time, np.ones(size) / size, "valid")
+    first, last = (
+        np.polyval(np.polyfit(rows, piece - piece[0], 1), rows) + piece[0]
+        for piece in (time[:size], time[-size:])
+    )
+    return np.concatenate([first[:half], middle, last[size - half :]])
+
+
+def _shift(table: LogTable, nodes: Array, delays: Array, notes: list[str]) -> LogTable:
+    """Subtract the delay of a clock from t."""
+    time = convert_column(table, "t")
+    size = f"{delays[0]:g} s" if len(delays) == 1 else f"{delays.min():g} to {delays.max():g} s"
+    notes.append(f"{table.name}: {size} subtracted from t")
+    return table._replace(rows=table.rows.assign(t=time - np.interp(time, nodes, delays)))
+
+
+def _drop_samples(table: LogTable, drop: Sequence[str], notes: list[str]) -> LogTable:
+    """Replace spikes by a line between their neighbours, and leave out stuck rows."""
+    time = convert_column(table, "t")
+    samples = {column: convert_column(table, column) for column in (*_FORCE, *_RATE)}
+    if "spikes" in drop:
+        bad = np.zeros(len(time), bool)
+        for column, values in samples.items():
+            wrong = find_bad_samples(values, column in _FORCE)
+            bad[wrong.absurd] = bad[wrong.spikes] = True
+        if not bad.all():
+            samples = {c: np.interp(time, time[~bad], v[~bad]) for c, v in samples.items()}
+        notes.append(
+            f"{table.name}: {int(bad.sum())} rows with spikes or absurd values replaced by a line"
+        )
+    rows = table.rows.assign(**samples)
+    if "stuck" in drop:
+        force, rate = (np.stack([samples[c] for c in group], -1) for group in (_FORCE, _RATE))
+        first, last = find_stuck(RawImu(time, force, rate, np.arange(len(time))))
+        rows = pd.concat([rows.iloc[: first + 1], rows.iloc[last + 1 :]]).reset_index(drop=True)
+        notes.append(f"{table.name}: {last - first} rows with equal samples left out")
+    return table._replace(rows=rows)
+
+
+# --------------------------------------------------------------------------------------------------
+# Checks of the settings.
+
+
+def _check_names(
+    key: str, names: Sequence[str] | Mapping[str, Any], allowed: Sequence[str]
+) -> None:
+    for name in [names] if isinstance(names, str) else names:
+        if name not in allowed:
+            raise ValueError(
+                f"scenario.corrections.{key} must be of {', '.join(allowed)}, got {name!r}. Choose one of these."
+            )
+
+
+def _check_vector(key: str, value: Vector) -> None:
+    if value is not None and not (len(value) == 3 and np.isfinite(np.array(value, float)).all()):
+        raise ValueError(
+            f"scenario.corrections.{key} must be 3 finite numbers in m, got {list(value)}. Set null for none."
+        )
+
+
+def _check_mapping(key: str, values: Any, kind: str) -> None:
+    if not isinstance(values, Mapping):
+        raise ValueError(
+            f"scenario.corrections.{key} must be values {kind}, got {values}. Set {{NAME: {values}}}."
+        )
+
+
+def _check_columns(key: str, values: Mapping[str, float]) -> None:
+    _check_mapping(key, values, "by column")
+    for column, value in values.items():
+        if not (isinstance(value, int | float) and np.isfinite(value)) or (
+            key.startswith("scale") and value == 0
+        ):
+            raise ValueError(
+                f"scenario.corrections.{key}.{column} must be a finite number, and a factor not 0, got {value}. "
+                "Set a number."
+            )
+
+
+def _numbers(values: Sequence[Any]) -> Array | None:
+    """Return three numbers, or None."""
+    is_numeric = len(values) == 3 and all(isinstance(v, int | float) for v in values)
+    return np.array(values, float) if is_numeric else None
+
+
+def _mounting_matrix(sensor: str, axes: Sequence[str | float]) -> Array:
+    """Return the matrix from the recorded to the body axes, [3, 3]."""
+    angles = _numbers(axes)
+    if angles is not None:
+        return np.asarray(Rotation.from_euler("ZYX", angles[::-1], degrees=True).as_matrix())
+    matrix = parse_axes([str(name) for name in axes])
+    if matrix is None:
+        raise ValueError(
+            f"scenario.corrections.mounting.{sensor} must be three different axes such as [x, -y, -z], or roll, "
+            f"pitch, yaw in deg, got {list(axes)}. Name the recorded axes that are forward, right, down."
+        )
+    return matrix
+
+
+def _level_matrix(frame: str, axes: Sequence[str]) -> Array:
+    """Return the matrix from the recorded to North, East, Down, [3, 3]."""
+    matrix = parse_axes([str(name) for name in axes], is_level=True)
+    if matrix is None:
+        raise ValueError(
+            f"scenario.corrections.level_axes.{frame} must be three different axes such as [e, n, -d], got "
+            f"{list(axes)}. Name the recorded axes that are North, East, Down."
+        )
+    return matrix
+
+
+def _nodes_of(table: str, shift: float | Sequence[Sequence[float]]) -> tuple[Array, Array]:
+    """Return times and delays of the nodes of a clock, [k]."""
+    pairs = [[0.0, shift]] if isinstance(shift, int | float) else [list(pair) for pair in shift]
+    if not pairs or any(len(pair) != 2 for pair in pairs):
+        raise ValueError(
+            f"scenario.corrections.shift_s.{table} must be a number in s, or nodes [[t, delay], ...], got {shift}. "
+            "Set the delay of the clock."
+        )
+    nodes, delays = np.array(pairs, float).T
+    if not np.isfinite(delays).all() or (np.diff(nodes) <= 0.0).any():
+        raise ValueError(
+            f"scenario.corrections.shift_s.{table} must have increasing times and finite delays, got {pairs}. "
+            "Sort the nodes."
+        )
+    return nodes, delays

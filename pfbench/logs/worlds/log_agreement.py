@@ -1,0 +1,425 @@
+"""Agreement of IMU, fixes and reference of a log.
+
+A difference that no sensor can explain is an error. A smaller one, which can be a measurement error,
+stays in the data, and a note names its largest row. The file is long since all pairs of tables share
+one rule for notes and errors.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pfbench.core import chart
+from pfbench.logs.sky.plausible_limits import PlausibleLimits
+from pfbench.logs.worlds.dead_reckoning import integrate_windows
+from pfbench.logs.worlds.log_checks import (
+    FEWEST_WINDOWS,
+    MIN_RMS_SPEED,
+    WINDOW,
+    check_position_scale,
+    check_turn_scale,
+)
+from pfbench.logs.worlds.log_tables import Array, GnssLog, ImuLog, LogTable, ReferenceLog
+from pfbench.logs.worlds.time_grid import interpolate
+from pfbench.nav import attitude
+
+_FIX_LIMITS = (2e3, 5e3, 1e4, 2e4, 5e4, 1e5)  # m; offered limits of the error of a fix
+_STRAIGHT = 1.5  # s; longest interval over which the velocity is taken as linear
+
+
+class Agreement(NamedTuple):
+    """Limits of a difference.
+
+    Attributes:
+        quantity: Name, with the compared tables.
+        unit: Unit.
+        noted: Difference beyond which a note names the row.
+        largest: Difference beyond which the log is rejected.
+    """
+
+    quantity: str
+    unit: str
+    noted: float
+    largest: float
+
+
+MOTION = Agreement("position change and integrated velocity of the reference", "m", 2.0, 200.0)
+VELOCITY = Agreement("velocity change of the reference and integrated force of the IMU", "m/s", 3.0, 30.0)  # fmt: skip
+ATTITUDE = Agreement("rotation of the reference and integrated rate of the IMU", "rad", 0.25, 1.5)
+FIX = Agreement("position of a fix and of the reference", "m", 20.0, math.inf)
+FIX_OFFSET = Agreement("median of the fixes and of the reference along an axis", "m", 3.0, math.inf)
+FIX_VELOCITY = Agreement("velocity of a fix and of the reference", "m/s", 5.0, math.inf)
+WHEELS = Agreement("wheel speed and speed of the reference", "m/s", 3.0, 50.0)
+YAW_RATE = Agreement("yaw rate and turn of the track", "rad/s", 1.0, 10.0)
+COMMON_TIME = 2.0  # s at an end of a table that other tables do not cover, without a note
+
+
+def compare_reference(table: LogTable, reference: ReferenceLog) -> tuple[str, ...]:
+    """Compare positions and velocities of a reference.
+
+    Returns notes.
+    """
+    dt = np.diff(reference.time)
+    expected = 0.5 * dt[:, None] * (reference.velocity[1:] + reference.velocity[:-1])
+    displacement = np.diff(reference.position, axis=0)
+    straight = (dt <= _STRAIGHT)[:, None]
+    sums = (np.where(straight, a, 0.0) for a in (expected, displacement))
+    check_position_scale(table, reference.time, *sums)
+    # the error of the straight line grows with the square of the interval
+    slack = np.maximum(1.0, dt / _STRAIGHT) ** 2
+    difference = np.linalg.norm(displacement - expected, axis=1) / slack
+    return _judge(MOTION, difference, table, np.arange(1, len(reference.time)))
+
+
+def compare_inertial(table: LogTable, imu: ImuLog, reference: ReferenceLog, gravity: float) -> tuple[str, ...]:  # fmt: skip
+    """Compare dead reckoning of the IMU with the reference between rows, and over about a second.
+
+    Returns notes.
+    """
+    inside = np.flatnonzero((reference.time >= imu.time[0]) & (reference.time <= imu.time[-1]))
+    stride = max(1, round(WINDOW / float(np.median(np.diff(reference.time)))))
+    notes = [
+        note
+        for nodes in (inside, inside[::stride])
+        if len(nodes) > 1
+        for note in _compare_windows(table, imu, reference, gravity, nodes)
+    ]
+    return tuple(dict.fromkeys(notes))
+
+
+def _compare_windows(
+    table: LogTable, imu: ImuLog, reference: ReferenceLog, gravity: float, nodes: NDArray[np.intp]
+) -> tuple[str, ...]:
+    """Compare dead reckoning between the rows `nodes` of the reference."""
+    time = reference.time[nodes]
+    rotation, velocity = integrate_windows(imu, time)
+    q = torch.from_numpy(reference.attitude[nodes])
+    inverse = q[1:] * q.new_tensor([1.0, -1.0, -1.0, -1.0])
+    turned = chart.quaternion_multiply(q[:-1], rotation)
+    angle = chart.rotation_vector_from_quaternion(chart.quaternion_multiply(inverse, turned)).norm(
+        dim=-1
+    )
+    true_rotation = q.new_tensor([1.0, -1.0, -1.0, -1.0]) * chart.quaternion_multiply(
+        inverse, q[:-1]
+    )
+    pair = (rotation, true_rotation)
+    x, y = (chart.rotation_vector_from_quaternion(a)[angle < ATTITUDE.noted] for a in pair)
+    check_turn_scale(table, x.numpy(), y.numpy(), float(np.median(np.diff(time))))
+    level = (attitude.dcm_from_quaternion(q[:-1]) @ velocity[..., None])[..., 0].numpy()
+    dt = np.diff(time)
+    level[:, 2] -= gravity * dt
+    change = np.diff(reference.velocity[nodes], axis=0)
+    # errors of an unaided IMU grow with the window, which a gap of the reference extends
+    scale = np.maximum(1.0, dt / WINDOW)
+    return (
+        *_judge(VELOCITY, np.linalg.norm(change - level, axis=1) / scale, table, nodes[1:]),
+        *_judge(ATTITUDE, angle.numpy() / scale, table, nodes[1:]),
+    )
+
+
+def compare_fixes(
+    table: LogTable, fixes: GnssLog, reference: ReferenceLog, limits: PlausibleLimits
+) -> tuple[GnssLog, tuple[str, ...]]:
+    """Compare fixes with the reference, and outside of it with the previous fix.
+
+    Returns the fixes, without those that `limits.drop_fixes` drops, and notes.
+    """
+    true = interpolate(reference, fixes.time)
+    position_error = np.linalg.norm(fixes.position - true[:, 7:], axis=1)
+    velocity_error = np.linalg.norm(fixes.velocity - true[:, 4:7], axis=1)
+    step = np.linalg.norm(np.diff(fixes.position, axis=0), axis=1)
+
+    def is_wrong(largest: float) -> NDArray[np.bool_]:
+        reach = limits.speed_m_s * np.diff(fixes.time) + 2.0 * largest
+        # a jump after a wrong fix is not an error of the next one, which the reference confirms
+        jump_mask = np.concatenate([[False], step > reach]) & np.isnan(position_error)
+        return (position_error > largest) | jump_mask
+
+    wrong_mask = is_wrong(limits.fix_error_m)
+    notes: tuple[str, ...] = ()
+    if wrong_mask.any():
+        rows = np.flatnonzero(wrong_mask)
+        i = int(rows[0])
+        distance = position_error[i] if np.isfinite(position_error[i]) else step[i - 1]
+        text = f"{distance:.0f} m in {table.row(i)}"
+        if not (limits.drop_fixes and _usable(fixes, wrong_mask)):
+            raise ValueError(
+                f"{table.name}: fixes must be at most {limits.fix_error_m:g} m from the reference "
+                f"and from neighbouring fixes at {limits.speed_m_s:g} m/s, got {text} "
+                f"({len(rows)} such rows). {_fix_remedy(fixes, wrong_mask, is_wrong)}"
+            )
+        notes = (f"{table.name}: {len(rows)} fixes dropped, the first off by {text}",)
+        position, velocity = fixes.position.copy(), fixes.velocity.copy()
+        position[wrong_mask] = velocity[wrong_mask] = np.nan
+        fixes = fixes._replace(position=position, velocity=velocity)
+    position_error, velocity_error = (
+        np.where(wrong_mask | np.isnan(error), 0.0, error)
+        for error in (position_error, velocity_error)
+    )
+    return fixes, (
+        *notes,
+        *_note_offset(table, fixes.position - true[:, 7:]),
+        *_judge(FIX, position_error, table, np.arange(len(fixes.time))),
+        *_judge(FIX_VELOCITY, velocity_error, table, np.arange(len(fixes.time))),
+    )
+
+
+def _usable(fixes: GnssLog, wrong_mask: NDArray[np.bool_]) -> int:
+    return int((np.isfinite(fixes.position[:, 0]) & ~wrong_mask).sum())
+
+
+def _fix_remedy(
+    fixes: GnssLog, wrong_mask: NDArray[np.bool_], is_wrong: Callable[[float], NDArray[np.bool_]]
+) -> str:
+    """Advise to drop wrong fixes if others remain, and to widen the limit if that accepts all."""
+    largest = next((limit for limit in _FIX_LIMITS if not is_wrong(limit).any()), None)
+    remedies = []
+    if _usable(fixes, wrong_mask) > int(wrong_mask.sum()):
+        remedies.append("Correct or remove these rows, or set scenario.limits.drop_fixes=true.")
+    else:
+        remedies.append(
+            "Check the origin, axes and clock of the fixes, which are wrong in most rows."
+        )
+    if largest is not None:
+        remedies.append(f"If fixes can be so wrong, set scenario.limits.fix_error_m={largest:g}.")
+    return " ".join(remedies)
+
+
+def _note_offset(table: LogTable, difference: Array) -> tuple[str, ...]:
+    """Note the largest median over time of fixes minus reference [n, 3]."""
+    difference = difference[np.isfinite(difference).all(1)]
+    if len(difference) < FEWEST_WINDOWS:
+        return ()
+    offset = np.median(difference, axis=0)
+    axis = int(np.argmax(np.abs(offset)))
+    if abs(offset[axis]) <= FIX_OFFSET.noted:
+        return ()
+    return (
+        f"{table.name}: {FIX_OFFSET.quantity} differ by more than {FIX_OFFSET.noted:g} {FIX_OFFSET.unit}, "
+        f"{offset[axis]:.3g} {FIX_OFFSET.unit} {('East', 'North', 'Up')[axis]}",
+    )
+
+
+def compare_wheels(
+    table: LogTable, speed: Array, yaw_rate: Array, reference: ReferenceLog
+) -> tuple[str, ...]:
+    """Compare wheel speed and yaw rate with the reference.
+
+    Returns notes. Shapes: speed [T], yaw_rate [T].
+    """
+    east, north = reference.velocity[:, :2].T
+    true_speed = np.hypot(east, north)
+    rows, dt = np.arange(len(speed)), np.diff(reference.time)
+    # the track changes with the heading while the car moves
+    turn = np.angle(np.exp(1j * np.diff(np.arctan2(east, north)))) / dt
+    steady = np.minimum(true_speed[1:], true_speed[:-1]) > 2.0 * MIN_RMS_SPEED
+    off = np.where(steady, np.abs(turn - 0.5 * (yaw_rate[1:] + yaw_rate[:-1])), 0.0)
+    return (
+        *_judge(WHEELS, np.abs(np.abs(speed) - true_speed), table, rows),
+        *_judge(YAW_RATE, off, table, rows[1:]),
+    )
+
+
+def compare_times(tables: tuple[tuple[str, Array], ...]) -> tuple[str, ...]:
+    """Name tables that begin later or end earlier than the others.
+
+    Returns notes. Shapes: tables [n].
+    """
+    first = min(time[0] for _, time in tables)
+    last = max(time[-1] for _, time in tables)
+    return tuple(
+        f"{name} covers t = {time[0]:.3f} to {time[-1]:.3f} s of {first:.3f} to {last:.3f} s"
+        for name, time in tables
+        if max(time[0] - first, last - time[-1]) > COMMON_TIME + 2 * np.median(np.diff(time))
+    )
+
+
+def describe_missing_times(name: str, time: Array, steps: Array) -> tuple[str, ...]:
+    """Name a table that does not cover the steps of a filter, or has a hole between them.
+
+    A clock that jumps forward leaves a hole. The rows after it still agree with each other.
+
+    Returns notes. Shapes: time [n], steps [T].
+    """
+    missing, interval = max(time[0] - steps[0], steps[-1] - time[-1]), np.diff(time)
+    longest = COMMON_TIME + 2 * np.median(interval) if len(interval) else 0.0
+    notes = []
+    if missing > longest:
+        notes.append(
+            f"{name} covers t = {time[0]:.3f} to {time[-1]:.3f} s of steps from {steps[0]:.3f} to "
+            f"{steps[-1]:.3f} s. Check the clock of t"
+        )
+    inside = (time[1:] > steps[0]) & (time[:-1] < steps[-1]) & (interval > longest)
+    if inside.any():
+        i, count = int(np.argmax(np.where(inside, interval, 0.0))), int(inside.sum())
+        notes.append(
+            f"{name} has {count} hole{'' if count == 1 else 's'} of more than {longest:.3g} s between steps, the longest "
+            f"from t = {time[i]:.3f} to {time[i + 1]:.3f} s. Check the clock of t"
+        )
+    return tuple(notes)
+
+
+def _judge(agreement: Agreement, difference: Array, table: LogTable, rows: NDArray[np.intp]) -> tuple[str, ...]:  # fmt: skip
+    """Reject, note or accept differences [n] at rows [n] of a table."""
+    if not len(difference):
+        return ()
+    i = int(np.argmax(difference))
+    value = f"{difference[i]:.3g} {agreement.unit} at {table.row(int(rows[i]))}"
+    if not difference[i] <= agreement.largest:
+        raise ValueError(
+            f"{table.name}: {agreement.quantity} must agree to {agreement.largest:g} "
+            f"{agreement.unit}, got {value}. Correct this row, or check units, axes and clocks."
+        )
+    count = int((difference > agreement.noted).sum())
+    if not count:
+        return ()
+    return (
+        f"{table.name}: {agreement.quantity} differ by more than {agreement.noted:g} "
+        f"{agreement.unit} in {count} of {len(difference)} rows, at most {value}",
+    )
+
+
+# --------------------------------------------------------------------------------------------------
+# Agreement of recorded satellites, pseudoranges and range rates.
+#
+# A range can be off by a reflection, so it stays in the data up to the limit of a fix. A satellite
+# moves smoothly, so its positions must agree.
+
+LEAST_RADIUS, LARGEST_RADIUS = 2.2e7, 4.6e7  # m; perigee of E14 23.3e6, geostationary 42.2e6
+_LONGEST = 5.0  # s between compared epochs
+POSITION_NOISE = 20.0  # m; position against those of the neighbouring epochs
+VELOCITY_NOISE = 20.0  # m/s; velocity against the change of position
+RANGE_NOTE = 200.0  # m; range residual beyond which a note names the satellite
+RATE_NOTE, LARGEST_RATE = 20.0, 200.0  # m/s; residual of a range rate
+
+DIRECTION_NOTE = np.radians(1.0)
+
+
+def check_orbits(
+    name: str, names: tuple[str, ...], time: Array, position: Array, velocity: Array | None = None
+) -> None:
+    """Check radius, smoothness and velocity of satellites.
+
+    Shapes: time [K], position [K, S, 3], velocity [K, S, 3].
+    """
+    for s, satellite in enumerate(names):
+        rows = np.flatnonzero(np.isfinite(position[:, s, 0]))
+        p, t = position[rows, s], time[rows]
+        radius = np.linalg.norm(p, axis=1)
+        wrong = np.flatnonzero((radius < LEAST_RADIUS) | (radius > LARGEST_RADIUS))
+        if wrong.size:
+            raise ValueError(
+                f"{name}: sx, sy, sz must be {LEAST_RADIUS:g} to {LARGEST_RADIUS:g} m from the "
+                f"centre of the Earth, got {radius[wrong[0]]:g} for {satellite} at "
+                f"t = {t[wrong[0]]:.3f}. Correct or remove this row."
+            )
+        dt = np.diff(t)
+        speed = np.diff(p, axis=0) / dt[:, None]
+        # accelerations are below 1 m/s^2
+        bend = np.linalg.norm(np.diff(speed, axis=0), axis=1) * np.minimum(dt[1:], dt[:-1])
+        near = (dt[1:] <= _LONGEST) & (dt[:-1] <= _LONGEST)
+        _reject(name, satellite, t[1:-1][near], bend[near], POSITION_NOISE, "position jump", "m")
+        if velocity is not None and len(t) > 1:
+            mean = 0.5 * (velocity[rows, s][1:] + velocity[rows, s][:-1])
+            off = np.linalg.norm(mean - speed, axis=1)
+            near = dt <= _LONGEST
+            _reject(
+                name, satellite, t[1:][near], off[near], VELOCITY_NOISE, "velocity error", "m/s"
+            )
+
+
+def compare_ranges(
+    name: str, names: tuple[str, ...], time: Array, residual: Array, limits: PlausibleLimits
+) -> tuple[str, ...]:
+    """Compare range residuals with the median of each epoch and system.
+
+    Returns notes. Shapes: time [K], residual [K, S].
+    """
+    return _judge_residuals(
+        f"{name}: pseudorange residual",
+        names,
+        time,
+        residual,
+        (RANGE_NOTE, limits.fix_error_m),
+        "m",
+    )
+
+
+def compare_rates(
+    name: str, names: tuple[str, ...], time: Array, residual: Array
+) -> tuple[str, ...]:
+    """Compare residuals of range rates with the median of each epoch and system.
+
+    Returns notes. Shapes: time [K], residual [K, S].
+    """
+    return _judge_residuals(
+        f"{name}: range rate residual", names, time, residual, (RATE_NOTE, LARGEST_RATE), "m/s"
+    )
+
+
+def compare_directions(
+    name: str, names: tuple[str, ...], time: Array, azimuth: Array, elevation: Array
+) -> tuple[str, ...]:
+    """Check recorded directions against those from the reference.
+
+    Returns a note if a direction is off by more than a degree. Shapes: time [K], azimuth [K, S],
+    elevation [K, S].
+    """
+    # near the zenith the azimuth is free, and angles wrap
+    off = np.nan_to_num(np.maximum(np.abs(np.sin(0.5 * azimuth)) * 2.0, np.abs(elevation)))
+    k, s = (int(i) for i in np.unravel_index(np.argmax(off), off.shape))
+    count = int((off > DIRECTION_NOTE).sum())
+    if not count:
+        return ()
+    return (
+        f"{name}: az and el differ from the direction of the satellite by more than 1 degree in "
+        f"{count} rows, at most {np.degrees(off[k, s]):.1f} for {names[s]} at t = {time[k]:.3f}",
+    )
+
+
+def _judge_residuals(
+    label: str,
+    names: tuple[str, ...],
+    time: Array,
+    residual: Array,
+    thresholds: tuple[float, float],
+    unit: str,
+) -> tuple[str, ...]:
+    """Reject or note residuals without the median of each epoch and system."""
+    off = np.zeros_like(residual)
+    for system in sorted({satellite[0] for satellite in names}):
+        columns = [i for i, satellite in enumerate(names) if satellite[0] == system]
+        group = residual[:, columns]
+        counts = np.isfinite(group).sum(1, keepdims=True)
+        clock = np.zeros(len(group))
+        some = counts[:, 0] > 0
+        clock[some] = np.nanmedian(group[some], axis=1)
+        # the common clock of one satellite alone is not confirmed
+        off[:, columns] = np.nan_to_num(np.abs(group - clock[:, None]))
+    k, s = (int(i) for i in np.unravel_index(np.argmax(off), off.shape))
+    value = f"{off[k, s]:.0f} {unit} for {names[s]} at t = {time[k]:.3f}"
+    noted, largest = thresholds
+    if off[k, s] > largest:
+        raise ValueError(
+            f"{label} must be at most {largest:g} {unit}, got {value}. Correct or remove this row, "
+            "or set scenario.limits.fix_error_m."
+        )
+    count = int((off > noted).sum())
+    return (f"{label} above {noted:g} {unit} in {count} rows, at most {value}",) if count else ()
+
+
+def _reject(
+    name: str, satellite: str, time: Array, values: Array, largest: float, label: str, unit: str
+) -> None:
+    if len(values) and values.max() > largest:
+        i = int(np.argmax(values))
+        raise ValueError(
+            f"{name}: {label} of a satellite must be at most {largest:g} {unit}, got "
+            f"{values[i]:.0f} for {satellite} near t = {time[i]:.3f}. Correct or remove this row."
+        )

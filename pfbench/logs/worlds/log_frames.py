@@ -1,0 +1,84 @@
+"""Local frame of a log: its origin, positions in East, North, Up, and attitude from roll, pitch, yaw."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from pfbench.logs.worlds.log_checks import STANDARD_GRAVITY
+from pfbench.logs.worlds.log_tables import Array, LogTable, parse_numbers, swap_frd_rfu
+from pfbench.nav import attitude, earth
+
+DEGREE = math.pi / 180.0
+GEODETIC_COLUMNS, LOCAL_COLUMNS = ("lat_deg", "lon_deg", "h_m"), ("pn", "pe", "pd")
+
+
+def find_origin(
+    origin: Sequence[float] | None, gnss: LogTable, truth: LogTable
+) -> tuple[float, ...] | None:
+    """Return lat_deg, lon_deg, h_m of the local frame, or None for local positions only."""
+    keys = [f"origin_{name}" for name in GEODETIC_COLUMNS]
+    stated = [
+        [float(table.stated[key]) for key in keys]
+        for table in (truth, gnss)
+        if all(key in table.stated for key in keys)
+    ]
+    if origin is not None or stated:
+        centre = stated[0] if origin is None else list(map(float, origin))
+        if len(centre) != 3 or not abs(centre[0]) <= 90.0:
+            raise ValueError(
+                f"scenario.origin must be lat_deg (-90 to 90), lon_deg, h_m, got {centre}. "
+                "Set the point pn = pe = pd = 0."
+            )
+        return tuple(centre)
+    for table in (gnss, truth):
+        if not table.has(LOCAL_COLUMNS) and not table.has(GEODETIC_COLUMNS):
+            parse_numbers(table, LOCAL_COLUMNS)  # raises with the names of the missing columns
+    local = [table.has(LOCAL_COLUMNS) for table in (gnss, truth)]
+    if all(local):
+        return None
+    if not any(local):
+        return tuple(parse_numbers(truth, GEODETIC_COLUMNS)[0].tolist())
+    raise ValueError(
+        f"{gnss.name} and {truth.name} must both have pn, pe, pd or both lat_deg, lon_deg, h_m, "
+        "got one with each and no file with the origin pn = pe = pd = 0. "
+        "Set scenario.origin=[lat_deg, lon_deg, h_m]."
+    )
+
+
+def read_positions(table: LogTable, origin: tuple[float, ...] | None) -> Array:
+    """Read positions in East, North, Up from the origin, m, [n, 3]."""
+    if table.has(LOCAL_COLUMNS) or not table.has(GEODETIC_COLUMNS):
+        return swap_frd_rfu(parse_numbers(table, LOCAL_COLUMNS))
+    pos = parse_numbers(table, GEODETIC_COLUMNS)
+    scale = np.array([DEGREE, DEGREE, 1.0])
+    return earth.local_enu(
+        torch.from_numpy(pos * scale), torch.from_numpy(np.array(origin) * scale)
+    ).numpy()
+
+
+def quaternion_of_angles(roll: Array, pitch: Array, yaw: Array) -> Array:
+    """Return quaternions from right-forward-up to East-North-Up, [n, 4], of angles, rad, [n].
+
+    Args:
+        roll: Rolls.
+        pitch: Pitches.
+        yaw: Yaws, clockwise from North.
+
+    Returns:
+        Quaternions.
+    """
+    euler = torch.from_numpy(np.stack([pitch, roll, -yaw], axis=-1))
+    return attitude.quaternion_from_dcm(attitude.dcm_from_euler(euler)).numpy()
+
+
+def gravity_at(centre: tuple[float, ...] | None) -> tuple[float, tuple[str, ...]]:
+    """Return the gravity at the origin, m/s^2, and a note if the origin is not known."""
+    if centre is None:
+        text = f"gravity {STANDARD_GRAVITY} m/s^2: the log does not contain its location"
+        return STANDARD_GRAVITY, (text,)
+    latitude, height = torch.tensor([centre[0] * DEGREE, centre[2]], dtype=torch.float64)
+    return float(earth.gravity(latitude, height)), ()

@@ -1,0 +1,69 @@
+"""`pfbench data`: the list is that of the page, and a folder is checked file by file."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import pytest
+import yaml
+from checkout import ROOT
+from command_line import pfbench as command
+
+from pfbench.job import conf_dir
+from pfbench.logs.cli import data
+from pfbench.logs.cli.data import check_data_set, read_data_sets
+
+CONTENT = b"t,x\n0,1\n"
+FILES = {"imu.csv": {"bytes": len(CONTENT), "sha256": hashlib.sha256(CONTENT).hexdigest()}}
+
+
+def test_the_states_of_a_data_set(tmp_path: Path) -> None:
+    assert check_data_set("walk", FILES, tmp_path).word == "missing"
+    (tmp_path / "walk").mkdir()
+    assert check_data_set("walk", FILES, tmp_path).missing == ("imu.csv",)
+    (tmp_path / "walk" / "imu.csv").write_bytes(CONTENT)
+    assert check_data_set("walk", FILES, tmp_path).word == "complete"
+    (tmp_path / "walk" / "imu.csv").write_bytes(CONTENT.replace(b"1", b"2"))
+    assert check_data_set("walk", FILES, tmp_path).changed == ("imu.csv",)
+
+
+def test_a_damaged_folder_is_refused_with_its_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    entry = next(iter(read_data_sets().values()))
+    monkeypatch.setattr(data, "read_data_sets", lambda: {"walk": {**entry, "files": FILES}})
+    (tmp_path / "walk").mkdir()
+    with pytest.raises(ValueError, match=r"got .* where walk/imu.csv is missing"):
+        data.list_data([str(tmp_path)])
+    (tmp_path / "walk" / "imu.csv").write_bytes(CONTENT)
+    data.list_data([str(tmp_path)])
+    assert "1 of 1 data sets are complete" in capsys.readouterr().out
+
+
+def test_bad_words_are_answered_by_a_sentence(tmp_path: Path) -> None:
+    said = command("data", "nowhere", home=tmp_path)
+    assert said.code == 2
+    assert "FOLDER must be a folder, got nowhere." in said.err
+    assert "must receive one folder, got a b" in command("data", "a", "b", home=tmp_path).err
+
+
+def test_the_page_has_source_commit_licence_and_size_of_each() -> None:
+    page = (ROOT / "docs" / "data_sets.md").read_text()
+    for name, facts in read_data_sets().items():
+        (row,) = [line for line in page.splitlines() if line.startswith(f"| `{name}` |")]
+        size = sum(file["bytes"] for file in facts["files"].values()) / 1e6
+        for text in (facts["source"], facts["commit"][:10], facts["licence"], f" {size:.1f} "):
+            assert text in row
+        assert len(facts["commit"]) == 40
+        assert all(len(file["sha256"]) == 64 for file in facts["files"].values())
+
+
+def test_all_folders_that_scenarios_name_are_listed() -> None:
+    names = set(read_data_sets())
+    for path in [*(conf_dir() / "scenario").glob("*.yaml"), *(conf_dir() / "noise").glob("*.yaml")]:
+        text = path.read_text()
+        node = yaml.safe_load(text)
+        if "${data.root}" in text and not path.stem.startswith("user_"):
+            assert any(name in text for name in names), path.stem
+            assert node
