@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import ast
 import importlib
+import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import house_budget
@@ -164,6 +167,61 @@ def test_the_floor_test_finds_forbidden_imports() -> None:
     fine = "from pfbench.model.base import StaticModel\nfrom . import smoothing\nimport torch"
     assert violations(fine, "pfbench.filter.loop") == []
     assert violations("from pfbench.results import store\nimport hydra", "pfbench.job.plan") == []
+
+
+@cache
+def names_of_the_wing() -> frozenset[str]:
+    """Return the names by which a door of another folder passes on a part of pfbench/logs."""
+    return frozenset(
+        f"{'.'.join(door.relative_to(ROOT).parent.parts)}.{alias.name}"
+        for door in PACKAGE.rglob("__init__.pyi")
+        for node in tree_of(door).body
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("pfbench.logs")
+        for alias in node.names
+    )
+
+
+def reaches_into_the_wing(source: str | ast.AST, module: str) -> set[str]:
+    """Return what a module outside of pfbench/logs imports of it, directly or through a door."""
+    tree = ast.parse(source) if isinstance(source, str) else source
+    names = set(imported(tree, tuple(module.split(".")[:-1])))
+    return {n for n in names if n.startswith("pfbench.logs") or n in names_of_the_wing()}
+
+
+def test_nothing_reaches_into_the_wing_of_logs() -> None:
+    found = {
+        module_name(file): reaches_into_the_wing(tree_of(file), module_name(file))
+        for file in FILES
+        if PACKAGE / "logs" not in file.parents
+    }
+    assert {module: names for module, names in found.items() if names} == {
+        "pfbench": {
+            "pfbench.door.make_log",
+            "pfbench.job.estimate_track",
+            "pfbench.scenario.inspect_log",
+        }
+    }  # lazy names that `pfbench` itself passes on
+    assert reaches_into_the_wing("from pfbench.scenario import UserLog", "pfbench.job.plan")
+
+
+@pytest.mark.slow
+def test_without_the_wing_worlds_are_simulated_and_reported(tmp_path: Path) -> None:
+    shutil.copytree(PACKAGE, tmp_path / "pfbench", ignore=shutil.ignore_patterns("logs", "*.pyc"))
+    for folder in ("conf", "experiments"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
+    code = """
+import sys; import pfbench; from pfbench.cli import main
+assert pfbench.__file__.startswith(sys.argv[1])
+main(["run", "-m", "scenario=linear_walk", "model=linear_walk", "filter=ekf,sir", "runs=5", "particles=20", "study=core"])
+main(["report", "study=core"])
+assert not [name for name in sys.modules if name.startswith("pfbench.logs")]
+"""
+    where = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    run = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, cwd=tmp_path, env=where
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    assert (tmp_path / "reports" / "core" / "index.html").is_file()
 
 
 def test_nothing_loose_at_the_top() -> None:
