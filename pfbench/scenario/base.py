@@ -49,10 +49,6 @@ def check_added_sd(name: str, sd: float) -> None:
     require_range(name, sd, "[0, inf] Use 0 for no added errors.")
 
 
-# --------------------------------------------------------------------------------------------------
-# Noise regime that remembers the measurement channels of a scenario, for a model with oracle noise.
-
-
 @dataclass(eq=False)
 class RecordingRegime:
     """Noise regime that records the measurement channels of the scenario.
