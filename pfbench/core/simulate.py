@@ -153,8 +153,9 @@ def draw_measurements(
     stream: RandomStream,
     purpose: str,
     errors: Tensor | None = None,
+    first: int = 0,
 ) -> Tensor:
-    """Draw the measurements of all steps.
+    """Draw the measurements of all steps, or of those from step `first` on.
 
     Independent normal measurements of all steps come from one array at stream step 0, the array
     of the noise regimes. Others are drawn at stream step t + 1.
@@ -167,17 +168,16 @@ def draw_measurements(
             for name in ("mean", "stddev")
         )
         return mean + sd * (stream.normal(purpose, *mean.shape[1:]) if errors is None else errors)
-    rows = [draw_values(d, stream.at_step(t + 1), purpose, 1) for t, d in enumerate(distributions)]
+    rows = [
+        draw_values(d, stream.at_step(t), purpose, 1)
+        for t, d in enumerate(distributions, first + 1)
+    ]
     return torch.cat(rows, 1)
 
 
 def is_independent_normal(distribution: Any) -> bool:
     """Return whether a distribution is normal with independent components."""
     return isinstance(distribution, Independent) and isinstance(distribution.base_dist, Normal)
-
-
-# --------------------------------------------------------------------------------------------------
-# Draws from a distribution by numbers of a random stream.
 
 
 # --------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pfbench.core.random_stream import BatchRandomStream, RandomStream
-from pfbench.core.record import FeedbackRun, Record, iterate_steps
+from pfbench.core.record import FeedbackRun, Record, iterate_steps, take_groups
 from pfbench.filter.belief import (
     Filter,
     GaussianBelief,
@@ -251,20 +251,18 @@ def run_filter(
     monitor = HealthMonitor(prepared, fits_tails=has_bounded_weights(method) is False)
     passes = [FilterPass(method, model, *batch, feedback) for batch in batches]
     selection = KeptSteps(monitor.visited, all_steps=watch is not None)
-    blocks: list[StepBlock] = []
     iterators = [run.iterate_blocks(selection) for run in passes]
     several = min(threads, len(passes)) if isinstance(method, MultiStepFilter) else 1
-    with _advance_in_threads(several) as advance:
-        for block in _join_passes(iterators, monitor.steps, advance):
-            blocks.append(_watch_block(block, watch, on_step))
-            if not monitor.visited.isdisjoint(block.infos):
-                monitor.check(model, prepared, block.beliefs, block.infos)
-    mean, variance, log_evidence = (
-        torch.cat(parts, 1) for parts in zip(*(block[1:4] for block in blocks), strict=True)
-    )
-    trace = {
-        name: torch.cat([block.trace[name] for block in blocks], 1) for name in blocks[0].trace
-    }
+
+    def take_blocks() -> Iterator[StepBlock]:
+        with _advance_in_threads(several) as advance:
+            for block in _join_passes(iterators, monitor.steps, advance):
+                yield _watch_block(block, watch, on_step)
+                if not monitor.visited.isdisjoint(block.infos):
+                    monitor.check(model, prepared, block.beliefs, block.infos)
+
+    parts = [_join_blocks(blocks, 1) for blocks in take_groups(take_blocks())]
+    _, mean, variance, log_evidence, trace, *_ = _join_blocks(parts, 1)
     valid = monitor.check_evidence(log_evidence).unsqueeze(-1)
     mean, variance = (torch.where(valid, a, torch.nan) for a in (mean, variance))
     monitor.check_moments(model, prepared, mean, variance, trace.get("ess"))
@@ -464,12 +462,14 @@ def _align_blocks(
         ]
 
 
-def _join_blocks(blocks: Sequence[StepBlock]) -> StepBlock:
-    """Join the same steps of several batches of runs. Kept are the steps that each block has."""
-    mean, variance, log_evidence = map(
-        torch.cat, zip(*(block[1:4] for block in blocks), strict=True)
+def _join_blocks(blocks: Sequence[StepBlock], axis: int = 0) -> StepBlock:
+    """Join the same steps of several batches of runs, or later steps along axis 1. Kept are the steps that each block has."""
+    mean, variance, log_evidence = (
+        torch.cat(parts, axis) for parts in zip(*(block[1:4] for block in blocks), strict=True)
     )
-    trace = {name: torch.cat([block.trace[name] for block in blocks]) for name in blocks[0].trace}
+    trace = {
+        name: torch.cat([block.trace[name] for block in blocks], axis) for name in blocks[0].trace
+    }
     steps = blocks[0].infos
     beliefs = {t: tuple(belief for block in blocks for belief in block.beliefs[t]) for t in steps}
     infos = {t: _join_infos([block.infos[t] for block in blocks]) for t in steps}

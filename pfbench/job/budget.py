@@ -179,6 +179,7 @@ class EpisodeSource:
 
     Attributes:
         limit: Bytes that the job may use. None if unknown.
+        run_bytes: Bytes of a run before it is drawn.
         seconds: Time of all draws.
         joint: Episode of all runs, or None if it is not in memory.
     """
@@ -188,7 +189,8 @@ class EpisodeSource:
         self.limit = memory_limit(plan.values["memory_limit_gib"], plan.values["device"])
         self.seconds = 0.0
         self.joint: Episode | None = None
-        if memory.fits_undrawn(len(plan.runs), self.limit):
+        self.run_bytes = memory.undrawn_bytes(plan.scenario, plan.model, self.limit)
+        if memory.fits_undrawn(len(plan.runs), self.limit, self.run_bytes):
             self.draw_all()
 
     def draw_all(self) -> Episode:
@@ -272,7 +274,9 @@ def max_runs_in_memory(plan: JobPlan, episodes: EpisodeSource) -> int:
     Returns runs per batch, at most all.
     """
     runs, limit = len(plan.runs), episodes.limit
-    if limit is None or not memory.needs_memory_trial(plan.method, plan.model, runs, limit):
+    if limit is None or not memory.needs_memory_trial(
+        plan.method, plan.model, runs, limit, episodes.run_bytes
+    ):
         if episodes.joint is None:
             episodes.draw_all()
         return runs

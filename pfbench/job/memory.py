@@ -188,6 +188,9 @@ _OVERHEAD = 2.0  # resident bytes per byte of live tensors, for workspace and ho
 
 _MAX_EPISODE = 30e6  # bytes per run, above those of all scenarios in conf/
 
+# bytes per sample of inertial sensors: of a run, and of the flight that all share [400 and 1400 to 1600 measured]
+_RUN_SAMPLE, _FLIGHT_SAMPLE = 600.0, 1600.0
+
 
 @dataclass(frozen=True)
 class MemoryEstimate:
@@ -229,11 +232,7 @@ def runs_within_limit(
         else:
             workload = f"the results of {runs} runs"
             remedy = f"Split the job (runs={runs // 2}, then first_run={runs // 2})"
-        size = estimate.peak(1, runs, is_whole) / GIB
-        raise ValueError(
-            f"memory must be at least {size:.3g} GiB for {workload}, got {limit / GIB:.3g} GiB. "
-            f"{remedy}, or set memory_limit_gib=... (GiB) if more is free."
-        )
+        raise _refusal(workload, estimate.peak(1, runs, is_whole), limit, remedy)
     low, high = 1, runs
     while low < high:
         middle = (low + high + 1) // 2
@@ -243,9 +242,35 @@ def runs_within_limit(
     return -(-runs // batches)
 
 
-def fits_undrawn(runs: int, limit: float | None) -> bool:
-    """Return whether the undrawn episodes of all runs of any scenario fit."""
-    return limit is None or _BASE + runs * _MAX_EPISODE <= limit
+def undrawn_bytes(scenario: Any, model: StateSpaceModel, limit: float | None) -> float:
+    """Return the bytes of a run that is not drawn, by its stated steps and samples, at least those of `conf/`.
+
+    Counted are what is drawn and the moments, errors and NEES of each step.
+
+    Raises:
+        ValueError: If one run and the flight that all runs share do not fit into memory.
+    """
+    steps, samples = (getattr(scenario, name, 0) for name in ("steps", "samples"))
+    drawn, told = model.chart.size + 2, 3 * model.chart.dimension + 3
+    numbers = (_SIMULATION_FACTOR * drawn + _TRACE_COPIES * told) * steps
+    run = max(_MAX_EPISODE, 8.0 * numbers + _RUN_SAMPLE * samples)
+    size = _BASE + run + _FLIGHT_SAMPLE * samples
+    if limit is not None and run > _MAX_EPISODE and size > limit:
+        raise _refusal("a single run", size, limit, "Use fewer steps or a shorter flight")
+    return run
+
+
+def fits_undrawn(runs: int, limit: float | None, run: float) -> bool:
+    """Return whether the undrawn episodes of all runs fit, each of as many bytes as `run`."""
+    return limit is None or _BASE + runs * run <= limit
+
+
+def _refusal(workload: str, size: float, limit: float, remedy: str) -> ValueError:
+    """Return the error of a job that does not fit."""
+    return ValueError(
+        f"memory must be at least {size / GIB:.3g} GiB for {workload}, got {limit / GIB:.3g} GiB. "
+        f"{remedy}, or set memory_limit_gib=... (GiB) if more is free."
+    )
 
 
 def fits_drawn(estimate: MemoryEstimate, runs: int, limit: float) -> bool:
@@ -253,13 +278,15 @@ def fits_drawn(estimate: MemoryEstimate, runs: int, limit: float) -> bool:
     return _BASE + runs * _SIMULATION_FACTOR * estimate.episode <= limit
 
 
-def needs_memory_trial(method: Any, model: StateSpaceModel, runs: int, limit: float) -> bool:
+def needs_memory_trial(
+    method: Any, model: StateSpaceModel, runs: int, limit: float, run: float = _MAX_EPISODE
+) -> bool:
     """Return whether a job may exceed the limit.
 
     Most jobs are small enough to skip the trial.
     """
     d = model.chart.dimension
-    return runs * (_MAX_EPISODE + 40.0 * _particles(method) * d * (d + 10)) > limit
+    return runs * (run + 40.0 * _particles(method) * d * (d + 10)) > limit
 
 
 def estimate_memory(

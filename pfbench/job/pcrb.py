@@ -62,13 +62,13 @@ def compute_posterior_bound(
     separate = model.linear or run_by_run
     root = _initial_root(_initial_covariance(model, converted, initial), runs, separate)
     record = model.prepare(record).to(model.anchor)
-    bounds = []
+    bounds = root.new_empty(record.y.shape[1], *root.shape[1:])
     for t, step_model, step in iterate_steps(model, record):
         if not isinstance(step_model, StaticModel):
             root = _predict(model, root, x[:, t], step.u)
         root = _add_information(root, _pool(_information_rows(model, x[:, t + 1], step), separate))
-        bounds.append((root @ root.mT).mean(0))
-    return torch.stack(bounds)
+        bounds[t] = (root @ root.mT).mean(0)
+    return bounds
 
 
 def _states(model: StateSpaceModel, truth: Tensor, record: Record) -> Tensor:

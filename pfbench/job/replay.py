@@ -15,6 +15,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.escapes import escape_csv
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.job.computation import compute_job
@@ -125,7 +126,16 @@ def recompute_run(stored: StoredRun, changes: Mapping[str, Any]) -> store.JobRes
     _check_inputs(stored.result.meta, find_inputs(config.values, config.trusted))
     choices = {group: config.choices[group] for group in CHOICES}
     title = " / ".join(choices[group] for group in ("scenario", "noise", "filter"))
-    meta, outputs = compute_job(build_plan(config), f"{title}, run {stored.run}")
+    plan, size = build_plan(config), len(stored.result.data["time"])
+    steps = round(getattr(plan.scenario, "steps", 0)) or size
+    require(
+        steps == size,
+        "the scenario of a stored result",
+        f"have its {size} steps",
+        steps,
+        "The file is damaged or made to take hours: run the job again.",
+    )
+    meta, outputs = compute_job(plan, f"{title}, run {stored.run}")
     head = {"key": stored.job.path.stem, "study": stored.job.path.parent.name}
     full = {**head, "choices": choices, "config": config.values, **meta}
     return store.JobResult(full, outputs)

@@ -71,6 +71,11 @@ class ManoeuvreTrajectory(TrajectorySource):
     segments: Sequence[Any]
     start: TrajectoryStart
 
+    @property
+    def duration_s(self) -> float:
+        """Duration of all segments, s."""
+        return sum(segment.duration_s for segment in _list_segments(self.segments))
+
     @override
     def generate(self, rate: float) -> TrajectoryData:
         return generate_manoeuvres(self.segments, self.start, rate)
@@ -127,9 +132,7 @@ def generate_manoeuvres(
 
     Returns truth and ideal increments, float64.
     """
-    plan = [
-        s for item in segments for s in ([item] if isinstance(item, ManoeuvreSegment) else item)
-    ]
+    plan = _list_segments(segments)
     counts = _sample_counts(plan, rate)
     at_samples = _profile(plan, counts, start, rate, torch.zeros(1, dtype=torch.float64))
     last = _profile(
@@ -143,6 +146,11 @@ def generate_manoeuvres(
         *(torch.cat([a[:, 0], b[-1:, 0]]) for a, b in zip(at_samples, last, strict=True))
     )
     return integrate_motion(samples, _profile(plan, counts, start, rate, NODES), start, rate)
+
+
+def _list_segments(items: Iterable[Any]) -> list[ManoeuvreSegment]:
+    """List the segments of manoeuvres and single segments."""
+    return [s for item in items for s in ([item] if isinstance(item, ManoeuvreSegment) else item)]
 
 
 class _ProfileState(NamedTuple):

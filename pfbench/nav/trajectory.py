@@ -96,7 +96,10 @@ class MotionProfile(NamedTuple):
 
 
 class TrajectorySource(Protocol):
-    """A motion that can be sampled at any rate."""
+    """A motion that can be sampled at any rate.
+
+    It may state `duration_s`, so that a flight that does not fit into memory is refused before it is generated.
+    """
 
     def generate(self, rate: float) -> TrajectoryData:
         """Generate truth and ideal sensors at `rate` samples per second, from time 0."""

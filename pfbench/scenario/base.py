@@ -22,7 +22,8 @@ class Scenario(Protocol):
 
     It may state what it provides, which is then compared with the model (`pfbench.core.record`):
     `channel_names`, the quantity, frame and unit of each component of y, and `input_type`, the NamedTuple
-    of the inputs u.
+    of the inputs u. It may state `steps`, its measurements per run, and `samples`, those of its inertial sensors:
+    a job that cannot fit into memory is then refused before they are drawn.
     """
 
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
@@ -46,14 +47,6 @@ def check_duration(name: str, value: float) -> None:
 def check_added_sd(name: str, sd: float) -> None:
     """Check the standard deviation of errors that are added to recorded measurements."""
     require_range(name, sd, "[0, inf] Use 0 for no added errors.")
-
-
-# --------------------------------------------------------------------------------------------------
-# Noise regime that remembers the measurement channels of a scenario, for a model with oracle noise.
-
-
-# --------------------------------------------------------------------------------------------------
-# Noise regime that remembers the measurement channels of a scenario, for a model with oracle noise.
 
 
 @dataclass(eq=False)

@@ -73,6 +73,16 @@ class SimulatedFlight(Scenario):
         kind: type | None = getattr(self.receiver, "input_type", None)
         return kind
 
+    @property
+    def samples(self) -> float:
+        """Samples of the inertial sensors."""
+        return getattr(self.trajectory, "duration_s", 0.0) * self.imu_rate_hz
+
+    @property
+    def steps(self) -> float:
+        """Measurements per run."""
+        return getattr(self.trajectory, "duration_s", 0.0) / self.filter_interval_s
+
     def __post_init__(self) -> None:
         samples = self.imu_rate_hz * self.filter_interval_s
         if samples < 2 or abs(samples / 2 - round(samples / 2)) > 1e-9:
@@ -284,6 +294,11 @@ class TerrainFlight(Scenario):
     interval_s: float = 1.0
     cache_dir: str | None = None
     channel_names, input_type = TerrainAided.channel_names, TerrainInputs
+
+    @property
+    def steps(self) -> float:
+        """Measurements per run."""
+        return getattr(self.trajectory, "duration_s", 0.0) / self.interval_s
 
     def __post_init__(self) -> None:
         for name in ("initial_sd", "drift", "measurement_sd", "interval_s"):

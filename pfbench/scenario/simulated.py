@@ -10,19 +10,20 @@ import hashlib
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.distributions import Distribution
 from typing_extensions import override
 
 from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode, MeasurementChannels, Record
+from pfbench.core.record import Episode, MeasurementChannels, Record, take_groups
 from pfbench.core.simulate import (
+    SimulatedStep,
     draw_initial_state,
     draw_measurements,
     is_independent_normal,
@@ -79,38 +80,47 @@ class ModelSimulation(Scenario):
         time = self.interval_s * torch.arange(1, self.steps + 1, dtype=torch.float64)
         blank = torch.full((len(runs), self.steps, 1), torch.nan, dtype=torch.float64)
         x = draw_initial_state(model, model.initial(len(runs)), stream, "world.state")
+        scale = process_variance_factors(noise, time).sqrt()
+
+        @cache
+        def draw_errors(shape: torch.Size, is_nominal: bool) -> Tensor:
+            channels = MeasurementChannels.of_one_kind(torch.ones(shape, dtype=torch.float64))
+            return (NominalNoise() if is_nominal else noise).draw_errors(stream, channels, time)
+
         with named_inputs(model):
             inputs = model.prepare(Record(blank))
-            scale = process_variance_factors(noise, time).sqrt()
-            steps = list(simulate_steps(model, inputs, stream, x, "world.state", scale))
-        y = _measurements(self.model, [step.distribution for step in steps], noise, stream, time)
-        states = torch.cat([step.x for step in steps], 1)
+            steps = simulate_steps(model, inputs, stream, x, "world.state", scale)
+            groups = take_groups(steps)
+            parts = [_join_steps(model, group, draw_errors, stream, noise) for group in groups]
+        states, y = (torch.cat(part, 1) for part in zip(*parts, strict=True))
         truth = {name: states[..., list(indices)] for name, indices in model.groups.items()}
         return Episode(Record(y), time, truth)
 
 
-def _measurements(
+def _join_steps(
     model: StateSpaceModel,
-    distributions: list[Distribution],
-    noise: NoiseRegime,
+    steps: list[SimulatedStep],
+    draw_errors: Callable[[torch.Size, bool], Tensor],
     stream: PhiloxStream,
-    time: Tensor,
-) -> Tensor:
-    """Draw measurements under a noise regime [R, T, Dy]."""
-    unit = torch.ones(distributions[0].event_shape, dtype=torch.float64)
-    channels = MeasurementChannels.of_one_kind(unit)
-    errors = noise.draw_errors(stream, channels, time)
+    noise: NoiseRegime,
+) -> tuple[Tensor, Tensor]:
+    """Join the states of consecutive steps, and draw their measurements [R, T, Dy].
+
+    `draw_errors` returns the errors of all steps, nominal ones if its second argument is true.
+    """
+    distributions = [step.distribution for step in steps]
+    shape, span = distributions[0].event_shape, slice(steps[0].t, steps[-1].t + 1)
+    states, errors = torch.cat([step.x for step in steps], 1), draw_errors(shape, False)[:, span]
     if all(is_independent_normal(distribution) for distribution in distributions):
-        return draw_measurements(distributions, stream, "world.receiver", errors)
-    missing_mask = torch.isnan(errors)
-    nominal = NominalNoise().draw_errors(stream, channels, time)
+        return states, draw_measurements(distributions, stream, "world.receiver", errors)
+    missing_mask, nominal = torch.isnan(errors), draw_errors(shape, True)[:, span]
     if not torch.equal(torch.where(missing_mask, nominal, errors), nominal):
         raise ValueError(
             f"noise must be nominal for {type(model).__name__}, whose measurement errors are not "
             f"independent normal, got {regime_name(noise)}. Choose noise=nominal."
         )
-    y = draw_measurements(distributions, stream, "world.receiver")
-    return torch.where(missing_mask, torch.nan, y)
+    y = draw_measurements(distributions, stream, "world.receiver", first=steps[0].t)
+    return states, torch.where(missing_mask, torch.nan, y)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,45 @@ def test_small_jobs_are_not_tried() -> None:
     assert not memory.needs_memory_trial(ParticleFilter(500), MODEL, 100, 16.0 * GIB)
     assert memory.needs_memory_trial(ParticleFilter(500), MODEL, 100000, 16.0 * GIB)
     assert memory.needs_memory_trial(ParticleFilter(10**8), MODEL, 1, 16.0 * GIB)
+
+
+# long worlds
+
+FLIGHT = f"scenario.trajectory.segments={SEGMENT}"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [*(f"scenario=linear_walk scenario.steps={n}" for n in (10**6, 10**7, 10**8, 10**9)),
+     "scenario=passive_1 scenario.steps=100000000",
+     *(f"scenario=flight_300s {FLIGHT.replace('4', str(s))}" for s in (20_000, 100_000, 10_000_000)),
+     f"scenario=flight_300s scenario.imu_rate_hz=10000000 {FLIGHT}", f"scenario=terrain {FLIGHT.replace('4', '100000000')}"],
+)  # fmt: skip
+def test_a_world_that_cannot_fit_is_refused_before_it_is_drawn(
+    words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plan.JobPlan, "draw_episode", lambda *_: pytest.fail("it was drawn"))
+    config = job.compose([*words.split(), "filter=ekf", "runs=2", "memory_limit_gib=0.5"])
+    told = r"memory must be at least \S+ GiB for a single run, got 0.5 GiB. Use fewer steps or a shorter flight, or set memory_limit_gib="
+    with pytest.raises(ValueError, match=told):
+        budget.EpisodeSource(job.build_plan(config))
+
+
+def test_a_world_and_its_filter_hold_objects_of_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Distributions and tensors of each step needed thirty times the bytes of its numbers."""
+    monkeypatch.setattr("pfbench.core.record._GROUP", 20)
+
+    def held(steps: int) -> int:
+        tracemalloc.start()
+        record, draws = world(1, steps).record, PhiloxStream(1, torch.arange(1))
+        run_filter(ParticleFilter(10), MODEL, record, draws)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return peak
+
+    held(30)
+    # what Python counts of each step: 600 bytes, most of them waiting for the collector, and 3000 with all steps in one group
+    assert held(400) - held(100) < 300 * 1200
 
 
 # what there is

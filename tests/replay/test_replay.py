@@ -65,6 +65,17 @@ def test_a_run_alone_equals_the_run_of_the_batch(home: Path, name: str) -> None:
     assert file.with_name("traces.svg").read_text().startswith("<?xml")
 
 
+def test_a_forged_number_of_steps_is_refused_at_once(home: Path, tmp_path: Path) -> None:
+    result = next(iter(store.list_results(home / "results/walks")))
+    config = result.meta["config"]
+    forged = {**config, "scenario": {**config["scenario"], "steps": 10**7}}
+    file = tmp_path / "results" / "walks" / f"{result.meta['key']}.npz"
+    store.write_result(file, {**result.meta, "config": forged}, result.data)
+    said = replay(tmp_path, "run=11", f"filter={result.meta['label']}")
+    assert said.code != 0
+    assert "must have its 8 steps, got 10000000. The file is damaged" in said.err
+
+
 def test_a_changed_number_is_found_with_its_time(home: Path, tmp_path: Path) -> None:
     results = list(store.list_results(home / "results/walks"))
     (result,) = [
