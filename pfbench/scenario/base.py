@@ -52,10 +52,6 @@ def check_added_sd(name: str, sd: float) -> None:
 # Noise regime that remembers the measurement channels of a scenario, for a model with oracle noise.
 
 
-# --------------------------------------------------------------------------------------------------
-# Noise regime that remembers the measurement channels of a scenario, for a model with oracle noise.
-
-
 @dataclass(eq=False)
 class RecordingRegime:
     """Noise regime that records the measurement channels of the scenario.

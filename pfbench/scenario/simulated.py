@@ -50,6 +50,8 @@ class ModelSimulation(Scenario):
     regime scales normal measurement errors. Its factor on the process noise multiplies the variance
     of the noise that drives a step, averaged over the interval that ends with the step.
 
+    A model that reads inputs has them from a subclass with `input_type` and `make_inputs`.
+
     Attributes:
         model: State-space model that draws states and measurements.
         steps: Measurements per run.
@@ -73,20 +75,25 @@ class ModelSimulation(Scenario):
     def __post_init__(self) -> None:
         require_ranges("scenario", self, steps="whole [1, inf)", interval_s="(0, inf]")
 
+    def make_inputs(self, time: Tensor) -> Any:
+        """Return the inputs of all runs at times [T]: a NamedTuple of tensors [1, T, ...], which is `input_type`."""
+        return ()
+
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
         model, stream = self.model, PhiloxStream(seed, runs)
         time = self.interval_s * torch.arange(1, self.steps + 1, dtype=torch.float64)
         blank = torch.full((len(runs), self.steps, 1), torch.nan, dtype=torch.float64)
         x = draw_initial_state(model, model.initial(len(runs)), stream, "world.state")
+        u = self.make_inputs(time)
         with named_inputs(model):
-            inputs = model.prepare(Record(blank))
+            inputs = model.prepare(Record(blank, u))
             scale = process_variance_factors(noise, time).sqrt()
             steps = list(simulate_steps(model, inputs, stream, x, "world.state", scale))
         y = _measurements(self.model, [step.distribution for step in steps], noise, stream, time)
         states = torch.cat([step.x for step in steps], 1)
         truth = {name: states[..., list(indices)] for name, indices in model.groups.items()}
-        return Episode(Record(y), time, truth)
+        return Episode(Record(y, u), time, truth)
 
 
 def _measurements(
