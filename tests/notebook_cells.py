@@ -80,3 +80,73 @@ class Room(StateSpaceModel):
     def observation(self, x, u):
         return independent_normal(x, self.sd)
 """
+WORLD = """
+import torch
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from pfbench.core import Episode, MeasurementChannels, PhiloxStream, Record
+from pfbench.model import StateSpaceModel, independent_normal, normal_batch
+from pfbench.noise import NoiseRegime
+
+
+class Ship(NamedTuple):
+    speed: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Drive:
+    gain: float = 1.0
+
+    def move(self, x, speed):
+        return x + self.gain * speed
+
+
+class Line(StateSpaceModel):
+    input_type = Ship
+
+    def __init__(self, drive=Drive()):
+        super().__init__()
+        self.register_buffer("sd", torch.tensor([SD], dtype=torch.float64))
+        self.drive = drive
+        self.names, self.units, self.groups, self.noise_dim = ("x",), ("m",), {"position": (0,)}, 1
+
+    def initial(self, runs):
+        return normal_batch(runs, self.sd, torch.zeros_like(self.sd))
+
+    def propagate(self, x, u, w):
+        return self.drive.move(x, u.speed[:, None, None]) + w
+
+    def observation(self, x, u):
+        return independent_normal(x, self.sd)
+
+
+@dataclass(frozen=True)
+class Sea:
+    drive: Drive = Drive()
+    input_type = Ship
+
+    def draw(self, noise, runs, seed):
+        stream = PhiloxStream(seed, runs)
+        time = torch.arange(1, 9, dtype=torch.float64)
+        x = self.drive.move(stream.normal("world.walk", 8, 1).cumsum(1), time[:, None])
+        channels = MeasurementChannels.of_one_kind(torch.ones(1, dtype=torch.float64))
+        y = x + noise.draw_errors(stream, channels, time)
+        return Episode(Record(y, Ship(torch.ones(1, 8, dtype=torch.float64))), time, {"position": x})
+
+
+@dataclass(frozen=True)
+class Slips(NoiseRegime):
+    factor: float = 3.0
+
+    def draw_errors(self, draws, channels, time):
+        z = draws.normal("world.receiver", len(time), len(channels.sd))
+        return channels.sd * torch.where(time[:, None] > 4.0, self.factor, 1.0) * z
+
+
+class Unrelated:
+    is_exact = True
+
+    def __call__(self, a, n, draws):
+        return a
+"""

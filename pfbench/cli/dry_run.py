@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pfbench.cli.compose import StudyPlan
@@ -100,11 +99,10 @@ def estimate_job(config: JobConfig, worlds: DrawnWorlds) -> JobEstimate:
     from pfbench.job.budget import apply_budget, estimate_job_memory
     from pfbench.job.inputs import find_inputs
     from pfbench.job.plan import build_plan
-    from pfbench.job.settings import job_key
+    from pfbench.job.run_job import find_result_path
 
     values = config.values
-    key = job_key(values, find_inputs(values, config.trusted))
-    file = Path(values["results_dir"]) / str(values["study"]) / f"{key}.npz"
+    file = find_result_path(values, find_inputs(values, config.trusted))
     if file.is_file() and not values["overwrite"]:
         return JobEstimate("skipped")
     plan = build_plan(_without_cache(config))

@@ -46,7 +46,10 @@ COMMANDS = {
         "open_report",
         "show the report of a study in a browser, and write it if it is missing",
     ),
-    "new": ("write_script", "write a script of your own filter, proposal, model, scenario or log"),
+    "new": (
+        "write_script",
+        "write a script of your own filter, proposal, model, scenario, noise regime or log",
+    ),
     "list": ("list_options", "list what a configuration can choose"),
     "check": ("check_installation", "compose all configurations and print versions"),
     "completion": ("print_completion", "print the completion of words for a shell"),

@@ -13,6 +13,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from pfbench.job.trust import WRITTEN
+
 # --------------------------------------------------------------------------------------------------
 # Error messages of the command line: key, value and remedy.
 
@@ -342,9 +344,12 @@ def describe_unknown(error: BaseException) -> str:
     files = [frame.f_locals.get(name) for frame in package_frames[:3] for name in _FILE_NAMES]
     path = next((value for value in files if isinstance(value, Path)), None)
     name = f"{stage} ({path})" if path else stage
-    reason = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
+    reason = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":").rstrip(".")
+    calls = traceback.extract_tb(error.__traceback__)
+    if own := [call for call in calls if Path(call.filename).parent.match(WRITTEN)]:
+        return f"{own[-1].name} of your class must succeed, got {reason}. Correct the line: {own[-1].line}"
     subject = str(path) if path else "the words of the command and the files that they name"
-    return f"{name} must succeed, got {reason.rstrip('.')}. Check {subject}."
+    return f"{name} must succeed, got {reason}. Check {subject}."
 
 
 def keep_trace(error: BaseException, words: Sequence[str]) -> Path | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from pfbench.cli.messages import suggest_similar
 
 HELP = """\
-pfbench new filter|proposal|model|scenario|log NAME
+pfbench new filter|proposal|model|scenario|noise|log NAME
 
 Write NAME.py into the current folder: a class of your own and a study of it beside filters of pfbench. It runs
 without a change. Change the class.
@@ -176,6 +176,38 @@ if __name__ == "__main__":
     print(study.summary())
     print(study.report())
 '''
+_NOISE = '''"""TITLE: a noise regime, beside the nominal one."""
+
+from dataclasses import dataclass
+
+import torch
+
+import pfbench
+from pfbench.noise import NoiseRegime
+
+
+@dataclass(frozen=True)
+class TITLE(NoiseRegime):
+    """Errors that are larger for some time, at times that differ between runs."""
+
+    share: float = 0.2
+    factor: float = 5.0
+
+    def draw_errors(self, draws, channels, time):
+        """Draw errors [R, T, Dy] of measurements with standard deviations channels.sd [Dy]; NaN is a missing one."""
+        z = draws.normal("world.receiver", len(time), len(channels.sd))
+        phase = draws.uniform("world.bursts", 1, 1)
+        is_burst = torch.remainder(time[:, None] / 20.0 + phase, 1.0) < self.share
+        return channels.sd * torch.where(is_burst, self.factor, 1.0) * z
+
+
+if __name__ == "__main__":
+    print(pfbench.check(TITLE()))
+    filters = ["ekf", "sir", "rpf"]
+    study = pfbench.run("growth", filters, noise=["nominal", TITLE()], runs=50, study="NAME")
+    print(study.summary())
+    print(study.report())
+'''
 _LOG = '''"""TITLE: filters on a recorded log."""
 
 import numpy as np
@@ -214,5 +246,6 @@ SCRIPTS = {
     "proposal": _PROPOSAL + _END,
     "model": _MODEL,
     "scenario": _SCENARIO,
+    "noise": _NOISE,
     "log": _LOG,
 }

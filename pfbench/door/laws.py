@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import torch
+
+from pfbench import testing
 from pfbench.cli.messages import format_error
+from pfbench.core import Episode, MeasurementChannels, PhiloxStream
+from pfbench.core.record import EACH_SATELLITE, map_inputs
 from pfbench.door.own_parts import find_group
-from pfbench.door.parts import Part, format_html_table, place_words, plain_errors
-from pfbench.job.config import compose
+from pfbench.door.parts import PART_GROUPS, Part, format_html_table, place_words, plain_errors
+from pfbench.filter import EssResampler, ParticleFilter, run_filter
+from pfbench.job import build_plan, instantiate
+from pfbench.job.config import JobConfig, compose
+from pfbench.job.inputs import find_inputs
+from pfbench.job.memory import first_steps
+from pfbench.job.run_job import find_result_path, list_used_packages
+from pfbench.job.trust import list_user_packages
+from pfbench.noise import NominalNoise, make_normal
+from pfbench.scenario import ModelSimulation, RecordingRegime
+from pfbench.testing import LawCheck
+from pfbench.testing.results import check_means
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from pfbench.testing import LawCheck
 
 _HEADS = ("law", "holds", "statistic", "limit", "message")
 
@@ -69,23 +83,30 @@ def _numbers(row: LawRow) -> str:
     return "" if row.statistic is None else f" ({row.statistic:.3g}, limit {row.limit:.3g})"
 
 
-def check_laws(thing: Any, runs: int = 200) -> LawTable:
+def check_laws(thing: Any, runs: int = 200, inputs: Any = ()) -> LawTable:
     """Check the laws that fit a part. A law that does not hold is a row and no error.
+
+    `pfbench.run` tries an own part by the same contract before any job starts, with two runs and without the statistical laws.
 
     Args:
         thing: Part, object or class of your own: filter, stage, model, scenario or noise regime.
         runs: Number of runs of the statistical checks of a filter.
+        inputs: Inputs of a model that reads some: its NamedTuple of tensors with the axes [1, T, ...] of all runs and steps.
 
     Returns:
         The laws with their results.
 
     Raises:
-        ValueError: If the object is none of these.
+        ValueError: If the object is none of these, or inputs are given to another part than a model.
     """
     with plain_errors():
         subject, group, stage = _build(thing)
+    if group != "model" and inputs != ():
+        raise ValueError(
+            f"inputs must be those of a model, got some for a {group}. Leave them out."
+        )
     checks: Mapping[str, Callable[[], Mapping[str, LawCheck]]] = {
-        "model": lambda: _check_model(subject),
+        "model": lambda: _check_model(subject, inputs),
         "scenario": lambda: _check_scenario(subject),
         "noise": lambda: _check_noise(subject),
     }
@@ -101,11 +122,49 @@ def check_laws(thing: Any, runs: int = 200) -> LawTable:
     )
 
 
+def try_own_parts(configs: Sequence[JobConfig]) -> None:
+    """Try the own parts of jobs before the first one starts, so that an error of a part comes at once and once.
+
+    Each world gives two runs. A filter of your own takes three steps of them, else a bootstrap filter does.
+
+    Raises:
+        ValueError: If a part breaks its contract.
+    """
+    episodes: dict[str, Episode] = {}
+    for config in configs:
+        inputs = find_inputs(config.values, config.trusted)
+        is_finished = find_result_path(config.values, inputs).is_file()
+        if not is_finished and list_used_packages(config):
+            with plain_errors(config.words):
+                try:
+                    _try_job(config, episodes)
+                except AssertionError as error:
+                    raise ValueError(f"{error}.") from error
+
+
+def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:
+    """Try the parts of a job; its world only if no job before has the same."""
+    plan = build_plan(config)
+    own = {name for name in PART_GROUPS if list_user_packages(config.values[name], config.trusted)}
+    world = json.dumps([plan.values[name] for name in ("scenario", "noise", "seed")], default=str)
+    if world not in episodes:
+        if "noise" in own:
+            _check_noise(plan.recording_regime.regime, runs=2)
+        if "scenario" in own:
+            _check_scenario(plan.scenario)
+        episodes[world] = plan.draw_episode(plan.runs[:2])
+    episode = episodes[world]
+    model = plan.make_filter_model(episode).to("cpu", torch.float64)
+    model.assemble(episode.truth)
+    method = plan.method if "filter" in own else ParticleFilter(20)
+    draws = PhiloxStream(plan.values["seed"], plan.runs[:2])
+    with torch.no_grad():
+        run_filter(method, model, first_steps(episode.record, 3), draws)
+
+
 def _build(thing: Any) -> tuple[Any, str, str]:
     """Return the object of a part or a class, its group, and its stage."""
     if isinstance(thing, Part):
-        from pfbench.job import instantiate
-
         config = compose([*thing.words(), *place_words([thing])])
         return instantiate(config.values[thing.group], config.trusted), thing.group, ""
     group, stage = find_group(thing)
@@ -114,11 +173,6 @@ def _build(thing: Any) -> tuple[Any, str, str]:
 
 def _check_filter(subject: Any, stage: str, runs: int) -> Mapping[str, LawCheck]:
     """Check a filter, or a stage by its own law and as a part of a filter."""
-    from dataclasses import replace
-
-    from pfbench import testing
-    from pfbench.filter import EssResampler, ParticleFilter
-
     if not stage:
         return testing.check_filter(subject, runs)
     alone: Mapping[str, Callable[[Any], LawCheck]] = {
@@ -134,20 +188,29 @@ def _check_filter(subject: Any, stage: str, runs: int) -> Mapping[str, LawCheck]
     return {**results, **testing.check_filter(method, runs)}
 
 
-def _check_model(model: Any) -> Mapping[str, LawCheck]:
+@dataclass(frozen=True)
+class _GivenInputs(ModelSimulation):
+    """Simulation of a model with inputs that are given."""
+
+    inputs: Any = ()
+
+    def make_inputs(self, time: torch.Tensor) -> Any:
+        """Return the inputs."""
+        return self.inputs
+
+
+def _check_model(model: Any, inputs: Any) -> Mapping[str, LawCheck]:
     """Check that a filter can follow data of a model, and the Jacobians that it states."""
-    import torch
-
-    from pfbench.core import PhiloxStream
-    from pfbench.core.record import map_inputs
-    from pfbench.filter import ParticleFilter, run_filter
-    from pfbench.model import StateSpaceModel
-    from pfbench.noise import NominalNoise
-    from pfbench.scenario import ModelSimulation, RecordingRegime
-    from pfbench.testing import LawCheck, check_jacobians
-
-    numbers, regime = torch.arange(20), RecordingRegime(NominalNoise())
-    episode = ModelSimulation(model, 10).draw(regime, numbers, 1)
+    needed = model.input_type
+    if needed is not None and not isinstance(inputs, needed):
+        raise ValueError(
+            f"inputs must be {needed.__name__} for {type(model).__name__}, got {type(inputs).__name__ if inputs else 'none'}. "
+            f"Use pfbench.check(model, inputs={needed.__name__}(...)) with tensors [1, T, ...]."
+        )
+    lengths = [10]
+    map_inputs(lambda a: lengths.insert(0, a.shape[1]), inputs)
+    numbers = torch.arange(20)
+    episode = _GivenInputs(model, lengths[0], inputs=inputs).draw(NominalNoise(), numbers, 1)
     result = run_filter(ParticleFilter(200), model, episode.record, PhiloxStream(1, numbers))
     lost = float((~torch.isfinite(result.mean).all(-1).all(-1)).sum())
     statement = "a bootstrap filter follows data of the model"
@@ -156,10 +219,12 @@ def _check_model(model: Any) -> Mapping[str, LawCheck]:
     )
     results = {"data": LawCheck(statement, lost, 0.0)}
     names = ("propagation_jacobian", "observation_jacobian", "noise_gain")
-    if any(getattr(type(model), n, None) is not getattr(StateSpaceModel, n, None) for n in names):
+    if any(hasattr(model, name) for name in names[:2]) or model.has_noise_gain:
         x = result.mean[:, -1:, :]
         if x.shape[-1] == model.chart.size:
-            errors = check_jacobians(model, x, map_inputs(lambda a: a[:, 0], episode.record.u))
+            errors = testing.check_jacobians(
+                model, x, map_inputs(lambda a: a[:, 0], episode.record.u)
+            )
             worst = max(errors, key=lambda name: errors[name])
             results["jacobians"] = LawCheck(
                 f"stated derivatives are those of the maps, worst {worst}", errors[worst], 1e-5
@@ -168,44 +233,78 @@ def _check_model(model: Any) -> Mapping[str, LawCheck]:
 
 
 def _check_scenario(scenario: Any) -> Mapping[str, LawCheck]:
-    """Check that a run is the same alone and among others."""
-    from pfbench.noise import NominalNoise
-    from pfbench.scenario import RecordingRegime
+    """Check that an episode has the axes of its runs and steps, and that a run is the same alone and among others."""
+    name = type(scenario).__name__
 
     def draw(numbers: Any) -> Any:
-        return scenario.draw(RecordingRegime(NominalNoise()), numbers, 1).record.y
+        episode = scenario.draw(RecordingRegime(NominalNoise()), numbers, 1)
+        assert isinstance(episode, Episode), (
+            f"{name}.draw must return an Episode, got {type(episode).__name__}. Return Episode(Record(y), time, truth)"
+        )
+        runs, steps = len(numbers), len(episode.time)
+        values = {"record.y": episode.record.y}
+        values |= {f"truth[{group!r}]": value for group, value in episode.truth.items()}
+        for key, value in values.items():
+            assert list(value.shape[:-1]) == [runs, steps], (
+                f"{name}.draw must return {key} with the axes of runs, steps and components, [{runs}, {steps}, ...], got "
+                f"{list(value.shape)}. Add the axis that it lacks, or let `time` have as many steps"
+            )
+        stated, width = getattr(scenario, "channel_names", ()), episode.record.y.shape[-1]
+        assert len(stated) in (0, width) or any(EACH_SATELLITE in text for text in stated), (
+            f"{name}.channel_names must be {width}, as the components of record.y, got {len(stated)}. Name each one"
+        )
+        inputs = getattr(scenario, "input_type", None) or type(episode.record.u)
+        assert isinstance(episode.record.u, inputs), (
+            f"{name}.draw must return the inputs {inputs.__name__}, which input_type states, got "
+            f"{type(episode.record.u).__name__}. Return Record(y, {inputs.__name__}(...))"
+        )
+        return episode.record.y
 
     return _check_alone("the data of a run do not depend on other runs", draw)
 
 
-def _check_noise(noise: Any) -> Mapping[str, LawCheck]:
-    """Check that the errors of a run are the same alone and among others."""
-    import torch
-
-    from pfbench.core import MeasurementChannels, PhiloxStream
-
-    channels = MeasurementChannels.of_one_kind(torch.ones(2, dtype=torch.float64))
-    time = torch.arange(1, 21, dtype=torch.float64)
+def _check_noise(noise: Any, runs: int = 2000) -> Mapping[str, LawCheck]:
+    """Check that the errors of a run are the same alone and among others, and have the distribution that is stated."""
+    channels = MeasurementChannels.of_one_kind(torch.ones(2, dtype=torch.float64), "position")
+    time, name = torch.arange(1, 201, dtype=torch.float64), type(noise).__name__
 
     def draw(numbers: Any) -> Any:
-        return noise.draw_errors(PhiloxStream(1, numbers), channels, time)
+        errors = noise.draw_errors(PhiloxStream(1, numbers), channels, time)
+        shape = [len(numbers), 200, 2]
+        got = list(getattr(errors, "shape", ())) or type(errors).__name__
+        assert got == shape, (
+            f"{name}.draw_errors must return errors [R, T, Dy] = {shape}, got {got}. Draw them by draws.normal(name, T, Dy)"
+        )
+        return errors
 
-    return _check_alone("the errors of a run do not depend on other runs", draw)
+    results = _check_alone("the errors of a run do not depend on other runs", draw)
+    factors = noise.process_factors(time)
+    got = list(factors.shape) if float(factors.min()) >= 0.0 else "a negative one"
+    assert got == [200], (
+        f"{name}.process_factors must return a factor of at least 0 for each time, [200], got {got}. "
+        "Leave the method out for nominal process noise"
+    )
+    try:
+        family, shift, scale = noise.error_distribution(channels, time)
+    except ValueError:
+        return results
+    errors, stated = draw(torch.arange(runs)), family(shift, scale)
+    ratio = (make_normal(shift, 0.7 * scale).log_prob(errors) - stated.log_prob(errors)).exp()
+    statement = "error_distribution is that of the errors"
+    means = {
+        "the ratio of a narrow normal density to it - 1": ratio.nan_to_num(1.0).mean(1).numpy()
+        - 1.0
+    }
+    law = check_means(statement, means, 4.5) if runs > 2 else LawCheck(statement, 0.0, 4.5)
+    return {**results, "distribution": law}
 
 
 def _check_alone(statement: str, draw: Callable[[Any], Any]) -> Mapping[str, LawCheck]:
-    """Compare the draws of a run alone with those among others, and with a second draw."""
-    import torch
-
-    from pfbench.testing import LawCheck
-
-    several, repeated, alone = draw(torch.arange(3)), draw(torch.arange(3)), draw(torch.tensor([2]))
-    assert torch.equal(several.nan_to_num(), repeated.nan_to_num()), (
-        f"{statement}: a second draw must be the same, got other numbers. Draw all random numbers from the stream"
-    )
-    difference = float((several[2] - alone[0]).abs().nan_to_num().max())
+    """Compare the draw of a run alone with that among others."""
+    several, alone = draw(torch.arange(2)), draw(torch.tensor([1]))
+    difference = float((several[1] - alone[0]).abs().nan_to_num().max())
     assert difference <= 1e-12, (
-        f"{statement}: run 2 alone must be as among others, got a difference of {difference:.3g}. "
-        "Draw all random numbers from PhiloxStream(seed, runs)"
+        f"{statement}: run 1 alone must be as among others, got a difference of {difference:.3g}. "
+        "Draw all random numbers from PhiloxStream(seed, runs), none from torch or NumPy"
     )
     return {"alone": LawCheck(statement, difference, 1e-12)}

@@ -28,7 +28,17 @@ STAGES = {
     "particle_count": ("belief",),
     "scheme": ("a", "n", "draws"),
 }
-_FAMILY = {"filter": "particle"}
+_MODEL = "model.StateSpaceModel", "a model, which is a module of torch", ("log_likelihood",)
+# by a method that only such a part has: base class, role, and what it inherits
+_BASES = {
+    "propagate": _MODEL,
+    "observation": _MODEL,
+    "draw_errors": (
+        "noise.NoiseRegime",
+        "a noise regime",
+        ("process_factors", "error_distribution"),
+    ),
+}
 
 
 def make_own(
@@ -41,7 +51,8 @@ def make_own(
     Args:
         thing: Filter, stage of a particle filter, model, scenario or noise regime. An object, or its class. Also the class
             of a network that `pfbench.train` trains as a proposal.
-        name: Name in tables and figures. The name of the class by default.
+        name: Name in tables and figures. The name of the class by default. A part with a name of pfbench is `own_NAME`
+            where a study chooses it.
         base: Particle filter that receives a stage.
         **arguments: Arguments of a class. For a scenario also `divergence_threshold`, the error above which a run has
             lost the track.
@@ -50,8 +61,7 @@ def make_own(
         The part.
 
     Raises:
-        ValueError: If the class has not the methods of any part, is defined inside of a function, or has the name of
-            a file of pfbench.
+        ValueError: If the class has not the methods of any part, or is defined inside of a function.
         TypeError: If an argument cannot be written into a file.
     """
     with plain_errors():
@@ -92,11 +102,12 @@ def find_group(thing: Any) -> tuple[str, str]:
                 f"{cls.__name__} must define {', '.join(missing)} to be a model, got a class without them. Add them."
             )
         return "model", ""
-    if callable(getattr(cls, "propagate", None)) or callable(getattr(cls, "observation", None)):
-        raise ValueError(
-            f"{cls.__name__} must be a subclass of pfbench.model.StateSpaceModel to be a model, which is a module of torch, "
-            f"got a subclass of {cls.__mro__[1].__name__}. Write class {cls.__name__}(StateSpaceModel)."
-        )
+    for method, (base, role, inherited) in _BASES.items():
+        if callable(getattr(cls, method, None)) and not all(hasattr(cls, n) for n in inherited):
+            raise ValueError(
+                f"{cls.__name__} must be a subclass of pfbench.{base} to be {role}, "
+                f"got a subclass of {cls.__mro__[1].__name__}. Write class {cls.__name__}({base.partition('.')[2]})."
+            )
     if _is_network(cls):
         return "filter", "network"
     methods = {"noise": ("draw_errors",), "scenario": ("draw",), "filter": ("init", "step")}
@@ -292,14 +303,12 @@ class _NodeWriter:
         return {**values, stage: [node] if stage == "moves" else node}
 
     def store(self, group: str, title: str, node: dict[str, Any]) -> Part:
-        """Write the file of a part into a folder named by its content."""
+        """Write the file of a part into a folder named by its content. A class with a name of pfbench is `own_NAME`."""
         import yaml
 
         name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|\W+", "_", title).strip("_").lower()
         if name in {path.stem for path in list_groups()[group]}:
-            raise ValueError(
-                f"name must not be that of a {group} of pfbench, got {name}. Use own(..., {title + ' 2'!r})."
-            )
+            name = f"own_{name}"
         head: dict[str, Any] = {}
         if self.model is not None:
             head = {"defaults": ["_self_", {"override /model@_global_.model": self.model.name}]}

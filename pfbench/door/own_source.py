@@ -1,20 +1,23 @@
-"""Source of a class of a script or a notebook as a module of its own, named by a digest of it.
+"""Source of a script or a notebook as modules that another process can import, so that workers run its classes.
 
-Another process can import the module, so that workers run the class and a result can be computed again. The module has the class,
-the functions, classes and constants of the script that it uses, and their imports, with the values at that time.
+Each class is stored once, in a module that is named by a digest of its text. It has the functions and constants of the script that
+the class uses, with their values at that time, and imports the other classes from theirs. So all parts of a script meet,
+and a part changes only with the code that it reaches.
 """
 
 from __future__ import annotations
 
 import ast
 import builtins
+import dis
 import hashlib
 import importlib
 import re
 import symtable
 import sys
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,32 +47,10 @@ class _Statement(NamedTuple):
 
 
 def write_module(cls: type) -> str:
-    """Write the module of a class of a script or a notebook.
+    """Write the module of a class of a script or a notebook, and those of the classes of the script that it uses.
 
     Returns the name of the module. The same source gives the same module.
     """
-    text = collect_source(cls)
-    digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-    stem = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|\W+", "_", cls.__name__).strip("_").lower()
-    name = f"own_{stem}_{digest}"
-    path = Path(WRITTEN) / f"{name}.py"
-    if not path.is_file() or path.read_text(encoding="utf-8") != text:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, lambda file: file.write(text.encode()))
-    split_trust([f"trust=[{name}]"])  # so that it is imported from its folder
-    importlib.invalidate_caches()
-    try:
-        import_module(name)
-    except Exception as error:
-        raise ValueError(
-            f"{cls.__name__} must run without the rest of its script, got {type(error).__name__}: {error}. "
-            f"Move it into a module of your own. The source that was collected is {path}."
-        ) from error
-    return name
-
-
-def collect_source(cls: type) -> str:
-    """Collect the source of a class of a script or a notebook with all that it uses."""
     if "<locals>" in cls.__qualname__:
         outer = cls.__qualname__.partition(".<locals>")[0]
         raise ValueError(
@@ -86,7 +67,75 @@ def collect_source(cls: type) -> str:
         raise ValueError(
             f"{cls.__name__} must be the class of that name, got one that was defined before. Make the object again."
         )
-    return _Collector(values, statements).collect(cls.__name__)
+    return _Script(values, statements).write(cls.__name__)
+
+
+class _Script:
+    """Script or notebook at one moment: values of its names, and the statements that define them.
+
+    Each class is in one module, from which all others import it, so that two parts that use a class mean the same one.
+    Functions and constants are repeated in each module: a part depends on nothing that it does not use.
+    """
+
+    def __init__(
+        self, values: Mapping[str, Any], statements: Mapping[str, list[_Statement]]
+    ) -> None:
+        self.values, self.statements = values, statements
+        self._modules: dict[str, str] = {}
+
+    def write(self, cls: str) -> str:
+        """Write the module of a class, once. Returns the name of the module."""
+        circle = [name for name in self._reach(cls) if cls in self._reach(name)]
+        classes = [name for name in (cls, *circle) if isinstance(self.values[name], type)]
+        head = min(classes, key=lambda name: self.statements[name][0].position)
+        if head not in self._modules:
+            text = _Collector(self, {*classes, *circle}).collect(head)
+            self._modules[head] = _store_module(head, text)
+        return self._modules[head]
+
+    def find_kind(self, name: str) -> str:
+        """Return how a module gets a name: import, constant, class, statement, or an empty text if it cannot."""
+        value = self.values[name]
+        if isinstance(value, types.ModuleType) or _is_of_module(value):
+            return "import"
+        if _is_constant(value):
+            return "constant"
+        if name not in self.statements:
+            return ""
+        return "class" if isinstance(value, type) else "statement"
+
+    def _reach(self, name: str) -> dict[str, None]:
+        """Return the classes and statements of the script that a name uses, directly or through others."""
+        reached: dict[str, None] = {}
+        pending = [name]
+        while pending:
+            texts = [statement.text for statement in self.statements[pending.pop()]]
+            used = {item for text in texts for item in list_globals(text) if item in self.values}
+            own = {item for item in used if self.find_kind(item) in ("class", "statement")}
+            pending += sorted(own - reached.keys())
+            reached |= dict.fromkeys(sorted(own))
+        return reached
+
+
+def _store_module(title: str, text: str) -> str:
+    """Store the text of a module under a name with its digest, and import it. Returns the name."""
+    digest = hashlib.sha256(text.encode()).hexdigest()[:10]
+    stem = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|\W+", "_", title).strip("_").lower()
+    name = f"own_{stem}_{digest}"
+    path = Path(WRITTEN) / f"{name}.py"
+    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, lambda file: file.write(text.encode()))
+    split_trust([f"trust=[{name}]"])  # so that it is imported from its folder
+    importlib.invalidate_caches()
+    try:
+        import_module(name)
+    except Exception as error:
+        raise ValueError(
+            f"{title} must run without the rest of its script, got {type(error).__name__}: {error}. "
+            f"Move it into a module of your own. The source that was collected is {path}."
+        ) from error
+    return name
 
 
 class _Collector:
@@ -97,10 +146,8 @@ class _Collector:
         selected: Statements of the script, by their position.
     """
 
-    def __init__(
-        self, values: Mapping[str, Any], statements: Mapping[str, list[_Statement]]
-    ) -> None:
-        self._values, self._statements = values, statements
+    def __init__(self, script: _Script, together: Collection[str]) -> None:
+        self._script, self._together = script, together
         self.lines: dict[str, str] = {}
         self.selected: dict[int, str] = {}
 
@@ -113,27 +160,30 @@ class _Collector:
 
     def _add_statements(self, name: str) -> None:
         """Add the statements that define a name, and the names that they use."""
-        for statement in self._statements[name]:
+        for statement in self._script.statements[name]:
             if statement.position not in self.selected:
                 self.selected[statement.position] = statement.text
                 for needed in list_globals(statement.text):
-                    self._add(needed, statement.node)
+                    self._add(needed, statement.text)
 
-    def _add(self, name: str, user: ast.stmt) -> None:
+    def _add(self, name: str, user: str) -> None:
         """Add a name that a statement uses, by its present value where that can be written."""
-        if name in self.lines or name not in self._values:
+        if name in self.lines or name not in self._script.values:
             self._check_exists(name, user)
             return
-        value = self._values[name]
+        value, kind = self._script.values[name], self._script.find_kind(name)
         if isinstance(value, types.ModuleType):
-            dotted = [statement.text for statement in self._statements.get(f"import {name}", ())]
+            imports = self._script.statements.get(f"import {name}", ())
+            dotted = [statement.text for statement in imports]
             self.lines[name] = "\n".join([f"import {value.__name__} as {name}", *dotted])
-        elif _is_of_module(value):
+        elif kind == "import":
             self.lines[name] = f"from {_find_home(value)} import {value.__qualname__} as {name}"
-        elif _is_constant(value):
+        elif kind == "constant":
             self.lines[name] = f"{name} = {value!r}"
-        elif name in self._statements:
-            for statement in self._statements[name]:
+        elif kind == "class" and name not in self._together:
+            self.lines[name] = f"from {self._script.write(name)} import {name}"
+        elif kind:
+            for statement in self._script.statements[name]:
                 _check_statement(name, statement.node)
             self._add_statements(name)
         else:
@@ -142,7 +192,7 @@ class _Collector:
                 "source. Pass it as an argument."
             )
 
-    def _check_exists(self, name: str, user: ast.stmt) -> None:
+    def _check_exists(self, name: str, user: str) -> None:
         """Check that a name is collected, a built-in one or only an annotation."""
         if name in self.lines or hasattr(builtins, name) or name in ("__name__", "__file__"):
             return
@@ -210,6 +260,7 @@ def _cut_text(text: str, node: ast.stmt) -> str:
     return "\n".join(text.splitlines()[first - 1 : node.end_lineno])
 
 
+@cache
 def list_globals(text: str) -> list[str]:
     """List the global names that a statement uses, those inside of its functions included."""
     names: dict[str, None] = {}
@@ -224,30 +275,20 @@ def list_globals(text: str) -> list[str]:
     return sorted(names)
 
 
-def _evaluated_names(node: ast.stmt) -> set[str]:
-    """Return the names in a statement outside of annotations, which a module does not evaluate."""
-
-    class Names(ast.NodeVisitor):
-        def __init__(self) -> None:
-            self.names: set[str] = set()
-
-        def visit_Name(self, node: ast.Name) -> None:
-            self.names.add(node.id)
-
-        def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
-            if node.value is not None:
-                self.visit(node.value)
-
-        def visit_arg(self, node: ast.arg) -> None:
-            pass
-
-        def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
-            for item in [*node.decorator_list, node.args, *node.body]:
-                self.visit(item)
-
-    visitor = Names()
-    visitor.visit(node)
-    return visitor.names
+def _evaluated_names(text: str) -> set[str]:
+    """Return the global names that a statement reads, without those of annotations, which a module does not evaluate."""
+    names: set[str] = set()
+    pending: list[Any] = [compile(text, "own", "exec", annotations.compiler_flag)]
+    while pending:
+        code = pending.pop()
+        pending += [item for item in code.co_consts if isinstance(item, types.CodeType)]
+        reads = (
+            item
+            for item in dis.get_instructions(code)
+            if item.opname in ("LOAD_GLOBAL", "LOAD_NAME")
+        )
+        names.update(item.argval for item in reads)
+    return names
 
 
 def _is_of_module(value: object) -> bool:

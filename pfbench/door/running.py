@@ -28,6 +28,7 @@ from pfbench.door.parts import (
 from pfbench.door.study import Study, open_study
 from pfbench.door.worker import COUNTER, JobReply, WorkerPool, run_config
 from pfbench.job.config import CHOICES, FILTER_SETS, JobConfig, compose
+from pfbench.job.run_job import list_used_packages
 from pfbench.results.conditions import JobFile
 
 log = logging.getLogger("pfbench")
@@ -77,6 +78,10 @@ def run_filters(
     jobs = [_list_words(choice, words) for choice in product(*parts, models)]
     with preserved_process():
         configs = [_compose_job(list(job)) for job in dict.fromkeys(map(tuple, jobs))]
+        if any(map(list_used_packages, configs)):
+            from pfbench.door.laws import try_own_parts
+
+            try_own_parts(configs)
         _run_jobs(configs, workers, progress)
     values = configs[0].values
     packages = dict.fromkeys(name for config in configs for name in config.trusted)

@@ -22,6 +22,10 @@ def check_fit(model: Any, scenario: Any, tree: Mapping[str, Any], trusted: Seque
     from pfbench.core.record import describe_misfit
 
     if difference := describe_misfit(model, scenario):
+        if not type(model).__module__.startswith("pfbench."):
+            raise ValueError(
+                f"model must fit the scenario: {difference}. Give both classes the same channel_names and input_type."
+            )
         raise _refusal(difference, list_fitting_models(tree, trusted))
 
 
@@ -37,10 +41,14 @@ def explain_error(
     Returns a refusal with the shipped models that fit. The error itself if there is none, or if the
     model fits this scenario, so that one of its values is wrong. A model without a name is judged by its class.
     """
-    target, fitting = (
-        str(tree["model"].get("_target_")),
-        list_fitting_models(tree, trusted, scenario),
-    )
+    target = str(tree["model"].get("_target_"))
+    if target.startswith("pfbench.") and not str(tree["scenario"]["_target_"]).startswith(
+        "pfbench."
+    ):
+        return ValueError(
+            "model must be given with a scenario of your own, got that of flights. Use pfbench.run(scenario, filters, model=...)."
+        )
+    fitting = list_fitting_models(tree, trusted, scenario)
     is_shipped = model in {path.stem for path in list_groups()["model"]}
     fits = model in fitting if is_shipped else target in fitting.values()
     if not fitting or fits or not target.startswith("pfbench."):

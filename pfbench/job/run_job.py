@@ -81,7 +81,7 @@ def run(
     config = resolve_config(config, choices)
     values = config.values
     inputs = find_inputs(values, config.trusted)
-    path = _result_path(values, inputs)
+    path = find_result_path(values, inputs)
     job_choices = {group: config.choices[group] for group in CHOICES}
     title = " / ".join(job_choices[group] for group in ("scenario", "noise", "filter"))
     name = title + describe_foreign(values)
@@ -199,8 +199,8 @@ def _read_meta(path: Path) -> dict[str, Any]:
         return {}
 
 
-def _result_path(values: Mapping[str, Any], inputs: Inputs) -> Path:
-    """Return the file of a job."""
+def find_result_path(values: Mapping[str, Any], inputs: Inputs) -> Path:
+    """Return the file of a job, whether it is finished or not."""
     study = values["study"]
     if study in _RESERVED:
         raise ValueError(

@@ -37,6 +37,9 @@ STUDY = re.compile(r"[A-Za-z0-9_][\w.+-]{0,99}", re.ASCII)
 WRITTEN = os.path.join(
     ".cache", "own"
 )  # in the current folder: modules of classes of a script or a notebook
+MODULE = re.compile(
+    r"own_\w+_[0-9a-f]{10}"
+)  # names of these modules, which end in a digest of the text
 _local: set[str] = set()  # trusted packages, which may lie in the current folder
 
 
@@ -60,9 +63,11 @@ class _CurrentFolder:
 
     @staticmethod
     def find_spec(name: str, path: object = None, target: object = None) -> ModuleSpec | None:
-        """Find a top-level package that the user trusts."""
-        is_trusted = path is None and name in {full.partition(".")[0] for full in _local}
+        """Find a top-level package that the user trusts, or a module of a script that a trusted one imports."""
         folders = [os.getcwd(), os.path.abspath(WRITTEN)]
+        if MODULE.fullmatch(name):
+            return PathFinder.find_spec(name, folders[1:])
+        is_trusted = path is None and name in {full.partition(".")[0] for full in _local}
         return PathFinder.find_spec(name, folders) if is_trusted else None
 
 

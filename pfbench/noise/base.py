@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypeAlias
@@ -23,8 +24,13 @@ _SAMPLES = 20  # samples of process noise within a step
 
 
 class NoiseRegime(Protocol):
-    """Deviations of a scenario from nominal noise."""
+    """Deviations of a scenario from nominal noise.
 
+    A regime of your own is a subclass with `draw_errors`. Errors that are multiples of `channels.sd` fit any scenario. The other
+    two methods are for process noise that changes with time, and for filters and bounds that know the distribution.
+    """
+
+    @abstractmethod
     def draw_errors(
         self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
     ) -> Tensor:
@@ -40,13 +46,14 @@ class NoiseRegime(Protocol):
         """
 
     def process_factors(self, time: Tensor) -> Tensor:
-        """Return factors on the process noise variance at times [T] s: [T].
+        """Return factors on the process noise variance at times [T] s: [T], 1 unless a regime changes them.
 
         In a simulation the factor applies to the white noise of the inertial sensors.
         """
+        return torch.ones_like(time)
 
     def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
-        """Return the distribution of the errors at times [T] s, for oracle noise.
+        """Return the distribution of the errors at times [T] s, for oracle noise and the bound of all filters.
 
         Args:
             channels: Nominal noise, kind and source of each component.
@@ -56,8 +63,10 @@ class NoiseRegime(Protocol):
             Family, shift and scale of the errors.
 
         Raises:
-            ValueError: If the errors do not have a distribution per step.
+            ValueError: If the errors do not have a distribution per step, or the regime does not define this method.
         """
+        name = type(self).__name__
+        raise make_no_distribution_error(name, f"{name} does not define error_distribution")
 
 
 class LayeredRegime(NoiseRegime):
@@ -137,14 +146,6 @@ def make_no_distribution_error(noise: str, reason: str) -> ValueError:
 # across regimes on common random numbers.
 
 
-class _UnitProcess(NoiseRegime):
-    """A regime with nominal process noise."""
-
-    @override
-    def process_factors(self, time: Tensor) -> Tensor:
-        return torch.ones_like(time)
-
-
 def _same_at_all_steps(
     family: Family, channels: MeasurementChannels, time: Tensor
 ) -> ErrorDistribution:
@@ -154,7 +155,7 @@ def _same_at_all_steps(
 
 
 @dataclass(frozen=True)
-class NominalNoise(_UnitProcess):
+class NominalNoise(NoiseRegime):
     """White normal errors of nominal size."""
 
     @override
@@ -169,7 +170,7 @@ class NominalNoise(_UnitProcess):
 
 
 @dataclass(frozen=True)
-class StudentTNoise(_UnitProcess):
+class StudentTNoise(NoiseRegime):
     """Student's t errors with `dof` degrees of freedom and nominal scale.
 
     The scale, and not the variance, is nominal. Nominal variance would make most errors smaller
@@ -205,7 +206,7 @@ class StudentTNoise(_UnitProcess):
 
 
 @dataclass(frozen=True)
-class LaplaceNoise(_UnitProcess):
+class LaplaceNoise(NoiseRegime):
     """Laplace errors of nominal variance.
 
     Only the shape differs from the assumption of a Kalman filter. Larger nominal errors become
@@ -226,7 +227,7 @@ class LaplaceNoise(_UnitProcess):
 
 
 @dataclass(frozen=True)
-class _ContaminatedNoise(_UnitProcess):
+class _ContaminatedNoise(NoiseRegime):
     """Normal errors, with some probability errors of another distribution.
 
     Attributes:
@@ -321,7 +322,7 @@ class GlintNoise(_ContaminatedNoise):
 
 
 @dataclass(frozen=True)
-class AddedErrors(_UnitProcess):
+class AddedErrors(NoiseRegime):
     """Errors in metres in addition to the nominal ones, for records whose measurements have errors already.
 
     Positions or, without positions, ranges get them; a scenario without both is refused. [ours]

@@ -92,10 +92,6 @@ class ErrorReplay(NoiseRegime):
         )
 
     @override
-    def process_factors(self, time: Tensor) -> Tensor:
-        return torch.ones_like(time)
-
-    @override
     def error_distribution(self, channels: MeasurementChannels, time: Tensor) -> ErrorDistribution:
         raise make_no_distribution_error(noise="replay", reason="its errors are correlated in time")
 

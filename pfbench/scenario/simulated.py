@@ -51,6 +51,8 @@ class ModelSimulation(Scenario):
     regime scales normal measurement errors. Its factor on the process noise multiplies the variance
     of the noise that drives a step, averaged over the interval that ends with the step.
 
+    A model that reads inputs has them from a subclass with `input_type` and `make_inputs`.
+
     Attributes:
         model: State-space model that draws states and measurements.
         steps: Measurements per run.
@@ -74,12 +76,17 @@ class ModelSimulation(Scenario):
     def __post_init__(self) -> None:
         require_ranges("scenario", self, steps="whole [1, inf)", interval_s="(0, inf]")
 
+    def make_inputs(self, time: Tensor) -> Any:
+        """Return the inputs of all runs at times [T]: a NamedTuple of tensors [1, T, ...], which is `input_type`."""
+        return ()
+
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
         model, stream = self.model, PhiloxStream(seed, runs)
         time = self.interval_s * torch.arange(1, self.steps + 1, dtype=torch.float64)
         blank = torch.full((len(runs), self.steps, 1), torch.nan, dtype=torch.float64)
         x = draw_initial_state(model, model.initial(len(runs)), stream, "world.state")
+        u = self.make_inputs(time)
         scale = process_variance_factors(noise, time).sqrt()
 
         @cache
@@ -88,13 +95,13 @@ class ModelSimulation(Scenario):
             return (NominalNoise() if is_nominal else noise).draw_errors(stream, channels, time)
 
         with named_inputs(model):
-            inputs = model.prepare(Record(blank))
+            inputs = model.prepare(Record(blank, u))
             steps = simulate_steps(model, inputs, stream, x, "world.state", scale)
             groups = take_groups(steps)
             parts = [_join_steps(model, group, draw_errors, stream, noise) for group in groups]
         states, y = (torch.cat(part, 1) for part in zip(*parts, strict=True))
         truth = {name: states[..., list(indices)] for name, indices in model.groups.items()}
-        return Episode(Record(y), time, truth)
+        return Episode(Record(y, u), time, truth)
 
 
 def _join_steps(

@@ -26,7 +26,7 @@ from pfbench.results import store
 
 WALK = ("scenario=linear_walk", "scenario.steps=5", "runs=3", "particles=30")
 # lines that a person writes or changes: the class with its imports, without the study
-GOAL = {"filter": 30, "proposal": 32, "model": 35, "scenario": 40, "log": 40}
+GOAL = {"filter": 30, "proposal": 32, "model": 35, "scenario": 40, "noise": 30, "log": 40}
 
 
 @pytest.mark.slow
@@ -84,7 +84,7 @@ def run_here(script: Path) -> str:
     ("words", "sentence"),
     [
         (("new",), "new must have a kind and a name, got none"),
-        (("new", "filtre", "x"), "kind must be one of filter, proposal, model, scenario, log, got filtre. Similar: filter"),
+        (("new", "filtre", "x"), "kind must be one of filter, proposal, model, scenario, noise, log, got filtre. Similar: filter"),
         (("new", "filter", "My-Idea"), "name must be of lower-case letters"),
         (("new", "filter", "torch"), "name must not be that of an installed package"),
         (("completion", "fish"), "shell must be one of bash, zsh, got fish"),

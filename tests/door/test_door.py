@@ -17,7 +17,7 @@ import torch
 from command_line import pfbench as command
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from notebook_cells import MODEL, PROPOSAL, Notebook
+from notebook_cells import MODEL, PROPOSAL, WORLD, Notebook
 
 import pfbench
 from pfbench.cli.compose import plan_study
@@ -163,6 +163,61 @@ def test_a_model_of_a_notebook_is_simulated_with_its_arguments(notebook: Noteboo
     assert pfbench.check(notebook["Room"]).passed
 
 
+def test_parts_of_a_script_share_its_classes_and_depend_on_what_they_reach(
+    notebook: Notebook,
+) -> None:
+    """Model and scenario have one input type and one helper; a class that no part reaches changes no key."""
+
+    def run_world() -> set[str]:
+        world, model, slips = (notebook[name]() for name in ("Sea", "Line", "Slips"))
+        study = pfbench.run(world, ["ekf", "sir"], model=model, noise=["nominal", slips], study="sea", **SMALL)  # fmt: skip
+        assert study.errors().shape == (8, 2)
+        return keys("sea")
+
+    notebook.run("SD = 1.0")
+    notebook.run(WORLD)
+    before = run_world()
+    assert len(before) == 4
+    notebook.run("class Unrelated:\n    pass")
+    assert run_world() == before
+    notebook.run("SD = 2.0")  # of the model
+    changed = run_world()
+    assert len(changed) == 8
+    helper = WORLD[WORLD.index("@dataclass") : WORLD.index("class Line")]
+    notebook.run(helper.replace("self.gain", "1.0 * self.gain"))  # of model and scenario
+    notebook.run(WORLD[WORLD.index("class Line") : WORLD.index("@dataclass(frozen=True)\nclass Slips")])  # fmt: skip
+    assert len(run_world()) == 12
+    result = next(iter(stored("sea").values()))
+    assert {"code of own_ship", "code of own_drive", "code of own_sea"} == result.meta["inputs"]["scenario"].keys()  # fmt: skip
+    ship = notebook["Ship"](torch.ones(1, 5, dtype=torch.float64))
+    assert pfbench.check(notebook["Line"](), inputs=ship).passed
+    assert "inputs must be Ship for Line, got none" in repr(pfbench.check(notebook["Line"]()))
+
+
+def test_classes_that_use_each_other_are_one_module(notebook: Notebook) -> None:
+    notebook.run(
+        "class A:\n    def __call__(self, a, n, draws):\n        return B\nclass B(A):\n    is_exact = True"
+    )
+    a, b = (pfbench.own(notebook[name]()).packages for name in "AB")
+    assert a == b
+
+
+@pytest.mark.parametrize("name", sorted(pfbench.names("noise")))
+def test_regimes_keep_the_contract_of_own_ones(name: str) -> None:
+    assert pfbench.check(pfbench.get("noise", name)).passed
+
+
+def test_a_regime_that_states_another_distribution_is_found(notebook: Notebook) -> None:
+    notebook.run(
+        WORLD.replace("NoiseRegime)", "NominalNoise)").replace(
+            "import NoiseRegime", "import NominalNoise"
+        )
+    )
+    (law,) = (row for row in pfbench.check(notebook["Slips"]()).rows if not row.holds)
+    assert law.statement == "error_distribution is that of the errors"
+    assert not pfbench.run(WALK, "ekf", noise=notebook["Slips"](), study="n", **SMALL).failed()
+
+
 def test_names_of_own_parts(notebook: Notebook) -> None:
     notebook.run("SCALE = 3.0")
     notebook.run(PROPOSAL)
@@ -187,6 +242,21 @@ def make(scale):
 """
 BAD_CELLS = {
     CLOSURE: ("make(2.0)()", "Scaled must be defined at the top level, got a class inside of make"),
+    f"SD = 1.0\n{WORLD}\nclass Bare:\n    def draw_errors(self, draws, channels, time):\n        return 0.0": (
+        "Bare()", "Bare must be a subclass of pfbench.noise.NoiseRegime to be a noise regime, got a subclass of object"
+    ),
+    f"SD = 1.0\n{WORLD}\nclass Flat(Slips):\n    def draw_errors(self, draws, channels, time):\n        return time": (
+        "Flat()", "Flat.draw_errors must return errors [R, T, Dy] = [2, 200, 2], got [200]"
+    ),
+    f"SD = 1.0\n{WORLD}\nclass Loud(Slips):\n    def draw_errors(self, draws, channels, time):\n        return time.nothing": (
+        "Loud()", "draw_errors of your class must succeed, got AttributeError: 'Tensor' object has no attribute 'nothing'. Correct the line: return time.nothing"
+    ),
+    f"SD = 1.0\n{WORLD}\nclass Dead(Sea):\n    def draw(self, noise, runs, seed):\n        e = super().draw(noise, runs, seed)\n        return Episode(e.record, e.time[:5], e.truth)": (
+        "Dead()", "Dead.draw must return record.y with the axes of runs, steps and components, [2, 5, ...], got [2, 8, 1]"
+    ),
+    f"SD = 1.0\n{WORLD}\nclass Calm(Sea):\n    def draw(self, noise, runs, seed):\n        return super().draw(noise, runs, seed)._replace(record=Record(torch.randn(len(runs), 8, 1)))": (
+        "Calm()", "draw of your class must succeed, got AttributeError: 'Episode' object has no attribute '_replace'"
+    ),
     "class Empty:\n    pass": ("Empty", "must have the methods of a part: filter init and step"),
     "class Call:\n    def __call__(self, x, y):\n        return x": ("Call()", "Got __call__(self, x, y)"),
     "class Plain:\n    def propagate(self, x, u, w):\n        return x": (
@@ -211,8 +281,12 @@ def test_classes_that_no_other_process_can_use_are_refused_in_a_sentence(
 ) -> None:
     expression, sentence = BAD_CELLS[cell]
     notebook.run(cell)
+    thing = eval(expression, vars(notebook.main))
+    kinds = {"draw_errors": "noise", "draw": "scenario"}
+    group = next((kinds[name] for name in kinds if hasattr(thing, name)), "filters")
+    model = {"model": notebook["Line"]()} if group == "scenario" else {}
     with pytest.raises((ValueError, TypeError), match=re.escape(sentence)):
-        pfbench.run(WALK, [eval(expression, vars(notebook.main))], **SMALL)
+        pfbench.run(**{"scenario": WALK, "filters": ["sir"], group: [thing], **model, **SMALL})
     assert not Path("results").exists()
 
 
