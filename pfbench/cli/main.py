@@ -21,6 +21,7 @@ from pfbench.cli.messages import (
 )
 from pfbench.cli.terminal import SignalStop, lasting_outputs, stop_workers, stopped_by_signals
 from pfbench.files.command_start import collect_as_usual, has_work_started, reset_work
+from pfbench.files.foreign_folder import guard_imports, make_child_environment
 from pfbench.job.trust import ENVIRONMENT, split_trust
 
 # command: function of the module of the same name, summary
@@ -59,6 +60,7 @@ _COMPOSING = (
     "infer",
     "datasheet",
 )  # that may choose files of the current folder
+_ENVIRONMENT = (ENVIRONMENT, "PYTHONSAFEPATH", "PYTHONPATH")
 USAGE = """\
 pfbench {version}: benchmarks of particle filters in integrated navigation
 
@@ -78,7 +80,9 @@ Python: import pfbench, then pfbench.run("growth", ["sir", "ekf"]); your own fil
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line."""
     words = list(sys.argv[1:] if argv is None else argv)
-    trusted, arguments = os.environ.get(ENVIRONMENT), sys.argv
+    before, arguments = {key: os.environ.get(key) for key in _ENVIRONMENT}, sys.argv
+    os.environ.update(make_child_environment())  # of the processes that a launcher starts
+    guard_imports()
     with lasting_outputs() as output, stopped_by_signals():
         try:
             _dispatch(words)
@@ -92,8 +96,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         finally:
             stop_workers()  # they keep the environment of this command
             # the next command of this process trusts nothing by this one
-            os.environ.pop(ENVIRONMENT, None)
-            os.environ.update({ENVIRONMENT: trusted} if trusted is not None else {})
+            for key, value in before.items():
+                os.environ.pop(key, None)
+                os.environ.update({key: value} if value is not None else {})
             sys.argv = arguments
         output.flush()
         if output.error and not isinstance(output.error, BrokenPipeError):
