@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import pfbench
@@ -21,7 +23,7 @@ from pfbench.cli.messages import (
 )
 from pfbench.cli.terminal import SignalStop, lasting_outputs, stop_workers, stopped_by_signals
 from pfbench.files.command_start import collect_as_usual, has_work_started, reset_work
-from pfbench.files.foreign_folder import guard_imports, make_child_environment
+from pfbench.files.foreign_folder import make_child_environment
 from pfbench.job.trust import ENVIRONMENT, split_trust
 
 # command: function of the module of the same name, summary
@@ -82,7 +84,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if argv is None else argv)
     before, arguments = {key: os.environ.get(key) for key in _ENVIRONMENT}, sys.argv
     os.environ.update(make_child_environment())  # of the processes that a launcher starts
-    guard_imports()
+    if os.path.exists("matplotlibrc"):  # which matplotlib reads before the settings of the user
+        with contextlib.chdir(Path(pfbench.__file__).parent):
+            import_module("matplotlib")
     with lasting_outputs() as output, stopped_by_signals():
         try:
             _dispatch(words)

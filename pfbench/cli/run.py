@@ -258,26 +258,23 @@ def run_with_retries(sweep: Callable[[], Any]) -> None:
             if not _LOST_PROCESS & {parent.__name__ for parent in type(error).__mro__}:
                 raise
             start_work()
+            loss = (
+                str(error).strip().split("\n")[-1] or type(error).__name__
+            )  # joblib's has the exit codes
             if not remaining:
                 packages = os.environ.get(ENVIRONMENT)
                 trusted = [f"trust=[{packages}]"] if packages else []
                 raise RuntimeError(
-                    f"the processes of a sweep must last, got lost ones {_RETRIES + 1} times ({_describe_loss(error)}). "
+                    f"the processes of a sweep must last, got lost ones {_RETRIES + 1} times ({loss}). "
                     "Finished jobs are kept. If the system killed them (SIGKILL), memory is short: use fewer processes "
                     "(hydra.launcher.n_jobs=2 or hydra.launcher.ray.init.num_cpus=2), or limit each job by "
                     "memory_limit_gib=... (GiB). Else their own lines above state the reason. Repeat the command: "
                     f"{shlex.join(['pfbench', 'run', *sys.argv[1:], *trusted])}"
                 ) from error
-            message = f"warning run: the sweep lost a process ({_describe_loss(error)}). Running the remaining jobs"
+            message = f"warning run: the sweep lost a process ({loss}). Running the remaining jobs"
             print(message, file=sys.stderr)
             if "ray" in sys.modules:
                 sys.modules["ray"].shutdown()  # the next attempt starts new processes of Ray
-
-
-def _describe_loss(error: Exception) -> str:
-    """Return how the processes of a launcher ended, as joblib states it, or the name of its error."""
-    codes = re.search(r"exit codes? of the workers? (?:are|is) \{(.+)\}", str(error))
-    return codes[1] if codes else type(error).__name__
 
 
 # --------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import logging
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -16,7 +17,7 @@ from contextlib import suppress
 from typing import Any, NamedTuple, Self
 
 from pfbench.cli.messages import format_error, notes_of
-from pfbench.files.foreign_folder import describe_end, start_python
+from pfbench.files.foreign_folder import start_python
 from pfbench.job.config import JobConfig
 from pfbench.job.trust import split_trust
 
@@ -130,9 +131,12 @@ class WorkerPool:
         answer = process.stdout.readline() if process.stdout else ""
         if answer:
             return JobReply(**json.loads(answer))
+        code = process.wait()
+        end = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         message = (
-            f"a worker must answer, got one of {len(self._processes)} that {describe_end(process.wait())}. "
-            "Use fewer workers, or limit each job by memory_limit_gib=... (GiB), or find the reason with workers=1."
+            f"a worker must answer, got one of {len(self._processes)} that ended with {end}. If the system killed it "
+            "(SIGKILL), memory is short: use fewer workers, or limit each job by memory_limit_gib=... (GiB). Else its own "
+            "lines above state the reason, and workers=1 shows it here."
         )
         name = _name(config)
         _end(process)
