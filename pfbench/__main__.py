@@ -7,10 +7,10 @@ from pathlib import Path
 import pfbench
 
 # Python puts the current folder first, where a file named like a library would run in its place
-if Path(pfbench.__file__).parents[1] != Path.cwd():
-    os.environ["PYTHONSAFEPATH"] = "1"  # for the processes of a launcher
-    if not sys.flags.safe_path and sys.path[:1] == [os.getcwd()]:
-        del sys.path[0]
+if not sys.flags.safe_path and sys.path[:1] == [os.getcwd()] != [
+    str(Path(pfbench.__file__).parents[1])
+]:
+    del sys.path[0]
 
 from pfbench.cli import main
 

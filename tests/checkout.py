@@ -8,7 +8,7 @@ from typing import Any
 TESTS = Path(__file__).resolve().parent
 ROOT = TESTS.parent
 PUBLISHED_FILE = re.compile(
-    r"reports/(README\.md|\w+/((report|worlds)\.md|(heat_map|matrices)\.svg|verdicts\.json(\.gz)?|words\.json|values\.json\.gz|runs\.parquet|figures/paper_\w+\.svg|results\.json\.gz"
+    r"reports/(README\.md|published\.json|\w+/((report|worlds)\.md|(heat_map|matrices)\.svg|verdicts\.json(\.gz)?|words\.json|values\.json\.gz|runs\.parquet|figures/paper_\w+\.svg|results\.json\.gz"
     r"|headline\.(png|svg)))"
 )
 _EVENTS = ("open", "os.listdir", "os.scandir")
@@ -35,6 +35,10 @@ def refuse_own_files(event: str, arguments: tuple[Any, ...]) -> None:
         return
     name = os.path.relpath(path, ROOT)
     top, _, below = name.partition("/")
-    is_published = PUBLISHED_FILE.fullmatch(name) and below.split("/")[0] in (*_LISTED, "README.md")
+    is_published = PUBLISHED_FILE.fullmatch(name) and below.split("/")[0] in (
+        *_LISTED,
+        "README.md",
+        "published.json",
+    )
     if top in ("reports", "results") and not (event == "open" and is_published):
         raise AssertionError(f"a test must not read {name}, which a clone in use may have")

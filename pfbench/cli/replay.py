@@ -26,12 +26,13 @@ a figure.
   scenario, noise, model     needed where the filter has results in several conditions
   device=cpu threads=1       where to compute; by default as stored
   trust=[mylab]              packages of a filter of your own, as in its run
+  checkpoint=FILE            weights that are not in results_dir
   results_dir, reports_dir   folders; files go to REPORTS/STUDY/replay/"""
 
 _CHOICES = ("scenario", "noise", "model")
 _REQUIRED = ("study", "run", "filter")
 _FOLDERS = ("results_dir", "reports_dir")
-_PLACES = ("device", "threads")
+_PLACES = ("device", "threads", "checkpoint")
 
 
 def replay_run(words: Sequence[str]) -> None:

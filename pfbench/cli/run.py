@@ -258,17 +258,20 @@ def run_with_retries(sweep: Callable[[], Any]) -> None:
             if not _LOST_PROCESS & {parent.__name__ for parent in type(error).__mro__}:
                 raise
             start_work()
+            loss = (
+                str(error).strip().split("\n")[-1] or type(error).__name__
+            )  # joblib's has the exit codes
             if not remaining:
                 packages = os.environ.get(ENVIRONMENT)
                 trusted = [f"trust=[{packages}]"] if packages else []
                 raise RuntimeError(
-                    "memory must be enough for all processes of the sweep, got a process that was "
-                    f"killed {_RETRIES + 1} times. Finished jobs are kept. Use fewer processes "
-                    "(hydra.launcher.n_jobs=2 or hydra.launcher.ray.init.num_cpus=2) or limit each "
-                    "job by memory_limit_gib=... (GiB). Then repeat the command: "
+                    f"the processes of a sweep must last, got lost ones {_RETRIES + 1} times ({loss}). "
+                    "Finished jobs are kept. If the system killed them (SIGKILL), memory is short: use fewer processes "
+                    "(hydra.launcher.n_jobs=2 or hydra.launcher.ray.init.num_cpus=2), or limit each job by "
+                    "memory_limit_gib=... (GiB). Else their own lines above state the reason. Repeat the command: "
                     f"{shlex.join(['pfbench', 'run', *sys.argv[1:], *trusted])}"
                 ) from error
-            message = "warning run: a process of the sweep was killed. Running the remaining jobs"
+            message = f"warning run: the sweep lost a process ({loss}). Running the remaining jobs"
             print(message, file=sys.stderr)
             if "ray" in sys.modules:
                 sys.modules["ray"].shutdown()  # the next attempt starts new processes of Ray

@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from pfbench.files.command_start import has_work_started
+from pfbench.files.escapes import ESCAPED
 
 _SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 _WATCH = "watch of the sweep"  # name of a thread
@@ -47,7 +48,7 @@ class LastingOutput:
         """Write a text."""
         if self.error is None:
             try:
-                return int(self._stream.write(text))
+                self._stream.write(text.translate(ESCAPED))
             except OSError as error:
                 self._leave(error)
         return len(text)

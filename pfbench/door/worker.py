@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -17,12 +17,12 @@ from contextlib import suppress
 from typing import Any, NamedTuple, Self
 
 from pfbench.cli.messages import format_error, notes_of
+from pfbench.files.foreign_folder import start_python
 from pfbench.job.config import JobConfig
 from pfbench.job.trust import split_trust
 
 COUNTER = "[...] "  # in the line of a job, replaced where the line is printed
-# the first argument is the search path of the process that starts the worker, so that both import the same modules
-_CODE = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from pfbench.door.worker import serve; serve()"
+_PROGRAM = "from pfbench.door.worker import serve; serve()"
 
 log = logging.getLogger("pfbench")
 
@@ -131,9 +131,12 @@ class WorkerPool:
         answer = process.stdout.readline() if process.stdout else ""
         if answer:
             return JobReply(**json.loads(answer))
+        code = process.wait()
+        end = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         message = (
-            f"memory must be enough for {len(self._processes)} workers, got a process that was killed "
-            f"(exit code {process.wait()}). Use fewer workers, or limit each job by memory_limit_gib=... (GiB)."
+            f"a worker must answer, got one of {len(self._processes)} that ended with {end}. If the system killed it "
+            "(SIGKILL), memory is short: use fewer workers, or limit each job by memory_limit_gib=... (GiB). Else its own "
+            "lines above state the reason, and workers=1 shows it here."
         )
         name = _name(config)
         _end(process)
@@ -141,10 +144,9 @@ class WorkerPool:
         return JobReply("failed", [f"{COUNTER}failed    {name}   {message}"], message)
 
     def _start(self) -> subprocess.Popen[str]:
-        """Start a worker, which imports what this process can import."""
-        path = json.dumps([os.path.abspath(folder) for folder in sys.path])
-        command, pipe = [sys.executable, "-c", _CODE, path], subprocess.PIPE
-        return subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
+        """Start a worker."""
+        pipe = subprocess.PIPE
+        return start_python(_PROGRAM, stdin=pipe, stdout=pipe, text=True)
 
 
 def _send(process: subprocess.Popen[str], message: Any) -> None:

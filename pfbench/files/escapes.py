@@ -15,6 +15,10 @@ from typing import Any
 # written. Each writer escapes them with the function of its format.
 
 
+# control characters of a terminal but line ends, tabs and the return of a progress bar
+ESCAPED = {c: f"\\x{c:02x}" for c in (*range(32), *range(127, 160)) if chr(c) not in "\n\r\t"}
+
+
 def _greek(letter: str) -> str:
     """Return the LaTeX name of a Greek letter."""
     return unicodedata.name(letter).split()[-1].lower().replace("lamda", "lambda")

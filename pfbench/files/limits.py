@@ -8,7 +8,7 @@ import stat
 import zipfile
 import zlib
 from collections import Counter
-from pathlib import Path
+from pathlib import Path, PurePath
 
 # of a configuration file
 CONFIG_BYTES = 1_000_000
@@ -53,6 +53,28 @@ def check_is_file(path: Path, most: int) -> None:
         raise LimitError(
             f"{path} must have at most {most} bytes, got {status.st_size}. Split the file."
         )
+
+
+def find_input(folder: str | Path, name: str, *, is_data_set: bool = False) -> Path:
+    """Return the path of a file or a folder that a configuration or a stored result names.
+
+    Args:
+        folder: Folder of the user.
+        name: Name below the folder. Nothing else is opened: no parent, no other place, no link that leads out of it.
+        is_data_set: Whether the name starts with a data set of the user's, which may be a link to another place.
+
+    Raises:
+        LimitError: If the name leaves the folder.
+    """
+    path, parts = Path(folder) / name, PurePath(name).parts
+    home = Path(folder, *parts[:is_data_set])
+    is_plain = ".." not in parts and not PurePath(name).is_absolute()
+    if is_plain and path.resolve().is_relative_to(home.resolve()):
+        return path
+    raise LimitError(
+        f"{name} must be a file or a folder below {folder}, got a path or a link that leaves it. "
+        "Copy it there, or name another folder on the command line, such as data.root=..."
+    )
 
 
 def check_columns(path: Path, count: int) -> None:

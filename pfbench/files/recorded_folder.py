@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
-import subprocess
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import Any, Self
@@ -31,7 +31,7 @@ class RecordedFolder:
     Use it as a context. At the end, files of the previous manifest that were not written again are
     removed if their content is unchanged. After an error nothing is removed. A file that the manifest
     does not list, or that was changed since, is never removed: it stays, or is renamed to `NAME.kept`
-    if its name is needed. A file whose content git stores is replaced without a copy.
+    if its name is needed. A file whose content this project has published is replaced without a copy.
 
     Args:
         path: The folder. It is created with the first file.
@@ -45,7 +45,6 @@ class RecordedFolder:
         self._previous = _read_manifest(self.path / MANIFEST)
         self._written: dict[str, str] = {}
         self._renamed: list[str] = []
-        self._in_git = list_unchanged_in_git(self.path) - self._previous.keys()
 
     def __enter__(self) -> Self:
         """Return the folder."""
@@ -64,7 +63,7 @@ class RecordedFolder:
         elif not self._written:
             return
         files = {**self._previous, **self._written}
-        _write_manifest(self.path / MANIFEST, files)
+        write_manifest(self.path / MANIFEST, files)
         self._report_other_files()
 
     def write(self, name: str, content: str | bytes) -> Path:
@@ -92,9 +91,8 @@ class RecordedFolder:
         start_work()
         plain = content.encode() if isinstance(content, str) else content
         digest = hash_content(plain)
-        expected = (digest, self._previous.get(name), self._written.get(name))
-        is_known = name in self._in_git or _hash_file(target) in expected
-        if target.is_symlink() or (target.exists() and not is_known):
+        expected = {digest, self._previous.get(name), self._written.get(name), *read_published()}
+        if target.is_symlink() or (target.exists() and _hash_file(target) not in expected):
             self._renamed.append(set_aside(target, "kept").relative_to(self.path).as_posix())
         write_atomically(target, lambda file: file.write(plain))
         self._written[name] = digest
@@ -128,8 +126,9 @@ class RecordedFolder:
             if (file.is_symlink() or file.is_file())
             and not any(file.is_relative_to(folder) for folder in nested)
             and (name := file.relative_to(self.path).as_posix())
-            not in (MANIFEST, *self._written, *self._previous, *self._in_git)
+            not in (MANIFEST, *self._written, *self._previous)
             and name not in self._renamed
+            and (file.is_symlink() or _hash_file(file) not in read_published())
         )
         if others and self._is_complete:
             log.warning(
@@ -171,7 +170,7 @@ def _find_fault(content: Any) -> str:
     return f"{bad[0]!r} is not a file of this folder" if bad else ""
 
 
-def _write_manifest(path: Path, files: dict[str, str]) -> None:
+def write_manifest(path: Path, files: dict[str, str]) -> None:
     """Write a manifest with its digest."""
     content: dict[str, Any] = {"files": dict(sorted(files.items()))}
     text = json.dumps({**content, DIGEST: hash_content(content)}, indent=1) + "\n"
@@ -203,25 +202,12 @@ def _list_names(names: Sequence[str]) -> str:
 
 
 # --------------------------------------------------------------------------------------------------
-# Files whose content git stores, so that a new file of that name loses nothing.
+# Files that this project has published, which a clone has without the manifests of their folders.
 
-_TIMEOUT = 10  # s
-
-
-def list_unchanged_in_git(folder: Path) -> set[str]:
-    """List the files of a folder whose content is that of the index of git.
-
-    Returns names relative to the folder, with `/`. Empty outside a repository and without git.
-    """
-    try:
-        stored, changed = (_list_files(folder, *option) for option in ((), ("--modified",)))
-    except (OSError, subprocess.SubprocessError):
-        return set()
-    return stored - changed
+PUBLISHED = Path(__file__).parents[2] / "reports" / "published.json"
 
 
-def _list_files(folder: Path, *options: str) -> set[str]:
-    """List the files of the index in a folder; with --modified those that differ from it."""
-    command = ["git", "-C", str(folder), "ls-files", "-z", *options]
-    done = subprocess.run(command, capture_output=True, check=True, timeout=_TIMEOUT)
-    return set(filter(None, done.stdout.decode(errors="surrogateescape").split("\0")))
+@cache
+def read_published() -> frozenset[str]:
+    """Read the digests of the published files of a checkout; none where pfbench is installed without it."""
+    return frozenset(_read_manifest(PUBLISHED).values())

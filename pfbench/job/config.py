@@ -483,7 +483,13 @@ def apply_readings(tree: Any, choices: Mapping[str, str]) -> None:
 
     if READING not in tree:
         return
-    node: Any = OmegaConf.to_container(tree[READING], resolve=False)
+    node: Any = tree[READING]
+    if not OmegaConf.is_dict(node):
+        raise ValueError(
+            f"{READING} must be papers with their readings, got {node!r:.80}. Choose one by "
+            f"{READING}/NUMBER=NAME: pfbench list {READING}"
+        )
+    node = OmegaConf.to_container(node, resolve=False)
     with flag_override(tree, ["struct", "readonly"], [False, False]):
         del tree[READING]
         for paper, stated in node.items():

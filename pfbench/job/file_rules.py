@@ -120,14 +120,16 @@ def launchers() -> tuple[str, ...]:
 
 
 def _walk(node: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
-    """Yield all values below a node with their paths."""
+    """Yield all values below a node with their paths; a key with dots is a path, as where a reading sets it."""
     if isinstance(node, Mapping):
         entries: Iterator[tuple[Any, Any]] = iter(node.items())
     else:
         entries = enumerate(node) if isinstance(node, list) else iter(())
     for key, value in entries:
-        yield (*path, key), value
-        yield from _walk(value, (*path, key))
+        is_path = isinstance(key, str) and "${" not in key
+        below = (*path, *((is_path and re.findall(r"[^.\[\]]+", key)) or [key]))
+        yield below, value
+        yield from _walk(value, below)
 
 
 def _find(node: Any, *path: str) -> Any:

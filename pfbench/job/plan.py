@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import hashlib
+import os
 import platform
 import subprocess
 import time
@@ -243,23 +245,39 @@ def describe_commit(checkout: Path) -> str:
 
     Pages, reports, analyses and tests do not count.
     """
-    present = [name for name in _DECIDING if (checkout / name).exists()]
-    commands = (
-        ("rev-parse", "--show-cdup", "--short", "HEAD"),  # the first is empty at the top
-        ("diff", "--no-ext-diff", "--name-only", "HEAD", "--", *present, ":!experiments/analyses"),
-    )
+    if not (checkout / ".git").exists():  # installed, perhaps in the repository of another project
+        return ""
+    commands = (("rev-parse", "--short", "HEAD"), ("ls-tree", "-rz", "HEAD", "--", *_DECIDING))
     try:
-        commit, changed = (_run_git(checkout, *command) for command in commands)
+        commit, tree = (_run_git(checkout, *command) for command in commands)
     except (OSError, subprocess.SubprocessError):
         return ""
-    if "/" in commit:
-        return ""
-    return f"{commit}-dirty" if commit and changed else commit
+    is_clean = all(_is_unchanged(checkout, entry) for entry in filter(None, tree.split("\0")))
+    return commit if is_clean else f"{commit}-dirty"
+
+
+def _is_unchanged(checkout: Path, entry: str) -> bool:
+    """Return whether a file has the content of its entry in a tree of git, which no filter of a repository decides."""
+    stored, _, name = entry.partition("\t")
+    file = checkout / name
+    content = file.read_bytes() if file.is_file() else b"missing"
+    blob = b"blob %d\0%s" % (len(content), content)
+    is_same = hashlib.sha1(blob, usedforsecurity=False).hexdigest() == stored.split()[2]
+    return is_same or name.startswith("experiments/analyses/")
 
 
 def _run_git(folder: Path, *words: str) -> str:
-    """Run git in a folder and return its output, empty after an error of git."""
-    command = ["git", "-C", str(folder), *words]
+    """Run git in a folder, without programs that its settings name, and return its output, empty after an error of git.
+
+    The commands read commits and trees. Neither reads the index or the files, so that neither asks monitors or filters.
+    """
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("GIT_")}
+    safe = ("-c", "core.fsmonitor=false", "-c", "safe.bareRepository=explicit")
     return subprocess.run(
-        command, capture_output=True, text=True, check=False, timeout=_TIMEOUT
+        ["git", "-C", str(folder), *safe, *words],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=_TIMEOUT,
+        env=environment | {"GIT_ALLOW_PROTOCOL": "none", "GIT_OPTIONAL_LOCKS": "0"},
     ).stdout.strip()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,7 +37,7 @@ from pfbench.results.plotting import (
     use_log_if_wide,
 )
 from pfbench.results.status import count_statuses, divergence_threshold
-from pfbench.results.store import DATA_FOLDERS, Inputs
+from pfbench.results.store import Inputs
 
 _ENGINES = ("kernels", "compiled")  # engines that a job may have used; the others are eager
 
@@ -71,9 +71,10 @@ def stored_config(meta: Mapping[str, Any], path: Path, changes: Mapping[str, Any
     }
     if meta.get("budget_allocation"):
         values["filter"]["particles"] = meta["particles"]
-    for key in DATA_FOLDERS:
-        _replace_folder(values, key.split("."), values["data"]["root"])
-    _replace_cache_folders(values["scenario"], values["episode_cache_dir"])
+    places = {"root": values["data"]["root"], "cache_dir": values["episode_cache_dir"]}
+    places |= {key: changes[key] for key in ("checkpoint",) if key in changes}
+    for name in parts:
+        _replace_places(values[name], places, path.parents[1])
     trusted = trusted_packages()
     packages = meta.get("trusted", [])
     if not set(packages) <= set(trusted):
@@ -103,21 +104,20 @@ def _list_changed_inputs(meta: Mapping[str, Any], present: Inputs) -> list[str]:
     return list_changed(meta["inputs"], present) if present and "inputs" in meta else []
 
 
-def _replace_folder(node: Any, path: Sequence[str], folder: str | None) -> None:
-    """Set a folder of data at a path of a stored configuration, if it has one."""
-    for name in path[:-1]:
-        node = node.get(name) if isinstance(node, dict) else None
-    if isinstance(node, dict) and node.get(path[-1]) is not None:
-        node[path[-1]] = folder
-
-
-def _replace_cache_folders(node: Any, folder: str | None) -> None:
-    """Set the cache folders of a stored scenario, which may be of another person."""
-    children = node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
-    for child in children:
-        _replace_cache_folders(child, folder)
-    if isinstance(node, dict) and node.get("cache_dir") is not None:
-        node["cache_dir"] = folder
+def _replace_places(node: Any, places: Mapping[str, str | None], results: Path) -> None:
+    """Set the folders of a stored configuration, which may be of another person, and check its weights."""
+    keys = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()  # fmt: skip
+    for key, value in keys:
+        if key in places and isinstance(value, str):
+            node[key] = places[key]
+        elif key == "checkpoint" and isinstance(value, str):
+            if not Path(value).resolve().is_relative_to(results.resolve()) and value != "untrained":
+                raise UntrustedConfigError(
+                    f"checkpoint must be a file below {results}, since a result names it, got {value}. Nothing was "
+                    f"opened. If it is yours, add checkpoint={value} to the command."
+                )
+        else:
+            _replace_places(value, places, results)
 
 
 def recompute_run(stored: StoredRun, changes: Mapping[str, Any]) -> store.JobResult:

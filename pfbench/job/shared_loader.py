@@ -124,6 +124,11 @@ class SharedLoader(ConfigLoaderImpl):
                 )
             return _references[key]
 
+        if "hydra_ray_launcher" in str(tree.hydra.launcher.get("_target_")):
+            from ray.job_config import JobConfig
+
+            # Ray puts the current folder before all libraries of a worker, unless there is a folder of its own
+            JobConfig._runtime_env_has_working_dir = lambda self: True
         sources = tree.hydra.runtime.config_sources
         is_foreign = any(source.provider.startswith(_SEARCH_PATH) for source in sources)
         check_composed(tree, overrides, compose_reference if is_foreign else None)

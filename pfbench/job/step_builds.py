@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from pfbench.files.atomic_write import write_atomically
+from pfbench.files.foreign_folder import start_python
 from pfbench.filter.particle import step_store
 from pfbench.job.memory import GIB, available_memory
 from pfbench.kernels import dispatch
@@ -44,11 +45,8 @@ _LARGEST_LEDGER = 500  # steps
 _LEAST_MEMORY = 4 * GIB  # free; a build takes less than 1 GiB
 _LONGEST_BUILD = 1800  # s
 _QUOTA = Path("/sys/fs/cgroup/cpu.max")
-# The low priority holds for the imports too. The folders of modules come first, so that all else can be imported.
-_PROGRAM = (
-    "import os, pickle, sys; os.nice(19); sys.path[:] = pickle.load(sys.stdin.buffer); "
-    "from pfbench.job.step_builds import build_step; build_step()"
-)
+# The low priority holds for the imports too.
+_PROGRAM = "import os; os.nice(19); from pfbench.job.step_builds import build_step; build_step()"
 _started: list[subprocess.Popen[bytes]] = []  # never waited for
 
 # --------------------------------------------------------------------------------------------------
@@ -153,7 +151,7 @@ def _start_build(name: str, parts: StepParts) -> None:
         step_store.clear_workshop()  # of a build that was killed
         with tempfile.TemporaryFile() as request:  # without a name, so that nothing remains of it
             try:
-                for item in (sys.path, (name, torch.get_num_threads()), parts):
+                for item in ((name, torch.get_num_threads()), parts):
                     pickle.dump(item, request)
             except (pickle.PicklingError, AttributeError, TypeError, RecursionError) as error:
                 _note(name, reason=f"another process cannot receive it: {error}"[:200])
@@ -161,17 +159,13 @@ def _start_build(name: str, parts: StepParts) -> None:
             request.seek(0)
             _note(name, reason="")
             _started.append(
-                subprocess.Popen(
-                    [sys.executable, "-P", "-c", _PROGRAM],
+                start_python(
+                    _PROGRAM,
+                    {**_ENVIRONMENT, "TORCHINDUCTOR_CACHE_DIR": str(step_store.workshop())},
                     stdin=request,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,
                     pass_fds=(lock,),
-                    env={
-                        **os.environ,
-                        **_ENVIRONMENT,
-                        "TORCHINDUCTOR_CACHE_DIR": str(step_store.workshop()),
-                    },
                 )
             )
     log.info("engine=auto: a background process compiles the step, which later jobs load")
@@ -208,7 +202,7 @@ def _lock() -> Iterator[int | None]:
 
 
 def build_step() -> None:
-    """Build the step that standard input describes, after the folders of modules. Note the reason if that fails."""
+    """Build the step that standard input describes. Note the reason if that fails."""
     signal.alarm(_LONGEST_BUILD)
     _offer_to_be_killed()
     name, threads = pickle.load(sys.stdin.buffer)

@@ -16,6 +16,7 @@ from typing_extensions import override
 from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
+from pfbench.files.limits import find_input
 from pfbench.files.table_file import check_parquet
 from pfbench.noise.base import (
     ErrorDistribution,
@@ -63,7 +64,11 @@ class ErrorReplay(NoiseRegime):
 
     def input_files(self) -> list[Path]:
         """List the file of the record."""
-        return [] if self.root is None else [Path(self.root) / self.folder / self.file]
+        return (
+            []
+            if self.root is None
+            else [find_input(self.root, f"{self.folder}/{self.file}", is_data_set=True)]
+        )
 
     @override
     def draw_errors(
@@ -109,7 +114,7 @@ class ErrorReplay(NoiseRegime):
                 f"environment variable PFBENCH_DATA, or data.root=..., "
                 f"to the folder that contains {self.folder}/."
             )
-        path = Path(self.root) / self.folder / self.file
+        path = self.input_files()[0]
         if not path.is_file():
             raise ValueError(
                 f"data.root must be the folder that contains {self.folder}/, got {self.root}. "

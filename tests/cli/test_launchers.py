@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import pytest
+from command_line import environment
 from hydra import compose, initialize_config_dir
 
-from pfbench import job
+from pfbench import cli, job
 from pfbench.cli.messages import format_error
 from pfbench.cli.run import run_with_retries
+from pfbench.door import worker
+from pfbench.files.foreign_folder import start_python
+
+main_module = import_module("pfbench.cli.main")
 
 
 def launcher(name: str, *words: str) -> Any:
@@ -70,7 +78,14 @@ def test_the_script_for_slurm_is_one_array_that_is_queued_again(tmp_path: Path) 
     )  # fmt: skip
     lines = script.splitlines()
     assert any(line.startswith("#SBATCH --array=0-11") for line in lines)
-    wanted = ("--requeue", "--cpus-per-task=2", "--mem=4GB", "--time=240", "--job-name=pfbench")
+    wanted = (
+        "--requeue",
+        "--cpus-per-task=2",
+        "--mem=4GB",
+        "--time=240",
+        "--export=ALL,PYTHONSAFEPATH=1",
+        "--job-name=pfbench",
+    )
     assert [option for option in wanted if f"#SBATCH {option}" not in lines] == []
     assert "module load python" in lines
 
@@ -121,13 +136,14 @@ def test_a_sweep_that_lost_a_process_goes_on_and_gives_up_in_the_end(
     assert answers == []
     assert (
         capsys.readouterr().err.count(
-            "a process of the sweep was killed. Running the remaining jobs"
+            "the sweep lost a process (TerminatedWorkerError). Running the remaining jobs"
         )
-        == 2
+        == 1
     )
-    answers += [TerminatedWorkerError()] * 9
+    ended = "worker stopped.\nThe exit codes of the workers are {EXIT(1), SIGKILL(-9)}"
+    answers += [TerminatedWorkerError(ended)] * 9
     words = ["pfbench run", "-m", "filter=sir,rpf", "scenario=a b"]
-    again = r"killed 4 times.*n_jobs=2.*: pfbench run -m filter=sir,rpf 'scenario=a b'$"
+    again = r"4 times \(.*\{EXIT\(1\), SIGKILL\(-9\)\}\).*n_jobs=2.*: pfbench run -m filter=sir,rpf 'scenario=a b'$"
     with mock.patch.object(sys, "argv", words), pytest.raises(RuntimeError, match=again):
         run_with_retries(sweep)
     assert len(answers) == 5
@@ -135,3 +151,107 @@ def test_a_sweep_that_lost_a_process_goes_on_and_gives_up_in_the_end(
     with pytest.raises(ValueError, match="a bad cell"):
         run_with_retries(sweep)
     assert len(answers) == 1
+
+
+# no child takes code or settings of the current folder
+
+LIBRARIES = ("cloudpickle", "copy", "csv", "json", "pickle", "queue", "random")
+AT_START = ("sitecustomize", "usercustomize")
+
+
+@pytest.fixture
+def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A current folder with modules that leave a file when they are imported, on the empty entry of PYTHONPATH too."""
+    for name in (*LIBRARIES, *AT_START):
+        (tmp_path / f"{name}.py").write_text(
+            f"open({str(tmp_path / 'ran')!r}, 'a').write(__name__)"
+        )
+    (tmp_path / "mylab.py").write_text("NAME = 'trusted'")
+    (tmp_path / "matplotlibrc").write_text("figure.facecolor: red")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep)
+    return tmp_path
+
+
+def ask(program: str, **more: str) -> str:
+    child = start_python(program, more, stdout=subprocess.PIPE, text=True)
+    return str(child.communicate()[0]).strip()
+
+
+@pytest.mark.parametrize("before", [[], [""]])  # a notebook has the current folder first
+def test_a_child_imports_libraries_and_trusted_packages(
+    hostile: Path, monkeypatch: pytest.MonkeyPatch, before: list[str]
+) -> None:
+    program = (
+        f"import {', '.join(LIBRARIES)}; from pfbench.job.trust import split_trust; "
+        "split_trust(['trust=[mylab]']); import mylab; print(mylab.NAME)"
+    )
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "path", [*before, *sys.path])
+        said = ask(program)
+    assert (said, (hostile / "ran").exists()) == ("trusted", False)
+
+
+def test_the_processes_of_joblib_import_nothing_of_the_current_folder(
+    hostile: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: dict[str, str] = {}
+    monkeypatch.setattr(main_module, "_dispatch", lambda words: seen.update(os.environ))
+    before = dict(os.environ)
+    cli.main(["run"])
+    assert dict(os.environ) == before
+    program = "import joblib; print(joblib.Parallel(2)(joblib.delayed(str)(x) for x in 'ab'))"
+    command = [sys.executable, "-P", "-c", program]
+    done = subprocess.run(command, env=seen, capture_output=True, text=True, check=True)
+    assert (done.stdout, (hostile / "ran").exists()) == ("['a', 'b']\n", False)
+
+
+def test_figures_have_the_settings_of_the_user_and_not_of_the_current_folder(
+    hostile: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    own = tmp_path_factory.mktemp("own") / "matplotlibrc"
+    own.write_text("figure.facecolor: blue")
+    show = "import matplotlib; print(matplotlib.rcParams['figure.facecolor'])"
+    guard = "from pfbench import cli; cli.main(['--version']); "
+    assert [ask(text).split()[-1] for text in (show, guard + show)] == ["red", "white"]
+    assert ask(guard + show, MATPLOTLIBRC=str(own)).endswith("blue")
+
+
+def test_ray_puts_no_current_folder_before_the_libraries_of_its_workers(hostile: Path) -> None:
+    pytest.importorskip("ray", reason='needs Ray: pip install "pfbench[ray]"')
+    program = (
+        "from pfbench import job; job.compose(['hydra/launcher=ray_local']); "
+        "from ray.job_config import JobConfig; print(JobConfig()._runtime_env_has_working_dir())"
+    )
+    assert (ask(program), (hostile / "ran").exists()) == ("True", False)
+
+
+@pytest.mark.parametrize(
+    ("end", "said"),
+    [("os._exit(3)", "exit code 3"), ("os.kill(os.getpid(), 9)", "SIGKILL"), ("os.abort()", "SIGABRT")],
+)  # fmt: skip
+def test_a_worker_that_ends_says_how(monkeypatch: pytest.MonkeyPatch, end: str, said: str) -> None:
+    monkeypatch.setattr(worker, "_PROGRAM", f"import os; sys.stdin.readline(); {end}")
+    config = job.compose(["scenario=linear_walk", "filter=ekf"])
+    with worker.WorkerPool(1) as pool:
+        (_, reply), *_ = pool.run([config])
+    assert f"ended with {said}." in reply.message
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["cores", "ray_local"])
+def test_a_study_in_a_hostile_folder_runs_and_is_reported(hostile: Path, launcher: str) -> None:
+    """The whole commands, with children of children."""
+    pytest.importorskip("ray", reason='needs Ray: pip install "pfbench[ray]"')
+    limit = (
+        "hydra.launcher.n_jobs=2" if launcher == "cores" else "hydra.launcher.ray.init.num_cpus=2"
+    )
+    study = ("run", "-m", "scenario=linear_walk", "filter=sir,ekf", "runs=10", "study=mine")
+    patient = {"RAY_raylet_start_wait_time_s": "300", "RAY_AUTH_MODE": "disabled"}
+    for words in ((*study, f"hydra/launcher={launcher}", limit), ("report", "study=mine")):
+        command = [sys.executable, "-P", "-m", "pfbench", *words]
+        env = os.environ | environment(hostile) | patient | {"PYTHONPATH": ""}
+        done = subprocess.run(command, env=env, cwd=hostile, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    assert not (hostile / "ran").exists()
+    assert "#ff0000" not in (hostile / "reports" / "mine" / "headline.svg").read_text()

@@ -36,7 +36,7 @@ QUIET = {
     "RAY_health_check_initial_delay_ms": "500", "RAY_health_check_period_ms": "500",
     "RAY_health_check_failure_threshold": "3",
 }  # fmt: skip
-LOST = "a process of the sweep was killed"
+LOST = "the sweep lost a process"
 
 
 def numbers(home: Path) -> dict[str, dict[str, np.ndarray]]:

@@ -43,6 +43,14 @@ REFUSED: dict[str, tuple[str, str, str]] = {  # place, text, message
     "folder by the sweep": ("experiment/a", SWEEP + "scenario: '{folder: a}'\n", r"scenario\.folder must be set"),
     "endless sweep": ("experiment/a", SWEEP + "runs: range(1,1000000000000)\n", "at most 100000 jobs"),
     "data of another key": ("train/a", "b: ${.root}\nroot: ${data.root}\n", "none of the user's folders"),
+    "data by a reading": (
+        "experiment/a",
+        "# @package _global_\nreading: {a: {factor: f, class: ours, why: w, filters: {sir: {'proposal.checkpoint': w.pt}}}}\n",
+        r"proposal\.checkpoint must be set on the command line",
+    ),
+    "cache by a reading": (
+        "experiment/a", "# @package _global_\nreading: {a: {filters: {sir: {'proposal[cache_dir]': w}}}}\n", "must be set"
+    ),
     "nested key": ("train/a", "c: data\nb: ${${train.c}.root}\n", "plain keys"),
     "quoted key": ("train/a", "b: ${oc.select:'data.root'}\n", "plain keys"),
     "circle": ("train/a", "defaults: [a]\n", "at most 300 files"),

@@ -22,10 +22,63 @@ from pfbench.files.table_file import read_table_file
 from pfbench.filter.learned.checkpoint import read_checkpoint
 from pfbench.logs.judge.formats import read_trajectories
 from pfbench.logs.judge.judge_options import SourceOptions
-from pfbench.logs.sky.ephemeris import read_rinex
+from pfbench.logs.sky.broadcast_orbits import BroadcastConstellation
+from pfbench.logs.sky.ephemeris import read_ephemeris, read_rinex
+from pfbench.logs.worlds.log_tables import find_dataset, list_tables
+from pfbench.logs.worlds.rinex_source import RinexSource
+from pfbench.noise.error_replay import ErrorReplay
 from pfbench.report import RUNS_FILE, read_stored_study
 from pfbench.results.store import read_metadata, read_result
 from pfbench.scenario.simulated import _read
+
+OUTSIDE = (
+    "../private/s.csv",
+    "logs/../../private/s.csv",
+    "{top}/private/s.csv",
+    "logs/link.csv",
+    "logs/away/s.csv",
+)
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_a_named_file_lies_in_the_folder_of_the_user(tmp_path: Path, name: str) -> None:
+    """No parent, other place or link below a data set leaves it. A data set itself may be a link of the user's."""
+    root, private = tmp_path / "data", tmp_path / "private"
+    for folder in (root / "logs", private):
+        folder.mkdir(parents=True)
+    (private / "s.csv").write_text("t,x\n1,2\n")
+    (root / "logs" / "own.csv").write_text("t,x\n1,2\n")
+    (root / "logs" / "link.csv").symlink_to(private / "s.csv")
+    (root / "logs" / "away").symlink_to(private)
+    (root / "mine").symlink_to(private)
+    for is_data_set in (False, True):
+        with pytest.raises(limits.LimitError, match="must be a file or a folder below"):
+            limits.find_input(root, name.format(top=tmp_path), is_data_set=is_data_set)
+        own = limits.find_input(root, "logs/own.csv", is_data_set=is_data_set)
+        assert own.read_text().startswith("t,x")
+    assert limits.find_input(root, "mine/s.csv", is_data_set=True).is_file()
+    with pytest.raises(limits.LimitError, match="Copy it there, or name another folder"):
+        limits.find_input(root, "mine/s.csv")
+
+
+PLACES: dict[str, Callable[[str, str], object]] = {
+    "table": lambda root, name: list_tables(root, "logs", (name,)),
+    "data set": lambda root, name: find_dataset(root, name),
+    "rinex": lambda root, name: RinexSource(observations=name).list_files(root, "logs"),
+    "rinex folder": lambda root, name: RinexSource().list_files(root, name),
+    "orbits": lambda root, name: BroadcastConstellation(root, name, 0.0).input_files(),
+    "ephemerides": lambda root, name: read_ephemeris(root, name),
+    "record": lambda root, name: ErrorReplay(root, "logs", name).input_files(),
+    "record of a folder": lambda root, name: ErrorReplay(root, name).read_record(),
+}
+
+
+@pytest.mark.parametrize("reader", PLACES)
+def test_every_reader_refuses_a_name_that_leaves_the_data(tmp_path: Path, reader: str) -> None:
+    (tmp_path / "data" / "logs").mkdir(parents=True)
+    for name in ("../../private", "logs/../../../private"):
+        with pytest.raises(limits.LimitError, match="private"):
+            PLACES[reader](str(tmp_path / "data"), name)
 
 
 def write_zip(path: Path) -> None:

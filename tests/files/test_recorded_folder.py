@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
 from checkout import ROOT
+from command_line import plant_programs, run_git
 
 from pfbench.files.atomic_write import DIGEST, hash_content, remove_temporary_files
 from pfbench.files.recorded_folder import MANIFEST, RecordedFolder
@@ -260,21 +260,21 @@ def test_no_other_module_removes_files() -> None:
 
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
-def test_a_file_that_git_stores_is_replaced_without_copy_and_warning(
+def test_a_published_file_is_replaced_without_copy_and_no_repository_runs_a_program(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As in a fresh clone, which has the published files without their manifest."""
-    for name in ("page.md", "figure.svg", "changed.md"):
-        (tmp_path / name).write_text("published")
-    for words in (("init", "-q"), ("add", ".")):
-        subprocess.run(["git", "-C", str(tmp_path), *words], check=True)
+    """As in a fresh clone, which has the published files without their manifest, and in the folder of a stranger."""
+    run_git(tmp_path, "init", "-q")
+    for name in ("report.md", "headline.svg", "changed.md"):
+        (tmp_path / name).write_bytes((ROOT / "reports" / "learn_gain" / "report.md").read_bytes())
+    plant_programs(tmp_path)
     (tmp_path / "changed.md").write_text("by hand")
     with RecordedFolder(tmp_path) as folder:
-        for name in ("page.md", "changed.md"):
+        for name in ("report.md", "changed.md"):
             folder.write(name, "new")
     names = {path.name for path in tmp_path.iterdir() if path.is_file()} - {MANIFEST}
-    assert names == {"page.md", "figure.svg", "changed.md", "changed.md.kept"}
+    assert names == {"report.md", "headline.svg", "changed.md", "changed.md.kept", ".gitattributes"}
     assert (tmp_path / "changed.md.kept").read_text() == "by hand"
     assert "changed.md.kept" in caplog.text
-    assert "page.md" not in caplog.text.replace("changed", "")
-    assert "figure.svg" not in caplog.text
+    assert "report.md" not in caplog.text
+    assert "headline.svg" not in caplog.text

@@ -7,17 +7,12 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from command_line import plant_programs, run_git as git
 
 from pfbench.job import trust
 from pfbench.job.plan import describe_commit
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
-
-
-def git(folder: Path, *words: str) -> str:
-    names = ("-c", "user.name=a", "-c", "user.email=a@b")
-    command = ["git", "-C", str(folder), *names, *words]
-    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
 
 def test_only_files_that_decide_results_mark_a_commit(tmp_path: Path) -> None:
@@ -53,6 +48,13 @@ def test_the_repository_of_another_project_is_not_that_of_pfbench(tmp_path: Path
     git(tmp_path, "commit", "-qm", "first")
     assert describe_commit(tmp_path) != ""
     assert describe_commit(inside) == ""
+    ran = plant_programs(tmp_path)
+    subprocess.run(["git", "-C", str(tmp_path), "diff", "HEAD"], capture_output=True)
+    assert ran.exists()  # the programs do run
+    ran.unlink()
+    assert describe_commit(tmp_path) == git(tmp_path, "rev-parse", "--short", "HEAD")
+    assert describe_commit(inside) == ""
+    assert not ran.exists()
 
 
 @pytest.mark.parametrize(

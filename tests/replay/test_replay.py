@@ -19,6 +19,7 @@ from pfbench.job.replay import (
     replay_config,
 )
 from pfbench.job.run_selection import StoredRun, find_run
+from pfbench.job.trust import UntrustedConfigError
 from pfbench.results import store
 
 WALK = ("scenario=linear_walk", "scenario.steps=8", "runs=4", "first_run=10", "score_steps=2")
@@ -172,6 +173,16 @@ def test_a_replay_writes_nowhere_else_whatever_a_result_says(home: Path) -> None
     assert "outside" not in json.dumps(values)
     assert values["scenario"]["cache_dir"] == values["scenario"]["nested"][0]["cache_dir"] == "mine"
     assert recompute_run(disguise(), changes).meta["study"] == "walks"
+    forged = {"deep": [{"root": "/private"}], "checkpoint": "/private/weights.pt"}
+    with pytest.raises(
+        UntrustedConfigError, match=r"add checkpoint=/private/weights\.pt to the command"
+    ):
+        replay_config(disguise(**forged), changes)
+    values = replay_config(disguise(**forged), {**changes, "checkpoint": "mine.pt"}).values
+    assert "private" not in json.dumps(values)
+    own = str(stored.job.path.parent / "checkpoints" / "weights.pt")
+    values = replay_config(disguise(checkpoint=own), changes).values
+    assert values["scenario"]["checkpoint"] == own
 
 
 OWN = """

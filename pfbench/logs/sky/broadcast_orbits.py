@@ -15,6 +15,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.parameter_checks import require_ranges
+from pfbench.files.limits import find_input
 from pfbench.files.reader_notes import announce_notes
 from pfbench.logs.sky.ephemeris import (
     CLOCK,
@@ -90,7 +91,7 @@ class BroadcastConstellation(Constellation):
 
     def input_files(self) -> list[Path]:
         """List the file of the ephemerides."""
-        return [] if self.root is None else [Path(self.root) / self.path]
+        return [] if self.root is None else [find_input(self.root, self.path, is_data_set=True)]
 
     @cached_property
     def epoch(self) -> float:

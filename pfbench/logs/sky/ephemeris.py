@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from pfbench.core.parameter_checks import require
-from pfbench.files.limits import read_text
+from pfbench.files.limits import find_input, read_text
 from pfbench.files.table_file import read_table_file
 from pfbench.logs.sky.rinex_blocks import find_ionosphere, unfold_blocks
 from pfbench.nav import earth
@@ -33,7 +33,7 @@ def read_ephemeris(root: str | None, path: str) -> RinexFile:
     )
     if root is None:
         raise ValueError(f"data.root is not set. Ephemerides are not part of the package. {remedy}")
-    file = Path(root) / path
+    file = find_input(root, path, is_data_set=True)
     require(file.is_file(), "data.root", f"contain {path}", f"{root} without {file}", remedy)
     if file.suffix == ".parquet":
         return RinexFile(check_numbers(read_table_file(file).rows, path), ())

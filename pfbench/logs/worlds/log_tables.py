@@ -13,6 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pfbench.core.parameter_checks import require
+from pfbench.files.limits import find_input
 from pfbench.files.table_file import Array as Array, read_table_file
 from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, PlausibleLimits, Quantity
 from pfbench.logs.worlds.time_order import find_order_remedy
@@ -43,7 +44,7 @@ def find_dataset(root: str | None, folder: str) -> Path:
         raise ValueError(
             f"data.root is not set. Recorded data are not part of the package. {remedy}"
         )
-    path = Path(root) / folder
+    path = find_input(root, folder, is_data_set=True)
     if not path.is_dir():
         raise ValueError(f"data.root must contain the folder {folder}, got {root}. {remedy}")
     return path
@@ -61,13 +62,16 @@ def list_tables(root: str | None, folder: str, names: Iterable[str | None]) -> l
 
     Returns the files that exist.
     """
+    if root is None:
+        return []
+    place = find_input(root, folder, is_data_set=True)
     paths = (
-        Path(root or "") / folder / f"{name}{suffix}"
+        find_input(place, f"{name}{suffix}")
         for name in names
         for suffix in _SUFFIXES
         if name is not None
     )
-    return [path for path in dict.fromkeys(paths) if root is not None and path.is_file()]
+    return [path for path in dict.fromkeys(paths) if path.is_file()]
 
 
 def find_table(folder: Path, name: str | None) -> Path:

@@ -13,6 +13,7 @@ import pandas as pd
 import torch
 
 from pfbench.core.parameter_checks import require
+from pfbench.files.limits import find_input
 from pfbench.files.reader_notes import skip_notes
 from pfbench.logs.sky.broadcast_orbits import BroadcastConstellation, Transmission, parse_gps_time
 from pfbench.logs.sky.ephemeris import WEEK
@@ -79,11 +80,14 @@ class RinexSource:
         must = "be codes of G and E on 1575.42 MHz, such as {G: [1C], E: [1C, 1X]}"
         require(codes and not wrong, "scenario.rinex.signals", must, ", ".join(wrong) or "none")
 
-    def list_files(self, folder: Path) -> list[Path]:
-        """List the files that are read; those that are not in the folder are left out."""
+    def list_files(self, root: str | None, name: str) -> list[Path]:
+        """List the files of a data set that are read; those that are not in its folder are left out."""
+        if root is None:
+            return []
+        folder = find_input(root, name, is_data_set=True)
         names = [self.observations, self.navigation]
         lists = [
-            [folder / name] if name else list_rinex(folder, kind)
+            [find_input(folder, name)] if name else list_rinex(folder, kind)
             for name, kind in zip(names, _KINDS.values(), strict=True)
         ]
         return [files[0] for files in lists if len(files) == 1 and files[0].is_file()]
@@ -157,10 +161,9 @@ class RinexSource:
         """Return the file of a key."""
         name, kind = getattr(self, key), _KINDS[key]
         if name is not None:
-            require(
-                (folder / name).is_file(), f"scenario.rinex.{key}", f"be a file in {folder}", name
-            )
-            return folder / name
+            file = find_input(folder, name)
+            require(file.is_file(), f"scenario.rinex.{key}", f"be a file in {folder}", name)
+            return file
         files = list_rinex(folder, kind)
         if not files and kind == "O":
             for file in sorted(folder.iterdir()):  # says how to unpack it
@@ -172,7 +175,7 @@ class RinexSource:
         got = ", ".join(file.name for file in files) or "none"
         label = {"O": "RINEX 3 observation", "N": "RINEX navigation"}[kind]
         require(len(files) == 1, f"the folder {folder}", f"contain one {label} file", got, f"Name it by scenario.rinex.{key}.")  # fmt: skip
-        return files[0]
+        return find_input(folder, files[0].name)
 
 
 def list_rinex(folder: Path, kind: str) -> list[Path]:

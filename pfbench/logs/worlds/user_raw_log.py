@@ -120,8 +120,8 @@ class UserRawLog(Scenario):
     def input_files(self) -> list[Path]:
         """List the files that `draw` reads."""
         names = (self.reference,) if self.standing is None and self.reference else ()
-        files = self.rinex.list_files(Path(self.root or "") / self.folder)
-        return [*list_tables(self.root, self.folder, names), *(files if self.root else [])]
+        rinex = self.rinex.list_files(self.root, self.folder)
+        return [*list_tables(self.root, self.folder, names), *rinex]
 
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
@@ -319,9 +319,8 @@ class UserInsLog(RecordedWalk):
 
     def input_files(self) -> list[Path]:
         """List the files that `draw` reads."""
-        files = self.rinex.list_files(Path(self.root or "") / self.folder)
         tables = list_tables(self.root, self.folder, (self.files.imu, self.files.reference))
-        return [*tables, *(files if self.root else [])]
+        return [*tables, *self.rinex.list_files(self.root, self.folder)]
 
     @override
     def _read_log(self, folder: Path) -> NavigationLog:

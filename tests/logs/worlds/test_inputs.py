@@ -15,6 +15,7 @@ from synthetic_log import tables, write
 
 from pfbench import job
 from pfbench.files.atomic_write import hash_file
+from pfbench.files.limits import LimitError
 from pfbench.job.inputs import check_unchanged, describe_unnamed_files, find_inputs
 from pfbench.job.plan import build_plan
 from pfbench.job.replay import recompute_run
@@ -103,6 +104,19 @@ def test_a_changed_table_is_another_job_of_the_same_settings(log: Path, name: st
     assert changed[:8] == key[:8]
     simulated = job.compose(["scenario=growth", "filter=ekf"])
     assert find_inputs(simulated.values) == {}
+
+
+def test_a_composed_name_reads_nothing_outside_the_data(log: Path) -> None:
+    """A file of a stranger must not write `..`, but it may compose it: the reader refuses it."""
+    home = log.parents[1]
+    folder = home / "conf" / "experiment"
+    folder.mkdir(parents=True)
+    for name, said in (("${d}${d}/secret", r"\.\./secret"), ("${d}${d}/${d}${d}/secret", r"\.\./\.\./secret")):  # fmt: skip
+        text = f"# @package _global_\nd: .\nscenario: {{files: {{imu: '{name}'}}}}\n"
+        (folder / "a.yaml").write_text(text)
+        words = (f"hydra.searchpath=[file://{folder.parent}]", "+experiment=a")
+        with pytest.raises(LimitError, match=said):
+            job.job_key(compose(home, *words).values)
 
 
 def test_a_digest_sees_a_change_that_keeps_size_and_time(tmp_path: Path) -> None:
