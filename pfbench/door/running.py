@@ -33,12 +33,15 @@ from pfbench.results.conditions import JobFile
 log = logging.getLogger("pfbench")
 
 
-def run_filters(
-    scenario: Any,
-    filters: Any,
+def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
+    scenario: str | Part | list[Any] | Any,
+    filters: str | Part | list[Any] | Any,
     *,
-    noise: Any = "nominal",
-    model: Any = None,
+    noise: str | Part | list[Any] | Any = "nominal",
+    model: str | Part | list[Any] | Any = None,
+    runs: int = 50,
+    particles: int | None = None,
+    seed: int | None = None,
     study: str = "notebook",
     workers: int = 1,
     progress: bool = True,
@@ -51,11 +54,16 @@ def run_filters(
         filters: Names, named sets, parts, or filters and stages of your own; one or a list.
         noise: Noise regime, or a list of them.
         model: Model of the filters. That of the scenario by default.
+        runs: Number of Monte Carlo runs, which all filters share.
+        particles: Number for each particle filter. 500 by default.
+        seed: With the number of a run it determines all random numbers. 1 by default.
         study: Name of the study.
         workers: Number of processes.
         progress: Whether each job prints a line.
-        **settings: Settings of the job by key, such as `runs=100`, `seed=2` or `particles=1000`. Two underscores stand
-            for a point. 50 runs by default.
+        **settings: Other settings by key. What is computed: `first_run`, `oracle_noise`, `pcrb`, `score_steps`, `budget`,
+            `checkpoint`. How: `dtype`, `device`, `threads`, `engine`, `memory_limit_gib`, `overwrite`. Where:
+            `results_dir`, `reports_dir`, `episode_cache_dir`. Keys of a part have two underscores for a point, such as
+            `scenario__steps=200`. `pfbench run --cfg job` prints all with their values.
 
     Returns:
         The study, which also holds results of earlier runs.
@@ -73,7 +81,9 @@ def run_filters(
         for group, value in (("scenario", scenario), ("noise", noise), ("filter", filters))
     ]
     models = [None] if model is None else list_parts("model", model)
-    words = format_words({"runs": 50, **settings, "study": study})
+    settings |= {"particles": particles} if particles is not None else {}
+    settings |= {"seed": seed} if seed is not None else {}
+    words = format_words({"runs": runs, **settings, "study": study})
     jobs = [_list_words(choice, words) for choice in product(*parts, models)]
     with preserved_process():
         configs = [_compose_job(list(job)) for job in dict.fromkeys(map(tuple, jobs))]
@@ -218,8 +228,9 @@ def _replies(configs: Sequence[JobConfig], workers: int) -> Iterator[tuple[int, 
         with WorkerPool(min(workers, len(configs))) as pool:
             yield from pool.run(configs)
         return
-    for number, config in enumerate(configs):
-        yield number, run_config(config)
+    with preserved_threads():
+        for number, config in enumerate(configs):
+            yield number, run_config(config)
 
 
 @contextlib.contextmanager
@@ -239,15 +250,24 @@ def _printed_lines() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def preserved_process() -> Iterator[None]:
-    """Restore the threads of torch and the environment after jobs, which set both."""
+def preserved_threads() -> Iterator[None]:
+    """Restore the threads of torch after jobs of this process. Those of workers need no torch here."""
     import torch
 
-    threads, environment = torch.get_num_threads(), dict(os.environ)
+    threads = torch.get_num_threads()
     try:
         yield
     finally:
         torch.set_num_threads(threads)
+
+
+@contextlib.contextmanager
+def preserved_process() -> Iterator[None]:
+    """Restore the environment after jobs, which set it."""
+    environment = dict(os.environ)
+    try:
+        yield
+    finally:
         for name in set(os.environ) - set(environment):
             del os.environ[name]
         os.environ.update(environment)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pfbench.cli.progress import StudyState, format_repeat, read_state
-from pfbench.door.parts import format_html_table, plain_errors
+from pfbench.door.parts import plain_errors
 from pfbench.job.trust import trusting
 
 if TYPE_CHECKING:
@@ -86,12 +86,15 @@ class Study:
             **options: Options of a report, such as `baseline="ekf"`.
 
         Returns:
-            Sentence and leaderboard, as text and in a notebook as a table.
+            Sentence, leaderboard and failed jobs, as text and in a notebook as tables.
         """
         from pfbench.door.comparisons import summarise_study
 
+        has_results = any((Path(self.results) / self.name).glob("*.npz"))
+        failures = self.failed()
         with plain_errors():
-            return summarise_study(self.name, self.conditions(), options)
+            conditions = self.conditions() if has_results or not failures else []
+            return summarise_study(self.name, conditions, failures, options)
 
     def compare(self, a: str, b: str) -> Comparison:
         """Compare two filters in the runs that both have, as all pages do.
@@ -156,12 +159,12 @@ class Study:
         Returns:
             A row per step: time, error, standard deviation, NEES and traces such as the effective sample size.
         """
-        from pfbench.door.running import preserved_process
+        from pfbench.door.running import preserved_process, preserved_threads
         from pfbench.job.config import compose
         from pfbench.job.replay import recompute_run, tabulate_traces
         from pfbench.job.run_selection import find_run
 
-        with plain_errors(), preserved_process(), trusting(self.trust):
+        with plain_errors(), preserved_process(), preserved_threads(), trusting(self.trust):
             stored = find_run(self.name, self.results, run, label, choice)
             places = compose([]).values
             names = ("data", "results_dir", "reports_dir", "episode_cache_dir")
@@ -266,12 +269,14 @@ class Study:
 
         return list_main_groups(self.conditions())
 
+    def __repr__(self) -> str:
+        try:
+            return f"study {self.name}\n\n{self.summary()!r}"
+        except ValueError as error:
+            return f"study {self.name} has no summary: {error}"
+
     def _repr_html_(self) -> str:
-        failures = self.failed()
-        rows = [(note["filter"], note["scenario"], note["message"]) for note in failures]
-        table = format_html_table(("failed filter", "scenario", "message"), rows) if rows else ""
-        has_results = any((Path(self.results) / self.name).glob("*.npz"))
-        return (self.summary()._repr_html_() if has_results else "") + table
+        return self.summary()._repr_html_()
 
 
 def open_study(
