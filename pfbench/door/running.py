@@ -40,8 +40,8 @@ def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
     noise: str | Part | list[Any] | Any = "nominal",
     model: str | Part | list[Any] | Any = None,
     runs: int = 50,
-    particles: int | None = None,
-    seed: int | None = None,
+    particles: int = 500,
+    seed: int = 1,
     study: str = "notebook",
     workers: int = 1,
     progress: bool = True,
@@ -55,8 +55,8 @@ def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
         noise: Noise regime, or a list of them.
         model: Model of the filters. That of the scenario by default.
         runs: Number of Monte Carlo runs, which all filters share.
-        particles: Number for each particle filter. 500 by default.
-        seed: With the number of a run it determines all random numbers. 1 by default.
+        particles: Number for each particle filter that states none of its own.
+        seed: With the number of a run it determines all random numbers.
         study: Name of the study.
         workers: Number of processes.
         progress: Whether each job prints a line.
@@ -81,13 +81,11 @@ def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
         for group, value in (("scenario", scenario), ("noise", noise), ("filter", filters))
     ]
     models = [None] if model is None else list_parts("model", model)
-    settings |= {"particles": particles} if particles is not None else {}
-    settings |= {"seed": seed} if seed is not None else {}
-    words = format_words({"runs": runs, **settings, "study": study})
+    named = {"runs": runs, "particles": particles, "seed": seed}
+    words = format_words({**named, **settings, "study": study})
     jobs = [_list_words(choice, words) for choice in product(*parts, models)]
-    with preserved_process():
-        configs = [_compose_job(list(job)) for job in dict.fromkeys(map(tuple, jobs))]
-        _run_jobs(configs, workers, progress)
+    configs = [_compose_job(list(job)) for job in dict.fromkeys(map(tuple, jobs))]
+    _run_jobs(configs, workers, progress)
     values = configs[0].values
     packages = dict.fromkeys(name for config in configs for name in config.trusted)
     return open_study(
@@ -177,10 +175,9 @@ def continue_jobs(study: Study, runs: int, workers: int, progress: bool) -> None
         for condition in study.conditions()
         for job in condition.jobs
     ]
-    with preserved_process():
-        for config in configs:
-            _check_settings(config)
-        _run_jobs(configs, workers, progress)
+    for config in configs:
+        _check_settings(config)
+    _run_jobs(configs, workers, progress)
 
 
 def _continue_job(job: JobFile, runs: int, trusted: Sequence[str]) -> JobConfig:
@@ -228,7 +225,7 @@ def _replies(configs: Sequence[JobConfig], workers: int) -> Iterator[tuple[int, 
         with WorkerPool(min(workers, len(configs))) as pool:
             yield from pool.run(configs)
         return
-    with preserved_threads():
+    with preserved_process():  # which imports torch, that workers import themselves
         for number, config in enumerate(configs):
             yield number, run_config(config)
 
@@ -250,24 +247,15 @@ def _printed_lines() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def preserved_threads() -> Iterator[None]:
-    """Restore the threads of torch after jobs of this process. Those of workers need no torch here."""
+def preserved_process() -> Iterator[None]:
+    """Restore the threads of torch and the environment after jobs, which set both."""
     import torch
 
-    threads = torch.get_num_threads()
+    threads, environment = torch.get_num_threads(), dict(os.environ)
     try:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-@contextlib.contextmanager
-def preserved_process() -> Iterator[None]:
-    """Restore the environment after jobs, which set it."""
-    environment = dict(os.environ)
-    try:
-        yield
-    finally:
         for name in set(os.environ) - set(environment):
             del os.environ[name]
         os.environ.update(environment)

@@ -159,12 +159,12 @@ class Study:
         Returns:
             A row per step: time, error, standard deviation, NEES and traces such as the effective sample size.
         """
-        from pfbench.door.running import preserved_process, preserved_threads
+        from pfbench.door.running import preserved_process
         from pfbench.job.config import compose
         from pfbench.job.replay import recompute_run, tabulate_traces
         from pfbench.job.run_selection import find_run
 
-        with plain_errors(), preserved_process(), preserved_threads(), trusting(self.trust):
+        with plain_errors(), preserved_process(), trusting(self.trust):
             stored = find_run(self.name, self.results, run, label, choice)
             places = compose([]).values
             names = ("data", "results_dir", "reports_dir", "episode_cache_dir")

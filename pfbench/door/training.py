@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from pfbench.door.parts import Part, add_changes, format_words, place_words, plain_errors
-from pfbench.door.running import list_parts, preserved_process, preserved_threads
+from pfbench.door.running import list_parts, preserved_process
 from pfbench.job.trust import trusting
 
 
@@ -49,7 +49,7 @@ def train_filter(
     words += [f"train={objective}", *(f"train.{word}" for word in format_words(settings))]
     words += [*format_words({"study": study}), *place_words(parts)]
     packages = [name for item in parts for name in item.packages]
-    with plain_errors(words), preserved_process(), preserved_threads(), trusting(packages):
+    with plain_errors(words), preserved_process(), trusting(packages):
         path = fit_network(words, print if progress else lambda line: None)
     return add_changes(parts[-1], format_words({"checkpoint": str(path.resolve())}))
 

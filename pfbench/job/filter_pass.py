@@ -121,7 +121,7 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
         counter.count = 0
         threads = values["threads"] if device == "cpu" else 1
         estimate = run_filter(method, model, episode.record, draws, watch, tick, batch, threads)
-        _wait_for(device)
+        wait_for(device)
     step_compile_seconds = step.seconds if step else 0.0
     filter_seconds = (
         clock() - start_time - warm_up_seconds - recorder.seconds - step_compile_seconds
@@ -194,13 +194,13 @@ def _warm_up(
     first = slice(0, batch)
     beginning = first_steps(record.select_runs(first), _WARM_UP_STEPS)
     run_filter(step or plan.method, model, beginning, draws.select_runs(first))
-    _wait_for(plan.values["device"])
+    wait_for(plan.values["device"])
     if step is None or (step.on_missing and not step.is_active and batch != by_kernels):
         return plan.method, by_kernels
     return step, batch
 
 
-def _wait_for(device: str) -> None:
+def wait_for(device: str) -> None:
     """Wait until a device has computed what was asked of it, so that a clock can be read."""
     if device != "cpu":
         torch.cuda.synchronize()
