@@ -60,6 +60,7 @@ def select_figures(pack: Pack) -> dict[str, Plot]:
     rows = find_rows(pack).values()
     has_ratio = any(is_number(row["ratio"]) for row in rows)
     has_cost = any(is_number(row["ratio"]) and is_number(row["ms"]) for row in rows)
+    has_cost = has_cost and all(note.get("is_timed") for note in pack["filter_notes"])
     regime = str(pack["regimes"][0]["key"]) if pack["regimes"] else ""
     plots: dict[str, tuple[Plot, bool]] = {
         "leaderboard": (plot_leaderboard, has_ratio),
