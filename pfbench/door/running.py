@@ -28,6 +28,7 @@ from pfbench.door.parts import (
 from pfbench.door.study import Study, open_study
 from pfbench.door.worker import COUNTER, JobReply, WorkerPool, run_config
 from pfbench.job.config import CHOICES, FILTER_SETS, JobConfig, compose
+from pfbench.job.settings import check_settings
 from pfbench.results.conditions import JobFile
 
 log = logging.getLogger("pfbench")
@@ -157,15 +158,8 @@ def _compose_job(words: list[str]) -> JobConfig:
     """Compose and check the configuration of a job. Raises ValueError with the sentence of the command line."""
     with plain_errors(words):
         config = compose(add_search_path(words))
-        _check_settings(config)
+        check_settings(config.values)
     return config
-
-
-def _check_settings(config: JobConfig) -> None:
-    """Check the settings of a job before the first one runs."""
-    from pfbench.job.settings import check_settings
-
-    check_settings(config.values)
 
 
 def continue_jobs(study: Study, runs: int, workers: int, progress: bool) -> None:
@@ -176,7 +170,7 @@ def continue_jobs(study: Study, runs: int, workers: int, progress: bool) -> None
         for job in condition.jobs
     ]
     for config in configs:
-        _check_settings(config)
+        check_settings(config.values)
     _run_jobs(configs, workers, progress)
 
 

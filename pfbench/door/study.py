@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import webbrowser
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,8 +65,10 @@ class Study:
         Returns:
             Errors in the unit of the group. Rows of several conditions have their names in the index.
         """
+        from pfbench.results.frame import list_main_groups
+
         frame = self.table("rmse")
-        mains = self._main_groups()
+        mains = list_main_groups(self.conditions())
         names = sorted(set(frame["group"]))
         if group is not None and group not in names:
             raise ValueError(
@@ -262,12 +263,6 @@ class Study:
 
         with plain_errors():
             return load_conditions(self.name, self.results)
-
-    def _main_groups(self) -> Mapping[tuple[str, str, str], str]:
-        """Return the main group by scenario, noise and model."""
-        from pfbench.results.frame import list_main_groups
-
-        return list_main_groups(self.conditions())
 
     def __repr__(self) -> str:
         try:

@@ -403,7 +403,6 @@ class MethodNotes:
         self._bounded: dict[str, set[bool | None]] = {}
         self._choices: dict[str, dict[str, None]] = {}
         self._truths: dict[str, None] = {}
-        self._cold: set[str] = set()
 
     def add(self, label: str, result: JobResult) -> None:
         """Add a job."""
@@ -412,8 +411,7 @@ class MethodNotes:
         counts = self._counts.setdefault(label, Counter())
         counts.update({name: int(status[name] or 0) for name in _COUNTS})
         counts["limited_runs"] += int(meta["runs"]) if status["diverged"] is not None else 0
-        if WARM_UP not in meta["seconds"] and STEP_TIME not in meta:
-            self._cold.add(label)
+        counts["cold_jobs"] += WARM_UP not in meta["seconds"] and STEP_TIME not in meta
         particles = meta.get("particles")
         self._particles.setdefault(label, {})[str(particles)] = None
         self._exact[label] = self._exact.get(label, True) and bool(meta.get("is_exact"))
@@ -436,7 +434,7 @@ class MethodNotes:
             has_limit = counts["limited_runs"] > 0
             notes.append({
                 "filter": label, "particles": " or ".join(particles), "is_exact": self._exact[label],
-                "has_bounded_weights": _common(self._bounded[label]), "is_timed": label not in self._cold,
+                "has_bounded_weights": _common(self._bounded[label]), "is_timed": not counts["cold_jobs"],
                 **{name: counts[name] for name in _COUNTS},
                 "diverged": counts["diverged"] if has_limit else None,
             })  # fmt: skip
