@@ -96,9 +96,7 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     Returns the results. Shapes: runs [R].
     """
     values, method, clock = plan.values, plan.method, plan.choose_timer()
-    device, engine = values["device"], values["engine"]
-    if engine == "auto" and values["budget"] != store.SAME_N:
-        engine = "kernels"  # as the trials that gave the number of particles
+    device = values["device"]
     model, steps = plan.make_filter_model(episode), episode.record.y.shape[1]
     truth = model.assemble(episode.truth).to(device, plan.dtype)
     recorder = ScoreRecorder(model, truth, values["score_steps"], clock, episode.measured_truth)
@@ -108,9 +106,7 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
         with counter.paused():
             return recorder(t, info)
 
-    compile_start = time.perf_counter()
-    engine = choose_engine(engine, method, model, len(runs), steps)
-    compile_seconds = time.perf_counter() - compile_start
+    engine, compile_seconds = _time_choice(plan, model, len(runs), steps)
     draws = PhiloxStream(values["seed"], runs.to(device), plan.dtype)
     with _prepare_torch(plan, engine), _show_progress(steps, label) as tick:
         step = _compile_step(engine, method, counter, clock, _make_wish(plan, len(runs), steps))
@@ -119,8 +115,16 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
         method, batch = _warm_up(plan, step, model, episode.record, draws)
         warm_up_seconds = clock() - start_time - (step.seconds if step else 0.0)
         counter.count = 0
-        threads = values["threads"] if device == "cpu" else 1
-        estimate = run_filter(method, model, episode.record, draws, watch, tick, batch, threads)
+        estimate = run_filter(
+            method,
+            model,
+            episode.record,
+            draws,
+            watch,
+            tick,
+            batch,
+            values["threads"] if device == "cpu" else 1,
+        )
         wait_for(device)
     step_compile_seconds = step.seconds if step else 0.0
     filter_seconds = (
@@ -133,13 +137,23 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
         "filter": filter_seconds,
         "per_step": filter_seconds / steps,
     }
-    compiled = "compiled" if step and step.is_active else "kernels"
     cost = {
-        "engine": "eager" if engine == "eager" else compiled,
+        "engine": "eager"
+        if engine == "eager"
+        else ("compiled" if step and step.is_active else "kernels"),
         "memory": peak_above(baseline, device),
         "likelihoods_per_step": counter.count / (len(runs) * steps),
     }
     return TimedFilterPass(model, estimate, recorder, seconds, cost)
+
+
+def _time_choice(plan: JobPlan, model: StateSpaceModel, runs: int, steps: int) -> tuple[str, float]:
+    """Choose the engine of a job. Returns it and the time of loading it, s."""
+    engine, start = plan.values["engine"], time.perf_counter()
+    if engine == "auto" and plan.values["budget"] != store.SAME_N:
+        engine = "kernels"  # as the trials that gave the number of particles
+    engine = choose_engine(engine, plan.method, model, runs, steps)
+    return engine, time.perf_counter() - start
 
 
 @contextmanager
