@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 from subprocess import CalledProcessError
@@ -59,6 +60,30 @@ class PlatformWheel(bdist_wheel):
     def get_tag(self) -> tuple[str, str, str]:
         """Return the tag of the wheel."""
         return "py3", "none", super().get_tag()[2]
+
+    def egg2dist(self, egginfo_path: str, distinfo_path: str) -> None:
+        """Write the metadata of the wheel, with the commit of an unchanged checkout."""
+        super().egg2dist(egginfo_path, distinfo_path)
+        if commit := _find_commit():
+            Path(distinfo_path, "COMMIT").write_text(f"{commit}\n")
+
+
+def _find_commit() -> str:
+    """Return the commit of this checkout; empty if a file is changed, or without git."""
+    git = ["git", "-C", str(HOME)]
+    try:
+        changes = subprocess.run(
+            [*git, "status", "--porcelain", "--untracked-files=no"],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        head = subprocess.run(
+            [*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
+        )
+    except (OSError, CalledProcessError):
+        return ""
+    return "" if changes.stdout else head.stdout.strip()
 
 
 setup(

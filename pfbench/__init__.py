@@ -105,7 +105,10 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"pfbench does not define {name!r}. Choose a name of pfbench.__all__.")
     if name in _DOOR:
-        return getattr(import_module("pfbench.door"), _DOOR[name])
+        value = getattr(import_module("pfbench.door"), _DOOR[name])
+        if name != value.__name__:  # so that `help` shows the name that was asked for
+            value.__name__, value.__qualname__, value.__module__ = name, name, __name__
+        return value
     if name in _ROOMS:
         return getattr(import_module(f"pfbench.{_ROOMS[name]}"), name)
     return import_module(f"pfbench.{name}")

@@ -119,6 +119,7 @@ def write(
             "world": 1.0,
             "filter": 1e-3 * method.milliseconds * steps,
             "per_step": 1e-3 * method.milliseconds,
+            "warm_up": 1e-3,
         },
         "state": STATE,
     }

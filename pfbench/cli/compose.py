@@ -154,6 +154,21 @@ def _parse_flags(words: list[str]) -> Any:
     parser: Any = get_args_parser()
     parser.error = refuse  # argparse would print its usage and end the process
     args, unknown = parser.parse_known_args(words)
+    faults = {
+        f"flags must stand before the first key=value, got {[*unknown, ''][0]} after it": unknown
+        and not unknown[0].startswith("-"),
+        "--hydra-help and --shell-completion are of Hydra's own program. The shell has pfbench completion": (
+            args.hydra_help or args.shell_completion
+        ),
+        "--package and --resolve choose what --cfg prints, as in pfbench run --cfg job -p noise": (
+            not args.cfg and (args.package or args.resolve)
+        ),
+        "--run, --multirun, --cfg and --info exclude each other. Leave out all but one": (
+            args.run + args.multirun + bool(args.cfg or args.info) > 1
+        ),
+    }
+    for message in (message for message, is_fault in faults.items() if is_fault):
+        refuse(message)
     if unknown:
         raise ValueError(format_flag(words, unknown[0], "run"))
     return args

@@ -31,6 +31,7 @@ _HEADS = (
     "coverage of 90 % intervals",
     "ms/step",
 )
+_FAILED_HEADS = ("failed filter", "scenario", "message")
 
 
 @dataclass(frozen=True, repr=False)
@@ -41,33 +42,43 @@ class Summary:
         sentence: Result in words.
         caption: Metric, worlds and baseline of the leaderboard.
         rows: Rows of the leaderboard: rank, filter, ratio with interval, words, track kept, coverage, ms/step.
+        failures: Filter, scenario and message of each failed job, which the leaderboard lacks.
     """
 
     sentence: str
     caption: str
     rows: tuple[tuple[str, ...], ...]
+    failures: tuple[tuple[str, ...], ...] = ()
 
     def table(self) -> pd.DataFrame:
         """Return the leaderboard as a table of texts."""
         return pd.DataFrame(self.rows, columns=list(_HEADS))
 
     def __repr__(self) -> str:
-        lines = [_HEADS, *self.rows]
-        widths = [max(len(line[k]) for line in lines) for k in range(len(_HEADS))]
+        lines = [_HEADS, *self.rows] if self.rows else []
+        widths = [max(len(line[k]) for line in lines) for k in range(len(_HEADS) if lines else 0)]
         texts = ["  ".join(f"{v:{w}}" for v, w in zip(line, widths, strict=True)) for line in lines]
-        return "\n".join([self.sentence, "", *(text.rstrip() for text in texts), "", self.caption])
+        table = "\n".join(text.rstrip() for text in texts)
+        failed = "\n".join(f"failed: {' / '.join(row)}" for row in self.failures)
+        return "\n\n".join(filter(None, (self.sentence, table, self.caption, failed)))
 
     def _repr_html_(self) -> str:
-        table = format_html_table(_HEADS, self.rows)
-        return (
-            f"<p><b>{html.escape(self.sentence)}</b></p>{table}<p>{html.escape(self.caption)}</p>"
-        )
+        table = format_html_table(_HEADS, self.rows) if self.rows else ""
+        failed = format_html_table(_FAILED_HEADS, self.failures) if self.failures else ""
+        sentence, caption = html.escape(self.sentence), html.escape(self.caption)
+        return f"<p><b>{sentence}</b></p>{table}<p>{caption}</p>{failed}"
 
 
 def summarise_study(
-    study: str, conditions: Sequence[Condition], options: Mapping[str, Any]
+    study: str,
+    conditions: Sequence[Condition],
+    failed: Sequence[Mapping[str, str]],
+    options: Mapping[str, Any],
 ) -> Summary:
-    """Summarise a study by the opening view of its page."""
+    """Summarise a study by the opening view of its page, and its failed jobs."""
+    failures = tuple((note["filter"], note["scenario"], note["message"]) for note in failed)
+    if not conditions:
+        return Summary("No job has finished.", "", (), failures)
     opening = describe_opening(build_pack(study, conditions, ReportOptions(**options)))
     rows = tuple(
         (
@@ -76,7 +87,7 @@ def summarise_study(
         )
         for row in opening["rows"]
     )  # fmt: skip
-    return Summary(opening["text"], opening["caption"], rows)
+    return Summary(opening["text"], opening["caption"], rows, failures)
 
 
 @dataclass(frozen=True, repr=False)

@@ -29,17 +29,21 @@ from pfbench.door.study import Study, open_study
 from pfbench.door.worker import COUNTER, JobReply, WorkerPool, run_config
 from pfbench.job.config import CHOICES, FILTER_SETS, JobConfig, compose
 from pfbench.job.run_job import list_used_packages
+from pfbench.job.settings import check_settings
 from pfbench.results.conditions import JobFile
 
 log = logging.getLogger("pfbench")
 
 
-def run_filters(
-    scenario: Any,
-    filters: Any,
+def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
+    scenario: str | Part | list[Any] | Any,
+    filters: str | Part | list[Any] | Any,
     *,
-    noise: Any = "nominal",
-    model: Any = None,
+    noise: str | Part | list[Any] | Any = "nominal",
+    model: str | Part | list[Any] | Any = None,
+    runs: int = 50,
+    particles: int = 500,
+    seed: int = 1,
     study: str = "notebook",
     workers: int = 1,
     progress: bool = True,
@@ -52,11 +56,16 @@ def run_filters(
         filters: Names, named sets, parts, or filters and stages of your own; one or a list.
         noise: Noise regime, or a list of them.
         model: Model of the filters. That of the scenario by default.
+        runs: Number of Monte Carlo runs, which all filters share.
+        particles: Number for each particle filter that states none of its own.
+        seed: With the number of a run it determines all random numbers.
         study: Name of the study.
         workers: Number of processes.
         progress: Whether each job prints a line.
-        **settings: Settings of the job by key, such as `runs=100`, `seed=2` or `particles=1000`. Two underscores stand
-            for a point. 50 runs by default.
+        **settings: Other settings by key. What is computed: `first_run`, `oracle_noise`, `pcrb`, `score_steps`, `budget`,
+            `checkpoint`. How: `dtype`, `device`, `threads`, `engine`, `memory_limit_gib`, `overwrite`. Where:
+            `results_dir`, `reports_dir`, `episode_cache_dir`. Keys of a part have two underscores for a point, such as
+            `scenario__steps=200`. `pfbench run --cfg job` prints all with their values.
 
     Returns:
         The study, which also holds results of earlier runs.
@@ -74,15 +83,16 @@ def run_filters(
         for group, value in (("scenario", scenario), ("noise", noise), ("filter", filters))
     ]
     models = [None] if model is None else list_parts("model", model)
-    words = format_words({"runs": 50, **settings, "study": study})
+    named = {"runs": runs, "particles": particles, "seed": seed}
+    words = format_words({**named, **settings, "study": study})
     jobs = [_list_words(choice, words) for choice in product(*parts, models)]
-    with preserved_process():
-        configs = [_compose_job(list(job)) for job in dict.fromkeys(map(tuple, jobs))]
-        if any(map(list_used_packages, configs)):
-            from pfbench.door.laws import try_own_parts
+    configs = [_compose_job(list(job)) for job in dict.fromkeys(map(tuple, jobs))]
+    if any(map(list_used_packages, configs)):
+        from pfbench.door.laws import try_own_parts
 
+        with preserved_process():
             try_own_parts(configs)
-        _run_jobs(configs, workers, progress)
+    _run_jobs(configs, workers, progress)
     values = configs[0].values
     packages = dict.fromkeys(name for config in configs for name in config.trusted)
     return open_study(
@@ -154,15 +164,8 @@ def _compose_job(words: list[str]) -> JobConfig:
     """Compose and check the configuration of a job. Raises ValueError with the sentence of the command line."""
     with plain_errors(words):
         config = compose(add_search_path(words))
-        _check_settings(config)
+        check_settings(config.values)
     return config
-
-
-def _check_settings(config: JobConfig) -> None:
-    """Check the settings of a job before the first one runs."""
-    from pfbench.job.settings import check_settings
-
-    check_settings(config.values)
 
 
 def continue_jobs(study: Study, runs: int, workers: int, progress: bool) -> None:
@@ -172,10 +175,9 @@ def continue_jobs(study: Study, runs: int, workers: int, progress: bool) -> None
         for condition in study.conditions()
         for job in condition.jobs
     ]
-    with preserved_process():
-        for config in configs:
-            _check_settings(config)
-        _run_jobs(configs, workers, progress)
+    for config in configs:
+        check_settings(config.values)
+    _run_jobs(configs, workers, progress)
 
 
 def _continue_job(job: JobFile, runs: int, trusted: Sequence[str]) -> JobConfig:
@@ -223,8 +225,9 @@ def _replies(configs: Sequence[JobConfig], workers: int) -> Iterator[tuple[int, 
         with WorkerPool(min(workers, len(configs))) as pool:
             yield from pool.run(configs)
         return
-    for number, config in enumerate(configs):
-        yield number, run_config(config)
+    with preserved_process():  # which imports torch, that workers import themselves
+        for number, config in enumerate(configs):
+            yield number, run_config(config)
 
 
 @contextlib.contextmanager

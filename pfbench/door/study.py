@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import webbrowser
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pfbench.cli.progress import StudyState, format_repeat, read_state
-from pfbench.door.parts import format_html_table, plain_errors
+from pfbench.door.parts import plain_errors
 from pfbench.job.trust import trusting
 
 if TYPE_CHECKING:
@@ -66,8 +65,10 @@ class Study:
         Returns:
             Errors in the unit of the group. Rows of several conditions have their names in the index.
         """
+        from pfbench.results.frame import list_main_groups
+
         frame = self.table("rmse")
-        mains = self._main_groups()
+        mains = list_main_groups(self.conditions())
         names = sorted(set(frame["group"]))
         if group is not None and group not in names:
             raise ValueError(
@@ -86,12 +87,15 @@ class Study:
             **options: Options of a report, such as `baseline="ekf"`.
 
         Returns:
-            Sentence and leaderboard, as text and in a notebook as a table.
+            Sentence, leaderboard and failed jobs, as text and in a notebook as tables.
         """
         from pfbench.door.comparisons import summarise_study
 
+        has_results = any((Path(self.results) / self.name).glob("*.npz"))
+        failures = self.failed()
         with plain_errors():
-            return summarise_study(self.name, self.conditions(), options)
+            conditions = self.conditions() if has_results or not failures else []
+            return summarise_study(self.name, conditions, failures, options)
 
     def compare(self, a: str, b: str) -> Comparison:
         """Compare two filters in the runs that both have, as all pages do.
@@ -260,18 +264,14 @@ class Study:
         with plain_errors():
             return load_conditions(self.name, self.results)
 
-    def _main_groups(self) -> Mapping[tuple[str, str, str], str]:
-        """Return the main group by scenario, noise and model."""
-        from pfbench.results.frame import list_main_groups
-
-        return list_main_groups(self.conditions())
+    def __repr__(self) -> str:
+        try:
+            return f"study {self.name}\n\n{self.summary()!r}"
+        except ValueError as error:
+            return f"study {self.name} has no summary: {error}"
 
     def _repr_html_(self) -> str:
-        failures = self.failed()
-        rows = [(note["filter"], note["scenario"], note["message"]) for note in failures]
-        table = format_html_table(("failed filter", "scenario", "message"), rows) if rows else ""
-        has_results = any((Path(self.results) / self.name).glob("*.npz"))
-        return (self.summary()._repr_html_() if has_results else "") + table
+        return self.summary()._repr_html_()
 
 
 def open_study(

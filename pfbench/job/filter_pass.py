@@ -17,10 +17,10 @@ from tqdm import tqdm
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record
 from pfbench.filter.belief import StepInfo
-from pfbench.filter.loop import FilterResult, Watch, choose_run_batch, run_filter
+from pfbench.filter.loop import FilterResult, choose_run_batch, run_filter
 from pfbench.filter.particle import step_store
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.job.memory import MemoryTrimmer, peak_above, start_peak_measurement
+from pfbench.job.memory import MemoryTrimmer, first_steps, peak_above, start_peak_measurement
 from pfbench.job.plan import JobPlan
 from pfbench.job.scoring import LikelihoodCounter, ScoreRecorder
 from pfbench.job.step_builds import BUILD_SECONDS, are_builds_allowed, say_once, want_step
@@ -28,6 +28,7 @@ from pfbench.kernels import dispatch
 from pfbench.kernels.cpp_library import is_library_loaded
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
+from pfbench.results.step_times import WARM_UP
 
 if TYPE_CHECKING:
     from pfbench.filter.particle.compiled_filter import CompiledParticleFilter, StepParts
@@ -40,6 +41,7 @@ _CUDA_NUMBERS = 5e8
 # stochastic volatility 0.5e-8, constant velocity in the plane 1.1e-8, 15 states nothing]
 _SAVED_PER_STEP = 3e-4  # s
 _SAVED_PER_PARTICLE = 0.6e-8  # s per particle and step
+_WARM_UP_STEPS = 2  # the second of a compiled filter is recorded
 _MANY_COMPONENTS = 10  # with these a step saves nothing per particle
 
 
@@ -94,9 +96,7 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     Returns the results. Shapes: runs [R].
     """
     values, method, clock = plan.values, plan.method, plan.choose_timer()
-    device, engine = values["device"], values["engine"]
-    if engine == "auto" and values["budget"] != store.SAME_N:
-        engine = "kernels"  # as the trials that gave the number of particles
+    device = values["device"]
     model, steps = plan.make_filter_model(episode), episode.record.y.shape[1]
     truth = model.assemble(episode.truth).to(device, plan.dtype)
     recorder = ScoreRecorder(model, truth, values["score_steps"], clock, episode.measured_truth)
@@ -106,45 +106,72 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
         with counter.paused():
             return recorder(t, info)
 
-    compile_start = time.perf_counter()
-    engine = choose_engine(engine, method, model, len(runs), steps)
-    compile_seconds = time.perf_counter() - compile_start
-    with _use_threads_for_runs(plan, engine), dispatch.use_kernels(engine != "eager"):
+    engine, compile_seconds = _time_choice(plan, model, len(runs), steps)
+    draws = PhiloxStream(values["seed"], runs.to(device), plan.dtype)
+    with _prepare_torch(plan, engine), _show_progress(steps, label) as tick:
         step = _compile_step(engine, method, counter, clock, _make_wish(plan, len(runs), steps))
         baseline = start_peak_measurement(device)
         start_time = clock()
-        estimate = _filter_episode(plan, step, model, episode, runs, watch, label)
+        method, batch = _warm_up(plan, step, model, episode.record, draws)
+        warm_up_seconds = clock() - start_time - (step.seconds if step else 0.0)
+        counter.count = 0
+        estimate = run_filter(
+            method,
+            model,
+            episode.record,
+            draws,
+            watch,
+            tick,
+            batch,
+            values["threads"] if device == "cpu" else 1,
+        )
+        wait_for(device)
     step_compile_seconds = step.seconds if step else 0.0
-    filter_seconds = clock() - start_time - recorder.seconds - step_compile_seconds
+    filter_seconds = (
+        clock() - start_time - warm_up_seconds - recorder.seconds - step_compile_seconds
+    )
     seconds = {
         "scores": recorder.seconds,
         "compile": compile_seconds + step_compile_seconds,
+        WARM_UP: warm_up_seconds,
         "filter": filter_seconds,
         "per_step": filter_seconds / steps,
     }
-    compiled = "compiled" if step and step.is_active else "kernels"
     cost = {
-        "engine": "eager" if engine == "eager" else compiled,
+        "engine": "eager"
+        if engine == "eager"
+        else ("compiled" if step and step.is_active else "kernels"),
         "memory": peak_above(baseline, device),
         "likelihoods_per_step": counter.count / (len(runs) * steps),
     }
     return TimedFilterPass(model, estimate, recorder, seconds, cost)
 
 
-@contextmanager
-def _use_threads_for_runs(plan: JobPlan, engine: str) -> Iterator[None]:
-    """Give torch one thread in the pass of a particle filter by C++ operators, which take no more.
+def _time_choice(plan: JobPlan, model: StateSpaceModel, runs: int, steps: int) -> tuple[str, float]:
+    """Choose the engine of a job. Returns it and the time of loading it, s."""
+    engine, start = plan.values["engine"], time.perf_counter()
+    if engine == "auto" and plan.values["budget"] != store.SAME_N:
+        engine = "kernels"  # as the trials that gave the number of particles
+    engine = choose_engine(engine, plan.method, model, runs, steps)
+    return engine, time.perf_counter() - start
 
-    Threads of torch would wait for each other at every small operation. Batches of runs have the threads of the job.
+
+@contextmanager
+def _prepare_torch(plan: JobPlan, engine: str) -> Iterator[None]:
+    """Let torch take the operators of an engine and no gradients, and one thread for a particle filter by C++ operators.
+
+    More threads of torch would wait for each other at every small operation. Batches of runs have the threads of the job.
     """
     threads = torch.get_num_threads()
-    is_alone = plan.values["device"] == "cpu" and engine != "eager"
-    if threads == 1 or not is_alone or not isinstance(plan.method, ParticleFilter):
-        yield
-        return
-    torch.set_num_threads(1)
+    if (
+        plan.values["device"] == "cpu"
+        and engine != "eager"
+        and isinstance(plan.method, ParticleFilter)
+    ):
+        torch.set_num_threads(1)
     try:
-        yield
+        with torch.no_grad(), dispatch.use_kernels(engine != "eager"):
+            yield
     finally:
         torch.set_num_threads(threads)
 
@@ -161,61 +188,49 @@ def _make_wish(plan: JobPlan, runs: int, steps: int) -> Callable[[str, StepParts
     return partial(_want_step, plan, runs, steps) if may_load else None
 
 
-def _drop_missing_step(
+def _warm_up(
     plan: JobPlan,
     step: CompiledParticleFilter | None,
     model: StateSpaceModel,
     record: Record,
     draws: PhiloxStream,
-) -> CompiledParticleFilter | None:
-    """Return the filter with compiled steps; None if its step is not stored, and kernels take other batches of runs.
+) -> tuple[Any, int]:
+    """Take two steps of the first batch of runs, whose results are not used.
 
-    The store is asked by two steps of the first batch, whose results are not used: the larger batches of kernels are faster
-    without a compiled step.
+    What a process loads once is not in the time of its first job then, and the store is asked for compiled steps. Without
+    one the larger batches of kernels are faster.
+
+    Returns the filter, with compiled steps if there are, and the runs of a batch.
     """
     runs = len(draws.runs)
-    batch = plan.choose_run_batch(plan.method, runs, is_compiled=True)
-    is_same = batch == plan.choose_run_batch(plan.method, runs)
-    if step is None or step.on_missing is None or is_same or record.feedback is not None:
-        return step
+    by_kernels = plan.choose_run_batch(plan.method, runs)
+    batch = plan.choose_run_batch(plan.method, runs, is_compiled=step is not None)
     first = slice(0, batch)
-    with torch.no_grad(), step.keep_count():
-        beginning = record.select_runs(first).select_steps(slice(0, 2))
-        run_filter(step, model, beginning, draws.select_runs(first))
-    return step if step.is_active else None
+    beginning = first_steps(record.select_runs(first), _WARM_UP_STEPS)
+    run_filter(step or plan.method, model, beginning, draws.select_runs(first))
+    wait_for(plan.values["device"])
+    if step is None or (step.on_missing and not step.is_active and batch != by_kernels):
+        return plan.method, by_kernels
+    return step, batch
 
 
-def _filter_episode(
-    plan: JobPlan,
-    step: CompiledParticleFilter | None,
-    model: StateSpaceModel,
-    episode: Episode,
-    runs: Tensor,
-    watch: Watch,
-    label: str,
-) -> FilterResult:
-    """Run a filter over an episode, with compiled steps if there are, and with a progress bar."""
-    device, trim = plan.values["device"], MemoryTrimmer()
-    draws = PhiloxStream(plan.values["seed"], runs.to(device), plan.dtype)
-    method = _drop_missing_step(plan, step, model, episode.record, draws) or plan.method
-    batch = plan.choose_run_batch(plan.method, len(runs), is_compiled=method is not plan.method)
+def wait_for(device: str) -> None:
+    """Wait until a device has computed what was asked of it, so that a clock can be read."""
+    if device != "cpu":
+        torch.cuda.synchronize()
+
+
+@contextmanager
+def _show_progress(steps: int, label: str) -> Iterator[Callable[[], None]]:
+    """Show a progress bar of the steps. Yields the function to call after each step, which also trims the memory."""
+    trim = MemoryTrimmer()
 
     def tick() -> None:
         bar.update()
         trim()
 
-    with (
-        torch.no_grad(),
-        tqdm(
-            total=episode.record.y.shape[1], desc=label, unit="step", delay=2, disable=None,
-            leave=False,
-        ) as bar,
-    ):  # fmt: skip
-        threads = plan.values["threads"] if device == "cpu" else 1
-        estimate = run_filter(method, model, episode.record, draws, watch, tick, batch, threads)
-        if device != "cpu":
-            torch.cuda.synchronize()
-    return estimate
+    with tqdm(total=steps, desc=label, unit="step", delay=2, disable=None, leave=False) as bar:
+        yield tick
 
 
 def choose_engine(

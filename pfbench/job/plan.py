@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cache
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
@@ -218,7 +219,7 @@ def make_provenance() -> dict[str, Any]:
 def read_versions() -> dict[str, str]:
     """Return the versions that affect the numbers.
 
-    `commit` is empty outside a checkout. `build` is the commit of an unchanged checkout, else a digest of
+    `commit` is that of the checkout or of the wheel, empty without both. `build` is the commit of an unchanged checkout, else a digest of
     the sources. Both are those of the first call in the process: later changes are not loaded.
     """
     commit, build = _read_build()
@@ -234,8 +235,10 @@ def read_versions() -> dict[str, str]:
 
 @cache
 def _read_build() -> tuple[str, str]:
-    """Return the commit and the build of this process."""
+    """Return the commit and the build of this process. A wheel states the commit of its checkout."""
     commit = describe_commit(Path(pfbench.__file__).resolve().parents[1])
+    stated = (dist.read_text("COMMIT") for dist in distributions(name="pfbench"))
+    commit = commit or (next(stated, None) or "").strip()
     is_clean = commit and not commit.endswith("-dirty")
     return commit, commit if is_clean else f"sources {hash_package()}"
 

@@ -94,8 +94,16 @@ def _check_device(device: str) -> None:
 
 
 _LARGEST = 1_000_000_000  # a number that is advised
-_INTEGERS = {"runs": 1, "first_run": 0, "threads": 1, "seed": 0, "score_steps": 0}  # with minimum
-_EXAMPLES = {"runs": 100, "first_run": 0, "threads": 1, "seed": 1, "score_steps": 10}
+# with minimum
+_INTEGERS = {"runs": 1, "particles": 2, "first_run": 0, "threads": 1, "seed": 0, "score_steps": 0}
+_EXAMPLES = {
+    "runs": 100,
+    "particles": 500,
+    "first_run": 0,
+    "threads": 1,
+    "seed": 1,
+    "score_steps": 10,
+}
 # threads beyond the cores only wait, and OpenMP ends the process with a fault if there are many
 _MOST = {"threads": max(256, os.cpu_count() or 1)}
 _REQUIREMENTS = {  # requirement and valid value by key

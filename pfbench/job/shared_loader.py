@@ -26,6 +26,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.default_element import InputDefault, ResultDefault
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from hydra.errors import ConfigCompositionException
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, flag_override
@@ -141,6 +142,14 @@ class SharedLoader(ConfigLoaderImpl):
         parsed = OverridesParser.create().parse_overrides(overrides=overrides)
         repository = _SharedRepository(self.repository, self.trusted)
         self._process_config_searchpath(config_name, parsed, repository)
+        main = repository.load_config(config_name) if config_name else None
+        for override in parsed if main else ():
+            key = override.key_or_group
+            is_of_group = repository.group_exists(key) or repository.group_exists(key.split(".")[0])
+            is_added = override.is_add() or override.is_force_add()
+            # a key that nothing reads, such as +particle=50, would give another job with the same numbers
+            if is_added and not is_of_group and not _has_key(to_plain(main.config), key):
+                raise ConfigCompositionException(f"Could not override '{key}'")
         return parsed, repository
 
     def _compose_config_from_defaults_list(
@@ -372,6 +381,11 @@ def check_composed(
 ) -> None:
     """Check a composed configuration."""
     check_study(tree._get_node("study")._value() if "study" in tree else None)  # not resolved
+    if tree.hydra.job.chdir:
+        raise UntrustedConfigError(
+            "hydra.job.chdir must be left out, since the folders of results and data are given from the folder of the command, "
+            f"got {tree.hydra.job.chdir}. Set results_dir=... and reports_dir=... for other folders."
+        )
     for group, name in tree.hydra.runtime.choices.items():
         if isinstance(name, str) and (name.startswith("/") or ".." in name.split("/")):
             raise UntrustedConfigError(
@@ -417,6 +431,14 @@ def _list_settings(tree: Any, words: Sequence[str]) -> Iterator[tuple[str, Any]]
     hydra["sweeper"] = {k: v for k, v in (hydra["sweeper"] or {}).items() if k != "params"}
     for key, value in sorted(hydra.items()):
         yield f"hydra.{key}", value
+
+
+def _has_key(values: Any, key: str) -> bool:
+    """Return whether nested dictionaries have a key with points."""
+    first, _, rest = key.partition(".")
+    return (
+        isinstance(values, dict) and first in values and (not rest or _has_key(values[first], rest))
+    )
 
 
 def to_plain(tree: Any) -> dict[str, Any]:

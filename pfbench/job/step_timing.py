@@ -18,7 +18,7 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.budget import EpisodeSource, max_runs_in_memory
-from pfbench.job.filter_pass import choose_engine
+from pfbench.job.filter_pass import choose_engine, wait_for
 from pfbench.job.memory import first_steps
 from pfbench.job.plan import JobPlan, build_plan, make_provenance
 from pfbench.job.replay import stored_config
@@ -61,8 +61,7 @@ class TimingTask:
         wall, cpu = time.perf_counter(), time.process_time()
         with torch.no_grad(), dispatch.use_kernels(self.engine != "eager"):
             run_filter(self.method, self.model, self.record, draws, run_batch=batch)
-            if values["device"] != "cpu":
-                torch.cuda.synchronize()
+            wait_for(values["device"])
         share = len(self.plan.runs) / (runs * steps)
         return (time.process_time() - cpu) * share, (time.perf_counter() - wall) * share
 

@@ -61,7 +61,11 @@ def join_metadata(metadata: Sequence[dict[str, Any]]) -> dict[str, Any]:
         **first,
         "runs": total,
         "parts": len(metadata),
-        "seconds": {name: sum(piece[name] for piece in times) for name in times[0]},
+        "seconds": {
+            name: sum(piece[name] for piece in times)
+            for name in times[0]
+            if all(name in piece for piece in times)
+        },
         "memory": None if None in memory else max(memory),
         "likelihoods_per_step": float(
             shares @ [float(piece["likelihoods_per_step"]) for piece in metadata]

@@ -20,6 +20,9 @@ from pfbench.stats.error_measures import Array
 
 STEP_TIMES = "step_times.json"
 STEP_TIME = "step_time"  # of the metadata of a job
+WARM_UP = (
+    "warm_up"  # of the seconds of a job whose time per step is without what its process loads once
+)
 FEWEST_ROUNDS = 5
 _FORMAT = 1
 _LARGEST = 50_000_000  # bytes

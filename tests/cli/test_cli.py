@@ -141,6 +141,26 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("-m", "seed=range(1,inf)"),
         ("seed must have 1 to 100000 values, got more of",),
     ),
+    "help of Hydra": (("--hydra-help",), ("--hydra-help and", "See pfbench run --help")),
+    "a package to print without --cfg": (
+        ("-m", "-p", "noise", "filter=ekf,sir"),
+        ("flags must stand before the first key=value, got filter=ekf,sir",),
+    ),
+    "a package alone": (("--package", "noise"), ("pfbench run --cfg job -p noise",)),
+    "resolved values without --cfg": (("--resolve",), ("--package and --resolve choose",)),
+    "one run and several": (("-r", "-m"), ("--run, --multirun, --cfg and --info exclude",)),
+    "another folder for each job": (
+        ("hydra.job.chdir=true",),
+        ("hydra.job.chdir must be left out", "Set results_dir=..."),
+    ),
+    "an added key that nothing reads": (
+        ("-m", "+particle=50,60"),
+        ("+particle=50,60: key particle does not exist. Similar: particles.",),
+    ),
+    "an added key of a group that nothing reads": (
+        ("++until_decided.max_run=3",),
+        ("key until_decided.max_run does not exist. Similar: until_decided.max_runs",),
+    ),
     "a word without a key": (("=x",), ("each word must be key=value, got one without a key",)),
     "a key that exists": (
         ("+seed=1",),

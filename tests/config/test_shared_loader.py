@@ -101,7 +101,7 @@ def test_each_configuration_is_composed_as_by_hydra(part: int) -> None:
     [
         ["hydra.mode=MULTIRUN"],
         ["hydra/job_logging=none", "hydra.verbose=true", "runs=3"],
-        ["~train", "+mine={a: [1, {b: 2}]}"],
+        ["~train", "+report.mine={a: [1, {b: 2}]}"],
         ["+experiment=quickstart", "filter=cofm_amssrcpf", "scenario=linear_walk"],
     ],
 )

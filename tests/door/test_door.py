@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+import pydoc
 import re
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from notebook_cells import MODEL, PROPOSAL, WORLD, Notebook
 import pfbench
 from pfbench.cli.compose import plan_study
 from pfbench.door import own_source
-from pfbench.job import IGNORED_IN_KEY, job_key
+from pfbench.job import IGNORED_IN_KEY, compose, job_key
 from pfbench.job.trust import FOLDERS
 from pfbench.report.overview.tables import read_world_facts
 from pfbench.results import main_component_group, store
@@ -317,6 +318,7 @@ def test_an_object_of_an_earlier_definition_is_refused(notebook: Notebook) -> No
         (lambda: pfbench.run(WALK, "sir", workers=0), "workers must be a whole number of at least 1, got 0"),
         (lambda: pfbench.run(WALK, "sir", workers=True), "workers must be a whole number of at least 1, got True"),
         (lambda: pfbench.run(WALK, "sir", runs=0), "runs must be a whole number of at least 1, got 0"),
+        (lambda: pfbench.run(WALK, "sir", particles=1e3), "particles must be a whole number of at least 2, got 1000.0. Write it"),
         (lambda: pfbench.run(WALK, "sir", partcles=3), "partcles=3: key partcles does not exist. Similar: particles"),
         (lambda: pfbench.run(WALK, "sir", study="a/b"), "study must be a name of letters"),
         (lambda: pfbench.run(WALK, "sir", particles=object()), "particles must be a number, a text, a list or a dictionary"),
@@ -350,6 +352,8 @@ def test_a_failed_job_is_listed_with_the_words_that_repeat_it(
     assert "must be a whole number of at least 2, got 0" in note["message"]
     printed = capsys.readouterr().out
     assert note["repeat"] in printed
+    assert note["message"] in repr(study.summary())
+    assert note["message"] in repr(study)
     assert "1 finished, 0 skipped, 1 failed" in printed
     words = note["repeat"].split()[2:]
     assert "filter.particles=0" in words
@@ -438,6 +442,7 @@ def test_summary_page_and_html(study: pfbench.Study) -> None:
     assert summary.sentence in page
     for row in summary.rows:
         assert row[1] in page
+    assert repr(summary) in repr(study)
     html = study._repr_html_()
     assert html.count("<tr>") == 4
     assert summary.rows[0][1] in html
@@ -484,6 +489,11 @@ def test_names_list_what_the_command_line_lists(
     lines = dict(line.split(maxsplit=1) for line in said.out.splitlines())
     assert {name: names[name] for name in lines} == lines
     assert names["tuned_baselines"].startswith("ekf_scaled_tuned")
+    shown = pydoc.render_doc(pfbench.run, renderer=pydoc.plaintext)
+    assert "runs: 'int' = 50, particles: 'int' = 500, seed: 'int' = 1" in shown
+    assert not {
+        k for k, v in compose([]).values.items() if type(v) is not dict and f"{k}" not in shown
+    }
     assert "<td" in names._repr_html_()
 
 

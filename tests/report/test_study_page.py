@@ -112,8 +112,10 @@ def test_first_lines_name_severely_overconfident_runs(tmp_path):
 def test_a_page_tells_exact_filters_from_bounded_weights(tmp_path):
     """A dash for what an older result does not state, and for a page stored before there was the flag."""
     pack = page_packs.build_pack(6)
-    del pack["filter_notes"][4]["has_bounded_weights"]
+    assert 'id="cost"' in page_packs.write(pack, tmp_path).read_text()
+    del pack["filter_notes"][4]["has_bounded_weights"], pack["filter_notes"][4]["is_timed"]
     page = page_packs.write(pack, tmp_path).read_text()
+    assert ('id="cost"' in page, "<code>pfbench cost study=" in page) == (False, True)
     rows = re.findall(r"<td>(yes|no)</td><td>(yes|no|–)</td>", page)
     bounded = ["yes", "no", "–", "yes", "–", "–"]
     assert rows == list(zip(["yes", "no"] * 3, bounded, strict=True))

@@ -97,12 +97,6 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         """True if a kind of step runs compiled."""
         return any(graph is not None for graph in self.graphs.values())
 
-    @contextmanager
-    def keep_count(self) -> Iterator[None]:
-        """Count no likelihood evaluations in this context."""
-        with _keep_count(self.counter):
-            yield
-
     @override
     def init(
         self,

@@ -63,7 +63,7 @@ from pfbench.results.looks import (
 from pfbench.results.metrics import page_metrics
 from pfbench.results.paper_block import REFERENCES, list_named_parts
 from pfbench.results.status import count_statuses
-from pfbench.results.step_times import StepTimes
+from pfbench.results.step_times import STEP_TIME, WARM_UP, StepTimes
 from pfbench.results.store import JobResult, list_failures
 from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
 from pfbench.stats.study_runs import StudyRuns, arrange_runs
@@ -411,6 +411,7 @@ class MethodNotes:
         counts = self._counts.setdefault(label, Counter())
         counts.update({name: int(status[name] or 0) for name in _COUNTS})
         counts["limited_runs"] += int(meta["runs"]) if status["diverged"] is not None else 0
+        counts["cold_jobs"] += WARM_UP not in meta["seconds"] and STEP_TIME not in meta
         particles = meta.get("particles")
         self._particles.setdefault(label, {})[str(particles)] = None
         self._exact[label] = self._exact.get(label, True) and bool(meta.get("is_exact"))
@@ -433,7 +434,7 @@ class MethodNotes:
             has_limit = counts["limited_runs"] > 0
             notes.append({
                 "filter": label, "particles": " or ".join(particles), "is_exact": self._exact[label],
-                "has_bounded_weights": _common(self._bounded[label]),
+                "has_bounded_weights": _common(self._bounded[label]), "is_timed": not counts["cold_jobs"],
                 **{name: counts[name] for name in _COUNTS},
                 "diverged": counts["diverged"] if has_limit else None,
             })  # fmt: skip

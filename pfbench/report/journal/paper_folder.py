@@ -65,7 +65,10 @@ def select_figures(pack: Pack) -> dict[str, Plot]:
         "leaderboard": (plot_leaderboard, has_ratio),
         "over_time": (plot_over_time, any(key[1] == regime for key in pack["curves"])),
         "planned": (plot_planned, bool(list_pairs(pack))),
-        "cost": (plot_error_against_cost, has_cost),
+        "cost": (
+            plot_error_against_cost,
+            has_cost and all(n.get("is_timed") for n in pack["filter_notes"]),
+        ),
         "calibration": (plot_calibration, bool(pack["calibration"].get((ALL, ALL)))),
     }
     return {name: plot for name, (plot, is_present) in plots.items() if is_present}

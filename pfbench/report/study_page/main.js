@@ -21,7 +21,7 @@ function refresh(everything = false) {
 function drawView(changed = true) {
   drawSwitches();
   drawBoard();
-  drawCost(find("#cost .figure"));
+  if (find("#cost")) drawCost(find("#cost .figure"));
   for (const select of findAll("select.cell")) {
     select.innerHTML = data.cells
       .filter(hasRuns)

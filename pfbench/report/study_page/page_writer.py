@@ -207,6 +207,7 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
         "heads": _heads(names[baseline]["name"]),
         "rows": (rows := [_row(row, names[row["filter"]]) for row in view["rows"]]),
         "tables": tables or [{"caption": caption, "rows": rows}],
+        "is_timed": all(note.get("is_timed") for note in pack["filter_notes"]),
         "has_costs": any(row.get("cost") is not None for row in view["rows"]),
     }
 
