@@ -212,14 +212,12 @@ def score_particles(
         crps, (w.unsqueeze(1) @ off.abs()).squeeze(1), w.square().sum(-1, keepdim=True)
     )
     quantiles = (torch.arange(_POINTS, device=w.device, dtype=w.dtype) + 0.5) / _POINTS
-    quantiles = quantiles.expand(len(w), -1).contiguous()
-    index = torch.searchsorted(w.cumsum(-1), quantiles).clamp(max=w.shape[1] - 1)
-    places = index.unsqueeze(-1).expand(-1, -1, error.shape[1])
-    points = error.unsqueeze(1) + deviation.gather(1, places)
+    index = torch.searchsorted(w.cumsum(-1), quantiles.repeat(len(w), 1)).clamp(max=w.shape[1] - 1)
+    points = error.unsqueeze(1) + deviation.gather(
+        1, index.unsqueeze(-1).expand(-1, -1, error.shape[1])
+    )
     share = (index.unsqueeze(1) == index.unsqueeze(2)).to(w).mean((1, 2))
-    parts = off.new_zeros(off.shape[-1], len(groups))
-    for g, components in enumerate(groups):
-        parts[list(components), g] = 1.0
+    parts = off.new_tensor([[float(k in c) for c in groups] for k in range(off.shape[-1])])
     distance = (w.unsqueeze(1) @ (off.square() @ parts).sqrt()).squeeze(1)
 
     def score_group(g: int, components: list[int]) -> Tensor:

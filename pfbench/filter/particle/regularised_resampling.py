@@ -186,8 +186,7 @@ def _move_where_uneven(
     Equal ones, as of the prior and after a step without measurement, weigh nothing: a smoothed cloud would no
     longer be that of the prediction.
     """
-    active = log_a > -torch.inf
-    uneven = (active & (log_a < log_a.amax(1, keepdim=True))).any(1)
+    uneven = ((log_a > -torch.inf) & (log_a < log_a.amax(1, keepdim=True))).any(1)
     return copies._replace(x=torch.where((resampled_mask & uneven)[:, None, None], x, copies.x))
 
 

@@ -252,8 +252,9 @@ class SwarmProposal(Proposal):
         if self.perturbation:
             chaos = memory["swarm.chaos"].index_copy(-1, frame.components, swarm.chaos.unsqueeze(1))
             memory = memory | {"swarm.chaos": chaos}
-        log_ratio = torch.where(measured, log_ratio, 0.0)
-        log_ratio = torch.where(torch.isfinite(log_w), log_ratio, -torch.inf)
+        log_ratio = torch.where(
+            torch.isfinite(log_w), torch.where(measured, log_ratio, 0.0), -torch.inf
+        )
         x = frame.to_states(torch.where(measured.unsqueeze(2), q, frame.q))
         return ProposalSample(x, log_ratio, memory, trace={"iterations": iterations})
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -19,7 +18,6 @@ from config_cases import GROUPS, composed
 from filter_cases import UNPRINTED, method_of
 from model_cases import tracker
 from omegaconf import OmegaConf
-from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
@@ -30,19 +28,9 @@ from pfbench.filter.moves.path_kernels import LastStateKernel, LikelihoodRatioKe
 from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import GaussianSmoothing
-from pfbench.filter.particle.resampling import Multinomial
 from pfbench.filter.particle.sqmc import HaltonPoints, halton_points
 from pfbench.filter.particle.stages import EssResampler, FixedCount, Systematic
-from pfbench.filter.proposed.dmc_controller import DmcController
-from pfbench.filter.proposed.reconstructed import NoWeightCorrection, ReconstructedProposal
-from pfbench.filter.proposed.swarm import SwarmLimits, SwarmProposal
-from pfbench.filter.proposed.swarm_coordinates import (
-    AllComponents,
-    LikelihoodFitness,
-    PrintedFitness,
-)
-from pfbench.filter.proposed.swarm_motion import IntervalStart, follow_logistic
-from pfbench.filter.proposed.swarm_weighting import PrintedWeighting
+from pfbench.filter.proposed.swarm import SwarmProposal
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.results.paper_block import (
     METHOD_FORMS,
@@ -262,111 +250,6 @@ def test_one_halton_set_of_001_is_the_same_in_each_draw() -> None:
     assert base[0, :3, 0].tolist() == [0.5, 0.25, 0.75]
 
 
-def test_the_literal_shift_of_003_counts_twice() -> None:
-    """ "II. State reconstruction", and "V. Prediction. X_{k+1} = f(X_k, W) + B U" with the U of II."""
-    method = method_of("dmc_reconstructed_literal")
-    assert method.resampler.scheme == Multinomial()
-    assert method.resampler.ess_threshold == 1.0
-    assert method.proposal.repeats_shift
-    assert not method.is_exact
-    model = LinearGaussian([[1.0]], [[1e-9]], [[1.0]], [1.0], [0.0], [1e-9])
-    y = torch.tensor([[[11.0], [11.0], [11.0]]], dtype=torch.float64)
-    found = {}
-    for repeats in (False, True):
-        proposal = ReconstructedProposal(
-            controller=DmcController(),
-            weight_correction=NoWeightCorrection(),
-            repeats_shift=repeats,
-        )
-        method = ParticleFilter(8, EssResampler(Systematic(), 1.0), proposal=proposal)
-        found[repeats] = run_filter(
-            method, model, Record(y), PhiloxStream(1, torch.arange(1))
-        ).mean[0, :, 0]
-    gain, once, twice = 1 / 11, [0.0], [0.0]
-    shift = 0.0
-    for _ in range(3):
-        once.append(once[-1] + gain * (11.0 - once[-1]))
-        predicted = twice[-1] + shift
-        shift = gain * (11.0 - predicted)
-        twice.append(predicted + shift)
-    torch.testing.assert_close(
-        found[False], torch.tensor(once[1:], dtype=torch.float64), rtol=0, atol=1e-6
-    )
-    torch.testing.assert_close(
-        found[True], torch.tensor(twice[1:], dtype=torch.float64), rtol=0, atol=1e-6
-    )
-
-
-def test_the_fitness_of_004_as_printed_is_the_sum_of_residuals() -> None:
-    """(37): Y = exp[-(z_New - z_Pred) / (2 R_k)], over the components; what is missing does not count."""
-    model, x = tracker(), torch.tensor([[[1.0, 2.0], [3.0, -1.0]]], dtype=torch.float64)
-    y = torch.tensor([[0.5, math.nan]], dtype=torch.float64)
-    record = Record(y)
-    value = PrintedFitness().fit_measurement(model, x, record)
-    torch.testing.assert_close(value, torch.tensor([[0.25, 1.25]], dtype=torch.float64))
-    both = PrintedFitness().fit_measurement(model, x, Record(torch.tensor([[0.5, 1.0]]).double()))
-    second = [(2.3 - 1.0) / 1.28, (-0.1 - 1.0) / 1.28]
-    torch.testing.assert_close(both - value, torch.tensor([second], dtype=torch.float64))
-    likelihood = LikelihoodFitness().fit_measurement(model, x, record)
-    torch.testing.assert_close(likelihood, model.log_likelihood(y, x, None))
-
-
-def test_the_literal_swarm_of_004_starts_on_a_line() -> None:
-    """(31), (39): "The random number z_0", "a new N-dimensional vector z = {z_1, ... z_N}": x^i = a + (b - a) z_i."""
-    z = follow_logistic(torch.tensor([[[0.2]]], dtype=torch.float64), 6, 3)
-    assert z.shape == (1, 6, 3)
-    first = [float(v) for v in z[0, :, 0]]
-    assert all(b == pytest.approx(4 * a * (1 - a)) for a, b in itertools.pairwise(first))
-    assert bool((z == z[..., :1]).all())
-    proposal = method_of("cpso_escape_literal").proposal
-    assert proposal.single_sequence
-    model, draws = tracker(), PhiloxStream(1, torch.arange(4))
-    belief = ParticleFilter(30).init(model, 4, draws)
-    x, memory = proposal._start_step(model, belief, draws.at_step(1))
-    white = (x - x.mean(1, keepdim=True)) / (x.amax(1) - x.amin(1)).unsqueeze(1)
-    torch.testing.assert_close(white[..., 0], white[..., 1], rtol=0, atol=1e-9)
-    assert memory["swarm.chaos"].shape == (4, 1, 30, 2)
-
-
-class Upwards:
-    """Velocities of one, for tests."""
-
-    def __call__(self, swarm: Any, *_: Any) -> Tensor:
-        return torch.ones_like(swarm.q)
-
-
-def test_the_literal_swarm_of_004_moves_by_the_velocity_of_the_iteration_before() -> None:
-    """(30): X_k = X_k-1 + V_k-1; (41): x + v_k-1. After three iterations it has moved twice."""
-    assert method_of("cpso_escape_literal").proposal.lags_velocity
-    assert method_of("pso_pf_literal").proposal.lags_velocity
-    model, draws = tracker(), PhiloxStream(1, torch.arange(2))
-    belief, record = ParticleFilter(9).init(model, 2, draws), Record(torch.zeros(2, 2).double())
-    ends = {}
-    for lags in (False, True):
-        proposal = SwarmProposal(
-            Upwards(), None, LikelihoodFitness(), AllComponents(), SwarmLimits(True, 9.0, None), None, 3,
-            IntervalStart(), PrintedWeighting(), lags,
-        )  # fmt: skip
-        ends[lags] = proposal(model, belief, record, draws.at_step(1)).x
-    torch.testing.assert_close(ends[False] - ends[True], torch.ones_like(ends[True]))
-
-
-@pytest.mark.parametrize("name", ["cpso_escape_literal", "pso_pf_literal"])
-def test_the_literal_swarms_of_004_never_resample(name: str) -> None:
-    """Steps (a) to (f) of section 5.4 list none; weights multiply on by (38)."""
-    method = method_of(name)
-    assert method.proposal.iterations == 150
-    log_w = torch.tensor([[0.0, -30.0, -60.0]], dtype=torch.float64)
-    x = torch.zeros(1, 3, 2, dtype=torch.float64)
-    belief = ParticleBelief(x, log_w, torch.zeros(1, dtype=torch.float64))
-    n = torch.tensor([[3]])
-    kept, resampled = method.resampler(
-        tracker(), belief, log_w, n, PhiloxStream(1, torch.arange(1))
-    )
-    assert not bool(resampled.any())
-    torch.testing.assert_close(kept.log_w, log_w)
-
-
 def test_the_printed_number_of_002_falls_to_its_minimum_for_good() -> None:
     """Step (3) "Calculate the effective sample size" stands before step (4) "The weight calculation formula"."""
     for name in ("cofm_amssrcpf_printed", "cofm_amssrcpf_each_printed"):
@@ -385,12 +268,6 @@ def test_the_printed_guide_of_002_is_that_of_akhlaghi() -> None:
     for name in ("cofm_amssrcpf_printed", "cofm_amssrcpf_each_printed"):
         assert method_of(name).proposal.guide_filter == guide
     assert method_of("cofm_amssrcpf").proposal.guide_filter == method_of("cofm_mssrckf")
-
-
-def test_the_literal_generator_of_001_draws_one_neighbour() -> None:
-    """(12): z_i = mean + u_i (x_k - mean), one k, no sum; its law is that of test_polymerised."""
-    assert method_of("thompson_taylor_literal").resampler.as_printed
-    assert not method_of("thompson_taylor").resampler.as_printed
 
 
 # the law of admission
