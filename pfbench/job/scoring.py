@@ -7,6 +7,7 @@ and the probability integral transform, from which rank histograms and interval 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution
 
-from pfbench.core.linear_algebra import factor, squared_length
+from pfbench.core.linear_algebra import squared_length
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import MeasuredTruth
 from pfbench.filter.belief import StepInfo, normalise_log_weights
@@ -27,7 +28,8 @@ from pfbench.model.base import StateSpaceModel
 
 Groups: TypeAlias = Collection[tuple[int, ...]]
 
-_POINTS = 64  # of an energy score: its bias, E|x - x'| / 128, is the same for all filters [ours]
+_POINTS = 64  # particles between which the distances of an energy score are averaged [ours]
+_STEP = 0.35  # in log s, of the integral of an energy score: a relative error of 1e-7
 
 
 class ProperScores(NamedTuple):
@@ -174,10 +176,10 @@ class ScoreRecorder:
             if sd is not None:  # particles of the measured truth
                 deviation = deviation + sd * draws.normal("measured truth", *deviation.shape[1:])
             return score_particles(error, deviation, log_w, groups)
-        z, covariance = draws.normal("energy score", _POINTS, error.shape[1]), info.covariance()
+        covariance = info.covariance()
         if sd is not None:
             covariance = covariance + torch.diag(sd**2)
-        return score_normal(error, covariance, z, groups)
+        return score_normal(error, covariance, groups)
 
 
 def _place_sd(
@@ -195,24 +197,49 @@ def _place_sd(
 def score_particles(
     error: Tensor, deviation: Tensor, log_w: Tensor, groups: Groups
 ) -> ProperScores:
-    """Compute the scores of weighted particles.
+    """Compute the scores of weighted particles, in their fair form.
+
+    The distance between two particles is averaged over different ones, so that a sample of a distribution has its
+    score on average [Ferro 2014]. Scores of a group are those of all particles; the distances between them are those
+    of 64 that stand for them.
 
     Shapes: error [R, d], deviation [R, N, d], log_w [R, N].
     """
     w = normalise_log_weights(log_w)
     crps, below = _marginal_scores(error, deviation, w)
+    off = error.nan_to_num().unsqueeze(1) + deviation
+    crps = _make_fair(
+        crps, (w.unsqueeze(1) @ off.abs()).squeeze(1), w.square().sum(-1, keepdim=True)
+    )
     quantiles = (torch.arange(_POINTS, device=w.device, dtype=w.dtype) + 0.5) / _POINTS
-    quantiles = quantiles.expand(len(w), -1).contiguous()
-    index = torch.searchsorted(w.cumsum(-1), quantiles).clamp(max=w.shape[1] - 1)
-    index = index.unsqueeze(-1).expand(-1, -1, error.shape[1])
-    points = error.unsqueeze(1) + deviation.gather(1, index)
-    return _make_scores(error, crps, below, points, groups)
+    index = torch.searchsorted(w.cumsum(-1), quantiles.repeat(len(w), 1)).clamp(max=w.shape[1] - 1)
+    points = error.unsqueeze(1) + deviation.gather(
+        1, index.unsqueeze(-1).expand(-1, -1, error.shape[1])
+    )
+    share = (index.unsqueeze(1) == index.unsqueeze(2)).to(w).mean((1, 2))
+    parts = off.new_tensor([[float(k in c) for c in groups] for k in range(off.shape[-1])])
+    distance = (w.unsqueeze(1) @ (off.square() @ parts).sqrt()).squeeze(1)
+
+    def score_group(g: int, components: list[int]) -> Tensor:
+        chosen = points[..., components]
+        near = chosen.norm(dim=-1).mean(1)
+        return _make_fair(_energy_score(chosen), near, share) + distance[:, g] - near
+
+    return _make_scores(error, crps, below, groups, score_group)
 
 
-def score_normal(error: Tensor, covariance: Tensor, z: Tensor, groups: Groups) -> ProperScores:
-    """Compute the scores of normal distributions.
+def _make_fair(score: Tensor, distance: Tensor, share: Tensor) -> Tensor:
+    """Average over pairs of different particles: score = distance - half the mean over all pairs.
 
-    Shapes: error [R, d], covariance [R, d, d], z [R or 1, n, d].
+    `share` is the part of a particle and itself among all pairs, the sum of the squared weights.
+    """
+    return torch.where(share < 1.0, distance - (distance - score) / (1.0 - share), distance)
+
+
+def score_normal(error: Tensor, covariance: Tensor, groups: Groups) -> ProperScores:
+    """Compute the scores of normal distributions, the energy score to 1e-7.
+
+    Shapes: error [R, d], covariance [R, d, d].
     """
     import scoringrules  # on use, as below
 
@@ -220,8 +247,33 @@ def score_normal(error: Tensor, covariance: Tensor, z: Tensor, groups: Groups) -
     spread = torch.where(sd > 0, sd, 1.0)
     crps = scoringrules.crps_normal(torch.zeros_like(error), error, spread, backend="torch")
     crps = torch.where(sd > 0, crps, error.abs())
-    points = error.unsqueeze(1) + z @ factor(covariance)[0].mT
-    return _make_scores(error, crps, torch.special.ndtr(-error / sd), points, groups)
+
+    def score_group(_: int, components: list[int]) -> Tensor:
+        own = covariance[:, components][:, :, components]
+        value, axes = torch.linalg.eigh(own.nan_to_num())
+        along = (error[:, None, components] @ axes).squeeze(1)
+        apart = _mean_length(torch.zeros_like(along), 2.0 * value)
+        return _mean_length(along, value) - 0.5 * apart + 0.0 * own.sum((1, 2))
+
+    return _make_scores(error, crps, torch.special.ndtr(-error / sd), groups, score_group)
+
+
+def _mean_length(mean: Tensor, variance: Tensor) -> Tensor:
+    """Compute E |x| of independent normal components [R, k] as [R].
+
+    E sqrt(q) = pi^(-1/2) int_0^inf (1 - E exp(-s^2 q)) s^(-2) ds for q = |x|^2, by the trapezoidal rule in log s, whose
+    error falls exponentially with the step. Beyond its range the integrand is exponential, and the sum geometric.
+    """
+    variance = variance.clamp(min=0.0)
+    scale = (mean.square() + variance).sum(-1, keepdim=True).sqrt()
+    unit = torch.where(scale > 0, scale, 1.0)
+    nodes = torch.arange(-6.0, 8.0 + _STEP, _STEP, device=mean.device, dtype=mean.dtype)
+    square = torch.exp(2.0 * nodes).unsqueeze(-1) / unit.unsqueeze(-1).square()  # [R, nodes, 1]
+    spread = 1.0 + 2.0 * square * variance.unsqueeze(1)
+    log_mean = -(0.5 * spread.log() + square * mean.square().unsqueeze(1) / spread).sum(-1)
+    height = -torch.expm1(log_mean) * torch.exp(-nodes)
+    ends = (height[:, 0] + height[:, -1]) / math.expm1(_STEP)
+    return scale.squeeze(-1) * (_STEP / math.sqrt(math.pi)) * (height.sum(-1) + ends)
 
 
 def _separate_marginals(error: Tensor, deviation: Tensor, w: Tensor) -> tuple[Tensor, Tensor]:
@@ -256,10 +308,16 @@ _energy_score = compilable(
 
 
 def _make_scores(
-    error: Tensor, crps: Tensor, pit: Tensor, points: Tensor, groups: Groups
+    error: Tensor,
+    crps: Tensor,
+    pit: Tensor,
+    groups: Groups,
+    score_group: Callable[[int, list[int]], Tensor],
 ) -> ProperScores:
-    """Add the energy scores of points minus truth [R, n, d], and NaN of the truth."""
+    """Add the energy scores, that of one component its CRPS, and NaN of the truth."""
     has_truth = ~torch.isnan(error)
-    energy = [_energy_score(points[:, :, components]) for components in map(list, groups)]
+    energy = [
+        crps[:, c[0]] if len(c) == 1 else score_group(g, c) for g, c in enumerate(map(list, groups))
+    ]
     crps, pit = (torch.where(has_truth, values, torch.nan) for values in (crps, pit))
     return ProperScores(crps, pit, torch.stack(energy, 1))

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import scoringrules
 import torch
 from scipy import stats
 from torch import Tensor
@@ -22,7 +23,13 @@ from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.job.scoring import LikelihoodCounter, ScoreRecorder, score_normal, score_particles
+from pfbench.job.scoring import (
+    LikelihoodCounter,
+    ScoreRecorder,
+    _mean_length,
+    score_normal,
+    score_particles,
+)
 from pfbench.kernels import dispatch
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.noise.base import NominalNoise
@@ -48,55 +55,71 @@ def both(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("both")
-def test_a_large_cloud_of_a_normal_law_scores_as_the_law() -> None:
+def test_a_cloud_of_a_normal_law_scores_as_the_law_on_average() -> None:
+    """With 12 particles, whose distances to themselves would cost a twelfth of the spread.
+
+    The energy score of the law itself is that of 1e5 points, far from the truth.
+    """
     error, covariance = law()
-    n, root = 40_000, torch.linalg.cholesky(covariance)
-    z = PhiloxStream(1, torch.arange(3)).normal("z", n, 2)
-    cloud = score_particles(error, z @ root.mT, torch.zeros(3, n, dtype=torch.float64), GROUPS)
-    exact = score_normal(error, covariance, z[:, :2000], GROUPS)
-    sd = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
-    assert ((cloud.crps - exact.crps).abs() < 6 * sd / math.sqrt(n)).all()
-    assert ((cloud.pit - exact.pit).abs() < 6 * 0.5 / math.sqrt(n)).all()
-    # 64 points stand for the cloud: the mean distance from the truth is off by a few standard errors of 64, and by the bias
-    assert (
-        (cloud.energy_score - exact.energy_score).abs() < 6 * sd.sum(-1, keepdim=True) / 8
-    ).all()
-    z = torch.tensor([0.5, -1.5], dtype=torch.float64)  # Gneiting and Raftery 2007, eq. 21
-    expected = (
-        z * (2 * torch.special.ndtr(z) - 1)
-        + 2 * torch.exp(-z * z / 2) / math.sqrt(2 * math.pi)
-        - 1 / math.sqrt(math.pi)
-    )
-    one = score_normal(
-        z[:, None],
-        torch.ones(2, 1, 1, dtype=torch.float64),
-        torch.zeros(2, 4, 1, dtype=torch.float64),
-        ((0,),),
-    )
-    torch.testing.assert_close(one.crps[:, 0], expected)
+    n, root = 12, torch.linalg.cholesky(covariance)
+    exact = score_normal(error, covariance, GROUPS)
+    for r in range(3):
+        z = PhiloxStream(1, torch.arange(4000)).normal("z", n, 2)
+        own = error[r].expand(4000, -1)
+        cloud = score_particles(own, z @ root[r].mT, torch.zeros(4000, n).double(), GROUPS)
+        for name in ("crps", "pit", "energy_score"):
+            found, wanted = getattr(cloud, name), getattr(exact, name)[r]
+            bound = 4.5 * found.std(0) / 4000**0.5
+            assert ((found.mean(0) - wanted).abs() < bound).all(), name
+    off = PhiloxStream(2, torch.arange(2)).normal("z", 100_000, 2) @ root[0].mT + error[2]
+    sample = off[0].norm(dim=-1) - 0.5 * (off[0] - off[1]).norm(dim=-1)
+    assert abs(sample.mean() - exact.energy_score[2, 2]) < 4.5 * sample.std() / 100_000**0.5
+
+
+def test_the_mean_length_of_a_normal_law_is_that_of_rayleigh_rice_and_a_point() -> None:
+    """sd sqrt(pi / 2) in the plane, 2 sd sqrt(2 / pi) in space, Rice's about a centre, |m| without spread."""
+    mean = torch.tensor(
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [3.0, 4.0, 0.0]]
+    ).double()
+    variance = torch.tensor(
+        [[4.0, 4.0, 0.0], [4.0, 4.0, 4.0], [4.0, 4.0, 0.0], [0.0, 0.0, 0.0]]
+    ).double()
+    wanted = [
+        2 * math.sqrt(math.pi / 2),
+        4 * math.sqrt(2 / math.pi),
+        stats.rice(2.5, scale=2).mean(),
+        5.0,
+    ]
+    found = _mean_length(1e3 * mean, 1e6 * variance)
+    torch.testing.assert_close(found, 1e3 * torch.tensor(wanted).double(), rtol=1e-6, atol=0.0)
 
 
 @pytest.mark.usefixtures("both")
-def test_the_energy_score_of_one_component_is_its_crps() -> None:
-    error, _ = law()
+def test_scores_of_particles_are_the_fair_ones_of_scoringrules() -> None:
+    """And the energy score of one component is its CRPS, by particles and by a normal law."""
+    error, covariance = law()
     deviation = PhiloxStream(2, torch.arange(3)).normal("z", 64, 2)
-    scores = score_particles(error, deviation, torch.zeros(3, 64, dtype=torch.float64), GROUPS)
-    torch.testing.assert_close(scores.energy_score[:, :2], scores.crps)
+    found = score_particles(error, deviation, torch.zeros(3, 64, dtype=torch.float64), GROUPS)
+    off = (error.unsqueeze(1) + deviation).numpy()
+    crps = scoringrules.crps_ensemble(0 * error.numpy(), off.swapaxes(1, 2), estimator="fair")
+    energy = scoringrules.es_ensemble(0 * error.numpy(), off, estimator="fair")
+    torch.testing.assert_close(found.crps, torch.tensor(crps))
+    torch.testing.assert_close(found.energy_score[:, 2], torch.tensor(energy))
+    for scores in (found, score_normal(error, covariance, GROUPS)):
+        torch.testing.assert_close(scores.energy_score[:, :2], scores.crps)
 
 
 @pytest.mark.usefixtures("both")
-def test_a_weighted_particle_is_as_many_particles() -> None:
-    error, _ = law()
-    deviation = PhiloxStream(2, torch.arange(3)).normal("z", 16, 2)
-    repeated = deviation.repeat_interleave(torch.tensor([1, 3] * 8), dim=1)
-    w = torch.tensor([1.0, 3.0] * 8, dtype=torch.float64).log().expand(3, -1)
-    empty = torch.cat([w, torch.full((3, 1), -torch.inf, dtype=torch.float64)], 1)
-    padded = torch.cat([deviation, torch.full((3, 1, 2), 1e6, dtype=torch.float64)], 1)
-    one = score_particles(error, padded, empty, GROUPS)
-    torch.testing.assert_close(
-        one._asdict(),
-        score_particles(error, repeated, torch.zeros(3, 32, dtype=w.dtype), GROUPS)._asdict(),
-    )
+def test_distances_of_weighted_particles_are_averaged_over_different_ones() -> None:
+    """E |x| - E |x - x'| / 2 over pairs of different particles by their weights; one without weight does not count."""
+    w = torch.tensor([0.5, 0.25, 0.25, 0.0]).double()
+    deviation = torch.tensor([[[-1.0], [0.5], [3.0], [1e6]]]).double().expand(1, 4, 2)
+    found = score_particles(torch.ones(1, 2).double(), deviation, w.log()[None], ((0, 1),))
+    x = deviation[0, :3, 0] + 1.0
+    apart = w[:3, None] * w[:3] * (x[:, None] - x).abs()
+    wanted = (w[:3] * x.abs()).sum() - 0.5 * apart.sum() / (1 - w.square().sum())
+    assert found.crps[0].tolist() == pytest.approx([float(wanted)] * 2)
+    assert float(found.energy_score) == pytest.approx(math.sqrt(2) * float(wanted))
 
 
 @pytest.mark.usefixtures("both")
@@ -118,7 +141,7 @@ def test_a_point_scores_its_distance() -> None:
         torch.zeros(3, 5, dtype=torch.float64),
         GROUPS,
     )
-    flat = score_normal(error, 0 * covariance, torch.zeros(3, 8, 2, dtype=torch.float64), GROUPS)
+    flat = score_normal(error, 0 * covariance, GROUPS)
     for scores in (point, flat):
         torch.testing.assert_close(scores.crps, error.abs())
         torch.testing.assert_close(scores.energy_score[:, 2], error.norm(dim=1))

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import pytest
@@ -17,12 +15,10 @@ from torch.distributions import Distribution
 from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
+from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.learned.differentiable_resampling import (
-    OptimalTransportResampler,
     SoftResampler,
     StopGradientResampler,
-    compute_transport_plan,
 )
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
@@ -141,9 +137,9 @@ def test_without_it_there_is_a_bias_and_the_test_sees_it(resampler: Resampler) -
 
 @pytest.mark.slow
 def test_the_bias_that_many_particles_leave() -> None:
-    """Of grad log Z_hat: the score's and transport's go, the dropped one stays, and soft weights mend part of it."""
+    """Of grad log Z_hat: the score's goes, the dropped one stays, and soft weights mend part of it."""
     cases: dict[str, tuple[Resampler, int]] = {
-        "dropped": (DROPPED, 400), "soft": (SoftResampler(0.3), 400), "transport": (OptimalTransportResampler(), 100), "score": (StopGradientResampler(), 2000)
+        "dropped": (DROPPED, 400), "soft": (SoftResampler(0.3), 400), "score": (StopGradientResampler(), 2000)
     }  # fmt: skip
     found = {
         name: bias(resampler, 100, runs, of_z=False) for name, (resampler, runs) in cases.items()
@@ -155,7 +151,6 @@ def test_the_bias_that_many_particles_leave() -> None:
     assert max(noise.values()) < 0.07
     assert share["dropped"] > 0.5
     assert 0.2 < share["soft"] < 0.9 * share["dropped"]
-    assert share["transport"] < 0.2
     assert share["score"] < 0.1
 
 
@@ -192,91 +187,7 @@ def cloud_of(n: int, d: int, runs: int = 3) -> ParticleBelief:
     return ParticleBelief(draws.normal("x", n, d), log_w, torch.zeros(runs, dtype=torch.float64))
 
 
-def test_a_plan_has_its_margins() -> None:
-    cloud = cloud_of(25, 2)
-    plan = compute_transport_plan(cloud.x, cloud.log_w, 0.3, 100)
-    torch.testing.assert_close(
-        plan.sum(1), torch.full((3, 25), 1 / 25, dtype=torch.float64), rtol=0, atol=1e-4
-    )
-    torch.testing.assert_close(plan.sum(2), cloud.log_w.exp(), rtol=1e-10, atol=1e-14)
-    assert (plan >= 0).all()
-
-
-def test_in_one_dimension_the_plan_goes_to_the_order_s() -> None:
-    """With little entropy x' are the means of the weighted cloud's even slices, in order: the exact transport on a line."""
-    x = torch.tensor([[[-1.0], [0.0], [1.0], [2.0]]], dtype=torch.float64)
-    a = torch.tensor([[0.5, 0.125, 0.125, 0.25]], dtype=torch.float64)
-    plan = compute_transport_plan(x, a.log(), 0.02, 1000)
-    moved = (plan.mT @ x / plan.sum(1, keepdim=True).mT)[0, :, 0]
-    torch.testing.assert_close(
-        moved.sort()[0],
-        torch.tensor([-1.0, -1.0, 0.5, 2.0], dtype=torch.float64),
-        rtol=0,
-        atol=5e-3,
-    )
-
-
-def test_transport_keeps_the_mean_and_most_of_the_spread() -> None:
-    model = Walker(THETA.expand(3, -1))
-    cloud = cloud_of(200, 1)
-    n = torch.tensor([[200]])
-    before, variance = weighted_mean_cov(model.chart, cloud)
-    for epsilon, iterations, least in ((0.05, 40, 0.9), (0.3, 2, 0.5)):
-        fresh, _ = OptimalTransportResampler(epsilon, iterations)(
-            model, cloud, cloud.log_w, n, PhiloxStream(1, torch.arange(3))
-        )
-        after, spread = weighted_mean_cov(model.chart, fresh)
-        torch.testing.assert_close(after, before, rtol=0, atol=1e-12)
-        torch.testing.assert_close(
-            fresh.log_w.logsumexp(1), torch.zeros(3, dtype=torch.float64), rtol=0, atol=1e-12
-        )
-        assert (spread < variance).all()
-        assert (spread > least * variance).all()
-
-
-def test_transport_says_that_it_is_not_exact_and_is_near() -> None:
-    method = ParticleFilter(60, OptimalTransportResampler())
-    assert not method.is_exact
-    runs, model = 40, Walker(THETA.expand(40, -1))
-    estimate = run_filter(
-        method, model, Record(Y.expand(runs, -1, -1)), PhiloxStream(1, torch.arange(runs))
-    )
-    away = estimate.log_evidence - kalman(THETA)
-    assert away.mean().abs() < 0.15 + 4.0 * away.std() / math.sqrt(runs)
-    assert away.std() < 0.8
-
-
-def test_transport_leaves_alone_what_it_need_not_touch() -> None:
-    cloud = cloud_of(20, 1)
-    even = cloud._replace(
-        log_w=cloud.log_w.clone().index_fill(0, torch.tensor([1]), -math.log(20.0))
-    )
-    n, draws = torch.tensor([[20]]), PhiloxStream(1, torch.arange(3))
-    fresh, hit = OptimalTransportResampler(threshold=0.9)(
-        Walker(THETA.expand(3, -1)), even, even.log_w, n, draws
-    )
-    assert hit.tolist() == [True, False, True]
-    assert torch.equal(fresh.x[1], even.x[1])
-    assert not torch.equal(fresh.x[0], even.x[0])
-
-
 def test_resampling_with_gradients_refuses_what_it_cannot_do() -> None:
-    cloud = cloud_of(20, 1)
-    remembers = cloud._replace(memory={"own": cloud.x})
-    with pytest.raises(ValueError, match="have a past or memory"):
-        OptimalTransportResampler()(
-            Walker(THETA.expand(3, -1)),
-            remembers,
-            cloud.log_w,
-            torch.tensor([[20]]),
-            PhiloxStream(1, torch.arange(3)),
-        )
-    makes: list[Callable[[], Any]] = [
-        partial(SoftResampler, 0.0),
-        partial(SoftResampler, 1.5),
-        partial(OptimalTransportResampler, 0.0),
-        partial(OptimalTransportResampler, 1.0, 0),
-    ]
-    for make in [*makes, partial(OptimalTransportResampler, threshold=2.0)]:
+    for alpha in (0.0, 1.5):
         with pytest.raises(ValueError, match=r"resampler\.\w+ must be"):
-            make()
+            SoftResampler(alpha)

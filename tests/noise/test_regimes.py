@@ -523,6 +523,14 @@ def test_added_errors_are_in_metres_of_positions_alone() -> None:
     assert within_chi_square(hits[hit], 400.0)
 
 
+def test_white_errors_and_outliers_beside_each_other_are_independent() -> None:
+    """The variance of both is the sum, 2^2 + 5^2; with shared numbers it would be (2 + 5)^2."""
+    hit = draw(AddedErrors(probability=0.3, outlier_sd_m=5.0), 0.0)[..., :3] != 0.0
+    both = draw(AddedErrors(2.0, 0.3, 5.0), 0.0)[..., :3]
+    assert within_chi_square(both[hit], 29.0)
+    assert within_chi_square(both[~hit], 4.0)
+
+
 def test_added_errors_of_ranges_are_those_of_each_satellite() -> None:
     ranges = MeasurementChannels(torch.ones(4, dtype=torch.float64), ("range",) * 4, (0, 1, 2, 3))
     hit = draw(AddedErrors(probability=0.2, outlier_sd_m=20.0), 0.0, ranges) != 0.0

@@ -14,6 +14,8 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+import statsmodels.api
+import statsmodels.formula.api
 from checkout import ROOT
 from scipy import stats
 
@@ -236,6 +238,26 @@ def test_ranks_are_those_of_scipy() -> None:
     assert ranks.p < 1e-6
     assert ranks.critical_difference == pytest.approx(2.343 * math.sqrt(3 * 4 / 36), rel=1e-3)
     assert rank_methods(worlds[:1], methods).reason == "ranks need two worlds and three methods"
+
+
+@pytest.mark.parametrize(("count", "methods"), [(5, "abcd"), (9, "abc")])
+def test_the_p_value_of_ranks_is_that_of_their_analysis_of_variance(
+    count: int, methods: str
+) -> None:
+    """By statsmodels: F of Iman and Davenport is that of ranks by worlds and methods, with both degrees of freedom."""
+    rng = np.random.default_rng(8)
+    worlds = [
+        make_world(rng, str(k), dict.fromkeys(methods, 0.0) | {"ekf": 0.0}, k) for k in range(count)
+    ]
+    levels = np.array([[w.losses[m].mean() for m in methods] for w in worlds])
+    rows = pd.DataFrame(
+        {"rank": stats.rankdata(levels, axis=1).ravel()}
+        | {"world": np.repeat(range(count), len(methods)), "method": list(methods) * count}
+    )
+    fit = statsmodels.formula.api.ols("rank ~ C(world) + C(method)", rows).fit()
+    wanted = statsmodels.api.stats.anova_lm(fit).loc["C(method)", "PR(>F)"]
+    assert 0.01 < wanted < 0.99
+    assert rank_methods(worlds, list(methods)).p == pytest.approx(wanted)
 
 
 def test_the_reference_is_that_of_the_tuning_and_not_of_the_runs(

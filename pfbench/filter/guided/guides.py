@@ -34,6 +34,7 @@ from pfbench.filter.particle.stages import (
     PointSet,
     Proposal,
     ProposalSample,
+    is_measured,
 )
 from pfbench.filter.whitening import (
     LOG_2PI,
@@ -227,7 +228,8 @@ class ParticleGuideProposal(Proposal):
     predicted and updated, x ~ N(x+, P+), and the ratio is p(x | parent) / N(x; x+, P+). P does not
     use the other particles, so the proposal is much wider than p(x | parent, y). In several
     dimensions few particles have weight. `GuidedNoiseProposal` is cheaper and better. The cost is N guide
-    steps per run.
+    steps per run. In a run without measurement particles follow the transition, since N(x+, P+) would leave
+    weight to few of them.
 
     Attributes:
         guide_filter: Gaussian filter. Its adaptations act per particle and on the proposal only.
@@ -253,8 +255,9 @@ class ParticleGuideProposal(Proposal):
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
         runs, n, _ = belief.x.shape
+        free = BootstrapProposal()(model, belief, record, draws)
         if isinstance(model, StaticModel):  # no transition in this step
-            return BootstrapProposal()(model, belief, record, draws)
+            return free
         covariance = (
             belief.memory[COVARIANCE]
             if COVARIANCE in belief.memory
@@ -283,9 +286,10 @@ class ParticleGuideProposal(Proposal):
         )
         log_ratio = _log_transition(model, belief.x, x, record.u) - log_q
         valid_mask = torch.isfinite(new.log_likelihood).unflatten(0, (runs, n))
+        measured = is_measured(record).unsqueeze(1)
         return ProposalSample(
-            x,
-            torch.where(valid_mask, log_ratio, -torch.inf),
+            torch.where(measured.unsqueeze(2), x, free.x),
+            torch.where(measured, torch.where(valid_mask, log_ratio, -torch.inf), free.log_ratio),
             belief.memory | pack_guide_belief(new, (runs, n)),
         )
 

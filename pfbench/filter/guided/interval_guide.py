@@ -32,7 +32,7 @@ from pfbench.filter.linearisation import (
     mean_noise,
     measurement_jacobian,
 )
-from pfbench.filter.particle.stages import Proposal, ProposalSample, draw_noise
+from pfbench.filter.particle.stages import Proposal, ProposalSample, draw_noise, is_measured
 from pfbench.filter.whitening import compute_half_square
 from pfbench.model.base import StateSpaceModel, StaticModel
 
@@ -95,13 +95,13 @@ class GuidedIntervalProposal(Proposal):
             return ProposalSample(x, log_ratio, belief.memory, w)
         check_moments(model, "noise", model.noise)
         interval = self._extended(model, belief, record, w)
-        is_measured = ~torch.isnan(record.y).all(-1)
-        if bool(is_measured.any()):
+        measured = is_measured(record)
+        if bool(measured.any()):
             z, moved_ratio = self._move(model, belief, record, interval, draws)
-            at_end = is_measured[:, None, None]
+            at_end = measured[:, None, None]
             x = torch.where(at_end, interval.propagate(model, z)[-1], x)
-            log_ratio = torch.where(is_measured[:, None], moved_ratio, log_ratio)
-            interval = interval._replace(length=torch.where(is_measured, 0, interval.length))
+            log_ratio = torch.where(measured[:, None], moved_ratio, log_ratio)
+            interval = interval._replace(length=torch.where(measured, 0, interval.length))
         return ProposalSample(x, log_ratio, pack_interval(belief.memory, interval))
 
     def _extended(

@@ -27,7 +27,7 @@ from typing_extensions import override
 
 from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import RandomStream
-from pfbench.filter.belief import ParticleBelief, normalise_log_weights, select_by_run
+from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.exactness import is_every_part_exact
 from pfbench.filter.particle.stages import EssResampler, Resampler, Systematic
 from pfbench.model.base import StateSpaceModel
@@ -117,89 +117,6 @@ class SoftResampler(Resampler):
                 -torch.inf,
             )
         return self.resampler(model, belief, log_a, n, draws)
-
-
-@dataclass(frozen=True)
-class OptimalTransportResampler(Resampler):
-    """Optimal transport of particles to equal weights, x_j' = N sum_i P_ij x_i.
-
-    P minimises |x_i - x_j|^2 less epsilon times its entropy between weighted and equal particles,
-    by Sinkhorn iterations on logarithms. Distances are in unweighted standard deviations over the
-    root of the dimension. The last half iteration normalises the rows, and the column sums become
-    the new weights [ours], so the mean is unchanged for any number of iterations. The covariance
-    shrinks with epsilon: the posterior is reached only as N grows and epsilon falls. In a curved
-    chart it uses coordinates about the mean [ours].
-
-    Attributes:
-        epsilon: Weight of the entropy.
-        iterations: Number of Sinkhorn iterations.
-        threshold: As in `EssResampler`.
-
-    References:
-        Reich 2013. Corenflos et al. 2021.
-    """
-
-    epsilon: float = 0.1
-    iterations: int = 15
-    threshold: float = 1.0
-    is_exact = False
-
-    def __post_init__(self) -> None:
-        require_ranges(
-            "resampler",
-            self,
-            epsilon="(0, inf]",
-            iterations="[1, inf]",
-            threshold="[0, 1] Use 0 for never, 1 for always.",
-        )
-
-    @override
-    def __call__(
-        self,
-        model: StateSpaceModel,
-        belief: ParticleBelief,
-        log_a: Tensor,
-        n: Tensor,
-        draws: RandomStream,
-    ) -> tuple[ParticleBelief, Tensor]:
-        if any(value.shape[1] > 1 for value in (*belief.memory.values(), *belief.window.values())):
-            raise ValueError(
-                "resampler must copy particles that have a past or memory, got "
-                "OptimalTransportResampler. Choose SoftResampler or StopGradientResampler."
-            )
-        a = normalise_log_weights(belief.log_w)  # transport needs no correction of probabilities
-        resampled = 1.0 / a.square().sum(-1) <= self.threshold * n.squeeze(1)
-        mean = model.chart.mean(belief.x, a).unsqueeze(1)
-        deviations = model.chart.subtract(belief.x, mean)
-        # unweighted: if one particle has all weight, weighted deviations are 0 and distances infinite
-        living = (belief.log_w > -torch.inf).to(a).unsqueeze(-1)
-        sd = torch.sqrt(
-            (living * deviations.square()).sum(1, keepdim=True) / living.sum(1, keepdim=True)
-        ).detach()
-        near = deviations / torch.where(sd > 0.0, sd, 1.0) / math.sqrt(deviations.shape[-1])
-        plan = compute_transport_plan(
-            near, torch.log_softmax(belief.log_w, 1), self.epsilon, self.iterations
-        )
-        column_sums = plan.sum(1)
-        fresh = belief._replace(
-            x=model.chart.add(mean, plan.mT @ deviations / column_sums.unsqueeze(-1)),
-            log_w=torch.log(column_sums),
-        )
-        return select_by_run(resampled, fresh, belief), resampled
-
-
-def compute_transport_plan(x: Tensor, log_a: Tensor, epsilon: float, iterations: int) -> Tensor:
-    """Return the transport plan; its rows sum to a exactly, its columns to 1/N nearly.
-
-    Returns p, [R, N, N]. Shapes: x [R, N, d], log_a [R, N].
-    """
-    cost = -(x.unsqueeze(2) - x.unsqueeze(1)).square().sum(-1) / epsilon
-    log_b = torch.full_like(log_a, -math.log(log_a.shape[1]))
-    f = torch.zeros_like(log_a)
-    for _ in range(iterations):
-        g = log_b - (cost + f.unsqueeze(2)).logsumexp(1)
-        f = log_a - (cost + g.unsqueeze(1)).logsumexp(2)
-    return torch.exp(cost + f.unsqueeze(2) + g.unsqueeze(1))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -130,7 +130,8 @@ class RegularisedResampler(Resampler):
         scale: Factor on the optimal bandwidth. Use 1/2 for several modes.
         shrink_to_mean: Shrink particles towards the mean first, which preserves the covariance
             [West 1993; Liu and West 2001]. Without it each resampling multiplies the covariance by
-            1 + h^2 times the variance of the kernel.
+            1 + h^2 times the variance of the kernel. Copies by equal probabilities, as before the first
+            measurement, stay as they are.
         kernel: Distribution of e.
 
     Raises:
@@ -174,8 +175,19 @@ class RegularisedResampler(Resampler):
             x = model.chart.add(centre, shrinkage.unsqueeze(-1) * deviations + step)
         else:
             x = model.chart.add(copies.x, step)
-        x = torch.where(resampled_mask[:, None, None], x, copies.x)
-        return copies._replace(x=x), resampled_mask
+        return _move_where_uneven(copies, x, log_a, resampled_mask), resampled_mask
+
+
+def _move_where_uneven(
+    copies: ParticleBelief, x: Tensor, log_a: Tensor, resampled_mask: Tensor
+) -> ParticleBelief:
+    """Move the copies to x [R, N, D] in resampled runs whose probabilities are not all equal.
+
+    Equal ones, as of the prior and after a step without measurement, weigh nothing: a smoothed cloud would no
+    longer be that of the prediction.
+    """
+    uneven = ((log_a > -torch.inf) & (log_a < log_a.amax(1, keepdim=True))).any(1)
+    return copies._replace(x=torch.where((resampled_mask & uneven)[:, None, None], x, copies.x))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -242,8 +254,7 @@ class ThompsonTaylorResampler(Resampler):
         centre = rows.mean(2)
         combination = self._combine(rows - centre.unsqueeze(2), draws)
         x = model.chart.add(mean.unsqueeze(1), centre + combination)
-        x = torch.where(resampled_mask[:, None, None], x, copies.x)
-        return copies._replace(x=x), resampled_mask
+        return _move_where_uneven(copies, x, log_a, resampled_mask), resampled_mask
 
     def _combine(self, r: Tensor, draws: RandomStream) -> Tensor:
         """Combine the deviations r [R, N, m, d] of neighbours from their mean, [R, N, d]."""

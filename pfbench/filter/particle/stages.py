@@ -393,6 +393,11 @@ class BootstrapProposal(Proposal):
         return ProposalSample(model.propagate(belief.x, record.u, w), log_ratio, belief.memory, w)
 
 
+def is_measured(record: Record) -> Tensor:
+    """Return which runs have a measurement in a step, [R]."""
+    return ~torch.isnan(record.y).all(-1)
+
+
 def draw_noise(model: StateSpaceModel, n: int, draws: RandomStream) -> Tensor:
     """Draw noise from the model's noise distribution.
 

@@ -27,6 +27,7 @@ from pfbench.filter.particle.stages import (
     ProposalSample,
     deactivate_invalid_particles,
     draw_noise,
+    is_measured,
 )
 from pfbench.filter.proposed.swarm_coordinates import (
     Fitness,
@@ -170,7 +171,7 @@ def _quantiles(p: float, maximum: int) -> list[float]:
 class SwarmProposal(Proposal):
     """Bootstrap prediction followed by particle swarm optimisation [Tian et al.].
 
-    Steps a to f of the paper. A run without measurement does not move. A run that satisfies
+    Steps a to f of the paper. A run without measurement follows the transition. A run that satisfies
     `stopping` moves no further. Chaotic sequences belong to slots, because resampled copies would
     otherwise share a sequence [ours].
 
@@ -247,11 +248,14 @@ class SwarmProposal(Proposal):
         )
         log_likelihood = model.log_likelihood(record.y, frame.to_states(swarm.q), record.u)
         q, log_ratio = self.weighting(frame, swarm.q, log_likelihood, log_w, draws)
+        measured = is_measured(record).unsqueeze(1)
         if self.perturbation:
             chaos = memory["swarm.chaos"].index_copy(-1, frame.components, swarm.chaos.unsqueeze(1))
             memory = memory | {"swarm.chaos": chaos}
-        log_ratio = torch.where(torch.isfinite(log_w), log_ratio, -torch.inf)
-        x = frame.to_states(q)
+        log_ratio = torch.where(
+            torch.isfinite(log_w), torch.where(measured, log_ratio, 0.0), -torch.inf
+        )
+        x = frame.to_states(torch.where(measured.unsqueeze(2), q, frame.q))
         return ProposalSample(x, log_ratio, memory, trace={"iterations": iterations})
 
     def optimise(
@@ -287,7 +291,7 @@ class SwarmProposal(Proposal):
         by_prior = self.limits.scale_by_prior
         scale = memory["swarm.scale"][..., frame.components] if by_prior else spread
         spare = self._draw_spare_seeds(frame.q, draws)
-        active = observed_runs = ~torch.isnan(record.y).all(1)
+        active = observed_runs = is_measured(record)
         iterations = torch.zeros_like(active, dtype=torch.long)
         for i in range(1, self.iterations + 1):
             if not (active.is_cuda or is_capturing()) and not bool(active.any()):

@@ -79,27 +79,6 @@ class PrintedWeighting(SwarmWeighting):
 
 
 @dataclass(frozen=True)
-class UnchangedWeighting(SwarmWeighting):
-    """Weights that do not change, which shows the effect of the swarm alone [ours].
-
-    The ratio is the inverse of the likelihood that `BayesWeightUpdate` adds.
-    """
-
-    is_exact = False
-
-    @override
-    def __call__(
-        self,
-        frame: SwarmFrame,
-        q: Tensor,
-        log_likelihood: Tensor,
-        log_w: Tensor,
-        draws: RandomStream,
-    ) -> tuple[Tensor, Tensor]:
-        return q, torch.where(torch.isfinite(log_likelihood), -log_likelihood, 0.0)
-
-
-@dataclass(frozen=True)
 class MixtureWeighting(SwarmWeighting):
     """Proposal centred on the final swarm, mixed with the predicted particles [ours].
 

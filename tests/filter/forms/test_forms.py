@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
 
+import numpy as np
 import pandas as pd
 import pytest
+import scipy
 import torch
 from checkout import ROOT
 from config_cases import GROUPS, composed
 from filter_cases import UNPRINTED, method_of
 from model_cases import tracker
 from omegaconf import OmegaConf
-from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
@@ -28,19 +28,9 @@ from pfbench.filter.moves.path_kernels import LastStateKernel, LikelihoodRatioKe
 from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import GaussianSmoothing
-from pfbench.filter.particle.resampling import Multinomial
 from pfbench.filter.particle.sqmc import HaltonPoints, halton_points
 from pfbench.filter.particle.stages import EssResampler, FixedCount, Systematic
-from pfbench.filter.proposed.dmc_controller import DmcController
-from pfbench.filter.proposed.reconstructed import NoWeightCorrection, ReconstructedProposal
-from pfbench.filter.proposed.swarm import SwarmLimits, SwarmProposal
-from pfbench.filter.proposed.swarm_coordinates import (
-    AllComponents,
-    LikelihoodFitness,
-    PrintedFitness,
-)
-from pfbench.filter.proposed.swarm_motion import IntervalStart, follow_logistic
-from pfbench.filter.proposed.swarm_weighting import PrintedWeighting
+from pfbench.filter.proposed.swarm import SwarmProposal
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.results.paper_block import (
     METHOD_FORMS,
@@ -260,111 +250,6 @@ def test_one_halton_set_of_001_is_the_same_in_each_draw() -> None:
     assert base[0, :3, 0].tolist() == [0.5, 0.25, 0.75]
 
 
-def test_the_literal_shift_of_003_counts_twice() -> None:
-    """ "II. State reconstruction", and "V. Prediction. X_{k+1} = f(X_k, W) + B U" with the U of II."""
-    method = method_of("dmc_reconstructed_literal")
-    assert method.resampler.scheme == Multinomial()
-    assert method.resampler.ess_threshold == 1.0
-    assert method.proposal.repeats_shift
-    assert not method.is_exact
-    model = LinearGaussian([[1.0]], [[1e-9]], [[1.0]], [1.0], [0.0], [1e-9])
-    y = torch.tensor([[[11.0], [11.0], [11.0]]], dtype=torch.float64)
-    found = {}
-    for repeats in (False, True):
-        proposal = ReconstructedProposal(
-            controller=DmcController(),
-            weight_correction=NoWeightCorrection(),
-            repeats_shift=repeats,
-        )
-        method = ParticleFilter(8, EssResampler(Systematic(), 1.0), proposal=proposal)
-        found[repeats] = run_filter(
-            method, model, Record(y), PhiloxStream(1, torch.arange(1))
-        ).mean[0, :, 0]
-    gain, once, twice = 1 / 11, [0.0], [0.0]
-    shift = 0.0
-    for _ in range(3):
-        once.append(once[-1] + gain * (11.0 - once[-1]))
-        predicted = twice[-1] + shift
-        shift = gain * (11.0 - predicted)
-        twice.append(predicted + shift)
-    torch.testing.assert_close(
-        found[False], torch.tensor(once[1:], dtype=torch.float64), rtol=0, atol=1e-6
-    )
-    torch.testing.assert_close(
-        found[True], torch.tensor(twice[1:], dtype=torch.float64), rtol=0, atol=1e-6
-    )
-
-
-def test_the_fitness_of_004_as_printed_is_the_sum_of_residuals() -> None:
-    """(37): Y = exp[-(z_New - z_Pred) / (2 R_k)], over the components; what is missing does not count."""
-    model, x = tracker(), torch.tensor([[[1.0, 2.0], [3.0, -1.0]]], dtype=torch.float64)
-    y = torch.tensor([[0.5, math.nan]], dtype=torch.float64)
-    record = Record(y)
-    value = PrintedFitness().fit_measurement(model, x, record)
-    torch.testing.assert_close(value, torch.tensor([[0.25, 1.25]], dtype=torch.float64))
-    both = PrintedFitness().fit_measurement(model, x, Record(torch.tensor([[0.5, 1.0]]).double()))
-    second = [(2.3 - 1.0) / 1.28, (-0.1 - 1.0) / 1.28]
-    torch.testing.assert_close(both - value, torch.tensor([second], dtype=torch.float64))
-    likelihood = LikelihoodFitness().fit_measurement(model, x, record)
-    torch.testing.assert_close(likelihood, model.log_likelihood(y, x, None))
-
-
-def test_the_literal_swarm_of_004_starts_on_a_line() -> None:
-    """(31), (39): "The random number z_0", "a new N-dimensional vector z = {z_1, ... z_N}": x^i = a + (b - a) z_i."""
-    z = follow_logistic(torch.tensor([[[0.2]]], dtype=torch.float64), 6, 3)
-    assert z.shape == (1, 6, 3)
-    first = [float(v) for v in z[0, :, 0]]
-    assert all(b == pytest.approx(4 * a * (1 - a)) for a, b in itertools.pairwise(first))
-    assert bool((z == z[..., :1]).all())
-    proposal = method_of("cpso_escape_literal").proposal
-    assert proposal.single_sequence
-    model, draws = tracker(), PhiloxStream(1, torch.arange(4))
-    belief = ParticleFilter(30).init(model, 4, draws)
-    x, memory = proposal._start_step(model, belief, draws.at_step(1))
-    white = (x - x.mean(1, keepdim=True)) / (x.amax(1) - x.amin(1)).unsqueeze(1)
-    torch.testing.assert_close(white[..., 0], white[..., 1], rtol=0, atol=1e-9)
-    assert memory["swarm.chaos"].shape == (4, 1, 30, 2)
-
-
-class Upwards:
-    """Velocities of one, for tests."""
-
-    def __call__(self, swarm: Any, *_: Any) -> Tensor:
-        return torch.ones_like(swarm.q)
-
-
-def test_the_literal_swarm_of_004_moves_by_the_velocity_of_the_iteration_before() -> None:
-    """(30): X_k = X_k-1 + V_k-1; (41): x + v_k-1. After three iterations it has moved twice."""
-    assert method_of("cpso_escape_literal").proposal.lags_velocity
-    assert method_of("pso_pf_literal").proposal.lags_velocity
-    model, draws = tracker(), PhiloxStream(1, torch.arange(2))
-    belief, record = ParticleFilter(9).init(model, 2, draws), Record(torch.zeros(2, 2).double())
-    ends = {}
-    for lags in (False, True):
-        proposal = SwarmProposal(
-            Upwards(), None, LikelihoodFitness(), AllComponents(), SwarmLimits(True, 9.0, None), None, 3,
-            IntervalStart(), PrintedWeighting(), lags,
-        )  # fmt: skip
-        ends[lags] = proposal(model, belief, record, draws.at_step(1)).x
-    torch.testing.assert_close(ends[False] - ends[True], torch.ones_like(ends[True]))
-
-
-@pytest.mark.parametrize("name", ["cpso_escape_literal", "pso_pf_literal"])
-def test_the_literal_swarms_of_004_never_resample(name: str) -> None:
-    """Steps (a) to (f) of section 5.4 list none; weights multiply on by (38)."""
-    method = method_of(name)
-    assert method.proposal.iterations == 150
-    log_w = torch.tensor([[0.0, -30.0, -60.0]], dtype=torch.float64)
-    x = torch.zeros(1, 3, 2, dtype=torch.float64)
-    belief = ParticleBelief(x, log_w, torch.zeros(1, dtype=torch.float64))
-    n = torch.tensor([[3]])
-    kept, resampled = method.resampler(
-        tracker(), belief, log_w, n, PhiloxStream(1, torch.arange(1))
-    )
-    assert not bool(resampled.any())
-    torch.testing.assert_close(kept.log_w, log_w)
-
-
 def test_the_printed_number_of_002_falls_to_its_minimum_for_good() -> None:
     """Step (3) "Calculate the effective sample size" stands before step (4) "The weight calculation formula"."""
     for name in ("cofm_amssrcpf_printed", "cofm_amssrcpf_each_printed"):
@@ -383,12 +268,6 @@ def test_the_printed_guide_of_002_is_that_of_akhlaghi() -> None:
     for name in ("cofm_amssrcpf_printed", "cofm_amssrcpf_each_printed"):
         assert method_of(name).proposal.guide_filter == guide
     assert method_of("cofm_amssrcpf").proposal.guide_filter == method_of("cofm_mssrckf")
-
-
-def test_the_literal_generator_of_001_draws_one_neighbour() -> None:
-    """(12): z_i = mean + u_i (x_k - mean), one k, no sum; its law is that of test_polymerised."""
-    assert method_of("thompson_taylor_literal").resampler.as_printed
-    assert not method_of("thompson_taylor").resampler.as_printed
 
 
 # the law of admission
@@ -464,3 +343,166 @@ def test_the_law_refuses_a_form_that_loses_a_run_more() -> None:
     assert not keeps_as_often(runs, "form", ())
     runs.loc[0, "keeps_track"] = False
     assert not keeps_as_often(runs, "form", ("sir",))
+
+
+# a step of each form from the equations, by numpy, from the same random numbers
+
+
+class Equations:
+    """Steps of a form on the tracker from the equations of its paper: particles x [N, 2] and weights w [N]."""
+
+    def __init__(self, name: str, x: np.ndarray) -> None:
+        model = tracker()
+        self.name, self.x, self.log_w = name, x, np.full(len(x), -math.log(len(x)))
+        self.f, self.g, self.h, self.r = (a.numpy() for a in (model.f, model.g, model.h, model.r))
+        self.shift = np.zeros_like(x)
+        self.chaos: Any = None
+
+    @property
+    def w(self) -> np.ndarray:
+        return np.exp(self.log_w)
+
+    def draw(self, kind: str, label: str, n: int, k: int) -> np.ndarray:
+        return np.asarray(getattr(self.draws, kind)(label, n, k)[0])
+
+    def choose(self, literal: bool) -> np.ndarray:
+        """Ancestors: with replacement, or systematic."""
+        n = len(self.w)
+        u = self.draw("uniform", "resample", n if literal else 1, 1)[:, 0]
+        return np.searchsorted(np.cumsum(self.w), u if literal else (np.arange(n) + u) / n, "right")
+
+    def predict(self, x: np.ndarray) -> np.ndarray:
+        return x @ self.f.T + self.draw("normal", "noise", len(x), 2) @ self.g.T
+
+    def weigh(self, x: np.ndarray, log_w: np.ndarray) -> None:
+        log_w = log_w - 0.5 * (((self.y - x @ self.h.T) / self.r) ** 2).sum(1)
+        self.x, self.log_w = x, log_w - scipy.special.logsumexp(log_w)
+
+    def step(self, draws: PhiloxStream, y: np.ndarray) -> None:
+        self.draws, self.y, literal = draws, y, self.name.endswith("_literal")
+        if self.name.startswith(("pso", "cpso")):
+            return self.swarm(literal)
+        n, each = len(self.w), not self.name.startswith(("rpf_printed", "rpf_half", "thompson"))
+        resamples = each or 1 / (self.w**2).sum() < n / 2
+        with_replacement = self.name in ("sir_literal", "dmc_reconstructed_literal")
+        chosen = self.choose(with_replacement) if resamples else np.arange(n)
+        x = self.x[chosen]
+        if self.name.startswith("rpf") and resamples and np.ptp(self.w) > 0:  # 000, eqs 7 to 9
+            base, nx = (4 / 14, 16) if literal else (1.0, 2)
+            h = (
+                (0.5 if self.name == "rpf_half" else 1.0)
+                * base ** (1 / (nx + 4))
+                * n ** (-1 / (nx + 4))
+            )
+            root = np.linalg.cholesky(np.cov(self.x.T, aweights=self.w, ddof=0))
+            x = x + h * self.draw("normal", "regularise", n, 2) @ root.T
+        if self.name.startswith("thompson") and resamples:  # 001, eqs 11 and 12, one neighbour
+            x = self.combine(x)
+        x = self.predict(x)
+        if self.name.startswith(
+            "dmc"
+        ):  # 003, eqs 27, 28 with Q = I, R = 10 I, and "+ B U" of step V
+            x = x + literal * self.shift[chosen]
+            gain = np.linalg.solve(self.h.T @ self.h + 10 * np.eye(2), self.h.T)
+            self.shift = (y - x @ self.h.T) @ gain.T
+            x = x + self.shift
+        self.weigh(x, 0 * self.log_w if resamples else self.log_w)
+
+    def combine(self, x: np.ndarray, m: int = 20) -> np.ndarray:
+        root = np.linalg.cholesky(np.cov(self.x.T, aweights=self.w, ddof=0))
+        white = np.linalg.solve(root, x.T).T
+        apart = np.linalg.norm(white[:, None] - white, axis=2)
+        near = np.sort(np.argsort(apart, 1, kind="stable")[:, :m], 1)
+        centre = x[near].mean(1)
+        u = 1 / m + np.sqrt(3 * (m - 1)) / m * (
+            2 * self.draw("uniform", "neighbours", len(x), m)[:, :1] - 1
+        )
+        k = (m * self.draw("uniform", "neighbour", len(x), 1)[:, 0]).astype(int)
+        return centre + u * (x[near[np.arange(len(x)), k]] - centre)
+
+    def swarm(self, literal: bool) -> None:
+        """004, eqs 29 to 44, steps a to f."""
+        n, chaotic, count = len(self.w), self.name.startswith("cpso"), 6
+        if self.chaos is None:
+            self.scale, low, high = self.x.std(0), self.x.min(0), self.x.max(0)
+            seed = (
+                self.draw("uniform", "swarm.chaos", *((1, 1) if literal else (n, 2)))
+                if chaotic
+                else np.zeros((n, 2))
+            )
+            quarter = np.floor(4 * seed) / 4
+            self.chaos = quarter + 1e-3 + (seed - quarter) * 0.992
+            if chaotic and literal:
+                values = [4 * self.chaos[0] * (1 - self.chaos[0])]
+                for _ in range(n - 1):
+                    values.append(4 * values[-1] * (1 - values[-1]))
+                self.chaos = np.repeat(values, 2, 1)
+            for _ in range(0 if literal else 50):
+                self.chaos = 4 * self.chaos * (1 - self.chaos)
+            if chaotic:
+                self.x = low + (high - low) * self.chaos
+        else:
+            chosen = np.arange(n) if literal else self.choose(False)
+            self.x, self.log_w = self.x[chosen], self.log_w * literal
+        x = self.predict(self.x)
+        v = np.zeros_like(x)
+
+        def fit(q: np.ndarray) -> np.ndarray:
+            off = self.y - q @ self.h.T
+            printed = literal and chaotic
+            return (-off / (2 * self.r**2) if printed else -0.5 * (off / self.r) ** 2).sum(1)
+
+        value = top = bottom = fit(x)
+        best = worst = x
+        for i in range(1, count + 1):
+            label, lead = f"swarm.velocity.{i}", best[top.argmax()]
+            if chaotic:
+                r = self.draw("uniform", label, n, 8 if "pf" not in self.name else 4).reshape(
+                    n, -1, 2
+                )
+                after = 0.8 * v + 1.2 * r[:, 0] * (best - x) + 1.2 * r[:, 1] * (lead - x)
+                if "pf" not in self.name:
+                    k = 25 * i  # of 150
+                    c = 0.12 * (
+                        1 - np.cos(np.pi * k) / 150 if literal else 1 - np.cos(np.pi * i / count)
+                    )
+                    after = after - c * (r[:, 2] * (worst - x) + r[:, 3] * (x[value.argmin()] - x))
+            else:
+                r = np.abs(self.draw("normal", label, n, 4)).reshape(n, 2, 2)
+                after = r[:, 0] * (best - x) + r[:, 1] * (lead - x)
+            after = np.clip(after, -3 * self.scale, 3 * self.scale)
+            x, v = x + (v if literal else after), after
+            value = fit(x)
+            if chaotic:
+                self.chaos = 4 * self.chaos * (1 - self.chaos)
+                other = x + 0.3 * self.scale * (2 * self.chaos - 1)
+                better = fit(other) > value
+                x, value = np.where(better[:, None], other, x), np.maximum(fit(other), value)
+            best, top = np.where((value > top)[:, None], x, best), np.maximum(value, top)
+            worst, bottom = np.where((value < bottom)[:, None], x, worst), np.minimum(value, bottom)
+        self.weigh(x, self.log_w)
+
+
+PRINTED = (
+    "sir_literal", "sir_printed", "rpf_literal", "rpf_printed", "rpf_half", "thompson_taylor_literal",
+    "dmc_reconstructed_literal", "dmc_reconstructed_printed", "pso_pf_literal", "pso_pf", "cpso_pf",
+    "cpso_escape_literal", "cpso_escape_printed",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_a_step_is_that_of_the_equations_of_the_paper(name: str) -> None:
+    """Four steps, so that what a step leaves for the next counts, and weights that are uneven; to 1e-12 at 40 particles."""
+    method, model, draws = method_of(name), tracker(), PhiloxStream(5, torch.arange(1))
+    method = replace(method, particles=40)
+    if isinstance(method.proposal, SwarmProposal):
+        method = replace(method, proposal=replace(method.proposal, iterations=6))
+    belief = method.init(model, 1, draws.at_step(0))
+    equations = Equations(name, belief.x[0].numpy())
+    y = torch.tensor([[[0.9, -1.4], [2.5, 1.0], [-0.4, 0.7], [1.6, 3.0]]], dtype=torch.float64)
+    for t in range(4):
+        at = draws.at_step(t + 1)
+        belief, _ = method.step(model, belief, Record(y[:, t]), at)
+        equations.step(at, y[0, t].numpy())
+        np.testing.assert_allclose(belief.x[0].numpy(), equations.x, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(belief.log_w[0].numpy(), equations.log_w, rtol=1e-12, atol=1e-11)

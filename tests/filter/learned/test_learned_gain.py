@@ -34,6 +34,7 @@ from pfbench.learn.training_job import train
 from pfbench.model.linear_gaussian import LinearGaussian, local_level
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.simulated import ModelSimulation
+from pfbench.testing import filter_record
 
 LEVEL = local_level(0.5, 1.0, 0.0, 1.0)
 HEAD = partial(SkipMlp, hidden=(16,))
@@ -107,6 +108,55 @@ def test_with_the_kalman_gain_it_is_the_kalman_filter() -> None:
     torch.testing.assert_close(found, wanted, rtol=0.0, atol=1e-6)
     wrong = filtered(LearnedGainFilter(KalmanGain(gains[0], 1.01)), y).mean  # type: ignore[arg-type]
     assert float((wrong - wanted).abs().max()) > 1e-4
+
+
+class Recording(LearnedGain):
+    """A gain that keeps what it is given."""
+
+    def forward(self, model: Any, inputs: GainInputs, past: Tensor) -> tuple[Tensor, Tensor]:
+        self.seen = [*getattr(self, "seen", []), (inputs, self._features(inputs))]
+        return super().forward(model, inputs, past)
+
+
+@pytest.mark.parametrize("normalisation", NORMALISATIONS)
+def test_the_inputs_are_the_four_differences_of_kalman_net(normalisation: str) -> None:
+    """Revach et al. 2022, F1 to F4: of measurements, of the prediction, of estimates, and of an estimate from its prediction.
+
+    From the estimates of the filter by numpy, in deviations that differ from 1 by component.
+    """
+    gain, y = Recording(shaken, 4, normalisation), measurements(2).nan_to_num(0.3)
+    found = filtered(LearnedGainFilter(gain), y).mean.numpy()
+    model = tracker()
+    f, h, r, sd = (a.numpy() for a in (model.f, model.h, model.r, model.l0.diagonal()))
+    for t in range(2, len(y[0])):
+        inputs, features = gain.seen[t]
+        mean, last, before = found[:, t - 1], found[:, t - 2], y[:, t - 1].numpy()
+        wanted = (
+            (y[:, t].numpy() - mean @ f.T @ h.T) / r, (y[:, t].numpy() - before) / r,
+            (mean - last @ f.T) / sd, (mean - last) / sd,
+        )  # fmt: skip
+        for name, a, scale in zip(GainInputs._fields, wanted, (r, r, sd, sd), strict=False):
+            np.testing.assert_allclose(getattr(inputs, name).numpy(), a * scale, atol=1e-9)
+        shape = np.arcsinh if normalisation == "asinh" else lambda a: a / np.linalg.norm(a, axis=1, keepdims=True)  # fmt: skip
+        columns = np.concatenate([*map(shape, wanted), np.ones((2, 2))], 1)
+        np.testing.assert_allclose(features.numpy(), columns, atol=1e-9)
+
+
+def test_estimates_do_not_depend_on_the_units_of_states_and_measurements() -> None:
+    """The same network with a state in 1/20 and measurements in 1/5 and 3 of their units: a gain in m per unit of y."""
+    base, y = tracker(), measurements(3)
+    state, unit = torch.tensor([20.0, 1.0]).double(), torch.tensor([5.0, 1 / 3]).double()
+    scaled = LinearGaussian(
+        state[:, None] * base.f / state, state[:, None] * base.g, unit[:, None] * base.h / state,
+        unit * base.r, state * base.m0, state[:, None] * base.l0,
+    )  # fmt: skip
+    means = [
+        filter_record(
+            LearnedGainFilter(LearnedGain(shaken, 8, "asinh", seed=3)), model, record
+        ).mean
+        for model, record in ((base, y), (scaled, y * unit))
+    ]
+    torch.testing.assert_close(means[0], means[1] / state, rtol=1e-9, atol=1e-9)
 
 
 # training

@@ -68,6 +68,22 @@ def test_a_split_keeps_the_covariance_and_leaves_the_stated_variance(components:
     torch.testing.assert_close(rest[0, 0], a[0, 0] if components == [0] else rest[0, 0])
 
 
+@pytest.mark.parametrize(
+    ("largest", "sd", "is_split"),
+    [(0.5, 0.45, False), (0.5, 0.55, True), (2.0, 1.9, False), (2.0, 2.1, True)],
+)
+def test_a_distribution_is_split_beyond_the_largest_deviation(
+    largest: float, sd: float, *, is_split: bool
+) -> None:
+    """At deviations below and above 1, where a variance is less and more than its root."""
+    model = LinearGaussian([[1.0]], [[0.1]], [[1.0]], [1.0], [0.0], [sd])
+    method = unmerged(sampled_states=["x0"], largest_sd=largest)
+    belief = method.init(model, 1, PhiloxStream(1, torch.arange(1)))
+    assert bool((belief.log_w > -math.inf).sum() > 1) == is_split
+    kept = belief.memory["covariance"][0, 0, 0, 0]
+    assert float(kept) == pytest.approx((0.5 * largest) ** 2 if is_split else sd**2)
+
+
 # linear models
 
 

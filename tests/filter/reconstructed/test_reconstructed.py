@@ -633,18 +633,6 @@ def test_it_runs_on_every_model_and_no_run_feels_its_neighbours(case: str, name:
     check_own(ParticleFilter(30, ALWAYS, proposal=ALL[name]), MODELS[case][0], y)
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_what_is_not_seen_shifts_nothing(name: str) -> None:
-    seen, draws = (
-        seen_of(torch.tensor([torch.nan]).double(), 3),
-        PhiloxStream(1, torch.arange(3)).at_step(1),
-    )
-    cloud = belief(WALK)
-    plain, sent = (p(WALK, cloud, seen, draws) for p in (BootstrapProposal(), ALL[name]))
-    assert torch.allclose(sent.x, plain.x, atol=1e-13)
-    assert torch.allclose(sent.log_ratio, torch.zeros_like(sent.log_ratio), atol=1e-13)
-
-
 class Explosive(LinearGaussian):
     """What is far away becomes infinite."""
 

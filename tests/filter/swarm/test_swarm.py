@@ -52,7 +52,6 @@ from pfbench.filter.proposed.swarm_motion import (
 from pfbench.filter.proposed.swarm_weighting import (
     MixtureWeighting,
     PrintedWeighting,
-    UnchangedWeighting,
 )
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
@@ -199,39 +198,6 @@ def test_chaotic_points_have_the_initial_law(dimension: int) -> None:
     assert not torch.equal(x, ParticleFilter(4000).init(model, 2, draws(2)).x)
 
 
-def test_the_printed_start_is_not_the_initial_law() -> None:
-    """Of 100 normal draws the range is 5.0 sigma, the arcsine law's standard deviation range / sqrt 8: 1.77 sigma."""
-    model = LinearGaussian(
-        torch.eye(2), torch.eye(2), torch.eye(2), [1.0, 1.0], [5.0, 0.0], [2.0, 0.1]
-    )
-    cloud = ParticleFilter(100).init(model, 300, draws(300))
-    x = IntervalStart()(model, cloud, iterate_logistic(draws(300).uniform("chaos", 100, 2)))
-    ratio = ((x - model.m0).square().mean((0, 1)).sqrt() / torch.tensor([2.0, 0.1])).numpy()
-    assert ratio == pytest.approx([1.76, 1.76], abs=0.1)
-    assert (x >= cloud.x.amin(1, keepdim=True) - 1e-12).all()
-    assert (x <= cloud.x.amax(1, keepdim=True) + 1e-12).all()
-    assert not IntervalStart().is_exact
-    assert not PRINTED.is_exact
-
-
-def test_slots_keep_sequences_of_their_own_when_particles_are_copied() -> None:
-    """Gathered with the particles, the sequences of siblings would be one, and after some steps all of them."""
-    y = measured(chain(), 2, 6)
-    method = ParticleFilter(40, ALWAYS, proposal=CORRECTED)
-    source, belief = draws(2), ParticleFilter(40).init(chain(), 2, draws(2, step=0))
-    before = None
-    for t in range(6):
-        belief, _ = method.step(chain(), belief, Record(y).at_step(t), source.at_step(t + 1))
-        chaos = belief.memory["swarm.chaos"][:, 0, :, :2]
-        assert chaos.shape == (2, 40, 2)
-        assert len(chaos.flatten().unique()) == chaos.numel()
-        if before is not None:  # five iterations further
-            for _ in range(5):
-                before = 4 * before * (1 - before)
-            assert torch.allclose(chaos, before, rtol=0, atol=1e-9)
-        before = chaos
-
-
 # flight
 
 
@@ -253,35 +219,6 @@ def still(flock_q: Tensor, **parts: Tensor) -> SwarmState:
         flock_q, torch.zeros_like(flock_q), zero, flock_q, zero, flock_q, zero, flock_q
     )
     return base._replace(**parts)
-
-
-def test_velocities_have_the_mean_and_variance_of_their_formulas() -> None:
-    """Uniform 1/2 and 1/12, half-normal sqrt(2/pi) and 1 - 2/pi, independent over particles and coordinates."""
-    n = 20_000
-    x = torch.zeros(1, n, 2, dtype=torch.float64)
-    fitness = torch.zeros(1, n, dtype=torch.float64)
-    fitness[0, 7], fitness[0, 3] = 1.0, -1.0
-    best, worst = x + torch.tensor([1.0, -2.0]), x + torch.tensor([3.0, 0.5])
-    best[0, 7], here = torch.tensor([4.0, 5.0]), x.clone()
-    here[0, 3] = torch.tensor([-6.0, 2.0])
-    flock = still(
-        here, v=torch.ones_like(x), fitness=fitness, best=best, best_fitness=fitness, worst=worst
-    )
-    live = torch.ones(1, n, dtype=torch.bool)
-    others = torch.arange(n) > 7
-    pulls = torch.stack([best[0, 9], best[0, 7], worst[0, 9], here[0, 3]])
-
-    v = InertiaVelocity(0.8, 1.1, 1.3, 0.12)(flock, live, 0.7, draws(1), "v")[0, others]
-    c = torch.tensor([1.1, 1.3, *[-0.12 * (1 - math.cos(0.7 * math.pi))] * 2], dtype=torch.float64)
-    expected, spread = 0.8 + 0.5 * c @ pulls, (c.square() @ pulls.square() / 12).sqrt()
-    assert ((v.mean(0) - expected).abs() < 4.5 * spread / math.sqrt(n)).all()
-    assert v.std(0).numpy() == pytest.approx(spread.numpy(), rel=0.03)
-
-    v = GaussianVelocity()(flock, live, 0.7, draws(1), "v")[0, others]
-    expected = math.sqrt(2 / math.pi) * pulls[:2].sum(0)
-    spread = ((1 - 2 / math.pi) * pulls[:2].square().sum(0)).sqrt()
-    assert ((v.mean(0) - expected).abs() < 4.5 * spread / math.sqrt(n)).all()
-    assert v.std(0).numpy() == pytest.approx(spread.numpy(), rel=0.03)
 
 
 class Spy:
@@ -355,43 +292,6 @@ def test_limits_hold_and_the_best_only_improves(velocity: Any, coordinates: Any)
     assert (final.best_fitness.amax(1) > flocks[0].best_fitness.amax(1)).all()
     assert (flocks[3].v.abs() == 6 * 0.05 * sd).any()  # the limits were met
     assert (final.q.abs() == 2.5 * sd).any()
-
-
-def test_a_perturbation_is_kept_only_where_it_improves() -> None:
-    """With velocities of nought the swarm moves by Dx alone: to a fitter place or not at all."""
-    model, swarm = (
-        chain(),
-        SwarmProposal(
-            InertiaVelocity(0.0, 0.0, 0.0),
-            ChaoticPerturbation(),
-            LikelihoodFitness(),
-            AllComponents(),
-            SwarmLimits(),
-            None,
-            1,
-        ),
-    )
-    x = torch.randn(2, 50, 4, dtype=torch.float64, generator=torch.manual_seed(4)).clamp(-2, 2)
-    frame = AllComponents()(model, x, torch.full((2, 50), 0.02, dtype=torch.float64), ())
-    chaos = iterate_logistic(draws(2).uniform("chaos", 50, 4))
-    seen = Record(torch.ones(2, 2, dtype=torch.float64))
-    flock, _ = swarm.optimise(
-        model,
-        frame,
-        torch.ones(2, 50, dtype=torch.bool),
-        {"swarm.chaos": chaos.unsqueeze(1)},
-        seen,
-        draws(2),
-    )
-    moved = flock.q - frame.q
-    went = moved.abs().amax(-1) > 0
-    assert 0.2 < went.double().mean() < 0.8
-    before = model.log_likelihood(seen.y, x, ())  # to rounding, which follows the layout in memory
-    assert torch.equal(went, flock.fitness > before + 1e-9)
-    sd = frame.covariance.diagonal(dim1=1, dim2=2).sqrt().unsqueeze(1)
-    dx = 6 * 0.05 * sd * (2 * (4 * chaos * (1 - chaos)) - 1)
-    inside = (frame.q + dx).abs().amax(-1) < (3 * sd).amin()
-    assert torch.allclose(moved[went & inside], dx[went & inside], rtol=0, atol=1e-12)
 
 
 def test_a_run_stops_where_its_best_particle_is_close_enough() -> None:
@@ -638,13 +538,6 @@ def test_keeping_all_is_the_bootstrap_filter() -> None:
     assert torch.allclose(same.log_evidence, plain.log_evidence, rtol=0, atol=1e-10)
 
 
-def test_equal_weights_take_the_likelihood_back() -> None:
-    y = measured(chain(), 3, 5)
-    estimate = run(dataclasses.replace(PRINTED, weighting=UnchangedWeighting()), chain(), y, 30)
-    assert estimate.trace["ess"].numpy() == pytest.approx(30.0)
-    assert estimate.log_evidence.numpy() == pytest.approx(0.0, abs=1e-9)
-
-
 # against the Kalman filter
 
 
@@ -663,13 +556,6 @@ def test_the_corrected_swarm_converges_at_the_monte_carlo_rate(velocity: Any) ->
     """Four times the particles halve the distance to the Kalman filter."""
     few, many = distances(dataclasses.replace(CORRECTED, velocity=velocity), (60, 240))
     assert 1.6 < few / many < 2.4
-
-
-def test_the_printed_weights_do_not_converge() -> None:
-    """Their distance to the Kalman filter is there to stay."""
-    few, many = distances(dataclasses.replace(CORRECTED, weighting=PrintedWeighting()), (60, 240))
-    assert many > 0.2
-    assert few / many < 1.5  # below the band of the corrected weights
 
 
 def test_the_corrected_evidence_converges() -> None:
@@ -693,20 +579,6 @@ SWARMS = {
     "corrected": CORRECTED,
     "pso": PSO,
 }
-
-
-@pytest.mark.parametrize("name", SWARMS)
-def test_where_nothing_is_seen_particles_are_predicted_and_no_more(name: str) -> None:
-    model = chain()
-    y = torch.full((2, 3, 2), math.nan, dtype=torch.float64)
-    swarm = dataclasses.replace(SWARMS[name], swarm_start=PriorStart())
-    plain, blind = (run_filter(ParticleFilter(200, ALWAYS, proposal=p), model, Record(y), draws(2)) for p in
-                    (dataclasses.replace(swarm, weighting=MixtureWeighting(1.0)), swarm))  # fmt: skip
-    if name == "corrected":  # half of it is drawn anew, from the same law
-        assert (blind.variance / plain.variance).numpy() == pytest.approx(1.0, abs=0.7)
-    else:
-        assert torch.allclose(blind.mean, plain.mean, rtol=0, atol=1e-10)
-    assert torch.isfinite(blind.mean).all()
 
 
 @pytest.mark.parametrize("name", SWARMS)
@@ -739,21 +611,6 @@ def test_empty_slots_and_broken_particles_harm_nobody(name: str) -> None:
     assert sent.x[:, alive].abs().max() < (
         1e4 if swarm.limits.scale_by_prior else 12.0
     )  # the first cloud's scale counts who then broke
-
-
-@pytest.mark.parametrize("name", SWARMS)
-def test_a_measurement_of_nothing_leaves_the_prediction(name: str) -> None:
-    """No coordinate is seen: nothing of the swarm is left where only those move."""
-    eye = torch.eye(2)
-    model = LinearGaussian(eye, eye, torch.zeros(1, 2), [1.0], [0.0, 0.0], [1.0, 1.0])
-    y = torch.ones(2, 4, 1, dtype=torch.float64)
-    estimate = run(SWARMS[name], model, y, 50, points=ChaoticPoints())
-    assert not estimate.lost.any()
-    if name == "corrected":
-        plain = run_filter(
-            ParticleFilter(50, ALWAYS, points=ChaoticPoints()), model, Record(y), draws(2, 5)
-        )
-        assert torch.allclose(estimate.mean, plain.mean, rtol=0, atol=1e-12)
 
 
 TOYS = [UnivariateGrowth(), StochasticVolatility(), Benes(), Pendulum(), Lorenz63()]

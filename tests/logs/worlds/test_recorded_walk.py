@@ -6,10 +6,12 @@ import math
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
+import scipy
 import torch
 from checkout import ROOT
 from hydra import compose, initialize_config_dir
@@ -23,6 +25,7 @@ from pfbench.core.record import Episode, MeasurementChannels
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
+from pfbench.logs.sky.raw_gnss import RawGnss, RawGnssTuning
 from pfbench.logs.worlds.raw_gnss import RawGnssReceiver, RecordedWalk
 from pfbench.model.strapdown import StrapdownTight, TightMemsInputs
 from pfbench.model.strapdown_tuning import RangeErrorModel, TightTuning
@@ -407,3 +410,22 @@ def test_the_filter_is_better_than_single_points() -> None:
     nees = (error.square() / estimate.variance[:, episode.time > 30.0])[..., :8].mean((0, 1))
     # one walk of some ten independent stretches; height is left out: the reference's own level is 2 to 3 m off
     assert 0.4 < float(nees.min()) < float(nees.max()) < 2.0
+
+
+@pytest.mark.parametrize("duration", [0.3, 2.0])
+def test_the_noise_of_raw_gnss_is_that_of_its_continuous_model(duration: float) -> None:
+    """Van Loan's matrix exponential by scipy, with another density for each axis: q T^3 / 3 of a position, 4 times q T^3 / 12."""
+    tuning = RawGnssTuning(
+        (0.7, 1.1, 2.0), (1.0,) * 3, (1.0,) * 3, ReceiverClock(bias_walk=0.4, drift_walk=0.2),
+        RangeErrorModel(1.0), RangeErrorModel(0.1), inter_system_walk=0.05,
+    )  # fmt: skip
+    model, a = RawGnss(tuning), np.zeros((9, 9))
+    a[[0, 1, 2, 6], [3, 4, 5, 7]] = 1.0
+    q = np.diag([0.0, 0.0, 0.0, 0.7, 1.1, 2.0, 0.4, 0.2, 0.05]) ** 2
+    block = scipy.linalg.expm(np.block([[-a, q], [np.zeros((9, 9)), a.T]]) * duration)
+    inputs = SimpleNamespace(duration=torch.tensor([duration], dtype=torch.float64))
+    gain = model.noise_gain(inputs)[0].numpy()  # type: ignore[arg-type]
+    np.testing.assert_allclose(gain @ gain.T, block[9:, 9:].T @ block[:9, 9:], atol=1e-12)
+    state = torch.arange(1.0, 10.0, dtype=torch.float64).reshape(1, 1, 9)
+    still = model.propagate(state, inputs, torch.zeros(1, 1, 9).double())  # type: ignore[arg-type]
+    np.testing.assert_allclose(still[0, 0].numpy(), block[9:, 9:].T @ state[0, 0].numpy())
