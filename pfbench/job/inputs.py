@@ -59,13 +59,10 @@ def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Input
 
 def _hash_values(node: Any, trusted: Sequence[str]) -> dict[str, str]:
     """Compute digests of the values that the classes of a user reach, by class. Those of packages without trust are not loaded."""
-    found = {
-        target: _find_class(target, trusted) for target in sorted(set(list_user_targets(node)))
-    }
     return {
         f"{CODE_OF[1]}{remove_digests(target)}": hash_reached(target, thing)
-        for target, thing in found.items()
-        if thing is not None
+        for target in sorted(set(list_user_targets(node)))
+        if (thing := _find_class(target, trusted)) is not None
     }
 
 
