@@ -1,4 +1,4 @@
-"""Digests of source code: of folders, and of modules with all that they import.
+"""Digests of source code: of folders, and of modules with all that they import; and of the values that code reaches.
 
 They enter the key of a job, the record of its build, and the names of compiled steps.
 """
@@ -6,12 +6,17 @@ They enter the key of a job, the record of its build, and the names of compiled 
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 import importlib.util
 import os
+import pickle
 import sys
+import threading
+import types
 from collections.abc import Collection, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 PACKAGE = Path(__file__).resolve().parents[1]  # pfbench
 # packages that are too large to be trusted as a whole: each can read, write or run files
@@ -114,3 +119,161 @@ def _imports(tree: ast.AST, package: str) -> Iterator[str]:
             base = parts[: len(parts) - node.level + 1] if node.level else []
             stem = ".".join([*base, *([node.module] if node.module else [])])
             yield from (stem, *(f"{stem}.{alias.name}" for alias in node.names))
+
+
+# Values that the code of a user reaches: a source that stays the same may read another number.
+_NAMED = (
+    types.GetSetDescriptorType, types.MemberDescriptorType, types.WrapperDescriptorType, types.MethodDescriptorType,
+    types.ClassMethodDescriptorType, types.MethodWrapperType, type(threading.Lock()), type(threading.RLock()),
+)  # fmt: skip
+_HOLDERS = (
+    property, staticmethod, classmethod, functools.cached_property, functools.partialmethod,
+    type(functools.cache(len)),
+)  # fmt: skip
+_HELD = ("__func__", "__wrapped__", "fget", "fset", "func", "args", "keywords")
+# of a class: its text has them, or Python computes them from the others
+_DERIVED = (
+    "__dict__", "__weakref__", "__doc__", "__module__", "__annotations__", "__abstractmethods__", "_abc_impl",
+    "__dataclass_fields__", "__firstlineno__", "__static_attributes__",
+)  # fmt: skip
+UNDESCRIBED = pickle.PicklingError, AttributeError, TypeError, ValueError, RecursionError
+_ENVIRONMENT = {"environ", "environb", "getenv", "getenvb"}
+
+
+def hash_reached(target: str, thing: Any) -> str:
+    """Compute a digest of all that a class or function of a user reaches.
+
+    That is code in memory, globals, closures, defaults, attributes of classes, arrays, and the variables of the environment
+    that the code names. Of modules that are neither in its package nor beside it only names count.
+
+    Raises:
+        ValueError: If a value cannot be described, as a generator or an open file.
+    """
+    stream = ReachedStream(target.partition(".")[0])
+    try:
+        stream.dump(thing)
+    except UNDESCRIBED as error:
+        raise ValueError(
+            f"{target} must reach values that the key of a job can contain, as numbers, arrays, functions and classes, "
+            f"got another kind ({error}). Make such a value inside of the function that uses it."
+        ) from error
+    for name in sorted(os.environ) if stream.reads_environment else ():
+        if any(word == name or (len(word) > 2 and word in name) for word in stream.words):
+            stream.sha256.update(f"{name}={os.environ[name]};".encode())
+    return stream.sha256.hexdigest()[:16]
+
+
+class ReachedStream(pickle.Pickler):
+    """Digest of a pickle that is never read, which follows the code of a user. The module `pickle` knows all other kinds of values.
+
+    Args:
+        package: Package of the user. Empty to follow none.
+        uncounted: Object that does not count.
+
+    Attributes:
+        sha256: The digest.
+        modules: Modules that define the values.
+        words: Texts in the code, which may name variables of the environment.
+        reads_environment: Whether the code names the environment.
+        has_values: Whether the numbers of tensors count.
+    """
+
+    def __init__(self, package: str = "", uncounted: object = None) -> None:
+        self.sha256, self.package, self.uncounted = hashlib.sha256(), package, uncounted
+        super().__init__(types.SimpleNamespace(write=self.sha256.update), protocol=5)
+        self.words: set[str] = set()
+        self.modules: set[str] = set()
+        self.reads_environment, self.has_values = False, True
+        self._tensors: dict[
+            int, tuple[int, Any]
+        ] = {}  # keeps them, so that no number is given twice
+        self._is_own = functools.cache(lambda name: _is_beside(name, package))
+
+    def is_own(self, module: Any) -> bool:
+        """Return whether a module is of the user."""
+        return self._is_own(str(module).partition(".")[0])
+
+    def persistent_id(self, value: Any) -> Any:
+        """Return the content of a text, a set or a tensor, which pickles do not write alike in two processes; None for others."""
+        if isinstance(value, str):
+            self.words.add(value)
+            return value.encode(errors="surrogatepass")
+        if isinstance(value, set | frozenset):
+            return "set", sorted(value, key=repr)
+        if value is self.uncounted and value is not None:
+            return "uncounted"
+        if isinstance(value, getattr(sys.modules.get("torch"), "Tensor", ())):
+            place, _ = self._tensors.setdefault(id(value), (len(self._tensors), value))
+            a = value.detach()
+            kind = place, str(a.dtype), str(a.device), tuple(a.shape), value.requires_grad
+            if not self.has_values:  # strides of a record depend on its length
+                return kind
+            flat = a.cpu().contiguous().reshape(-1).view(sys.modules["torch"].uint8)
+            return kind, a.stride(), flat.numpy().tobytes()
+        return None
+
+    def reducer_override(self, value: Any) -> Any:
+        """Return name and content of a value: all that code of the user reaches, and names of what others define."""
+        kind = type(value)
+        if value is str:  # the start of all that follows
+            return NotImplemented
+        if value is os.environ or value is os.getenv:
+            self.reads_environment = True
+            return str, ("environment",)
+        if isinstance(value, types.CodeType):
+            self.reads_environment |= not _ENVIRONMENT.isdisjoint(value.co_names)
+            return (
+                str,
+                ("code",),
+                [value.co_code, value.co_names, value.co_varnames, value.co_consts],
+            )
+        if isinstance(value, _HOLDERS):
+            return str, (kind.__name__,), [getattr(value, name, None) for name in _HELD]
+        if isinstance(value, types.FunctionType | type):
+            self.modules.add(str(value.__module__))
+        if isinstance(value, types.ModuleType | types.FunctionType | type):
+            return str, (_name(value),), self._list_content(value)
+        is_named = (
+            callable(value)
+            and isinstance(getattr(value, "__qualname__", None), str)
+            and not (self.is_own(kind.__module__) or self.is_own(value.__module__))
+        )
+        is_free = isinstance(getattr(value, "__self__", None), types.ModuleType | type | None)
+        if isinstance(value, _NAMED) or (is_named and is_free):
+            return str, (_name(value),)
+        home = {} if self.is_own(kind.__module__) else vars(sys.modules.get(kind.__module__, types))
+        kept = [key for key, item in list(home.items()) if item is value]
+        if kept:  # an object that a library keeps, as a type of numbers or a distribution of scipy
+            return str, (f"{_name(kind)} {kept[0]}",)
+        return NotImplemented
+
+    def _list_content(self, value: Any) -> Any:
+        """List what a module, a function or a class of the user consists of; of a function of others what it was given."""
+        if isinstance(value, types.FunctionType):
+            given = [value.__defaults__, value.__kwdefaults__, vars(value)]
+            given += [cell.cell_contents for cell in value.__closure__ or ()]
+            if not self.is_own(
+                value.__module__
+            ):  # with the line, two functions without a name differ
+                return given if self.package else [*given, value.__code__.co_firstlineno]
+            names = sorted(_list_names(value.__code__) & set(value.__globals__))
+            return [*given, value.__code__, {name: value.__globals__[name] for name in names}]
+        is_class = isinstance(value, type)
+        if not self.is_own(value.__module__ if is_class else value.__name__):
+            return None
+        content = {name: item for name, item in vars(value).items() if name not in _DERIVED}
+        if is_class:
+            return [value.__mro__[1:], content]
+        return {name: item for name, item in content.items() if not name.startswith("__")}
+
+
+def _name(value: Any) -> str:
+    """Return the name of a module, a function or a class with its module."""
+    name = getattr(value, "__qualname__", None) or getattr(value, "__name__", type(value).__name__)
+    return f"{getattr(value, '__module__', '')}.{name}"
+
+
+def _list_names(code: types.CodeType) -> set[str]:
+    """List the names that a function and those inside of it use."""
+    inner = [_list_names(item) for item in code.co_consts if isinstance(item, types.CodeType)]
+    return set(code.co_names).union(*inner)

@@ -10,17 +10,25 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from pfbench.files.atomic_write import hash_file
+from pfbench.files.source_digest import find_module, hash_reached
 from pfbench.job.config import CHOICES
-from pfbench.job.trust import check_configuration, hash_user_code, trusted_packages
+from pfbench.job.trust import (
+    check_configuration,
+    hash_user_code,
+    list_user_targets,
+    trusted_packages,
+)
 from pfbench.results.inputs import list_changed
 from pfbench.results.paper_block import remove_all_blocks
 from pfbench.results.store import Inputs, remove_digests
 
-CODE_OF = "code of "  # start of the names of source files of a user's classes
+# start of the names of source files of a user's classes, and of the values that the classes reach
+CODE_OF = "code of ", "values of "
 _MISSING = "missing"
 # public classes of pfbench with a method `input_files`, so that no other class is imported to find them
 READERS = {
@@ -41,10 +49,21 @@ def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Input
         node = values.get(group)
         entries = _hash_files(_list_files(node, trusted), values.get("data", {}).get("root"))
         code = hash_user_code(node).items()
-        entries |= {f"{CODE_OF}{remove_digests(name)}": value for name, value in code}
+        entries |= {f"{CODE_OF[0]}{remove_digests(name)}": value for name, value in code}
+        if code:
+            entries |= _hash_values(node, trusted)
         if entries:
             digests[group] = entries
     return digests
+
+
+def _hash_values(node: Any, trusted: Sequence[str]) -> dict[str, str]:
+    """Compute digests of the values that the classes of a user reach, by class. Those of packages without trust are not loaded."""
+    return {
+        f"{CODE_OF[1]}{remove_digests(target)}": hash_reached(target, thing)
+        for target in sorted(set(list_user_targets(node)))
+        if (thing := _find_class(target, trusted)) is not None
+    }
 
 
 def check_unchanged(before: Inputs, values: Mapping[str, Any], trusted: Sequence[str] = ()) -> None:
@@ -132,10 +151,13 @@ def _find_class(target: Any, trusted: Sequence[str]) -> Any:
     packages = [f"{package}." for package in ("pfbench", *trusted)]
     if not isinstance(target, str) or not target.startswith(tuple(packages)):
         return None
-    module, _, name = target.rpartition(".")
+    module = find_module(target)
     try:
-        return getattr(import_module(module), name, None)
-    except ImportError:  # the plan of the job imports it again, and raises with its key
+        return attrgetter(target.removeprefix(f"{module}."))(import_module(module))
+    except (
+        ImportError,
+        AttributeError,
+    ):  # the plan of the job imports it again, and raises with its key
         return None
 
 

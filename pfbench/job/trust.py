@@ -263,7 +263,7 @@ def hash_user_code(values: Any) -> dict[str, str]:
     The files are those of the modules that `_target_` names, and of all modules that these import,
     directly or through others. Installed libraries and pfbench are left out.
     """
-    return hash_modules(find_module(target) for target in sorted(set(_user_targets(values))))
+    return hash_modules(find_module(target) for target in sorted(set(list_user_targets(values))))
 
 
 @cache
@@ -279,18 +279,18 @@ def hash_package() -> str:
 
 def list_user_packages(values: Any, trusted: Sequence[str]) -> list[str]:
     """List the trusted packages that define a class of a configuration."""
-    targets = list(_user_targets(values))
+    targets = list(list_user_targets(values))
     return [name for name in trusted if any(t.startswith(f"{name}.") for t in targets)]
 
 
-def _user_targets(node: Any) -> Iterator[str]:
+def list_user_targets(node: Any) -> Iterator[str]:
     """Yield the names of classes that are defined by neither pfbench nor a general library."""
     if isinstance(node, Mapping):
         target = node.get("_target_")
         if isinstance(target, str) and target.split(".")[0] not in ("pfbench", *BROAD):
             yield target
         for value in node.values():
-            yield from _user_targets(value)
+            yield from list_user_targets(value)
     elif isinstance(node, list | tuple):
         for value in node:
-            yield from _user_targets(value)
+            yield from list_user_targets(value)

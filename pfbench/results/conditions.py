@@ -13,7 +13,7 @@ import numpy as np
 
 from pfbench.files.atomic_write import set_aside
 from pfbench.results import store
-from pfbench.results.inputs import describe_older, select_newest_inputs
+from pfbench.results.inputs import describe_libraries, describe_older, select_newest_inputs
 from pfbench.results.joined_runs import find_consecutive_parts, join_metadata, read_joined
 from pfbench.results.step_times import STEP_TIME, add_step_times
 from pfbench.results.store import DATA_FOLDERS
@@ -57,7 +57,8 @@ class Condition(NamedTuple):
         noise: Noise regime.
         model: Model.
         jobs: Result files.
-        older: Sentence on the results of the study that are not compared, since their inputs have changed.
+        older: Sentences on the results of the study that are not compared, since their inputs have changed, and on those of
+            several versions of a library.
     """
 
     scenario: str
@@ -92,7 +93,8 @@ def load_conditions(
     if not items:
         raise FileNotFoundError(_no_results_message(study, Path(results)))
     items, older = select_newest_inputs(items)
-    if sentence := describe_older(older):
+    sentences = describe_older(older), describe_libraries([meta for _, meta in items])
+    if sentence := " ".join(filter(None, sentences)):
         log.warning("warning  study %s: %s", study, sentence)
     _check_distinct(items)
     if not allow_mixed_versions:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import errno
-import importlib
 import json
 import os
+import random
 import shutil
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -20,6 +21,7 @@ import pytest
 import torch
 from compiled_cases import RUNS, agree, compiler, record_of, run
 
+from pfbench.files.atomic_write import DIGEST, hash_content
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.particle import compiled_filter, step_store
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
@@ -110,16 +112,13 @@ def test_whatever_decides_the_code_decides_the_name(other: Callable[[], str]) ->
 
 
 def test_structure_counts_not_only_values() -> None:
-    """Lists of equal values, values under other names, functions with other defaults and closures."""
-
-    def shifted(by: float) -> Callable[[float], float]:
-        return lambda x: x + by
+    """Lists of equal values, values under other names, functions with other arguments."""
 
     a, b = torch.ones(2), torch.ones(2)
     trees = [
         [1, 2], (1, 2), [[1], 2], [1, [2]], {"a": 1}, {"b": 1}, 1, 1.0, True, "1", b"1", None, float("nan"),
         [a, a], [a, b], a, 2 * a, a.double(), a[:1], a.expand(2, 2), np.ones(2), np.ones(2, dtype=np.float32),
-        shifted(1.0), shifted(2.0), partial(max, 1), partial(max, 2), partial(min, 1), torch.sin, torch.cos, {1, 2}, {1, 3},
+        partial(max, 1), partial(max, 2), partial(min, 1), torch.sin, torch.cos, {1, 2}, {1, 3},
         linear_walk, UnivariateGrowth, UnivariateGrowth(), UnivariateGrowth().propagate, UnivariateGrowth().log_likelihood,
     ]  # fmt: skip
     names = [step_store.name_step(tree, ()) for tree in trees]
@@ -128,22 +127,7 @@ def test_structure_counts_not_only_values() -> None:
 
 
 class Slotted:
-    """An object whose attributes lie in slots."""
-
-    __slots__ = ("a",)
-
-    def __init__(self, a: float) -> None:
-        self.a = a
-
-
-class Whole(int):
-    """A number with a class of its own."""
-
-
-def test_attributes_in_slots_and_values_of_own_kinds_of_numbers_count() -> None:
-    for kind in (Slotted, Whole):
-        assert step_store.name_step(kind(1), ()) == step_store.name_step(kind(1), ())
-        assert step_store.name_step(kind(1), ()) != step_store.name_step(kind(2), ())
+    """A class that is not of pfbench, as those of a user."""
 
 
 def test_cycles_have_an_end() -> None:
@@ -154,34 +138,25 @@ def test_cycles_have_an_end() -> None:
 
 @pytest.mark.parametrize(
     "value",
-    [torch.Generator(), iter([1]), {Slotted(1)}, np.array([Slotted(1)])],
-    ids=["generator", "iterator", "set", "array"],
+    [(x for x in [1]), memoryview(b"1")],
+    ids=["generator", "memory"],
 )
 def test_what_cannot_be_described_has_no_name(value: object) -> None:
     assert step_store.name_step([ParticleFilter(20), value], ()) is None
 
 
-def test_a_changed_class_of_a_user_or_a_module_that_it_imports_is_another_step(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    helper, models = tmp_path / "steplab_units.py", tmp_path / "steplab.py"
-    models.write_text("import steplab_units\n\n\nclass Model:\n    scale = 2.0\n")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    names = []
-    for text in ("METRE = 1.0\n", "METRE = 2.0\n", "METRE = 1.0\n"):
-        helper.write_text(text)
-        importlib.invalidate_caches()
-        names.append(step_store.name_step(importlib.import_module("steplab").Model(), ()))
-    models.write_text(models.read_text().replace("2.0", "2.5"))
-    names.append(step_store.name_step(importlib.import_module("steplab").Model(), ()))
-    assert names[0] == names[2]
-    assert len(set(names)) == 3
-    assert None not in names
+def own_walk(x: Any) -> Any:
+    return x
 
 
-def test_a_class_without_a_file_has_no_name() -> None:
-    kind = type("Typed", (), {"__module__": "a_notebook"})
-    assert step_store.name_step(kind(), ()) is None
+@pytest.mark.parametrize(
+    "value",
+    [Slotted(), Slotted, own_walk, partial(own_walk, 1), {"a": [own_walk]}, type("Typed", (), {"__module__": "__main__"})()],
+    ids=["object", "class", "function", "partial", "nested", "script"],
+)  # fmt: skip
+def test_a_step_that_reaches_code_of_a_user_has_no_name(value: object) -> None:
+    """It may take a number from a global, a closure, the environment or a file, which nothing here would see."""
+    assert step_store.name_step([ParticleFilter(20), value], ()) is None
 
 
 # --------------------------------------------------------------------------------------------------
@@ -211,6 +186,90 @@ def filtered(builds: bool = True, scale: float = 1.0) -> CompiledParticleFilter:
 def stored_graph(step: CompiledParticleFilter) -> Any:
     (graph,) = step.graphs.values()
     return graph
+
+
+def damage_step(folder: Path, rng: random.Random) -> str:
+    """Damage a stored step in one of many ways. Returns the way."""
+    file = folder / rng.choice(FILES)
+    data = bytearray(file.read_bytes())
+    record = json.loads((folder / "step.json").read_text())
+    at, other = rng.randrange(len(data)), folder / rng.choice(FILES)
+    way = rng.choice(["flip", "flip", "byte", "cut", "append", "repeat", "empty", "gone", "swap", "field", "field", "field", "extra", "drop",
+                      "constants", "mode", "owner of all", "folder", "link", "pipe", "file"])  # fmt: skip
+    if way == "flip":
+        data[at] ^= 1 << rng.randrange(8)
+    elif way == "byte":
+        data[at : at + rng.randrange(1, 40)] = rng.randbytes(rng.randrange(1, 40))
+    elif way in ("cut", "empty"):
+        del data[at if way == "cut" else 0 :]
+    elif way in ("append", "repeat"):
+        data += rng.randbytes(20) if way == "append" else data[at:]
+    if way in ("flip", "byte", "cut", "append", "repeat", "empty"):
+        file.write_bytes(bytes(data))
+    elif way in ("gone", "folder", "link", "pipe"):
+        moved = file.rename(folder.parent / "moved")
+        if way == "folder":
+            file.mkdir()
+        elif way == "link":
+            file.symlink_to(moved)
+        elif way == "pipe":
+            os.mkfifo(file)
+    elif way == "swap":
+        file.write_bytes(other.read_bytes())
+        other.write_bytes(bytes(data))
+    elif way == "field":
+        record["outputs"] = rng.choice([rng.randrange(-3, 300), 1 << 40, 2.5, "9", None, [10]])
+    elif way == "extra":
+        record[rng.choice(FILES)] = rng.randrange(9)
+    elif way == "drop":
+        del record[rng.choice(list(record))]
+    elif way == "constants":
+        torch.save([torch.randn(rng.randrange(1, 9))] * rng.randrange(4), folder / "constants.pt")
+    elif way in ("mode", "owner of all"):
+        (file if way == "mode" else folder).chmod(rng.choice([0o622, 0o777, 0o666, 0o722]))
+    elif way == "file":
+        shutil.rmtree(folder)
+        folder.write_bytes(bytes(data[:100]))
+    if way in ("field", "extra", "drop"):
+        (folder / "step.json").write_text(json.dumps(record))
+    return way
+
+
+def mutate_steps(built: Path, place: Path, trials: int, seed: int) -> Counter[str]:
+    """Load damaged copies of a step, each in a process of its own. Returns the outcomes.
+
+    They are: signal, valid (used, with the numbers of the uncompiled step), removed and refused (both said), kept (not used, and
+    neither), silent (without a word), false (another number).
+    """
+    rng, counts = random.Random(seed), Counter[str]()
+    outcomes = ["valid", "removed", "refused", "kept", "silent", "false"]
+    for trial in range(trials):
+        folder = place / str(trial) / built.name
+        shutil.copytree(built, folder)
+        damage_step(folder, rng)
+        if (child := os.fork()) == 0:
+            os._exit(outcomes.index(_load_damaged(folder)))
+        status = os.waitpid(child, 0)[1]
+        counts["signal" if os.WIFSIGNALED(status) else outcomes[os.WEXITSTATUS(status)]] += 1
+        shutil.rmtree(folder.parent)
+    return counts
+
+
+def _load_damaged(folder: Path) -> str:
+    """Filter with a damaged step, and return the outcome of `mutate_steps`."""
+    said: list[str] = []
+    step_store.log.warning = lambda text, *values: said.append(text % values)  # type: ignore[method-assign]
+    step_store._folder = lambda: folder.parent
+    try:
+        graph = stored_graph(filtered(builds=False))
+    except BaseException:
+        return "false"
+    if graph is not None:
+        return "valid"
+    if not said:
+        return "silent" if folder.is_dir() else "removed"  # a file of this name is no step
+    is_refused = "stored steps are not used" in said[0]
+    return "refused" if is_refused else "kept" if folder.exists() else "removed"
 
 
 @pytest.fixture
@@ -274,6 +333,23 @@ class TestStored:
         assert said.startswith("engine=compiled: a stored step is damaged")
         assert not filled.exists()
 
+    @pytest.mark.parametrize("outputs", [9, 11, 3, 200])
+    def test_another_number_of_outputs_is_damage(
+        self, filled: Path, outputs: int, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        """The number of results that the code writes: with another one it would write beyond its memory."""
+        record = json.loads((filled / "step.json").read_text())
+        (filled / "step.json").write_text(json.dumps({**record, "outputs": outputs}))
+        assert stored_graph(filtered(builds=False)) is None
+        assert "a stored step is damaged and removed" in caplog.text
+        assert not filled.exists()
+
+    def test_random_damage_ends_no_process(self, filled: Path, tmp_path: Path) -> None:
+        """A child takes each mutation, so that a signal would be seen."""
+        counts = mutate_steps(filled, tmp_path / "mutants", trials=40, seed=1)
+        assert not {"signal", "kept", "silent", "false"} & counts.keys(), counts
+        assert counts["removed"] + counts["refused"] + counts["valid"] == 40
+
     def test_a_step_that_gives_other_numbers_is_not_used(
         self, filled: Path, cache: Path, caplog: pytest.LogCaptureFixture
     ) -> None:
@@ -283,19 +359,23 @@ class TestStored:
             patch.setattr(step_store, "has_step", names.append)
             filtered(builds=False, scale=1.5)
         os.rename(filled, cache / names[0])
+        record = {**json.loads((cache / names[0] / "step.json").read_text()), "name": names[0]}
+        record[DIGEST] = hash_content({**record, **step_store._read_files(cache / names[0])})
+        (cache / names[0] / "step.json").write_text(json.dumps(record))
         assert stored_graph(filtered(builds=False, scale=1.5)) is None
         assert "a stored step is removed (its numbers must be those of" in caplog.text
         assert not list(cache.iterdir())
 
+    @pytest.mark.parametrize("place", ["", "step.so"])
     @pytest.mark.parametrize("fault", ["others can write it", "another user"])
     def test_a_store_of_others_is_not_used(
-        self, fault: str, filled: Path, refuse_compiler: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+        self, fault: str, place: str, filled: Path, refuse_compiler: None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:  # fmt: skip
         if fault == "another user":
             user = os.getuid()
             monkeypatch.setattr(os, "getuid", lambda: user + 1)
         else:
-            filled.chmod(0o777)
+            (filled / place).chmod(0o777)
         assert stored_graph(filtered(builds=False)) is None
         assert "stored steps are not used" in caplog.text
         assert "others cannot write" in caplog.text

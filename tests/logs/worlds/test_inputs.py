@@ -209,7 +209,7 @@ def test_a_users_class_names_its_files_and_its_code_is_an_input(own: Path) -> No
     node: dict[str, Any] = {"_target_": "inputlab.World", "file": str(own / "map.txt")}
     assert find_inputs({"scenario": node}).keys() == {"scenario"}  # its code, which is not run
     found = find_inputs({"scenario": node}, ["inputlab"])["scenario"]
-    assert found.keys() == {f"{own.name}/map.txt", "code of inputlab"}
+    assert found.keys() == {f"{own.name}/map.txt", "code of inputlab", "values of inputlab.World"}
     assert describe_unnamed_files(node, ["inputlab"]) == ()
     bare = {**node, "_target_": "inputlab_bare.World"}
     (note,) = describe_unnamed_files(bare, ["inputlab_bare"])
