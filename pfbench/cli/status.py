@@ -8,6 +8,7 @@ from pathlib import Path
 from pfbench.cli.compose import split_words
 from pfbench.cli.progress import list_repeats, read_state
 from pfbench.job.config import compose
+from pfbench.results.inputs import describe_libraries
 
 HELP = """\
 pfbench status [study=NAME] [results_dir=FOLDER]
@@ -33,7 +34,11 @@ def report_status(words: Sequence[str]) -> None:
         state = read_state(folder)
         if not (state.failures or state.running):
             check_has_results(folder.name, results)
-        print(state, *list_repeats(folder), sep="\n")
+        from pfbench.results.conditions import read_undamaged
+
+        jobs = filter(None, map(read_undamaged, folder.glob("*.npz")))
+        mixed = describe_libraries([meta for _, meta in jobs])
+        print(state, *filter(None, [mixed]), *list_repeats(folder), sep="\n")
         return
     folders = [
         path for path in results.glob("*") if path.is_dir() and path.name not in _NOT_STUDIES

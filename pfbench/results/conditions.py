@@ -89,7 +89,7 @@ def load_conditions(
     """
     files = sorted((Path(results) / study).glob("*.npz"))
     paths = [path for path in files if keys is None or path.stem in keys]
-    items = [item for path in paths if (item := _read_undamaged(path)) is not None]
+    items = [item for path in paths if (item := read_undamaged(path)) is not None]
     if not items:
         raise FileNotFoundError(_no_results_message(study, Path(results)))
     items, older = select_newest_inputs(items)
@@ -155,7 +155,7 @@ def list_stored_studies(results: Path) -> list[str]:
     return sorted({path.parent.name for path in results.glob("*/*.npz")} - {DATASHEETS})
 
 
-def _read_undamaged(path: Path) -> tuple[Path, dict[str, Any]] | None:
+def read_undamaged(path: Path) -> tuple[Path, dict[str, Any]] | None:
     """Read the metadata of a result. A damaged file is set aside and left out, one that is not a result is left out."""
     try:
         return path, store.read_result(path).meta

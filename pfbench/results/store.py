@@ -24,7 +24,7 @@ from pfbench.files.atomic_write import (
     write_atomically,
 )
 from pfbench.files.command_start import start_work
-from pfbench.files.limits import LimitError, check_zip
+from pfbench.files.limits import LimitError, check_zip, find_input
 from pfbench.kernels.generator_version import GENERATOR_VERSION
 
 # --------------------------------------------------------------------------------------------------
@@ -194,10 +194,12 @@ def _opened(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
             f"{path} is damaged: it must be a file, got another kind. Delete it and run the job again."
         )
     try:
+        find_input(path.parent, path.name)
         check_zip(path)
     except LimitError as error:
         raise DamagedResultError(
-            f"{path} is damaged: its size must be plausible ({error}). Delete it and run the job again."
+            f"{path} is damaged: it must be a file of this folder, of a plausible size ({error}). "
+            "Delete it and run the job again."
         ) from error
     # opened here, since numpy leaves a damaged file open
     with path.open("rb") as raw:

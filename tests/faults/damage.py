@@ -139,7 +139,7 @@ def make_report_data(folder: Path) -> Subject:
 
     def read(path: Path) -> str:
         if path.suffix == ".npz":
-            if conditions._read_undamaged(path) is None:
+            if conditions.read_undamaged(path) is None:
                 raise ValueError(
                     "a damaged result must be left out of the report. It was set aside"
                 )

@@ -124,6 +124,11 @@ def test_a_result_under_the_name_of_another_job_is_not_its_result(result: Path) 
     ):
         store.read_result(other)
     other.unlink()
+    (result.parent / "deep").mkdir()
+    link = result.parent / "deep" / result.name
+    link.symlink_to(result)
+    with pytest.raises(store.DamagedResultError, match="must be a file of this folder"):
+        store.read_result(link)
 
 
 def test_a_report_leaves_a_damaged_job_out_and_says_so(tmp_path: Path) -> None:
@@ -143,6 +148,15 @@ def test_a_report_leaves_a_damaged_job_out_and_says_so(tmp_path: Path) -> None:
     assert "npz was damaged. Run the job again" in page
     assert file.stem in page
     assert not file.exists()
+    assert "are mixed" not in page
+    other = min(folder.glob("*.npz"))
+    meta, data = store.read_result(other)
+    store.write_result(other, {**meta, "versions": {**meta["versions"], "torch": "2.0.0"}}, data)
+    assert pfbench(*words, home=tmp_path).code == 0
+    said = "Results of torch 2.0.0 and "  # of another version: in the first lines of both pages, and in the state
+    assert said in (tmp_path / "reports" / "adhoc" / "report.md").read_text()[:2000]
+    assert said in (tmp_path / "reports" / "adhoc" / "index.html").read_text()
+    assert said in pfbench("status", "study=adhoc", home=tmp_path).out
 
 
 def test_equal_digests_mean_equal_contents() -> None:
