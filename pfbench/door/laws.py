@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
+from types import FrameType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -111,7 +116,9 @@ def check_laws(thing: Any, runs: int = 200, inputs: Any = ()) -> LawTable:
         "noise": lambda: _check_noise(subject),
     }
     try:
-        results = checks[group]() if group in checks else _check_filter(subject, stage, runs)
+        with _watched_files(subject) as opened:
+            results = checks[group]() if group in checks else _check_filter(subject, stage, runs)
+        _check_declared(subject, opened)
     except AssertionError as error:
         statement, _, message = f"{error}".partition(": ")
         return LawTable((LawRow(statement, False, message=message or statement),))
@@ -119,6 +126,49 @@ def check_laws(thing: Any, runs: int = 200, inputs: Any = ()) -> LawTable:
         return LawTable((LawRow("the part runs", False, message=format_error(error)),))
     return LawTable(
         tuple(LawRow(c.statement, True, c.statistic, c.limit) for c in results.values())
+    )
+
+
+_LIBRARIES = (sys.prefix, sys.base_prefix)
+_watched: list[
+    tuple[str, set[str]]
+] = []  # modules of parts that are checked, and files that their code opens
+
+
+@cache
+def _start_watching() -> None:
+    """Note the files that the code of checked parts opens. Python keeps such a hook until its end."""
+
+    def note(event: str, values: tuple[Any, ...]) -> None:
+        if event != "open" or not _watched or not isinstance(values[0], str):
+            return
+        frame: FrameType | None = sys._getframe(1)
+        while frame is not None and frame.f_code.co_filename.startswith(_LIBRARIES):
+            frame = frame.f_back  # who asked the library; an import is frozen code
+        if frame is not None and frame.f_globals.get("__name__") == _watched[-1][0]:
+            _watched[-1][1].add(os.path.realpath(values[0]))
+
+    sys.addaudithook(note)
+
+
+@contextmanager
+def _watched_files(subject: Any) -> Iterator[set[str]]:
+    """Collect the files that the module of a part opens meanwhile."""
+    _start_watching()
+    _watched.append((type(subject).__module__, set()))
+    try:
+        yield _watched[-1][1]
+    finally:
+        _watched.pop()
+
+
+def _check_declared(subject: Any, opened: set[str]) -> None:
+    """Check that a part states the files that it opens, since a job is known by what it states."""
+    stated = subject.input_files() if hasattr(subject, "input_files") else ()
+    hidden = sorted(opened - set(map(os.path.realpath, stated)))
+    assert not hidden, (
+        f"files that it reads are stated: {type(subject).__name__} opens {', '.join(hidden)}. Return their paths from a method "
+        "input_files(self), so that a changed file is a new job"
     )
 
 
