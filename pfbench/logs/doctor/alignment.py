@@ -20,6 +20,7 @@ from pfbench.logs.doctor.finding import (
     describe_change,
     thin_curve,
 )
+from pfbench.logs.doctor.force_windows import fit_force, integrate_force
 from pfbench.logs.doctor.raw_log import RawLog, dcm_of, interpolate_columns
 from pfbench.logs.doctor.thresholds import REFUSED_OFFSET, limit_of
 from pfbench.logs.doctor.turn_search import (
@@ -34,7 +35,13 @@ _DEGREE = np.pi / 180.0
 _GAIN = 0.15  # of the score by another unit
 _CERTAIN = 0.9  # score at which no other unit is tried, and that of a piece of the log
 _PIECE, _FEWEST_PIECES, _MOST_PIECES = 15.0, 3, 8  # s, and number of pieces for the drift
+_NO_TURN = 1e-5  # rad; RMS turn of a window of an attitude that does not change
 _LEAST_TURN = 0.03  # rad; RMS turn of a piece that shows an offset
+_LEAST_COST, _CLEAR_COST = (
+    0.01,
+    0.5,
+)  # (m/s^2)^2 of a wrong attitude, and the part that the true one may leave
+_COLUMNS = ("roll", "pitch", "yaw")
 _STRAIGHT = 0.35  # part of the spread that a drift may leave
 _UNITS = {
     "": (1.0, 1.0, 1.0),
@@ -69,6 +76,12 @@ class Alignment:
     rate_axes: Array
     rate_ratio: float
 
+    @property
+    def ratio(self) -> float:
+        """Turns of the IMU over those of the reference."""
+        true, measured = self.pair
+        return float(np.sqrt((measured**2).sum() / max(float((true**2).sum()), 1e-300)))
+
     def over(self, log: RawLog) -> Alignment:
         """Return the alignment of the same log with other velocities."""
         return replace(self, log=log)
@@ -94,20 +107,61 @@ def align_clocks(log: RawLog, facts: dict[str, Any]) -> tuple[Alignment | None, 
         return None, [*findings, *(strangers if _has_turns(search, turns) else [])]
     if pair is None:
         return None, findings
-    findings += _describe_offset(log, search, turns, (offset, score), facts)
     aligned = Alignment(log, offset, dcm, nodes, search, pair[:2], pair[2], np.eye(3), 1.0)
+    if wrong := _find_scale(aligned):
+        converted, finding = wrong
+        mended, more = align_clocks(converted, facts)
+        return mended, [*findings, finding, *more]
+    findings += _describe_offset(log, search, turns, (offset, score), facts)
     aligned, more = _convert_rate(aligned, facts)
     return _fit_rate_axes(aligned), [*findings, *more]
 
 
+def _unit_of(ratio: float) -> float:
+    """Return degrees in place of a ratio near them."""
+    near = [unit for unit in (1.0 / _DEGREE, _DEGREE) if 0.7 < ratio / unit < 1.4]
+    return near[0] if near else ratio
+
+
+def _find_scale(aligned: Alignment) -> tuple[RawLog, Finding] | None:
+    """Find an attitude with which the force explains the motion much better, where turns differ by a factor.
+
+    Turns alone do not tell a heading in another unit from rates in another unit.
+
+    Returns the log in its unit, and the finding.
+    """
+    log, factor = aligned.log, _unit_of(aligned.ratio)
+    if 1.0 / limit_of("unit of rate") < factor < limit_of("unit of rate"):
+        return None
+    plain, results = _find_force_cost(log, aligned.offset), []
+    for unit in ("yaw", "roll, pitch, yaw"):
+        scales = [factor if name in unit else 1.0 for name in _COLUMNS]
+        scaled = log._replace(
+            reference=log.reference._replace(angles=log.reference.angles * scales)
+        )
+        results.append((_find_force_cost(scaled, aligned.offset), unit, scaled))
+    cost, unit, scaled = min(results, key=lambda result: result[0])
+    if not (plain > _LEAST_COST and cost < _CLEAR_COST * plain):
+        return None
+    text = f"{log.names[2]}: {unit} turn{'s' * (unit == 'yaw')} {1.0 / aligned.ratio:.3g} times as much as {log.names[0]}, and with it the force does not explain the motion: another unit"
+    return scaled, _describe_unit(
+        log, unit, (plain / max(cost, 1e-12), 1.0 / _CLEAR_COST, "times the least residual"), text, factor
+    )  # fmt: skip
+
+
+def _find_force_cost(log: RawLog, offset: float) -> float:
+    """Return what the best axes of the force leave of the acceleration of the reference, (m/s^2)^2; 0 without windows."""
+    windows = integrate_force(log, dcm_of(log.reference.angles), offset)
+    return min(fit_force(windows, axes).cost for axes in BODY_ORDERS) if windows else 0.0
+
+
 def _convert_rate(aligned: Alignment, facts: dict[str, Any]) -> tuple[Alignment, list[Finding]]:
     """Convert the rate to the unit of the reference, and name another unit."""
-    (true, measured), log = aligned.pair, aligned.log
-    ratio = float(np.sqrt((measured**2).sum() / max(float((true**2).sum()), 1e-300)))
+    (true, measured), log, ratio = aligned.pair, aligned.log, aligned.ratio
     facts["rate over that of the reference"] = ratio
     if 1.0 / limit_of("unit of rate") < ratio < limit_of("unit of rate"):
         return aligned, []
-    factor = _DEGREE if 40.0 < ratio < 80.0 else 1.0 / ratio
+    factor = 1.0 / _unit_of(ratio)
     converted = replace(
         aligned,
         log=log._replace(imu=log.imu._replace(rate=log.imu.rate * factor)),
@@ -155,19 +209,25 @@ def _convert_attitude(log: RawLog, unit: str, score: float) -> tuple[RawLog, lis
     """Convert the attitude to radians, and name the columns in degrees."""
     if not unit:
         return log, []
-    columns = unit.split(", ")
-    reference = log.reference
-    finding = Finding(
-        "unit of attitude", REFUSE, score, _CERTAIN, "score",
-        f"{log.names[2]}: {unit} {'is' if len(columns) == 1 else 'are'} in degrees: turns then agree with the IMU "
-        f"to a score of {score:.3f}",
-        f"Multiply by {_DEGREE:.10f}, or set scenario.corrections.scale",
-        {"corrections": {"scale": {"reference": dict.fromkeys(columns, _DEGREE)}}},
-        picture=Picture("t [s]", "yaw as recorded", (thin_curve("yaw", reference.time, reference.angles[:, 2]),)),
-    )  # fmt: skip
+    reference, verb = log.reference, "is" if unit == "yaw" else "are"
+    text = f"{log.names[2]}: {unit} {verb} in degrees: turns then agree with the IMU to a score of {score:.3f}"
+    finding = _describe_unit(log, unit, (score, _CERTAIN, "score"), text, _DEGREE)
     return log._replace(reference=reference._replace(angles=reference.angles * _UNITS[unit])), [
         finding
     ]
+
+
+def _describe_unit(
+    log: RawLog, unit: str, evidence: tuple[float, float, str], text: str, factor: float
+) -> Finding:
+    """Describe columns of the attitude in another unit, with statistic, threshold and unit of the evidence."""
+    yaw = thin_curve("yaw", log.reference.time, log.reference.angles[:, 2])
+    return Finding(
+        "unit of attitude", REFUSE, *evidence, text,
+        f"Multiply by {factor:.10g}, or set scenario.corrections.scale",
+        {"corrections": {"scale": {"reference": dict.fromkeys(unit.split(", "), factor)}}},
+        picture=Picture("t [s]", "yaw as recorded", (yaw,)),
+    )  # fmt: skip
 
 
 def _turn_picture(log: RawLog, search: TurnSearch, turns: Array, offset: float) -> Picture:
@@ -187,18 +247,24 @@ def _turn_picture(log: RawLog, search: TurnSearch, turns: Array, offset: float) 
 
 
 def _describe_strangers(log: RawLog, search: TurnSearch, turns: Array, score: float) -> Finding:
+    moves = np.square(turns - turns.mean(0)).sum(1).mean() > _NO_TURN**2
+    evidence = f"show no common turn at any offset up to 25 s: the best score is {score:.2f}"
+    causes = ("another clock", "a wrong attitude", "a log without turns")
+    if not moves:
+        evidence = "disagree: roll, pitch, yaw do not turn, and wx, wy, wz do"
+        causes = ("an attitude in another unit", "an attitude that was not recorded")
     return Finding(
         "common motion", REFUSE, score, limit_of("common motion"), "score",
-        f"{log.names[0]} and {log.names[2]} show no common turn at any offset up to 25 s: the best score is {score:.2f}",
-        "Check that both tables are of one drive, and that the clocks differ by less than 25 s",
-        explanations=("another clock", "a wrong attitude", "a log without turns"),
+        f"{log.names[0]} and {log.names[2]} {evidence}",
+        "Check that both tables are of one drive, and that the clocks differ by less than 25 s" if moves
+        else "Check roll, pitch, yaw",
+        explanations=causes,
         picture=_turn_picture(log, search, turns, 0.0),
     )  # fmt: skip
 
 
 def _describe_rate_unit(log: RawLog, pair: tuple[Array, Array], ratio: float) -> Finding:
-    is_degrees = 40.0 < ratio < 80.0
-    factor = _DEGREE if is_degrees else 1.0 / ratio
+    factor, is_degrees = 1.0 / _unit_of(ratio), _unit_of(ratio) != ratio
     true, measured = pair
     axis, rows = int(np.argmax(np.square(true).sum(0))), np.arange(len(true))
     unit = "they are in deg/s" if is_degrees else "they have another unit"

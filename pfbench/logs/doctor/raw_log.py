@@ -105,7 +105,7 @@ def take_log(
     return RawLog(
         RawImu(imu.time, swap_frd_rfu(imu.force), swap_frd_rfu(imu.rate), np.arange(len(imu.time))),
         RawFixes(fixes.time[usable], swap_frd_rfu(fixes.position[usable]), usable),
-        _take_reference(reference) if reference else _NO_REFERENCE,
+        take_reference(reference) if reference else _NO_REFERENCE,
         gravity,
         (tables[0].name, tables[1].name, tables[2].name),
         (tables[0].row, tables[1].row, tables[2].row),
@@ -116,7 +116,7 @@ _NO_ROWS = np.empty((0, 3))
 _NO_REFERENCE = RawReference(np.empty(0), _NO_ROWS, _NO_ROWS, _NO_ROWS, np.empty(0, np.intp))
 
 
-def _take_reference(reference: ReferenceLog) -> RawReference:
+def take_reference(reference: ReferenceLog) -> RawReference:
     """Return a reference in the axes of the tables."""
     q = reference.attitude[:, [1, 2, 3, 0]]
     axes = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # of both frames

@@ -16,20 +16,18 @@ import torch
 from numpy.typing import NDArray
 
 from pfbench.core import chart
+from pfbench.logs.doctor.raw_log import take_reference
+from pfbench.logs.doctor.reference_checks import check_reference, drop_wrong_rows
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
 from pfbench.logs.worlds.dead_reckoning import integrate_windows
-from pfbench.logs.worlds.log_checks import (
-    FEWEST_WINDOWS,
-    MIN_RMS_SPEED,
-    WINDOW,
-    check_position_scale,
-    check_turn_scale,
-)
 from pfbench.logs.worlds.log_tables import Array, GnssLog, ImuLog, LogTable, ReferenceLog
 from pfbench.logs.worlds.time_grid import interpolate
 from pfbench.nav import attitude
 
 _FIX_LIMITS = (2e3, 5e3, 1e4, 2e4, 5e4, 1e5)  # m; offered limits of the error of a fix
+_WINDOW = 1.0  # s; IMU and reference are compared over windows of about this length
+_STEADY = 2.0  # m/s; least speed at which the track turns as the car
+_FEWEST = 5  # fixes with a median
 _STRAIGHT = 1.5  # s; longest interval over which the velocity is taken as linear
 
 
@@ -61,16 +59,22 @@ COMMON_TIME = 2.0  # s at an end of a table that other tables do not cover, with
 
 
 def compare_reference(table: LogTable, reference: ReferenceLog) -> tuple[str, ...]:
-    """Compare positions and velocities of a reference.
+    """Check that positions change as velocities say, for a whole reference and between its rows.
 
     Returns notes.
     """
+    notes = compare_velocities(table, reference)
+    _, findings = check_reference(table.name, drop_wrong_rows(take_reference(reference)), {})
+    if findings:
+        raise ValueError(f"{findings[0].evidence}. Correct units, signs and order of the columns.")
+    return notes
+
+
+def compare_velocities(table: LogTable, reference: ReferenceLog) -> tuple[str, ...]:
+    """Compare the changes of position between rows with the velocities; return notes."""
     dt = np.diff(reference.time)
     expected = 0.5 * dt[:, None] * (reference.velocity[1:] + reference.velocity[:-1])
     displacement = np.diff(reference.position, axis=0)
-    straight = (dt <= _STRAIGHT)[:, None]
-    sums = (np.where(straight, a, 0.0) for a in (expected, displacement))
-    check_position_scale(table, reference.time, *sums)
     # the error of the straight line grows with the square of the interval
     slack = np.maximum(1.0, dt / _STRAIGHT) ** 2
     difference = np.linalg.norm(displacement - expected, axis=1) / slack
@@ -83,7 +87,7 @@ def compare_inertial(table: LogTable, imu: ImuLog, reference: ReferenceLog, grav
     Returns notes.
     """
     inside = np.flatnonzero((reference.time >= imu.time[0]) & (reference.time <= imu.time[-1]))
-    stride = max(1, round(WINDOW / float(np.median(np.diff(reference.time)))))
+    stride = max(1, round(_WINDOW / float(np.median(np.diff(reference.time)))))
     notes = [
         note
         for nodes in (inside, inside[::stride])
@@ -105,69 +109,81 @@ def _compare_windows(
     angle = chart.rotation_vector_from_quaternion(chart.quaternion_multiply(inverse, turned)).norm(
         dim=-1
     )
-    true_rotation = q.new_tensor([1.0, -1.0, -1.0, -1.0]) * chart.quaternion_multiply(
-        inverse, q[:-1]
-    )
-    pair = (rotation, true_rotation)
-    x, y = (chart.rotation_vector_from_quaternion(a)[angle < ATTITUDE.noted] for a in pair)
-    check_turn_scale(table, x.numpy(), y.numpy(), float(np.median(np.diff(time))))
     level = (attitude.dcm_from_quaternion(q[:-1]) @ velocity[..., None])[..., 0].numpy()
     dt = np.diff(time)
     level[:, 2] -= gravity * dt
     change = np.diff(reference.velocity[nodes], axis=0)
     # errors of an unaided IMU grow with the window, which a gap of the reference extends
-    scale = np.maximum(1.0, dt / WINDOW)
+    scale = np.maximum(1.0, dt / _WINDOW)
     return (
         *_judge(VELOCITY, np.linalg.norm(change - level, axis=1) / scale, table, nodes[1:]),
         *_judge(ATTITUDE, angle.numpy() / scale, table, nodes[1:]),
     )
 
 
-def compare_fixes(
+def drop_fixes(
     table: LogTable, fixes: GnssLog, reference: ReferenceLog, limits: PlausibleLimits
 ) -> tuple[GnssLog, tuple[str, ...]]:
-    """Compare fixes with the reference, and outside of it with the previous fix.
+    """Leave out wrong fixes if `limits.drop_fixes` says so and others remain.
 
-    Returns the fixes, without those that `limits.drop_fixes` drops, and notes.
+    Returns the fixes, and notes.
     """
-    true = interpolate(reference, fixes.time)
-    position_error = np.linalg.norm(fixes.position - true[:, 7:], axis=1)
-    velocity_error = np.linalg.norm(fixes.velocity - true[:, 4:7], axis=1)
+    wrong = _find_wrong(fixes, reference, limits.speed_m_s)(limits.fix_error_m)
+    if not (limits.drop_fixes and wrong.any() and _usable(fixes, wrong)):
+        return fixes, ()
+    position, velocity = fixes.position.copy(), fixes.velocity.copy()
+    position[wrong] = velocity[wrong] = np.nan
+    text = f"{table.name}: {int(wrong.sum())} fixes dropped, the first off by {_describe_first(table, fixes, reference, wrong)}"
+    return fixes._replace(position=position, velocity=velocity), (text,)
+
+
+def compare_fixes(
+    table: LogTable, fixes: GnssLog, reference: ReferenceLog, limits: PlausibleLimits
+) -> tuple[str, ...]:
+    """Compare fixes with the reference, and outside of it with the previous fix; return notes."""
+    is_wrong = _find_wrong(fixes, reference, limits.speed_m_s)
+    wrong = is_wrong(limits.fix_error_m)
+    if wrong.any():
+        raise ValueError(
+            f"{table.name}: fixes must be at most {limits.fix_error_m:g} m from the reference and from neighbouring "
+            f"fixes at {limits.speed_m_s:g} m/s, got {_describe_first(table, fixes, reference, wrong)} "
+            f"({int(wrong.sum())} such rows). {_fix_remedy(fixes, wrong, is_wrong)}"
+        )
+    true, rows = interpolate(reference, fixes.time), np.arange(len(fixes.time))
+    position_error, velocity_error = (
+        np.nan_to_num(np.linalg.norm(seen - expected, axis=1))
+        for seen, expected in ((fixes.position, true[:, 7:]), (fixes.velocity, true[:, 4:7]))
+    )
+    return (
+        *_note_offset(table, fixes.position - true[:, 7:]),
+        *_judge(FIX, position_error, table, rows),
+        *_judge(FIX_VELOCITY, velocity_error, table, rows),
+    )
+
+
+def _find_wrong(
+    fixes: GnssLog, reference: ReferenceLog, speed: float
+) -> Callable[[float], NDArray[np.bool_]]:
+    """Return a function that finds the fixes, [m], that are off by more than a distance, m."""
+    error = np.linalg.norm(fixes.position - interpolate(reference, fixes.time)[:, 7:], axis=1)
     step = np.linalg.norm(np.diff(fixes.position, axis=0), axis=1)
 
     def is_wrong(largest: float) -> NDArray[np.bool_]:
-        reach = limits.speed_m_s * np.diff(fixes.time) + 2.0 * largest
+        reach = speed * np.diff(fixes.time) + 2.0 * largest
         # a jump after a wrong fix is not an error of the next one, which the reference confirms
-        jump_mask = np.concatenate([[False], step > reach]) & np.isnan(position_error)
-        return (position_error > largest) | jump_mask
+        return (error > largest) | np.concatenate([[False], step > reach]) & np.isnan(error)
 
-    wrong_mask = is_wrong(limits.fix_error_m)
-    notes: tuple[str, ...] = ()
-    if wrong_mask.any():
-        rows = np.flatnonzero(wrong_mask)
-        i = int(rows[0])
-        distance = position_error[i] if np.isfinite(position_error[i]) else step[i - 1]
-        text = f"{distance:.0f} m in {table.row(i)}"
-        if not (limits.drop_fixes and _usable(fixes, wrong_mask)):
-            raise ValueError(
-                f"{table.name}: fixes must be at most {limits.fix_error_m:g} m from the reference "
-                f"and from neighbouring fixes at {limits.speed_m_s:g} m/s, got {text} "
-                f"({len(rows)} such rows). {_fix_remedy(fixes, wrong_mask, is_wrong)}"
-            )
-        notes = (f"{table.name}: {len(rows)} fixes dropped, the first off by {text}",)
-        position, velocity = fixes.position.copy(), fixes.velocity.copy()
-        position[wrong_mask] = velocity[wrong_mask] = np.nan
-        fixes = fixes._replace(position=position, velocity=velocity)
-    position_error, velocity_error = (
-        np.where(wrong_mask | np.isnan(error), 0.0, error)
-        for error in (position_error, velocity_error)
-    )
-    return fixes, (
-        *notes,
-        *_note_offset(table, fixes.position - true[:, 7:]),
-        *_judge(FIX, position_error, table, np.arange(len(fixes.time))),
-        *_judge(FIX_VELOCITY, velocity_error, table, np.arange(len(fixes.time))),
-    )
+    return is_wrong
+
+
+def _describe_first(
+    table: LogTable, fixes: GnssLog, reference: ReferenceLog, wrong: NDArray[np.bool_]
+) -> str:
+    """Return error, or change outside of the reference, and row of the first wrong fix."""
+    i = int(np.argmax(wrong))
+    error = fixes.position[i] - interpolate(reference, fixes.time[i : i + 1])[0, 7:]
+    change = error if np.isfinite(error).all() else fixes.position[i] - fixes.position[i - 1]
+    return f"{np.linalg.norm(change):.0f} m in {table.row(i)}"
 
 
 def _usable(fixes: GnssLog, wrong_mask: NDArray[np.bool_]) -> int:
@@ -194,7 +210,7 @@ def _fix_remedy(
 def _note_offset(table: LogTable, difference: Array) -> tuple[str, ...]:
     """Note the largest median over time of fixes minus reference [n, 3]."""
     difference = difference[np.isfinite(difference).all(1)]
-    if len(difference) < FEWEST_WINDOWS:
+    if len(difference) < _FEWEST:
         return ()
     offset = np.median(difference, axis=0)
     axis = int(np.argmax(np.abs(offset)))
@@ -218,7 +234,7 @@ def compare_wheels(
     rows, dt = np.arange(len(speed)), np.diff(reference.time)
     # the track changes with the heading while the car moves
     turn = np.angle(np.exp(1j * np.diff(np.arctan2(east, north)))) / dt
-    steady = np.minimum(true_speed[1:], true_speed[:-1]) > 2.0 * MIN_RMS_SPEED
+    steady = np.minimum(true_speed[1:], true_speed[:-1]) > _STEADY
     off = np.where(steady, np.abs(turn - 0.5 * (yaw_rate[1:] + yaw_rate[:-1])), 0.0)
     return (
         *_judge(WHEELS, np.abs(np.abs(speed) - true_speed), table, rows),

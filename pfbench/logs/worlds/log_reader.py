@@ -16,8 +16,7 @@ A table can contain several flights and sensors. The columns `path` and `imu` id
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -29,23 +28,18 @@ from pfbench.logs.doctor.checks import run_checks
 from pfbench.logs.doctor.finding import REFUSE, Finding
 from pfbench.logs.doctor.raw_log import RawLog, take_log
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
-from pfbench.logs.worlds.clock_offsets import find_fix_offset, find_imu_offset
 from pfbench.logs.worlds.corrections import LogCorrections
 from pfbench.logs.worlds.fix_codes import FixCodes, select_usable
 from pfbench.logs.worlds.imu_gaps import GAP_SAMPLES, LONGEST_BRIDGE, bridge_gaps
 from pfbench.logs.worlds.log_agreement import (
     compare_fixes,
     compare_inertial,
-    compare_reference,
     compare_times,
+    compare_velocities,
+    drop_fixes,
 )
-from pfbench.logs.worlds.log_checks import (
-    check_force,
-    check_overlap,
-    check_rotation,
-)
+from pfbench.logs.worlds.log_checks import check_overlap
 from pfbench.logs.worlds.log_frames import (
-    DEGREE,
     find_origin,
     gravity_at,
     quaternion_of_angles,
@@ -68,7 +62,6 @@ from pfbench.logs.worlds.log_tables import (
     swap_frd_rfu,
 )
 
-_CLOCKS = ("imu clock: ", "gnss clock: ")
 _OF_FIXES = ("lever arm", "fix shift")  # a reference that also gives the fixes has none
 _VELOCITY, _DERIVED = ("vn", "ve", "vd"), ("vn_d", "ve_d", "vd_d")
 
@@ -150,18 +143,20 @@ def check_tables(
     fixes, mended_fixes = mending.correct_fixes(fixes, reference, gnss.name)
     for name, time in ((gnss.name, fixes.time), (truth.name, reference.time)):
         check_overlap(inertial.name, sensors.time, name, time)
-    late = _check_motion((inertial, sensors), (truth, reference))
     gravity, gravity_notes = gravity_at(centre)
-    notes += (*gravity_notes, *compare_reference(truth, reference))
-    with _explain(late):
-        notes += compare_inertial(truth, sensors, reference, gravity)
-    fixes, fix_notes = _compare_fixes(gnss, fixes, (truth, reference), limits or PlausibleLimits())
-    dropped = dict.fromkeys(note for table in (inertial, gnss, truth) for note in table.notes)
+    rows = compare_velocities(truth, reference)
+    fixes, left_out = drop_fixes(gnss, fixes, reference, limits or PlausibleLimits())
+    # faults of a whole table first: they spoil single rows, too
     raw = take_log((inertial, gnss, truth), sensors, fixes, reference, gravity)
+    angles = parse_numbers(truth, ("roll", "pitch", "yaw"))  # not within a turn, as degrees are not
+    raw = raw._replace(reference=raw.reference._replace(angles=angles))
     diagnosed = diagnose(raw, has_own_fixes=gnss.name != truth.name, diagnosis=diagnosis)
-    notes = (*dropped, *mended, *mended_fixes, late, *usable_notes, *notes, *fix_notes)
+    rows += compare_inertial(truth, sensors, reference, gravity)
+    rows += compare_fixes(gnss, fixes, reference, limits or PlausibleLimits())
+    dropped = dict.fromkeys(note for table in (inertial, gnss, truth) for note in table.notes)
+    notes = (*dropped, *mended, *mended_fixes, *usable_notes, *notes, *gravity_notes, *left_out)
     spans = ((inertial.name, sensors.time), (gnss.name, fixes.time), (truth.name, reference.time))
-    notes = (*_leave_out_offsets(notes, diagnosed), *diagnosed, *compare_times(spans))
+    notes = (*notes, *rows, *diagnosed, *compare_times(spans))
     return NavigationLog(sensors, fixes, reference, gravity, notes, centre)
 
 
@@ -195,56 +190,6 @@ def diagnose(
         for finding in findings
         if has_own_fixes or finding.check not in _OF_FIXES
     )
-
-
-def _leave_out_offsets(notes: Iterable[str], diagnosed: Iterable[str]) -> Iterator[str]:
-    """Yield the notes without empty ones and without offsets of clocks that the diagnosis names."""
-    clocks = [note.split(": ")[1] for note in diagnosed if note.startswith(_CLOCKS)]
-    yield from (n for n in notes if n and not any(n.startswith(f"{t}: t is") for t in clocks))
-
-
-def _check_motion(inertial: tuple[LogTable, ImuLog], truth: tuple[LogTable, ReferenceLog]) -> str:
-    """Check force and turns of the IMU against the reference; return a note on its clock, or ''."""
-    (table, sensors), (reference_table, reference) = inertial, truth
-    check_force(sensors, reference, table.name)
-    offset = find_imu_offset(sensors, reference)
-    late = offset.describe(table.name, reference_table.name) if offset else ""
-    check_rotation(
-        sensors,
-        reference,
-        (table.name, reference_table.name),
-        lambda: _other_attitudes(reference_table, reference),
-        late,
-    )
-    return late
-
-
-def _compare_fixes(
-    table: LogTable,
-    fixes: GnssLog,
-    truth: tuple[LogTable, ReferenceLog],
-    limits: PlausibleLimits,
-) -> tuple[GnssLog, tuple[str, ...]]:
-    """Compare fixes with the reference, and name the offset of a clock that is not its own."""
-    reference_table, reference = truth
-    is_own = table.name == reference_table.name
-    offset = None if is_own else find_fix_offset(fixes, reference)
-    late = offset.describe(table.name, reference_table.name) if offset else ""
-    with _explain(late):
-        fixes, notes = compare_fixes(table, fixes, reference, limits)
-    return fixes, ((late, *notes) if late else notes)
-
-
-@contextlib.contextmanager
-def _explain(offset: str) -> Iterator[None]:
-    """Add the offset of a clock to the error of a comparison, which it can cause."""
-    try:
-        yield
-    except ValueError as error:
-        if not offset:
-            raise
-        text = f"{error} First correct the clock: {offset}."
-        raise ValueError(text) from None
 
 
 def read_samples(table: LogTable) -> tuple[ImuLog, tuple[str, ...]]:
@@ -333,21 +278,3 @@ def _motion(table: LogTable, origin: tuple[float, ...] | None) -> ReferenceLog:
         velocity,
         read_positions(table, origin),
     )
-
-
-def _other_attitudes(table: LogTable, reference: ReferenceLog) -> dict[str, ReferenceLog]:
-    """Return the reference as other units and signs of its attitude would give it."""
-    roll, pitch, yaw = parse_numbers(table, ("roll", "pitch", "yaw")).T
-    angles = {
-        f"yaw is in degrees: multiply it by {DEGREE:.10f}.": (roll, pitch, DEGREE * yaw),
-        f"roll, pitch, yaw are in degrees: multiply them by {DEGREE:.10f}.": (
-            DEGREE * roll,
-            DEGREE * pitch,
-            DEGREE * yaw,
-        ),
-        "yaw is counted anticlockwise: negate it.": (roll, pitch, -yaw),
-    }
-    return {
-        f"{table.name}: {text}": reference._replace(attitude=quaternion_of_angles(*values))
-        for text, values in angles.items()
-    }

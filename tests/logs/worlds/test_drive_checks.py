@@ -67,7 +67,7 @@ def test_a_slow_climb_shows_another_unit_of_the_height(tmp_path: Path, factor: f
     table["pd"] = (3.0 + 0.2 * np.cos(0.5 * table["t"])) * factor
     table["vd"] = -0.1 * np.sin(0.5 * table["t"])
     write(tmp_path, {"reference": table})
-    context = nullcontext() if factor == 1.0 else pytest.raises(ValueError, match="the Up position")
+    context = nullcontext() if factor == 1.0 else pytest.raises(ValueError, match=r"velocities say, by factors of \[1\.0, 1\.0, ")  # fmt: skip
     with context:
         read_motion(tmp_path, "reference", [40.0, -105.0, 1500.0])
 

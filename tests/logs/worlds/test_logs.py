@@ -225,7 +225,7 @@ BAD: dict[str, tuple[Callable[[Log], None], str]] = {
     "gnss in ms": (scale("gnss", "t", 1e3), r"gnss\.csv: column t.*in ms"),
     "in g": (
         scale("imu", "fx fy fz", 1 / GRAVITY),
-        r"got a median norm of 1\.\d+ .*They are in g: multiply by 9\.80665\.",
+        r"have a median norm of 1\.\d+, .*they are in g\. Multiply by 9\.80665",
     ),
     "odd force": (
         scale("imu", "fx fy fz", 100.0),
@@ -233,7 +233,7 @@ BAD: dict[str, tuple[Callable[[Log], None], str]] = {
     ),
     "z up": (
         left_up,
-        r"fz when level .*a median fz of \+9\.81.*forward-left-up: negate fy, fz, wy, wz",
+        r"axes disagree.*forward, right, down are the axes \[x, -y, -z\]",
     ),
     "fast in deg/s": (
         scale("imu", "wx wy wz", 3e3),
@@ -241,13 +241,16 @@ BAD: dict[str, tuple[Callable[[Log], None], str]] = {
     ),
     "slow in deg/s": (
         scale("imu", "wx wy wz", 180 / np.pi),
-        r"must turn together, got rates .* 57\.3 times .*in deg/s: multiply by 0\.0174",
+        r"wx, wy, wz are 57\.3 times the turns of the reference: they are in deg/s\. Multiply by 0\.0174",
     ),
     "other sense": (
         scale("imu", "wz", -1.0),
-        r"imu\.csv and reference\.csv must turn together, got .* of -1 times",
+        r"imu\.csv and reference\.csv: axes disagree.*wx, wy, wz alone have other axes, \[x, y, -z\]",
     ),
-    "yaw in degrees": (scale("reference", "yaw", 180 / np.pi), r"must turn together"),
+    "yaw in degrees": (
+        scale("reference", "yaw", 180 / np.pi),
+        r"reference\.csv: .*in degrees.*Multiply by 0\.0174",
+    ),
     "pitch in degrees": (
         edit("reference", "pitch", lambda p: p + 5.0),
         r"column pitch .*got 5 in line 2.*If in degrees, multiply",
@@ -333,7 +336,7 @@ def test_the_page_use_your_data_runs(
             block(code, tmp_path)
     said = capsys.readouterr().out
     assert "3000 samples, 30 fixes" in said
-    assert "got rates wx, wy, wz of 57.3 times" in said
+    assert "wx, wy, wz are 57.3 times the turns of the reference" in said
     assert len(list(tmp_path.glob("results/*/*.npz"))) == 4
     assert (tmp_path / "track.gpx").read_text().count("<trk>") == 2
     assert "refuse axes" in said

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,7 +13,10 @@ import pytest
 from synthetic_log import drive, tables, write
 
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
+from pfbench.logs.worlds.corrections import LogCorrections
 from pfbench.logs.worlds.log_reader import read_log
+from pfbench.logs.worlds.log_tables import LogTable
+from pfbench.scenario import inspect_log
 
 Log = dict[str, pd.DataFrame]
 
@@ -157,22 +161,14 @@ def fast() -> Log:
 
 
 def obey(log: Log, said: str, unit: str = "") -> None:
-    """Does to a log what a message about units, signs or axes tells, where two fit for the true unit."""
-    name, _, rest = said.partition(".csv")
-    columns = re.findall(r"\b(f[xyz]|w[xyz]|v[ned]|p[ned]|roll|pitch|yaw)\b", rest)
-    if match := re.search(r"reference\.csv: ([a-z, ]+?) (?:is|are) .*: (multiply|negate)", said):
-        name, columns = "reference", match[1].split(", ")
-    group = next((g for g in GROUPS if columns[0] in g), columns[:3])
-    if "roll" in group or "yaw" in group:
-        group = [column for column in ANGLES if column in columns]
+    """Does to a log what a message about units tells, where two fit for the true unit."""
+    name, _, rest = said.removeprefix("the log must agree in itself, got: ").partition(".csv")
+    columns = re.findall(r"\b(f[xyz]|w[xyz]|v[ned]|p[ned])\b", rest)
+    group = next((g for g in GROUPS if columns and columns[0] in g), [])
     said = said.partition(f"in {unit},")[2] or said if unit else said
-    if factor := re.search(r"multiply (?:it |them )?by (-?[\d.e-]+\d)", said):
+    if factor := re.search(r"multiply by (-?[\d.e-]+\d)", said):
         log[name][group] *= float(factor[1])
-    if negated := re.search(r"negate ([a-z, ]+?(?: and [a-z]+)?)[.;]", said):
-        names = re.findall(r"\b[a-z]{2,5}\b", negated[1])
-        columns = [c for c in names if c in log[name]]
-        log[name][columns or group] *= -1
-    if "Gravity is missing" in said:
+    if "gravity is missing" in said:
         near = np.searchsorted(log["reference"]["t"], log["imu"]["t"]).clip(
             max=len(log["reference"]) - 1
         )
@@ -180,6 +176,13 @@ def obey(log: Log, said: str, unit: str = "") -> None:
         log["imu"]["fx"] += 9.80665 * np.sin(pitch)
         log["imu"]["fy"] -= 9.80665 * np.cos(pitch) * np.sin(roll)
         log["imu"]["fz"] -= 9.80665 * np.cos(pitch) * np.cos(roll)
+
+
+def set_keys(log: Log, settings: Mapping[str, Any]) -> None:
+    """Does to a log what keys of `scenario.corrections` do."""
+    read = (LogTable(table, name, True, {}) for name, table in log.items())
+    corrected, _ = LogCorrections(**settings).correct_tables(*read)
+    log.update(zip(log, (table.rows for table in corrected), strict=True))
 
 
 def add_gravity(log: Log) -> None:
@@ -231,7 +234,11 @@ def test_another_unit_or_sign_is_named_and_corrected(
         said = said_or_none(tmp_path, log)
         if said is None:
             break
-        obey(log, said, name.partition(" in ")[2])
+        keys = inspect_log(tmp_path).settings
+        if keys:
+            set_keys(log, keys["corrections"])
+        else:
+            obey(log, said, name.partition(" in ")[2])
     expected, read = read_log(write(tmp_path / "clean", clean())), read_log(write(tmp_path, log))
     assert np.allclose(read.imu.force, expected.imu.force, atol=1e-6)
     assert np.allclose(read.imu.rate, expected.imu.rate, atol=1e-6)
@@ -252,7 +259,7 @@ def test_no_remedy_is_named_that_does_not_help(tmp_path: Path) -> None:
     log = tables()
     log["imu"][FORCE] = np.random.default_rng(1).normal(size=(len(log["imu"]), 3)) * 0.65
     said = message(tmp_path, log)
-    assert "No other unit, sign or axes of fx, fy, fz agree with the reference" in said
+    assert "no other unit, sign or axes of fx, fy, fz agree with the reference" in said
     spike = tables()
     spike["imu"].loc[100, "wx"] = 100.0
     said = message(tmp_path, spike)
