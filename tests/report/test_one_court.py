@@ -54,7 +54,7 @@ def turn(row: dict[str, Any]) -> dict[str, Any]:
 def check_first(study: str, pack: dict[str, Any]) -> list[str]:
     """The filter that a sentence calls first in the table is its first better one."""
     markdown = render_markdown(pack)
-    named = re.search(r"first in the table: (.*?)[,)]", markdown)
+    named = re.search(r"first in the table: (.*?)(?:, \d|\)[;.])", markdown)
     better = re.search(r"^\| \d+ \| ([^|]*?)(?: \(proposed\))? \| [^|]*\| ▲ better", markdown, re.MULTILINE)  # fmt: skip
     if named and better and better[1] != named[1] and not pack.get("world_orders"):
         return [f"{study}: {named[1]} is not {better[1]}"]
