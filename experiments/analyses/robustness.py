@@ -29,9 +29,10 @@ from terrain_wins import STUDIES as TERRAIN_STUDIES, describe_answer, terrain_ta
 from tuned_worlds import tuned_table
 
 from pfbench.files import markdown_head, markdown_row
-from pfbench.report import StudyFacts, arrange_study, read_stored_study
+from pfbench.report import StudyFacts, read_stored_study
 from pfbench.results import (
     Verdict,
+    arrange_runs,
     compare_filters,
     compute_losses,
     decide,
@@ -164,7 +165,7 @@ def compare_with_control(
     labels = [label for label in facts.looks if label in set(table["filter"])]
     if CONTROL not in labels:
         return []
-    arranged = arrange_study(table, labels, facts.worlds)
+    arranged = arrange_runs(table, labels)
     pairs = [(label, CONTROL) for label in labels if label != CONTROL]
     return decide(compare_filters(arranged, compute_losses(arranged, "rmse"), pairs))
 

@@ -19,8 +19,8 @@ import pandas as pd
 from scipy import stats
 
 from pfbench.files import markdown_head, markdown_row
-from pfbench.report import StudyFacts, arrange_study
-from pfbench.results import compare_filters, compute_losses, decide
+from pfbench.report import StudyFacts
+from pfbench.results import arrange_runs, compare_filters, compute_losses, decide
 
 RUNS = Path(__file__).parent / "second_seed.parquet"
 CONDITION = ["scenario", "regime"]
@@ -93,7 +93,7 @@ def rank_filters(runs: pd.DataFrame, facts: StudyFacts) -> dict[tuple[str, str],
         facts: Other inputs of its decisions.
     """
     labels = [label for label in facts.looks if label in set(runs["filter"])]
-    arranged = arrange_study(runs, labels, facts.worlds)
+    arranged = arrange_runs(runs, labels)
     losses = compute_losses(arranged, "rmse")
     rankings: dict[tuple[str, str], Ranking] = {}
     for k, row in arranged.conditions.iterrows():

@@ -19,8 +19,15 @@ from paired_errors import ALPHA, LOST, compare_with_all, describe_comparison, si
 from second_seed import read_runs
 
 from pfbench.files import markdown_head, markdown_row
-from pfbench.report import StudyFacts, arrange_study, read_stored_study
-from pfbench.results import compare_filters, compute_losses, decide, holm, wilcoxon_signed_rank
+from pfbench.report import read_stored_study
+from pfbench.results import (
+    arrange_runs,
+    compare_filters,
+    compute_losses,
+    decide,
+    holm,
+    wilcoxon_signed_rank,
+)
 
 LIMITS = Path(__file__).with_name("terrain_limit.json")
 REPORTS = Path(__file__).parents[2] / "reports"
@@ -211,10 +218,10 @@ def describe_joint(name: str, scenario: str) -> str:
         name: Name of the study.
         scenario: Name of the condition in the stored files.
     """
-    pack, table = read_stored_study(REPORTS / name)
+    table = read_stored_study(REPORTS / name).table
     runs = table[table["scenario"] == scenario]
     labels = sorted(set(runs["filter"]))
-    arranged = arrange_study(runs, labels, StudyFacts.from_pack(pack).worlds)
+    arranged = arrange_runs(runs, labels)
     pairs = [(label, PARTICLES) for label in labels if label != PARTICLES]
     verdicts = decide(compare_filters(arranged, compute_losses(arranged, "rmse"), pairs))
     told = (

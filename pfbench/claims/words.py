@@ -130,7 +130,8 @@ class _Evidence(NamedTuple):
 _Region = tuple[float, float]
 _Key = TypeVar("_Key", str, tuple[str, str])
 _TABLE = pd.DataFrame([["claim", "claim", "claim"]], columns=CONDITION)
-_NOTHING = Effect("claim", "border", "run", np.zeros(0), 1.0, 1.0)
+_NOTHING = Effect("claim", "border", "run", np.zeros(0), 1.0, 1.0, 1.0)
+_TESTS = ("p", "p_trimmed", "p_sign")  # of an effect
 
 
 def find_borders(kind: str, printed: float = math.nan) -> tuple[_Region, _Region]:
@@ -264,9 +265,11 @@ def _orient(c: ClaimSample, border: float, sign: float) -> _Evidence:
     effect = effect._replace(differences=d)
     if len(d) >= MIN_RUNS and np.ptp(d) <= LOG_TOLERANCE:
         is_certain = bool(d.max() < 0)
-        return _Evidence(effect._replace(p=1.0, p_trimmed=1.0), is_certain, not is_certain)
+        return _Evidence(
+            effect._replace(p=1.0, p_trimmed=1.0, p_sign=1.0), is_certain, not is_certain
+        )
     if len(d) < MIN_RUNS or not effect.is_smaller:
-        effect = effect._replace(p=1.0, p_trimmed=1.0)
+        effect = effect._replace(p=1.0, p_trimmed=1.0, p_sign=1.0)
     return _Evidence(effect)
 
 
@@ -278,8 +281,8 @@ def _hold_everywhere(parts: Sequence[_Evidence]) -> _Evidence:
     if not tested:
         return parts[0]
     weakest = max(tested, key=lambda e: max(e.p, e.p_trimmed))
-    p, p_trimmed = (max(getattr(e, name) for e in tested) for name in ("p", "p_trimmed"))
-    return _Evidence(weakest._replace(p=p, p_trimmed=p_trimmed))
+    largest = {name: max(getattr(e, name) for e in tested) for name in _TESTS}
+    return _Evidence(weakest._replace(**largest))
 
 
 def _hold_somewhere(parts: Sequence[_Evidence]) -> _Evidence:
@@ -289,8 +292,8 @@ def _hold_somewhere(parts: Sequence[_Evidence]) -> _Evidence:
     if not parts or all(item.is_excluded for item in parts):
         return _Evidence(_NOTHING, is_excluded=bool(parts))
     strongest = min((item.effect for item in parts), key=lambda e: max(e.p, e.p_trimmed))
-    p, p_trimmed = (min(1.0, len(parts) * p) for p in (strongest.p, strongest.p_trimmed))
-    return _Evidence(strongest._replace(p=p, p_trimmed=p_trimmed))
+    smallest = {name: min(1.0, len(parts) * getattr(strongest, name)) for name in _TESTS}
+    return _Evidence(strongest._replace(**smallest))
 
 
 def _select_decided(evidence: Mapping[_Key, _Evidence], alpha: float) -> list[_Key]:

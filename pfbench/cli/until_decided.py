@@ -200,11 +200,9 @@ class GrowingSweep:
 
     def _decide(self, data: LookResults) -> list[PairState]:
         """Decide the pairs that were fixed in advance with the runs so far."""
-        from pfbench.report.board import arrange_study
-        from pfbench.results.looks import study_part_names
         from pfbench.results.paper_block import plan_installed_pairs
         from pfbench.stats.pair_states import decide_at_looks
-        from pfbench.stats.study_runs import share_conditions
+        from pfbench.stats.study_runs import arrange_runs, share_conditions
 
         count, required = len(data.table[["seed", "run"]].drop_duplicates()), self.schedule.runs[0]
         if count < required:
@@ -213,7 +211,7 @@ class GrowingSweep:
                 "scenario whose data differ from run to run, or set a number of runs."
             )
         labels = sorted(data.table["filter"].unique())
-        runs = arrange_study(data.table, labels, study_part_names(data.conditions, "scenario"))
+        runs = arrange_runs(data.table, labels)
         pairs = [pair for pair in plan_installed_pairs(labels) if share_conditions(runs, *pair)]
         margin = math.log1p(self.report["equivalence_margin"])
         return decide_at_looks(

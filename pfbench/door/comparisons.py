@@ -12,15 +12,17 @@ import pandas as pd
 
 from pfbench.door.parts import format_html_table
 from pfbench.report.board import build_pack, build_run_table
+from pfbench.report.board.entries import name_regimes
+from pfbench.report.board.pack import open_court
 from pfbench.report.board.recorded_units import count_drives, describe_drives
 from pfbench.report.methods_text import is_recorded
 from pfbench.report.options import ReportOptions
-from pfbench.report.overview.tables import read_world_facts
 from pfbench.report.study_page.page_writer import describe_opening
-from pfbench.results.conditions import Condition, parse_label
-from pfbench.results.looks import study_part_names
+from pfbench.results.conditions import Condition
+from pfbench.results.looks import study_looks
 from pfbench.stats.comparison import Verdict
-from pfbench.stats.world_table import World, build_world, compare_methods
+from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
+from pfbench.stats.sentences import format_with_interval
 
 _HEADS = (
     "#",
@@ -120,7 +122,7 @@ class Comparison:
 
     def table(self) -> pd.DataFrame:
         """Return the verdicts as a table, a row per condition."""
-        rows = [{"condition": name, **verdict._asdict()} for name, verdict in self.verdicts.items()]
+        rows = [{"condition": name, **verdict.to_row()} for name, verdict in self.verdicts.items()]
         return pd.DataFrame(rows)
 
     def _single(self) -> Verdict:
@@ -143,20 +145,21 @@ class Comparison:
 
 def _format(verdict: Verdict) -> str:
     """Format a verdict as a sentence."""
-    if not np.isfinite(verdict.ratio):
-        return f"{verdict.a} and {verdict.b} are not compared: {verdict.reason}."
     reason = f" ({verdict.reason})" if verdict.reason else ""
-    sample = f"{verdict.n} paired runs"
-    ends = f"{verdict.low:.3g} to {verdict.high:.3g}"
+    loses = f", {verdict.lost.word} runs" if verdict.lost.word else ""
+    if not np.isfinite(verdict.ratio):
+        if not verdict.n:
+            return f"{verdict.a} and {verdict.b} are not compared: {verdict.reason}."
+        return f"{verdict.a} against {verdict.b}: {verdict.word}{loses}{reason}."
+    size = format_with_interval(verdict.ratio, verdict.low, verdict.high)
     return (
-        f"the error of {verdict.a} is {verdict.ratio:.3g} times that of {verdict.b} ({ends}, {sample}): "
-        f"{verdict.word}{reason}."
+        f"the error of {verdict.a} is {size} times that of {verdict.b} ({verdict.n} paired runs): "
+        f"{verdict.word}{loses}{reason}."
     )
 
 
 def compare_in_conditions(conditions: Sequence[Condition], a: str, b: str) -> Comparison:
-    """Compare two filters in all conditions that have both."""
-    names = [condition.name for condition in conditions]
+    """Select the verdicts on two filters in all conditions that have both, as the page of the study has them."""
     labels = sorted({job.label for condition in conditions for job in condition.jobs})
     for label in (a, b):
         if label not in labels:
@@ -165,12 +168,16 @@ def compare_in_conditions(conditions: Sequence[Condition], a: str, b: str) -> Co
             )
     if a == b:
         raise ValueError(f"filters must be two, got {a} twice. Choose from {', '.join(labels)}.")
-    worlds = [
-        _make_world(condition, name, (a, b))
-        for name, condition in zip(names, conditions, strict=True)
-        if {a, b} <= {job.label for job in condition.jobs}
-    ]
-    if not worlds:
+    table = build_run_table(conditions)
+    table = drop_runs(table, assess_runs(table, "rmse", RUN).copies, RUN)
+    court = open_court(table, study_looks(conditions), ReportOptions())
+    present = court.runs.conditions
+    verdicts = {}
+    for condition, regime in zip(conditions, name_regimes(conditions), strict=True):
+        mask = (present["scenario"] == condition.scenario) & (present["regime"] == regime)
+        if {a, b} <= {job.label for job in condition.jobs}:
+            verdicts[condition.name] = court.find("rmse", mask.to_numpy(), a, b)
+    if not verdicts:
         raise ValueError(
             f"{a} and {b} must have a condition in common, got none. Run both in one scenario."
         )
@@ -179,32 +186,4 @@ def compare_in_conditions(conditions: Sequence[Condition], a: str, b: str) -> Co
     reach = " ".join(
         f"{text}. The page of the study has other stretches and drives." for text in drives
     )
-    verdicts = {pair.world: pair.verdict for pair in compare_methods(worlds, (a, b))}
     return Comparison(verdicts, reach)
-
-
-def _make_world(condition: Condition, name: str, pair: tuple[str, str]) -> World:
-    """Make the world of a condition with two filters."""
-    jobs = tuple(job for job in condition.jobs if job.label in pair)
-    selected = condition._replace(jobs=jobs)
-    rows = build_run_table([selected]).assign(scenario=name)
-    return build_world(rows, pair[1], _find_cap(selected, rows))
-
-
-def _find_cap(condition: Condition, rows: pd.DataFrame) -> float:
-    """Return the largest error that counts: that of the world, or any that changes nothing where all runs keep track.
-
-    Raises ValueError where the cap would matter and no file states it.
-    """
-    limit = study_part_names([condition], "scenario")[condition.scenario].limit
-    facts = read_world_facts(parse_label(condition.scenario)[0], condition.model)
-    stated = limit or (facts.cap if facts else np.nan)
-    if np.isfinite(stated):
-        return float(stated)
-    errors = rows["rmse"].to_numpy(dtype=float)
-    if rows["lost"].any() or not np.isfinite(errors).all():
-        raise ValueError(
-            f"{condition.scenario} must state the error above which a run has lost the track, since runs were lost, got none. "
-            "Set scenario.paper.divergence_threshold, or use own(..., divergence_threshold=...)."
-        )
-    return float(max(errors.max(), np.finfo(float).tiny))

@@ -87,8 +87,6 @@ def _list_fit(fit: WorldFit) -> Iterator[str]:
     yield f"  rule: {json.dumps(FIT_RULE)}"
     for key, value in (("noise", fit.regime), ("runs", fit.runs), ("particles", fit.particles)):
         yield f"  {key}: {value}"
-    yield f"  cap: {fit.cap:.{_DIGITS}g}"
-    yield f"  cap_source: {json.dumps(fit.cap_source)}"
     yield "  objectives:"
     yield from (f"    {name}: {score:.{_DIGITS}g}" for name, score in fit.objectives.items())
     yield "  ratios:  # with both ends of the interval"
@@ -154,7 +152,8 @@ FIT_LIMIT = (
 _LEVEL = 0.05  # of the two intervals together
 FIT_RULE = (
     "false if SIR or RPF has less than 0.95 of the error of the best filter: geometric mean over runs, "
-    "Student interval without 0.95, 95 % for both together; errors are at most the cap, which a lost run has"
+    "Student interval without 0.95, 95 % for both together; errors are at most the limit of the scenario, "
+    "else the median error of dead reckoning, which a lost run has"
 )
 _NO_FIX = {"r_factor": 1e12, "q_factor": 1.0}  # dead reckoning
 
@@ -180,8 +179,6 @@ class WorldFit:
     Attributes:
         best: Name of the filter with the smallest objective.
         objectives: Objective by filter, with capped errors.
-        cap: Largest error of a run, in the unit of the scenario.
-        cap_source: What the cap is.
         regime: Noise regime of the ratios.
         particles: Number of particles.
         runs: Number of runs of the ratios.
@@ -190,8 +187,6 @@ class WorldFit:
 
     best: str
     objectives: dict[str, float]
-    cap: float
-    cap_source: str
     regime: str
     particles: int
     runs: int
@@ -244,7 +239,7 @@ def measure_fit(
     errors = {name: _errors_of(search, name) for name in _UNTUNED}
     errors = {name: e for name, e in errors.items() if e}
     errors |= {name: choice.errors for name, choice in tuned.items()}
-    cap, source, threshold = _find_cap(search, first)
+    cap, threshold = _find_cap(search, first)
     best, objectives = find_best(errors, cap)
     reference = _run(search, best, first, tuned.get(best), threshold)
     ratios = {}
@@ -252,7 +247,7 @@ def measure_fit(
         search.progress(f"{name} particles={particles}")
         errors_of_runs = _run(search, name, first, threshold=threshold)
         ratios[name] = compare_errors(errors_of_runs, reference, cap, len(_PARTICLE_FILTERS))
-    return WorldFit(best, objectives, cap, source, regime, particles, runs, ratios)
+    return WorldFit(best, objectives, regime, particles, runs, ratios)
 
 
 def _errors_of(search: CandidateSearch, name: str) -> dict[str, float]:
@@ -267,18 +262,18 @@ def _errors_of(search: CandidateSearch, name: str) -> dict[str, float]:
         return {}
 
 
-def _find_cap(search: CandidateSearch, words: list[str]) -> tuple[float, str, float]:
-    """Return the cap, its source, and the divergence threshold of the scenario; infinite without one.
+def _find_cap(search: CandidateSearch, words: list[str]) -> tuple[float, float]:
+    """Return the cap of a search, and the divergence threshold of the scenario; infinite without one.
 
     Without a threshold the cap is the median error of dead reckoning: a filter that ignores all measurements.
     """
     config = search.compose("ekf_scaled", search.regimes[0])
     stated: Any = (config.values["scenario"].get(PAPER) or {}).get("divergence_threshold")
     if stated:
-        return float(stated), "divergence threshold of the scenario", float(stated)
+        return float(stated), float(stated)
     search.progress("dead reckoning")
     errors = _run(search, "ekf_scaled", words, Candidate(_NO_FIX, 0.0, 0.0, {}))
-    return float(np.median(errors)), "median error of dead reckoning", math.inf
+    return float(np.median(errors)), math.inf
 
 
 def _run(

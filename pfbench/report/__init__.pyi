@@ -3,7 +3,6 @@
 from pfbench.report.board.entries import cell_entries as cell_entries
 from pfbench.report.board.pack import (
     StudyFacts as StudyFacts,
-    arrange_study as arrange_study,
     decide_parts as decide_parts,
 )
 from pfbench.report.board.view import find_lost_conditions as find_lost_conditions

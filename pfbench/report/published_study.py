@@ -7,7 +7,6 @@ must agree in all common runs, which checks data, build and settings of a world 
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -26,8 +25,9 @@ from pfbench.report.overview.tables import CENTRAL, has_overview, read_world_fac
 from pfbench.report.stored_study import RUNS_FILE, StoredStudy, read_stored_study
 from pfbench.report.study_report import find_overviews
 from pfbench.results.conditions import Condition, parse_label
-from pfbench.results.looks import PartName, study_looks
+from pfbench.results.looks import study_looks
 from pfbench.stats.comparison import Verdict
+from pfbench.stats.sentences import format_with_interval
 from pfbench.stats.world_table import (
     World,
     WorldResult,
@@ -95,7 +95,7 @@ class PublishedComparison(NamedTuple):
     def table(self) -> pd.DataFrame:
         """Return the verdicts as a table, a row per condition and pair."""
         rows = [
-            {"condition": name, "witness": self.witnesses[name], **verdict._asdict()}
+            {"condition": name, "witness": self.witnesses[name], **verdict.to_row()}
             for name, verdicts in self.verdicts.items()
             for verdict in verdicts
         ]
@@ -117,12 +117,14 @@ def _word_filter(label: str, verdicts: Sequence[Verdict]) -> Iterator[str]:
     """Yield how an own filter compares with all published ones, and with the strongest of them."""
     words = Counter(verdict.word for verdict in verdicts)
     counts = ", ".join(f"{word} {count}" for word, count in words.items())
-    strongest = max(verdicts, key=lambda verdict: verdict.ratio if verdict.n else 0.0)
+    sized = [verdict for verdict in verdicts if verdict.ratio > 0]
     yield f"  {label} against {len(verdicts)} filters: {counts}"
-    yield (
-        f"  {label} / {strongest.b}, the strongest in these runs: {strongest.ratio:.3g} "
-        f"[{strongest.low:.3g}, {strongest.high:.3g}] in {strongest.n} paired runs, {strongest.word}"
-    )
+    if sized:
+        strongest = max(sized, key=lambda verdict: verdict.ratio)
+        yield (
+            f"  {label} / {strongest.b}, the strongest in these runs: {format_with_interval(*strongest[3:6])} "
+            f"in {strongest.n} paired runs, {strongest.word}"
+        )
 
 
 def find_published(name: str, reports: Path) -> Path:
@@ -178,14 +180,13 @@ def compare_tables(table: pd.DataFrame, study: StoredStudy) -> PublishedComparis
         stored = study.table[(study.table[_CONDITION] == list(key)).all(axis=1)]
         try:
             witnesses[name] = find_witness(rows, stored)
-            cap = _find_cap(facts.worlds[str(key[0])], str(key[2]))
         except ValueError as error:
             left_out[name] = str(error)
             continue
-        members.append((name, cap, rows, stored[stored["seed"] == rows["seed"].iloc[0]]))
+        members.append((name, rows, stored[stored["seed"] == rows["seed"].iloc[0]]))
     pairs = [_make_pairs(*member) for member in members]
     verdicts = dict(zip([m[0] for m in members], compare_with_each(pairs), strict=True))
-    counts = {int(n) for _, _, rows, _ in members for n in rows["particles"].dropna()}
+    counts = {int(n) for _, rows, _ in members for n in rows["particles"].dropna()}
     return PublishedComparison(
         verdicts, witnesses, left_out,
         _list_cells([w for w, _ in pairs], verdicts) if has_overview(study.table, facts.looks) else (),
@@ -218,15 +219,6 @@ def _list_cells(
         for cell in decide_cells(members, labels)
         if (cell.world, cell.filter) in decided
     ]
-
-
-def _find_cap(world: PartName, model: str) -> float:
-    """Return the largest error that counts in a world, of its file or of the file of its tuning."""
-    facts = read_world_facts(parse_label(world.key)[0], model)
-    cap = world.limit or (facts.cap if facts else math.nan)
-    if not math.isfinite(cap):
-        raise ValueError("its file must state the error above which a run has lost track, got none")
-    return float(cap)
 
 
 def find_witness(rows: pd.DataFrame, stored: pd.DataFrame) -> str:
@@ -277,7 +269,7 @@ def _pair(rows: pd.DataFrame, stored: pd.DataFrame) -> pd.DataFrame:
 
 
 def _make_pairs(
-    name: str, cap: float, rows: pd.DataFrame, stored: pd.DataFrame
+    name: str, rows: pd.DataFrame, stored: pd.DataFrame
 ) -> tuple[World, list[tuple[str, str]]]:
     """Make the world of a condition with the filters of both studies, and the pairs of own and published filters."""
     published = {str(v): parse_label(str(v))[0] for v in stored["filter"].unique()}
@@ -296,4 +288,4 @@ def _make_pairs(
         if pd.isna(counts[a]) or pd.isna(counts[b]) or counts[a] == counts[b]
     ]
     joined = pd.concat([rows[rows["filter"].isin(labels)], stored]).assign(scenario=name)
-    return build_world(joined, next(iter(published)), cap), pairs
+    return build_world(joined, next(iter(published))), pairs

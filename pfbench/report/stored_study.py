@@ -30,7 +30,7 @@ _FIGURE = re.compile(r"figures/paper_[\w.+-]+\.(svg|png)")
 _KEYED = ("curves",)  # parts with a tuple as key
 _OMITTED = ("tracks", "downloads", "definitions")  # large, or made again with the page
 _DECIDED = (
-    "alpha", "margin", "filters", "metrics", "baselines", "views", "planned", "recorded", "warnings", "calibration", "runs", "sweeps",
+    "alpha", "margin", "filters", "metrics", "baselines", "views", "planned", "decisions", "recorded", "warnings", "calibration", "runs", "sweeps",
 )  # fmt: skip
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import math
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,8 @@ from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import provenance, provenance as cost, writers
 from pfbench.report.board import build_pack, read_study
 from pfbench.report.board.entries import ViewKey
-from pfbench.report.board.pack import StudyFacts, arrange_study
+from pfbench.report.board.pack import StudyFacts
+from pfbench.report.board.study_views import DECISION_COLUMNS
 from pfbench.report.journal.ratio_figures import HEADLINE, render_headline
 from pfbench.report.options import ReportOptions
 from pfbench.report.overview.page import BOARD_PAGE, render_overview
@@ -40,14 +40,7 @@ from pfbench.results.conditions import (
 from pfbench.results.metrics import METRICS
 from pfbench.results.paper_block import name_run_command
 from pfbench.results.step_times import STEP_TIMES
-from pfbench.stats.comparison import Verdict, decide
 from pfbench.stats.consistency_bands import assess_consistency
-from pfbench.stats.study_runs import (
-    compare_filters,
-    compute_losses,
-    natural_sort_key,
-    share_conditions,
-)
 
 Files = dict[str, str | bytes]
 _SUMMARISED = ("scenario", "noise", "model", "label", "group", "component", "metric", "unit")
@@ -156,7 +149,9 @@ def render_study(
         pack["world_picture"] = f"data:image/svg+xml;base64,{base64.b64encode(headline).decode()}"
     files: Files = {
         "verdicts.csv": format_verdicts(pack),
-        "decisions.csv": format_csv(list_decisions(pack, table)),
+        "decisions.csv": format_csv(
+            pd.DataFrame(pack["decisions"], columns=list(DECISION_COLUMNS))
+        ),
         "pfbench.bib": pack["bibtex"],
         **({HEADLINE: headline} if headline else {}),
     }
@@ -183,17 +178,6 @@ def find_overviews(pack: Mapping[str, Any], table: pd.DataFrame) -> dict[TabKey,
     overviews = build_overviews(table, facts.looks, facts.worlds)
     enough = all(len(overview.worlds) >= FEWEST_WORLDS for overview in overviews.values())
     return overviews if enough else None  # without references of worlds there is nothing to show
-
-
-def list_decisions(pack: Mapping[str, Any], table: pd.DataFrame) -> pd.DataFrame:
-    """Decide all pairs of filters over all conditions that both have, in one family, by the metric of the page."""
-    facts = StudyFacts.from_pack(pack)
-    labels = sorted(facts.looks, key=natural_sort_key)
-    runs = arrange_study(table, labels, facts.worlds)
-    pairs = [pair for pair in combinations(labels, 2) if share_conditions(runs, *pair)]
-    losses, margin = compute_losses(runs, facts.options.metric), math.log1p(pack["margin"])
-    verdicts = decide(compare_filters(runs, losses, pairs), margin, pack["alpha"])
-    return pd.DataFrame(verdicts, columns=list(Verdict._fields))
 
 
 def format_verdicts(pack: Mapping[str, Any]) -> str:

@@ -233,11 +233,3 @@ def format_number(value: Any) -> str:
 def _is_number(column: pd.Series) -> bool:
     """Return whether a column contains numbers."""
     return bool(pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column))
-
-
-def format_with_interval(ratio: float, low: float, high: float) -> str:
-    """Format a ratio with its interval: three decimals where two would put a bound on one that is not one."""
-    if not math.isfinite(high):
-        return f"{ratio:.2f}"
-    digits = 3 if any(bound != 1.0 and f"{bound:.2f}" == "1.00" for bound in (low, high)) else 2
-    return f"{ratio:.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"

@@ -1,15 +1,18 @@
 """Comparison of two filters: the effect on paired losses, and the verdicts on a family of effects.
 
-All pages decide here. The loss of a run is the logarithm of its error, at most that of the cap of the world. A
-lost run has the loss of the cap, so that no filter, pair or world leaves a table for one lost run.
+All pages decide here. The loss of a run is the logarithm of its error, infinite for a lost run: it is worse than every
+kept one, and two lost runs tie. Ranks, signs and means of pairs need no number for it, so no error is replaced.
 
-A verdict needs two tests that agree: Wilcoxon's signed-rank test, whose estimate is that of Hodges and Lehmann
-and whose interval is printed, and the t test of the trimmed mean. The first asks which filter has the smaller
-error in most runs; with skewed differences it rejects although the means are equal, and the second does not.
+A verdict needs three tests that agree: Wilcoxon's signed-rank test, whose estimate is that of Hodges and Lehmann and
+whose interval is printed, the t test of the trimmed mean, and the sign test. The first two hold the error rate of the
+family. With skewed differences the first rejects although each filter has the smaller error in half of the runs;
+the sign test, without a correction, does not. Lost runs have a word of their own, by McNemar's exact test.
 
 References:
     F. Wilcoxon (1945), Individual comparisons by ranking methods.
+    Q. McNemar (1947), Note on the sampling error of the difference between correlated proportions.
     J. L. Hodges and E. L. Lehmann (1963), Estimates of location based on rank tests.
+    C. J. Clopper and E. S. Pearson (1934), The use of confidence or fiducial limits in the case of the binomial.
     S. Holm (1979), A simple sequentially rejective multiple test procedure.
     O. Guilbaud (2008), Simultaneous confidence regions corresponding to Holm's step-down procedure.
 """
@@ -17,14 +20,14 @@ References:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import cache
-from typing import Final, Literal, NamedTuple
+from collections.abc import Callable, Sequence
+from functools import cache, partial
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import scipy  # scipy.special is imported at its first use, which takes a tenth of the start of a job
 
-from pfbench.stats.error_measures import Array, Flags
+from pfbench.stats.error_measures import Array
 from pfbench.stats.rank_tests import (
     EXACT_DIFFERENCES,
     Alternative,
@@ -34,22 +37,69 @@ from pfbench.stats.rank_tests import (
 )
 
 Unit = Literal["run", "block", "drive", "world"]
-Word = Literal["better", "worse", "equal", "identical", "not decided"]
+Word = Literal["better", "worse", "equal", "equal in kept runs", "identical", "not decided"]
+LossWord = Literal["loses more", "loses fewer", ""]
 BETTER_THAN: Final = "better"
 WORSE_THAN: Final = "worse"
 EQUAL_WORD: Final = "equal"
+EQUAL_KEPT: Final = "equal in kept runs"
+EQUAL_WORDS: Final = (EQUAL_WORD, EQUAL_KEPT, "identical")
+LOSES_MORE: Final = "loses more"
+LOSES_FEWER: Final = "loses fewer"
 SAME_RUNS: Final = "identical"
 NO_DECISION: Final = "not decided"
 EQUALITY_MARGIN = math.log(1.05)  # log ratios within it are equal [ours]
 ALPHA = 0.05
 MIN_RUNS = 10  # units that a decision requires [ours]
 TRIM_SHARE = 0.2  # removed at each end; the middle 60 % of the units remain
+MOST_LOST = 0.2  # of the pairs may have a lost run; beyond it there is no ratio [ours]
+TRACK_BOUND = (
+    0.1  # of the runs that a filter may lose alone and be called equal, as an upper bound [ours]
+)
 # Errors are stored in single precision: smaller differences of a logarithm are rounding. Without
 # the tolerance, EKF and UKF of a linear model would differ by how they round.
 LOG_TOLERANCE = 1e-6
 _ROUNDING = 1e-12  # relative spread of equal values
 _FEW_DIFFERENCES = 200  # up to which the means of all pairs are formed
 _HALVINGS = 52  # of the range of the differences: the precision of a double
+_LEAST_SUM = 1e-300  # of errors relative to the largest one
+_FAR = 1e4  # stands for an infinite log ratio in means of pairs; all finite ones are below 1500
+
+
+class LostRuns(NamedTuple):
+    """Runs of a pair that one or both filters lost.
+
+    Attributes:
+        a: Number of runs that the first filter lost alone.
+        b: Number of runs that the second filter lost alone.
+        both: Number of runs that both lost.
+        word: Whether it is shown that the first filter loses more runs, or fewer; empty for neither.
+    """
+
+    a: int = 0
+    b: int = 0
+    both: int = 0
+    word: LossWord = ""
+
+
+class Evidence(NamedTuple):
+    """What a verdict rests on beside its p-value.
+
+    Attributes:
+        smaller: Share of the runs in which the first filter has the smaller error.
+        larger: Share of the runs in which it has the larger one.
+        p_trimmed: p-value of the trimmed mean with Holm's correction.
+        p_sign: p-value of the sign test, without a correction.
+        p_lost: p-value of McNemar's test with Holm's correction.
+        pairs: Number of pairs of the family.
+    """
+
+    smaller: float = math.nan
+    larger: float = math.nan
+    p_trimmed: float = math.nan
+    p_sign: float = math.nan
+    p_lost: float = math.nan
+    pairs: int = 0
 
 
 class Effect(NamedTuple):
@@ -59,9 +109,13 @@ class Effect(NamedTuple):
         a: Name of the first filter.
         b: Name of the second filter.
         unit: What was drawn independently: a run, a block of time, a drive or a world.
-        differences: Log ratios of their losses, [n]; negative where the first filter is better.
+        differences: Log ratios of their losses, [n]; negative where the first filter is better, infinite where one is
+            lost, 0 where both are.
         p: p-value of the signed-rank test, two-sided; 1 without a difference.
         p_trimmed: p-value of the trimmed mean.
+        p_sign: p-value of the sign test, two-sided.
+        lost: Runs that are lost.
+        mean: Log ratio of the mean errors over the runs that both keep; NaN without one.
     """
 
     a: str
@@ -70,6 +124,9 @@ class Effect(NamedTuple):
     differences: Array
     p: float
     p_trimmed: float
+    p_sign: float
+    lost: LostRuns = LostRuns()
+    mean: float = math.nan
 
     @property
     def location(self) -> float:
@@ -85,13 +142,27 @@ class Effect(NamedTuple):
         negative, count = int(np.maximum(below, 0).sum()), len(ordered) * (len(ordered) + 1) // 2
         return self.location < 0 if 2 * negative == count else 2 * negative > count
 
+    @property
+    def p_lost(self) -> float:
+        """p-value of McNemar's exact test: whether one filter loses more runs than the other."""
+        return _sign_p(self.lost.a, self.lost.b)
+
+    @property
+    def has_ratio(self) -> bool:
+        """Return whether at most a fifth of the pairs has a lost run."""
+        return sum(self.lost[:3]) <= MOST_LOST * len(self.differences)
+
     def estimate(self, alpha: float) -> tuple[float, float, float]:
         """Return the log ratio, and the ends of its interval that belongs to the signed-rank test."""
         n = len(self.differences)
         k, count = _count_outside(n, alpha), n * (n + 1) // 2
         ranks = [max(k, 1), (count + 1) // 2, count // 2 + 1, count + 1 - max(k, 1)]
-        low, *middle, high = _select_means(self.differences, ranks)
-        return (middle[0] + middle[1]) / 2, low if k else -math.inf, high if k else math.inf
+        low, *middle, high = _select_means(np.clip(self.differences, -_FAR, _FAR), ranks)
+        value = (middle[0] + middle[1]) / 2
+        low, value, high = (
+            math.copysign(math.inf, x) if abs(x) > _FAR / 4 else x for x in (low, value, high)
+        )
+        return value, low if k else -math.inf, high if k else math.inf
 
 
 class Verdict(NamedTuple):
@@ -100,13 +171,16 @@ class Verdict(NamedTuple):
     Attributes:
         a: Name of the first filter.
         b: Name of the second filter.
-        word: better, worse, equal, identical or not decided, of the first filter.
-        ratio: Error of the first filter divided by that of the second.
+        word: better, worse, equal, equal in kept runs, identical or not decided, of the first filter.
+        ratio: Error of the first filter divided by that of the second; NaN if more than a fifth of the pairs has a
+            lost run.
         low: Lower end of the interval of the ratio.
-        high: Upper end.
+        high: Upper end; infinite where lost runs or few runs leave it open.
         p: p-value of the signed-rank test with Holm's correction.
         n: Number of runs, blocks or worlds.
-        reason: Why nothing is decided; empty otherwise.
+        lost: Runs that one or both filters lost.
+        evidence: What the verdict rests on beside `p`.
+        reason: Why nothing is decided, or what a reader of the word must know; else empty.
     """
 
     a: str
@@ -117,27 +191,16 @@ class Verdict(NamedTuple):
     high: float
     p: float
     n: int
-    reason: str
+    lost: LostRuns = LostRuns()
+    evidence: Evidence = Evidence()
+    reason: str = ""
 
-
-def bound_losses(error: Array, keeps_track: Flags, cap: float) -> Array:
-    """Return the losses of runs: the logarithm of the error, at most that of the cap.
-
-    Args:
-        error: Errors, [...], not negative. NaN and infinity count as the cap.
-        keeps_track: Runs that keep track, [...]. The others count as the cap.
-        cap: Largest error that counts, positive, in the unit of the error.
-
-    Raises:
-        ValueError: If the cap is not a positive number.
-    """
-    if not (cap > 0 and math.isfinite(cap)):
-        raise ValueError(
-            f"cap must be a positive number, got {cap}. State the divergence threshold of the world."
-        )
-    counts = keeps_track & np.isfinite(error)
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.log(np.where(counts, np.minimum(error, cap), cap)))
+    def to_row(self) -> dict[str, Any]:
+        """Return the values of the verdict as one row of a table."""
+        row = {name: getattr(self, name) for name in Verdict._fields[:8]}
+        a, b, both, loses = self.lost
+        lost = {"loses": loses, "lost_a": a, "lost_b": b, "lost_both": both}
+        return {**row, **lost, **self.evidence._asdict(), "reason": self.reason}
 
 
 def compare(a: tuple[str, Array], b: tuple[str, Array], unit: Unit = "run") -> Effect:
@@ -166,10 +229,25 @@ def compare_all(
                 f"{np.shape(second)}. Select common {unit}s."
             )
         differences.append(subtract_losses(first, second))
-    return [
-        Effect(a[0], b[0], unit, d, float(value), _trimmed_p(d))
-        for (a, b), d, value in zip(pairs, differences, _signed_rank_p(differences), strict=True)
-    ]
+    p = _signed_rank_p(differences)
+    effects = []
+    for (a, b), d, value in zip(pairs, differences, p, strict=True):
+        tests = (float(value), _trimmed_p(d), _sign_p(int((d > 0).sum()), int((d < 0).sum())))
+        effects.append(Effect(a[0], b[0], unit, d, *tests, *_describe_losses(a[1], b[1])))
+    return effects
+
+
+def _describe_losses(first: Array, second: Array) -> tuple[LostRuns, float]:
+    """Count the lost runs of a pair, and compare the mean errors of its other runs."""
+    lost_a, lost_b = np.isposinf(first), np.isposinf(second)
+    counts = (lost_a & ~lost_b, lost_b & ~lost_a, lost_a & lost_b)
+    kept = ~(lost_a | lost_b)
+    mean = math.nan
+    if kept.any():
+        largest = max(first[kept].max(), second[kept].max())
+        sums = [np.exp(losses[kept] - largest).sum() for losses in (first, second)]
+        mean = math.log(max(sums[0], _LEAST_SUM)) - math.log(max(sums[1], _LEAST_SUM))
+    return LostRuns(*(int(flags.sum()) for flags in counts)), mean
 
 
 def decide(
@@ -183,22 +261,40 @@ def decide(
         alpha: Error rate of the family.
 
     Returns:
-        A verdict for each effect. "better" and "worse" need both tests after Holm's correction; "equal" needs
-        the interval within the margin.
+        A verdict for each effect. "better" and "worse" need the signed-rank test and the trimmed mean after Holm's
+        correction, and the sign test without one; "equal" needs the interval within the margin, and bounds on the
+        runs that one filter loses alone.
     """
-    if not effects:
-        return []
+    return [verdict() for verdict in open_family(effects, margin, alpha)]
+
+
+def open_family(
+    effects: Sequence[Effect], margin: float, alpha: float
+) -> list[Callable[[], Verdict]]:
+    """Correct the tests of a family. Its verdicts are made when they are called: an interval costs most of a verdict."""
     tested = [
         is_testable(effect) for effect in effects
     ]  # the others cannot be decided, but stay in the family
     corrected = [
         holm([getattr(e, name) if yes else 1.0 for e, yes in zip(effects, tested, strict=True)])
-        for name in ("p", "p_trimmed")
+        for name in ("p", "p_trimmed", "p_lost")
     ]
     return [
-        _decide_one(effect, (p, q), alpha / len(effects), margin, alpha)
-        for effect, p, q in zip(effects, *corrected, strict=True)
+        partial(
+            _decide_one,
+            effect,
+            float(p),
+            Evidence(*_share_signs(effect), float(q), effect.p_sign, float(r), len(effects)),
+            (alpha / len(effects), margin, alpha),
+        )
+        for effect, p, q, r in zip(effects, *corrected, strict=True)
     ]
+
+
+def _share_signs(effect: Effect) -> tuple[float, float]:
+    """Return the shares of the units in which the first filter is better and worse; NaN without a unit."""
+    d, n = effect.differences, len(effect.differences) or math.nan
+    return (d < 0).sum() / n, (d > 0).sum() / n
 
 
 def is_testable(effect: Effect) -> bool:
@@ -210,10 +306,14 @@ def find_largest_p(pairs: Sequence[tuple[Array, Array]]) -> float:
     """Return the largest one-sided p-value of both tests: whether a filter is better than all others.
 
     Each pair has the losses of the filter and of one other in their common runs. The test of the union of the
-    hypotheses needs no correction for their number. Shapes: losses [n] of a pair.
+    hypotheses needs no correction for their number; 1 unless the sign test agrees in each pair, as in `decide`.
+    Shapes: losses [n] of a pair.
     """
     differences = [subtract_losses(first, second) for first, second in pairs]
     if not differences or not all(map(_varies, differences)):
+        return 1.0
+    counts = [(int((d > 0).sum()), int((d < 0).sum())) for d in differences]
+    if any(more >= fewer or _sign_p(more, fewer) >= ALPHA for more, fewer in counts):
         return 1.0
     signed = map(float, _signed_rank_p(differences, "less"))
     return max(*signed, *(_trimmed_p(d, "less") for d in differences))
@@ -236,43 +336,121 @@ def subtract_losses(first: Array, second: Array) -> Array:
     return np.where(np.abs(d) <= LOG_TOLERANCE, 0.0, d)
 
 
+def _sign_p(more: int, fewer: int) -> float:
+    """Return the p-value of the exact test that two counts have the same expectation, two-sided."""
+    least, total = min(more, fewer), more + fewer
+    return min(1.0, 2 * float(scipy.special.bdtr(least, total, 0.5))) if total else 1.0
+
+
 def _varies(d: Array) -> bool:
-    """Return whether there are enough differences, and they are not all equal."""
-    return len(d) >= MIN_RUNS and bool(np.ptp(d) > LOG_TOLERANCE)
+    """Return whether there are enough differences, and they are not all equal; lost runs always count."""
+    if len(d) < MIN_RUNS:
+        return False
+    return bool(np.isinf(d[0]) or subtract_losses(d, np.full_like(d, d[0])).any())
 
 
 def _decide_one(
-    effect: Effect, p: tuple[float, float], level: float, margin: float, alpha: float
+    effect: Effect, p: float, evidence: Evidence, levels: tuple[float, float, float]
 ) -> Verdict:
-    """Decide one pair: `p` has the corrected p-values of both tests."""
-    names, n = (effect.a, effect.b), len(effect.differences)
+    """Decide one pair: `p` is corrected, and `levels` has those of the interval, of equality and of the tests."""
+    n, (level, margin, alpha) = len(effect.differences), levels
+    nothing = Verdict(effect.a, effect.b, NO_DECISION, math.nan, 0.0, math.inf, math.nan, n, effect.lost, evidence)  # fmt: skip
     if n == 0:
-        return Verdict(
-            *names, NO_DECISION, math.nan, 0.0, math.inf, math.nan, 0, f"no common {effect.unit}s"
-        )
+        return nothing._replace(reason=f"no common {effect.unit}s")
+    if effect.lost.both == n:
+        return nothing._replace(reason=f"both lose track in all {n} runs")
     if not effect.differences.any():
-        return Verdict(*names, SAME_RUNS, 1.0, 1.0, 1.0, math.nan, n, f"all {effect.unit}s agree")
+        return nothing._replace(
+            word=SAME_RUNS, ratio=1.0, low=1.0, high=1.0, reason=f"all {effect.unit}s agree"
+        )
     location, low, high = effect.estimate(level)
+    decided = nothing._replace(lost=effect.lost._replace(word=_word_lost(effect, evidence, alpha)))
+    if effect.has_ratio:
+        decided = decided._replace(ratio=math.exp(location))
     if not is_testable(effect):
         units = f"{n} {effect.unit}{'' if n == 1 else 's'}"
-        reason = f"{units}, {MIN_RUNS} are required" if n < MIN_RUNS else "no variation"
-        return Verdict(*names, NO_DECISION, math.exp(location), 0.0, math.inf, math.nan, n, reason)
-    is_signed, is_trimmed = p[0] < alpha, p[1] < alpha
-    if is_signed:  # the interval that belongs to Holm's test may end at 0
+        few = f"{units}, {MIN_RUNS} are required" if n < MIN_RUNS else "no variation"
+        return decided._replace(reason=few)
+    if p < alpha:  # the interval that belongs to Holm's test may end at 0
         low, high = (low, min(high, 0.0)) if location < 0 else (max(low, 0.0), high)
     else:
         low, high = min(low, 0.0), max(high, 0.0)
-    trimmed = _trimmed_mean(effect.differences)[0]
-    word: Word = NO_DECISION
-    reason = ""
+    word, reason = _choose_word(effect, (p, evidence), (location, low, high), (margin, alpha))
+    if effect.has_ratio:
+        decided = decided._replace(low=math.exp(low), high=_exp(high))
+    else:
+        decided = decided._replace(low=math.nan, high=math.nan)
+        reason = describe_lost(effect)
+    return decided._replace(word=word, p=p, reason=reason)
+
+
+def _choose_word(
+    effect: Effect,
+    tests: tuple[float, Evidence],
+    ends: tuple[float, float, float],
+    levels: tuple[float, float],
+) -> tuple[Word, str]:
+    """Return the word on the errors of a pair, with the reason of a word that needs one."""
+    (p, evidence), (location, low, high), (margin, alpha) = tests, ends, levels
     if -margin < low and high < margin:
-        word = EQUAL_WORD
-    elif is_signed and is_trimmed and trimmed * location > 0:
-        word = BETTER_THAN if location < 0 else WORSE_THAN
-    elif is_signed:
-        reason = "the trimmed mean does not agree"
-    ends = (math.exp(location), math.exp(low), math.exp(high))
-    return Verdict(*names, word, *ends, float(p[0]), n, reason)
+        is_bounded = all(_bound_lost(count, effect) < TRACK_BOUND for count in effect.lost[:2])
+        return (EQUAL_WORD if is_bounded else EQUAL_KEPT), ""
+    if p >= alpha:
+        return NO_DECISION, ""
+    side = math.copysign(1.0, location)
+    if evidence.p_trimmed >= alpha or _trimmed_mean(effect.differences)[0] * side <= 0:
+        return NO_DECISION, "the trimmed mean does not agree"
+    if evidence.p_sign >= ALPHA or np.sign(effect.differences).sum() * side <= 0:
+        return NO_DECISION, "the sign test does not agree"
+    is_opposite = effect.unit == "run" and effect.mean * side < 0
+    first, second = (effect.a, effect.b) if side < 0 else (effect.b, effect.a)
+    reason = f"the mean error of {first} over the kept runs is larger than that of {second}" if is_opposite else ""  # fmt: skip
+    return (BETTER_THAN if side < 0 else WORSE_THAN), reason
+
+
+def _word_lost(effect: Effect, evidence: Evidence, alpha: float) -> LossWord:
+    """Return whether a filter is shown to lose more or fewer runs than the other."""
+    if evidence.p_lost >= alpha:
+        return ""
+    return LOSES_MORE if effect.lost.a > effect.lost.b else LOSES_FEWER
+
+
+def _bound_lost(count: int, effect: Effect) -> float:
+    """Return the upper 95 % bound of Clopper and Pearson of a share of lost runs; 0 for other units than runs."""
+    n = len(effect.differences)
+    return (
+        float(scipy.special.betaincinv(count + 1, n - count, 1 - ALPHA))
+        if effect.unit == "run"
+        else 0.0
+    )
+
+
+def describe_lost(effect: Effect) -> str:
+    """Say how many runs each filter of a pair loses."""
+    n, (a, b, both, _) = len(effect.differences), effect.lost
+    return f"{effect.a} loses {a + both} and {effect.b} {b + both} of {n} runs"
+
+
+def flip(verdict: Verdict) -> Verdict:
+    """Return the verdict on the second filter of a pair against the first."""
+    words: dict[str, Word] = {BETTER_THAN: WORSE_THAN, WORSE_THAN: BETTER_THAN}
+    losses: dict[str, LossWord] = {LOSES_MORE: LOSES_FEWER, LOSES_FEWER: LOSES_MORE}
+    ratio, high, low = (
+        1 / x if x > 0 else math.inf * (x == 0) for x in (verdict.ratio, verdict.low, verdict.high)
+    )
+    a, b, both, loses = verdict.lost
+    evidence = verdict.evidence._replace(
+        smaller=verdict.evidence.larger, larger=verdict.evidence.smaller
+    )
+    return verdict._replace(
+        a=verdict.b, b=verdict.a, word=words.get(verdict.word, verdict.word), ratio=ratio, low=low, high=high,
+        lost=LostRuns(b, a, both, losses.get(loses, "")), evidence=evidence,
+    )  # fmt: skip
+
+
+def _exp(log_ratio: float) -> float:
+    """Return a ratio of any size."""
+    return math.exp(log_ratio) if log_ratio < 700.0 else math.inf
 
 
 def _select_means(d: Array, ranks: Sequence[int]) -> list[float]:
@@ -306,11 +484,16 @@ def _count_outside(n: int, alpha: float) -> int:
 def _trimmed_mean(d: Array) -> tuple[float, float, float]:
     """Return the trimmed mean of differences, its standard error and its degrees of freedom.
 
-    The error is that of Tukey and McLaughlin, from the winsorised differences.
+    The error is that of Tukey and McLaughlin, from the winsorised differences. Where lost runs remain after trimming, the
+    sum of the signs stands for the mean, without an error.
     """
     n, cut = len(d), int(TRIM_SHARE * len(d) + 1e-9)
     middle = n - 2 * cut
     ordered = np.sort(d)
+    if not np.isfinite(
+        ordered[[cut, n - cut - 1]]
+    ).all():  # lost runs remain: only signs are numbers
+        return float(np.sign(d).sum()), math.nan, math.nan
     location = float(ordered[cut : n - cut].mean())
     if middle < 2:
         return location, math.inf, 1.0
@@ -322,10 +505,14 @@ def _trimmed_mean(d: Array) -> tuple[float, float, float]:
 
 
 def _trimmed_p(d: Array, alternative: str = "two-sided") -> float:
-    """Return the p-value of the trimmed mean; 1 where the middle runs do not differ."""
+    """Return the p-value of the trimmed mean, 1 where the middle runs do not differ; of the signs where lost runs are among them."""
     if len(d) < 2:
         return 1.0
     value, error, df = _trimmed_mean(d)
+    if math.isnan(error):
+        more, fewer = int((d > 0).sum()), int((d < 0).sum())
+        one_sided = float(scipy.special.bdtr(more, more + fewer, 0.5))
+        return one_sided if alternative == "less" else _sign_p(more, fewer)
     if value == 0:
         return 1.0
     t = value / error if error > 0 else math.copysign(math.inf, value)
@@ -337,7 +524,7 @@ def _trimmed_p(d: Array, alternative: str = "two-sided") -> float:
 
 
 # --------------------------------------------------------------------------------------------------
-# Estimate with a Student distribution, and log ratios of losses that can be infinite.
+# Estimate with a Student distribution.
 
 
 class EffectEstimate(NamedTuple):
@@ -382,22 +569,3 @@ def estimate_mean(values: Array) -> EffectEstimate:
         return EffectEstimate(*(np.asarray(np.nan) for _ in range(3)))
     error = values.std(ddof=1) / np.sqrt(n) if n > 1 else np.nan
     return EffectEstimate(np.asarray(values.mean()), np.asarray(error), np.asarray(n - 1.0))
-
-
-def log_ratio(a: Array, b: Array) -> Array:
-    """Compute finite log ratios of the losses of two filters.
-
-    Where one of the two is lost, the result lies beyond all others. Where both are lost, or the
-    ratio differs from 1 by less than the stored precision, it is 0.
-
-    Shapes: a [n], b [n].
-    """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        d = np.log(a) - np.log(b)
-    d = np.where((a == b) | (np.abs(d) <= LOG_TOLERANCE), 0.0, d)
-    return np.where(np.isfinite(d), d, np.sign(d) * beyond_finite(d))
-
-
-def beyond_finite(d: Array) -> float:
-    """Return a number so large that its mean with any finite difference exceeds them all."""
-    return 4 * float(np.abs(d[np.isfinite(d)]).max(initial=0.0)) + 1

@@ -25,6 +25,16 @@ def format_digits(value: float, digits: int = 3) -> str:
     )
 
 
+def format_with_interval(ratio: float, low: float, high: float) -> str:
+    """Format a ratio with its interval: three decimals where two would put a bound on one that is not one.
+
+    An end that lost runs or few runs leave open is infinite.
+    """
+    digits = 3 if any(end != 1.0 and f"{end:.2f}" == "1.00" for end in (low, high)) else 2
+    upper = "∞" if high == math.inf else f"{high:.{digits}f}"
+    return f"{ratio:.{digits}f} [{low:.{digits}f}, {upper}]"
+
+
 def percent(log_ratio: float) -> str:
     """Format a log ratio as a change in percent with two digits, without its sign."""
     value = abs(100 * math.expm1(min(log_ratio, 20.0)))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pfbench.stats.comparison import Effect, Unit, bound_losses, compare_all
+from pfbench.stats.comparison import Effect, Unit, compare, compare_all
 from pfbench.stats.error_measures import Array, Flags
 
 if TYPE_CHECKING:
@@ -25,8 +25,8 @@ CONDITION = ["family", "scenario", "regime"]
 LOG_SCORE = (
     "log_score"  # the only metric that is a logarithm, with larger values for better filters
 )
-CAPPED_METRICS = ("rmse", "crps")  # in the unit of the cap of a world
-_LEAST_ERROR = 1e-300  # an error of exactly 0 has a finite loss
+LEAST_ERROR = 1e-300  # an error of exactly 0 has a finite loss
+_ROUNDING = 1e-9  # of a sum of weights
 
 
 class StudyRuns(NamedTuple):
@@ -38,7 +38,6 @@ class StudyRuns(NamedTuple):
         values: Values by column of the table, [F, C, N].
         keeps: Runs that keep track, [F, C, N].
         present: Runs that exist, [F, C, N].
-        caps: Largest error that counts in each condition, [C]; NaN where the world states none.
     """
 
     filters: tuple[str, ...]
@@ -46,7 +45,6 @@ class StudyRuns(NamedTuple):
     values: Mapping[str, Array]
     keeps: Flags
     present: Flags
-    caps: Array
 
     def select(self, mask: Flags) -> StudyRuns:
         """Select conditions.
@@ -59,13 +57,10 @@ class StudyRuns(NamedTuple):
             values=values,
             keeps=self.keeps[:, mask],
             present=self.present[:, mask],
-            caps=self.caps[mask],
         )
 
 
-def arrange_runs(
-    table: pd.DataFrame, filters: Sequence[str], caps: Mapping[str, float] | None = None
-) -> StudyRuns:
+def arrange_runs(table: pd.DataFrame, filters: Sequence[str]) -> StudyRuns:
     """Arrange a table with one row per filter, condition and run as arrays.
 
     The axis of runs has the numbers of the runs, and of several seeds of a scenario one after the other.
@@ -73,7 +68,6 @@ def arrange_runs(
     Args:
         table: Columns filter, family, scenario, regime, seed, run, keeps_track and those of the metrics.
         filters: Labels of the filters.
-        caps: Largest error that counts by scenario; without one a lost run counts as the largest error of a pair.
 
     Raises:
         ValueError: If a run is there twice.
@@ -96,34 +90,25 @@ def arrange_runs(
     numbers = table.select_dtypes(["number", "bool"]).columns
     values = {str(name): arrange(str(name)) for name in numbers}
     keeps = values["keeps_track"]
-    stated = dict(caps or {})
-    limits = np.array([stated.get(str(name), np.nan) for name in conditions["scenario"]])
-    return StudyRuns(tuple(filters), conditions, values, keeps == 1, ~np.isnan(keeps), limits)
+    return StudyRuns(tuple(filters), conditions, values, keeps == 1, ~np.isnan(keeps))
 
 
 def compute_losses(runs: StudyRuns, metric: str) -> Array:
-    """Compute the losses of all runs, [F, C, N]; NaN for a run without a value.
+    """Compute the losses of all runs, [F, C, N]: the logarithm of the error, infinite for a run that does not keep track.
 
-    A run that does not keep track has the loss of the cap. Without a cap its loss is infinite here, and in a pair
-    that of the largest error of the two filters in this condition.
+    A run that a filter does not have, or that has no value of the metric, is NaN.
 
     Args:
         runs: Runs of a study.
         metric: Column of the error.
     """
     value = runs.values[metric]
-    is_lost = runs.present & ~runs.keeps
     if metric == LOG_SCORE:
         losses = -value
     else:
         with np.errstate(divide="ignore", invalid="ignore"):
-            losses = np.log(np.maximum(value, _LEAST_ERROR))
-    losses = np.where(is_lost, np.inf, np.where(runs.present, losses, np.nan))
-    for k, cap in enumerate(runs.caps):
-        if metric in CAPPED_METRICS and np.isfinite(cap):
-            bounded = bound_losses(value[:, k], runs.keeps[:, k], float(cap))
-            losses[:, k] = np.where(np.isnan(losses[:, k]), np.nan, bounded)
-    return losses
+            losses = np.log(np.maximum(value, LEAST_ERROR))
+    return np.where(runs.present & ~runs.keeps, np.inf, np.where(runs.present, losses, np.nan))
 
 
 def weigh_conditions(conditions: pd.DataFrame) -> Array:
@@ -154,12 +139,34 @@ def compare_filters(
     index = {label: k for k, label in enumerate(runs.filters)}
     keys = np.empty(len(runs.conditions), dtype=object)
     keys[:] = list(zip(runs.conditions["family"], runs.conditions["scenario"], strict=True))
-    average = _average_worlds if unit == "world" else _average_runs
+    families = runs.conditions["family"].to_numpy()
+    worlds = [families == name for name in dict.fromkeys(families)] if unit == "world" else []
     members = []
     for a, b in pairs:
-        first, second = average(keys, losses[index[a]], losses[index[b]])
-        members.append(((a, first), (b, second)))
+        first, second = losses[index[a]], losses[index[b]]
+        if unit == "world":
+            sides = [_average_runs(keys[w], first[w], second[w]) for w in worlds]
+            sides = [side for side in sides if len(side[0])]
+            members.append(locate_groups((a, b), sides))
+        else:
+            averages = _average_runs(keys, first, second)
+            members.append(((a, averages[0]), (b, averages[1])))
     return compare_all(members, unit)
+
+
+def locate_groups(
+    names: tuple[str, str], groups: Sequence[tuple[Array, Array]]
+) -> tuple[tuple[str, Array], tuple[str, Array]]:
+    """Return the log ratio of a pair in each group of runs as losses, the second of which are 0: of worlds or drives.
+
+    Args:
+        names: Names of the two filters.
+        groups: Losses of both in the runs of each group, [n].
+    """
+    a, b = names
+    located = [compare((a, first), (b, second)).location for first, second in groups]
+    d = np.array(located, dtype=np.float64)
+    return (a, np.where(d == -np.inf, 0.0, d)), (b, np.where(d == -np.inf, np.inf, 0.0))
 
 
 def share_conditions(runs: StudyRuns, a: str, b: str) -> bool:
@@ -201,42 +208,22 @@ def _check_unique(table: pd.DataFrame, index: np.ndarray) -> None:
         )
 
 
-def _bound_pair(first: Array, second: Array) -> tuple[Array, Array, Flags]:
-    """Return the losses of two filters [C, N] with lost runs at the largest error of both, and the common runs."""
-    common = ~(np.isnan(first) | np.isnan(second))
-    both = np.stack([first, second])
-    finite = np.where(np.isfinite(both) & common, both, -np.inf)
-    largest = finite.max(axis=(0, 2), initial=-np.inf)
-    largest = np.where(np.isfinite(largest), largest, 0.0)[:, None]
-    first, second = (np.where(np.isposinf(x), largest, x) for x in both)
-    return first, second, common
-
-
 def _average_runs(keys: np.ndarray, first: Array, second: Array) -> tuple[Array, Array]:
     """Average the losses [C, N] of each run over the conditions that both filters have, [n].
 
-    Only runs of all these conditions count. Shapes: keys [C], world and scenario of each condition.
+    Only runs of all these conditions count. A run is lost by the filter that loses it in more of the conditions; both
+    lose it that lose it in as many. Shapes: keys [C], world and scenario of each condition.
     """
-    first, second, common = _bound_pair(first, second)
+    common = ~(np.isnan(first) | np.isnan(second))
     used = common.any(axis=1)
     if not used.any():
         return np.zeros(0), np.zeros(0)
     everywhere = common[used].all(axis=0)
     weights = _weigh(tuple(keys[used]))
-    return weights @ first[used][:, everywhere], weights @ second[used][:, everywhere]
-
-
-def _average_worlds(keys: np.ndarray, first: Array, second: Array) -> tuple[Array, Array]:
-    """Average the losses [C, N] of each world over its common runs and conditions, [W]."""
-    first, second, common = _bound_pair(first, second)
-    used = common.any(axis=1)
-    count = np.maximum(common[used].sum(axis=1), 1)
-    means = [np.where(common, x, 0.0)[used].sum(axis=1) / count for x in (first, second)]
-    families = np.array([key[0] for key in keys[used]])
-    rows = [np.flatnonzero(families == family) for family in dict.fromkeys(families)]
-    weights = [_weigh(tuple(keys[used][members])) for members in rows]
-    first, second = (
-        np.array([w @ mean[members] for w, members in zip(weights, rows, strict=True)])
-        for mean in means
-    )
-    return first, second
+    both = np.stack([first, second])[:, used][:, :, everywhere]
+    is_lost = np.isposinf(both)
+    lost = np.einsum("c,scn->sn", weights, is_lost.astype(float))
+    mean = np.einsum("c,scn->sn", weights, np.where(is_lost, 0.0, both))
+    loses = (lost > 0) & (lost >= lost[::-1] - _ROUNDING)
+    mean = np.where(loses, np.inf, mean)
+    return mean[0], mean[1]

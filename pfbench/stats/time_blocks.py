@@ -28,10 +28,9 @@ from pfbench.stats.comparison import (
     SAME_RUNS,
     Effect,
     Verdict,
-    bound_losses,
     compare,
 )
-from pfbench.stats.error_measures import Array
+from pfbench.stats.error_measures import Array, Flags
 from pfbench.stats.sentences import format_digits
 
 BLOCKS = 30  # of all sequences together [ours]
@@ -57,6 +56,26 @@ def count_blocks(seconds: Sequence[float], block_s: float = 0.0) -> list[int]:
     """Return the number of blocks of each sequence, in proportion to its length, at least 1."""
     length = block_s or sum(seconds) / BLOCKS
     return [max(round(s / length), 1) for s in seconds]
+
+
+def bound_losses(error: Array, keeps_track: Flags, cap: float) -> Array:
+    """Return the logarithm of errors, at most that of the cap: of blocks of time, whose lost runs count apart.
+
+    Args:
+        error: Errors, [...], not negative. NaN and infinity count as the cap.
+        keeps_track: Errors that count as they are, [...]. The others count as the cap.
+        cap: Largest error that counts, positive, in the unit of the error.
+
+    Raises:
+        ValueError: If the cap is not a positive number.
+    """
+    if not (cap > 0 and math.isfinite(cap)):
+        raise ValueError(
+            f"cap must be a positive number, got {cap}. State the divergence threshold of the world."
+        )
+    counts = keeps_track & np.isfinite(error)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(np.where(counts, np.minimum(error, cap), cap)))
 
 
 def block_losses(error: Array, blocks: int, cap: float) -> Array:

@@ -24,13 +24,13 @@ from pfbench.stats.comparison import (
     ALPHA,
     Effect,
     Verdict,
-    bound_losses,
     compare,
     decide,
     find_largest_p,
 )
 from pfbench.stats.error_measures import Array
 from pfbench.stats.rank_tests import holm
+from pfbench.stats.study_runs import LEAST_ERROR
 
 TRACK_SHARE = 0.8  # a filter that keeps track in a smaller share of runs loses track [ours]
 SHARED_SEEDS = "runs of different worlds have the same random numbers"
@@ -43,8 +43,7 @@ class World(NamedTuple):
         name: Name of the world.
         reference: Conventional filter with which all others are compared, fixed before the study.
         kalman_fits: Whether Kalman filters fit the world, by a rule on another seed; None if unknown.
-        cap: Largest error that counts, in the unit of the world.
-        losses: Losses by run, of each filter.
+        losses: Losses by run, of each filter; infinite for a lost run.
         keeps_track: Whether track is kept by run, of each filter.
         seed: Seed of the random numbers.
     """
@@ -52,7 +51,6 @@ class World(NamedTuple):
     name: str
     reference: str
     kalman_fits: bool | None
-    cap: float
     losses: Mapping[str, pd.Series]
     keeps_track: Mapping[str, pd.Series]
     seed: int
@@ -103,7 +101,7 @@ class MeanRanks(NamedTuple):
     """Mean ranks of methods over worlds, a description.
 
     Attributes:
-        means: Mean rank of each method, 1 for the smallest loss.
+        means: Mean rank of each method, 1 for the smallest median loss.
         p: p-value of Friedman's test in the form of Iman and Davenport.
         critical_difference: Difference of mean ranks that Nemenyi's test can show.
         reason: Why there are none; empty otherwise.
@@ -117,15 +115,12 @@ class MeanRanks(NamedTuple):
     worlds: int = 0
 
 
-def build_world(
-    rows: pd.DataFrame, reference: str, cap: float, kalman_fits: bool | None = None
-) -> World:
+def build_world(rows: pd.DataFrame, reference: str, kalman_fits: bool | None = None) -> World:
     """Build a world from a table.
 
     Args:
         rows: Columns scenario, filter, run, rmse, keeps_track, lost and seed, of one scenario.
         reference: Filter with which the others are compared.
-        cap: Largest error that counts.
         kalman_fits: Whether Kalman filters fit the world.
 
     Raises:
@@ -139,10 +134,11 @@ def build_world(
     losses, tracks = {}, {}
     for label, group in rows.groupby("filter", observed=True, sort=False):
         keeps = group["keeps_track"].to_numpy(dtype=bool) & ~group["lost"].to_numpy(dtype=bool)
-        loss = bound_losses(group["rmse"].to_numpy(dtype=float), keeps, cap)
+        error = np.where(keeps, group["rmse"].to_numpy(dtype=float), np.inf)
+        loss = np.log(np.maximum(np.where(np.isnan(error), np.inf, error), LEAST_ERROR))
         losses[str(label)] = pd.Series(loss, index=group["run"].to_numpy())
         tracks[str(label)] = pd.Series(keeps, index=group["run"].to_numpy())
-    return World(name, reference, kalman_fits, cap, losses, tracks, seed)
+    return World(name, reference, kalman_fits, losses, tracks, seed)
 
 
 def decide_cells(
@@ -213,7 +209,7 @@ def rank_methods(worlds: Sequence[World], methods: Sequence[str]) -> MeanRanks:
         return MeanRanks({}, math.nan, math.nan, SHARED_SEEDS)
     if len(shared) < 2 or len(methods) < 3:
         return MeanRanks({}, math.nan, math.nan, "ranks need two worlds and three methods")
-    levels = np.array([[w.losses[m].mean() for m in methods] for w in shared])
+    levels = np.array([[w.losses[m].median() for m in methods] for w in shared])
     count, k = levels.shape
     ranks = scipy.stats.rankdata(np.round(levels, 6), axis=1)
     statistic = float(scipy.stats.friedmanchisquare(*np.round(levels, 6).T).statistic)

@@ -11,10 +11,11 @@ import pytest
 from command_line import Said, pfbench
 
 import pfbench as package
-from pfbench.report.board import arrange_study, build_run_table
+from pfbench.report.board import build_run_table
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
 from pfbench.stats.pair_states import LookSchedule, decide_at_looks
+from pfbench.stats.study_runs import arrange_runs
 
 STUDY = ("scenario=linear_walk", "scenario.steps=12", "particles=60", "pcrb=false", "score_steps=0")
 SWEEP = ("run", "-m", *STUDY, "filter=ekf,sir,rpf")
@@ -58,7 +59,7 @@ def test_looks_decide_as_one_study_of_all_runs(home: Path, said: Said) -> None:
     assert left[columns[:-1]].equals(right[columns[:-1]])
     np.testing.assert_allclose(left["value"], right["value"], rtol=1e-9)
     table = build_run_table(load_conditions("fixed", home / "results"))
-    runs = arrange_study(table, sorted(set(table["filter"])), {})
+    runs = arrange_runs(table, sorted(set(table["filter"])))
     for line, count in ((first, 20), (second, 40)):
         early = runs._replace(
             present=runs.present[..., :count], keeps=runs.keeps[..., :count],

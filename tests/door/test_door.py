@@ -25,9 +25,7 @@ from pfbench.cli.compose import plan_study
 from pfbench.door import own_source
 from pfbench.job import IGNORED_IN_KEY, compose, job_key
 from pfbench.job.trust import FOLDERS
-from pfbench.report.overview.tables import read_world_facts
 from pfbench.results import main_component_group, store
-from pfbench.stats.comparison import EQUALITY_MARGIN, bound_losses, compare, decide
 
 SMALL = {"runs": 4, "particles": 40}
 WALK = pfbench.get("scenario", "linear_walk", steps=6)
@@ -426,24 +424,21 @@ def test_errors_are_those_of_the_files(study: pfbench.Study) -> None:
         study.errors("wing")
 
 
-def test_a_comparison_is_the_one_of_the_package(study: pfbench.Study) -> None:
+def test_a_comparison_is_the_one_of_the_page_and_of_the_errors(study: pfbench.Study) -> None:
+    """Word and interval are those of the view of the condition; the ratio is that of `errors()`."""
     comparison = study.compare("sir", "ekf")
-    rows = study.table("rmse")
-    group = main_component_group(study.conditions()[0].jobs[0].meta["state"]).group
-    rows = rows[(rows["group"] == group) & (rows["component"] == "norm")]
-    cap = read_world_facts("linear_walk", "linear_walk").cap  # of the tuning of this world
-    effects = []
-    for noise in ("nominal", "outliers"):
-        pair = []
-        for name in ("sir", "ekf"):
-            of_filter = rows[(rows["noise"] == noise) & (rows["label"] == name)].sort_values("run")
-            values, keeps = of_filter["value"].to_numpy(), of_filter["keeps_track"].to_numpy()
-            pair.append((name, bound_losses(values, keeps.astype(bool), cap)))
-        effects.append(compare(*pair))
-    expected = decide(effects, EQUALITY_MARGIN)
-    for verdict, reference in zip(comparison.verdicts.values(), expected, strict=True):
-        assert (verdict.word, verdict.n) == (reference.word, reference.n)
-        np.testing.assert_allclose(verdict[3:7], reference[3:7], rtol=1e-5)
+    errors = study.errors()
+    rows = pd.read_csv(study.report(figure_formats=("svg",)).with_name("verdicts.csv"))
+    for noise, verdict in zip(("nominal", "outliers"), comparison.verdicts.values(), strict=True):
+        logs = np.log(errors.loc[noise])
+        d = (logs["sir"] - logs["ekf"]).to_numpy()
+        means = np.add.outer(d, d)[np.triu_indices(len(d))] / 2
+        assert verdict.ratio == pytest.approx(np.exp(np.median(means)), rel=1e-5)
+        view = rows.query("metric == 'rmse' and regime == @noise and filter == 'sir' and baseline == 'ekf'")  # fmt: skip
+        for row in view.to_dict("records"):
+            assert row["verdict"] in (verdict.word, "loses track")
+            shown = [row[name] for name in ("ratio", "ratio_low", "ratio_high", "p")]
+            np.testing.assert_allclose(verdict[3:7], shown, rtol=1e-3)
     assert "sir" in repr(comparison)
     assert len(comparison.table()) == 2
     with pytest.raises(ValueError, match="must have one condition, got 2"):

@@ -14,18 +14,18 @@ from scipy import stats
 
 from pfbench.report import RUNS_FILE, read_stored_study
 from pfbench.report.board.entries import StudyNames, metric_entries
-from pfbench.report.board.pack import arrange_study
 from pfbench.report.board.study_views import (
     build_views,
-    decide_planned,
     planned_entries,
     round_ratio,
+    select_everywhere,
 )
 from pfbench.report.board.view import BoardRow, View, build_rows, describe_filters, describe_view
 from pfbench.report.options import ReportOptions
 from pfbench.report.study_page.page_writer import describe_pairs
-from pfbench.results.looks import PartName, find_looks
-from pfbench.stats.study_runs import arrange_runs, compute_losses
+from pfbench.results.looks import PartName, find_looks, plan_look_pairs
+from pfbench.stats.court import Court, fix_pairs
+from pfbench.stats.study_runs import arrange_runs
 
 EFFECTS = {"mcmc_rpf": -0.3, "sir": 0.0, "ukf": 0.5}
 CAP = 1e4
@@ -53,18 +53,18 @@ def table(
     return pd.concat(rows, ignore_index=True)
 
 
-def make_view(data: pd.DataFrame, cap: float = math.nan, alpha: float = 0.05) -> View:
+def make_view(data: pd.DataFrame, has_limit: bool = True, alpha: float = 0.05, baseline: str = "sir") -> View:  # fmt: skip
     """View of all conditions."""
     labels = tuple(sorted(data["filter"].unique()))
-    runs = arrange_runs(data, labels, dict.fromkeys(data["scenario"].unique(), cap))
+    runs = arrange_runs(data, labels)
     described = describe_filters(runs, alpha)
     times: list[dict[str, Any]] = [{} for _ in range(len(runs.conditions))]
-    losses = compute_losses(runs, "rmse")
-    return View(runs, losses, "rmse", "m", described, times, cap > 0, alpha, MARGIN)
+    court = Court(runs, fix_pairs(labels, [], baseline), MARGIN, alpha)
+    return View(court, select_everywhere(runs), "rmse", "m", described, times, has_limit)
 
 
-def board(data: pd.DataFrame, baseline: str = "sir", cap: float = math.nan) -> dict[str, BoardRow]:
-    return {row["filter"]: row for row in build_rows(make_view(data, cap), baseline)}
+def board(data: pd.DataFrame, baseline: str = "sir") -> dict[str, BoardRow]:
+    return {row["filter"]: row for row in build_rows(make_view(data, baseline=baseline), baseline)}
 
 
 def lose(data: pd.DataFrame, label: str, runs: int, **where: str) -> pd.DataFrame:
@@ -124,33 +124,6 @@ def test_another_filter_changes_no_row_but_the_size_of_the_family() -> None:
     assert many["ukf"]["rank"] == few["ukf"]["rank"] + 1  # gpf is better, qmc_gpf is worse
 
 
-def test_an_error_beyond_the_cap_and_a_lost_run_count_as_the_cap() -> None:
-    data = table()
-    hit = data["filter"].eq("ukf") & (data["run"] < 4)
-    at_cap = board(data.assign(rmse=data["rmse"].mask(hit, CAP)), cap=CAP)
-    beyond = board(data.assign(rmse=data["rmse"].mask(hit, 1e9 * CAP)), cap=CAP)
-    assert repr(at_cap) == repr(beyond)
-    lost = board(lose(data.assign(rmse=data["rmse"].mask(hit)), "ukf", 4), cap=CAP)
-    apart = {key for label in lost for key in lost[label] if repr(lost[label][key]) != repr(at_cap[label][key])}  # fmt: skip
-    assert apart == {"track"}
-    below = board(data.assign(rmse=data["rmse"].mask(hit, CAP / 1e4)), cap=CAP)
-    assert below["ukf"]["p"] > at_cap["ukf"]["p"]  # an error below it does count
-
-
-def test_without_a_cap_a_lost_run_counts_as_the_largest_error_of_the_pair() -> None:
-    """In its condition, whatever a third filter does."""
-    data = table({"sir": 0.0, "ukf": 0.1, "gpf": 4.0})
-    lost = lose(data, "ukf", 9, scenario="w0", regime="nominal")
-    here = data["scenario"].eq("w0") & data["regime"].eq("nominal")
-    kept = here & (data["filter"].eq("sir") | (data["filter"].eq("ukf") & (data["run"] >= 9)))
-    off = here & data["filter"].eq("ukf") & (data["run"] < 9)
-    replaced = data.assign(rmse=data["rmse"].mask(off, data.loc[kept, "rmse"].max()))
-    shown = board(lost)["ukf"]
-    for key in ("ratio", "ratio_low", "ratio_high", "p"):
-        assert shown[key] == pytest.approx(board(replaced)["ukf"][key], rel=1e-12)
-    assert shown["ratio"] > board(data)["ukf"]["ratio"]
-
-
 @pytest.mark.parametrize("lost", [0, 8])
 def test_word_interval_and_p_of_a_row_agree(lost: int) -> None:
     """Over effects from none to clear, and with lost runs."""
@@ -158,7 +131,7 @@ def test_word_interval_and_p_of_a_row_agree(lost: int) -> None:
     for seed in range(24):
         effect = 0.02 * (seed % 12 - 6)
         data = table({"sir": 0.0, "ukf": effect, "gpf": 0.2, "rpf": -effect / 2}, 1, 160, seed)
-        for row in board(lose(data, "ukf", lost), cap=CAP).values():
+        for row in board(lose(data, "ukf", lost)).values():
             low, high, p = row["ratio_low"], row["ratio_high"], row["p"]
             words[row["verdict"]] = words.get(row["verdict"], 0) + 1
             if row["verdict"] in ("baseline", "loses track"):
@@ -171,7 +144,7 @@ def test_word_interval_and_p_of_a_row_agree(lost: int) -> None:
             elif row["verdict"] == "equal":
                 assert 1 / 1.05 < low <= high < 1.05
             else:
-                assert p >= 0.05 or "the trimmed mean does not agree" in row["words"]
+                assert p >= 0.05 or "does not agree" in row["words"]
                 assert low <= 1 / 1.05 or high >= 1.05
     assert set(words) >= {"better", "worse", "equal", "not decided"}
 
@@ -184,7 +157,7 @@ def test_equal_filters_are_rarely_called_better_or_worse() -> None:
             data = table({"sir": 0.0, "ukf": effect, "gpf": 0.0}, 1, 24, seed)
             rng = np.random.default_rng([7, seed])
             data["keeps_track"] = rng.uniform(size=len(data)) > 0.05
-            words = {k: row["verdict"] for k, row in board(data, cap=CAP).items()}
+            words = {k: row["verdict"] for k, row in board(data).items()}
             said = [words[k] in ("better", "worse") for k in ("ukf", "gpf")]
             wrong += effect == 0 and any(said)
             found += effect != 0 and words["ukf"] == "better"
@@ -218,21 +191,22 @@ def test_verdicts_of_few_equal_and_missing_filters() -> None:
     assert board(skewed)["ukf"]["verdict"] not in ("better", "worse")
 
 
-def test_a_filter_that_loses_track_keeps_its_place_and_its_ratio() -> None:
+def test_a_filter_that_loses_track_keeps_its_place() -> None:
     """In a single condition the word is that of track; over several the conditions are counted beside the verdict."""
     data = lose(table(runs=60), "mcmc_rpf", 24)
-    row = board(data, cap=CAP)["mcmc_rpf"]
+    row = board(data)["mcmc_rpf"]
     assert row["verdict"] in ("worse", "not decided")
     assert row["words"].endswith("loses track in 4/4")
     assert row["track"] == pytest.approx(0.6)
-    assert row["ratio"] > board(table(runs=60), cap=CAP)["mcmc_rpf"]["ratio"]
+    assert math.isnan(row["ratio"])  # 24 of 60 runs are lost
+    assert "mcmc_rpf loses 24 and sir 0 of 60 runs" in row["words"]
     one = data[data["scenario"].eq("w0") & data["regime"].eq("nominal")]
-    row = board(one, cap=CAP)["mcmc_rpf"]
+    row = board(one)["mcmc_rpf"]
     assert (row["verdict"], row["words"]) == ("loses track", "loses track in 40 % of runs")
-    assert row["ratio"] > 0
-    base = board(one, "mcmc_rpf", CAP)["mcmc_rpf"]
+    assert row["loses"] == "loses more"
+    base = board(one, "mcmc_rpf")["mcmc_rpf"]
     assert (base["verdict"], base["words"]) == ("baseline", "baseline, loses track in 40 % of runs")
-    assert board(lose(table(), "mcmc_rpf", 3), cap=CAP)["mcmc_rpf"]["verdict"] == "better"
+    assert board(lose(table(), "mcmc_rpf", 3))["mcmc_rpf"]["verdict"] == "better"
 
 
 def views_of(data: pd.DataFrame, limit: float | None = None, **options: Any) -> dict[Any, Any]:
@@ -240,9 +214,10 @@ def views_of(data: pd.DataFrame, limit: float | None = None, **options: Any) -> 
     labels = sorted(data["filter"].unique())
     worlds = {w: PartName(w, w, "", "m", limit, w) for w in data["scenario"].unique()}
     names = StudyNames(find_looks(labels), worlds, {}, [k for k in ("sir", "ukf") if k in labels])
-    runs = arrange_study(data, labels, worlds)
+    runs = arrange_runs(data, labels)
+    court = Court(runs, fix_pairs(labels, [], names.baselines[0]), MARGIN, 0.05)
     groups = data.groupby(["scenario", "regime"])[["unit", "group"]].first()
-    return build_views(runs, groups, names, ReportOptions(**options))
+    return build_views(court, groups, names, ReportOptions(**options))
 
 
 def test_filters_are_compared_where_all_of_them_were_run() -> None:
@@ -315,7 +290,9 @@ def test_sentences_of_small_studies(runs: int, labels: list[str], is_lost: bool)
     assert ("no other filter is compared" in text) == (len(labels) == 1)
     if not is_lost and len(labels) > 1 and runs == 30:
         first = "Of 1 filter, 1 is" if len(labels) == 2 else "Of 2 filters, 1 is"
-        assert text.startswith(f"{first} better than [[SIR]] in Flight (best: [[MCMC-RPF]], 0.7")
+        assert text.startswith(
+            f"{first} better than [[SIR]] in Flight (first in the table: [[MCMC-RPF]], 0.7"
+        )
 
 
 def test_the_counts_of_a_sentence_are_those_of_its_rows() -> None:
@@ -329,16 +306,18 @@ def test_the_counts_of_a_sentence_are_those_of_its_rows() -> None:
         "mcmc_rpf": 0.3,
     }
     data = lose(table(effects, worlds=1, runs=60), "ekf", 40)
-    rows = build_rows(make_view(data[data["regime"] == "nominal"], CAP), "sir")
+    rows = build_rows(make_view(data[data["regime"] == "nominal"]), "sir")
     counts = {word: sum(row["verdict"] == word for row in rows) for word in ("better", "equal", "worse", "not decided", "loses track")}  # fmt: skip
     text = describe_view(rows, find_looks(list(effects)), "sir", "in Flight", "error")
     assert counts["better"] == counts["loses track"] == 1
-    assert text.startswith("Of 6 filters, 1 is better than [[SIR]] in Flight (best: [[CKF]], 0.6")
+    assert text.startswith(
+        "Of 6 filters, 1 is better than [[SIR]] in Flight (first in the table: [[CKF]], 0.6"
+    )
     for word, said in (("equal", "equal to it"), ("worse", "worse"), ("not decided", "not decided"), ("loses track", "without track")):  # fmt: skip
         number = counts[word]
         expected = f"{number} {'is' if number == 1 else 'are'} {said}"
         assert (expected in text) == (number > 0)
-    assert "Best proposed method: [[MCMC-RPF]], 1.3" in text
+    assert "First proposed method: [[MCMC-RPF]], 1.3" in text
 
 
 def check_sentences(views: dict[Any, Any]) -> int:
@@ -388,9 +367,8 @@ def test_planned_pairs_have_the_numbers_of_the_board() -> None:
     data = table({"mcmc_rpf": -0.3, "sir": 0.0, "rpf": 0.1})
     looks, options = find_looks(sorted(data["filter"].unique())), ReportOptions(alpha=0.1)
     worlds = {k: PartName(k, f"World {k}", "", "m", CAP, k) for k in ("w0", "w1")}
-    runs = arrange_study(data, looks, worlds)
-    planned = decide_planned(runs, looks, options)
-    entries = planned_entries(planned, runs, looks, worlds, options)
+    court = Court(arrange_runs(data, looks), plan_look_pairs(looks), MARGIN, options.alpha)
+    entries = planned_entries(court, looks, worlds, options)
     assert [(entry["a"], entry["b"]) for entry in entries] == [
         ("mcmc_rpf", "sir"),
         ("mcmc_rpf", "rpf"),
@@ -398,7 +376,7 @@ def test_planned_pairs_have_the_numbers_of_the_board() -> None:
     for entry in entries:
         pair = data[data["filter"].isin([entry["a"], entry["b"]])]
         # level 0.1 / 2: the family has two pairs
-        rows = build_rows(make_view(pair, CAP, 0.05), entry["b"])
+        rows = build_rows(make_view(pair, True, 0.05, entry["b"]), entry["b"])
         row = next(row for row in rows if row["filter"] == "mcmc_rpf")
         shown = [entry[name] for name in ("estimate", "low", "high")]
         assert shown == pytest.approx(
@@ -412,7 +390,7 @@ def test_planned_pairs_have_the_numbers_of_the_board() -> None:
         assert "30 paired runs" in entry["sentence"]
         assert entry["new_world"] is None  # ten worlds are required
         for cell in entry["cells"]:
-            own = board(pair[pair["scenario"] == cell["world"]], entry["b"], CAP)["mcmc_rpf"]
+            own = board(pair[pair["scenario"] == cell["world"]], entry["b"])["mcmc_rpf"]
             assert cell["estimate"] == pytest.approx(own["ratio"], rel=1e-3)
             assert cell["name"] == f"World {cell['world']}"
 
@@ -421,8 +399,8 @@ def test_the_interval_of_a_new_world_needs_ten_worlds() -> None:
     data = table({"mcmc_rpf": -0.3, "sir": 0.0}, worlds=11, runs=10)
     looks, options = find_looks(["mcmc_rpf", "sir"]), ReportOptions()
     worlds = {f"w{k}": PartName(f"w{k}", f"w{k}", "", "m", None, f"w{k}") for k in range(11)}
-    runs = arrange_study(data, looks, worlds)
-    (entry,) = planned_entries(decide_planned(runs, looks, options), runs, looks, worlds, options)
+    court = Court(arrange_runs(data, looks), plan_look_pairs(looks))
+    (entry,) = planned_entries(court, looks, worlds, options)
     new = entry["new_world"]
     assert (new["worlds"], new["word"]) == (11, "better")
     assert new["low"] < entry["estimate"] < new["high"]
@@ -431,8 +409,8 @@ def test_the_interval_of_a_new_world_needs_ten_worlds() -> None:
 def test_too_few_runs_say_why_a_planned_pair_has_no_interval() -> None:
     data = table(runs=4, worlds=1)
     looks, options = find_looks(sorted(data["filter"].unique())), ReportOptions()
-    runs = arrange_study(data, looks, {})
-    (entry, *_) = planned_entries(decide_planned(runs, looks, options), runs, looks, {}, options)
+    court = Court(arrange_runs(data, looks), plan_look_pairs(looks))
+    (entry, *_) = planned_entries(court, looks, {}, options)
     assert (entry["low"], entry["high"], entry["word"]) == (None, None, "not decided")
     assert "are not decided (4 runs, 10 are required; ratio" in entry["sentence"]
     pack = {"planned": [entry], "filters": [{"key": k, "name": k} for k in looks]}

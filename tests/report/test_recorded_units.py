@@ -19,9 +19,9 @@ from pfbench.report.board.recorded_units import (
     _list_losses,
     decide_records,
 )
-from pfbench.report.options import ReportOptions
 from pfbench.report.study_report import rebuild_page, write_report
 from pfbench.results import store
+from pfbench.stats.court import Court
 from pfbench.stats.study_runs import StudyRuns, arrange_runs
 
 Array = np.ndarray
@@ -41,7 +41,7 @@ def decide_pair(errors: dict[str, Array], drives: int = 1, lost: dict[str, int] 
     number = np.arange(len(errors["a"]))
     losses = _list_losses(errors, np.arange(STEPS, dtype=float), number % drives)
     record = {"world": "own", "regime": "nominal", "noise": "nominal", "added": "", "simulated": "", "drives": drives, "recorded": drives, "runs": len(number), **losses}  # fmt: skip
-    decided = decide_records([record], study_runs(errors, lost or {}), ["b"], ReportOptions())
+    decided = decide_records([record], Court(study_runs(errors, lost or {}), [("a", "b")]), ["b"])
     return dict(decided[0]["rows"][0])
 
 

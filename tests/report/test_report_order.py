@@ -13,8 +13,8 @@ import synthetic_results as synthetic
 
 from pfbench.report import study_report
 from pfbench.report.board import build_pack, read_study
+from pfbench.report.board.pack import StudyFacts, decide_parts
 from pfbench.report.options import ReportOptions
-from pfbench.report.study_report import list_decisions
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
 
@@ -52,7 +52,8 @@ def stored(tmp_path_factory: pytest.TempPathFactory) -> Stored:
 
 
 def decide(stored: Stored, table: pd.DataFrame) -> pd.DataFrame:
-    return list_decisions(stored[0], table).set_index(["a", "b"])
+    facts = StudyFacts.from_pack(stored[0])
+    return pd.DataFrame(decide_parts(table, facts)["decisions"]).set_index(["a", "b"])
 
 
 def test_all_pairs_are_decided_in_one_family(stored: Stored) -> None:

@@ -13,9 +13,10 @@ import synthetic_results as synthetic
 
 from pfbench.report import study_report, writers
 from pfbench.report.board.curves import make_curves
+from pfbench.report.board.study_views import DECISION_COLUMNS
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
-from pfbench.stats.comparison import Verdict
+from pfbench.stats.sentences import format_with_interval
 
 QUICK = study_report.ReportOptions(figure_formats=("svg",))
 
@@ -179,7 +180,7 @@ def test_a_toy_without_map_particles_or_rival(tmp_path):
     store.write_result(path, {**meta, "state": state}, toy)
     made = study_report.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     assert "kalman" in made.read_text()
-    assert (made.parent / "decisions.csv").read_text() == f"{','.join(Verdict._fields)}\n"
+    assert (made.parent / "decisions.csv").read_text() == f"{','.join(DECISION_COLUMNS)}\n"
 
 
 def test_a_filter_that_lost_every_run_has_the_largest_errors_and_no_number(tmp_path):
@@ -191,7 +192,8 @@ def test_a_filter_that_lost_every_run_has_the_largest_errors_and_no_number(tmp_p
     rows = pd.read_csv(made.parent / "verdicts.csv").query("baseline == 'ekf' and metric == 'rmse'")
     doomed = rows[rows["filter"] == "doomed"]
     assert set(doomed["words"]) == {"loses runs in 100 % of runs"}
-    assert (doomed["ratio"] >= 1).all()  # each of its runs has the largest error of the pair
+    assert doomed["ratio"].isna().all()  # no number stands for a lost run
+    assert set(doomed["loses"]) == {"loses more"}
     assert doomed["value"].isna().all()
     row = pd.read_csv(made.parent / "metrics.csv").query(
         "filter == 'doomed' and metric == 'rmse' and component == 'norm' and group == 'position'"
@@ -257,11 +259,11 @@ def test_numbers_have_three_digits(value, text):
     ("numbers", "text"),
     [
         ((0.951, 0.899, 0.9964), "0.951 [0.899, 0.996]"), ((1.05, 1.0031, 1.1), "1.050 [1.003, 1.100]"),
-        ((0.5, 0.4, 0.6), "0.50 [0.40, 0.60]"), ((1.0, 1.0, 1.0), "1.00 [1.00, 1.00]"), ((2.0, 1.0, float("inf")), "2.00"),
+        ((0.5, 0.4, 0.6), "0.50 [0.40, 0.60]"), ((1.0, 1.0, 1.0), "1.00 [1.00, 1.00]"), ((2.0, 1.0, float("inf")), "2.00 [1.00, ∞]"),
     ],
 )  # fmt: skip
 def test_an_interval_without_one_does_not_seem_to_end_there(numbers, text):
-    assert writers.format_with_interval(*numbers) == text
+    assert format_with_interval(*numbers) == text
 
 
 def test_markdown_columns_line_up():

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import math
-
+import numpy as np
 import pandas as pd
 import pytest
 from decision_cases import make_study
 
 from pfbench.report.board.view import View, build_rows, describe_filters
 from pfbench.stats.comparison import compare, decide
+from pfbench.stats.court import Court
 from pfbench.stats.pair_states import LookSchedule, decide_at_looks
 from pfbench.stats.study_runs import arrange_runs, compare_filters, compute_losses
 from pfbench.stats.world_table import build_world, compare_methods, decide_cells
 
-CAP, MARGIN = 2.0, math.log(1.05)
-
 
 def page_verdict(table: pd.DataFrame) -> tuple[str, float]:
     blank = dict.fromkeys(("coverage_90", "nees_ratio", "ms"), 1.0)
-    runs = arrange_runs(table.assign(**blank), ("A", "B"), {"scenario_0": CAP})
-    view = View(
-        runs, compute_losses(runs, "rmse"), "rmse", "m", describe_filters(runs), [{}], True, 0.05, MARGIN
-    )  # fmt: skip
+    runs = arrange_runs(table.assign(**blank), ("A", "B"))
+    court = Court(runs, [("A", "B")])
+    view = View(court, np.ones(1, dtype=bool), "rmse", "m", describe_filters(runs), [{}], True)
     row = next(row for row in build_rows(view, "B") if row["filter"] == "A")
     return row["words"].partition(" within")[0].partition(", ")[0], row["ratio"]
 
@@ -31,11 +28,11 @@ def page_verdict(table: pd.DataFrame) -> tuple[str, float]:
 @pytest.mark.parametrize("lost", [0.0, 0.1])
 def test_all_callers_agree(effect: float, lost: float) -> None:
     table = make_study({"A": effect, "B": 0.0}, 1, 1, 40, lost={"A": lost, "B": 0.05}, seed=4)
-    runs = arrange_runs(table, ("A", "B"), {"scenario_0": CAP})
+    runs = arrange_runs(table, ("A", "B"))
     losses = compute_losses(runs, "rmse")
     (pair,) = decide(compare_filters(runs, losses, [("A", "B")]))
     (direct,) = decide([compare(("A", losses[0, 0]), ("B", losses[1, 0]))])
-    world = build_world(table, "B", CAP)
+    world = build_world(table, "B")
     (cell,) = decide_cells([world], ["A"])
     (method,) = compare_methods([world], ["A", "B"])
     (state,) = decide_at_looks(runs, [("A", "B")], LookSchedule(40))

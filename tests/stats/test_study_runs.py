@@ -1,4 +1,4 @@
-"""Losses of filters in the conditions of a study: caps, lost runs, weights, units, and error rates of verdicts."""
+"""Losses of filters in the conditions of a study: lost runs, weights, units, and error rates of verdicts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from decision_cases import make_study
-from row_oracle import decide_family, estimate, pair_losses, subtract
+from row_oracle import arrange, decide_family, estimate, pair_losses, subtract
 
 from pfbench.stats.comparison import decide
 from pfbench.stats.study_runs import (
@@ -29,68 +29,55 @@ def decide_pairs(runs: StudyRuns, metric: str = "rmse", unit: str = "run") -> li
     return list(map(tuple, decide(effects)))
 
 
-def caps(table: pd.DataFrame, cap: float = 1.6) -> dict[str, float]:
-    return dict.fromkeys(table["scenario"].unique(), cap)
-
-
-@pytest.mark.parametrize("cap", [1.6, math.nan])
-def test_verdicts_are_those_of_the_independent_computation(cap: float) -> None:
-    table = make_study(EFFECTS, worlds=3, regimes=2, runs=25, lost={"B": 0.2, "C": 0.1})
+@pytest.mark.parametrize("lost", [0.0, 0.08])
+def test_verdicts_are_those_of_the_independent_computation(lost: float) -> None:
+    table = make_study(EFFECTS, worlds=3, regimes=2, runs=25, lost={"B": lost, "C": lost / 2})
     table = table[~((table["filter"] == "A") & (table["run"] == 7) & (table.regime == "regime_1"))]
-    runs = arrange_runs(table, tuple(EFFECTS), caps(table, cap))
-    family = [subtract(pair_losses(table, pair, caps(table, cap))) for pair in PAIRS]
-    assert [len(d) for d in family] == [24, 24, 25]
+    runs, wide = arrange_runs(table, tuple(EFFECTS)), arrange(table, "rmse")
+    family = [pair_losses(wide, pair) for pair in PAIRS]
+    assert [losses.shape[1] for losses in family] == [24, 24, 25]
     effects = compare_filters(runs, compute_losses(runs, "rmse"), PAIRS)
-    for effect, d in zip(effects, family, strict=True):
-        np.testing.assert_allclose(effect.differences, d, atol=1e-12)
+    for effect, losses in zip(effects, family, strict=True):
+        np.testing.assert_allclose(effect.differences, subtract(losses), atol=1e-12)
     for verdict, wanted in zip(decide(effects), decide_family(family, math.log(1.05), 0.05), strict=True):  # fmt: skip
-        assert verdict.word == wanted["word"]
-        assert math.log(verdict.ratio) == pytest.approx(wanted["ratio"])
+        assert (verdict.word, verdict.lost.word) == (wanted["word"], wanted["loses"])
+        assert math.log(verdict.ratio) == pytest.approx(wanted["ratio"], nan_ok=True)
         assert verdict.p == pytest.approx(wanted["p"], rel=1e-6)
-    assert estimate(family[0], 0.05) == pytest.approx(effects[0].estimate(0.05))
+    assert estimate(subtract(family[0]), 0.05) == pytest.approx(effects[0].estimate(0.05))
 
 
-def test_an_error_beyond_the_cap_and_a_lost_run_count_as_the_cap() -> None:
-    table = make_study(EFFECTS, worlds=2, regimes=1, runs=20, lost={"B": 0.2})
-    base = decide_pairs(arrange_runs(table, tuple(EFFECTS), caps(table)))
-    beyond = table["rmse"] > 1.6
-    assert beyond.any()
-    larger = table.assign(rmse=table["rmse"].where(~beyond, table["rmse"] * 1e3))
-    at_cap = table.assign(rmse=table["rmse"].where(table["keeps_track"], 1.6), keeps_track=True)
-    no_number = table.assign(rmse=table["rmse"].where(table["keeps_track"], math.nan))
-    for changed in (larger, at_cap, no_number):
-        assert decide_pairs(arrange_runs(changed, tuple(EFFECTS), caps(table))) == base
-    smaller = table.assign(rmse=table["rmse"].where(~beyond, 1.0))  # the control
-    assert decide_pairs(arrange_runs(smaller, tuple(EFFECTS), caps(table))) != base
+def test_the_size_of_an_error_counts_while_the_run_is_kept_and_not_once_it_is_lost() -> None:
+    table = make_study(EFFECTS, worlds=2, regimes=1, runs=20, lost={"B": 0.1})
+    base = decide_pairs(arrange_runs(table, tuple(EFFECTS)))
+    off = ~table["keeps_track"]
+    for number in (1e-3, 1e9, math.nan):
+        changed = table.assign(rmse=table["rmse"].mask(off, number))
+        assert decide_pairs(arrange_runs(changed, tuple(EFFECTS))) == base
+    larger = table.assign(rmse=table["rmse"].mask((table["run"] == 3) & ~off, 1e9))
+    assert decide_pairs(arrange_runs(larger, tuple(EFFECTS))) != base
 
 
-def test_without_a_cap_a_lost_run_counts_as_the_largest_error_of_the_pair() -> None:
-    table = make_study(EFFECTS, worlds=1, regimes=1, runs=20, lost={"B": 0.2})
-    runs = arrange_runs(table, tuple(EFFECTS))
-    losses = compute_losses(runs, "rmse")
-    lost = ~runs.keeps[1, 0]
-    assert np.isposinf(losses[1, 0, lost]).all()
-    largest = losses[:2, 0][:, ~lost].max()
-    largest = max(largest, losses[0, 0].max())
-    effect = compare_filters(runs, losses, [("B", "A")])[0]
-    np.testing.assert_allclose(effect.differences[lost], largest - losses[0, 0, lost])
-    assert np.isfinite(effect.differences).all()
+def test_a_run_of_several_conditions_is_lost_by_the_filter_that_loses_more_of_them() -> None:
+    table = make_study({"A": 0.0, "B": 0.3}, worlds=2, regimes=2, runs=12)
+    off = {("A", 0): 1, ("B", 1): 1, ("A", 2): 2, ("B", 2): 1, ("A", 3): 1, ("B", 3): 1}
+    order = table.groupby(["filter", "run"]).cumcount()
+    lost = [off.get(key, 0) > place for *key, place in zip(table["filter"], table["run"], order, strict=True) for key in [tuple(key)]]  # fmt: skip
+    runs = arrange_runs(table.assign(keeps_track=~np.array(lost)), ("A", "B"))
+    (effect,) = compare_filters(runs, compute_losses(runs, "rmse"), [("A", "B")])
+    assert effect.differences[:4].tolist() == [math.inf, -math.inf, math.inf, 0.0]
+    assert effect.lost == (2, 1, 1, "")
+    assert np.isfinite(effect.differences[4:]).all()
 
 
 def test_another_filter_changes_no_number_of_a_pair() -> None:
     """It changes the size of a family alone, and the effects of a pair are the same."""
     table = make_study({**EFFECTS, "D": 3.0}, worlds=2, runs=20, lost={"D": 0.9, "B": 0.1})
     small = table[table["filter"] != "D"]
-    for cap in (1.6, math.nan):
-        sides = [
-            arrange_runs(t, sorted(set(t["filter"])), caps(table, cap)) for t in (table, small)
-        ]
-        first, second = (
-            compare_filters(runs, compute_losses(runs, "rmse"), PAIRS) for runs in sides
-        )
-        for a, b in zip(first, second, strict=True):
-            np.testing.assert_array_equal(a.differences, b.differences)
-            assert (a.p, a.p_trimmed) == (b.p, b.p_trimmed)
+    sides = [arrange_runs(t, sorted(set(t["filter"]))) for t in (table, small)]
+    first, second = (compare_filters(runs, compute_losses(runs, "rmse"), PAIRS) for runs in sides)
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a.differences, b.differences)
+        assert (a.p, a.p_trimmed, a.lost) == (b.p, b.p_trimmed, b.lost)
 
 
 def test_worlds_scenarios_and_regimes_have_equal_weight() -> None:
@@ -125,7 +112,7 @@ def test_worlds_as_units_need_ten_of_them() -> None:
 
 def test_a_log_score_is_better_where_it_is_larger() -> None:
     table = make_study(EFFECTS, worlds=1, regimes=1, runs=20)
-    runs = arrange_runs(table.assign(log_score=-np.log(table["rmse"])), tuple(EFFECTS), caps(table))
+    runs = arrange_runs(table.assign(log_score=-np.log(table["rmse"])), tuple(EFFECTS))
     assert decide_pairs(runs, "log_score")[0][2] == "better"
 
 
@@ -139,12 +126,12 @@ def test_the_selection_of_conditions_keeps_as_many_results_as_possible() -> None
     assert not select_conditions(np.eye(2, dtype=bool)).any()
 
 
-@pytest.mark.parametrize(("lost", "cap"), [(0.0, math.nan), (0.3, math.nan), (0.3, 1.6)])
-def test_equal_filters_are_called_different_at_the_level(lost: float, cap: float) -> None:
+@pytest.mark.parametrize("lost", [0.0, 0.02])
+def test_equal_filters_are_called_different_at_the_level(lost: float) -> None:
     """Any false word in a study of three pairs: at most 5 % of 300 studies, and two standard errors."""
     studies, wrong, found, rng = 300, 0, 0, np.random.default_rng(4)
     table = make_study(dict.fromkeys("ABC", 0.0), 2, 2, 20)
-    arranged = arrange_runs(table, ("A", "B", "C"), caps(table, cap))
+    arranged = arrange_runs(table, ("A", "B", "C"))
     for study in range(studies):
         errors = np.exp(0.3 * rng.standard_normal(arranged.keeps.shape))
         keeps = rng.random(errors.shape) >= lost

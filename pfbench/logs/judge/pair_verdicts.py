@@ -18,7 +18,6 @@ from pfbench.stats.comparison import (
     Effect,
     Unit,
     Verdict,
-    bound_losses,
     compare,
     decide,
 )
@@ -26,6 +25,7 @@ from pfbench.stats.error_measures import Array, Flags, rmse_per_run
 from pfbench.stats.sentences import format_count
 from pfbench.stats.time_blocks import (
     block_losses,
+    bound_losses,
     compare_blocks,
     count_blocks,
     remove_drift,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
@@ -42,13 +42,12 @@ from pfbench.report.board.recorded_units import (
 )
 from pfbench.report.board.study_views import (
     build_views,
-    decide_planned,
+    list_decisions,
     order_worlds,
     planned_entries,
 )
 from pfbench.report.methods_text import collect_methods_facts
 from pfbench.report.options import ReportOptions
-from pfbench.report.overview.tables import read_world_facts
 from pfbench.report.provenance import format_bibliography
 from pfbench.results.conditions import Condition, differing_settings, parse_label
 from pfbench.results.frame import drop_before, to_long_rows
@@ -57,6 +56,7 @@ from pfbench.results.looks import (
     PartName,
     add_tuning,
     find_looks,
+    plan_look_pairs,
     study_looks,
     study_part_names,
 )
@@ -65,8 +65,9 @@ from pfbench.results.paper_block import REFERENCES, list_named_parts
 from pfbench.results.status import count_statuses
 from pfbench.results.step_times import STEP_TIME, WARM_UP, StepTimes
 from pfbench.results.store import JobResult, list_failures
+from pfbench.stats.court import Court, fix_pairs
 from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
-from pfbench.stats.study_runs import StudyRuns, arrange_runs
+from pfbench.stats.study_runs import arrange_runs
 
 
 def build_pack(
@@ -308,15 +309,14 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
         facts: Inputs of decisions other than the runs.
     """
     looks, worlds, options = facts.looks, facts.worlds, facts.options
-    runs = arrange_study(table, looks, worlds)
-    conditions = len(runs.conditions)
+    court = open_court(table, looks, options)
+    conditions = len(court.runs.conditions)
     most = _MOST_BASELINES if len(looks) * conditions <= _MANY else _FEW_BASELINES
     baselines = select_baselines(looks, options.baseline)[:most]
     names = StudyNames(looks, worlds, facts.regimes, baselines)
     groups = table.groupby(["scenario", "regime"])[["unit", "group"]].first()
-    views = build_views(runs, groups, names, options, facts.times)
-    planned = decide_planned(runs, looks, options)
-    recorded = decide_records(facts.records, runs, baselines, options)
+    views = build_views(court, groups, names, options, facts.times)
+    recorded = decide_records(facts.records, court, baselines)
     for key, view in views.items():
         reach = describe_reach(recorded, (key.world, key.regime), worlds)
         view["sentence"] = " ".join(filter(None, (view["sentence"], reach)))
@@ -330,9 +330,10 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
         "metrics": metric_entries(table, options.metric),
         "baselines": baselines,
         "views": views,
-        "planned": planned_entries(planned, runs, looks, worlds, options),
+        "planned": planned_entries(court, looks, worlds, options),
+        "decisions": list_decisions(court, options.metric),
         "recorded": recorded,
-        "world_orders": order_worlds(runs, views, looks, options),
+        "world_orders": order_worlds(court, views, looks, options),
         "warnings": [
             text for text in (_count_failures(len(facts.failures)), facts.warning) if text
         ],
@@ -343,24 +344,20 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
     }
 
 
-def arrange_study(
-    table: pd.DataFrame, labels: Iterable[str], worlds: Mapping[str, PartName]
-) -> StudyRuns:
-    """Arrange the runs of a study, with the largest error that counts in each world.
-
-    It is the divergence threshold of the scenario, or that which the file of its tuning states.
+def open_court(
+    table: pd.DataFrame, looks: Mapping[str, MethodLook], options: ReportOptions
+) -> Court:
+    """Open the court of a study: the pairs that are fixed before its results, and all others.
 
     Args:
         table: Table of `build_run_table`.
-        labels: Filters.
-        worlds: Names of the scenarios by key.
+        looks: Looks by label.
+        options: Options of the report.
     """
-    caps = {}
-    for key, model in table.groupby("scenario", observed=True)["model"].first().items():
-        name, facts = worlds.get(str(key)), read_world_facts(str(key), str(model))
-        limit = name.limit if name else None
-        caps[str(key)] = float(limit or (facts.cap if facts else math.nan))
-    return arrange_runs(table, tuple(labels), caps)
+    baseline = select_baselines(looks, options.baseline)[0]
+    fixed = fix_pairs(list(looks), plan_look_pairs(looks), baseline)
+    margin = math.log1p(options.equivalence_margin)
+    return Court(arrange_runs(table, tuple(looks)), fixed, margin, options.alpha)
 
 
 def _count_failures(number: int) -> str:

@@ -7,7 +7,6 @@ would: these are other units, with p-values of their own.
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,14 +16,14 @@ import numpy as np
 
 from pfbench.report.board.entries import round_values
 from pfbench.report.methods_text import is_recorded
-from pfbench.report.options import ReportOptions
 from pfbench.results.conditions import main_component_group
 from pfbench.results.looks import PartName
 from pfbench.results.store import JobResult
 from pfbench.stats.comparison import NO_DECISION, SAME_RUNS, Effect, Verdict, compare, decide
+from pfbench.stats.court import Court
 from pfbench.stats.error_measures import Array, Flags
 from pfbench.stats.sentences import format_count, format_digits
-from pfbench.stats.study_runs import StudyRuns, compare_filters, compute_losses
+from pfbench.stats.study_runs import StudyRuns, compute_losses, locate_groups
 from pfbench.stats.time_blocks import (
     block_losses,
     compare_blocks,
@@ -163,24 +162,19 @@ def _without_drift(error: Array) -> Array:
 
 
 def decide_records(
-    records: Sequence[RecordedCondition],
-    runs: StudyRuns,
-    baselines: Sequence[str],
-    options: ReportOptions,
+    records: Sequence[RecordedCondition], court: Court, baselines: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Decide each filter of recorded conditions against the baseline, by each unit.
 
     Args:
         records: Conditions of `collect_record`.
-        runs: Runs of the study.
+        court: Court that decides the pairs of the study, in runs.
         baselines: Labels of the baselines, the first that a condition has counts.
-        options: Options of the report.
 
     Returns:
         The conditions with a row per filter: verdict, ratio, interval and p-value by unit.
     """
-    losses = compute_losses(runs, "rmse")
-    decided = []
+    runs, decided = court.runs, []
     for record in records:
         labels = [label for label in record["filters"] if label in runs.filters]
         base = next((label for label in baselines if label in labels), labels[0] if labels else "")
@@ -189,7 +183,7 @@ def decide_records(
         mask = ((conditions["scenario"] == record["world"]) & (conditions["regime"] == record["regime"])).to_numpy()  # fmt: skip
         if not mask.any():
             continue
-        verdicts = _decide_units(record, runs.select(mask), losses[:, mask], pairs, options)
+        verdicts = _decide_units(record, court, mask, pairs)
         decided.append({
             **{key: record[key] for key in ("world", "regime", "noise", "added", "simulated", "seconds", "drives", "runs")},
             "baseline": base,
@@ -199,25 +193,18 @@ def decide_records(
 
 
 def _decide_units(
-    record: RecordedCondition,
-    cell: StudyRuns,
-    losses: Array,
-    pairs: Sequence[tuple[str, str]],
-    options: ReportOptions,
+    record: RecordedCondition, court: Court, mask: Flags, pairs: Sequence[tuple[str, str]]
 ) -> dict[str, list[dict[str, Any]]]:
-    """Decide the pairs of one condition by each unit, each a family."""
-    margin, alpha = math.log1p(options.equivalence_margin), options.alpha
-    starts = decide(compare_filters(cell, losses, pairs), margin, alpha)
+    """Decide the pairs of one condition by each unit; the words on starts are those of the study."""
+    cell, levels = court.runs.select(mask), (court.margin, court.alpha)
     units = {
-        "starts": [
-            _to_entry(v._replace(reason=_count_lost(cell, pair)) if v.word == SAME_RUNS else v)
-            for v, pair in zip(starts, pairs, strict=True)
-        ]
-    }  # both at the bound of a lost run are equal, too
-    units["blocks"] = _decide_blocks(record, cell, pairs, (margin, alpha))
+        "starts": [_to_entry(court.find("rmse", mask, *pair)) for pair in pairs],
+        "blocks": _decide_blocks(record, cell, pairs, levels),
+    }
     if record["drives"] > 1:
+        losses = compute_losses(cell, "rmse")
         effects = [_compare_drives(record["recorded"], cell, losses, pair) for pair in pairs]
-        units["drives"] = [_to_entry(v) for v in decide(effects, margin, alpha)]
+        units["drives"] = [_to_entry(v) for v in decide(effects, *levels)]
     return units
 
 
@@ -228,14 +215,9 @@ def _decide_blocks(
     levels: tuple[float, float],
 ) -> list[dict[str, Any]]:
     """Decide the pairs by blocks of time; a lost run is one event, whatever its blocks."""
-    cap = float(cell.caps[0])
-    bound = math.log(cap) if cap > 0.0 else math.inf
 
     def compare_by(kind: str) -> list[Any]:
-        sides = {
-            label: (label, np.minimum(values[kind], bound))
-            for label, values in record["filters"].items()
-        }
+        sides = {label: (label, np.array(v[kind])) for label, v in record["filters"].items()}
         return [compare_blocks(sides[a], sides[b]) for a, b in pairs]
 
     full, steady = compare_by("blocks"), compare_by("steady")
@@ -263,18 +245,13 @@ def _count_lost(cell: StudyRuns, pair: tuple[str, str]) -> str:
 
 
 def _compare_drives(drives: int, cell: StudyRuns, losses: Array, pair: tuple[str, str]) -> Effect:
-    """Compare the mean losses of each drive in the runs that both filters have."""
+    """Compare the log ratios of the drives in the runs that both filters have."""
     i, j = (cell.filters.index(name) for name in pair)
     common: Flags = (cell.present[i] & cell.present[j])[0]
     first, second = losses[i, 0, common], losses[j, 0, common]
-    largest = max(float(x[np.isfinite(x)].max(initial=-np.inf)) for x in (first, second))
     drive = cell.values["run"][i, 0, common].astype(int) % drives
-    numbers = np.unique(drive)
-    sides = [
-        (name, np.array([np.minimum(x, largest)[drive == number].mean() for number in numbers]))
-        for name, x in zip(pair, (first, second), strict=True)
-    ]
-    return compare(sides[0], sides[1], "drive")
+    groups = [(first[drive == number], second[drive == number]) for number in np.unique(drive)]
+    return compare(*locate_groups(pair, groups), "drive")
 
 
 def _to_entry(verdict: Verdict) -> dict[str, Any]:

@@ -39,8 +39,10 @@ from pfbench.results.looks import (
 )
 from pfbench.results.metrics import page_metrics
 from pfbench.results.step_times import StepTimes
-from pfbench.stats.comparison import MIN_RUNS, Verdict, decide
-from pfbench.stats.error_measures import Array, Flags
+from pfbench.stats.comparison import EQUAL_WORDS, MIN_RUNS, NO_DECISION, Verdict, decide
+from pfbench.stats.court import Court
+from pfbench.stats.error_measures import Flags
+from pfbench.stats.sentences import format_with_interval
 from pfbench.stats.study_runs import (
     StudyRuns,
     compare_filters,
@@ -75,7 +77,7 @@ class Selection(NamedTuple):
 
 
 def build_views(
-    runs: StudyRuns,
+    court: Court,
     groups: pd.DataFrame,
     names: StudyNames,
     options: ReportOptions,
@@ -84,18 +86,17 @@ def build_views(
     """Build all views that have runs. The first one opens the page.
 
     Args:
-        runs: Runs of the study.
+        court: Court that decides the pairs of the study.
         groups: Unit and main group by scenario and regime.
         names: Names of the filters, worlds and regimes.
         options: Options of the report.
         times: Times of the filters in rounds by scenario and regime.
     """
-    selections = _list_selections(runs, groups, names, options)
+    selections = _list_selections(court.runs, groups, names, options)
     views: dict[ViewKey, dict[str, Any]] = {}
-    for metric in list_metrics(runs.values, options.metric):
-        losses = compute_losses(runs, metric)
+    for metric in list_metrics(court.runs.values, options.metric):
         for selection in selections:
-            view = _make_view(selection, metric, losses, names, options, times or {})
+            view = _make_view(court, selection, metric, names, times or {})
             name = _name_metric(metric, selection.groups["group"])
             small_print = f"{selection.small_print} {_describe_timing(view)}"
             for baseline in names.baselines:
@@ -103,17 +104,16 @@ def build_views(
                 views[ViewKey(metric, selection.world, selection.regime, baseline)] = {
                     "sentence": describe_view(rows, names.looks, baseline, selection.where, name),
                     "small_print": small_print,
-                    "rows": [round_values(_hide_track(row, view.has_limit)) for row in rows],
+                    "rows": [_round_row(row, view.has_limit) for row in rows],
                 }
     return views
 
 
 def _make_view(
+    court: Court,
     selection: Selection,
     metric: str,
-    losses: Array,
     names: StudyNames,
-    options: ReportOptions,
     times: Mapping[CellKey, Mapping[str, StepTimes]],
 ) -> View:
     """Collect the data of a view."""
@@ -121,16 +121,15 @@ def _make_view(
     is_single = len(groups) == 1 and page_metrics()[metric].is_of_group
     worlds = [names.worlds.get(name) for name in selection.runs.conditions["scenario"].unique()]
     return View(
-        selection.runs, losses[:, selection.mask], metric, groups["unit"].iloc[0] if is_single else "",
-        selection.filters, [times.get(key, {}) for key in groups.index],
-        all(world is None or world.limit is not None for world in worlds),
-        options.alpha, math.log1p(options.equivalence_margin),
+        court, selection.mask, metric, groups["unit"].iloc[0] if is_single else "", selection.filters,
+        [times.get(key, {}) for key in groups.index], all(world is None or world.limit is not None for world in worlds),
     )  # fmt: skip
 
 
-def _hide_track(row: BoardRow, has_limit: bool) -> BoardRow:
-    """Return the values of a row for the page: no track without a divergence threshold."""
-    return row if has_limit else {**row, "track": math.nan}
+def _round_row(row: BoardRow, has_limit: bool) -> BoardRow:
+    """Return the values of a row for the page: no track without a divergence threshold, an open interval as infinity."""
+    rounded: BoardRow = round_values(row if has_limit else {**row, "track": math.nan})
+    return rounded | ({"ratio_high": math.inf} if row["ratio_high"] == math.inf else {})
 
 
 def _list_scopes(conditions: pd.DataFrame) -> Iterator[tuple[str, str, Flags]]:
@@ -151,7 +150,7 @@ def _name_metric(metric: str, groups: pd.Series[str]) -> str:
     return f"{groups.iloc[0]} {entry.page_name}" if is_one else entry.page_name
 
 
-def _select_common(runs: StudyRuns, mask: Flags) -> Flags:
+def select_common(runs: StudyRuns, mask: Flags) -> Flags:
     """Select the conditions of a scope in which its filters are compared; all if none is common."""
     common = select_conditions(runs.present.any(axis=2) & mask)
     return common if common.any() else mask
@@ -172,7 +171,7 @@ def _list_selections(
     """List the scopes, their runs and what is said of them whatever the metric."""
     selections = []
     for world, regime, in_scope in _list_scopes(runs.conditions):
-        mask = _select_common(runs, in_scope)
+        mask = select_common(runs, in_scope)
         selected = runs.select(mask)
         keys = list(selected.conditions[["scenario", "regime"]].itertuples(index=False, name=None))
         described = describe_filters(selected, options.alpha)
@@ -213,7 +212,7 @@ def _describe_timing(view: View) -> str:
     number = str(rounds[0]) if len(rounds) == 1 else f"{rounds[0]} to {rounds[-1]}"
     return (
         f"ms/step: of all runs of a job; median and quartiles of {number} rounds in which the filters took turns. "
-        f"Ratio of the times paired by round, {format_interval_level(view.alpha)} interval."
+        f"Ratio of the times paired by round, {format_interval_level(view.court.alpha)} interval."
     )
 
 
@@ -233,8 +232,9 @@ def _small_print(runs: StudyRuns, options: ReportOptions, names: StudyNames) -> 
     ))  # fmt: skip
     return (
         f"{sample}. Ratios are those of Hodges and Lehmann over paired runs, with simultaneous "
-        f"{format_interval_level(options.alpha)} intervals. Better and worse: Wilcoxon's test and the trimmed mean agree. "
-        f"A lost run counts as the limit of the world, or without one as the largest error of the pair. {' '.join(filter(None, texts))}"
+        f"{format_interval_level(options.alpha)} intervals; without one where more than a fifth of the pairs has a lost run. "
+        f"Better and worse: Wilcoxon's test, the trimmed mean and the sign test agree. "
+        f"A lost run is worse than every kept one. {' '.join(filter(None, texts))}"
     ).rstrip()
 
 
@@ -249,36 +249,50 @@ def _count_runs(runs: StudyRuns) -> str:
 # Pairs that a study compares in advance: each method with its own baselines.
 
 
-def decide_planned(
-    runs: StudyRuns, looks: Mapping[str, MethodLook], options: ReportOptions
-) -> list[Verdict]:
-    """Decide the pairs that were fixed before the results, in one family, over the conditions that both have."""
-    pairs = [pair for pair in plan_look_pairs(looks) if share_conditions(runs, *pair)]
-    effects = compare_filters(runs, compute_losses(runs, options.metric), pairs)
-    return decide(effects, math.log1p(options.equivalence_margin), options.alpha)
-
-
 def planned_entries(
-    planned: Sequence[Verdict],
-    runs: StudyRuns,
+    court: Court,
     looks: Mapping[str, MethodLook],
     worlds: Mapping[str, PartName],
     options: ReportOptions,
 ) -> list[dict[str, Any]]:
     """List the entries of the pairs that were compared in advance, in ratios, with each scenario and a new world."""
+    mask = select_everywhere(court.runs)
+    runs = court.runs.select(mask)
+    pairs = [pair for pair in plan_look_pairs(looks) if share_conditions(runs, *pair)]
+    planned = [court.find(options.metric, mask, *pair) for pair in pairs]
     losses = compute_losses(runs, options.metric)
-    pairs = [(verdict.a, verdict.b) for verdict in planned]
-    margin = math.log1p(options.equivalence_margin)
-    new = decide(compare_filters(runs, losses, pairs, "world"), margin, options.alpha)
+    new = decide(compare_filters(runs, losses, pairs, "world"), court.margin, court.alpha)
     return [
         {
             "a": v.a, "b": v.b, "kind": _find_kind(looks[v.a], looks[v.b]), "word": v.word, "reason": v.reason or None,
             "sentence": describe_planned(v, looks, runs.conditions), **show_ratio(v), "p": round_values(v.p),
-            "cells": _list_cells(runs, losses, (v.a, v.b), worlds, options.alpha),
+            "loses": v.lost.word, "cells": _list_cells(court, options.metric, (v.a, v.b), worlds),
             "new_world": {**show_ratio(w), "word": w.word, "worlds": w.n} if w.n >= MIN_RUNS else None,
         }
         for v, w in zip(planned, new, strict=True)
     ]  # fmt: skip
+
+
+_NO_VERDICT = Verdict("", "", NO_DECISION, math.nan, math.nan, math.nan, math.nan, 0)
+DECISION_COLUMNS = ("world", "family", *_NO_VERDICT.to_row())  #: of the table of all pairs
+
+
+def list_decisions(court: Court, metric: str) -> list[dict[str, Any]]:
+    """List the verdicts on all pairs with their families: over all conditions, and in each of a few scenarios."""
+    scenarios = court.runs.conditions["scenario"]
+    scopes = [(ALL, select_everywhere(court.runs))]
+    if 1 < scenarios.nunique() <= MOST_WORLDS:  # whose page has the order of each world
+        scopes += [(str(name), select_common(court.runs, (scenarios == name).to_numpy())) for name in scenarios.unique()]  # fmt: skip
+    return [
+        {"world": world, "family": family, **verdict.to_row()}
+        for world, mask in scopes
+        for family, verdict in court.list_verdicts(metric, mask)
+    ]
+
+
+def select_everywhere(runs: StudyRuns) -> Flags:
+    """Select the conditions of the view that opens a page, [C]."""
+    return select_common(runs, np.ones(len(runs.conditions), dtype=bool))
 
 
 def describe_planned(
@@ -287,15 +301,16 @@ def describe_planned(
     """Describe the verdict on a pair in a sentence."""
     first, second = (f"[[{looks[label].name}]]" for label in (verdict.a, verdict.b))
     where = f"in {_count_worlds(conditions)}, {count_words(verdict.n, 'paired run')}"
-    size = f"ratio {verdict.ratio:.3g}, {verdict.low:.3g} to {verdict.high:.3g}"
+    size = f"ratio {format_with_interval(*verdict[3:6])}" if verdict.ratio > 0 else verdict.reason
     if verdict.word in ("better", "worse"):
         than = "smaller" if verdict.word == "better" else "larger"
         return f"{first} has a {than} error than {second} in most runs ({size}; {where})."
-    if verdict.word == "equal":
-        return f"{first} and {second} are equal within the margin ({size}; {where})."
+    if verdict.word in EQUAL_WORDS[:2]:
+        kept = verdict.word.removeprefix("equal")
+        return f"{first} and {second} are equal within the margin{kept} ({size}; {where})."
     if verdict.word == "identical":
         return f"{first} and {second} have the same errors ({where})."
-    reason = f"{verdict.reason}; " if verdict.reason else ""
+    reason = f"{verdict.reason}; " if verdict.reason not in ("", size) else ""
     return f"{first} and {second} are not decided ({reason}{size}; {where})."
 
 
@@ -307,25 +322,19 @@ def _find_kind(method: MethodLook, baseline: MethodLook) -> str:
 
 
 def _list_cells(
-    runs: StudyRuns,
-    losses: Array,
-    pair: tuple[str, str],
-    worlds: Mapping[str, PartName],
-    alpha: float,
+    court: Court, metric: str, pair: tuple[str, str], worlds: Mapping[str, PartName]
 ) -> list[dict[str, Any]]:
-    """List the ratio of a pair in each scenario with its own interval; none for one scenario."""
-    scenarios = runs.conditions["scenario"]
+    """List the ratio of a pair in each scenario, of its view; none for one scenario."""
+    scenarios = court.runs.conditions["scenario"]
     if scenarios.nunique() < 2:
         return []
     cells = []
     for scenario in scenarios.unique():
-        mask = (scenarios == scenario).to_numpy()
-        effect = compare_filters(runs.select(mask), losses[:, mask], [pair])[0]
-        if len(effect.differences):
-            ends = dict(zip(_ENDS, map(round_ratio, effect.estimate(alpha)), strict=True))
-            cells.append(
-                {"world": scenario, "regime": "all", "name": worlds[scenario].name, **ends}
-            )
+        mask = select_common(court.runs, (scenarios == scenario).to_numpy())
+        verdict = court.find(metric, mask, *pair)
+        if verdict.n:
+            name = worlds[scenario].name
+            cells.append({"world": scenario, "regime": "all", "name": name, **show_ratio(verdict)})
     return cells
 
 
@@ -346,7 +355,8 @@ def round_ratio(log_ratio: float) -> float | None:
 def show_ratio(verdict: Verdict) -> dict[str, float | None]:
     """Return the ratio of a verdict and its interval."""
     logs = (math.log(v) if v > 0 else -math.inf for v in (verdict.ratio, verdict.low, verdict.high))
-    return dict(zip(_ENDS, map(round_ratio, logs), strict=True))
+    ends = dict(zip(_ENDS, map(round_ratio, logs), strict=True))
+    return ends | ({"high": math.inf} if verdict.high == math.inf and verdict.low > 0 else {})
 
 
 # --------------------------------------------------------------------------------------------------
@@ -356,7 +366,7 @@ MOST_WORLDS = 3  # more worlds have a page of their own, or an average
 
 
 def order_worlds(
-    runs: StudyRuns,
+    court: Court,
     views: Mapping[ViewKey, Mapping[str, Any]],
     looks: Mapping[str, MethodLook],
     options: ReportOptions,
@@ -365,19 +375,17 @@ def order_worlds(
 
     Empty unless the study has two or three worlds, each one scenario, in one noise regime.
     """
-    conditions = runs.conditions
+    conditions = court.runs.conditions
     worlds = list(conditions["scenario"].unique())
     is_few = 1 < len(worlds) <= MOST_WORLDS and conditions["family"].nunique() == len(worlds)
     if not is_few or conditions["regime"].nunique() > 1:
         return []
-    losses, baseline, orders = compute_losses(runs, options.metric), next(iter(views)).baseline, []
+    baseline, orders = next(iter(views)).baseline, []
     for world in worlds:
         view = views[ViewKey(options.metric, world, ALL, baseline)]
         labels = [row["filter"] for row in view["rows"] if row["rank"] is not None]
-        mask = (conditions["scenario"] == world).to_numpy()
-        pairs = [(label, labels[0]) for label in labels[1:]]
-        effects = compare_filters(runs.select(mask), losses[:, mask], pairs)
-        verdicts = decide(effects, math.log1p(options.equivalence_margin), options.alpha)
+        mask = select_common(court.runs, (conditions["scenario"] == world).to_numpy())
+        verdicts = [court.find(options.metric, mask, label, labels[0]) for label in labels[1:]]
         ties = [v.a for v in verdicts if v.word != "worse"]
         is_said = not ties and labels[0] == baseline  # by the sentence of the view
         text = "" if is_said else _describe_ties(labels[0], ties, len(verdicts), looks)

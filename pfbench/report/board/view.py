@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from functools import cache
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 import scipy  # scipy.stats is imported at its first use
 
-from pfbench.report.writers import format_with_interval
 from pfbench.results.looks import MethodLook
 from pfbench.results.step_times import StepTimes, describe_costs
-from pfbench.stats.comparison import MIN_RUNS, Verdict, decide, estimate_mean
+from pfbench.stats.comparison import EQUAL_WORDS, MIN_RUNS, Verdict, estimate_mean
+from pfbench.stats.court import Court
 from pfbench.stats.error_measures import Array, Flags
 from pfbench.stats.rank_tests import holm
-from pfbench.stats.study_runs import StudyRuns, compare_filters, weigh_conditions
+from pfbench.stats.sentences import format_with_interval
+from pfbench.stats.study_runs import StudyRuns, compute_losses, weigh_conditions
 from pfbench.stats.world_table import TRACK_SHARE
 
 BASE, MISSING, LOSES_TRACK = "baseline", "missing", "loses track"
@@ -27,30 +29,32 @@ _MOST_WORDS = 55  # of the sentence of a view
 BoardRow = dict[str, Any]
 
 
-class View(NamedTuple):
+@dataclass(frozen=True)
+class View:
     """Filters in the conditions of a view, whatever the baseline.
 
     Attributes:
-        runs: Runs of the conditions of the view.
-        losses: Losses of all runs, [F, C, N].
+        court: Court that decides the pairs of the study.
+        mask: Conditions of the view, [C].
         metric: Column of the error.
         unit: Unit of the error, empty for several conditions.
         filters: Description of each filter, see `describe_filters`.
         times: Times of the filters in rounds, by label in each condition.
         has_limit: Whether all scenarios state a divergence threshold.
-        alpha: Error rate of a family, and of each interval of a level.
-        margin: Log ratio within which two filters are equal.
     """
 
-    runs: StudyRuns
-    losses: Array
+    court: Court
+    mask: Flags
     metric: str
     unit: str
     filters: Mapping[str, BoardRow]
     times: Sequence[Mapping[str, StepTimes]]
     has_limit: bool
-    alpha: float
-    margin: float
+
+    @cached_property
+    def runs(self) -> StudyRuns:
+        """Runs of the conditions of the view."""
+        return self.court.runs.select(self.mask)
 
 
 def build_rows(view: View, baseline: str) -> list[BoardRow]:
@@ -59,9 +63,9 @@ def build_rows(view: View, baseline: str) -> list[BoardRow]:
     A row has filter, rank, value with its interval (of a single condition), ratio with its simultaneous interval,
     verdict and its words, and the description of the filter. A value that does not exist is NaN.
     """
-    runs = view.runs
+    runs, alpha = view.runs, view.court.alpha
     complete = np.all(runs.present.any(axis=2), axis=1)
-    verdicts = decide_against(view, baseline, complete)
+    verdicts = find_against(view, baseline, complete)
     values = summarise_levels(view)
     level = np.where(complete, values[0], np.nan)
     track = np.array([view.filters[label]["track"] for label in runs.filters])
@@ -69,7 +73,7 @@ def build_rows(view: View, baseline: str) -> list[BoardRow]:
     rows = []
     for i in order:
         label = runs.filters[i]
-        costs = describe_costs(view.times, label, baseline, view.alpha)
+        costs = describe_costs(view.times, label, baseline, alpha)
         rows.append({
             "filter": label,
             "rank": int((level < level[i] - _SAME_LEVEL).sum()) + 1 if complete[i] else None,
@@ -81,22 +85,21 @@ def build_rows(view: View, baseline: str) -> list[BoardRow]:
     return rows
 
 
-def decide_against(view: View, baseline: str, complete: Flags) -> dict[str, Verdict | None]:
-    """Decide all filters of a view against a baseline, in one family; None for the baseline."""
+def find_against(view: View, baseline: str, complete: Flags) -> dict[str, Verdict | None]:
+    """Find the verdicts on all filters of a view against a baseline; None for the baseline."""
     labels = [name for name, is_there in zip(view.runs.filters, complete, strict=True) if is_there]
     others = [name for name in labels if name != baseline and baseline in labels]
-    effects = compare_filters(view.runs, view.losses, [(name, baseline) for name in others])
-    decided = decide(effects, view.margin, view.alpha)
-    return {baseline: None, **dict(zip(others, decided, strict=True))}
+    found = {name: view.court.find(view.metric, view.mask, name, baseline) for name in others}
+    return {baseline: None, **found}
 
 
 def summarise_levels(view: View) -> Array:
     """Summarise the losses of each filter: mean over conditions of the medians over runs, and an interval.
 
     Returns level and, for a single condition, the ends of the interval of its median, [3, F]. A level is infinite
-    where half of the runs are lost and no cap is known.
+    where half of the runs are lost.
     """
-    losses = view.losses
+    losses = compute_losses(view.runs, view.metric)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # filters without runs
         medians = np.nanmedian(losses, axis=2)
@@ -105,7 +108,7 @@ def summarise_levels(view: View) -> Array:
     ends = np.full((2, len(level)), np.nan)
     if losses.shape[1] == 1:
         for i, row in enumerate(losses[:, 0]):
-            ends[:, i] = _interval_of_median(row[~np.isnan(row)], view.alpha)
+            ends[:, i] = _interval_of_median(row[~np.isnan(row)], view.court.alpha)
     return np.stack([level, *ends])
 
 
@@ -134,7 +137,7 @@ def _show_level(view: View, level: Array) -> BoardRow:
 
 def _show_verdict(view: View, label: str, verdicts: Mapping[str, Verdict | None]) -> BoardRow:
     """Return ratio, interval, verdict and words of a row."""
-    ends = dict.fromkeys(("ratio", "ratio_low", "ratio_high", "p"), math.nan)
+    ends = {**dict.fromkeys(("ratio", "ratio_low", "ratio_high", "p"), math.nan), "loses": ""}
     if label not in verdicts:
         return {**ends, "verdict": MISSING, "words": "not run in all conditions"}
     verdict, lost = verdicts[label], view.filters[label]["lost_conditions"]
@@ -145,14 +148,18 @@ def _show_verdict(view: View, label: str, verdicts: Mapping[str, Verdict | None]
             "verdict": BASE,
             "words": ", ".join(filter(None, (BASE, _word_lost(view, label)))),
         }
-    ends = {"ratio": verdict.ratio, "ratio_low": verdict.low, "ratio_high": verdict.high, "p": verdict.p}  # fmt: skip
+    ends = {
+        "ratio": verdict.ratio, "ratio_low": verdict.low, "ratio_high": verdict.high, "p": verdict.p,
+        "loses": verdict.lost.word,
+    }  # fmt: skip
+    more = f"{verdict.lost.word} runs" if verdict.lost.word else ""
     if lost and len(view.runs.conditions) == 1:
         return {**ends, "verdict": LOSES_TRACK, "words": _word_lost(view, label)}
-    words = f"equal within {100 * math.expm1(view.margin):.3g} %" if verdict.word == "equal" else ""
-    words = ", ".join(
-        filter(None, (words or verdict.word, verdict.reason, _word_lost(view, label)))
+    words = f" within {100 * math.expm1(view.court.margin):.3g} %" * (
+        verdict.word in EQUAL_WORDS[:2]
     )
-    return {**ends, "verdict": verdict.word, "words": words}
+    texts = (f"{verdict.word}{words}", more, verdict.reason, _word_lost(view, label))
+    return {**ends, "verdict": verdict.word, "words": ", ".join(filter(None, texts))}
 
 
 def _word_lost(view: View, label: str) -> str:
@@ -240,9 +247,9 @@ def describe_view(
             else f" of {value['value']:.3g} {value['unit']}".rstrip()
         )
         return f"{base} has a median {metric}{number} {where}; no other filter is compared with it."
-    better = sorted((r for r in others if r["verdict"] == "better"), key=lambda r: r["ratio"])
+    better = [row for row in others if row["verdict"] == "better"]  # in the order of the table
     counts = [
-        (sum(r["verdict"] in ("equal", "identical") for r in others), "equal to it"),
+        (sum(r["verdict"] in EQUAL_WORDS for r in others), "equal to it"),
         (sum(r["verdict"] == "not decided" for r in others), "not decided"),
         (sum(r["verdict"] == "worse" for r in others), "worse"),
         (sum(r["verdict"] == LOSES_TRACK for r in others), "without track"),
@@ -254,7 +261,9 @@ def describe_view(
     head += f" {'is' if len(better) < 2 else 'are'} better than {base} {where}"
     if better:
         first = better[0]
-        head += f" (best: [[{looks[first['filter']].name}]], {format_with_interval(first['ratio'], first['ratio_low'], first['ratio_high'])} of its {metric})"
+        size = _word_ratio(first)
+        text = f", {size} of its {metric}" if size else ""
+        head += f" (first in the table: [[{looks[first['filter']].name}]]{text})"
     head = f"{head}; {rest}." if rest else f"{head}."
     texts = [f"{head} {text}".rstrip() for text in _describe_proposed(others, better, looks)]
     return next((text for text in texts if len(text.split()) <= _MOST_WORDS), head)
@@ -263,19 +272,21 @@ def describe_view(
 def _describe_proposed(
     others: Sequence[BoardRow], better: Sequence[BoardRow], looks: Mapping[str, MethodLook]
 ) -> list[str]:
-    """State the proposed method of the smallest ratio, with its interval and without; empty if it is the best filter."""
+    """State the first proposed method of the table, with its interval and without; empty if the sentence names it."""
     proposed = [row for row in others if looks[row["filter"]].proposed]
     if not proposed or (better and looks[better[0]["filter"]].proposed):
         return [""]
-    row = min(proposed, key=lambda r: (r["verdict"] == LOSES_TRACK, r["ratio"]))
-    head = f"Best proposed method: [[{looks[row['filter']].name}]]"
-    return [
-        f"{head}, {ratio}, {row['verdict']}."
-        for ratio in (
-            format_with_interval(row["ratio"], row["ratio_low"], row["ratio_high"]),
-            f"{row['ratio']:.2f}",
-        )
-    ]
+    row = next((r for r in proposed if r["verdict"] != LOSES_TRACK), proposed[0])
+    head = f"First proposed method: [[{looks[row['filter']].name}]]"
+    sizes = dict.fromkeys((_word_ratio(row), _word_ratio(row).partition(" ")[0]))
+    return [", ".join(filter(None, (head, size, row["verdict"]))) + "." for size in sizes]
+
+
+def _word_ratio(row: BoardRow) -> str:
+    """Format the ratio of a row with its interval; empty where lost runs leave none."""
+    if math.isnan(row["ratio"]):
+        return ""
+    return format_with_interval(row["ratio"], row["ratio_low"], row["ratio_high"])
 
 
 def count_words(number: int, noun: str) -> str:

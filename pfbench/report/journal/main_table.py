@@ -324,7 +324,7 @@ def _describe_lost(pack: Pack, cells: Sequence[tuple[str, str]]) -> str:
         return rf" Lost runs of {len(lost)} filters: Table~\ref{{tab:cost}}."
     names = {str(look["key"]): str(look["name"]) for look in pack["filters"]}
     listed = ", ".join(f"{escape_latex(names[key])} {number}" for key, number in lost.items())
-    return f" Lost runs, counted as errors at the limit of the world: {listed}."
+    return f" Lost runs, which are worse than all others: {listed}."
 
 
 # --------------------------------------------------------------------------------------------------

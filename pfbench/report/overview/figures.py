@@ -19,6 +19,7 @@ from matplotlib.patches import Rectangle
 
 from pfbench.report.overview.tables import Overview, WorldRow
 from pfbench.results.plotting import RC, line_styles, set_plain_ticks
+from pfbench.stats.comparison import EQUAL_WORDS
 from pfbench.stats.world_table import WorldResult, count_wins
 
 BLUE, ORANGE, GREY, INK = "#2166ac", "#c4561a", "#d4d4d4", "#1b1b1b"
@@ -197,7 +198,7 @@ def dose_points(
         points += [
             DosePoint(x, cell.verdict.ratio, cell.verdict.low, cell.verdict.high)
             for cell in overview.cells
-            if (cell.world, cell.filter) == (world.key, label)
+            if (cell.world, cell.filter) == (world.key, label) and cell.verdict.ratio > 0
         ]
     return points
 
@@ -298,13 +299,18 @@ def describe_cell(
     if cell.loses_track:
         return CellLook(f"{100 * cell.track_share:.0f} %", is_grey=True)
     word, ratio = cell.verdict.word, cell.verdict.ratio
-    if word in ("equal", "identical"):
+    if word in EQUAL_WORDS:
         return CellLook("=")
     star = any(w.wins for w in overview.winners if (w.world, w.filter) == (world.key, label))
-    text = f"{format_ratio(ratio)}{'☆' if star else ''}"
+    has_ratio = (
+        ratio > 0
+    )  # else too many runs are lost, and the share that keeps track stands for it
+    size = format_ratio(ratio) if has_ratio else f"{100 * cell.track_share:.0f} %"
+    text = f"{size}{'☆' if star else ''}"
     if word == "not decided":
         return CellLook(text)
-    return CellLook(text, math.log(ratio), is_strong=word == "better")
+    value = math.log(ratio) if has_ratio else _SCALE * (1 if word == "worse" else -1)
+    return CellLook(text, value, is_strong=word == "better")
 
 
 def format_ratio(value: float) -> str:

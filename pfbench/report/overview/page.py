@@ -26,11 +26,12 @@ from pfbench.report.overview.tables import (
 )
 from pfbench.report.papers.figures import list_paper_pages
 from pfbench.report.study_page.page_writer import describe_page_knobs
-from pfbench.report.writers import format_csv, format_with_interval, template_environment
+from pfbench.report.writers import format_csv, template_environment
 from pfbench.results.conditions import parse_label
 from pfbench.results.looks import find_looks
 from pfbench.results.paper_block import read_paper_block
-from pfbench.stats.comparison import TRIM_SHARE
+from pfbench.stats.comparison import EQUAL_WORDS, TRIM_SHARE, Verdict
+from pfbench.stats.sentences import format_with_interval
 from pfbench.stats.world_table import WorldResult
 
 BOARD_PAGE = "worlds.html"  # the page of each world, which is the first page of other studies
@@ -180,7 +181,7 @@ def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> 
     better_than_each = f" (in {single} than all single ones)" if single else ""
     counts = [
         f"better in {words.count('better')} of {len(cells)} cells{better_than_each}",
-        f"equal in {words.count('equal') + words.count('identical')}",
+        f"equal in {sum(word in EQUAL_WORDS for word in words)}",
         f"not decided in {words.count('not decided')}",
         f"worse in {words.count('worse')}",
     ]
@@ -203,7 +204,7 @@ def describe_setting(overview: Overview, level: TabKey = 0) -> str:
     counts = f"{runs[0]}" if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
     return (
         f"{len(overview.worlds)} worlds, {counts} paired runs each{f', {level} particles' if level else ''}{_name_numbers(overview)}.{_name_absent(overview)} "
-        f"{_describe_reference(overview)} A run that loses track, or has an error above the limit of its world, counts as that limit."
+        f"{_describe_reference(overview)} A run that loses track is worse than every other one."
     )
 
 
@@ -229,7 +230,7 @@ def _name_absent(overview: Overview) -> str:
 def _describe_reference(overview: Overview) -> str:
     """Say how the best Kalman filter was chosen, and where it is not the best in these runs."""
     better = [
-        f"{overview.names[world.outdone.b]} in {world.name} (the chosen one has {world.outdone.ratio:.2f} times its error)"
+        f"{overview.names[world.outdone.b]} in {world.name} ({_size_outdone(world.outdone)})"
         for world in overview.worlds
         if world.outdone
     ]
@@ -242,6 +243,13 @@ def _describe_reference(overview: Overview) -> str:
     if better:
         text += f" In these runs another one is better: {', '.join(better)}."
     return text
+
+
+def _size_outdone(verdict: Verdict) -> str:
+    """Say how much worse the chosen filter is."""
+    if verdict.ratio > 0:
+        return f"the chosen one has {verdict.ratio:.2f} times its error"
+    return verdict.reason
 
 
 def _count_plain_losses(overview: Overview) -> str:
@@ -302,14 +310,10 @@ def list_ratios(overview: Overview) -> list[tuple[WorldRow, list[str]]]:
         texts = []
         for label in (*overview.methods, *overview.conventional):
             cell = cells.get((world.key, label))
-            text = (
-                "–"
-                if cell is None
-                else format_with_interval(cell.verdict.ratio, cell.verdict.low, cell.verdict.high)
-            )
-            share = (
-                f"; {100 * cell.track_share:.0f} % keep track" if cell and cell.loses_track else ""
-            )
+            has_ratio = cell is not None and cell.verdict.ratio > 0
+            text = format_with_interval(*cell.verdict[3:6]) if cell and has_ratio else "–"
+            is_lost = cell is not None and (cell.loses_track or not has_ratio)
+            share = f"; {100 * cell.track_share:.0f} % keep track" if cell and is_lost else ""
             texts.append(text + share)
         rows.append((world, texts))
     return rows
@@ -377,7 +381,7 @@ def list_verdicts(overview: Overview) -> pd.DataFrame:
     rows: list[dict[str, Any]] = []
     for cell in overview.cells:
         winner = winners.get((cell.world, cell.filter))
-        verdict = {k: v for k, v in cell.verdict._asdict().items() if k not in ("a", "b")}
+        verdict = {k: v for k, v in cell.verdict.to_row().items() if k not in ("a", "b")}
         rows.append({
             "world": cell.world, "filter": cell.filter, "reference": references[cell.world], "limit": limits[cell.world], **verdict,
             "track_share": cell.track_share, "loses_track": cell.loses_track,
@@ -389,7 +393,7 @@ def list_verdicts(overview: Overview) -> pd.DataFrame:
 
 def list_comparisons(overview: Overview) -> pd.DataFrame:
     """List all pairs of methods in each world."""
-    return pd.DataFrame([{"world": p.world, **p.verdict._asdict()} for p in overview.pairs])
+    return pd.DataFrame([{"world": p.world, **p.verdict.to_row()} for p in overview.pairs])
 
 
 def _summary(label: str) -> str:

@@ -21,7 +21,7 @@ from pfbench.results.conditions import parse_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.results.paper_block import conf_dir, read_paper_block
 from pfbench.results.store import SAME_TIME
-from pfbench.stats.comparison import Verdict
+from pfbench.stats.comparison import EQUAL_WORDS, Verdict
 from pfbench.stats.world_table import (
     MeanRanks,
     Winner,
@@ -43,7 +43,7 @@ CONVENTIONAL = (SIR, "rpf", "rpf_tuned", "ekf_bank")  # that stand next to the m
 TabKey = int | str  # a number of particles, 0 for a study of one number, or one of the two below
 EQUAL_TIME, PRINTED = "equal time", "as printed"
 _TUNING_BYTES = 1_000_000
-_WORDS = ("better", "worse", "equal", "identical", "not decided")
+_WORDS = ("better", "worse", *EQUAL_WORDS, "not decided")
 _FAMILIES = ("particle", "guided", "swarm", "gaussian", "learned", "kalman", "")
 
 
@@ -54,12 +54,12 @@ class WorldRow(NamedTuple):
         key: Name of the scenario, with its model if the study has several.
         name: Name for a reader.
         reference: Name of the conventional filter that is best on the seed of the tuning.
-        level: Error of the reference, geometric mean over runs with lost runs at the cap.
+        level: Error of the reference, median over runs; infinite if it loses half of them.
         unit: Unit of the error.
         runs: Number of runs.
         kalman_fits: Whether Kalman filters fit the world; None without a tuning.
         words: What the world is, in a line.
-        limit: Largest error that counts.
+        limit: Error above which a run has lost the track; NaN without one.
         outdone: Verdict on the reference against the best other single Kalman filter, if that is better in these runs.
         notes: What must be known before a number of the world is quoted.
         plain_losses: Methods that are worse than the reference and than the UKF, which is not tuned; None without a UKF.
@@ -117,13 +117,11 @@ class WorldFacts(NamedTuple):
     Attributes:
         reference: Best conventional filter.
         kalman_fits: Whether Kalman filters fit the world; None if it is not known.
-        cap: Largest error that counts; NaN if it is not stated.
         has_part: Whether the tuning had settings of the scenario of its own, such as a part of a recording.
     """
 
     reference: str
     kalman_fits: bool | None
-    cap: float
     has_part: bool = False
 
 
@@ -140,11 +138,9 @@ def read_world_facts(scenario: str, model: str) -> WorldFacts | None:
             if (world.get("scenario"), world.get("model")) != (scenario, model):
                 continue
             if content.get("best"):
-                cap = float((content.get("fit") or {}).get("cap", math.nan))
                 facts = WorldFacts(
                     str(content["best"]),
                     content.get("kalman_fits"),
-                    cap,
                     bool(world.get("settings")),
                 )
                 candidates.append((world.get("regimes") != [CENTRAL], facts))
@@ -203,7 +199,7 @@ def build_overview(
     for key, group in table.groupby("scenario", observed=True, sort=False):
         try:
             facts = _read_facts(central_rows(group), parts[str(key)])
-            world = _build_world(central_rows(group), parts[str(key)], facts, by_name)
+            world = _build_world(central_rows(group), facts, by_name)
         except ValueError as error:
             left_out[parts[str(key)].name] = str(error)
             continue
@@ -258,7 +254,9 @@ def _find_outdone(worlds: Sequence[World], single: Sequence[str]) -> dict[str, V
         for world, some in zip(worlds, verdicts, strict=True)
     }
     return {
-        name: max(some, key=lambda verdict: verdict.ratio) for name, some in worse.items() if some
+        name: max(some, key=lambda v: v.ratio if v.ratio > 0 else math.inf)
+        for name, some in worse.items()
+        if some
     }
 
 
@@ -399,22 +397,17 @@ def _read_facts(rows: pd.DataFrame, name: PartName) -> WorldFacts:
     return facts
 
 
-def _build_world(
-    rows: pd.DataFrame, name: PartName, facts: WorldFacts, labels: Mapping[str, str]
-) -> World:
-    """Build a world with the reference and the cap that its tuning states."""
-    cap = name.limit if name.limit else facts.cap
-    return build_world(
-        rows, labels.get(facts.reference, facts.reference), float(cap), facts.kalman_fits
-    )
+def _build_world(rows: pd.DataFrame, facts: WorldFacts, labels: Mapping[str, str]) -> World:
+    """Build a world with the reference that its tuning states."""
+    return build_world(rows, labels.get(facts.reference, facts.reference), facts.kalman_fits)
 
 
 def _describe_world(world: World, name: PartName, looks: Mapping[str, MethodLook]) -> WorldRow:
     """Return the row of a world."""
     losses = world.losses[world.reference]
     return WorldRow(
-        world.name, name.name, looks[world.reference].name, float(np.exp(losses.mean())), name.unit,
-        len(losses), world.kalman_fits, name.words, world.cap,
+        world.name, name.name, looks[world.reference].name, float(np.exp(losses.median())), name.unit,
+        len(losses), world.kalman_fits, name.words, math.nan if name.limit is None else name.limit,
     )  # fmt: skip
 
 
@@ -434,7 +427,7 @@ def tell_story(overview: Overview, method: str, summary: str) -> dict[str, str]:
     names = {world.key: world.name for world in overview.worlds}
     over_all = {w.world for w in overview.kalman_winners if w.wins and w.filter == method}
     by_word: dict[str, list[WorldResult]] = {word: [] for word in (*_WORDS, "lost")}
-    for cell in sorted(cells, key=lambda c: abs(math.log(c.verdict.ratio)), reverse=True):
+    for cell in sorted(cells, key=_distance, reverse=True):
         by_word["lost" if cell.loses_track else cell.verdict.word].append(cell)
 
     def join(*words: str, dagger: Collection[str] = ()) -> str:
@@ -442,7 +435,7 @@ def tell_story(overview: Overview, method: str, summary: str) -> dict[str, str]:
         return "; ".join(
             names[cell.world]
             + (
-                f" ({cell.verdict.ratio:.2f}{'†' if cell.world in dagger else ''})"
+                f" ({_size(cell)}{'†' if cell.world in dagger else ''})"
                 * (word in ("better", "worse"))
             )
             for word in words
@@ -454,11 +447,23 @@ def tell_story(overview: Overview, method: str, summary: str) -> dict[str, str]:
         "name": overview.names[method],
         "is": summary,
         "wins": join("better", dagger=names.keys() - over_all) or "None shown.",
-        "equal": join("equal", "identical") or "–",
+        "equal": join(*EQUAL_WORDS) or "–",
         "open": join("not decided") or "–",
         "loses": ". ".join(filter(None, losses)) or "None shown.",
         "time": format_times(overview, method),
     }
+
+
+def _distance(cell: WorldResult) -> float:
+    """Return the distance of a ratio from 1; infinite where lost runs leave none."""
+    return abs(math.log(cell.verdict.ratio)) if cell.verdict.ratio > 0 else math.inf
+
+
+def _size(cell: WorldResult) -> str:
+    """Format the ratio of a cell; the share of runs that keep track where lost runs leave none."""
+    if cell.verdict.ratio > 0:
+        return f"{cell.verdict.ratio:.2f}"
+    return f"{100 * cell.track_share:.0f} % keep track"
 
 
 def list_rivals(overview: Overview) -> list[tuple[str, str, str, str]]:

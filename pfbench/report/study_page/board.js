@@ -1,5 +1,5 @@
 // Sentence, switches and leaderboard.
-const signs = { better: "▲", equal: "≈", identical: "≈", "not decided": "?", worse: "▼", "loses track": "✕", missing: "–" };
+const signs = { better: "▲", equal: "≈", "equal in kept runs": "≈", identical: "≈", "not decided": "?", worse: "▼", "loses track": "✕", missing: "–" };
 const few = new Set(["rank", "filter", "ratio", "verdict", "track"]); // columns of a telephone
 const numeric = new Set(["rank", "ratio", "track", "ms"]);
 
@@ -86,7 +86,7 @@ const valueText = (row) =>
   row.value === null ? "–" : `${short(row.value)} ${row.unit || ""} ${interval(row.low, row.high)}`;
 
 function ratioBars(rows) {
-  const ends = rows.flatMap((row) => [row.ratio, row.ratio_low, row.ratio_high]).filter((v) => v > 0);
+  const ends = rows.flatMap((row) => [row.ratio, row.ratio_low, row.ratio_high]).filter((v) => v > 0 && v < Infinity);
   const low = Math.max(Math.min(0.9, ...ends), 0.05) / 1.05;
   const high = Math.min(Math.max(1.1, ...ends), 20) * 1.05;
   const x = logarithmic(low, high, 6, 112);
@@ -189,7 +189,7 @@ function drawBoard() {
         `<th scope="row"${look.proposed ? ' class="proposed"' : ""}><button type="button" class="name" data-row="${esc(row.filter)}" aria-expanded="${open}" title="${esc(look.long || look.name)}">${icon(look)}${esc(look.name)}</button></th>` +
         `<td class="desk">${several ? strip(row.filter) : esc(valueText(row))}</td>` +
         `<td class="number"><b>${short(row.ratio)}</b> <span class="interval faint">${interval(row.ratio_low, row.ratio_high)}</span></td>` +
-        `<td class="desk scale">${drawBar(row)}</td><td class="verdict ${row.verdict.replace(" ", "_")}">${signs[row.verdict] || ""} ${esc(row.words)}</td>` +
+        `<td class="desk scale">${drawBar(row)}</td><td class="verdict ${row.verdict.replaceAll(" ", "_")}">${signs[row.verdict] || ""} ${esc(row.words)}</td>` +
         `<td class="number">${percent(row.track)}</td><td class="desk">${percent(row.coverage)}${row.calibration ? ", " : ""}<span class="not_decided">${esc(row.calibration || "")}</span></td>` +
         `<td class="number desk"${row.cost > 0 ? ` title="ratio ${short(row.cost)} ${interval(row.cost_low, row.cost_high)}"` : ""}>${short(row.ms)}${row.ms_low > 0 ? ` <span class="interval faint">${quartiles(row)}</span>` : ""}</td></tr>${open ? details(row, columns.length) : ""}`
       );

@@ -15,7 +15,7 @@ function drawCost(part) {
   const axis = wrap(`error ÷ ${looks[state.baseline].name} (log) → worse`, height - 40, 11);
   const [left, right, top, bottom] = [34 + 12 * axis.length, 10, 14, 40];
   const ratios = rows.map((row) => row.ratio).sort((a, b) => a - b);
-  const ends = rows.flatMap((row) => [row.ratio, row.ratio_low, row.ratio_high]).filter((v) => v > 0);
+  const ends = rows.flatMap((row) => [row.ratio, row.ratio_low, row.ratio_high]).filter((v) => v > 0 && v < Infinity);
   const usual = ratios[Math.floor(0.9 * (ratios.length - 1))];
   const high = Math.max(1, Math.min(Math.max(...ends), Math.max(2.6, 1.6 * usual))) * 1.06;
   const low = Math.min(1, Math.max(Math.min(...ends), 0.5 * ratios[0])) / 1.06;

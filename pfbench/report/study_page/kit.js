@@ -10,6 +10,7 @@ const plain = (text) => String(text).replace(/\[\[|\]\]/g, "");
 // Numbers with significant digits, as page_writer.py writes them.
 function short(value, digits = 3) {
   if (value === null || value === undefined) return "–";
+  if (value === Infinity) return "∞"; // the end of an interval that lost runs leave open
   const rounded = Number(value.toPrecision(digits));
   if (rounded === 0) return "0";
   const exponent = Math.floor(Math.log10(Math.abs(rounded)) + 1e-12);

@@ -34,6 +34,7 @@ _OPTIONAL = (
 _STATIC = (
     *_OPTIONAL,
     "facts",
+    "decisions",
     "methods",
     "bibtex",
     "provenance",
@@ -143,7 +144,7 @@ def _group_files(downloads: Sequence[Mapping[str, Any]]) -> list[tuple[str, list
 # Sentence, table and decisions of a page before its script runs.
 
 SIGNS = {
-    "better": "▲", "equal": "≈", "identical": "≈", "not decided": "?", "worse": "▼", "loses track": "✕",
+    "better": "▲", "equal": "≈", "equal in kept runs": "≈", "identical": "≈", "not decided": "?", "worse": "▼", "loses track": "✕",
     "missing": "–", "baseline": "",
 }  # fmt: skip
 _DASH = "–"
@@ -154,6 +155,8 @@ def format_short(value: float | None, digits: int = 3) -> str:
     """Format a number with significant digits, as the script of the page does."""
     if value is None:
         return _DASH
+    if value == math.inf:
+        return "∞"
     rounded = Context(prec=digits, rounding=ROUND_HALF_UP).create_decimal(Decimal(value))
     if rounded == 0:
         return "0"
@@ -383,6 +386,7 @@ def encode_pack(pack: Mapping[str, Any], limit: int) -> str:
         **pack,
         "opening": list(next(iter(pack["views"]))),
         "views": _encode_views(pack["views"]),
+        "planned": _encode(pack["planned"]),
         "curves": _nest(pack["curves"]),
         "calibration": _nest(pack["calibration"]),
         "runs": _nest(pack["runs"]),
@@ -410,8 +414,17 @@ def _encode_views(views: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
         "keys": [list(key) for key in views],
         "columns": columns,
         "texts": [{k: v for k, v in view.items() if k != "rows"} for view in views.values()],
-        "rows": [[[row.get(name) for name in columns] for row in view["rows"]] for view in views.values()],
+        "rows": [[_encode([row.get(name) for name in columns]) for row in view["rows"]] for view in views.values()],
     }  # fmt: skip
+
+
+def _encode(value: Any) -> Any:
+    """Return a value for JSON, which has no infinity; the script of the page turns it back."""
+    if isinstance(value, Mapping):
+        return {key: _encode(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_encode(item) for item in value]
+    return "∞" if value == math.inf else value
 
 
 def _nest(values: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:

@@ -1,5 +1,5 @@
 // Planned comparisons as a forest, and curves over a parameter.
-const verdictStyle = (word) => ({ better: "good", worse: "bad", equal: "good", identical: "good" })[word] || "open";
+const verdictStyle = (word) => ({ better: "good", worse: "bad", equal: "good", identical: "good" })[word.split(" ")[0]] || "open";
 
 function drawForest(part) {
   const kinds = ["paper", "tuned", ""];
@@ -10,7 +10,7 @@ function drawForest(part) {
 }
 
 function forest(part, pairs) {
-  const shown = (v) => v > 0;
+  const shown = (v) => v > 0 && v < Infinity;
   const width = widthOf(part);
   const narrow = width < 800;
   const wordsOf = (pair) => {

@@ -24,7 +24,8 @@ async function unpack() {
   const packed = atob(find("#data").textContent.trim());
   const bytes = Uint8Array.from(packed, (sign) => sign.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
-  data = JSON.parse(await new Response(stream).text());
+  const open = (_, value) => (value === "∞" ? Infinity : value); // JSON has no infinity
+  data = JSON.parse(await new Response(stream).text(), open);
   data.filters.forEach((look, index) => (look.index = index));
   looks = Object.fromEntries(data.filters.map((look) => [look.key, look]));
   viewKeys = data.views.keys;
