@@ -306,7 +306,7 @@ def main() -> None:
         f"and ends; {' or '.join(map(str, rounds))} interleaved rounds after a pass that filled the caches; CPU time of the process. "
         "Ratios are taken round by round, against the fastest form of a library. Other processes may share the machine: times compare "
         "within a study. The default settings of pfbench are float64; "
-        f"`{STORED.label}`: the store has their compiled step, from such a build in the background or from one run with "
+        f"`{STORED.label}`: the store has their compiled step, from one run with "
         "`engine=compiled`; an empty one does not, and kernels are taken. "
         "`particles float32` and JAX compute in float32, `particles` in float64. The log evidence of W4 is minus the exact one. "
         "Written by `benchmarks/campaigns.py` from campaigns.json.", "", least, *lines, "",

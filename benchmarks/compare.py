@@ -336,8 +336,8 @@ def main() -> None:
     page = [
         "# pfbench and its peers", "",
         *summary(found), "", *missing, "",
-        f"`{DEFAULT.label}`: float64 and `engine=auto`, which takes kernels until a build in the background repays itself. `{STORED.label}`: the same "
-        "job once the store has its compiled step, from such a build or from one run with `engine=compiled`. Its s until warm contain that compilation.", "",
+        f"`{DEFAULT.label}`: float64 and `engine=auto`, which takes kernels where no step is stored. `{STORED.label}`: the same "
+        "job once one run with `engine=compiled` has stored its step. Its s until warm contain that compilation.", "",
         f"One thread each, one process at a time, {' or '.join(map(str, sorted(rounds)))} interleaved rounds after a warm-up; "
         "CPU time of the process; systematic resampling at every step. Every contestant delivers mean, variance and effective "
         "sample size at every step and, where it has one, the log evidence (of W4 and W5: minus the exact one). Ratios are taken "

@@ -10,9 +10,6 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # torch's compiler starts processes for kernels of a GPU, tries each set of vector instructions of the processor, and compiles
 # all headers in advance, which takes longer than the few kernels of the tests save.
 os.environ |= {"TORCHINDUCTOR_COMPILE_THREADS": "1", "TORCHINDUCTOR_VEC_ISA_OK": "1"}
-os.environ["PFBENCH_BACKGROUND_BUILDS"] = (
-    "0"  # a build would outlive its test, in the cache of the user
-)
 os.environ["TORCHINDUCTOR_CPP_CACHE_PRECOMPILE_HEADERS"] = "0"
 
 import checkout  # noqa: E402

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -192,3 +193,19 @@ def _track(time: np.ndarray, runs: int) -> np.ndarray:
     east, north = 400 * np.sin(time / 25), 12 * time
     up = 50 + 40 * (1 - np.cos(time / 40))
     return np.broadcast_to(np.stack([east, north, up], axis=-1), (runs, time.size, 3))
+
+
+def list_results(folder: str | Path) -> Iterator[store.JobResult]:
+    """Read all finished jobs of a folder, sorted by scenario, noise, label, seed and key.
+
+    Arrays are read one job at a time.
+    """
+    paths = sorted(Path(folder).glob("*.npz"), key=_rank)
+    return map(store.read_result, paths)
+
+
+def _rank(path: Path) -> tuple[str, str, str, int, str]:
+    meta = store.read_metadata(path)
+    choices = meta["choices"]
+    names = str(choices["scenario"]), str(choices["noise"]), str(meta["label"])
+    return *names, int(meta["seed"]), str(meta["key"])

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from ceiling import STORE, largest_limit, root_mean
 from recorded_wins import KALMAN, KINDS, Condition, recorded_table
+from scipy import stats
 from second_seed import (
     compare_better,
     compare_rankings,
@@ -36,7 +37,6 @@ from pfbench.results import (
     compare_filters,
     compute_losses,
     decide,
-    order_statistic_interval,
 )
 
 TOP = Path(__file__).parents[2]
@@ -68,6 +68,25 @@ class Study(NamedTuple):
         order = list(self.facts.regimes)
         selected = [row for row in records if world in ("", row["world"])]
         return sorted(selected, key=lambda row: order.index(row["regime"]))
+
+
+def order_statistic_interval(d: np.ndarray, level: float) -> tuple[float, float]:
+    """Compute the interval of a median between two order statistics, exact for any distribution.
+
+    Args:
+        d: Sample, [n].
+        level: Least coverage.
+
+    Returns:
+        Its ends, infinite if n is too small.
+    """
+    ordered, n = np.sort(d), d.size
+    k = int(stats.binom.ppf((1 - level) / 2, n, 0.5)) if n else -1
+    if n and stats.binom.cdf(k, n, 0.5) > (1 - level) / 2:
+        k -= 1
+    if k < 0:
+        return -np.inf, np.inf
+    return float(ordered[k]), float(ordered[n - 1 - k])
 
 
 @cache
@@ -107,10 +126,10 @@ def format_median(errors: np.ndarray) -> str:
         errors: Error of each run, NaN for a lost run, [R].
     """
     values = np.where(np.isnan(errors), np.inf, errors)
-    interval = order_statistic_interval(values, LEVEL)
+    low, high = order_statistic_interval(values, LEVEL)
     ordered = np.sort(values)
     median = (ordered[(values.size - 1) // 2] + ordered[values.size // 2]) / 2
-    return f"{_digits(median)} [{_digits(interval.low)}, {_digits(interval.high)}]"
+    return f"{_digits(median)} [{_digits(low)}, {_digits(high)}]"
 
 
 def _world_table(study: Study, world: str) -> str:

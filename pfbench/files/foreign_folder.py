@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
 from typing import Any
 
 
@@ -18,17 +17,14 @@ def make_child_environment() -> dict[str, str]:
     return {**os.environ, "PYTHONSAFEPATH": "1", "PYTHONPATH": os.pathsep.join(folders)}
 
 
-def start_python(
-    program: str, more: Mapping[str, str] | None = None, **options: Any
-) -> subprocess.Popen[Any]:
+def start_python(program: str, **options: Any) -> subprocess.Popen[Any]:
     """Start a program in Python, which imports what this process can import and libraries first.
 
     Args:
         program: Source.
-        more: Additional environment variables.
         options: Of `subprocess.Popen`, such as its streams.
     """
     here = os.getcwd()  # on the path of a notebook and of a script beside it
     folders = sorted(map(os.path.abspath, sys.path), key=lambda folder: folder == here)
     command = [sys.executable, "-P", "-c", f"import sys; sys.path[:] = {folders!r}; {program}"]
-    return subprocess.Popen(command, env={**make_child_environment(), **(more or {})}, **options)
+    return subprocess.Popen(command, env=make_child_environment(), **options)

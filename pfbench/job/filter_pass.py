@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cache
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -23,7 +23,6 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.memory import MemoryTrimmer, first_steps, peak_above, start_peak_measurement
 from pfbench.job.plan import JobPlan
 from pfbench.job.scoring import LikelihoodCounter, ScoreRecorder
-from pfbench.job.step_builds import BUILD_SECONDS, are_builds_allowed, say_once, want_step
 from pfbench.kernels import dispatch
 from pfbench.kernels.cpp_library import is_library_loaded
 from pfbench.model.base import StateSpaceModel
@@ -31,12 +30,13 @@ from pfbench.results import store
 from pfbench.results.step_times import WARM_UP
 
 if TYPE_CHECKING:
-    from pfbench.filter.particle.compiled_filter import CompiledParticleFilter, StepParts
+    from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 
 log = logging.getLogger("pfbench")
 
 # normal numbers of a job: on a CUDA device compiling costs seconds and saves 15 ms per million [measured]
 _CUDA_NUMBERS = 5e8
+_LEAST_SAVING = 20.0  # s: twice what compiling takes [measured: 10 to 14 s]
 # a compiled step of a batch of runs saves this in place of C++ operators [measured in float64: growth model 3e-4 and 0.3e-8,
 # stochastic volatility 0.5e-8, constant velocity in the plane 1.1e-8, 15 states nothing]
 _SAVED_PER_STEP = 3e-4  # s
@@ -109,7 +109,7 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     engine, compile_seconds = _time_choice(plan, model, len(runs), steps)
     draws = PhiloxStream(values["seed"], runs.to(device), plan.dtype)
     with _prepare_torch(plan, engine), _show_progress(steps, label) as tick:
-        step = _compile_step(engine, method, counter, clock, _make_wish(plan, len(runs), steps))
+        step = _compile_step(engine, method, counter, clock, _may_load_steps(plan))
         baseline = start_peak_measurement(device)
         start_time = clock()
         method, batch = _warm_up(plan, step, model, episode.record, draws)
@@ -176,16 +176,13 @@ def _prepare_torch(plan: JobPlan, engine: str) -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _make_wish(plan: JobPlan, runs: int, steps: int) -> Callable[[str, StepParts], None] | None:
-    """Return the function that notes which step a job wanted. None for a job that may not load a stored step.
+def _may_load_steps(plan: JobPlan) -> bool:
+    """Return whether a job takes stored steps: by `auto`, in double precision.
 
-    A job may by `auto`, in double precision. In single precision engines agree to Monte Carlo error only. Trials of
-    times use kernels.
+    In single precision engines agree to Monte Carlo error only. Trials of times use kernels.
     """
-    values = plan.values
-    is_auto = values["engine"] == "auto" and values["budget"] == store.SAME_N
-    may_load = is_auto and plan.dtype == torch.float64
-    return partial(_want_step, plan, runs, steps) if may_load else None
+    is_auto = plan.values["engine"] == "auto" and plan.values["budget"] == store.SAME_N
+    return is_auto and plan.dtype == torch.float64
 
 
 def _warm_up(
@@ -209,7 +206,7 @@ def _warm_up(
     beginning = first_steps(record.select_runs(first), _WARM_UP_STEPS)
     run_filter(step or plan.method, model, beginning, draws.select_runs(first))
     wait_for(plan.values["device"])
-    if step is None or (step.on_missing and not step.is_active and batch != by_kernels):
+    if step is None or (step.loads_only and not step.is_active and batch != by_kernels):
         return plan.method, by_kernels
     return step, batch
 
@@ -239,8 +236,7 @@ def choose_engine(
     """Choose how the steps of a job are executed, and load the C++ operators.
 
     On the CPU `auto` takes the operators always, and compiles the step where that is predicted to save twice the
-    time that it takes. A smaller job takes a compiled step that is stored (`_compile_step`), or notes that it wanted
-    one (`step_builds`). On a CUDA device it takes kernels for large jobs. Numbers of all engines agree to rounding; a
+    time that it takes. A smaller job takes a compiled step that is stored (`_compile_step`). On a CUDA device it takes kernels for large jobs. Numbers of all engines agree to rounding; a
     result states its engine.
 
     Returns the engine: `eager` if the operators cannot be loaded.
@@ -261,11 +257,17 @@ def choose_engine(
     saved = 0.0
     if isinstance(method, ParticleFilter) and not method.obstacle:
         saved = _predict_saving(method, model, runs, steps)
-    if saved < 2.0 * BUILD_SECONDS:
-        say_once("engine=auto: C++ operators")
+    if saved < _LEAST_SAVING:
+        _say_once("engine=auto: C++ operators")
         return "kernels"
-    say_once(f"engine=auto: the step is compiled, which saves about {saved:.0f} s")
+    _say_once(f"engine=auto: the step is compiled, which saves about {saved:.0f} s")
     return "compiled"
+
+
+@cache
+def _say_once(line: str) -> None:
+    """Log a line, once in a process."""
+    log.info(line)
 
 
 def _predict_saving(method: ParticleFilter, model: StateSpaceModel, runs: int, steps: int) -> float:
@@ -274,14 +276,6 @@ def _predict_saving(method: ParticleFilter, model: StateSpaceModel, runs: int, s
     batches = -(-runs // choose_run_batch(runs, method.particles, dimension))
     per_particle = _SAVED_PER_PARTICLE if dimension < _MANY_COMPONENTS else 0.0
     return steps * (_SAVED_PER_STEP * batches + per_particle * runs * method.particles)
-
-
-def _want_step(plan: JobPlan, runs: int, steps: int, name: str, parts: StepParts) -> None:
-    """Note that a job wanted the step of a batch of its runs."""
-    batch = len(parts.belief.x)
-    is_last = batch < plan.choose_run_batch(plan.method, runs, is_compiled=True)
-    share = (batch if is_last else runs - runs % batch) / runs
-    want_step(name, share * _predict_saving(plan.method, parts.model, runs, steps), parts)
 
 
 def _count_numbers(method: Any, model: StateSpaceModel) -> int:
@@ -299,15 +293,14 @@ def _compile_step(
     method: Any,
     counter: LikelihoodCounter,
     clock: Callable[[], float],
-    wish: Callable[[str, StepParts], None] | None,
+    may_load: bool,
 ) -> CompiledParticleFilter | None:
     """Return the filter with its step compiled as a whole, if requested and possible.
 
-    A job with `kernels` that may load stored steps compiles none, and calls `wish` for steps that are not stored.
+    A job with `kernels` that may load stored steps compiles none.
     """
     is_step = isinstance(method, ParticleFilter) and not method.obstacle
-    takes_stored = engine == "kernels" and wish is not None and is_step
-    takes_stored = takes_stored and (are_builds_allowed() or step_store.has_steps())
+    takes_stored = engine == "kernels" and may_load and is_step and step_store.has_steps()
     if engine != "compiled" and not takes_stored:
         return None
     if not is_step:
@@ -317,4 +310,4 @@ def _compile_step(
         return None
     from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 
-    return CompiledParticleFilter(method, counter, clock, wish if takes_stored else None)
+    return CompiledParticleFilter(method, counter, clock, takes_stored)

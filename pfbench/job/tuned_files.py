@@ -112,23 +112,6 @@ def _list_rows(result: TuningResult) -> Iterator[list[str]]:
         yield [*words, *(f"{score:.{_DIGITS}g}" for score in scores)]
 
 
-def read_candidates(node: Mapping[str, Any]) -> tuple[list[Candidate], Candidate]:
-    """Read the candidates of a filter from the file of a tuning."""
-    head, *rows = (line.split() for line in node["candidates"].splitlines())
-    places = {name: k for k, name in enumerate(head)}
-    knobs, regimes = head[: places["log_ratio"]], head[places["nees_ratio"] + 1 :]
-    candidates = [
-        Candidate(
-            {knob: float(row[places[knob]]) for knob in knobs if row[places[knob]] != "-"},
-            float(row[places["log_ratio"]]),
-            float(row[places["nees_ratio"]]),
-            {r.removeprefix(_ERROR): float(row[places[r]]) for r in regimes},
-        )
-        for row in rows
-    ]
-    return candidates[:-1], candidates[-1]
-
-
 def describe_world(world: Mapping[str, Any]) -> str:
     """Describe the data of a search for reports."""
     settings = [re.sub(r"^scenario\.", "", word) for word in world.get("settings", ())]

@@ -19,7 +19,6 @@ from pfbench.stats.comparison import (
 )
 from pfbench.stats.intervals import (
     crossed_mean_interval as crossed_mean_interval,
-    order_statistic_interval as order_statistic_interval,
 )
 from pfbench.stats.pair_states import (
     LookSchedule as LookSchedule,

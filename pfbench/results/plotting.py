@@ -212,11 +212,6 @@ def compute_run_quantiles(values: np.ndarray, q: Sequence[float]) -> np.ndarray:
     return result
 
 
-def compute_jitter(n: int) -> np.ndarray:
-    """Return n deterministic offsets [n] from multiples of the golden ratio."""
-    return 0.4 * ((np.arange(n) * 0.6180339887) % 1 - 0.5)
-
-
 # --------------------------------------------------------------------------------------------------
 # Scales, limits and tick labels of axes.
 

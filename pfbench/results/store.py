@@ -133,15 +133,6 @@ def write_failure(
     return _note(path)
 
 
-def list_results(folder: str | Path) -> Iterator[JobResult]:
-    """Read all finished jobs of a folder, sorted by scenario, noise, label, seed and key.
-
-    Arrays are read one job at a time.
-    """
-    paths = sorted(Path(folder).glob("*.npz"), key=_rank)
-    return map(read_result, paths)
-
-
 def list_failures(folder: str | Path) -> list[dict[str, Any]]:
     """List the failures of jobs without a result by key: failure notes, then damaged files."""
     notes = sorted(Path(folder).glob("*.failed.json"))
@@ -240,13 +231,6 @@ def _meta(path: Path, file: np.lib.npyio.NpzFile) -> dict[str, Any]:
         ) from error
     check_metadata(path, meta)
     return meta
-
-
-def _rank(path: Path) -> tuple[str, str, str, int, str]:
-    meta = read_metadata(path)
-    choices = meta["choices"]
-    names = str(choices["scenario"]), str(choices["noise"]), str(meta["label"])
-    return *names, int(meta["seed"]), str(meta["key"])
 
 
 # --------------------------------------------------------------------------------------------------

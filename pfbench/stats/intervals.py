@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
 from scipy import stats
 
 from pfbench.stats.error_measures import Array
@@ -23,25 +22,6 @@ class ConfidenceInterval(NamedTuple):
     low: float
     high: float
     method: str
-
-
-def order_statistic_interval(d: Array, level: float) -> ConfidenceInterval:
-    """Compute the interval of a median between two order statistics, exact for any distribution.
-
-    Args:
-        d: Sample, [n].
-        level: Least coverage.
-
-    Returns:
-        The interval, infinite and of method "none" if n is too small.
-    """
-    ordered, n = np.sort(d), d.size
-    k = int(stats.binom.ppf((1 - level) / 2, n, 0.5)) if n else -1
-    if n and stats.binom.cdf(k, n, 0.5) > (1 - level) / 2:
-        k -= 1
-    if k < 0:
-        return ConfidenceInterval(-np.inf, np.inf, "none")
-    return ConfidenceInterval(float(ordered[k]), float(ordered[n - 1 - k]), "order statistics")
 
 
 def crossed_mean_interval(values: Array, level: float = 0.95) -> tuple[float, float]:

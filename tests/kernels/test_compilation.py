@@ -554,7 +554,7 @@ def test_auto_takes_the_operators_and_compiles_the_step_where_it_repays(
     gaussian = gaussian_filter.GaussianFilter(
         linearisation_rules.SigmaPointLinearisation(CubaturePoints())
     )
-    filter_pass.say_once.cache_clear()
+    filter_pass._say_once.cache_clear()
     choose = filter_pass.choose_engine
     for _ in range(2):
         assert choose("auto", small, model, 1, 10) == "kernels"

@@ -17,6 +17,7 @@ import pytest
 import torch
 from command_line import pfbench
 from network_cases import NETWORKS, shaken
+from synthetic_results import list_results
 from torch import Tensor, nn
 from torch.distributions import Distribution, Independent, Normal
 
@@ -49,7 +50,6 @@ from pfbench.learn.training_data import TrainingData, draw_training_data
 from pfbench.learn.training_job import train, write_losses
 from pfbench.model.linear_gaussian import local_level
 from pfbench.noise.base import NoiseRegime, NominalNoise
-from pfbench.results import store
 from pfbench.scenario.simulated import ModelSimulation
 
 LEVEL = local_level(1.0, 0.3, 0.0, 1.0)  # what is seen is three times as sure as what is predicted
@@ -544,7 +544,7 @@ def test_train_and_run_at_the_command_line(tmp_path: Path) -> None:
     run = [*words, "runs=3", f"checkpoint={path}"]
     said = pfbench("run", *run, home=tmp_path)
     assert said.code == 0, said.err
-    (result,) = store.list_results(tmp_path / "results" / "mine")
+    (result,) = list_results(tmp_path / "results" / "mine")
     assert result.meta["is_exact"]
     assert result.meta["trained"]["cost"] == checkpoint.read_checkpoint(path)["cost"]
     assert result.meta["trained"]["weights"] == checkpoint.hash_weights(kept["networks"])
@@ -552,7 +552,7 @@ def test_train_and_run_at_the_command_line(tmp_path: Path) -> None:
     moved.write_bytes(path.read_bytes())
     assert pfbench("run", *words, "runs=3", f"checkpoint={moved}", home=tmp_path).code == 0
     assert (
-        len(list(store.list_results(tmp_path / "results" / "mine"))) == 1
+        len(list(list_results(tmp_path / "results" / "mine"))) == 1
     )  # the same weights, the same job
 
 

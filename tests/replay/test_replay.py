@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from command_line import Said, pfbench
+from synthetic_results import list_results
 
 from pfbench import job
 from pfbench.job.replay import (
@@ -55,7 +56,7 @@ def test_a_run_alone_equals_the_run_of_the_batch(home: Path, name: str) -> None:
     table = pd.read_csv(file)
     (result,) = [
         r
-        for r in store.list_results(home / "results/walks")
+        for r in list_results(home / "results/walks")
         if (r.meta["label"], r.meta["choices"]["noise"]) == (name, "nominal")
     ]
     component, unit = result.meta["state"]["names"][0], result.meta["state"]["units"][0]
@@ -67,7 +68,7 @@ def test_a_run_alone_equals_the_run_of_the_batch(home: Path, name: str) -> None:
 
 
 def test_a_forged_number_of_steps_is_refused_at_once(home: Path, tmp_path: Path) -> None:
-    result = next(iter(store.list_results(home / "results/walks")))
+    result = next(iter(list_results(home / "results/walks")))
     config = result.meta["config"]
     forged = {**config, "scenario": {**config["scenario"], "steps": 10**7}}
     file = tmp_path / "results" / "walks" / f"{result.meta['key']}.npz"
@@ -78,7 +79,7 @@ def test_a_forged_number_of_steps_is_refused_at_once(home: Path, tmp_path: Path)
 
 
 def test_a_changed_number_is_found_with_its_time(home: Path, tmp_path: Path) -> None:
-    results = list(store.list_results(home / "results/walks"))
+    results = list(list_results(home / "results/walks"))
     (result,) = [
         r for r in results if (r.meta["label"], r.meta["choices"]["noise"]) == ("ekf", "nominal")
     ]
@@ -146,7 +147,7 @@ def test_magnification_is_a_power_of_ten_that_keeps_errors_below_the_track() -> 
 
 
 def test_results_of_other_programs_are_refused(home: Path, tmp_path: Path) -> None:
-    result = next(iter(store.list_results(home / "results/walks")))
+    result = next(iter(list_results(home / "results/walks")))
     meta = {**result.meta, "config": json.loads("{}")}
     store.write_result(tmp_path / "results/walks" / f"{meta['key']}.npz", meta, result.data)
     label = meta["label"]
@@ -202,7 +203,7 @@ def test_a_filter_of_the_user_is_replayed_and_timed_with_the_trust_of_its_run(
     monkeypatch.syspath_prepend(str(tmp_path))
     words = ("filter=ekf", "filter._target_=replaylab.filters.Mine", "trust=[replaylab]")
     assert pfbench("run", *WALK, "study=walks", *words, home=tmp_path).code == 0
-    (result,) = store.list_results(tmp_path / "results/walks")
+    (result,) = list_results(tmp_path / "results/walks")
     assert result.meta["trusted"] == ["replaylab"]
     again = ("run=12", "filter=ekf")
     said = replay(tmp_path, *again)
@@ -227,4 +228,4 @@ def test_a_filter_of_the_user_is_replayed_and_timed_with_the_trust_of_its_run(
 
 
 def test_a_filter_of_pfbench_needs_no_trust(home: Path) -> None:
-    assert all(r.meta["trusted"] == [] for r in store.list_results(home / "results/walks"))
+    assert all(r.meta["trusted"] == [] for r in list_results(home / "results/walks"))

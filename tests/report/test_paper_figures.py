@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
+from synthetic_results import list_results
 
 from pfbench.cli.compose import expand_sweep, read_sweep
 from pfbench.job.config import compose
@@ -70,7 +71,7 @@ def drawn(results: Path, *wanted: str, study: str = "paper_004") -> dict[str, tu
 
 
 def loaded(results: Path, label: str, noise: str = "nominal") -> store.JobResult:
-    every = store.list_results(results / "paper_004")
+    every = list_results(results / "paper_004")
     return next(r for r in every if (r.meta["label"], r.meta["choices"]["noise"]) == (label, noise))
 
 
@@ -393,7 +394,7 @@ def test_err_is_the_horizontal_error_over_the_range_in_two_panels_of_a_row(tmp_p
     assert sorted(legend(figure)) == sorted(
         {"SIR (each step)", "GPF", "QMC-GPF", "QMC-PRPF", "QMC-PRPF (printed)"}
     )
-    results = store.list_results(tmp_path / "paper_001")
+    results = list_results(tmp_path / "paper_001")
     own = [r for r in results if r.meta["label"] == "gpf"]
     shares = [
         100
@@ -458,7 +459,7 @@ def test_values_of_a_parameter_have_a_line_each(tmp_path: Path) -> None:
         method = synthetic.Method(name(value), size)
         synthetic.write(tmp_path / "paper_002_bound", method, runs=20, steps=30)
     ((caption, figure),) = drawn(tmp_path, "002-3-bound", study="paper_002_bound").values()
-    results = {r.meta["label"]: r for r in store.list_results(tmp_path / "paper_002_bound")}
+    results = {r.meta["label"]: r for r in list_results(tmp_path / "paper_002_bound")}
     for key, text in (("1.0", "ratio bound 1"), ("1000000000.0", "ratio bound 10⁹")):
         error = np.abs(results[name(key)].data["error"][..., 6].astype(float))
         np.testing.assert_allclose(line(figure.axes[0], text)[1], np.median(error, 0), rtol=1e-6)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import synthetic_results as synthetic
+from synthetic_results import list_results
 
 from pfbench.job.run_selection import find_run
 from pfbench.results import conditions, conditions as state_groups, frame, store
@@ -36,7 +37,7 @@ def test_one_row_per_run_and_figure(results):
 
 def test_numbers_and_units_by_hand(results):
     table = frame.load_frame("demo", results, start_time_s=10.0)
-    (raw,) = [r for r in store.list_results(results / "demo") if r.meta["label"] == "ekf"]
+    (raw,) = [r for r in list_results(results / "demo") if r.meta["label"] == "ekf"]
     late = raw.data["time"] >= 10.0
     error = raw.data["error"][3, late].astype(float)
     rows = table[(table.label == "ekf") & (table.run == 3)].set_index(

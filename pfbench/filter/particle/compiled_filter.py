@@ -69,8 +69,7 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         method: The filter. It runs uncompiled if it states an obstacle.
         counter: Counter of likelihood evaluations, which compiled steps cannot increment.
         clock: Clock that measures the time of compilation, s.
-        on_missing: Function that is called with name and parts of a step that is not stored, in place of compiling it. None
-            to compile it.
+        loads_only: Whether a step that is not stored runs uncompiled.
         seconds: Time of compilation so far, s.
         graphs: Compiled step by kind of step; None if that kind runs uncompiled.
     """
@@ -78,7 +77,7 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     method: ParticleFilter
     counter: CallCounter | None = None
     clock: Callable[[], float] = time.perf_counter
-    on_missing: Callable[[str, StepParts], None] | None = None
+    loads_only: bool = False
     seconds: float = 0.0
     graphs: dict[Any, CompiledStep | None] = field(default_factory=dict)
 
@@ -217,7 +216,7 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         start_time = self.clock()
         try:
             parts = StepParts(self.method, model, belief, record, draws, self.counter)
-            graph = compile_step(parts, self.on_missing)
+            graph = compile_step(parts, self.loads_only)
         except Exception as error:  # torch raises many kinds
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             log.warning(
@@ -434,14 +433,12 @@ class StepParts(NamedTuple):
         return step_store.name_step((self.method, self.model), arguments, self.counter)
 
 
-def compile_step(
-    parts: StepParts, on_missing: Callable[[str, StepParts], None] | None = None
-) -> CompiledStep | None:
+def compile_step(parts: StepParts, loads_only: bool = False) -> CompiledStep | None:
     """Load a filter's step from the store, or record and compile it.
 
     Its numbers are compared with those of the uncompiled step.
 
-    Returns the compiled step. If it is not stored and there is a function `on_missing`, calls that and returns None.
+    Returns the compiled step. None if it is not stored and only loaded.
     """
     method, model, belief, record, draws, counter = parts
     names: list[list[str]] = []
@@ -450,16 +447,14 @@ def compile_step(
     shared = [torch.as_tensor(draws.seed), draws.runs]
     example = [*state, torch.as_tensor(draws.step), *inputs, *shared]
     name = None if example[0].is_cuda else parts.name()
-    if on_missing and not (name and step_store.has_step(name)):
-        if name:
-            on_missing(name, parts)
+    if loads_only and not (name and step_store.has_step(name)):
         return None
     with _keep_count(counter) as count:
         expected = make(names, record_step=False)(*example)
         evaluations = count()
         run, entry = None, _load_step(name, example, expected, len(state))
         is_stored = entry is not None
-        if not is_stored and on_missing:
+        if not is_stored and loads_only:
             return None
         if not is_stored:
             run, entry = _compile_and_store(name, make([]), example, expected, len(state))

@@ -162,16 +162,6 @@ def remove_step(name: str) -> None:
     shutil.rmtree(_folder() / name, ignore_errors=True)
 
 
-def workshop() -> Path:
-    """Return the folder where torch's compiler works for a build in the background."""
-    return code_folder() / "build"
-
-
-def clear_workshop() -> None:
-    """Remove the files of a build."""
-    shutil.rmtree(workshop(), ignore_errors=True)
-
-
 def _folder() -> Path:
     """Return the folder of compiled steps."""
     return code_folder() / "steps"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from pfbench.cli.messages import format_error
 from pfbench.cli.tune import tune_filters
 from pfbench.job import tuning
 from pfbench.job.config import FILTER_SETS, TUNED_METHODS, expand_filter_sets
-from pfbench.job.tuned_files import Ratio, compare_errors, decide_fit, find_best, read_candidates
+from pfbench.job.tuned_files import Ratio, compare_errors, decide_fit, find_best
 from pfbench.job.tuned_knobs import AUTO, NOMINAL
 from pfbench.job.tuning import (
     KNOBS,
@@ -48,6 +49,23 @@ TUNED = sorted(
     for path in (job.conf_dir() / "tuned").glob("*.yaml")
     if path.stem not in (AUTO, NOMINAL)
 )
+
+
+def read_candidates(node: Mapping[str, Any]) -> tuple[list[Candidate], Candidate]:
+    """Read the candidates of a filter from the file of a tuning."""
+    head, *rows = (line.split() for line in node["candidates"].splitlines())
+    places = {name: k for k, name in enumerate(head)}
+    knobs, regimes = head[: places["log_ratio"]], head[places["nees_ratio"] + 1 :]
+    candidates = [
+        Candidate(
+            {knob: float(row[places[knob]]) for knob in knobs if row[places[knob]] != "-"},
+            float(row[places["log_ratio"]]),
+            float(row[places["nees_ratio"]]),
+            {r.removeprefix("error_"): float(row[places[r]]) for r in regimes},
+        )
+        for row in rows
+    ]
+    return candidates[:-1], candidates[-1]
 
 
 def candidate(log_ratio: float, nees_ratio: float, r: float = 1.0) -> Candidate:

@@ -1,0 +1,94 @@
+"""Steps of a job: their batches, and their times after what a process loads once."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from config_cases import truncated
+
+from pfbench.filter.loop import run_filter
+from pfbench.filter.particle import step_store
+from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
+from pfbench.job import compose, filter_pass
+from pfbench.job.config import resolve_config
+from pfbench.job.plan import build_plan
+
+JOB = ["scenario=growth", "filter=sir", "runs=3", "particles=50"]
+
+
+def settings(tmp_path: Path, *words: str) -> Any:
+    """A job with results and episodes of its own."""
+    return compose([*JOB, f"results_dir={tmp_path}/results", "episode_cache_dir=null", *words])
+
+
+@pytest.mark.parametrize("is_stored", [False, True])
+def test_a_job_without_its_step_takes_the_batches_of_kernels(
+    is_stored: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of a compiled step are smaller where the state has many components, and slower without it."""
+    passes: list[tuple[int, int | None]] = []
+
+    def spy(method: Any, model: Any, record: Any, draws: Any, *more: Any) -> Any:
+        passes.append((record.y.shape[1], more[2] if more else None))
+        return run_filter(method, model, record, draws, *more)
+
+    monkeypatch.setattr(filter_pass, "run_filter", spy)
+    monkeypatch.setattr(CompiledParticleFilter, "is_active", is_stored)
+    monkeypatch.setattr(step_store, "has_steps", lambda: True)
+    words = ["scenario=flight_300s", "runs=4", "particles=8000", "engine=auto"]
+    plan = build_plan(resolve_config(settings(tmp_path, *words)))
+    episode = truncated(plan.draw_episode(plan.runs), 3)
+    result = filter_pass.pass_filter(plan, episode, plan.runs, "")
+    assert passes == [(2, None), (3, 2 if is_stored else 4)]
+    assert result.cost["likelihoods_per_step"] == 8000.0
+    # 15 components: the overhead of calls alone, in one batch
+    assert filter_pass._predict_saving(plan.method, plan.model, 4, 1000) == pytest.approx(0.3)
+
+
+def test_what_a_process_loads_once_is_not_in_the_time_of_a_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[float] = []
+
+    def load_first(*arguments: Any) -> Any:
+        end = time.process_time() + (0.0 if calls else 0.5)
+        while time.process_time() < end:
+            pass
+        calls.append(end)
+        return run_filter(*arguments)
+
+    monkeypatch.setattr(filter_pass, "run_filter", load_first)
+    plan = build_plan(
+        resolve_config(settings(tmp_path, "scenario=growth", "runs=2", "particles=10"))
+    )
+    result = filter_pass.pass_filter(
+        plan, truncated(plan.draw_episode(plan.runs), 3), plan.runs, ""
+    )
+    assert result.seconds["warm_up"] >= 0.5
+    assert result.seconds["filter"] < 0.4
+
+
+def test_both_orders_of_two_jobs_have_equal_times(tmp_path: Path) -> None:
+    """One filter in two jobs of a process, in several processes: the first is no dearer than the second."""
+    code = (
+        "import json; from pfbench import job; from pfbench.results import store; "
+        "words = ['scenario=growth', 'filter=sir', 'runs=50', 'episode_cache_dir=null']; "
+        "paths = [job.run(job.compose([*words, f'study={name}'])).path for name in 'ab']; "
+        "print(json.dumps([store.read_metadata(p)['seconds']['per_step'] for p in paths]))"
+    )
+    ratios = []
+    for k in range(9):
+        (tmp_path / f"{k}").mkdir()
+        said = subprocess.run(
+            [sys.executable, "-c", code], cwd=tmp_path / f"{k}", capture_output=True, text=True
+        )
+        first, second = json.loads(said.stdout.splitlines()[-1])
+        ratios.append(first / second)
+    assert 0.95 <= statistics.median(ratios) <= 1.05, ratios
