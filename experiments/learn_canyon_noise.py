@@ -29,6 +29,7 @@ import torch
 from hydra import compose, initialize_config_module
 from matplotlib import ticker
 from matplotlib.figure import Figure
+from pfbench.experiments.study_parts import ResumableResults
 from pyro.distributions import Independent, LogNormal, Normal, TransformedDistribution
 from torch import Tensor, nn
 from torch.distributions.transforms import SigmoidTransform
@@ -37,7 +38,7 @@ from tqdm import tqdm
 from pfbench.core import PhiloxStream, Record
 from pfbench.files import markdown_bullets, markdown_head, markdown_paragraph, markdown_row
 from pfbench.filter import ParticleFilter, run_filter
-from pfbench.job import ResumableResults, instantiate
+from pfbench.job import instantiate
 from pfbench.model import (
     LosNlosRangeError,
     NormalExponentialMixture,

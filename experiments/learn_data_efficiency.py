@@ -30,6 +30,7 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_module
 from matplotlib.figure import Figure
+from pfbench.experiments.study_parts import crossed_mean_interval
 
 from pfbench.core import PhiloxStream
 from pfbench.files import markdown_bullets, markdown_paragraph
@@ -56,7 +57,7 @@ from pfbench.learn import Training, draw_training_data, train
 from pfbench.model import StateSpaceModel, StochasticVolatility
 from pfbench.noise import NominalNoise
 from pfbench.report import COLUMN, RC, add_legend, line_styles, render_palette_png
-from pfbench.results import crossed_mean_interval, holm, wilcoxon_signed_rank
+from pfbench.results import holm, wilcoxon_signed_rank
 from pfbench.scenario import ModelSimulation, Scenario
 
 MEASURES = {

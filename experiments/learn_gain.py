@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_module
 from matplotlib.figure import Figure
+from pfbench.experiments.study_parts import ResumableResults, crossed_mean_interval
 
 from pfbench.core import PhiloxStream
 from pfbench.files import markdown_bullets, markdown_head, markdown_paragraph, markdown_row
@@ -44,11 +45,11 @@ from pfbench.filter import (
     TaylorLinearisation,
     run_filter,
 )
-from pfbench.job import ResumableResults, instantiate
+from pfbench.job import instantiate
 from pfbench.learn import Training, draw_training_data, train
 from pfbench.model import StateSpaceModel
 from pfbench.report import COLUMN, RC, line_styles, render_palette_png
-from pfbench.results import crossed_mean_interval, holm, wilcoxon_signed_rank
+from pfbench.results import holm, wilcoxon_signed_rank
 
 WORLDS = ("linear_walk, nominal", "linear_walk, outliers")
 OTHER_WORLDS = ("growth, nominal", "stochastic_volatility, nominal")  # of learned proposals only

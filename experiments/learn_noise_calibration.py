@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from pfbench.experiments.study_parts import ResumableResults
 from pyro.distributions import LogNormal
 from scipy.stats import chisquare
 
 from pfbench.core import Record
 from pfbench.files import markdown_head, markdown_paragraph, markdown_row
 from pfbench.filter import GaussianFilter, ParticleFilter, TaylorLinearisation
-from pfbench.job import ResumableResults
 from pfbench.model import (
     PassiveLocation,
     PlatformInputs,

@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from hydra import compose, initialize_config_module
 from matplotlib.figure import Figure
+from pfbench.experiments.study_parts import ResumableResults
 from pyro.distributions import LogNormal, Normal
 from scipy.stats import bootstrap
 from tqdm import tqdm
@@ -39,7 +40,7 @@ from pfbench.filter import (
     TaylorLinearisation,
     run_filter,
 )
-from pfbench.job import ResumableResults, instantiate
+from pfbench.job import instantiate
 from pfbench.model import StrapdownTotal, StrapdownTuning
 from pfbench.noise import NominalNoise
 from pfbench.ppl import (

@@ -25,6 +25,7 @@ import matplotlib
 import torch
 from hydra import compose, initialize_config_module
 from matplotlib.figure import Figure
+from pfbench.experiments.study_parts import ResumableResults
 from torch import Tensor
 
 from pfbench.core import PhiloxStream, Record, map_inputs
@@ -41,7 +42,7 @@ from pfbench.filter import (
     TaylorLinearisation,
     normalise_log_weights,
 )
-from pfbench.job import ResumableResults, instantiate
+from pfbench.job import instantiate
 from pfbench.model import StateSpaceModel, StaticModel
 from pfbench.report import COLUMN, RC, add_legend, line_styles, render_palette_png
 from pfbench.scenario import RecordingRegime

@@ -20,7 +20,6 @@ from pfbench.job.plan import (
 )
 from pfbench.job.run_job import (
     JobOutcome as JobOutcome,
-    ResumableResults as ResumableResults,
     run as run,
 )
 from pfbench.job.scoring import (

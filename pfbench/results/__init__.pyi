@@ -17,9 +17,6 @@ from pfbench.stats.comparison import (
     decide as decide,
     find_largest_p as find_largest_p,
 )
-from pfbench.stats.intervals import (
-    crossed_mean_interval as crossed_mean_interval,
-)
 from pfbench.stats.pair_states import (
     LookSchedule as LookSchedule,
     PairState as PairState,

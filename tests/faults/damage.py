@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from pfbench.experiments.study_parts import ResumableResults
 
 from faults.children import run_child
 from faults.sweeps import CLEAR, result_files, run_sweep
@@ -19,7 +20,6 @@ from faults.tally import FINE, Tally
 from pfbench.files.atomic_write import hash_content
 from pfbench.filter.learned.checkpoint import hash_weights, read_checkpoint, write_checkpoint
 from pfbench.job import run_job
-from pfbench.job.run_job import ResumableResults
 from pfbench.results import conditions, store
 from pfbench.scenario import simulated
 

@@ -17,6 +17,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from checkout import ROOT
+from pfbench.experiments.study_parts import ResumableResults
 
 from faults import (
     clock,
@@ -33,7 +34,6 @@ from faults import (
     storage,
 )
 from faults.tally import Tally
-from pfbench.job.run_job import ResumableResults
 
 STORE = ROOT / "results" / "faults"
 

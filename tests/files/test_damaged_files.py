@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import pfbench
+from pfbench.experiments.study_parts import ResumableResults
 
 from pfbench.files.atomic_write import (
     DIGEST,
@@ -23,7 +24,6 @@ from pfbench.files.atomic_write import (
     write_atomically,
 )
 from pfbench.filter.learned import checkpoint
-from pfbench.job.run_job import ResumableResults
 from pfbench.results import store
 from pfbench.scenario import simulated
 

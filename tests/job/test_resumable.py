@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from pfbench.experiments.study_parts import ResumableResults
 
 from pfbench.files.escapes import (
     WIDTH,
@@ -13,7 +14,6 @@ from pfbench.files.escapes import (
     markdown_paragraph,
     markdown_row,
 )
-from pfbench.job.run_job import ResumableResults
 from pfbench.ppl.parameter_posterior import ParameterPosterior
 
 

@@ -7,9 +7,9 @@ import math
 
 import numpy as np
 import pytest
+from pfbench.experiments.study_parts import crossed_mean_interval
 from scipy import stats
 
-from pfbench.results import crossed_mean_interval
 from pfbench.stats.comparison import (
     EQUAL_KEPT,
     EQUAL_WORD,
