@@ -16,8 +16,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from pfbench.files import RecordedFolder, hash_content
-from pfbench.files.recorded_folder import PUBLISHED, write_manifest
+from pfbench.files import PUBLISHED, RecordedFolder, hash_content, write_manifest
 from pfbench.report import RUNS_FILE, rebuild_page
 
 REPORTS = Path(__file__).parents[2] / "reports"

@@ -12,4 +12,8 @@ from pfbench.files.escapes import (
     markdown_paragraph as markdown_paragraph,
     markdown_row as markdown_row,
 )
-from pfbench.files.recorded_folder import RecordedFolder as RecordedFolder
+from pfbench.files.recorded_folder import (
+    PUBLISHED as PUBLISHED,
+    RecordedFolder as RecordedFolder,
+    write_manifest as write_manifest,
+)
