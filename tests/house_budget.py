@@ -128,7 +128,7 @@ def _count_entered(code: str, *words: str, folder: str) -> int:
     return int(run.stdout.splitlines()[-1].split()[1])
 
 
-def measure_reading() -> dict[str, Table]:
+def measure_reading() -> Table:
     """Return how many functions a step, a run and a report enter: what somebody reads who follows them."""
     words = ("scenario=linear_walk", "model=linear_walk", "runs=4", "particles=50", "study=toy")
     with tempfile.TemporaryDirectory() as folder:
@@ -136,7 +136,7 @@ def measure_reading() -> dict[str, Table]:
         entered["a run"] = _count_entered(_COMMAND, "run", "filter=sir", *words, folder=folder)
         _count_entered(_COMMAND, "run", "filter=apf", *words, folder=folder)
         entered["a report"] = _count_entered(_COMMAND, "report", "study=toy", folder=folder)
-    return {"functions entered": entered}
+    return entered
 
 
 def read_ceilings() -> dict[str, Table]:
@@ -193,7 +193,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--lower", action="store_true", help="lower each ceiling to what is used")
     options = parser.parse_args()
-    used, ceilings = measure() | measure_reading(), read_ceilings()
+    used, ceilings = measure(), read_ceilings()
+    print("functions entered, without a ceiling:", measure_reading())
     for table, values in used.items():
         for name, value in sorted(values.items()):
             print(f"{table:20}{name:26}{value:8} of {ceilings.get(table, {}).get(name, 0):8}")

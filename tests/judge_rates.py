@@ -17,12 +17,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy.fft import dct
 from scipy.signal import lfilter
-from scipy.special import stdtr
+from scipy.special import bdtr, stdtr
 
 from pfbench.logs.judge.judge_options import JudgeOptions
 from pfbench.logs.judge.pair_verdicts import PairVerdict, judge_pairs
 from pfbench.results.store import JobResult
-from pfbench.stats.comparison import EQUALITY_MARGIN, MIN_RUNS
+from pfbench.stats.comparison import EQUALITY_MARGIN, LOG_TOLERANCE, MIN_RUNS
 from pfbench.stats.rank_tests import rank_sum_cdf, wilcoxon_signed_rank_rows
 from pfbench.stats.time_blocks import (
     BLOCKS,
@@ -250,8 +250,10 @@ def _words(d: np.ndarray, ratio: np.ndarray, margin: float = EQUALITY_MARGIN) ->
     with np.errstate(divide="ignore", invalid="ignore"):  # equal differences, as of lost epochs
         t = np.where((error == 0.0) & (trimmed == 0.0), 0.0, trimmed / error)
     equal = (np.minimum(low, np.where(p < 0.05, low, 0)) > -margin) & (np.maximum(high, np.where(p < 0.05, high, 0)) < margin)  # fmt: skip
-    agree = (p < 0.05) & (2 * stdtr(h - 1, -np.abs(t)) < 0.05)
-    sign = np.where(agree & ~equal & (trimmed * location[:, 0] > 0), np.sign(location[:, 0]), 0)  # fmt: skip
+    more, fewer = (d > LOG_TOLERANCE).sum(axis=1), (d < -LOG_TOLERANCE).sum(axis=1)
+    agree = (p < 0.05) & (2 * stdtr(h - 1, -np.abs(t)) < 0.05) & (2 * bdtr(np.minimum(more, fewer), more + fewer, 0.5) < 0.05)  # fmt: skip
+    sides = (trimmed * location[:, 0] > 0) & ((more - fewer) * location[:, 0] > 0)
+    sign = np.where(agree & ~equal & sides, np.sign(location[:, 0]), 0)
     return Words(sign, equal, n / ratio)
 
 

@@ -304,12 +304,6 @@ def test_no_sum_of_ceilings_rises() -> None:
     assert house_budget.list_raised_sums(more.replace("ruler = 1", "ruler = 2"), old) == []
 
 
-@pytest.mark.slow
-def test_a_step_a_run_and_a_report_enter_few_functions() -> None:
-    used = house_budget.measure_reading()
-    assert house_budget.list_excesses(used, house_budget.read_ceilings()) == []
-
-
 def test_the_counts_of_the_house_are_of_statements() -> None:
     source = '''"""Text."""
 from typing import NamedTuple

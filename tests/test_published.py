@@ -20,7 +20,7 @@ from markupsafe import escape
 from pyarrow import parquet
 
 from pfbench.claims import write_claims
-from pfbench.files.recorded_folder import PUBLISHED
+from pfbench.files.recorded_folder import PUBLISHED_FILES
 from pfbench.report import is_equal_drawing
 from pfbench.report.stored_study import RUNS_FILE, read_stored_study
 from pfbench.report.study_report import rebuild_page
@@ -53,7 +53,9 @@ def test_no_file_in_git_is_ignored() -> None:
 def test_git_stores_only_the_published_files_of_a_report() -> None:
     stored = [name for name in list_git_files() if name.startswith("reports/")]
     assert [name for name in stored if not PUBLISHED_FILE.fullmatch(name)] == []
-    assert json.loads(PUBLISHED.read_text())["files"] == load("publish_reports").hash_published()
+    assert (
+        json.loads(PUBLISHED_FILES.read_text())["files"] == load("publish_reports").hash_published()
+    )
     studies = {name.split("/")[1] for name in stored} - {"README.md", "published.json"}
     assert studies > set(load("publish_reports").HEADLINES)
     for study in studies:

@@ -16,7 +16,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from pfbench.files import PUBLISHED, RecordedFolder, hash_content, write_manifest
+from pfbench.files import PUBLISHED_FILES, RecordedFolder, hash_content, write_manifest
 from pfbench.report import RUNS_FILE, rebuild_page
 
 REPORTS = Path(__file__).parents[2] / "reports"
@@ -133,7 +133,7 @@ def main() -> None:
             publish_report(page.parent)
         elif (page.parent / RUNS_FILE).is_file():
             rebuild_page(page.parent)
-    write_manifest(PUBLISHED, hash_published())
+    write_manifest(PUBLISHED_FILES, hash_published())
 
 
 def hash_published() -> dict[str, str]:

@@ -227,7 +227,7 @@ def _format_measured(line: ClaimWord, decision: ClaimDecision | None) -> str:
 
 def _format_ratio(value: float, low: float, high: float) -> str:
     """Format a ratio and its interval without an exponent, with the decimals that two digits of its width need."""
-    width, least = min(high, 1e4) - low, max(low, 1e-3)
+    width, least = min(high, 1e4) - low, min(max(low, 1e-3), 1e4)
     decimals = 1 - math.floor(math.log10(width)) if width > 0 else 2
     decimals = min(max(decimals, -math.floor(math.log10(least)), 0), 5)
     ratio, first, last = (

@@ -20,10 +20,10 @@ from pfbench.claims.claim_list import KINDS
 from pfbench.stats.comparison import (
     ALPHA,
     BETTER_THAN,
-    LOG_TOLERANCE,
     MIN_RUNS,
     Effect,
     decide,
+    is_testable,
 )
 from pfbench.stats.error_measures import Array, Flags
 from pfbench.stats.study_runs import CONDITION, StudyRuns, compare_filters, compute_losses
@@ -52,7 +52,7 @@ class ClaimSample(NamedTuple):
         kind: One of `KINDS`, or "level", "size" or "within".
         a: Values of a, [n], positive.
         b: Values of b, [n].
-        lost_a: Runs that a lost, [n]. They have the largest value of both.
+        lost_a: Runs that a lost, [n]. Their loss is infinite.
         lost_b: Runs that b lost, [n].
         early: Runs of the first look, [n].
         printed: Printed ratio of the kind "size", or largest one of the kind "within".
@@ -237,7 +237,7 @@ def compare_to_border(c: ClaimSample, border: float) -> Effect:
     values = np.stack([c.a, c.b])[:, None]
     is_lost = np.stack([c.lost_a, c.lost_b])[:, None]
     present = ~np.isnan(values) | is_lost
-    runs = StudyRuns(("a", "b"), _TABLE, {"value": values}, ~is_lost, present, np.array([math.nan]))
+    runs = StudyRuns(("a", "b"), _TABLE, {"value": values}, ~is_lost, present)
     losses = compute_losses(runs, "value")
     losses[1] += border
     return compare_filters(runs, losses, [("a", "b")])[0]
@@ -263,7 +263,7 @@ def _orient(c: ClaimSample, border: float, sign: float) -> _Evidence:
     effect = compare_to_border(c, border)
     d = -sign * effect.differences if sign > 0 else effect.differences
     effect = effect._replace(differences=d)
-    if len(d) >= MIN_RUNS and np.ptp(d) <= LOG_TOLERANCE:
+    if len(d) >= MIN_RUNS and not is_testable(effect):
         is_certain = bool(d.max() < 0)
         return _Evidence(
             effect._replace(p=1.0, p_trimmed=1.0, p_sign=1.0), is_certain, not is_certain

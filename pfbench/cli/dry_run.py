@@ -138,7 +138,7 @@ def _time_filter(plan: JobPlan, episode: Episode) -> float:
 
     model, runs = plan.make_filter_model(episode), len(plan.runs)
     steps = episode.record.y.shape[1]
-    short = first_steps(episode.record, min(_STEPS, steps))
+    short = first_steps(model, episode.record, min(_STEPS, steps))
     index = torch.arange(runs) % len(short.y)
 
     def copy(a: Any) -> Any:

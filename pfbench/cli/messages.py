@@ -352,8 +352,8 @@ def describe_unknown(error: BaseException) -> str:
     name = f"{stage} ({path})" if path else stage
     reason = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":").rstrip(".")
     calls = traceback.extract_tb(error.__traceback__)
-    if own := [call for call in calls if Path(call.filename).parent.match(WRITTEN)]:
-        return f"{own[-1].name} of your class must succeed, got {reason}. Correct the line: {own[-1].line}"
+    if own_frames := [call for call in calls if Path(call.filename).parent.match(WRITTEN)]:
+        return f"{own_frames[-1].name} of your class must succeed, got {reason}. Correct the line: {own_frames[-1].line}"
     subject = str(path) if path else "the words of the command and the files that they name"
     return f"{name} must succeed, got {reason}. Check {subject}."
 

@@ -195,21 +195,23 @@ def try_own_parts(configs: Sequence[JobConfig]) -> None:
 def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:
     """Try the parts of a job; its world only if no job before has the same."""
     plan = build_plan(config)
-    own = {name for name in PART_GROUPS if list_user_packages(config.values[name], config.trusted)}
+    own_groups = {
+        name for name in PART_GROUPS if list_user_packages(config.values[name], config.trusted)
+    }
     world = json.dumps([plan.values[name] for name in ("scenario", "noise", "seed")], default=str)
     if world not in episodes:
-        if "noise" in own:
+        if "noise" in own_groups:
             _check_noise(plan.recording_regime.regime, runs=2)
-        if "scenario" in own:
+        if "scenario" in own_groups:
             _check_scenario(plan.scenario)
         episodes[world] = plan.draw_episode(plan.runs[:2])
     episode = episodes[world]
     model = plan.make_filter_model(episode).to("cpu", torch.float64)
     model.assemble(episode.truth)
-    method = plan.method if "filter" in own else ParticleFilter(20)
+    method = plan.method if "filter" in own_groups else ParticleFilter(20)
     draws = PhiloxStream(plan.values["seed"], plan.runs[:2])
     with torch.no_grad():
-        run_filter(method, model, first_steps(episode.record, 3), draws)
+        run_filter(method, model, first_steps(model, episode.record, 3), draws)
 
 
 def _build(thing: Any) -> tuple[Any, str, str]:
@@ -345,8 +347,8 @@ def _check_noise(noise: Any, runs: int = 2000) -> Mapping[str, LawCheck]:
         "the ratio of a narrow normal density to it - 1": ratio.nan_to_num(1.0).mean(1).numpy()
         - 1.0
     }
-    law = check_means(statement, means, 4.5) if runs > 2 else LawCheck(statement, 0.0, 4.5)
-    return {**results, "distribution": law}
+    check = check_means(statement, means, 4.5) if runs > 2 else LawCheck(statement, 0.0, 4.5)
+    return {**results, "distribution": check}
 
 
 def _check_alone(statement: str, draw: Callable[[Any], Any]) -> Mapping[str, LawCheck]:

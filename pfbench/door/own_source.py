@@ -111,9 +111,9 @@ class _Script:
         while pending:
             texts = [statement.text for statement in self.statements[pending.pop()]]
             used = {item for text in texts for item in list_globals(text) if item in self.values}
-            own = {item for item in used if self.find_kind(item) in ("class", "statement")}
-            pending += sorted(own - reached.keys())
-            reached |= dict.fromkeys(sorted(own))
+            own_names = {item for item in used if self.find_kind(item) in ("class", "statement")}
+            pending += sorted(own_names - reached.keys())
+            reached |= dict.fromkeys(sorted(own_names))
         return reached
 
 
@@ -146,8 +146,8 @@ class _Collector:
         selected: Statements of the script, by their position.
     """
 
-    def __init__(self, script: _Script, together: Collection[str]) -> None:
-        self._script, self._together = script, together
+    def __init__(self, script: _Script, members: Collection[str]) -> None:
+        self._script, self._together = script, members
         self.lines: dict[str, str] = {}
         self.selected: dict[int, str] = {}
 

@@ -83,8 +83,8 @@ def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
         for group, value in (("scenario", scenario), ("noise", noise), ("filter", filters))
     ]
     models = [None] if model is None else list_parts("model", model)
-    named = {"runs": runs, "particles": particles, "seed": seed}
-    words = format_words({**named, **settings, "study": study})
+    settings_of_all = {"runs": runs, "particles": particles, "seed": seed}
+    words = format_words({**settings_of_all, **settings, "study": study})
     jobs = [_list_words(choice, words) for choice in product(*parts, models)]
     configs = [_compose_job(list(job)) for job in dict.fromkeys(map(tuple, jobs))]
     if any(map(list_used_packages, configs)):

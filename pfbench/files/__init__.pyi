@@ -13,7 +13,7 @@ from pfbench.files.escapes import (
     markdown_row as markdown_row,
 )
 from pfbench.files.recorded_folder import (
-    PUBLISHED as PUBLISHED,
+    PUBLISHED_FILES as PUBLISHED_FILES,
     RecordedFolder as RecordedFolder,
     write_manifest as write_manifest,
 )

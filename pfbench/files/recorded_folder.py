@@ -171,7 +171,12 @@ def _find_fault(content: Any) -> str:
 
 
 def write_manifest(path: Path, files: dict[str, str]) -> None:
-    """Write a manifest with its digest."""
+    """Write a manifest with its digest.
+
+    Args:
+        path: File of the manifest.
+        files: Digest of each file by its name below the folder.
+    """
     content: dict[str, Any] = {"files": dict(sorted(files.items()))}
     text = json.dumps({**content, DIGEST: hash_content(content)}, indent=1) + "\n"
     write_atomically(path, lambda file: file.write(text.encode()))
@@ -204,10 +209,10 @@ def _list_names(names: Sequence[str]) -> str:
 # --------------------------------------------------------------------------------------------------
 # Files that this project has published, which a clone has without the manifests of their folders.
 
-PUBLISHED = Path(__file__).parents[2] / "reports" / "published.json"
+PUBLISHED_FILES = Path(__file__).parents[2] / "reports" / "published.json"
 
 
 @cache
 def read_published() -> frozenset[str]:
     """Read the digests of the published files of a checkout; none where pfbench is installed without it."""
-    return frozenset(_read_manifest(PUBLISHED).values())
+    return frozenset(_read_manifest(PUBLISHED_FILES).values())

@@ -203,12 +203,12 @@ class ReachedStream(pickle.Pickler):
         if value is self.uncounted and value is not None:
             return "uncounted"
         if isinstance(value, getattr(sys.modules.get("torch"), "Tensor", ())):
-            place, _ = self._tensors.setdefault(id(value), (len(self._tensors), value))
-            a = value.detach()
-            kind = place, str(a.dtype), str(a.device), tuple(a.shape), value.requires_grad
+            index, _ = self._tensors.setdefault(id(value), (len(self._tensors), value))
+            a: Any = value
+            kind = index, str(a.dtype), str(a.device), tuple(a.shape), a.requires_grad
             if not self.has_values:  # strides of a record depend on its length
                 return kind
-            flat = a.cpu().contiguous().reshape(-1).view(sys.modules["torch"].uint8)
+            flat = a.detach().cpu().contiguous().reshape(-1).view(sys.modules["torch"].uint8)
             return kind, a.stride(), flat.numpy().tobytes()
         return None
 
@@ -242,22 +242,22 @@ class ReachedStream(pickle.Pickler):
         if isinstance(value, _NAMED) or (is_named and is_free):
             return str, (_name(value),)
         home = {} if self.is_own(kind.__module__) else vars(sys.modules.get(kind.__module__, types))
-        kept = [key for key, item in list(home.items()) if item is value]
-        if kept:  # an object that a library keeps, as a type of numbers or a distribution of scipy
-            return str, (f"{_name(kind)} {kept[0]}",)
+        names = [key for key, item in list(home.items()) if item is value]
+        if names:  # an object that a library keeps, as a type of numbers or a distribution of scipy
+            return str, (f"{_name(kind)} {names[0]}",)
         return NotImplemented
 
     def _list_content(self, value: Any) -> Any:
         """List what a module, a function or a class of the user consists of; of a function of others what it was given."""
         if isinstance(value, types.FunctionType):
-            given = [value.__defaults__, value.__kwdefaults__, vars(value)]
-            given += [cell.cell_contents for cell in value.__closure__ or ()]
+            reached = [value.__defaults__, value.__kwdefaults__, vars(value)]
+            reached += [cell.cell_contents for cell in value.__closure__ or ()]
             if not self.is_own(
                 value.__module__
             ):  # with the line, two functions without a name differ
-                return given if self.package else [*given, value.__code__.co_firstlineno]
+                return reached if self.package else [*reached, value.__code__.co_firstlineno]
             names = sorted(_list_names(value.__code__) & set(value.__globals__))
-            return [*given, value.__code__, {name: value.__globals__[name] for name in names}]
+            return [*reached, value.__code__, {name: value.__globals__[name] for name in names}]
         is_class = isinstance(value, type)
         if not self.is_own(value.__module__ if is_class else value.__name__):
             return None

@@ -83,7 +83,7 @@ class CostTrial:
 
         Other programs can only lengthen a pass, so the minimum is the better estimate.
         """
-        record = first_steps(self.record, _TRIAL_STEPS)
+        record = first_steps(self.model, self.record, _TRIAL_STEPS)
         return min(self._run(method, record) for _ in range(2)) / record.y.shape[1]
 
     def likelihoods(self, method: Any) -> float:
@@ -91,7 +91,7 @@ class CostTrial:
 
         Moves follow a resampling, which not every step has: short records need more runs.
         """
-        record = first_steps(self.record, 5 * _TRIAL_STEPS)
+        record = first_steps(self.model, self.record, 5 * _TRIAL_STEPS)
         record = record.select_runs(slice(0, -(-_TRIAL_RUN_STEPS // record.y.shape[1])))
         before = self.counter.count
         self._run(method, record)

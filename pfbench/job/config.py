@@ -273,7 +273,7 @@ def _load_experiment(path: Path, changed_ns: int) -> Any:
     from hydra.core.config_store import ConfigNode
     from omegaconf import OmegaConf
 
-    node = OmegaConf.load(path)
+    node: Any = OmegaConf.load(path)
     params = OmegaConf.select(node, "hydra.sweeper.params")
     if params is not None and "filter" in params:
         params["filter"] = expand_filter_names(str(params["filter"]))

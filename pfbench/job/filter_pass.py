@@ -203,8 +203,12 @@ def _warm_up(
     by_kernels = plan.choose_run_batch(plan.method, runs)
     batch = plan.choose_run_batch(plan.method, runs, is_compiled=step is not None)
     first = slice(0, batch)
-    beginning = first_steps(record.select_runs(first), _WARM_UP_STEPS)
-    run_filter(step or plan.method, model, beginning, draws.select_runs(first))
+    run_filter(
+        step or plan.method,
+        model,
+        first_steps(model, record.select_runs(first), _WARM_UP_STEPS),
+        draws.select_runs(first),
+    )
     wait_for(plan.values["device"])
     if step is None or (step.loads_only and not step.is_active and batch != by_kernels):
         return plan.method, by_kernels

@@ -25,6 +25,7 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record, map_inputs
 from pfbench.filter.loop import Watch, run_filter
 from pfbench.model.base import StateSpaceModel
+from pfbench.scenario.oracle_noise import OracleNoiseModel
 
 # --------------------------------------------------------------------------------------------------
 # Memory of this machine, control group or GPU: free, used, counted and released.
@@ -251,8 +252,8 @@ def undrawn_bytes(scenario: Any, model: StateSpaceModel, limit: float | None) ->
         ValueError: If one run and the flight that all runs share do not fit into memory.
     """
     steps, samples = (getattr(scenario, name, 0) for name in ("steps", "samples"))
-    drawn, told = model.chart.size + 2, 3 * model.chart.dimension + 3
-    numbers = (_SIMULATION_FACTOR * drawn + _TRACE_COPIES * told) * steps
+    numbers, moments = model.chart.size + 2, 3 * model.chart.dimension + 3
+    numbers = (_SIMULATION_FACTOR * numbers + _TRACE_COPIES * moments) * steps
     run = max(_MAX_EPISODE, 8.0 * numbers + _RUN_SAMPLE * samples)
     size = _BASE + run + _FLIGHT_SAMPLE * samples
     if limit is not None and run > _MAX_EPISODE and size > limit:
@@ -313,7 +314,7 @@ def estimate_memory(
             _measure(
                 small,
                 model,
-                first_steps(record.select_runs(slice(0, r)), trial_steps),
+                first_steps(model, record.select_runs(slice(0, r)), trial_steps),
                 batch,
                 watch,
             )
@@ -338,14 +339,17 @@ def estimate_memory(
     )
 
 
-def first_steps(record: Record, steps: int) -> Record:
+def first_steps(model: StateSpaceModel, record: Record, steps: int) -> Record:
     """Copy the first steps of a record.
+
+    Oracle noise is that of the whole record, which its model prepares before.
 
     Returns the copy, without a feedback process.
     """
-    start, spread = (None if a is None else a.clone() for a in (record.start, record.spread))
-    u = map_inputs(lambda a: a[:, :steps].clone(), record.u)
-    return Record(record.y[:, :steps].clone(), u, start, spread)
+    inputs = model.prepare(record) if isinstance(model, OracleNoiseModel) else record
+    start, spread = (None if a is None else a.clone() for a in (inputs.start, inputs.spread))
+    u = map_inputs(lambda a: a[:, :steps].clone(), inputs.u)
+    return Record(inputs.y[:, :steps].clone(), u, start, spread)
 
 
 def _measure(

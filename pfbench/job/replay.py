@@ -106,7 +106,7 @@ def _list_changed_inputs(meta: Mapping[str, Any], present: Inputs) -> list[str]:
 
 def _replace_places(node: Any, places: Mapping[str, str | None], results: Path) -> None:
     """Set the folders of a stored configuration, which may be of another person, and check its weights."""
-    keys = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()  # fmt: skip
+    keys: Any = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()  # fmt: skip
     for key, value in keys:
         if key in places and isinstance(value, str):
             node[key] = places[key]

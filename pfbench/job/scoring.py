@@ -221,9 +221,9 @@ def score_particles(
     distance = (w.unsqueeze(1) @ (off.square() @ parts).sqrt()).squeeze(1)
 
     def score_group(g: int, components: list[int]) -> Tensor:
-        chosen = points[..., components]
-        near = chosen.norm(dim=-1).mean(1)
-        return _make_fair(_energy_score(chosen), near, share) + distance[:, g] - near
+        selected = points[..., components]
+        near = selected.norm(dim=-1).mean(1)
+        return _make_fair(_energy_score(selected), near, share) + distance[:, g] - near
 
     return _make_scores(error, crps, below, groups, score_group)
 
@@ -249,11 +249,11 @@ def score_normal(error: Tensor, covariance: Tensor, groups: Groups) -> ProperSco
     crps = torch.where(sd > 0, crps, error.abs())
 
     def score_group(_: int, components: list[int]) -> Tensor:
-        own = covariance[:, components][:, :, components]
-        value, axes = torch.linalg.eigh(own.nan_to_num())
+        block = covariance[:, components][:, :, components]
+        value, axes = torch.linalg.eigh(block.nan_to_num())
         along = (error[:, None, components] @ axes).squeeze(1)
-        apart = _mean_length(torch.zeros_like(along), 2.0 * value)
-        return _mean_length(along, value) - 0.5 * apart + 0.0 * own.sum((1, 2))
+        distance = _mean_length(torch.zeros_like(along), 2.0 * value)
+        return _mean_length(along, value) - 0.5 * distance + 0.0 * block.sum((1, 2))
 
     return _make_scores(error, crps, torch.special.ndtr(-error / sd), groups, score_group)
 

@@ -129,7 +129,7 @@ class SharedLoader(ConfigLoaderImpl):
             from ray.job_config import JobConfig
 
             # Ray puts the current folder before all libraries of a worker, unless there is a folder of its own
-            JobConfig._runtime_env_has_working_dir = lambda self: True
+            setattr(JobConfig, "_runtime_env_has_working_dir", lambda self: True)  # noqa: B010
         sources = tree.hydra.runtime.config_sources
         is_foreign = any(source.provider.startswith(_SEARCH_PATH) for source in sources)
         check_composed(tree, overrides, compose_reference if is_foreign else None)
@@ -143,12 +143,13 @@ class SharedLoader(ConfigLoaderImpl):
         repository = _SharedRepository(self.repository, self.trusted)
         self._process_config_searchpath(config_name, parsed, repository)
         main = repository.load_config(config_name) if config_name else None
-        for override in parsed if main else ():
+        root = to_plain(main.config) if main is not None else {}
+        for override in parsed if main is not None else ():
             key = override.key_or_group
             is_of_group = repository.group_exists(key) or repository.group_exists(key.split(".")[0])
             is_added = override.is_add() or override.is_force_add()
             # a key that nothing reads, such as +particle=50, would give another job with the same numbers
-            if is_added and not is_of_group and not _has_key(to_plain(main.config), key):
+            if is_added and not is_of_group and not _has_key(root, key):
                 raise ConfigCompositionException(f"Could not override '{key}'")
         return parsed, repository
 

@@ -139,10 +139,11 @@ def _build_tasks(
         size = max_runs_in_memory(plan, episodes)
         episode = episodes.batch(0, size)
         model = plan.make_filter_model(episode)
-        record = first_steps(episode.record, steps)
         engine = choose_engine(plan.values["engine"], plan.method, model, size, steps)
         method = plan.method
         if engine == "compiled" and isinstance(method, ParticleFilter) and method.history is None:
             method = CompiledParticleFilter(method)
-        tasks.append(TimingTask(plan, model, record, engine, method))
+        tasks.append(
+            TimingTask(plan, model, first_steps(model, episode.record, steps), engine, method)
+        )
     return tasks

@@ -87,8 +87,12 @@ def describe_older(older: Sequence[OlderResult]) -> str:
 
 def describe_libraries(metadata: Sequence[Mapping[str, Any]]) -> str:
     """State which versions of torch and numpy computed the results of a study, if there are several; else empty."""
-    found = {k: {str(m.get("versions", {}).get(k)) for m in metadata} for k in ("torch", "numpy")}
-    mixed = [f"{k} {' and '.join(sorted(names))}" for k, names in found.items() if len(names) > 1]
+    versions = {
+        k: {str(m.get("versions", {}).get(k)) for m in metadata} for k in ("torch", "numpy")
+    }
+    mixed = [
+        f"{k} {' and '.join(sorted(names))}" for k, names in versions.items() if len(names) > 1
+    ]
     return (
         f"Results of {' and of '.join(mixed)} are mixed. Run the jobs again with one, by overwrite=true."
         if mixed

@@ -99,7 +99,7 @@ class ModelSimulation(Scenario):
             steps = simulate_steps(model, inputs, stream, x, "world.state", scale)
             groups = take_groups(steps)
             parts = [_join_steps(model, group, draw_errors, stream, noise) for group in groups]
-        states, y = (torch.cat(part, 1) for part in zip(*parts, strict=True))
+        states, y = (torch.cat(group, 1) for group in zip(*parts, strict=True))
         truth = {name: states[..., list(indices)] for name, indices in model.groups.items()}
         return Episode(Record(y, u), time, truth)
 

@@ -241,13 +241,14 @@ def _describe_losses(first: Array, second: Array) -> tuple[LostRuns, float]:
     """Count the lost runs of a pair, and compare the mean errors of its other runs."""
     lost_a, lost_b = np.isposinf(first), np.isposinf(second)
     counts = (lost_a & ~lost_b, lost_b & ~lost_a, lost_a & lost_b)
-    kept = ~(lost_a | lost_b)
+    is_common = ~(lost_a | lost_b)
     mean = math.nan
-    if kept.any():
-        largest = max(first[kept].max(), second[kept].max())
-        sums = [np.exp(losses[kept] - largest).sum() for losses in (first, second)]
+    if is_common.any():
+        largest = max(first[is_common].max(), second[is_common].max())
+        sums = [np.exp(losses[is_common] - largest).sum() for losses in (first, second)]
         mean = math.log(max(sums[0], _LEAST_SUM)) - math.log(max(sums[1], _LEAST_SUM))
-    return LostRuns(*(int(flags.sum()) for flags in counts)), mean
+    of_a, of_b, of_both = (int(flags.sum()) for flags in counts)
+    return LostRuns(of_a, of_b, of_both), mean
 
 
 def decide(

@@ -59,6 +59,7 @@ def test_rankings_follow_the_order_of_the_report(study: str) -> None:
         assert (order[0], ranking[0][1]) == (1, "best")
         assert {word for _, word in ranking[1:]} <= {
             "equal",
+            "equal in kept runs",
             "worse",
             "not decided",
             "identical",

@@ -51,7 +51,12 @@ def run_module() -> None:
 
 
 def start_python() -> None:
-    subprocess.run([commands.sys.executable, "-c", "import mylab"], check=True)
+    # without the switch that a command gives to its children
+    subprocess.run(
+        [commands.sys.executable, "-c", "import mylab"],
+        env={**os.environ, "PYTHONSAFEPATH": ""},
+        check=True,
+    )
 
 
 def run_shell() -> None:

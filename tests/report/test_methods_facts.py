@@ -32,7 +32,7 @@ CHANGED: dict[str, tuple[Any, str]] = {
     "budgets": (["particles", "time"], "chosen for equal cost (time)."),
     "metric": ("CRPS", "The metric is the CRPS over the time of a run"),
     "alpha": (0.01, "simultaneous intervals (99 %)"),
-    "margin": (0.1, "Equal: the interval lies within 10 %."),
+    "margin": (0.1, "Equal: the interval lies within 10 %, and fewer"),
     "rounds": (7, "Times per step are medians of 7 or more rounds"),
     "software": (
         {"pfbench": ["1.2"], "commit": [], "python": ["3.14"], "torch": ["2.9"], "numpy": ["2.4"],
@@ -128,11 +128,14 @@ def test_pairs_and_names_are_those_that_the_page_decides_again(pack: dict[str, A
     pack["planned"] = [{}, {}]
     text = text_of(pack)
     assert "Particle filters used 100 (Filter 0) and 200 (New name) particles." in text
-    assert "The 2 planned pairs are one family, and so are the filters of a table." in text
+    assert (
+        "table: the 2 planned pairs and the filters against the first baseline, and all other pairs."
+        in text
+    )
     pack["planned"] = [{}]
-    assert "The 1 planned pair is one family" in text_of(pack)
+    assert "table: the 1 planned pair and the filters against" in text_of(pack)
     pack["planned"] = []
-    assert "No pair was planned; the filters of a table are one family." in text_of(pack)
+    assert "Two families share the pairs of a table: the filters against the first" in text_of(pack)
 
 
 def test_the_paragraph_has_the_words_of_the_tests_that_decide(pack: dict[str, Any]) -> None:
@@ -142,9 +145,13 @@ def test_the_paragraph_has_the_words_of_the_tests_that_decide(pack: dict[str, An
         "Wilcoxon's signed-rank test",
         "trimmed mean",
         "Holm's correction",
+        "the sign test rejects without one, and all agree in sign",
+        "the bounds of Clopper and Pearson",
+        "Loses more: McNemar's exact test",
+        "There is no ratio where more than a fifth of the pairs has a lost run.",
     ):
         assert words in text
-    assert "counts as the limit of its world, or as the largest error of the pair" in text
+    assert "lost or diverges is worse than every other one, and two such runs tie" in text
 
 
 @pytest.mark.parametrize(("numbers", "text", "kind"), [

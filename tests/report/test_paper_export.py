@@ -254,7 +254,7 @@ def test_bold_is_the_smallest_printed_number_and_worse_has_a_dagger() -> None:
     (worse,) = (tex for tex in cells.values() if "textdagger}}}" in tex and "black!62" in tex)
     assert r"\num{9.00}" in worse
     name = next(f["name"] for f in pack["filters"] if f["key"] == rows[2]["filter"])
-    assert f"Lost runs, counted as errors at the limit of the world: {name} 4." in table.caption
+    assert f"Lost runs, which are worse than all others: {name} 4." in table.caption
 
 
 def test_lost_and_missing_entries_are_words() -> None:

@@ -249,7 +249,7 @@ def _turn_picture(log: RawLog, search: TurnSearch, turns: Array, offset: float) 
 def _describe_strangers(log: RawLog, search: TurnSearch, turns: Array, score: float) -> Finding:
     moves = np.square(turns - turns.mean(0)).sum(1).mean() > _NO_TURN**2
     evidence = f"show no common turn at any offset up to 25 s: the best score is {score:.2f}"
-    causes = ("another clock", "a wrong attitude", "a log without turns")
+    causes: tuple[str, ...] = ("another clock", "a wrong attitude", "a log without turns")
     if not moves:
         evidence = "disagree: roll, pitch, yaw do not turn, and wx, wy, wz do"
         causes = ("an attitude in another unit", "an attitude that was not recorded")

@@ -32,10 +32,10 @@ def drop_wrong_rows(reference: RawReference) -> RawReference:
     Readers name these rows, with their limits.
     """
     time, velocity = reference.time, reference.velocity
-    moved = np.diff(reference.position, axis=0) - np.diff(integrate(time, velocity), axis=0)
+    difference = np.diff(reference.position, axis=0) - np.diff(integrate(time, velocity), axis=0)
     turned = turns_between(dcm_of(reference.angles), np.arange(len(time)))
     wrong = np.zeros(len(time), bool)
-    for change, least in ((moved, _LEAST_JUMP), (turned, _LEAST_TURN)):
+    for change, least in ((difference, _LEAST_JUMP), (turned, _LEAST_TURN)):
         size = np.linalg.norm(change, axis=1)
         jump = np.minimum(size[1:], size[:-1])
         rest = np.linalg.norm(change[1:] + change[:-1], axis=1)

@@ -82,7 +82,7 @@ def decisions_as_json(judgement: Judgement, options: JudgeOptions) -> dict[str, 
 
 def _to_dict(pair: PairVerdict) -> dict[str, Any]:
     """Return a verdict in JSON types; a number that is not finite becomes text."""
-    values = {**pair._asdict(), **pair.verdict._asdict(), "sequences": list(pair.sequences)}
+    values = {**pair._asdict(), **pair.verdict.to_row(), "sequences": list(pair.sequences)}
     del values["verdict"]
     return {
         key: str(value) if isinstance(value, float) and not math.isfinite(value) else value

@@ -151,8 +151,8 @@ def compare_fixes(
         )
     true, rows = interpolate(reference, fixes.time), np.arange(len(fixes.time))
     position_error, velocity_error = (
-        np.nan_to_num(np.linalg.norm(seen - expected, axis=1))
-        for seen, expected in ((fixes.position, true[:, 7:]), (fixes.velocity, true[:, 4:7]))
+        np.nan_to_num(np.linalg.norm(measured - expected, axis=1))
+        for measured, expected in ((fixes.position, true[:, 7:]), (fixes.velocity, true[:, 4:7]))
     )
     return (
         *_note_offset(table, fixes.position - true[:, 7:]),

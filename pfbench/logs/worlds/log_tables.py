@@ -64,9 +64,9 @@ def list_tables(root: str | None, folder: str, names: Iterable[str | None]) -> l
     """
     if root is None:
         return []
-    place = find_input(root, folder, is_data_set=True)
+    data_folder = find_input(root, folder, is_data_set=True)
     paths = (
-        find_input(place, f"{name}{suffix}")
+        find_input(data_folder, f"{name}{suffix}")
         for name in names
         for suffix in _SUFFIXES
         if name is not None

@@ -81,7 +81,12 @@ class RinexSource:
         require(codes and not wrong, "scenario.rinex.signals", must, ", ".join(wrong) or "none")
 
     def list_files(self, root: str | None, name: str) -> list[Path]:
-        """List the files of a data set that are read; those that are not in its folder are left out."""
+        """List the files of a data set that are read; those that are not in its folder are left out.
+
+        Args:
+            root: Folder of all data, None for no files.
+            name: Name of the data set.
+        """
         if root is None:
             return []
         folder = find_input(root, name, is_data_set=True)

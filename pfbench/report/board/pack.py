@@ -46,6 +46,7 @@ from pfbench.report.board.study_views import (
     order_worlds,
     planned_entries,
 )
+from pfbench.report.board.view import shorten_view
 from pfbench.report.methods_text import collect_methods_facts
 from pfbench.report.options import ReportOptions
 from pfbench.report.provenance import format_bibliography
@@ -318,8 +319,9 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
     views = build_views(court, groups, names, options, facts.times)
     recorded = decide_records(facts.records, court, baselines)
     for key, view in views.items():
-        reach = describe_reach(recorded, (key.world, key.regime), worlds)
-        view["sentence"] = " ".join(filter(None, (view["sentence"], reach)))
+        view["sentence"] = shorten_view(
+            f"{view['sentence']} {describe_reach(recorded, (key.world, key.regime), worlds)}".rstrip()
+        )
         view["small_print"] = " ".join(filter(None, (view["small_print"], facts.differing)))
     first = next(iter(views.values()))["rows"]
     return {

@@ -21,7 +21,6 @@ from pfbench.report.board.view import (
     BoardRow,
     View,
     build_rows,
-    count_words,
     describe_filters,
     describe_view,
 )
@@ -42,7 +41,7 @@ from pfbench.results.step_times import StepTimes
 from pfbench.stats.comparison import EQUAL_WORDS, MIN_RUNS, NO_DECISION, Verdict, decide
 from pfbench.stats.court import Court
 from pfbench.stats.error_measures import Flags
-from pfbench.stats.sentences import format_with_interval
+from pfbench.stats.sentences import format_count, format_with_interval
 from pfbench.stats.study_runs import (
     StudyRuns,
     compare_filters,
@@ -160,7 +159,7 @@ def _describe_common(mask: Flags, in_scope: Flags, filters: int) -> str:
     """State that filters are compared in a selection of the conditions; empty if in all."""
     if mask.sum() == in_scope.sum():
         return ""
-    count = f"{mask.sum()} of {count_words(int(in_scope.sum()), 'condition')}"
+    count = f"{mask.sum()} of {format_count(int(in_scope.sum()), 'condition')}"
     verb = "is" if mask.sum() == 1 else "are"
     return f"{count} {verb} compared: not all {filters} filters were run in the others. "
 
@@ -199,8 +198,8 @@ def _describe_scope(conditions: pd.DataFrame, names: StudyNames) -> str:
 def _count_worlds(conditions: pd.DataFrame) -> str:
     """Count the scenarios, and the worlds where several scenarios share a trajectory."""
     scenarios, worlds = conditions["scenario"].nunique(), conditions["family"].nunique()
-    text = count_words(scenarios, "scenario")
-    return text if scenarios == worlds else f"{text} of {count_words(worlds, 'world')}"
+    text = format_count(scenarios, "scenario")
+    return text if scenarios == worlds else f"{text} of {format_count(worlds, 'world')}"
 
 
 def _describe_timing(view: View) -> str:
@@ -226,9 +225,9 @@ def _small_print(runs: StudyRuns, options: ReportOptions, names: StudyNames) -> 
         describe_tuning(count_tuned(names.looks), len(names.looks)),
     )
     sample = ", ".join((
-        count_words(filters, "filter"), _count_worlds(runs.conditions),
-        count_words(runs.conditions["regime"].nunique(), "noise regime"),
-        f"{_count_runs(runs)} per condition", count_words(len(seeds), "seed"),
+        format_count(filters, "filter"), _count_worlds(runs.conditions),
+        format_count(runs.conditions["regime"].nunique(), "noise regime"),
+        f"{_count_runs(runs)} per condition", format_count(len(seeds), "seed"),
     ))  # fmt: skip
     return (
         f"{sample}. Ratios are those of Hodges and Lehmann over paired runs, with simultaneous "
@@ -241,7 +240,7 @@ def _small_print(runs: StudyRuns, options: ReportOptions, names: StudyNames) -> 
 def _count_runs(runs: StudyRuns) -> str:
     """Count the paired runs of a condition, as a range where conditions differ."""
     counts = runs.present.any(axis=0).sum(axis=1)
-    largest = count_words(int(counts.max()), "paired run")
+    largest = format_count(int(counts.max()), "paired run")
     return largest if counts.min() == counts.max() else f"{counts.min()} to {largest}"
 
 
@@ -300,14 +299,14 @@ def describe_planned(
 ) -> str:
     """Describe the verdict on a pair in a sentence."""
     first, second = (f"[[{looks[label].name}]]" for label in (verdict.a, verdict.b))
-    where = f"in {_count_worlds(conditions)}, {count_words(verdict.n, 'paired run')}"
+    where = f"in {_count_worlds(conditions)}, {format_count(verdict.n, 'paired run')}"
     size = f"ratio {format_with_interval(*verdict[3:6])}" if verdict.ratio > 0 else verdict.reason
     if verdict.word in ("better", "worse"):
         than = "smaller" if verdict.word == "better" else "larger"
         return f"{first} has a {than} error than {second} in most runs ({size}; {where})."
     if verdict.word in EQUAL_WORDS[:2]:
-        kept = verdict.word.removeprefix("equal")
-        return f"{first} and {second} are equal within the margin{kept} ({size}; {where})."
+        suffix = verdict.word.removeprefix("equal")
+        return f"{first} and {second} are equal within the margin{suffix} ({size}; {where})."
     if verdict.word == "identical":
         return f"{first} and {second} have the same errors ({where})."
     reason = f"{verdict.reason}; " if verdict.reason not in ("", size) else ""

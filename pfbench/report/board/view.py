@@ -89,8 +89,8 @@ def find_against(view: View, baseline: str, complete: Flags) -> dict[str, Verdic
     """Find the verdicts on all filters of a view against a baseline; None for the baseline."""
     labels = [name for name, is_there in zip(view.runs.filters, complete, strict=True) if is_there]
     others = [name for name in labels if name != baseline and baseline in labels]
-    found = {name: view.court.find(view.metric, view.mask, name, baseline) for name in others}
-    return {baseline: None, **found}
+    verdicts = {name: view.court.find(view.metric, view.mask, name, baseline) for name in others}
+    return {baseline: None, **verdicts}
 
 
 def summarise_levels(view: View) -> Array:
@@ -289,6 +289,10 @@ def _word_ratio(row: BoardRow) -> str:
     return format_with_interval(row["ratio"], row["ratio_low"], row["ratio_high"])
 
 
-def count_words(number: int, noun: str) -> str:
-    """Format a count with its noun."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+def shorten_view(sentence: str) -> str:
+    """Shorten the sentence of a view where it is longer than the opening screen allows."""
+    return (
+        sentence
+        if len(sentence.split()) <= _MOST_WORDS
+        else sentence.replace("(first in the table: ", "(first: ")
+    )

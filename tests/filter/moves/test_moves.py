@@ -1129,7 +1129,8 @@ def test_epanechnikov_s_law(d: int) -> None:
 
 def test_shrinking_keeps_the_covariance_with_any_kernel() -> None:
     x = one(runs=300).normal("x", 100, 2) * torch.tensor([100.0, 1e-3])
-    before = ParticleBelief(x, torch.full((300, 100), -math.log(100)).double(), torch.zeros(300))
+    uneven = torch.linspace(0.0, 1e-3, 100, dtype=torch.float64).log_softmax(-1)  # equal ones stay
+    before = ParticleBelief(x, uneven.expand(300, -1), torch.zeros(300))
     n = torch.full((300, 1), 100.0, dtype=torch.float64)
     for shrink, grown in (
         (True, 1.0),

@@ -250,8 +250,9 @@ def test_an_exchange_of_equal_particles_is_no_mistake() -> None:
 
 @pytest.mark.parametrize("shrink", [False, True])
 def test_regularisation_says_that_it_is_not_exact_and_is_right(shrink: bool) -> None:
+    # of so few particles that a shrunk kernel, which only its shape makes wrong, is seen too
     method = ParticleFilter(
-        25, RegularisedResampler(EssResampler(Systematic(), 1.0), shrink_to_mean=shrink)
+        10, RegularisedResampler(EssResampler(Systematic(), 1.0), shrink_to_mean=shrink)
     )
     assert not method.is_exact
     with pytest.raises(AssertionError, match=r"\+-"):

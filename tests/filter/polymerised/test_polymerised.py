@@ -642,9 +642,7 @@ def neighbourhood(
     """A cloud of m particles has one neighbourhood: its mean and covariance, and those of the new particles over many runs."""
     x = PhiloxStream(6, torch.arange(1)).normal("x", m, 2)
     before = ParticleBelief(
-        x.expand(runs, -1, -1),
-        torch.full((runs, m), -math.log(m)).double(),
-        torch.zeros(runs).double(),
+        x.expand(runs, -1, -1), nearly_equal(runs, m), torch.zeros(runs).double()
     )
     method = ThompsonTaylorResampler(EssResampler(Systematic(), 1.0), m, printed)
     n = torch.full((runs, 1), float(m), dtype=torch.float64)
@@ -688,7 +686,7 @@ def test_over_a_sample_the_generator_loses_what_its_neighbourhoods_lack() -> Non
     """Cov z = Cov xbar_i + (m - 1)/m mean S_i. With 400 points in 4 dimensions neighbourhoods are wide and their means lean
     inwards, so that the sample as a whole does not keep its covariance, whatever is said of it."""
     before, n = one_cloud(60)
-    before, m = before._replace(log_w=torch.full_like(before.log_w, -math.log(N))), 10
+    before, m = before._replace(log_w=nearly_equal(60, N)), 10
     x = before.x[0].numpy()
     z = np.linalg.solve(np.linalg.cholesky(np.cov(x.T)), x.T).T
     near = np.argsort(np.linalg.norm(z[:, None] - z[None], axis=-1), 1)[:, :m]
