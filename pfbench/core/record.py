@@ -114,7 +114,7 @@ _GROUP = 256  # steps
 
 
 def take_groups(steps: Iterator[_Step]) -> Iterator[list[_Step]]:
-    """Take steps in groups, each of which the caller joins.
+    """Take steps in groups, which the caller joins.
 
     A step alone is some small tensors and objects of Python, which need 3 kB where its numbers need 100 bytes [measured].
     """

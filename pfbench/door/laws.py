@@ -189,7 +189,7 @@ def try_own_parts(configs: Sequence[JobConfig]) -> None:
                 try:
                     _try_job(config, episodes)
                 except AssertionError as error:
-                    raise ValueError(f"{error}.") from error
+                    raise ValueError(f"the part must keep its contract: {error}.") from error
 
 
 def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:

@@ -24,7 +24,7 @@ def start_python(program: str, **options: Any) -> subprocess.Popen[Any]:
         program: Source.
         options: Of `subprocess.Popen`, such as its streams.
     """
-    current = os.getcwd()  # on the path of a notebook and of a script beside it
+    current = os.getcwd()  # on the path of a notebook and of a script in this folder
     folders = sorted(map(os.path.abspath, sys.path), key=lambda folder: folder == current)
     command = [sys.executable, "-P", "-c", f"import sys; sys.path[:] = {folders!r}; {program}"]
     return subprocess.Popen(command, env=make_child_environment(), **options)

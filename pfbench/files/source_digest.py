@@ -144,7 +144,7 @@ def hash_reached(target: str, thing: Any) -> str:
     """Compute a digest of all that a class or function of a user reaches.
 
     That is code in memory, globals, closures, defaults, attributes of classes, arrays, and the variables of the environment
-    that the code names. Of modules that are neither in its package nor beside it only names count.
+    that the code names. Of modules that are neither in its package nor in its folder only names count.
 
     Raises:
         ValueError: If a value cannot be described, as a generator or an open file.
@@ -164,7 +164,7 @@ def hash_reached(target: str, thing: Any) -> str:
 
 
 class ReachedStream(pickle.Pickler):
-    """Digest of a pickle that is never read, which follows the code of a user. The module `pickle` knows all other kinds of values.
+    """Digest of a pickle that is never read, which follows the code of a user. The module `pickle` handles all other kinds of values.
 
     Args:
         package: Package of the user. Empty to follow none.
@@ -248,7 +248,7 @@ class ReachedStream(pickle.Pickler):
         return NotImplemented
 
     def _list_content(self, value: Any) -> Any:
-        """List what a module, a function or a class of the user consists of; of a function of others what it was given."""
+        """List what a module, a function or a class of the user consists of; of a function of others its arguments."""
         if isinstance(value, types.FunctionType):
             reached = [value.__defaults__, value.__kwdefaults__, vars(value)]
             reached += [cell.cell_contents for cell in value.__closure__ or ()]

@@ -257,7 +257,8 @@ def undrawn_bytes(scenario: Any, model: StateSpaceModel, limit: float | None) ->
     run = max(_MAX_EPISODE, 8.0 * numbers + _RUN_SAMPLE * samples)
     size = _BASE + run + _FLIGHT_SAMPLE * samples
     if limit is not None and run > _MAX_EPISODE and size > limit:
-        raise _refusal("a single run", size, limit, "Use fewer steps or a shorter flight")
+        workload = "a single run"
+        raise _refusal(workload, size, limit, "Use fewer steps or a shorter flight")
     return run
 
 

@@ -66,7 +66,7 @@ def _merge(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any
 
 
 def make_reading(paper: str, name: str) -> dict[str, Any]:
-    """Make the content of the file of Hydra that a row stands for."""
+    """Make the content of the file of Hydra of a row."""
     row = read_reading_table(paper)[name]
     overrides = [{f"override /{group}": choice} for group, choice in row.get("use", {}).items()]
     is_central = name == CENTRAL_READING

@@ -150,7 +150,7 @@ class SharedLoader(ConfigLoaderImpl):
             is_added = override.is_add() or override.is_force_add()
             # a key that nothing reads, such as +particle=50, would give another job with the same numbers
             if is_added and not is_of_group and not _has_key(root, key):
-                raise ConfigCompositionException(f"Could not override '{key}'")
+                raise ConfigCompositionException(f"{key} must be a key. Could not override '{key}'")
         return parsed, repository
 
     def _compose_config_from_defaults_list(

@@ -52,7 +52,7 @@ EQUALITY_MARGIN = math.log(1.05)  # log ratios within it are equal [ours]
 ALPHA = 0.05
 MIN_RUNS = 10  # units that a decision requires [ours]
 TRIM_SHARE = 0.2  # removed at each end; the middle 60 % of the units remain
-MOST_LOST = 0.2  # of the pairs may have a lost run; beyond it there is no ratio [ours]
+MOST_LOST = 0.2  # of the pairs may have a lost run; above it no ratio is given [ours]
 TRACK_BOUND = (
     0.1  # of the runs that a filter may lose alone and be called equal, as an upper bound [ours]
 )
@@ -63,7 +63,7 @@ _ROUNDING = 1e-12  # relative spread of equal values
 _FEW_DIFFERENCES = 200  # up to which the means of all pairs are formed
 _HALVINGS = 52  # of the range of the differences: the precision of a double
 _LEAST_SUM = 1e-300  # of errors relative to the largest one
-_FAR = 1e4  # stands for an infinite log ratio in means of pairs; all finite ones are below 1500
+_FAR = 1e4  # replaces an infinite log ratio in means of pairs; all finite ones are below 1500
 
 
 class LostRuns(NamedTuple):
@@ -83,7 +83,7 @@ class LostRuns(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What a verdict rests on beside its p-value.
+    """Evidence of a verdict besides its p-value.
 
     Attributes:
         smaller: Share of the runs in which the first filter has the smaller error.
@@ -179,7 +179,7 @@ class Verdict(NamedTuple):
         p: p-value of the signed-rank test with Holm's correction.
         n: Number of runs, blocks or worlds.
         lost: Runs that one or both filters lost.
-        evidence: What the verdict rests on beside `p`.
+        evidence: Evidence of the verdict besides `p`.
         reason: Why nothing is decided, or what a reader of the word must know; else empty.
     """
 
@@ -263,7 +263,7 @@ def decide(
 
     Returns:
         A verdict for each effect. "better" and "worse" need the signed-rank test and the trimmed mean after Holm's
-        correction, and the sign test without one; "equal" needs the interval within the margin, and bounds on the
+        correction, and the sign test without one. The word "equal" needs the interval within the margin, and bounds on the
         runs that one filter loses alone.
     """
     return [verdict() for verdict in open_family(effects, margin, alpha)]
@@ -486,7 +486,7 @@ def _trimmed_mean(d: Array) -> tuple[float, float, float]:
     """Return the trimmed mean of differences, its standard error and its degrees of freedom.
 
     The error is that of Tukey and McLaughlin, from the winsorised differences. Where lost runs remain after trimming, the
-    sum of the signs stands for the mean, without an error.
+    sum of the signs replaces the mean, without an error.
     """
     n, cut = len(d), int(TRIM_SHARE * len(d) + 1e-9)
     middle = n - 2 * cut

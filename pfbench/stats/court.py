@@ -1,4 +1,4 @@
-"""One verdict for each pair of filters, metric and selection of conditions, whoever asks for it.
+"""One verdict for each pair of filters, metric and selection of conditions, for all who ask for it.
 
 Two families of tests share the pairs of a selection: those that are fixed before the results, and all others. A pair
 is in one of them, so that pages, tables and consoles have the same word for it. They select verdicts, and compute none.

@@ -96,7 +96,7 @@ def arrange_runs(table: pd.DataFrame, filters: Sequence[str]) -> StudyRuns:
 def compute_losses(runs: StudyRuns, metric: str) -> Array:
     """Compute the losses of all runs, [F, C, N]: the logarithm of the error, infinite for a run that does not keep track.
 
-    A run that a filter does not have, or that has no value of the metric, is NaN.
+    A run that a filter does not have, or that lacks a value of the metric, is NaN.
 
     Args:
         runs: Runs of a study.
@@ -157,7 +157,7 @@ def compare_filters(
 def locate_groups(
     names: tuple[str, str], groups: Sequence[tuple[Array, Array]]
 ) -> tuple[tuple[str, Array], tuple[str, Array]]:
-    """Return the log ratio of a pair in each group of runs as losses, the second of which are 0: of worlds or drives.
+    """Return the log ratio of a pair in each group of runs as losses, and 0 as second losses: of worlds or drives.
 
     Args:
         names: Names of the two filters.

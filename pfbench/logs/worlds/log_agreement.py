@@ -66,7 +66,9 @@ def compare_reference(table: LogTable, reference: ReferenceLog) -> tuple[str, ..
     notes = compare_velocities(table, reference)
     _, findings = check_reference(table.name, drop_wrong_rows(take_reference(reference)), {})
     if findings:
-        raise ValueError(f"{findings[0].evidence}. Correct units, signs and order of the columns.")
+        raise ValueError(
+            f"the columns must agree: {findings[0].evidence}. Correct units, signs and order of the columns."
+        )
     return notes
 
 

@@ -302,9 +302,7 @@ def describe_cell(
     if word in EQUAL_WORDS:
         return CellLook("=")
     star = any(w.wins for w in overview.winners if (w.world, w.filter) == (world.key, label))
-    has_ratio = (
-        ratio > 0
-    )  # else too many runs are lost, and the share that keeps track stands for it
+    has_ratio = ratio > 0  # else too many runs are lost, and the share that keeps track is drawn
     size = format_ratio(ratio) if has_ratio else f"{100 * cell.track_share:.0f} %"
     text = f"{size}{'☆' if star else ''}"
     if word == "not decided":

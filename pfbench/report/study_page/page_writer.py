@@ -419,7 +419,7 @@ def _encode_views(views: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
 
 
 def _encode(value: Any) -> Any:
-    """Return a value for JSON, which has no infinity; the script of the page turns it back."""
+    """Return a value for JSON, which cannot hold infinity; the script of the page turns it back."""
     if isinstance(value, Mapping):
         return {key: _encode(item) for key, item in value.items()}
     if isinstance(value, list):
