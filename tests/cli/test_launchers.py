@@ -174,8 +174,10 @@ def hostile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def ask(program: str, **more: str) -> str:
-    child = start_python(program, more, stdout=subprocess.PIPE, text=True)
-    return str(child.communicate()[0]).strip()
+    with mock.patch.dict(os.environ, more):
+        return str(
+            start_python(program, stdout=subprocess.PIPE, text=True).communicate()[0]
+        ).strip()
 
 
 @pytest.mark.parametrize("before", [[], [""]])  # a notebook has the current folder first

@@ -118,7 +118,7 @@ def test_a_writer_that_is_not_atomic_is_reported(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_missing_digest_check_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pfbench.job.run_job.has_valid_digest", lambda _: True)
+    monkeypatch.setattr("pfbench.experiments.study_parts.has_valid_digest", lambda _: True)
     assert damage.run("resumable parts", 4 * SHORT, 7).counts["false"] > 0
 
 
