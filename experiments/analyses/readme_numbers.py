@@ -91,7 +91,7 @@ def format_table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 def _digits(value: float) -> str:
     """Format a number with three significant digits and no exponent."""
-    return f"{float(f'{value:.3g}'):.15g}"
+    return f"{float(f'{value:.3g}'):.15g}".replace("inf", "∞")
 
 
 def describe_knobs(study: str) -> str:
