@@ -207,8 +207,9 @@ def _list_names(names: Sequence[str]) -> str:
 
 
 # --------------------------------------------------------------------------------------------------
-# Files that this project has published, which a clone has without the manifests of their folders.
+# Files that this project has published
 
+#: Digests of published files, which a clone has without the manifests of their folders.
 PUBLISHED_FILES = Path(__file__).parents[2] / "reports" / "published.json"
 
 

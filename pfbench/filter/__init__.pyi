@@ -125,7 +125,6 @@ from pfbench.filter.particle.gaussian_particle_filter import (
 from pfbench.filter.particle.particle_count import (
     CountLimits as CountLimits,
     EssStepCount as EssStepCount,
-    EssTargetCount as EssTargetCount,
 )
 from pfbench.filter.particle.particle_filter import ParticleFilter as ParticleFilter
 from pfbench.filter.particle.regularised_resampling import (
@@ -164,7 +163,6 @@ from pfbench.filter.particle.stages import (
     ProposalSample as ProposalSample,
     Resampler as Resampler,
     ResamplingScheme as ResamplingScheme,
-    Stage as Stage,
     Systematic as Systematic,
     WeightUpdate as WeightUpdate,
 )

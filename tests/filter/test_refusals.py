@@ -33,9 +33,7 @@ REFUSED: dict[str, list[Refusal]] = {
         ("minimum=200", lambda: f.CountLimits(200, 300, 100)),
         ("particle_count.increment must be at least 0, got -1", lambda: f.EssStepCount(-1)),
         (r"ess_threshold must be in \[0, 1\], got 1\.5", lambda: f.EssStepCount(ess_threshold=1.5)),
-        ("particle_count.target must be positive, got 0.0", lambda: f.EssTargetCount(0.0)),
         ("particle_count.limits.maximum must be at most .*got 200", lambda: counted(f.EssStepCount())),
-        ("particle_count.limits.maximum must be at most .*got 1000", lambda: counted(f.EssTargetCount())),
     ],
     "weights": [
         (r"tempering\.strength must be .*got -0\.1", lambda: f.PowerTempering(-0.1)),

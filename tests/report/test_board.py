@@ -199,7 +199,7 @@ def test_a_filter_that_loses_track_keeps_its_place() -> None:
     assert row["words"].endswith("loses track in 4/4")
     assert row["track"] == pytest.approx(0.6)
     assert math.isnan(row["ratio"])  # 24 of 60 runs are lost
-    assert "mcmc_rpf loses 24 and sir 0 of 60 runs" in row["words"]
+    assert "loses more runs (24 of 60, the baseline 0)" in row["words"]
     one = data[data["scenario"].eq("w0") & data["regime"].eq("nominal")]
     row = board(one)["mcmc_rpf"]
     assert (row["verdict"], row["words"]) == ("loses track", "loses track in 40 % of runs")

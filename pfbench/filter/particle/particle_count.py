@@ -101,37 +101,6 @@ class EssStepCount(ParticleCount):
         return number.clamp(self.limits.minimum, self.limits.maximum)
 
 
-@dataclass(frozen=True)
-class EssTargetCount(ParticleCount):
-    """N target / ESS particles, within limits [ours].
-
-    This number has the target ESS if ESS / N does not change.
-
-    Attributes:
-        target: Effective sample size.
-        limits: Limits of the number.
-
-    Raises:
-        ValueError: If the target is not positive.
-    """
-
-    target: float = 100.0
-    limits: CountLimits = field(default_factory=lambda: CountLimits(100, 1000, 150))
-    is_exact = True
-
-    def __post_init__(self) -> None:
-        require_ranges("particle_count", self, target="(0, inf] Choose an effective sample size.")
-
-    @override
-    def initial_count(self, slots: int) -> int:
-        return self.limits.initial_count(slots)
-
-    @override
-    def __call__(self, belief: ParticleBelief) -> Tensor:
-        number = _active_count(belief) * self.target / ess(belief.log_w).unsqueeze(1)
-        return number.round().clamp(self.limits.minimum, self.limits.maximum)
-
-
 def _active_count(belief: ParticleBelief) -> Tensor:
     """Return the number of active particles [R, 1], as float."""
     return (belief.log_w > -torch.inf).sum(1, keepdim=True).to(belief.log_w)

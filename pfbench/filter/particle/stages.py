@@ -27,15 +27,6 @@ from pfbench.kernels import dispatch
 from pfbench.kernels.dispatch import compilable, is_capturing
 from pfbench.model.base import StateSpaceModel
 
-
-class Stage(Protocol):
-    """Stage of a particle filter, which states whether it is asymptotically exact."""
-
-    @property
-    def is_exact(self) -> bool:
-        """True if the weighted particles converge to the posterior as N grows."""
-
-
 # --------------------------------------------------------------------------------------------------
 # Resampling probabilities: the weights themselves by default.
 

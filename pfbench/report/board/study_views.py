@@ -300,7 +300,9 @@ def describe_planned(
     """Describe the verdict on a pair in a sentence."""
     first, second = (f"[[{looks[label].name}]]" for label in (verdict.a, verdict.b))
     where = f"in {_count_worlds(conditions)}, {format_count(verdict.n, 'paired run')}"
-    size = f"ratio {format_with_interval(*verdict[3:6])}" if verdict.ratio > 0 else verdict.reason
+    a, b, both, _ = verdict.lost
+    lost = f"{a + both} and {b + both} of {verdict.n} runs lost" if a + b else verdict.reason
+    size = f"ratio {format_with_interval(*verdict[3:6])}" if verdict.ratio > 0 else lost
     if verdict.word in ("better", "worse"):
         than = "smaller" if verdict.word == "better" else "larger"
         return f"{first} has a {than} error than {second} in most runs ({size}; {where})."
@@ -309,7 +311,7 @@ def describe_planned(
         return f"{first} and {second} are equal within the margin{suffix} ({size}; {where})."
     if verdict.word == "identical":
         return f"{first} and {second} have the same errors ({where})."
-    reason = f"{verdict.reason}; " if verdict.reason not in ("", size) else ""
+    reason = f"{verdict.reason}; " if verdict.ratio > 0 and verdict.reason else ""
     return f"{first} and {second} are not decided ({reason}{size}; {where})."
 
 

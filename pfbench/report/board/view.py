@@ -152,13 +152,15 @@ def _show_verdict(view: View, label: str, verdicts: Mapping[str, Verdict | None]
         "ratio": verdict.ratio, "ratio_low": verdict.low, "ratio_high": verdict.high, "p": verdict.p,
         "loses": verdict.lost.word,
     }  # fmt: skip
-    more = f"{verdict.lost.word} runs" if verdict.lost.word else ""
+    more, reason = f"{verdict.lost.word} runs" if verdict.lost.word else "", verdict.reason
+    if math.isnan(verdict.ratio) and verdict.lost.a + verdict.lost.b:  # its reason has labels
+        more, reason = f"{more or 'lost runs'} ({verdict.lost.a + verdict.lost.both} of {verdict.n}, the baseline {verdict.lost.b + verdict.lost.both})", ""  # fmt: skip
     if lost and len(view.runs.conditions) == 1:
         return {**ends, "verdict": LOSES_TRACK, "words": _word_lost(view, label)}
     words = f" within {100 * math.expm1(view.court.margin):.3g} %" * (
         verdict.word in EQUAL_WORDS[:2]
     )
-    texts = (f"{verdict.word}{words}", more, verdict.reason, _word_lost(view, label))
+    texts = (f"{verdict.word}{words}", more, reason, _word_lost(view, label))
     return {**ends, "verdict": verdict.word, "words": ", ".join(filter(None, texts))}
 
 

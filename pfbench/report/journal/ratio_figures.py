@@ -42,11 +42,15 @@ from pfbench.results.plotting import LETTER, SMALL, set_plain_ticks
 
 _GREY = "0.45"
 _HALF_DIAMOND = 0.26  # rows
+_FAR = 5e3  # m; from there errors are in km
+Columns = tuple[str, str, str]
+_RATIO: Columns = ("ratio", "ratio_low", "ratio_high")
+_LEVEL: Columns = ("value", "low", "high")
 
 
 def plot_leaderboard(pack: Pack, setting: FigureSetting) -> Figure:
     """Plot the error of each filter relative to the baseline, with its interval."""
-    rows = _select_ratios(find_rows(pack))
+    rows = _select_rows(find_rows(pack))
     looks = filters_by_key(pack)
     names = [str(looks[key]["name"]) for key in rows]
     figure = setting.make_figure(MARGIN + measure_rows(names, setting.page))
@@ -55,17 +59,25 @@ def plot_leaderboard(pack: Pack, setting: FigureSetting) -> Figure:
 
 
 def plot_worlds(pack: Pack, setting: FigureSetting) -> Figure:
-    """Plot the leaderboard of each world side by side, in its own order, with the share of runs that keep track."""
+    """Plot each world side by side, in its own order, with the share of runs that keep track.
+
+    A world shows ratios, or median errors if a ratio is missing since a filter or the baseline loses too many runs.
+    """
     worlds = [str(order["world"]) for order in pack["world_orders"]]
-    tables = [_select_ratios(find_rows(pack, world)) for world in worlds]
+    tables = [find_rows(pack, world) for world in worlds]
+    columns = [
+        _RATIO if all(is_number(r["ratio"]) or not is_number(r["value"]) for r in rows.values()) else _LEVEL
+        for rows in tables
+    ]  # fmt: skip
+    tables = [_select_rows(*table) for table in zip(tables, columns, strict=True)]
     figure = setting.make_figure(MARGIN + 0.2 + 1.3 * ROW * max(map(len, tables)))
-    for axis, world, rows in zip(
-        figure.subplots(1, len(worlds), squeeze=False)[0], worlds, tables, strict=True
+    for axis, world, rows, names in zip(
+        figure.subplots(1, len(worlds), squeeze=False)[0], worlds, tables, columns, strict=True
     ):
-        _draw_leaderboard(axis, pack, rows, setting)
+        _draw_leaderboard(axis, pack, rows, setting, names)
         axis.set_title(setting.escape(name_of(pack, "worlds", world)), fontweight="bold")
         for y, row in enumerate(rows.values()):
-            if row["verdict"] == "loses track" or "loses" in row["words"]:
+            if row["verdict"] == "loses track" or "loses track" in row["words"]:
                 text = setting.escape(f"{100 * float(row['track']):.0f} % keep track")
                 axis.annotate(
                     text, (0.02, y), xycoords=("axes fraction", "data"), ha="left", va="center",
@@ -74,37 +86,41 @@ def plot_worlds(pack: Pack, setting: FigureSetting) -> Figure:
     return figure
 
 
-def _select_ratios(rows: Mapping[str, Row]) -> dict[str, Row]:
-    """Select the rows that have a ratio."""
-    return {key: row for key, row in rows.items() if is_number(row["ratio"])}
+def _select_rows(rows: Mapping[str, Row], columns: Columns = _RATIO) -> dict[str, Row]:
+    """Select the rows that have a value of the columns."""
+    return {key: row for key, row in rows.items() if is_number(row[columns[0]])}
 
 
 def _draw_leaderboard(
-    axis: Axes, pack: Pack, rows_with_ratio: Mapping[str, Row], setting: FigureSetting
+    axis: Axes,
+    pack: Pack,
+    rows: Mapping[str, Row],
+    setting: FigureSetting,
+    columns: Columns = _RATIO,
 ) -> None:
-    """Draw the rows of a leaderboard."""
-    looks = filters_by_key(pack)
-    limits = ratio_limits([
-        float(row[name]) for row in rows_with_ratio.values() for name in ("ratio", "ratio_low", "ratio_high") if is_number(row[name])
-    ])  # fmt: skip
+    """Draw the rows of a leaderboard: a value with the ends of its interval; the upper end may be open."""
+    looks, is_ratio = filters_by_key(pack), columns == _RATIO
+    values = [[float(row[n]) if is_number(row[n]) else np.inf for n in columns] for row in rows.values()]  # fmt: skip
+    is_far = not is_ratio and min(row[0] for row in values) > _FAR
+    ends = np.multiply(values, 1e-3 if is_far else 1.0)
+    finite = ends[np.isfinite(ends)]
+    limits = ratio_limits(list(finite)) if is_ratio else (finite.min() / 1.08, finite.max() * 1.08)
     use_ratio_scale(axis, *limits)
-    label_rows(axis, [str(looks[key]["name"]) for key in rows_with_ratio], setting)
-    least = min((f"{row['ratio']:.2f}" for row in rows_with_ratio.values()), default="")
-    for y, (key, row) in enumerate(rows_with_ratio.items()):
-        ends = [
-            float(row[n]) if is_number(row[n]) else np.nan
-            for n in ("ratio", "ratio_low", "ratio_high")
-        ]
-        draw_interval(axis, y, (ends[0], ends[1], ends[2]), looks[key], limits)
-        text = f"{ends[0]:.2f}"
+    label_rows(axis, [str(looks[key]["name"]) for key in rows], setting)
+    texts = [f"{value:.2f}" if is_ratio else f"{value:.3g}" for value in ends[:, 0]]
+    for y, ((key, row), text) in enumerate(zip(rows.items(), texts, strict=True)):
+        draw_interval(axis, y, tuple(ends[y]), looks[key], limits)
         axis.annotate(
             text, (1.0, y), xycoords=("axes fraction", "data"), xytext=(3, 0), textcoords="offset points", va="center",
-            fontsize=setting.page.tick_size, fontweight="bold" if text == least else "normal", annotation_clip=False,
+            fontsize=setting.page.tick_size, fontweight="bold" if text == min(texts, key=float) else "normal", annotation_clip=False,
         )  # fmt: skip
         if row["verdict"] == "worse":
             _write_dagger(axis, y, text, setting)
-    baseline = looks[str(pack["baselines"][0])]["name"] if pack["baselines"] else ""
-    axis.set_xlabel(setting.escape(f"{pack['metrics'][0]['name']} relative to {baseline}"))
+    metric, baseline = pack["metrics"][0], looks[str(pack["baselines"][0])]["name"] if pack["baselines"] else ""  # fmt: skip
+    level = f"median {metric['name']} [{'k' * is_far}{metric['unit']}]"
+    axis.set_xlabel(
+        setting.escape(f"{metric['name']} relative to {baseline}" if is_ratio else level)
+    )
 
 
 def plot_planned(pack: Pack, setting: FigureSetting) -> Figure:

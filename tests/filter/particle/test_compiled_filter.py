@@ -24,7 +24,7 @@ from pfbench.filter.health import HealthMonitor
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle import compiled_filter, step_store
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
-from pfbench.filter.particle.particle_count import CountLimits, EssTargetCount
+from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.resampling import Stratified
 from pfbench.filter.particle.stages import EssResampler, Proposal, Systematic
@@ -435,7 +435,7 @@ ALWAYS = EssResampler(Systematic(), 1.0)
         (Picked(), {"resampler": EssResampler(Stratified(), 1.0)}, False),
         (Picked(), {"auxiliary_weights": LookAheadWeights()}, False),
         (Picked(), {"weight_update": PowerLikelihoodUpdate(2.0)}, False),
-        (Picked(), {"particle_count": EssTargetCount(100.0, CountLimits(4000, 4100, 4100))}, True),
+        (Picked(), {"particle_count": EssStepCount(limits=CountLimits(4000, 4100, 4100))}, True),
     ],
 )
 def test_a_step_is_one_operator_where_nothing_comes_between(

@@ -15,15 +15,14 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief, ess
+from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_count import CountLimits, EssStepCount, EssTargetCount
+from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.resampling import Multinomial, Stratified
 from pfbench.filter.particle.stages import (
     AuxiliaryWeights,
     EssResampler,
-    ParticleCount,
     PosteriorWeights,
     ResamplingScheme,
     Systematic,
@@ -188,23 +187,12 @@ def test_a_step_up_or_down() -> None:
     ]
 
 
-def test_an_effective_size_is_aimed_at() -> None:
-    size = EssTargetCount(40.0, CountLimits(20, 100, 50))
-    log_w = torch.stack([log_weights([1.0] * n + [1e-12] * (50 - n), 100) for n in (25, 50, 10)])
-    torch.testing.assert_close(ess(log_w), torch.tensor([25.0, 50.0, 10.0], dtype=torch.float64))
-    assert size(cloud(log_w)).tolist() == [[80.0], [40.0], [100.0]]
-
-
 FEW = CountLimits(10, 40, 25)
 
 
-@pytest.mark.parametrize(
-    "size", [EssStepCount(7, 0.6, FEW), EssTargetCount(15.0, FEW)], ids=lambda s: type(s).__name__
-)
 @pytest.mark.parametrize("threshold", [0.5, 1.0])
-def test_a_changing_number_leaves_everything_unbiased(
-    size: ParticleCount, threshold: float
-) -> None:
+def test_a_changing_number_leaves_everything_unbiased(threshold: float) -> None:
+    size = EssStepCount(7, 0.6, FEW)
     method = ParticleFilter(40, EssResampler(Systematic(), threshold), size, TemperedWeights())
     assert method.is_exact
     check_evidence(method, WALK, WALK_Y, reference_moments(WALK, WALK_Y))
