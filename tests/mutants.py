@@ -33,36 +33,19 @@ def pattern_of(text: str) -> re.Pattern[str]:
     return re.compile(r"\s*(?:,\s*)?".join(re.escape(token) for token in tokens))
 
 
-def locate(fault: dict[str, Any], root: Path) -> Path:
-    """Return the file in which the text of a fault occurs once.
+def break_source(fault: dict[str, Any], root: Path) -> str:
+    """Return the source of the file of a fault with its text replaced.
 
     Raises:
-        ValueError: If no file, or more than one, holds it once.
+        ValueError: If the text does not occur once, or this is no Python.
     """
-    pattern, named = pattern_of(fault["text"]), root / fault["file"]
-    if named.is_file() and len(pattern.findall(named.read_text())) == 1:
-        return named
-    files = [
-        file
-        for file in sorted((root / "pfbench").rglob("*.py"))
-        if pattern.search(file.read_text())
-    ]
-    count = sum(len(pattern.findall(file.read_text())) for file in files)
-    if count != 1:
-        raise ValueError(
-            f"text must occur once, got {count}: {fault['text']!r}. Adapt tests/mutants.toml"
-        )
-    return files[0]
-
-
-def break_source(fault: dict[str, Any], file: Path) -> str:
-    """Return the source of a file with the text of a fault replaced.
-
-    Raises:
-        ValueError: If this is no Python.
-    """
+    file, pattern = root / fault["file"], pattern_of(fault["text"])
     source, broken = file.read_text(), fault["broken"].lstrip()  # that before the text stays
-    source = pattern_of(fault["text"]).sub(lambda _: broken, source, count=1)
+    if (count := len(pattern.findall(source))) != 1:
+        raise ValueError(
+            f"text must occur once in {fault['file']}, got {count}: {fault['text']!r}. Adapt tests/mutants.toml"
+        )
+    source = pattern.sub(lambda _: broken, source)
     try:
         compile(source if file.suffix == ".py" else "", str(file), "exec")
     except SyntaxError as error:
@@ -72,8 +55,7 @@ def break_source(fault: dict[str, Any], file: Path) -> str:
 
 def plant(fault: dict[str, Any], root: Path) -> None:
     """Replace the text of a fault in a copy of the checkout."""
-    file = locate(fault, root)
-    file.write_text(break_source(fault, file))
+    (root / fault["file"]).write_text(break_source(fault, root))
 
 
 def run_tests(tests: list[str], root: Path) -> int:
@@ -145,9 +127,8 @@ def main() -> int:
         start = time.perf_counter()
         if options.check:
             try:
-                file = locate(faults[name], ROOT)
-                break_source(faults[name], file)
-                outcome = f"in {file.relative_to(ROOT)}"
+                break_source(faults[name], ROOT)
+                outcome = f"in {faults[name]['file']}"
             except ValueError as error:
                 outcome, failures = str(error), failures + 1
         else:

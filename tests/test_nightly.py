@@ -69,6 +69,23 @@ def test_each_planted_fault_has_a_test_by_day(request: pytest.FixtureRequest) ->
             assert not all(tests), f"{name}: all its tests wait for the night"
 
 
+@cache
+def squeeze_file(path: str) -> str:
+    return squeeze((TESTS.parent / path).read_text())
+
+
+def squeeze(text: str) -> str:
+    """White space and commas, which a formatter moves."""
+    return "".join(text.replace(",", " ").split())
+
+
+def test_each_planted_fault_is_found_once_in_its_file() -> None:
+    """Else it plants nothing, and `make mutants` says so only when somebody runs it."""
+    for name, fault in mutants.read_faults().items():
+        count = squeeze_file(fault["file"]).count(squeeze(fault["text"]))
+        assert count == 1, f"{name}: its text is found {count} times in {fault['file']}"
+
+
 def test_words_select_as_pytest_does() -> None:
     test = "tests/a/test_of_it.py::test_of_that[Case-2]"
     for words in ("that", "case-2 and not other", "(other or of_it) and test_of", "not (other)"):

@@ -105,6 +105,16 @@ def test_ratio_interval_and_p_of_a_row_are_those_of_scipy() -> None:
             assert outside < 0.05 / 3 < inside
 
 
+def test_the_interval_of_a_median_has_the_order_statistics_of_the_level() -> None:
+    data = table(worlds=1)
+    data = data[data["regime"] == "nominal"]
+    for label, row in board(data).items():
+        errors = np.sort(data.loc[data["filter"] == label, "rmse"])
+        k = int(np.searchsorted(errors, row["low"] * (1 + 1e-9))) - 1
+        assert (row["low"], row["high"]) == pytest.approx((errors[k], errors[-1 - k]))
+        assert stats.binom.cdf(k, 30, 0.5) <= 0.025 < stats.binom.cdf(k + 1, 30, 0.5)
+
+
 def test_another_filter_changes_no_row_but_the_size_of_the_family() -> None:
     few, many = (board(table({**EFFECTS, **more})) for more in ({}, {"gpf": -0.5, "qmc_gpf": 3.0}))
     for label in EFFECTS:

@@ -130,6 +130,17 @@ def test_better_needs_the_sign_test_and_says_where_the_mean_error_is_larger() ->
     assert (better.word, better.reason) == ("better", "the mean error of a over the kept runs is larger than that of b")  # fmt: skip
 
 
+def test_better_needs_the_trimmed_mean() -> None:
+    """Ranks and signs agree, and the middle of the runs does not differ from zero."""
+    d = np.repeat([-10.0, -0.01, 4.0], [35, 35, 30])
+    (verdict,) = decide([compare(*pair(d))])
+    assert max(stats.wilcoxon(d).pvalue, stats.binomtest(30, 100).pvalue) < 0.001
+    middle = np.sort(d)[20:80]
+    error = np.clip(d, middle[0], middle[-1]).std(ddof=1) / (0.6 * 10)  # Tukey and McLaughlin
+    assert abs(middle.mean() / error) < stats.t.ppf(0.975, 59)
+    assert (verdict.word, verdict.reason) == (NO_DECISION, "the trimmed mean does not agree")
+
+
 def test_words_of_clear_cases() -> None:
     rng = np.random.default_rng(2)
     x = rng.normal(size=60)
