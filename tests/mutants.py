@@ -90,6 +90,8 @@ def try_fault(fault: dict[str, Any], baseline: bool = False) -> str:
         root = Path(folder)
         for name in FOLDERS:
             shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
+        for name in ("conf", "experiments"):  # else an editable install finds those of the checkout
+            (root / "pfbench" / name).symlink_to(root / name)
         shutil.copy(ROOT / "pyproject.toml", root)
         (root / "reports").mkdir()
         shutil.copy(ROOT / "reports" / "README.md", root / "reports")  # tests/checkout.py reads it
