@@ -523,12 +523,15 @@ def test_added_errors_are_in_metres_of_positions_alone() -> None:
     assert within_chi_square(hits[hit], 400.0)
 
 
-def test_white_errors_and_outliers_beside_each_other_are_independent() -> None:
+@pytest.mark.parametrize(("white", "share", "outlier"), [(2.0, 0.3, 5.0), (4.0, 0.6, 3.0)])
+def test_white_errors_and_outliers_beside_each_other_are_independent(
+    white: float, share: float, outlier: float
+) -> None:
     """The variance of both is the sum, 2^2 + 5^2; with shared numbers it would be (2 + 5)^2."""
-    hit = draw(AddedErrors(probability=0.3, outlier_sd_m=5.0), 0.0)[..., :3] != 0.0
-    both = draw(AddedErrors(2.0, 0.3, 5.0), 0.0)[..., :3]
-    assert within_chi_square(both[hit], 29.0)
-    assert within_chi_square(both[~hit], 4.0)
+    hit = draw(AddedErrors(probability=share, outlier_sd_m=outlier), 0.0)[..., :3] != 0.0
+    both = draw(AddedErrors(white, share, outlier), 0.0)[..., :3]
+    assert within_chi_square(both[hit], white**2 + outlier**2)
+    assert within_chi_square(both[~hit], white**2)
 
 
 def test_added_errors_of_ranges_are_those_of_each_satellite() -> None:

@@ -142,10 +142,13 @@ def test_the_inputs_are_the_four_differences_of_kalman_net(normalisation: str) -
         np.testing.assert_allclose(features.numpy(), columns, atol=1e-9)
 
 
-def test_estimates_do_not_depend_on_the_units_of_states_and_measurements() -> None:
+@pytest.mark.parametrize("units", [(20.0, 1.0, 5.0, 1 / 3), (1.0, 0.1, 1.0, 8.0)])
+def test_estimates_do_not_depend_on_the_units_of_states_and_measurements(
+    units: tuple[float, ...],
+) -> None:
     """The same network with a state in 1/20 and measurements in 1/5 and 3 of their units: a gain in m per unit of y."""
     base, y = tracker(), measurements(3)
-    state, unit = torch.tensor([20.0, 1.0]).double(), torch.tensor([5.0, 1 / 3]).double()
+    state, unit = torch.tensor(units, dtype=torch.float64).split(2)
     scaled = LinearGaussian(
         state[:, None] * base.f / state, state[:, None] * base.g, unit[:, None] * base.h / state,
         unit * base.r, state * base.m0, state[:, None] * base.l0,
