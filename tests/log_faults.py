@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from pfbench.logs.doctor.checks import run_checks
 from pfbench.logs.doctor.finding import Finding
-from pfbench.logs.doctor.inspection import LogSource, take_tables
+from pfbench.logs.worlds.log_reader import LogSource
 from pfbench.logs.worlds.log_tables import LogTable
 
 Tables = dict[str, pd.DataFrame]
@@ -276,8 +276,8 @@ def findings_of(log: Tables, settings: dict[str, object] | None = None) -> list[
     """Findings of tables, read with the settings of a remedy."""
     source = LogSource(Path()).with_settings(settings or {})
     tables = tuple(LogTable(table, name, False, {}) for name, table in log.items())
-    corrected, _ = source.corrections.correct_tables(*tables)
-    return run_checks(take_tables(corrected, source))[0]
+    corrected, _ = source.mending.correct_tables(*tables)
+    return run_checks(source.take(corrected))[0]
 
 
 def checks_of(log: Tables, settings: dict[str, object] | None = None) -> set[str]:

@@ -13,6 +13,7 @@ from typing import IO, TYPE_CHECKING, Any
 from pfbench.door.parts import Part, describe_value, format_words, plain_errors
 from pfbench.files.atomic_write import write_atomically
 from pfbench.job.trust import WRITTEN
+from pfbench.logs.units import UNITS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,7 +40,7 @@ _POSITION = (("lat_deg", "lon_deg", "h_m"), ("pn", "pe", "pd"))
 _UNITS = re.compile(
     r"(?<=[a-z0-9])[_ .\[(]*(m/?s\^?2|mps2|rad/?s|radps|m/?s|mps|rad|deg|s|m)[\])]*$", re.IGNORECASE
 )
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_SECONDS = {"s": 1.0, **UNITS["time"]}
 _SIGNS = {"frd": (1.0, 1.0, 1.0), "flu": (1.0, -1.0, -1.0)}
 
 
@@ -180,11 +181,8 @@ def _write_text(text: str, file: IO[bytes]) -> None:
 
 def _check(folder: Path, settings: Mapping[str, Any], *, has_reference: bool) -> None:
     """Read the log as a job would, so that its errors appear at once."""
-    from pfbench.logs.worlds.aligned_reader import read_aligned_log
     from pfbench.scenario import LogFiles, read_log
 
     options = {key: settings[key] for key in ("origin", "fix_codes") if key in settings}
-    if has_reference:
-        read_log(folder, **options)
-    else:
-        read_aligned_log(folder, LogFiles(reference=None), **options)
+    files = LogFiles() if has_reference else LogFiles(reference=None)
+    read_log(folder, files, has_attitude=has_reference, **options)

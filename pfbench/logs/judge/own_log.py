@@ -24,6 +24,7 @@ from pfbench.logs.judge.trajectory_table import (
     euler_angles,
     rotation_from_quaternion,
 )
+from pfbench.logs.units import UNITS
 from pfbench.stats.error_measures import Array
 
 ROLES = {
@@ -32,7 +33,7 @@ ROLES = {
     "reference": ("t", *GEODETIC, *LOCAL, *VELOCITY_COLUMNS, *ATTITUDE_COLUMNS),
 }
 LAYOUTS = ("", "table", "tum", "nmea", "kf_gins", "rtklib", "euroc", "kitti")
-_UNITS_OF_TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_UNITS_OF_TIME = {"s": 1.0, **UNITS["time"]}
 _REPEATS = ("refuse", "first")
 _WEEK = 604800.0  # s
 _FLIP = np.diag([1.0, -1.0, -1.0])  # forward-left-up and forward-right-down

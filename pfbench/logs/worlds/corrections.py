@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from pfbench.logs.worlds.time_grid import interpolate
 from pfbench.nav.strapdown import rotate
 
 Tables = dict[str, LogTable]
+LogTables = tuple[LogTable, LogTable, LogTable | None]  # IMU, fixes and, if there is one, reference
 Vector = Sequence[float] | None
 _TABLES = ("imu", "gnss", "reference")
 _FORCE, _RATE, _ANGLES = ("fx", "fy", "fz"), ("wx", "wy", "wz"), ("roll", "pitch", "yaw")
@@ -107,26 +108,19 @@ class LogCorrections:
         for table, shift in (self.shift_s or {}).items():
             _nodes_of(table, shift)
 
-    @property
-    def is_empty(self) -> bool:
-        """True if nothing is corrected."""
-        return not any(getattr(self, f.name) not in ("refuse", None) and getattr(self, f.name) for f in fields(self))  # fmt: skip
-
-    def correct_tables(self, inertial: LogTable, gnss: LogTable, truth: LogTable) -> tuple[tuple[LogTable, LogTable, LogTable], tuple[str, ...]]:  # fmt: skip
+    def correct_tables(self, inertial: LogTable, gnss: LogTable, truth: LogTable | None) -> tuple[LogTables, tuple[str, ...]]:  # fmt: skip
         """Correct the tables as recorded.
 
         Args:
             inertial: IMU table.
             gnss: Table of fixes.
-            truth: Reference table.
+            truth: Reference table, None for a log without one.
 
         Returns:
             Corrected tables, and a note for each correction.
         """
-        tables = {"imu": inertial, "gnss": gnss, "reference": truth}
+        tables = {"imu": inertial, "gnss": gnss} | ({"reference": truth} if truth else {})
         notes: list[str] = []
-        if self.is_empty:
-            return (inertial, gnss, truth), ()
         for name, order in (self.times or {}).items():
             tables[name] = _sort(tables[name], notes)
             if order == "even":
@@ -139,7 +133,7 @@ class LogCorrections:
         if self.gaps == "longest":
             tables["imu"], note = cut_longest(tables["imu"], convert_column(tables["imu"], "t"))
             notes += note
-        return (tables["imu"], tables["gnss"], tables["reference"]), tuple(notes)
+        return (tables["imu"], tables["gnss"], tables.get("reference")), tuple(notes)
 
     def _correct_columns(self, tables: Tables, notes: list[str]) -> None:
         """Apply factors, axes, convention and biases to the columns."""
@@ -176,12 +170,12 @@ class LogCorrections:
                 tables[name] = _apply(tables[name], (column,), lambda v, b=value: v - b)
             notes.append(f"{tables[name].name}: {dict(values)} subtracted")
 
-    def correct_fixes(self, fixes: GnssLog, reference: ReferenceLog, name: str) -> tuple[GnssLog, tuple[str, ...]]:  # fmt: skip
+    def correct_fixes(self, fixes: GnssLog, reference: ReferenceLog | None, name: str) -> tuple[GnssLog, tuple[str, ...]]:  # fmt: skip
         """Correct the fixes with the reference.
 
         Args:
             fixes: Fixes.
-            reference: Reference.
+            reference: Reference, None for a log without one.
             name: Name of the table of fixes.
 
         Returns:
@@ -193,7 +187,7 @@ class LogCorrections:
             notes.append(
                 f"{name}: {list(self.offset_m)} m North, East, Down subtracted from the fixes"
             )
-        if self.lever_arm is not None:
+        if self.lever_arm is not None and reference:
             lever = torch.from_numpy(swap_frd_rfu(np.array(self.lever_arm, float)))
             q = torch.from_numpy(interpolate(reference, fixes.time)[:, :4])
             position -= rotate(q, lever.expand(len(q), 3)).numpy()
@@ -202,7 +196,7 @@ class LogCorrections:
             )
         velocity = fixes.velocity.copy()
         for kind in ("outliers", "frozen"):
-            if kind in (self.drop or ()):
+            if kind in (self.drop or ()) and reference:
                 mask = _wrong_fixes(fixes._replace(position=position), reference, kind)
                 position[mask] = velocity[mask] = np.nan
                 notes.append(f"{name}: {int(mask.sum())} fixes dropped as {kind}")
