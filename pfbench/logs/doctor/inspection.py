@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from pfbench.files.reader_notes import announce_notes
 from pfbench.logs.doctor.checks import WITHOUT_REFERENCE, run_checks
-from pfbench.logs.doctor.finding import REFUSE, Finding, LogDiagnosis, merge_settings
+from pfbench.logs.doctor.finding import REFUSE, TELL, Finding, LogDiagnosis, merge_settings
 from pfbench.logs.doctor.sensor_grade import measure_noise
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
 from pfbench.logs.worlds.corrections import LogTables
@@ -54,7 +55,24 @@ def inspect_log(
         if more == settings:
             break
         settings = more
+    if settings and not _is_mended(findings, remaining):
+        findings, settings = withhold_remedies(findings), {}
     return LogDiagnosis(tuple(findings), facts, settings, tuple(checks))
+
+
+def _is_mended(findings: Sequence[Finding], remaining: Sequence[Finding]) -> bool:
+    """Return whether a log with all settings is refused no more, and has no finding that it did not have."""
+    known = {finding.check for finding in findings if not finding.settings}
+    return all(f.level == TELL or (f.level != REFUSE and f.check in known) for f in remaining)
+
+
+def withhold_remedies(findings: Sequence[Finding]) -> list[Finding]:
+    """Take the settings from findings, and say that they were tried: together they do not mend the log."""
+    return [
+        f._replace(settings={}, remedy=f"Nothing that was tried explains the log as a whole; tried: {dict(f.settings)}")
+        if f.settings else f
+        for f in findings
+    ]  # fmt: skip
 
 
 def _inspect(source: LogSource, tables: LogTables) -> tuple[list[Finding], dict[str, Any]]:

@@ -254,13 +254,16 @@ def _check_units(table: TrajectoryTable, reference: ReferenceTrack) -> Iterator[
         others = [u for u, f in units.items() if abs(ratio / f - 1) < _CLOSE]
         if names or others:
             texts = [*names, *(f"reference in {name}" for name in others)]
+            mine = [units[name] for name in names]
+            if unit == "rad" and others:
+                mine, texts = [1 / units[others[0]]], ["rad, converted twice", *texts]
             if unit == "rad" and table.angle_unit == "deg":  # the reader has converted them
-                unit, texts = "deg", ["radians", *texts]
+                unit, texts = "deg", ["radians", *texts[bool(others) :]]
             evidence = (
                 f"{table.file}: column {pair.name} must be in {unit}, got values {ratio:.4g} times those of "
                 f"{reference.file}: {', or '.join(texts)}"
             )
-            remedy = _describe_factors(pairs, pair, [units[n] for n in names], [1 / units[n] for n in others])  # fmt: skip
+            remedy = _describe_factors(pairs, pair, mine, [1 / units[n] for n in others])  # fmt: skip
             yield Finding(f"unit of {dimension}", REFUSE, ratio, 1.0, "1", evidence, remedy)
 
 

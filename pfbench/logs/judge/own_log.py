@@ -34,7 +34,7 @@ ROLES = {
 }
 LAYOUTS = ("", "table", "tum", "nmea", "kf_gins", "rtklib", "euroc", "kitti")
 _UNITS_OF_TIME = {"s": 1.0, **UNITS["time"]}
-_REPEATS = ("refuse", "first")
+_REPEATS, _MOST_REPEATS = ("refuse", "first"), 0.5  # share of rows that another sampling explains
 _WEEK = 604800.0  # s
 _FLIP = np.diag([1.0, -1.0, -1.0])  # forward-left-up and forward-right-down
 _FROM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -144,10 +144,13 @@ def _check_times(role: str, table: ImportedTable, options: ImportOptions) -> Imp
             f"{role} must have at least two rows with a time, got {int(np.isfinite(time).sum())}. Check the file."
         )
     repeated = pd.Series(time).duplicated().to_numpy()
-    if repeated.any() and options.repeats == "refuse":
+    if repeated.mean() > _MOST_REPEATS or (repeated.any() and options.repeats == "refuse"):
+        remedy = f"Set {role}.repeats=first to keep the first of them."
+        if repeated.mean() > _MOST_REPEATS:
+            remedy = "The times have lost digits: write them again with more, since no key brings them back."
         raise ValueError(
             f"{role} must have one row for each time, got {int(repeated.sum())} rows that repeat one, the first at "
-            f"t = {time[repeated][0]:g}. Set {role}.repeats=first to keep the first of them."
+            f"t = {time[repeated][0]:g}. {remedy}"
         )
     if not repeated.any():
         return table

@@ -150,11 +150,12 @@ def _check_velocities(table: TrajectoryTable, ratio: float) -> Iterator[Finding]
 
 def _list_units(table: TrajectoryTable) -> Iterator[tuple[str, Mapping[str, float]]]:
     """Yield units with the factors of their columns that may explain other velocities."""
-    columns = {"time": ["t"], "velocity": [name for name in VELOCITY_COLUMNS if name in table.values]}  # fmt: skip
+    columns = {"time": ["t"]}
     if table.has(LOCAL):
         columns["length"] = list(LOCAL)
     elif (np.abs(table.select(GEODETIC[:2])) <= [math.pi / 2, math.pi]).all():
         columns["place"] = list(GEODETIC[:2])
+    columns["velocity"] = [name for name in VELOCITY_COLUMNS if name in table.values]
     for dimension, names in columns.items():
         yield from ((unit, dict.fromkeys(names, f)) for unit, f in UNITS[dimension].items())
 

@@ -56,7 +56,7 @@ class LogCorrections:
         mounting: By imu, accelerometer or gyroscope: the recorded axes that are forward, right, down, such as
             [x, -y, -z]. Three numbers are the angles of the sensor in the body, roll, pitch, yaw, deg.
         level_axes: By gnss, reference or reference_velocity: the recorded axes that are North, East, Down, such as
-            [e, n, -d].
+            [e, n, -d]. One number is the turn of the frame about the vertical, deg.
         attitude: Convention of the recorded attitude, such as yaw_from_east. None for that of the tables.
         bias: Values that are subtracted, by table and column.
         shift_s: Delay of the clock by table, s, which is subtracted from t. Nodes [t, delay] for one that changes.
@@ -73,7 +73,7 @@ class LogCorrections:
     times: Mapping[str, str] = field(default_factory=dict)
     scale: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     mounting: Mapping[str, Sequence[str | float]] = field(default_factory=dict)
-    level_axes: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    level_axes: Mapping[str, Sequence[str | float]] = field(default_factory=dict)
     attitude: str | None = None
     bias: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     shift_s: Mapping[str, float | Sequence[Sequence[float]]] = field(default_factory=dict)
@@ -371,12 +371,14 @@ def _mounting_matrix(sensor: str, axes: Sequence[str | float]) -> Array:
     return matrix
 
 
-def _level_matrix(frame: str, axes: Sequence[str]) -> Array:
+def _level_matrix(frame: str, axes: Sequence[str | float]) -> Array:
     """Return the matrix from the recorded to North, East, Down, [3, 3]."""
+    if len(axes) == 1 and isinstance(axes[0], int | float):
+        return np.asarray(Rotation.from_euler("z", -axes[0], degrees=True).as_matrix())
     matrix = parse_axes([str(name) for name in axes], is_level=True)
     if matrix is None:
         raise ValueError(
-            f"scenario.corrections.level_axes.{frame} must be three different axes such as [e, n, -d], got "
+            f"scenario.corrections.level_axes.{frame} must be three different axes such as [e, n, -d], or a turn in deg, got "
             f"{list(axes)}. Name the recorded axes that are North, East, Down."
         )
     return matrix
