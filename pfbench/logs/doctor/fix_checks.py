@@ -109,7 +109,13 @@ def check_codes(log: RawLog) -> Iterator[Finding]:
     numbers = {int(code) for code in np.unique(log.codes)}
     if share >= limit_of("fix codes") or not numbers - {0, 1}:
         return
-    is_nmea = bool(numbers & {4, 5}) and numbers <= set(range(9))
+    is_nmea = bool(numbers & {4, 5}) and numbers <= {
+        0,
+        1,
+        2,
+        4,
+        5,
+    }  # 3 and 6 are other things elsewhere
     name = log.names[1]
     causes = ("quality of NMEA: 4 RTK fixed, 5 RTK float", "quality of RTKLIB: 4 differential, 5 single")  # fmt: skip
     yield Finding(
@@ -143,7 +149,7 @@ def _check_frame(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
     if len(used) < _FEWEST:
         return
     for _ in range(3):
-        fixes, error = (a[used, :2] @ [1.0, 1.0j] for a in (log.fixes.position, plain.error))
+        fixes, error = (a[used, :2] @ [1.0, 1j] for a in (log.fixes.position, plain.error))
         true = fixes - error
         moved, expected = fixes - fixes.mean(), true - true.mean()
         factor = np.vdot(expected, moved) / max(np.vdot(expected, expected).real, 1e-9)
@@ -186,10 +192,9 @@ def _check_frame(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
 def _check_slow(log: RawLog, at: Array, rest: Array, facts: dict[str, Any]) -> Iterator[Finding]:
     """Check for errors of the fixes that last: blocks of ten seconds far from the others."""
     block = np.floor((at - at[0]) / _BLOCK_S).astype(int)
-    means = np.stack([np.bincount(block, axis) for axis in rest.T[:2]], -1)
-    counts = np.bincount(block)
+    counts, sums = np.bincount(block), [np.bincount(block, axis) for axis in rest.T[:2]]
     full = counts >= _FEWEST_OF_BLOCK
-    means = means[full] / counts[full, None]
+    means: Array = np.stack(sums, -1)[full] / counts[full, None]
     if len(means) < 2:
         return
     size = np.linalg.norm(means - np.median(means, 0), axis=1)

@@ -287,12 +287,13 @@ def _ros_cause(state: ForceState) -> Cause | None:
     """Explain by axes of ROS in all tables: these agree with each other, and gravity alone points the other way."""
     log, flip = state.aligned.log, np.array([1.0, -1.0, -1.0])
     imu, swap = log.imu, np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    parts = log.reference, log.fixes
-    reference, fixes = (part._replace(position=part.position @ swap) for part in parts)
     angles = convert_angles("forward_left_up", log.reference.angles)
+    reference = log.reference._replace(
+        velocity=log.reference.velocity @ swap, position=log.reference.position @ swap, angles=angles
+    )  # fmt: skip
     mended = log._replace(
-        imu=imu._replace(force=imu.force * flip, rate=imu.rate * flip), fixes=fixes,
-        reference=reference._replace(velocity=log.reference.velocity @ swap, angles=angles),
+        imu=imu._replace(force=imu.force * flip, rate=imu.rate * flip), reference=reference,
+        fixes=log.fixes._replace(position=log.fixes.position @ swap),
     )  # fmt: skip
     windows = integrate_force(mended, dcm_of(angles), state.aligned.offset)
     if windows is None or fit_force(windows).cost >= _EQUAL * state.least:

@@ -69,7 +69,7 @@ def check_run(
 class _Motion:
     """Positions of a trajectory that are moved in time against the reference."""
 
-    def __init__(self, table: TrajectoryTable, reference: ReferenceTrack, rows: Array | slice) -> None:  # fmt: skip
+    def __init__(self, table: TrajectoryTable, reference: ReferenceTrack, rows: np.ndarray | slice) -> None:  # fmt: skip
         time, position = table.time[rows], reference.locate(table)[rows]
         every = max(1, len(time) // 1500)
         self.time, self.position, self.reference = time[::every], position[::every], reference

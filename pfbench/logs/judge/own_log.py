@@ -52,6 +52,7 @@ class ImportOptions:
         time: Unit of the time of a table: s, ms, us or ns.
         repeats: refuse, or first: keep the first row of each time.
         columns: Name in the file by name of pfbench, for a table.
+        scale: Factor by name of pfbench, for a column of a table in another unit.
     """
 
     layout: str = ""
@@ -59,6 +60,7 @@ class ImportOptions:
     time: str = "s"
     repeats: str = "refuse"
     columns: Mapping[str, str] = field(default_factory=dict)
+    scale: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for key, value, allowed in (
@@ -168,7 +170,7 @@ def _read_named(role: str) -> Callable[[Path, ImportOptions], ImportedTable]:
     def read(path: Path, options: ImportOptions) -> ImportedTable:
         content = read_table_file(path)
         names = {name: options.columns.get(name, name) for name in ROLES[role]}
-        unknown = [name for name in options.columns if name not in ROLES[role]]
+        unknown = [name for name in (*options.columns, *options.scale) if name not in ROLES[role]]
         missing = [f"{new} ({old})" for new, old in names.items() if new in options.columns and old not in content.rows]  # fmt: skip
         if unknown or missing:
             raise ValueError(
@@ -182,6 +184,8 @@ def _read_named(role: str) -> Callable[[Path, ImportOptions], ImportedTable]:
                 f"Set {role}.columns=t:NAME."
             )
         rows["t"] *= _UNITS_OF_TIME[options.time]
+        for name, factor in options.scale.items():
+            rows[name] *= float(factor)
         return ImportedTable(rows, content.notes)
 
     return read

@@ -72,8 +72,9 @@ def compare_reference(table: LogTable, reference: ReferenceLog) -> tuple[str, ..
     Returns notes.
     """
     notes = compare_velocities(table, reference)
-    columns = parse_numbers(table, ("roll", "pitch", "yaw")), *map(swap_frd_rfu, reference[2:])
-    raw = RawReference(reference.time, *columns, np.arange(len(reference.time)))
+    angles = parse_numbers(table, ("roll", "pitch", "yaw"))
+    velocity, position = swap_frd_rfu(reference.velocity), swap_frd_rfu(reference.position)
+    raw = RawReference(reference.time, angles, velocity, position, np.arange(len(angles)))
     _, findings = check_reference(table.name, drop_wrong_rows(raw), {})
     if findings:
         raise ValueError(

@@ -96,7 +96,7 @@ class LogSource:
             another has pn, and the metadata of the files do not contain it.
         limits: Limits of the platform. None for the default limits.
         fix_codes: Meaning of the column `fix` of the fixes: the program that wrote it (nmea, rtklib,
-            ublox), the codes of the fixes to use, or None for 1 (use) and 0.
+            mavlink, ublox), the codes of the fixes to use, or None for 1 (use) and 0.
         corrections: Corrections that are applied before the checks. None for none.
         has_attitude: Whether the reference has an attitude. Without one it gives positions at most.
     """
@@ -361,12 +361,14 @@ def check_level(force: Array, name: str) -> None:
 
     Shapes: force [n, 3], right, forward, up.
     """
-    typical, up = float(np.median(np.linalg.norm(force, axis=1))), float(np.median(force[:, 2]))
+    middle, names = swap_frd_rfu(np.median(force, axis=0)), "xyz"
+    axis, typical = int(np.abs(middle).argmax()), float(np.median(np.linalg.norm(force, axis=1)))
+    down = f"{'-' * bool(middle[axis] > 0.0)}{names[axis]}"
+    remedy = f"Gravity lies on f{names[axis]}: set +scenario.corrections.mounting.imu with {down} as its third axis, which is down."
+    if down == "-z":
+        remedy = "Axes forward, left, up need +scenario.corrections.mounting.imu=[x,-y,-z]; see pfbench inspect."
     must = "be about -9.8 on fz for most of the time, in axes forward, right, down"
-    remedy = "Axes forward, left, up need +scenario.corrections.mounting.imu=[x,-y,-z]; see pfbench inspect."
-    require(
-        up > 0.5 * typical, f"{name}: the specific force", must, f"a median of {-up:.3g}", remedy
-    )
+    require(middle[2] < -0.5 * typical, f"{name}: the specific force", must, f"a median of {middle[2]:.3g}", remedy)  # fmt: skip
 
 
 def check_corrections(corrections: LogCorrections, has_positions: bool) -> None:

@@ -65,6 +65,8 @@ FAULTS: dict[str, tuple[Change, Change, str]] = {  # of the program, of the refe
     "degrees in both": (noisy_degrees, noisy_degrees, "direction of motion in degrees. Set reference.scale"),
     "turned degrees in both": (lambda d: d.assign(yaw=DEGREE * d.yaw + 30),) * 2 + ("in degrees. Set reference.scale",),
     "rad converted twice": (scale(1 / DEGREE, "yaw"), unharmed, "mine.scale=yaw:57.2958"),
+    "tenths of degrees": (scale(10 * DEGREE, "yaw"), unharmed, "mine.scale=yaw:0.00174533"),
+    "gon": (scale(200 / np.pi, "yaw"), unharmed, "mine.scale=yaw:0.015708"),
     "all angles": (scale(DEGREE, "roll", "pitch", "yaw"), unharmed, "If in degrees, set mine.scale=pitch:0.01745"),
     "cm/s": (scale(1e2, *VELOCITY), unharmed, "If in cm/s, set mine.scale=vn:0.01; if in mm/s"),
     "opposite yaw": (scale(-1, "yaw"), unharmed, "Multiply the column by -1"),
