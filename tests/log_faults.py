@@ -194,8 +194,10 @@ def drifting(log: Tables) -> None:
 
 def without_gravity(log: Tables) -> None:
     truth, t = log["reference"], log["imu"]["t"]
-    angles = np.stack([np.interp(t, truth["t"], np.unwrap(truth[c])) for c in ANGLES[::-1]], -1)
-    log["imu"][FORCE] += Rotation.from_euler("ZYX", angles).apply([0.0, 0.0, 9.80665], inverse=True)
+    turns = Rotation.from_euler(
+        "ZYX", np.stack([np.interp(t, truth["t"], np.unwrap(truth[c])) for c in ANGLES[::-1]], -1)
+    )
+    log["imu"][FORCE] += turns.apply([0.0, 0.0, 9.80665], inverse=True)
 
 
 _LATE = ("imu clock drift", "imu clock")

@@ -151,12 +151,12 @@ def _check_frame(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
     for _ in range(3):
         fixes, error = (a[used, :2] @ [1.0, 1j] for a in (log.fixes.position, plain.error))
         true = fixes - error
-        moved, expected = fixes - fixes.mean(), true - true.mean()
-        factor = np.vdot(expected, moved) / max(np.vdot(expected, expected).real, 1e-9)
-        rest = np.abs(moved - factor * expected)
-        kept = rest <= 4.0 * np.median(rest) + 1e-9
-        before = float(np.sqrt(np.square(np.abs(moved - expected)[kept]).mean()))
-        after, used = float(np.sqrt(np.square(rest[kept]).mean())), used[kept]
+        measured, expected = fixes - fixes.mean(), true - true.mean()
+        factor = np.vdot(expected, measured) / max(np.vdot(expected, expected).real, 1e-9)
+        rest = np.abs(measured - factor * expected)
+        keep = rest <= 4.0 * np.median(rest) + 1e-9
+        before = float(np.sqrt(np.square(np.abs(measured - expected)[keep]).mean()))
+        after, used = float(np.sqrt(np.square(rest[keep]).mean())), used[keep]
     scale, turn = float(np.abs(factor)), float(np.rad2deg(np.angle(factor)))
     facts["turn and scale of fixes"] = [round(turn, 3), round(scale, 4)]
     quarter = abs((turn + 45.0) % 90.0 - 45.0)  # orders of axes have their own check
@@ -169,7 +169,7 @@ def _check_frame(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
         return
     name, units = log.names[1], find_units("length", scale, limit_of("fix scale"))
     picture = Picture("North [m]", "East [m]", tuple(
-        thin_curve(label, z.real, z.imag) for label, z in ((name, moved), (log.names[2], expected))
+        thin_curve(label, z.real, z.imag) for label, z in ((name, measured), (log.names[2], expected))
     ))  # fmt: skip
     if is_scaled:
         unit, value = next(iter(units.items()), ("another unit or map", 1.0 / scale))

@@ -62,8 +62,8 @@ def inspect_log(
 
 def _is_mended(findings: Sequence[Finding], remaining: Sequence[Finding]) -> bool:
     """Return whether a log with all settings is refused no more, and is as good as a clean one."""
-    known = {finding.check for finding in findings if not finding.settings} - {"slow errors"}
-    return all(f.level == TELL or (f.level != REFUSE and f.check in known) for f in remaining)
+    unmended = {finding.check for finding in findings if not finding.settings} - {"slow errors"}
+    return all(f.level == TELL or (f.level != REFUSE and f.check in unmended) for f in remaining)
 
 
 def withhold_remedies(findings: Sequence[Finding]) -> list[Finding]:

@@ -369,7 +369,7 @@ def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Fi
     variance = np.diag(np.linalg.inv(a.T @ a + 1e-9 * np.eye(3))) * fit.residual.var()
     error = np.sqrt(variance * (1.0 + memory) / (1.0 - memory))
     facts.update({"force scale": scale, "accelerometer bias [m/s^2]": bias.round(3).tolist()})
-    if abs(scale - 1.0) > limit_of("force scale"):
+    if abs(scale - 1.0) > limit_of("force scale") and windows.gravity:
         yield Finding(
             "force scale", WARN, scale - 1.0, limit_of("force scale"), "1",
             f"{name}: fx, fy, fz are {scale:.3f} times the force that {state.aligned.log.names[2]} and gravity need",
@@ -387,7 +387,8 @@ def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Fi
             f"{name}: accelerometer bias {bias.round(2).tolist()} m/s^2, forward, right, down, within "
             f"{(2.0 * error).round(2).tolist()}",
             "Set scenario.corrections.bias, or the nominal bias scenario.tuning.accelerometer_bias",
-            {"corrections": {"bias": {"imu": _by_column("f", bias)}}},
+            # more than half of gravity is no bias, and to subtract it would hide other axes
+            {"corrections": {"bias": {"imu": _by_column("f", bias)}}} if np.linalg.norm(bias) < 5.0 else {},
             ("a bias", "an attitude of the sensor that differs from that of the reference"), _force_picture(windows),
         )  # fmt: skip
 

@@ -197,12 +197,12 @@ class _Pair(NamedTuple):
 
 def _pair_columns(table: TrajectoryTable, reference: ReferenceTrack, fewest: int) -> list[_Pair]:
     """Pair the columns that both have where the reference has no hole; none of few rows."""
-    rows, known, clock = reference.is_bridged(table.time), reference.table.values, reference.table.time  # fmt: skip
+    rows, recorded, clock = reference.is_bridged(table.time), reference.table.values, reference.table.time  # fmt: skip
     if rows.sum() < fewest:
         return []
     origin = dict(zip(GEODETIC, reference.origin, strict=False))
-    level = {name: np.full(len(clock), origin[name]) for name in origin if name not in known}
-    columns = {**known, **level}
+    level = {name: np.full(len(clock), origin[name]) for name in origin if name not in recorded}
+    columns = {**recorded, **level}
     return [
         _Pair(name, table.values[name][rows], np.interp(table.time[rows], clock, columns[name]))
         for name in _DIMENSIONS
@@ -338,19 +338,19 @@ def check_axes(table: TrajectoryTable, reference: ReferenceTrack) -> None:
 def _list_axis_faults(pairs: Iterable[_Pair]) -> Iterator[tuple[str, str, str]]:
     """Yield column, problem and remedy of each column that is not its own one in the reference."""
     pairs = list(pairs)
-    for own in pairs:
-        column, mine = own.name, own.mine
-        slope, share = regress_column(mine, own.theirs, column == "yaw")
-        for other in pairs:
-            factor, explained = regress_column(mine, other.theirs)
+    for pair in pairs:
+        column, mine = pair.name, pair.mine
+        slope, share = regress_column(mine, pair.theirs, column == "yaw")
+        for candidate in pairs:
+            factor, explained = regress_column(mine, candidate.theirs)
             is_better = explained >= _AGREES and 1 - share > _WORSE * (1 - explained)
-            if other is not own and is_better and abs(abs(factor) - 1) < _CLOSE:
+            if candidate is not pair and is_better and abs(abs(factor) - 1) < _CLOSE:
                 sign = "" if factor > 0 else ", and multiply the column by -1"
-                remedy = f"Give it the name or the place of {other.name}{sign}"
-                yield column, f"values {factor:.3f} times those of {other.name}", remedy
+                remedy = f"Give it the name or the place of {candidate.name}{sign}"
+                yield column, f"values {factor:.3f} times those of {candidate.name}", remedy
         if share >= _HALF and abs(slope + 1) < _SIGN:
             # yaw from East also has another zero
-            total = float(np.angle(np.exp(1j * (mine + own.theirs)).mean())) if column == "yaw" else 0.0  # fmt: skip
+            total = float(np.angle(np.exp(1j * (mine + pair.theirs)).mean())) if column == "yaw" else 0.0  # fmt: skip
             remedy = "Multiply the column by -1"
             if abs(total) >= 0.1:
                 remedy = f"Subtract the column from {total:.4g} rad: it counts from another axis, the opposite way"

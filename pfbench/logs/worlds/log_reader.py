@@ -124,10 +124,12 @@ class LogSource:
     def read_tables(self) -> LogTables:
         """Read the tables, without a check of their contents."""
         names, select = self.files, {"path": self.path, "imu": self.imu}
-        wanted = [names.imu, names.gnss, names.reference]
+        names_read = [names.imu, names.gnss, names.reference]
         if names.reference is None and not self.has_attitude:
-            wanted.pop()
-        inertial, gnss, *truth = (read_table(self.folder, n, select, self.limits) for n in wanted)
+            names_read.pop()
+        inertial, gnss, *truth = (
+            read_table(self.folder, n, select, self.limits) for n in names_read
+        )
         return inertial, gnss, truth[0] if truth else None
 
     def read(self) -> NavigationLog:
@@ -199,8 +201,8 @@ class LogSource:
         # faults of a whole table first: they spoil single rows, too
         if findings is None or left_out:
             raw = self.take(tables)
-            kept = np.isfinite(fixes.position[raw.fixes.rows, 0])
-            findings, _, _ = run_checks(raw._replace(fixes=RawFixes(*take_rows(raw.fixes, kept))))
+            keep = np.isfinite(fixes.position[raw.fixes.rows, 0])
+            findings, _, _ = run_checks(raw._replace(fixes=RawFixes(*take_rows(raw.fixes, keep))))
         diagnosed = judge_findings(findings, has_own_fixes=truth is None or gnss.name != truth.name)
         if truth and motion:
             rows += compare_inertial(truth, sensors, motion, gravity)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import judge_cases as cases
-import numpy as np
 import pandas as pd
 import pytest
 from command_line import pfbench
