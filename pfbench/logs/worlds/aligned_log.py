@@ -56,7 +56,7 @@ class AlignedLog(UserLog):
 
     def read_checked(self, folder: Path) -> NavigationLog:
         """Read and check the log in a folder."""
-        return self.read_with(folder, has_attitude=False)
+        return self.read_tables(folder, has_attitude=False)
 
     @override
     def resample(self, log: NavigationLog) -> ResampledLog:
