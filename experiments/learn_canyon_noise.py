@@ -6,7 +6,7 @@ The mixture `LosNlosRangeError` has four parameters: share of direct signals at 
 delay. They are estimated at the positions of the reference, where the clock of the receiver is the only unknown state. With an
 unknown position the log likelihood of 2000 particles has a standard deviation of about 100, and no chain moves. The posterior
 takes one epoch of two seconds, because reflections last. The maximum likelihood estimate models the clock by straight lines
-between knots (`pfbench.logs.worlds.urban_error_fit`); with 0 draws it is the only estimate. The scores are the log
+between knots (`pfbench.experiments.urban_error_fit`); with 0 draws it is the only estimate. The scores are the log
 evidence per range on the other stretch, and the error of a particle filter without reference. The command resumes from the
 parts in its folder and writes `report.md` and its figures.
 """

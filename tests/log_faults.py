@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from pfbench.logs.doctor.checks import run_checks
 from pfbench.logs.doctor.finding import Finding
-from pfbench.logs.doctor.inspection import LogSource, take_tables
+from pfbench.logs.worlds.log_reader import LogSource
 from pfbench.logs.worlds.log_tables import LogTable
 
 Tables = dict[str, pd.DataFrame]
@@ -164,6 +164,42 @@ def enu(table: str, *groups: Sequence[str]) -> Callable[[Tables], None]:
     return both(*(mixed(table, g, [g[1], g[0], f"-{g[2]}"]) for g in groups))
 
 
+def turned(table: str, degrees: float, *groups: Sequence[str]) -> Callable[[Tables], None]:
+    """Turn North and East of a frame about the vertical."""
+
+    def plant(log: Tables) -> None:
+        turn = np.exp(1j * np.radians(degrees))
+        for north, east, _ in groups:
+            z = turn * (log[table][north] + 1j * log[table][east]).to_numpy()
+            log[table][north], log[table][east] = z.real, z.imag
+
+    return plant
+
+
+def mounted(*angles: float) -> Callable[[Tables], None]:
+    """Turn the sensor by roll, pitch, yaw, deg."""
+
+    def plant(log: Tables) -> None:
+        matrix = Rotation.from_euler("ZYX", angles[::-1], degrees=True).as_matrix()
+        for columns in (FORCE, RATE):
+            log["imu"][columns] = log["imu"][columns].to_numpy() @ matrix
+
+    return plant
+
+
+def drifting(log: Tables) -> None:
+    t = log["gnss"]["t"]
+    log["gnss"]["pe"] += 20.0 * (t - t.iloc[0]) / np.ptp(t)
+
+
+def without_gravity(log: Tables) -> None:
+    truth, t = log["reference"], log["imu"]["t"]
+    turns = Rotation.from_euler(
+        "ZYX", np.stack([np.interp(t, truth["t"], np.unwrap(truth[c])) for c in ANGLES[::-1]], -1)
+    )
+    log["imu"][FORCE] += turns.apply([0.0, 0.0, 9.80665], inverse=True)
+
+
 _LATE = ("imu clock drift", "imu clock")
 FAULTS = {
     "gnss clock +18 s": Fault(late("gnss", 18.0), "gnss clock"),
@@ -223,6 +259,31 @@ FAULTS = {
     "NMEA fix codes": Fault(nmea_codes, "fix codes"),
     "gnss hole 30 s": Fault(gap("gnss", 30.0), "fix hole"),
     "imu at 5 Hz": Fault(slow, "imu rate", (*_LATE, "gyro scale")),
+    "gravity removed": Fault(without_gravity, "unit of force"),
+    "axes of ROS": Fault(
+        both(
+            body("x", "-y", "-z"),
+            enu("reference", POSITION, VELOCITY),
+            enu("gnss", POSITION),
+            scaled("reference", ["pitch", "yaw"], -1.0),
+            added("reference", "yaw", np.pi / 2),
+        ),
+        "axes",
+        ("fix axes",),
+    ),
+    "fixes turned 12 deg": Fault(turned("gnss", 12.0, POSITION), "fix turn"),
+    "fixes drift 20 m": Fault(drifting, "slow errors", ("fix shift", "gnss clock")),
+    "fixes in feet": Fault(scaled("gnss", POSITION, 1 / 0.3048), "fix scale"),
+    "reference turned 12 deg": Fault(
+        both(
+            turned("reference", 12.0, POSITION, VELOCITY),
+            added("reference", "yaw", np.radians(12.0)),
+        ),
+        "fix turn",
+    ),
+    "sensor backwards": Fault(body("-x", "-y", "z"), "axes"),
+    "sensor tilted 10 deg": Fault(mounted(0.0, 10.0, 0.0), "mounting"),
+    "sensor turned 20 deg": Fault(mounted(0.0, 0.0, 20.0), "mounting"),
 }
 
 # logs by the name of a fault test: folder, tables, flight, sensor
@@ -276,8 +337,8 @@ def findings_of(log: Tables, settings: dict[str, object] | None = None) -> list[
     """Findings of tables, read with the settings of a remedy."""
     source = LogSource(Path()).with_settings(settings or {})
     tables = tuple(LogTable(table, name, False, {}) for name, table in log.items())
-    corrected, _ = source.corrections.correct_tables(*tables)
-    return run_checks(take_tables(corrected, source))[0]
+    corrected, _ = source.mending.correct_tables(*tables)
+    return run_checks(source.take(corrected))[0]
 
 
 def checks_of(log: Tables, settings: dict[str, object] | None = None) -> set[str]:

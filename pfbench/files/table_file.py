@@ -127,14 +127,15 @@ def _has_names_in_comment(lines: Sequence[str]) -> bool:
 def _check_names(file: Path, lines: Sequence[str], names: Sequence[str]) -> None:
     """Raise ValueError if line 1 is a comment, has other separators, or has numbers instead of names."""
     problem, remedy, line = "", "", lines[0]
-    separator = next((s for s in _SEPARATORS if s in line), "")
+    # a name can contain a comma between other separators
+    separator = next((s for s in _SEPARATORS if line.count(s) >= max(1, line.count(","))), "")
     if line.lstrip().startswith(tuple(_COMMENT)):
         has_names = len(lines) > 1 and line.count(",") == lines[1].count(",") > 0
         problem = "a comment"
         remedy = (
             "Remove the sign of the comment before the names." if has_names else "Remove this line."
         )
-    elif len(names) == 1 and (separator or len(line.split()) > 2):
+    elif separator or (len(names) == 1 and len(line.split()) > 2):
         pattern = separator or r"\s+"
         problem = f"{_SEPARATORS.get(separator, 'blanks')} as separators"
         decimal = ", decimal=','" if any("," in text for text in lines[1:2]) else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -13,6 +13,7 @@ from typing import IO, TYPE_CHECKING, Any
 from pfbench.door.parts import Part, describe_value, format_words, plain_errors
 from pfbench.files.atomic_write import write_atomically
 from pfbench.job.trust import WRITTEN
+from pfbench.logs.units import UNITS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,7 +40,7 @@ _POSITION = (("lat_deg", "lon_deg", "h_m"), ("pn", "pe", "pd"))
 _UNITS = re.compile(
     r"(?<=[a-z0-9])[_ .\[(]*(m/?s\^?2|mps2|rad/?s|radps|m/?s|mps|rad|deg|s|m)[\])]*$", re.IGNORECASE
 )
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_SECONDS = {"s": 1.0, **UNITS["time"]}
 _SIGNS = {"frd": (1.0, 1.0, 1.0), "flu": (1.0, -1.0, -1.0)}
 
 
@@ -132,13 +133,13 @@ def _convert(
     if name != "imu" and not any(set(position) <= set(targets) for position in _POSITION):
         missing.append(" ".join(_POSITION[0]))
     if missing:
+        # a name is proposed for what it says alone: by order, gyro and force change places
         free = [column for column, target in mapping.items() if not target]
-        example = ", ".join(
-            f"{column!r}: {target!r}"
-            for column, target in zip(free or ["YOUR_COLUMN"], missing, strict=False)
-        )
+        pairs = [(c, _guess(c, missing)) for c in free]
+        example = ", ".join(f"{c!r}: {target!r}" for c, target in pairs if target)
+        remedy = f"columns={{{example or repr('YOUR_COLUMN') + ': ' + repr(missing[0])}}}"
         raise ValueError(
-            f"{name} must have the columns {', '.join(missing)}, got {', '.join(mapping)}. Name yours: columns={{{example}}}."
+            f"{name} must have the columns {', '.join(missing)}, got {', '.join(mapping)}. Name yours: {remedy}."
         )
     changed = [f"{column} is {target}" for column, target in renamed.items() if column != target]
     result = table[list(renamed)].rename(columns=renamed)
@@ -155,6 +156,19 @@ def _find_name(column: str, columns: Mapping[str, str]) -> str:
     plain = re.sub(r"[^a-z0-9]", "", _UNITS.sub("", column.strip()).lower())
     names = (target for target, others in _NAMES.items() if column == target or plain in others)
     return next(names, "")
+
+
+def _guess(column: str, missing: Sequence[str]) -> str:
+    """Return the missing column whose quantity and axis a name states; empty for none."""
+    match = re.fullmatch(
+        r"(?P<kind>.*?(?:acc|gyr|force|rate|omega)\w*?)[^a-z0-9]*(?P<axis>[xyz012])\W*",
+        column.lower(),
+    )
+    if not match:
+        return ""
+    letter = "f" if re.search("acc|force", match["kind"]) else "w"
+    target = letter + dict(zip("012", "xyz", strict=True)).get(match["axis"], match["axis"])
+    return target if target in missing else ""
 
 
 def _store(tables: Mapping[str, pd.DataFrame]) -> Path:
@@ -180,11 +194,8 @@ def _write_text(text: str, file: IO[bytes]) -> None:
 
 def _check(folder: Path, settings: Mapping[str, Any], *, has_reference: bool) -> None:
     """Read the log as a job would, so that its errors appear at once."""
-    from pfbench.logs.worlds.aligned_reader import read_aligned_log
     from pfbench.scenario import LogFiles, read_log
 
     options = {key: settings[key] for key in ("origin", "fix_codes") if key in settings}
-    if has_reference:
-        read_log(folder, **options)
-    else:
-        read_aligned_log(folder, LogFiles(reference=None), **options)
+    files = LogFiles() if has_reference else LogFiles(reference=None)
+    read_log(folder, files, has_attitude=has_reference, **options)

@@ -18,7 +18,7 @@ each finding and scenario/suggested.yaml, settings that mend them.
 
   imu=NAME gnss=NAME reference=NAME   names of the tables (imu, gnss, reference); a log can have no reference
   path=N sensor=N            flight and sensor of tables with the columns path and imu
-  fix_codes=NAME|[4,5]       codes of the column fix: nmea, rtklib, ublox or a list
+  fix_codes=NAME|[4,5]       codes of the column fix: nmea, rtklib, mavlink, ublox or a list
   origin=LAT,LON,H           origin of local positions, deg, deg, m
   reports_dir=FOLDER         folder of reports (reports)
 

@@ -19,6 +19,7 @@ KITTI (the folder of a drive for each of the three).
 
   NAME.format=table|tum|kf_gins|nmea|rtklib|euroc|kitti
   NAME.columns=t:time,...   name of pfbench:name in the file
+  NAME.scale=lat_deg:1e-7,...   factors of columns
   NAME.time=s|ms|us|ns      unit of the time of a table
   NAME.repeats=first        keep the first row of each time
   NAME.frame=enu|ned        axes of a TUM file
@@ -27,7 +28,7 @@ KITTI (the folder of a drive for each of the three).
 Exit codes: those of pfbench inspect"""
 
 _TABLES = ("imu", "gnss", "reference")
-_KEYS = ("format", "frame", "time", "repeats", "columns")
+_KEYS = ("format", "frame", "time", "repeats", "columns", "scale")
 
 
 def import_log(words: Sequence[str]) -> None:
@@ -65,7 +66,7 @@ def _split_words(
             files[key] = value
         elif role in _TABLES and name in _KEYS:
             field = "layout" if name == "format" else name
-            options.setdefault(role, {})[field] = _split_columns(key, value) if name == "columns" else value  # fmt: skip
+            options.setdefault(role, {})[field] = _split_columns(key, value) if name in ("columns", "scale") else value  # fmt: skip
         elif key in ("reports_dir", "fix_codes", "origin"):
             others.append(word)
         else:

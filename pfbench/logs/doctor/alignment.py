@@ -30,8 +30,8 @@ from pfbench.logs.doctor.turn_search import (
     select_nodes,
     turns_between,
 )
+from pfbench.logs.units import DEGREE
 
-_DEGREE = np.pi / 180.0
 _GAIN = 0.15  # of the score by another unit
 _CERTAIN = 0.9  # score at which no other unit is tried, and that of a piece of the log
 _PIECE, _FEWEST_PIECES, _MOST_PIECES = 15.0, 3, 8  # s, and number of pieces for the drift
@@ -45,8 +45,8 @@ _COLUMNS = ("roll", "pitch", "yaw")
 _STRAIGHT = 0.35  # part of the spread that a drift may leave
 _UNITS = {
     "": (1.0, 1.0, 1.0),
-    "roll, pitch, yaw": (_DEGREE, _DEGREE, _DEGREE),
-    "yaw": (1.0, 1.0, _DEGREE),
+    "roll, pitch, yaw": (DEGREE, DEGREE, DEGREE),
+    "yaw": (1.0, 1.0, DEGREE),
 }
 
 
@@ -119,7 +119,7 @@ def align_clocks(log: RawLog, facts: dict[str, Any]) -> tuple[Alignment | None, 
 
 def _unit_of(ratio: float) -> float:
     """Return degrees in place of a ratio near them."""
-    near = [unit for unit in (1.0 / _DEGREE, _DEGREE) if 0.7 < ratio / unit < 1.4]
+    near = [unit for unit in (1.0 / DEGREE, DEGREE) if 0.7 < ratio / unit < 1.4]
     return near[0] if near else ratio
 
 
@@ -211,7 +211,7 @@ def _convert_attitude(log: RawLog, unit: str, score: float) -> tuple[RawLog, lis
         return log, []
     reference, verb = log.reference, "is" if unit == "yaw" else "are"
     text = f"{log.names[2]}: {unit} {verb} in degrees: turns then agree with the IMU to a score of {score:.3f}"
-    finding = _describe_unit(log, unit, (score, _CERTAIN, "score"), text, _DEGREE)
+    finding = _describe_unit(log, unit, (score, _CERTAIN, "score"), text, DEGREE)
     return log._replace(reference=reference._replace(angles=reference.angles * _UNITS[unit])), [
         finding
     ]

@@ -58,6 +58,7 @@ CONVENTIONS: dict[str, tuple[str, Callable[[Array, Array, Array], tuple[Array, A
     "yaw_plus_180": ("yaw is turned by 180 deg", lambda r, p, y: (r, p, y + np.pi)),
     "roll_pitch_exchanged": ("roll and pitch are exchanged", lambda r, p, y: (p, r, y)),
     "pitch_negated": ("pitch has the other sign", lambda r, p, y: (r, -p, y)),
+    "forward_left_up": ("roll, pitch, yaw are those of forward, left, up in East, North, Up", lambda r, p, y: (r, -p, np.pi / 2 - y)),
     "roll_negated": ("roll has the other sign", lambda r, p, y: (-r, p, y)),
 }  # fmt: skip
 

@@ -26,6 +26,7 @@ from pfbench.logs.doctor.thresholds import (
     STANDARD_ERRORS,
     limit_of,
 )
+from pfbench.logs.units import find_units
 
 _Mask = NDArray[np.bool_]
 _MOST, _FEWEST, _LEAST_SHARE = 400, 12, 0.4  # compared fixes
@@ -35,6 +36,8 @@ _CLIP, _MARGIN = 30.0, 12.0  # m of an increment, and variances of the noise
 _NEIGHBOURS = 10  # fixes on each side of a local level
 _MOST_OUTLIERS = 0.05  # share of fixes
 _AXES = ("North", "East", "Down")
+_FRAME = 0.3  # part of the distances that a turn or a unit may leave
+_BLOCK_S, _FEWEST_OF_BLOCK = 10.0, 5  # s and fixes of a block
 _REACH = 2.5  # median steps of the reference: longer ones are gaps
 
 
@@ -62,6 +65,7 @@ class JointFit(NamedTuple):
         offset_error: Its standard error, s.
         shift: Constant shift, m, [3].
         deviation: Standard deviation of the fixes, m, [3].
+        rest: What the fit leaves, m, [n, 3].
     """
 
     lever: Array
@@ -70,12 +74,17 @@ class JointFit(NamedTuple):
     offset_error: float
     shift: Array
     deviation: Array
+    rest: Array
 
 
 def check_fixes(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
     """Check the fixes."""
     yield from check_codes(log)
     if len(log.fixes.time) < _FEWEST:
+        return
+    frame = list(_check_frame(log, facts))
+    yield from frame
+    if frame:
         return
     errors = _find_coarse_offset(log)
     errors = _prefer_axes(log, errors) if errors.offset else errors
@@ -100,7 +109,13 @@ def check_codes(log: RawLog) -> Iterator[Finding]:
     numbers = {int(code) for code in np.unique(log.codes)}
     if share >= limit_of("fix codes") or not numbers - {0, 1}:
         return
-    is_nmea = bool(numbers & {4, 5}) and numbers <= set(range(9))
+    is_nmea = bool(numbers & {4, 5}) and numbers <= {
+        0,
+        1,
+        2,
+        4,
+        5,
+    }  # 3 and 6 are other things elsewhere
     name = log.names[1]
     causes = ("quality of NMEA: 4 RTK fixed, 5 RTK float", "quality of RTKLIB: 4 differential, 5 single")  # fmt: skip
     yield Finding(
@@ -122,6 +137,84 @@ def _compare(log: RawLog, offset: float) -> FixErrors:
     at, time = log.fixes.time - offset, log.reference.time
     inside = (at >= time[0]) & (at <= time[-1])
     return FixErrors(offset, log.fixes.position - reference_at(log, at), inside)
+
+
+def _check_frame(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
+    """Check that the fixes are not turned about the vertical, or in another unit, against the reference.
+
+    A turn or a factor explains them if it leaves a small part of the distances that remain after a shift.
+    """
+    plain = _compare(log, 0.0)
+    used = np.flatnonzero(plain.inside)
+    if len(used) < _FEWEST:
+        return
+    for _ in range(3):
+        fixes, error = (a[used, :2] @ [1.0, 1j] for a in (log.fixes.position, plain.error))
+        true = fixes - error
+        measured, expected = fixes - fixes.mean(), true - true.mean()
+        factor = np.vdot(expected, measured) / max(np.vdot(expected, expected).real, 1e-9)
+        rest = np.abs(measured - factor * expected)
+        keep = rest <= 4.0 * np.median(rest) + 1e-9
+        before = float(np.sqrt(np.square(np.abs(measured - expected)[keep]).mean()))
+        after, used = float(np.sqrt(np.square(rest[keep]).mean())), used[keep]
+    scale, turn = float(np.abs(factor)), float(np.rad2deg(np.angle(factor)))
+    facts["turn and scale of fixes"] = [round(turn, 3), round(scale, 4)]
+    quarter = abs((turn + 45.0) % 90.0 - 45.0)  # orders of axes have their own check
+    is_turned, is_scaled = quarter > limit_of("fix turn"), abs(scale - 1.0) > limit_of("fix scale")
+    if (
+        after > _FRAME * before
+        or before < limit_of("fix shift") * _FRAME
+        or not (is_turned or is_scaled)
+    ):
+        return
+    name, units = log.names[1], find_units("length", scale, limit_of("fix scale"))
+    picture = Picture("North [m]", "East [m]", tuple(
+        thin_curve(label, z.real, z.imag) for label, z in ((name, measured), (log.names[2], expected))
+    ))  # fmt: skip
+    if is_scaled:
+        unit, value = next(iter(units.items()), ("another unit or map", 1.0 / scale))
+        yield Finding(
+            "fix scale", REFUSE, scale - 1.0, limit_of("fix scale"), "1",
+            f"{name}: the fixes move {scale:.4g} times as far as {log.names[2]}: {'they are in ' + unit if units else unit}",
+            f"Multiply pn, pe, pd by {value:.7g}, or set scenario.corrections.scale",
+            {"corrections": {"scale": {"gnss": dict.fromkeys(("pn", "pe", "pd"), value)}}}, picture=picture,
+        )  # fmt: skip
+    if is_turned:
+        yield Finding(
+            "fix turn", REFUSE, turn, limit_of("fix turn"), "deg",
+            f"{name}: North and East of the fixes are turned by {turn:.2f} deg against those of {log.names[2]}",
+            f"Use the same grid in both, or set +scenario.corrections.level_axes.gnss=[{turn:.3f}]",
+            {"corrections": {"level_axes": {"gnss": [round(turn, 3)]}}},
+            ("grid North in place of true or magnetic North",), picture,
+        )  # fmt: skip
+
+
+def _check_slow(log: RawLog, at: Array, rest: Array, facts: dict[str, Any]) -> Iterator[Finding]:
+    """Check for errors of the fixes that last: blocks of ten seconds far from the others."""
+    block = np.floor((at - at[0]) / _BLOCK_S).astype(int)
+    counts, sums = np.bincount(block), [np.bincount(block, axis) for axis in rest.T[:2]]
+    full = counts >= _FEWEST_OF_BLOCK
+    means: Array = np.stack(sums, -1)[full] / counts[full, None]
+    if len(means) < 2:
+        return
+    size = np.linalg.norm(means - np.median(means, 0), axis=1)
+    noise = float(np.linalg.norm(np.diff(rest[:, :2], axis=0).std(0))) / np.sqrt(
+        2.0 * _FEWEST_OF_BLOCK
+    )
+    i, largest = int(size.argmax()), max(limit_of("slow errors"), STANDARD_ERRORS * noise)
+    facts["slow error of fixes [m]"] = float(size[i])
+    if size[i] > largest:
+        start = float(at[0] + _BLOCK_S * np.flatnonzero(full)[i])
+        yield Finding(
+            "slow errors", WARN, float(size[i]), largest, "m",
+            f"{log.names[1]}: the fixes are {size[i]:.1f} m off for {_BLOCK_S:g} s from t = {start:.1f}, beyond lever arm, "
+            "offset and shift",
+            "Nothing that was tried explains this: shift, turn, unit, axes, lever arm and clock",
+            explanations=("reflections", "fixes that drift", f"a jump or another frame of {log.names[2]}"),
+            picture=Picture("t [s]", "fix minus reference, horizontal [m]", (
+                thin_curve(log.names[1], at, np.linalg.norm(rest[:, :2], axis=1)),
+            ), (start,)),
+        )  # fmt: skip
 
 
 def _find_coarse_offset(log: RawLog) -> FixErrors:
@@ -367,6 +460,7 @@ def _check_joint(log: RawLog, errors: FixErrors, outliers: _Mask, facts: dict[st
         yield _describe_lever(log, fit, error, at)
     if np.abs(middle).max() > limit_of("fix shift"):
         yield _describe_shift(log, error, middle)
+    yield from _check_slow(log, at[used], fit.rest, facts)
 
 
 def _fit_jointly(log: RawLog, error: Array, at: Array) -> JointFit:
@@ -393,7 +487,13 @@ def _fit_jointly(log: RawLog, error: Array, at: Array) -> JointFit:
     variance = np.diag(np.linalg.inv(information)) * (1.0 + memory) / (1.0 - memory)
     sd = np.sqrt(variance)
     return JointFit(
-        solution[:3], sd[:3], float(solution[3]), float(sd[3]), solution[4:], np.asarray(deviation)
+        solution[:3],
+        sd[:3],
+        float(solution[3]),
+        float(sd[3]),
+        solution[4:],
+        np.asarray(deviation),
+        rest,
     )
 
 

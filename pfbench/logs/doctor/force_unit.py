@@ -13,9 +13,9 @@ from pfbench.logs.doctor.finding import REFUSE, Finding, Picture, thin_curve
 from pfbench.logs.doctor.force_windows import ForceWindows, fit_force
 from pfbench.logs.doctor.raw_log import RawLog
 from pfbench.logs.doctor.thresholds import LEAST_ACCELERATION, limit_of
+from pfbench.logs.units import find_units
 
 _GRAVITY = 9.80665
-_UNITS = {"in g": _GRAVITY, "in mg": 1e-3 * _GRAVITY, "in cm/s^2": 0.01}
 _UNIT_ERROR = 0.25  # relative
 _LEFT = 0.25  # part of the squared force that a true unit may leave
 _MISSING = (
@@ -38,7 +38,7 @@ def check_force_unit(
     is_usual = gravity / largest < norm < gravity * largest
     if norm == 0.0 or (is_usual and (windows is None or not _may_lack_gravity(windows))):
         return log, []
-    near = {f: u for u, f in _UNITS.items() if abs(f * norm / gravity - 1.0) < _UNIT_ERROR}
+    near = {f: f"in {u}" for u, f in find_units("force", norm / gravity, _UNIT_ERROR).items()}
     units = {1.0: ""} if is_usual else near or {gravity / norm: "in another unit"}
     factor = next(iter(units))
     if windows is not None:

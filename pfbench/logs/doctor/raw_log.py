@@ -10,13 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pfbench.files.table_file import Array
-from pfbench.logs.worlds.log_tables import (
-    GnssLog,
-    ImuLog,
-    LogTable,
-    ReferenceLog,
-    swap_frd_rfu,
-)
 
 Rows = NDArray[np.intp]
 
@@ -93,48 +86,8 @@ def take_rows(columns: Iterable[Any], rows: Any) -> Iterator[Any]:
         yield column[rows]
 
 
-def take_log(
-    tables: tuple[LogTable, LogTable, LogTable],
-    imu: ImuLog,
-    fixes: GnssLog,
-    reference: ReferenceLog | None,
-    gravity: float,
-) -> RawLog:
-    """Return what a reader has read in the axes of the tables; without a reference its table is empty."""
-    usable = np.flatnonzero(np.isfinite(fixes.position).all(1))
-    return RawLog(
-        RawImu(imu.time, swap_frd_rfu(imu.force), swap_frd_rfu(imu.rate), np.arange(len(imu.time))),
-        RawFixes(fixes.time[usable], swap_frd_rfu(fixes.position[usable]), usable),
-        take_reference(reference) if reference else _NO_REFERENCE,
-        gravity,
-        (tables[0].name, tables[1].name, tables[2].name),
-        (tables[0].row, tables[1].row, tables[2].row),
-    )
-
-
 _NO_ROWS = np.empty((0, 3))
-_NO_REFERENCE = RawReference(np.empty(0), _NO_ROWS, _NO_ROWS, _NO_ROWS, np.empty(0, np.intp))
-
-
-def take_reference(reference: ReferenceLog) -> RawReference:
-    """Return a reference in the axes of the tables."""
-    q = reference.attitude[:, [1, 2, 3, 0]]
-    axes = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # of both frames
-    return RawReference(
-        reference.time,
-        euler_of(axes @ Rotation.from_quat(q).as_matrix() @ axes),
-        swap_frd_rfu(reference.velocity),
-        swap_frd_rfu(reference.position),
-        np.arange(len(reference.time)),
-    )
-
-
-def euler_of(dcm: Array) -> Array:
-    """Return roll, pitch, yaw, rad, [k, 3], of rotations from the body to the level frame, [k, 3, 3]."""
-    pitch = -np.arcsin(np.clip(dcm[:, 2, 0], -1.0, 1.0))
-    roll = np.arctan2(dcm[:, 2, 1], dcm[:, 2, 2])
-    yaw = np.arctan2(dcm[:, 1, 0], dcm[:, 0, 0])
-    return np.stack([roll, pitch, yaw], -1)
+NO_REFERENCE = RawReference(np.empty(0), _NO_ROWS, _NO_ROWS, _NO_ROWS, np.empty(0, np.intp))
 
 
 def dcm_of(angles: Array) -> Array:

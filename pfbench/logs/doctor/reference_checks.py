@@ -12,6 +12,7 @@ from pfbench.logs.doctor.finding import REFUSE, Finding, Picture, thin_curve
 from pfbench.logs.doctor.raw_log import RawReference, dcm_of, take_rows
 from pfbench.logs.doctor.thresholds import limit_of
 from pfbench.logs.doctor.turn_search import integrate, select_nodes, turns_between
+from pfbench.logs.units import find_units
 
 _LONGEST = 1.8  # s of a window
 _FEWEST = 5  # windows
@@ -19,7 +20,6 @@ _LEAST_MOTION = 0.3  # m per window on an axis that is judged
 _SLOPES, _CORRELATION = (0.8, 1.25), 0.8
 _SLOW_SLOPES, _CLEAR_CORRELATION = (0.7, 1.4), 0.95  # of an axis with less motion
 _EXPLAINED = 0.3  # part of the residual that other axes may leave
-_UNITS = {"km/h": 3.6, "knots": 1.943844, "cm/s": 100.0, "mm/s": 1000.0, "ft/s": 3.28084}
 _UNIT_ERROR = 0.03  # relative
 _LEAST_JUMP, _LEAST_TURN = 2.0, 0.25  # m and rad of a wrong row
 _RETURN = 0.5  # part of a jump that remains after the next row
@@ -96,9 +96,9 @@ def _explain(
         text = f"the velocities North, East, Down are the columns {', '.join(names)}"
         corrections = {"level_axes": {"reference_velocity": names}}
         return text, corrections, reference.velocity @ best.T
-    for unit, factor in _UNITS.items():
-        if (np.abs(slope * factor - 1.0) < _UNIT_ERROR).all():
-            scale = {"reference": dict.fromkeys(("vn", "ve", "vd"), 1.0 / factor)}
-            return f"velocities are in {unit}", {"scale": scale}, reference.velocity / factor
+    for unit, factor in find_units("velocity", 1.0 / float(np.median(slope)), _UNIT_ERROR).items():
+        if (np.abs(slope / factor - 1.0) < _UNIT_ERROR).all():
+            scale = {"reference": dict.fromkeys(("vn", "ve", "vd"), factor)}
+            return f"velocities are in {unit}", {"scale": scale}, reference.velocity * factor
     derived = np.gradient(reference.position, reference.time, axis=0)
     return "the unit of velocity or position, or another order", {}, derived

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from pfbench.files.table_file import Array
 from pfbench.logs.doctor.alignment import Alignment
@@ -34,6 +36,11 @@ from pfbench.logs.doctor.thresholds import (
 from pfbench.logs.doctor.turn_search import TurnSearch, turns_between
 
 _EQUAL = 1.3  # times the least residual: explanations that fit as well
+_FORCE_SPREAD = 0.3  # m/s^2, of a window
+_LEAST_SPEED, _AHEAD = (
+    2.0,
+    0.9,
+)  # m/s, and mean cosine between yaw and course of a vehicle that drives forward
 _BLOCKS = 10  # of windows, whose differences give a standard error
 _DOWN = np.array([0.0, 0.0, 1.0])
 _FEWEST = 20  # windows for scales
@@ -89,6 +96,10 @@ def check_force_and_rate(aligned: Alignment, facts: dict[str, Any]) -> tuple[Raw
     windows = integrate_force(aligned.log, aligned.dcm, aligned.offset)
     if windows is None:
         return aligned.log, []
+    turned = _find_rotation(aligned, windows, facts)
+    if turned:
+        finding, log = turned
+        return log, [finding]
     state = _try_axes(aligned, windows)
     horizontal = float(np.sqrt(np.square(windows.change[:, :2]).mean()))
     ratio = state.fit.cost / max(state.least, 1e-12)
@@ -111,6 +122,59 @@ def check_force_and_rate(aligned: Alignment, facts: dict[str, Any]) -> tuple[Raw
         *_check_force_errors(state, facts),
         *_check_rate_errors(aligned, facts),
     ]
+
+
+def _find_rotation(aligned: Alignment, windows: ForceWindows, facts: dict[str, Any]) -> tuple[Finding, RawLog] | None:  # fmt: skip
+    """Find a sensor that is turned by an angle that no order of axes explains.
+
+    Turns and force are fitted together: a bias can take the place of a tilt in the force, but turns the axis of no turn.
+
+    Returns the finding, and the log with the sensor turned back.
+    """
+    true, measured = aligned.pair
+    orders = [m for m in BODY_ORDERS if np.linalg.det(m) > 0.0]
+    rates = [float(np.square(measured @ m.T - true).sum()) for m in orders]
+    forces = [fit_force(windows, m).cost for m in orders]
+    spread = 1.4826 * float(np.median(np.abs(measured @ orders[int(np.argmin(rates))].T - true))) + 1e-4  # fmt: skip
+
+    def residuals(vector: Array, start: Array) -> Array:
+        matrix = Rotation.from_rotvec(vector).as_matrix() @ start
+        force = windows.change - np.einsum("nijk,jk->ni", windows.products, matrix) - windows.gravity * _DOWN  # fmt: skip
+        return np.concatenate([((measured @ matrix.T - true) / spread).ravel(), force.ravel() / _FORCE_SPREAD])  # fmt: skip
+
+    starts = [orders[0], orders[int(np.argmin(rates))], orders[int(np.argmin(forces))]]
+    fits = [(least_squares(residuals, np.zeros(3), loss="soft_l1", args=(m,)), m) for m in starts]
+    fit, start = min(fits, key=lambda pair: pair[0].cost)
+    matrix = Rotation.from_rotvec(fit.x).as_matrix() @ start
+    trace = max(float(np.trace(matrix @ m.T)) for m in orders)
+    angle = float(np.rad2deg(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))))
+    facts["turn of the sensor [deg]"] = round(angle, 2)
+    gains = (
+        min(rates) / max(float(np.square(measured @ matrix.T - true).sum()), 1e-300),
+        min(forces) / max(fit_force(windows, matrix).cost, 1e-12),
+    )
+    if angle < limit_of("mounting") or max(gains) < limit_of("axes") or min(gains) < 1.0 / _EQUAL:
+        return None
+    log, names = aligned.log, aligned.log.names
+    angles = [round(float(a), 2) for a in Rotation.from_matrix(matrix).as_euler("ZYX", degrees=True)[::-1]]  # fmt: skip
+    mended = log.imu._replace(force=log.imu.force @ matrix.T, rate=log.imu.rate @ matrix.T)
+    finding = Finding(
+        "mounting", REFUSE, angle, limit_of("mounting"), "deg",
+        f"{names[0]}: the sensor is turned by roll, pitch, yaw {angles} deg against the attitude of {names[2]}, {angle:.1f} deg "
+        "from any order of axes",
+        f"Set +scenario.corrections.mounting.imu={angles}", {"corrections": {"mounting": {"imu": angles}}},
+        ("a sensor that is tilted or turned", f"an attitude of {names[2]} in another frame, as a magnetic yaw"),
+        _force_picture(windows),
+    )  # fmt: skip
+    return finding, log._replace(imu=mended)
+
+
+def _drives_forward(log: RawLog) -> bool:
+    """Return whether the recorded yaw is the course where a vehicle moves."""
+    north, east = log.reference.velocity[:, :2].T
+    moves = np.hypot(north, east) > _LEAST_SPEED
+    off = log.reference.angles[moves, 2] - np.arctan2(east, north)[moves]
+    return bool(moves.any() and np.cos(off).mean() > _AHEAD)
 
 
 def _try_axes(aligned: Alignment, windows: ForceWindows) -> ForceState:
@@ -185,8 +249,11 @@ def _list_causes(state: ForceState, is_rate: bool) -> Iterator[Cause]:
     """Yield the explanations, simple ones first."""
     log, limit = state.aligned.log, _EQUAL * state.least
     imu = log.imu
+    ros = _ros_cause(state)
+    if not is_rate and ros:
+        yield ros
     for rest, cost, name in state.conventions:
-        if rest < _EQUAL and cost < limit:
+        if rest < _EQUAL and cost < limit and not ("yaw" in name and _drives_forward(log)):
             yield _convention_cause(log, name)
     axes = _find_mounting(state)
     if is_rate and fit_force(state.windows, axes).cost < limit:
@@ -214,6 +281,29 @@ def _convention_cause(log: RawLog, name: str) -> Cause:
     angles = convert_angles(name, log.reference.angles)
     mended = log._replace(reference=log.reference._replace(angles=angles))
     return Cause(f"{log.names[2]}: {CONVENTIONS[name][0]}", {"attitude": name}, mended)
+
+
+def _ros_cause(state: ForceState) -> Cause | None:
+    """Explain by axes of ROS in all tables: these agree with each other, and gravity alone points the other way."""
+    log, flip = state.aligned.log, np.array([1.0, -1.0, -1.0])
+    imu, swap = log.imu, np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    angles = convert_angles("forward_left_up", log.reference.angles)
+    reference = log.reference._replace(
+        velocity=log.reference.velocity @ swap, position=log.reference.position @ swap, angles=angles
+    )  # fmt: skip
+    mended = log._replace(
+        imu=imu._replace(force=imu.force * flip, rate=imu.rate * flip), reference=reference,
+        fixes=log.fixes._replace(position=log.fixes.position @ swap),
+    )  # fmt: skip
+    windows = integrate_force(mended, dcm_of(angles), state.aligned.offset)
+    if windows is None or fit_force(windows).cost >= _EQUAL * state.least:
+        return None
+    level = ["e", "n", "-d"]
+    settings = {
+        "mounting": {"imu": ["x", "-y", "-z"]}, "level_axes": {"reference": level, "gnss": level},
+        "attitude": "forward_left_up",
+    }  # fmt: skip
+    return Cause("all tables: East, North, Up and forward, left, up, as in ROS", settings, mended)
 
 
 def _find_mounting(state: ForceState) -> Array:
@@ -279,7 +369,7 @@ def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Fi
     variance = np.diag(np.linalg.inv(a.T @ a + 1e-9 * np.eye(3))) * fit.residual.var()
     error = np.sqrt(variance * (1.0 + memory) / (1.0 - memory))
     facts.update({"force scale": scale, "accelerometer bias [m/s^2]": bias.round(3).tolist()})
-    if abs(scale - 1.0) > limit_of("force scale"):
+    if abs(scale - 1.0) > limit_of("force scale") and windows.gravity:
         yield Finding(
             "force scale", WARN, scale - 1.0, limit_of("force scale"), "1",
             f"{name}: fx, fy, fz are {scale:.3f} times the force that {state.aligned.log.names[2]} and gravity need",
@@ -297,7 +387,8 @@ def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Fi
             f"{name}: accelerometer bias {bias.round(2).tolist()} m/s^2, forward, right, down, within "
             f"{(2.0 * error).round(2).tolist()}",
             "Set scenario.corrections.bias, or the nominal bias scenario.tuning.accelerometer_bias",
-            {"corrections": {"bias": {"imu": _by_column("f", bias)}}},
+            # more than half of gravity is no bias, and to subtract it would hide other axes
+            {"corrections": {"bias": {"imu": _by_column("f", bias)}}} if np.linalg.norm(bias) < 5.0 else {},
             ("a bias", "an attitude of the sensor that differs from that of the reference"), _force_picture(windows),
         )  # fmt: skip
 

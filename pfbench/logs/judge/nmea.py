@@ -195,7 +195,7 @@ def _compute_checksum(body: str) -> str:
 def _check_checksums(file: Path, sentences: list[_Sentence]) -> list[str]:
     """Raise ValueError for a wrong checksum, or a missing one among others; return notes."""
     read = [sentence for sentence in sentences if sentence.kind]
-    wrong = [sentence for sentence in sentences if sentence.checksum == "wrong"]
+    wrong = [sentence for sentence in read if sentence.checksum == "wrong"]
     none = [sentence for sentence in read if sentence.checksum == "none"]
     bad = wrong or (none if len(none) < len(read) else [])
     if bad:
@@ -210,7 +210,9 @@ def _check_checksums(file: Path, sentences: list[_Sentence]) -> list[str]:
             f"{'another one' if wrong else 'none'} in {body[:60]!r} ({len(bad)} of {len(sentences)} "
             f"sentences). {remedy}"
         )
-    return ["no checksums: damaged lines cannot be told from valid ones"] if none else []
+    damaged = sum(not sentence.kind and sentence.checksum == "wrong" for sentence in sentences)
+    notes = [f"{damaged} damaged sentences of kinds that are not read"] if damaged else []
+    return [*notes, *(["no checksums: damaged lines cannot be told from valid ones"] if none else [])]  # fmt: skip
 
 
 def _field_error(file: Path, sentence: _Sentence) -> ValueError:

@@ -24,6 +24,7 @@ from pfbench.logs.judge.trajectory_table import (
     euler_angles,
     rotation_from_quaternion,
 )
+from pfbench.logs.units import UNITS
 from pfbench.stats.error_measures import Array
 
 ROLES = {
@@ -32,8 +33,8 @@ ROLES = {
     "reference": ("t", *GEODETIC, *LOCAL, *VELOCITY_COLUMNS, *ATTITUDE_COLUMNS),
 }
 LAYOUTS = ("", "table", "tum", "nmea", "kf_gins", "rtklib", "euroc", "kitti")
-_UNITS_OF_TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_REPEATS = ("refuse", "first")
+_UNITS_OF_TIME = {"s": 1.0, **UNITS["time"]}
+_REPEATS, _MOST_REPEATS = ("refuse", "first"), 0.5  # share of rows that another sampling explains
 _WEEK = 604800.0  # s
 _FLIP = np.diag([1.0, -1.0, -1.0])  # forward-left-up and forward-right-down
 _FROM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -51,6 +52,7 @@ class ImportOptions:
         time: Unit of the time of a table: s, ms, us or ns.
         repeats: refuse, or first: keep the first row of each time.
         columns: Name in the file by name of pfbench, for a table.
+        scale: Factor by name of pfbench, for a column of a table in another unit.
     """
 
     layout: str = ""
@@ -58,6 +60,7 @@ class ImportOptions:
     time: str = "s"
     repeats: str = "refuse"
     columns: Mapping[str, str] = field(default_factory=dict)
+    scale: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for key, value, allowed in (
@@ -143,10 +146,13 @@ def _check_times(role: str, table: ImportedTable, options: ImportOptions) -> Imp
             f"{role} must have at least two rows with a time, got {int(np.isfinite(time).sum())}. Check the file."
         )
     repeated = pd.Series(time).duplicated().to_numpy()
-    if repeated.any() and options.repeats == "refuse":
+    if repeated.mean() > _MOST_REPEATS or (repeated.any() and options.repeats == "refuse"):
+        remedy = f"Set {role}.repeats=first to keep the first of them."
+        if repeated.mean() > _MOST_REPEATS:
+            remedy = "The times have lost digits: write them again with more, since no key brings them back."
         raise ValueError(
             f"{role} must have one row for each time, got {int(repeated.sum())} rows that repeat one, the first at "
-            f"t = {time[repeated][0]:g}. Set {role}.repeats=first to keep the first of them."
+            f"t = {time[repeated][0]:g}. {remedy}"
         )
     if not repeated.any():
         return table
@@ -164,7 +170,7 @@ def _read_named(role: str) -> Callable[[Path, ImportOptions], ImportedTable]:
     def read(path: Path, options: ImportOptions) -> ImportedTable:
         content = read_table_file(path)
         names = {name: options.columns.get(name, name) for name in ROLES[role]}
-        unknown = [name for name in options.columns if name not in ROLES[role]]
+        unknown = [name for name in (*options.columns, *options.scale) if name not in ROLES[role]]
         missing = [f"{new} ({old})" for new, old in names.items() if new in options.columns and old not in content.rows]  # fmt: skip
         if unknown or missing:
             raise ValueError(
@@ -178,6 +184,8 @@ def _read_named(role: str) -> Callable[[Path, ImportOptions], ImportedTable]:
                 f"Set {role}.columns=t:NAME."
             )
         rows["t"] *= _UNITS_OF_TIME[options.time]
+        for name, factor in options.scale.items():
+            rows[name] *= float(factor)
         return ImportedTable(rows, content.notes)
 
     return read

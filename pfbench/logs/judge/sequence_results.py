@@ -18,13 +18,7 @@ from pfbench.logs.judge.alignment import (
     find_common_epochs,
     position_errors,
 )
-from pfbench.logs.judge.checks import (
-    check_axes,
-    check_clock,
-    check_common_time,
-    check_distance,
-    check_units,
-)
+from pfbench.logs.judge.checks import check_axes, check_clock, check_run
 from pfbench.logs.judge.formats import TrajectoryFile, read_trajectories
 from pfbench.logs.judge.judge_options import JudgeOptions, SourceOptions, name_program
 from pfbench.logs.judge.reference_track import ReferenceTrack
@@ -118,10 +112,7 @@ def _check_run(
     table: TrajectoryTable, reference: ReferenceTrack, source: SourceOptions, align: str
 ) -> tuple[TrajectoryTable, float]:
     """Check a run against the reference and by itself; return it with its notes and its clock offset."""
-    check_common_time(table, reference, source.shift)
-    table = check_consistent_units(check_units(table, reference))
-    if align == "none":
-        check_distance(table, reference)
+    table = check_consistent_units(check_run(table, reference, align, source.shift))
     if align == "yaw":
         return table, math.nan
     offset = check_clock(table, reference, source.shift)

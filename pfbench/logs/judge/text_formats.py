@@ -30,7 +30,8 @@ from pfbench.logs.judge.trajectory_table import (
     euler_angles,
     rotation_from_quaternion,
 )
-from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS
+from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, QUANTITIES
+from pfbench.logs.units import ALIASES
 from pfbench.stats.error_measures import Array
 
 _TUM_COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
@@ -212,27 +213,6 @@ def _read_numbers(
 # Reader of CSV and Parquet tables with named columns.
 
 _STATED_UNIT = re.compile(r"[\[(]\s*([^\[(\])]+?)\s*[\])]\s*$")  # at the end of a name
-_RADIAN = {"rad": 57.29577951, "radians": 57.29577951}
-_DEGREE = dict.fromkeys(("deg", "degrees", "°"), 0.01745329252)
-_FACTORS: dict[str, dict[str, float]] = {  # of units in names of columns, by quantity
-    "time": {
-        "ms": 1e-3,
-        "msec": 1e-3,
-        "us": 1e-6,
-        "µs": 1e-6,
-        "ns": 1e-9,
-        "min": 60.0,
-        "h": 3600.0,
-    },
-    "local position": {"km": 1e3, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048},
-    "height": {"km": 1e3, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048},
-    "velocity": {"km/h": 1 / 3.6, "cm/s": 1e-2, "mm/s": 1e-3, "ft/s": 0.3048, "kn": 1852 / 3600},
-    "latitude": _RADIAN,
-    "longitude": _RADIAN,
-    "roll": _DEGREE,
-    "pitch": _DEGREE,
-    "yaw": _DEGREE,
-}
 
 
 def read_csv_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
@@ -281,7 +261,9 @@ def _check_stated_units(file: Path, options: SourceOptions) -> None:
     factors: dict[str, float] = {}
     for name, in_file in options.columns.items():
         match = _STATED_UNIT.search(in_file)
-        factor = _FACTORS.get(LIMIT_COLUMNS.get(name, ""), {}).get(match[1] if match else "", 1.0)
+        stated = match[1] if match else ""
+        units = QUANTITIES[LIMIT_COLUMNS[name]].units if name in LIMIT_COLUMNS else {}
+        factor = units.get(ALIASES.get(stated, stated), 1.0)
         if factor != 1 and name not in options.scale:
             factors[name] = factor
     if factors:

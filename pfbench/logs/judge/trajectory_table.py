@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, QUANTITIES
+from pfbench.logs.worlds.time_order import find_order_remedy
 from pfbench.stats.error_measures import Array
 
 LOCAL = ("pn", "pe", "pd")
@@ -37,23 +38,7 @@ COLUMN_GROUPS = (
 )
 SD_GROUPS = (POSITION_SD, VELOCITY_SD, ATTITUDE_SD)
 ALL_COLUMNS = ("t", *(name for group in COLUMN_GROUPS for name in group))
-_COUNTERS = (604800.0, 86400.0, 3600.0)  # s: week, day and hour, after which counters start again
-_BITS_32 = tuple(2.0**32 * unit for unit in (1.0, 1e-3, 1e-6, 1e-9))
-_PERIODS = (*(unit * s for unit in (1.0, 1e3, 1e6, 1e9) for s in _COUNTERS), *_BITS_32)
-_SEAM_STEPS, _SEAM_SHARE = 20, 1e-3  # longest gap where a counter starts again: steps, share of it
-_CHECK_ORDER = "Check the unit and the order of the columns."
-_DEGREES = {np.pi / 180: "degrees"}
-_UNITS = {  # factors that bring values into the range of a quantity
-    "latitude": {1e-7: "1e-7 deg"},
-    "longitude": {1e-7: "1e-7 deg"},
-    "height": {1e-3: "mm"},
-    "velocity": {1e-2: "cm/s", 1e-3: "mm/s"},
-    "roll": _DEGREES,
-    "pitch": _DEGREES,
-    "yaw": _DEGREES,
-}
 _MOSTLY = 0.1  # share of the rows that are not removed for a column
-_LEAST_RUN = 10  # rows
 _SD_COLUMNS = {name for group in SD_GROUPS for name in group}
 
 
@@ -164,50 +149,11 @@ def _check_order(table: TrajectoryTable) -> None:
     if not len(rows):
         return
     row = int(rows[0])
+    remedy = find_order_remedy(table.time, lambda i: f"line {table.lines[i]}")
     raise ValueError(
         f"{_place(table, row, 't')} must be later than the row before, got {table.time[row]:.12g} after "
-        f"{table.time[row - 1]:.12g} ({len(rows)} such rows). {_order_remedy(table, rows)}"
+        f"{table.time[row - 1]:.12g} ({len(rows)} such rows). {remedy}"
     )
-
-
-def _order_remedy(table: TrajectoryTable, rows: np.ndarray) -> str:
-    """Return a remedy that was tried for times that do not increase after some rows."""
-    lines = ", ".join(str(table.lines[row]) for row in rows[:5]) + (
-        ", ..." if len(rows) > 5 else ""
-    )
-    step = np.diff(table.time)
-    usual = float(np.median(step[step > 0])) if (step > 0).any() else 0.0
-    if (step[rows - 1] == 0).all():
-        if all((v[rows] == v[rows - 1]).all() for v in table.values.values()):
-            return f"Remove the repeated rows: line {lines}."
-        return (
-            "If column t has lost digits, write more of them, else remove the rows that repeat a time: line "
-            f"{lines}."
-        )
-    for period in _PERIODS:
-        seam = max(_SEAM_STEPS * usual, _SEAM_SHARE * period)
-        before, after = table.time[rows - 1], table.time[rows]
-        if ((after >= 0) & (before <= period) & (after - before + period > 0)).all() and (
-            after - before + period <= seam
-        ).all():
-            again = ", and once more from each further line" if len(rows) > 1 else ""
-            return (
-                f"The counter starts again after {period:.10g}: add {period:.10g} to column t from line "
-                f"{lines}{again}."
-            )
-    starts = np.concatenate([[0], rows, [len(table.time)]])
-    if (np.diff(starts) >= _LEAST_RUN).all() and (table.time[rows] <= table.time[0] + usual).all():
-        return f"The file has {len(rows) + 1} runs: write one file for each, split before line {lines}."
-    order = np.argsort(table.time, kind="stable")
-    if _path_length(table, order) <= _path_length(table, np.arange(len(order))):
-        return "Sort the rows by t, and remove repetitions."
-    return "Sorted by t, the positions would jump: repair the clock that wrote column t."
-
-
-def _path_length(table: TrajectoryTable, order: np.ndarray) -> float:
-    """Return the sum of the steps of the position in an order of the rows."""
-    position = table.select(LOCAL if table.has(LOCAL) else GEODETIC)[order]
-    return float(np.linalg.norm(np.diff(position, axis=0), axis=1).sum())
 
 
 def _check_range(table: TrajectoryTable, name: str, value: Array) -> None:
@@ -226,14 +172,18 @@ def _check_range(table: TrajectoryTable, name: str, value: Array) -> None:
 
 def _unit_remedy(name: str, value: Array, hint: str) -> str:
     """Return the options for factors of units that bring all values into their range."""
-    units = {
-        unit: factor
-        for factor, unit in _UNITS.get(LIMIT_COLUMNS.get(name, ""), {}).items()
+    units = QUANTITIES[LIMIT_COLUMNS[name]].units if name in LIMIT_COLUMNS else {}
+    options = [
+        f"if in {unit}, set NAME.scale={name}:{factor:.8g}"
+        for unit, factor in units.items()
         for least, largest, _, _ in _ranges(name)
         if least <= (factor * value).min() and (factor * value).max() <= largest
-    }
-    options = [f"if in {unit}, set NAME.scale={name}:{f:.8g}" for unit, f in units.items()]
-    return f"I{'; '.join(options)[1:]}." if options else hint or _CHECK_ORDER
+    ]
+    return (
+        f"I{'; '.join(options)[1:]}."
+        if options
+        else hint or "Check the unit and the order of the columns."
+    )
 
 
 def _ranges(name: str) -> Iterator[tuple[float, float, str, str]]:

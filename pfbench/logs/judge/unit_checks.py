@@ -1,4 +1,4 @@
-"""Checks of the units of one trajectory by itself: time, positions, velocities and yaw must fit together.
+"""Findings on the units of one trajectory by itself: time, positions, velocities and yaw must fit together.
 
 A unit that all files have in common is not shown by a comparison with the reference. Velocities show it against
 the change of positions, and yaw against the direction of motion.
@@ -7,11 +7,12 @@ the change of positions, and yaw against the direction of motion.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
+from pfbench.logs.doctor.finding import REFUSE, TELL, Finding
 from pfbench.logs.judge.trajectory_table import (
     GEODETIC,
     LOCAL,
@@ -19,31 +20,30 @@ from pfbench.logs.judge.trajectory_table import (
     TrajectoryTable,
     to_north_east_down,
 )
+from pfbench.logs.units import DEGREE, UNITS
 from pfbench.stats.error_measures import Array
 
-_LATEST = 1e11  # s, above GPS and Unix times
-_SINCE_1970 = (1e8, 1e10)  # s, from 1973 to 2286
-_TIME = {
-    1e-3: "milliseconds",
-    1e-6: "microseconds",
-    1e-9: "nanoseconds",
-    60.0: "minutes",
-    3600.0: "hours",
-}
-_POSITION = {1e3: "km", 1e-3: "mm", 1e-2: "cm", 0.3048: "feet"}  # factors to m
-_VELOCITY = {1e-3: "mm/s", 1e-2: "cm/s", 0.277778: "km/h", 0.514444: "knots", 0.3048: "feet/s"}
-_DEGREE = math.pi / 180
-_CLOSE = 0.03  # relative difference from a factor
-_NO_UNIT = (0.8, 1.25)  # ratios that errors of a program explain
-_SHORTEST_STEP = 1e-3  # s
-_LEAST_ROWS, _WINDOWS = 20, 10
+_LATEST, _SINCE_1970 = 1e11, (1e8, 1e10)  # s: above GPS and Unix times; from 1973 to 2286
+_CLOSE, _NO_UNIT = (
+    0.03,
+    (0.8, 1.25),
+)  # relative difference from a factor; ratios that errors of a program explain
+_LEAST_ROWS, _WINDOWS, _SHORTEST_STEP = 20, 10, 1e-3  # s
 _EXPLAINED = 0.9  # share of the change of positions that the velocities explain
 _LEAST_SPEED, _LEAST_MOVE = 1.0, 3.0  # m/s, m: the direction of motion is clear
-_SLOW, _FAST, _LONG = 0.05, 2000.0, 100.0  # m/s, m/s, m
-_USUAL = (0.5, 500.0)  # m/s
+_SLOW, _FAST, _LONG, _USUAL = 0.05, 2000.0, 100.0, (0.5, 500.0)  # m/s, m/s, m, m/s
 _SCATTER, _SHARE, _STRAIGHT = 0.05, 0.1, 0.2  # circular variance; share of another one; rad
-_BEYOND = 2.1 * math.pi  # rad, above a turn
-_EQUATOR = 0.02  # deg, where simulations start
+_BEYOND, _EQUATOR = 2.1 * math.pi, 0.02  # rad, above a turn; deg, where simulations start
+
+
+def settle(table: TrajectoryTable, findings: Iterable[Finding]) -> TrajectoryTable:
+    """Raise the first finding that refuses a trajectory, and add the others to its notes."""
+    notes = []
+    for finding in findings:
+        if finding.level == REFUSE:
+            raise ValueError(finding.text)
+        notes.append(finding.text.removesuffix("."))
+    return replace(table, notes=(*table.notes, *notes))
 
 
 def check_consistent_units(table: TrajectoryTable) -> TrajectoryTable:
@@ -51,21 +51,24 @@ def check_consistent_units(table: TrajectoryTable) -> TrajectoryTable:
 
     Returns the trajectory, with notes on what looks like another unit and cannot be decided.
     """
-    _check_largest_time(table)
+    return settle(table, _inspect_units(table))
+
+
+def _inspect_units(table: TrajectoryTable) -> Iterator[Finding]:
+    """Yield what the units of a trajectory contradict, and then what they leave in doubt."""
+    yield from _check_largest_time(table)
     position = _horizontal(table)
     ratio = _velocity_ratio(table, position)
-    _check_velocities(table, ratio)
-    _check_yaw(table, position)
-    doubts = list(_describe_doubts(table, position))
+    yield from _check_velocities(table, ratio)
+    yield from _check_yaw(table, position)
+    yield from _list_doubts(table, position)
     if not _NO_UNIT[0] < ratio < _NO_UNIT[1]:
-        doubts.append(
-            f"positions change by {ratio:.4g} times what the velocities say, as in no unit"
-        )
-    return replace(table, notes=(*table.notes, *doubts))
+        text = f"positions change by {ratio:.4g} times what the velocities say, as in no unit"
+        yield Finding("unit of velocity", TELL, ratio, 1.0, "1", text)
 
 
 def find_angle_factor(mine: Array, theirs: Array) -> tuple[float, bool]:
-    """Find the factor that turns an angle to another one: pi / 180 for degrees, 180 / pi, or 1.
+    """Find the factor that turns an angle to another one: that of a unit, 180 / pi, or 1.
 
     The factor is certain if it leaves a tenth of the circular variance without it, and of that without an
     angle. It is certain for a constant angle beyond a turn too, as 63 for 1.1 rad. A constant angle within a
@@ -75,13 +78,13 @@ def find_angle_factor(mine: Array, theirs: Array) -> tuple[float, bool]:
     """
     scatter, zero = _scatter(mine - theirs)
     nothing, _ = _scatter(theirs)
-    for factor in (_DEGREE, 1 / _DEGREE):
-        rest, offset = _scatter(factor * mine - theirs)
-        if rest < _SCATTER and max(rest, 1e-4) < _SHARE * min(scatter, nothing):
-            return factor, True
-        is_near = abs(offset) < _STRAIGHT < abs(zero) and abs(offset) < _SHARE * abs(zero)
-        if factor < 1 and rest < _SCATTER and is_near:
-            return factor, bool(np.median(np.abs(mine)) > _BEYOND)
+    factors = (*UNITS["angle"].values(), *UNITS["rare angle"].values(), 1 / DEGREE)
+    (rest, offset), factor = min((_scatter(factor * mine - theirs), factor) for factor in factors)
+    if rest < _SCATTER and max(rest, 1e-4) < _SHARE * min(scatter, nothing):
+        return factor, True
+    rest, offset = _scatter(DEGREE * mine - theirs)
+    if rest < _SCATTER and abs(offset) < min(_STRAIGHT, _SHARE * abs(zero)) and abs(zero) > _STRAIGHT:  # fmt: skip
+        return DEGREE, bool(np.median(np.abs(mine)) > _BEYOND)
     return 1.0, True
 
 
@@ -91,19 +94,15 @@ def _scatter(angle: Array) -> tuple[float, float]:
     return 1 - float(np.abs(mean)), float(np.angle(mean))
 
 
-def _check_largest_time(table: TrajectoryTable) -> None:
-    """Raise ValueError for a count of ms, us or ns since 1970."""
+def _check_largest_time(table: TrajectoryTable) -> Iterator[Finding]:
+    """Refuse a count of ms, us or ns since 1970."""
     largest = float(np.abs(table.time).max())
-    if largest <= _LATEST:
-        return
-    units = {f: u for f, u in _TIME.items() if _SINCE_1970[0] < f * largest < _SINCE_1970[1]}
-    remedy = next(
-        (f"It is in {u} since 1970: set NAME.scale=t:{f:g}." for f, u in units.items()), ""
-    )
-    raise ValueError(
-        f"{table.file}: column t must be in s, got {largest:.10g}. "
-        f"{remedy or 'Set NAME.scale=t:FACTOR, so that it is in s.'}"
-    )
+    if largest > _LATEST:
+        fits = [(u, f) for u, f in UNITS["time"].items() if _SINCE_1970[0] < f * largest < _SINCE_1970[1]]  # fmt: skip
+        texts = [f"It is in {u} since 1970: set NAME.scale=t:{f:g}" for u, f in fits]
+        remedy = next(iter(texts), "Set NAME.scale=t:FACTOR, so that it is in s")
+        evidence = f"{table.file}: column t must be in s, got {largest:.10g}"
+        yield Finding("unit of time", REFUSE, largest, _LATEST, "s", evidence, remedy)
 
 
 def _horizontal(table: TrajectoryTable) -> Array:
@@ -131,8 +130,8 @@ def _velocity_ratio(table: TrajectoryTable, position: Array) -> float:
     return common / sizes[1]
 
 
-def _check_velocities(table: TrajectoryTable, ratio: float) -> None:
-    """Raise ValueError if positions change by a known factor more or less than velocities say."""
+def _check_velocities(table: TrajectoryTable, ratio: float) -> Iterator[Finding]:
+    """Refuse positions that change by a known factor more or less than velocities say."""
     if abs(ratio - 1) < _CLOSE:
         return
     remedies = []
@@ -143,43 +142,43 @@ def _check_velocities(table: TrajectoryTable, ratio: float) -> None:
             word = ",".join(f"{name}:{factor:.6g}" for name, factor in factors.items())
             remedies.append(f"{', '.join(factors)} in {unit}: set NAME.scale={word}")
     if remedies:
-        raise ValueError(
-            f"{table.file}: positions must change by the velocities, got {ratio:.4g} times as much. "
-            f"{'; or '.join(remedies)}."
+        evidence = (
+            f"{table.file}: positions must change by the velocities, got {ratio:.4g} times as much"
         )
+        yield Finding("unit of velocity", REFUSE, ratio, 1.0, "1", evidence, "; or ".join(remedies))
 
 
 def _list_units(table: TrajectoryTable) -> Iterator[tuple[str, Mapping[str, float]]]:
     """Yield units with the factors of their columns that may explain other velocities."""
-    for factor, unit in _TIME.items():
-        yield unit, {"t": factor}
+    columns = {"time": ["t"]}
     if table.has(LOCAL):
-        for factor, unit in _POSITION.items():
-            yield unit, dict.fromkeys(LOCAL, factor)
+        columns["length"] = list(LOCAL)
     elif (np.abs(table.select(GEODETIC[:2])) <= [math.pi / 2, math.pi]).all():
-        yield "rad", dict.fromkeys(GEODETIC[:2], 1 / _DEGREE)
-    columns = [name for name in VELOCITY_COLUMNS if name in table.values]
-    for factor, unit in _VELOCITY.items():
-        yield unit, dict.fromkeys(columns, factor)
+        columns["place"] = list(GEODETIC[:2])
+    columns["velocity"] = [name for name in VELOCITY_COLUMNS if name in table.values]
+    for dimension, names in columns.items():
+        yield from ((unit, dict.fromkeys(names, f)) for unit, f in UNITS[dimension].items())
 
 
-def _check_yaw(table: TrajectoryTable, position: Array) -> None:
-    """Raise ValueError if yaw has the direction of motion in degrees."""
+def _check_yaw(table: TrajectoryTable, position: Array) -> Iterator[Finding]:
+    """Refuse a yaw that has the direction of motion in another unit."""
     yaw = table.values.get("yaw")
     direction, is_moving = _course(table, position)
     if yaw is None or is_moving.sum() < _LEAST_ROWS:
         return
     factor, is_certain = find_angle_factor(yaw[is_moving], direction[is_moving])
     if factor != 1 and is_certain:
-        unit = {True: "degrees", False: "rad, converted twice"}[factor < 1]
+        units = {**UNITS["angle"], **UNITS["rare angle"]}
+        unit = next((u for u, f in units.items() if f == factor), "rad, converted twice")
         if table.angle_unit == "deg":  # the reader has converted it
             unit = "rad" if factor > 1 else "degrees, in 1/57.3 of its unit"
         level = float(np.median(np.abs(yaw[is_moving])))
-        raise ValueError(
+        evidence = (
             f"{table.file}: column yaw must be in {table.angle_unit}, got a median size of {level:.4g} rad, which "
-            f"agrees with the direction of motion in {unit}. Set NAME.scale=yaw:{factor:.6g}, and the same "
-            "for roll and pitch if they have this unit."
+            f"agrees with the direction of motion in {unit}"
         )
+        remedy = f"Set NAME.scale=yaw:{factor:.6g}, and the same for roll and pitch if they have this unit"
+        yield Finding("unit of attitude", REFUSE, 1 / factor, 1.0, "1", evidence, remedy)
 
 
 def _course(table: TrajectoryTable, position: Array) -> tuple[Array, np.ndarray]:
@@ -198,23 +197,25 @@ def _course(table: TrajectoryTable, position: Array) -> tuple[Array, np.ndarray]
         lag *= 2
 
 
-def _describe_doubts(table: TrajectoryTable, position: Array) -> Iterator[str]:
-    """Yield notes on speeds and places that another unit would explain."""
+def _list_doubts(table: TrajectoryTable, position: Array) -> Iterator[Finding]:
+    """Yield speeds and places that another unit would explain."""
     lag = max(1, len(position) // _WINDOWS)
     move = np.linalg.norm(position[lag:] - position[:-lag], axis=1)
     speed = float((move / (table.time[lag:] - table.time[:-lag])).max())
-    extent = float(np.ptp(position, axis=0).max())
+    text = ""
     if table.has(GEODETIC) and not table.has(LOCAL):
-        lat, lon = np.abs(table.select(GEODETIC[:2])).T
-        if _EQUATOR < lat.max() <= math.pi / 2 and _EQUATOR < lon.max() <= math.pi:
-            factor = 1 / _DEGREE
-            yield (
+        lat, lon = np.abs(table.select(GEODETIC[:2])).max(0)
+        if _EQUATOR < lat <= math.pi / 2 and _EQUATOR < lon <= math.pi:
+            factor = UNITS["place"]["radians"]
+            text = (
                 "latitude and longitude may be in rad, since they are within a quarter and half a turn. "
                 f"NAME.scale=lat_deg:{factor:.6g},lon_deg:{factor:.6g} converts them"
             )
-    if extent > _LONG and speed < _SLOW:
-        usual = {f: u for f, u in _TIME.items() if _USUAL[0] < speed / f < _USUAL[1]}
-        hint = "".join(f". If t is in {u}, set NAME.scale=t:{f:g}" for f, u in usual.items())
-        yield f"the largest speed is {speed:.3g} m/s{hint or '. Check the unit of t'}"
-    if speed > _FAST:
-        yield f"the largest speed is {speed:.4g} m/s. Check the units of t and of the positions"
+            yield Finding("unit of place", TELL, lat, math.pi / 2, "deg", text)
+    text = f"the largest speed is {speed:.4g} m/s. Check the units of t and of the positions"
+    if speed < _SLOW:
+        fits = [(u, f) for u, f in UNITS["time"].items() if _USUAL[0] < speed / f < _USUAL[1]]
+        hints = [f". If t is in {u}, set NAME.scale=t:{f:g}" for u, f in fits]
+        text = f"the largest speed is {speed:.3g} m/s{''.join(hints) or '. Check the unit of t'}"
+    if speed > _FAST or (speed < _SLOW and np.ptp(position, axis=0).max() > _LONG):
+        yield Finding("unit of time", TELL, speed, _FAST, "m/s", text)

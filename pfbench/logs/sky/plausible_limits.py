@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 from pfbench.core.parameter_checks import require_ranges
+from pfbench.logs.units import UNITS
 
 
 class Quantity(NamedTuple):
@@ -19,7 +20,7 @@ class Quantity(NamedTuple):
         rate: Largest rate of change, unit/s. Infinite if the change is not limited.
         allowance: Change that is accepted in any time, for noise.
         source: Source of the numbers.
-        units: Other units of such columns, with the factors that convert them.
+        dimension: Key of the other units of such columns in `UNITS`.
         key: Field of `PlausibleLimits` that replaces `largest`.
     """
 
@@ -29,60 +30,58 @@ class Quantity(NamedTuple):
     rate: float = math.inf
     allowance: float = 0.0
     source: str = ""
-    units: tuple[tuple[str, float], ...] = ()
+    dimension: str = ""
     key: str = ""
 
     @property
-    def hint(self) -> str:
-        """Conversions of other units, for a message."""
-        return " ".join(f"If in {unit}, multiply by {factor:.9g}." for unit, factor in self.units)
+    def units(self) -> dict[str, float]:
+        """Other units of such columns, with the factors that convert them."""
+        return UNITS.get(self.dimension, {})
 
 
-_DEGREES = (("degrees", 0.0174532925),)
-_DEGREES_PER_SECOND = (("deg/s", 0.0174532925),)
 _HALF_TURN, _QUARTER_TURN = 1.001 * math.pi, 1.001 * math.pi / 2
 
 QUANTITIES = {
-    "time": Quantity("s", -1e19, 1e19, source="nanoseconds since 1970 in a float64"),
+    "time": Quantity("s", -1e19, 1e19, source="nanoseconds since 1970 in a float64", dimension="time"),
     "specific force": Quantity(
         "m/s^2", -400.0, 400.0, 2e4, 100.0, "range of tactical accelerometers, 40 g",
-        (("mg", 9.80665e-3), ("cm/s^2", 0.01)), "force_m_s2",
+        "force", "force_m_s2",
     ),
     "angular rate": Quantity(
         "rad/s", -35.0, 35.0, 2e3, 10.0, "range of common MEMS gyros, 2000 deg/s",
-        _DEGREES_PER_SECOND, "angular_rate_rad_s",
+        "rate", "angular_rate_rad_s",
     ),
     "latitude": Quantity(
-        "deg", -90.0, 90.0, source="definition", units=(("1e-7 deg", 1e-7),)
+        "deg", -90.0, 90.0, source="definition", dimension="place"
     ),
     "longitude": Quantity(
-        "deg", -180.0, 360.0, source="definition, both conventions", units=(("1e-7 deg", 1e-7),)
+        "deg", -180.0, 360.0, source="definition, both conventions", dimension="place"
     ),
     "height": Quantity(
         "m", -1000.0, 40000.0, source="Dead Sea with a margin; above all aircraft",
-        units=(("mm", 1e-3), ("cm", 1e-2)), key="height_m"
+        dimension="length", key="height_m"
     ),
-    "local position": Quantity("m", -2.1e7, 2.1e7, source="half the circumference of the Earth"),
+    "local position": Quantity("m", -2.1e7, 2.1e7, source="half the circumference of the Earth", dimension="length"),
     "geocentric position": Quantity("m", -6.5e6, 6.5e6, source="radius of the Earth and 120 km"),
     "velocity": Quantity(
         "m/s", -1000.0, 1000.0, 200.0, 10.0, "fastest aircraft 980 m/s; 20 g",
-        (("mm/s", 1e-3), ("cm/s", 1e-2)), "speed_m_s"
+        "velocity", "speed_m_s"
     ),
-    "roll": Quantity("rad", -_HALF_TURN, _HALF_TURN, source="definition", units=_DEGREES),
-    "pitch": Quantity("rad", -_QUARTER_TURN, _QUARTER_TURN, source="definition", units=_DEGREES),
-    "yaw": Quantity("rad", -1e4, 1e4, source="unwrapped, 1600 turns", units=_DEGREES),
+    "roll": Quantity("rad", -_HALF_TURN, _HALF_TURN, source="definition", dimension="angle"),
+    "pitch": Quantity("rad", -_QUARTER_TURN, _QUARTER_TURN, source="definition", dimension="angle"),
+    "yaw": Quantity("rad", -1e4, 1e4, source="unwrapped, 1600 turns", dimension="angle"),
     "number": Quantity("1", 0.0, 1e9, source="counts and identifiers"),
     "static pressure": Quantity(
         "kPa", 0.2, 120.0, 20.0, 0.5, "standard atmosphere, 40 km to -1 km",
-        (("hPa", 0.1), ("Pa", 1e-3)),
+        "pressure",
     ),
     "magnetic field": Quantity(
         "gauss", -6.0, 6.0, 50.0, 1.0, "Earth 0.7 gauss and hard iron",
-        (("nT", 1e-5), ("uT", 1e-2), ("mgauss", 1e-3)),
+        "field",
     ),
     "speed of wheels": Quantity("m/s", -150.0, 150.0, 30.0, 5.0, "road vehicles; 3 g"),
     "yaw rate": Quantity(
-        "rad/s", -10.0, 10.0, 50.0, 1.0, "road vehicles", _DEGREES_PER_SECOND
+        "rad/s", -10.0, 10.0, 50.0, 1.0, "road vehicles", "rate"
     ),
     "pseudorange": Quantity("m", 1.5e7, 6e7, source="height of GNSS orbits and 0.1 s of clock"),
     "range rate": Quantity("m/s", -3e3, 3e3, source="orbits 1 km/s, aircraft 1 km/s, clock 3 us/s"),

@@ -14,12 +14,9 @@ from pfbench.core.parameter_checks import require
 from pfbench.core.record import Episode, MeasuredTruth
 from pfbench.files.reader_notes import announce_notes
 from pfbench.files.table_file import Array
-from pfbench.logs.worlds.aligned_reader import check_corrections, read_aligned_log
 from pfbench.logs.worlds.drive import RecordedDrive
-from pfbench.logs.worlds.log_tables import (
-    NavigationLog,
-    find_dataset,
-)
+from pfbench.logs.worlds.log_reader import check_corrections
+from pfbench.logs.worlds.log_tables import NavigationLog, find_dataset
 from pfbench.logs.worlds.odometer import SimulatedOdometer
 from pfbench.logs.worlds.start_alignment import StartAlignment, StartEstimate
 from pfbench.logs.worlds.time_grid import ResampledLog, interpolate
@@ -27,8 +24,6 @@ from pfbench.logs.worlds.user_log import UserLog
 from pfbench.noise.base import NoiseRegime
 
 HELD_OUT = "held-out fixes"
-_VELOCITY = ("vn", "ve", "vd")
-_REMEDY = "Leave these out. A lever arm is a key of scenario.constraints, too."
 
 
 @dataclass(frozen=True)
@@ -61,14 +56,7 @@ class AlignedLog(UserLog):
 
     def read_checked(self, folder: Path) -> NavigationLog:
         """Read and check the log in a folder."""
-        return read_aligned_log(
-            folder,
-            self.files,
-            origin=self.origin,
-            limits=self.limits,
-            fix_codes=self.fix_codes,
-            corrections=self.corrections,
-        )
+        return self.read_tables(folder, has_attitude=False)
 
     @override
     def resample(self, log: NavigationLog) -> ResampledLog:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from pfbench.logs.worlds.time_grid import interpolate
 from pfbench.nav.strapdown import rotate
 
 Tables = dict[str, LogTable]
+LogTables = tuple[LogTable, LogTable, LogTable | None]  # IMU, fixes and, if there is one, reference
 Vector = Sequence[float] | None
 _TABLES = ("imu", "gnss", "reference")
 _FORCE, _RATE, _ANGLES = ("fx", "fy", "fz"), ("wx", "wy", "wz"), ("roll", "pitch", "yaw")
@@ -55,7 +56,7 @@ class LogCorrections:
         mounting: By imu, accelerometer or gyroscope: the recorded axes that are forward, right, down, such as
             [x, -y, -z]. Three numbers are the angles of the sensor in the body, roll, pitch, yaw, deg.
         level_axes: By gnss, reference or reference_velocity: the recorded axes that are North, East, Down, such as
-            [e, n, -d].
+            [e, n, -d]. One number is the turn of the frame about the vertical, deg.
         attitude: Convention of the recorded attitude, such as yaw_from_east. None for that of the tables.
         bias: Values that are subtracted, by table and column.
         shift_s: Delay of the clock by table, s, which is subtracted from t. Nodes [t, delay] for one that changes.
@@ -72,7 +73,7 @@ class LogCorrections:
     times: Mapping[str, str] = field(default_factory=dict)
     scale: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     mounting: Mapping[str, Sequence[str | float]] = field(default_factory=dict)
-    level_axes: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    level_axes: Mapping[str, Sequence[str | float]] = field(default_factory=dict)
     attitude: str | None = None
     bias: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     shift_s: Mapping[str, float | Sequence[Sequence[float]]] = field(default_factory=dict)
@@ -107,26 +108,19 @@ class LogCorrections:
         for table, shift in (self.shift_s or {}).items():
             _nodes_of(table, shift)
 
-    @property
-    def is_empty(self) -> bool:
-        """True if nothing is corrected."""
-        return not any(getattr(self, f.name) not in ("refuse", None) and getattr(self, f.name) for f in fields(self))  # fmt: skip
-
-    def correct_tables(self, inertial: LogTable, gnss: LogTable, truth: LogTable) -> tuple[tuple[LogTable, LogTable, LogTable], tuple[str, ...]]:  # fmt: skip
+    def correct_tables(self, inertial: LogTable, gnss: LogTable, truth: LogTable | None) -> tuple[LogTables, tuple[str, ...]]:  # fmt: skip
         """Correct the tables as recorded.
 
         Args:
             inertial: IMU table.
             gnss: Table of fixes.
-            truth: Reference table.
+            truth: Reference table, None for a log without one.
 
         Returns:
             Corrected tables, and a note for each correction.
         """
-        tables = {"imu": inertial, "gnss": gnss, "reference": truth}
+        tables = {"imu": inertial, "gnss": gnss} | ({"reference": truth} if truth else {})
         notes: list[str] = []
-        if self.is_empty:
-            return (inertial, gnss, truth), ()
         for name, order in (self.times or {}).items():
             tables[name] = _sort(tables[name], notes)
             if order == "even":
@@ -139,7 +133,7 @@ class LogCorrections:
         if self.gaps == "longest":
             tables["imu"], note = cut_longest(tables["imu"], convert_column(tables["imu"], "t"))
             notes += note
-        return (tables["imu"], tables["gnss"], tables["reference"]), tuple(notes)
+        return (tables["imu"], tables["gnss"], tables.get("reference")), tuple(notes)
 
     def _correct_columns(self, tables: Tables, notes: list[str]) -> None:
         """Apply factors, axes, convention and biases to the columns."""
@@ -176,12 +170,12 @@ class LogCorrections:
                 tables[name] = _apply(tables[name], (column,), lambda v, b=value: v - b)
             notes.append(f"{tables[name].name}: {dict(values)} subtracted")
 
-    def correct_fixes(self, fixes: GnssLog, reference: ReferenceLog, name: str) -> tuple[GnssLog, tuple[str, ...]]:  # fmt: skip
+    def correct_fixes(self, fixes: GnssLog, reference: ReferenceLog | None, name: str) -> tuple[GnssLog, tuple[str, ...]]:  # fmt: skip
         """Correct the fixes with the reference.
 
         Args:
             fixes: Fixes.
-            reference: Reference.
+            reference: Reference, None for a log without one.
             name: Name of the table of fixes.
 
         Returns:
@@ -193,7 +187,7 @@ class LogCorrections:
             notes.append(
                 f"{name}: {list(self.offset_m)} m North, East, Down subtracted from the fixes"
             )
-        if self.lever_arm is not None:
+        if self.lever_arm is not None and reference:
             lever = torch.from_numpy(swap_frd_rfu(np.array(self.lever_arm, float)))
             q = torch.from_numpy(interpolate(reference, fixes.time)[:, :4])
             position -= rotate(q, lever.expand(len(q), 3)).numpy()
@@ -202,7 +196,7 @@ class LogCorrections:
             )
         velocity = fixes.velocity.copy()
         for kind in ("outliers", "frozen"):
-            if kind in (self.drop or ()):
+            if kind in (self.drop or ()) and reference:
                 mask = _wrong_fixes(fixes._replace(position=position), reference, kind)
                 position[mask] = velocity[mask] = np.nan
                 notes.append(f"{name}: {int(mask.sum())} fixes dropped as {kind}")
@@ -377,12 +371,14 @@ def _mounting_matrix(sensor: str, axes: Sequence[str | float]) -> Array:
     return matrix
 
 
-def _level_matrix(frame: str, axes: Sequence[str]) -> Array:
+def _level_matrix(frame: str, axes: Sequence[str | float]) -> Array:
     """Return the matrix from the recorded to North, East, Down, [3, 3]."""
+    if len(axes) == 1 and isinstance(axes[0], int | float):
+        return np.asarray(Rotation.from_euler("z", -axes[0], degrees=True).as_matrix())
     matrix = parse_axes([str(name) for name in axes], is_level=True)
     if matrix is None:
         raise ValueError(
-            f"scenario.corrections.level_axes.{frame} must be three different axes such as [e, n, -d], got "
+            f"scenario.corrections.level_axes.{frame} must be three different axes such as [e, n, -d], or a turn in deg, got "
             f"{list(axes)}. Name the recorded axes that are North, East, Down."
         )
     return matrix

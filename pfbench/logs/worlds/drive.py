@@ -224,11 +224,11 @@ class RecordedFlights(Scenario):
             read_log(
                 folder,
                 self.files,
-                self.flights[i],
-                self.imu_index,
-                self.origin,
-                self.limits,
-                self.fix_codes,
+                path=self.flights[i],
+                imu=self.imu_index,
+                origin=self.origin,
+                limits=self.limits,
+                fix_codes=self.fix_codes,
             )
             for i in used
         ]

@@ -23,6 +23,10 @@ PROGRAMS: dict[str, tuple[dict[int, str], dict[int, str]]] = {
         {1: "fixed", 2: "float", 3: "SBAS", 4: "differential", 5: "single", 6: "PPP"},
         {0: "none", 7: "dead reckoning"},
     ),
+    "mavlink": (  # GPS_FIX_TYPE of ArduPilot and PX4
+        {3: "3D", 4: "differential", 5: "RTK float", 6: "RTK fixed", 8: "PPP"},
+        {0: "no receiver", 1: "none", 2: "2D", 7: "static"},
+    ),
     "ublox": (  # fixType of UBX-NAV-PVT
         {3: "3D", 4: "3D with dead reckoning"},
         {0: "none", 1: "dead reckoning", 2: "2D", 5: "time only"},

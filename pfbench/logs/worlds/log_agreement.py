@@ -16,11 +16,19 @@ import torch
 from numpy.typing import NDArray
 
 from pfbench.core import chart
-from pfbench.logs.doctor.raw_log import take_reference
+from pfbench.logs.doctor.raw_log import RawReference
 from pfbench.logs.doctor.reference_checks import check_reference, drop_wrong_rows
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
 from pfbench.logs.worlds.dead_reckoning import integrate_windows
-from pfbench.logs.worlds.log_tables import Array, GnssLog, ImuLog, LogTable, ReferenceLog
+from pfbench.logs.worlds.log_tables import (
+    Array,
+    GnssLog,
+    ImuLog,
+    LogTable,
+    ReferenceLog,
+    parse_numbers,
+    swap_frd_rfu,
+)
 from pfbench.logs.worlds.time_grid import interpolate
 from pfbench.nav import attitude
 
@@ -64,7 +72,10 @@ def compare_reference(table: LogTable, reference: ReferenceLog) -> tuple[str, ..
     Returns notes.
     """
     notes = compare_velocities(table, reference)
-    _, findings = check_reference(table.name, drop_wrong_rows(take_reference(reference)), {})
+    angles = parse_numbers(table, ("roll", "pitch", "yaw"))
+    velocity, position = swap_frd_rfu(reference.velocity), swap_frd_rfu(reference.position)
+    raw = RawReference(reference.time, angles, velocity, position, np.arange(len(angles)))
+    _, findings = check_reference(table.name, drop_wrong_rows(raw), {})
     if findings:
         raise ValueError(
             f"the columns must agree: {findings[0].evidence}. Correct units, signs and order of the columns."

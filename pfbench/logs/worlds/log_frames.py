@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 
+from pfbench.logs.units import DEGREE
 from pfbench.logs.worlds.log_checks import STANDARD_GRAVITY
 from pfbench.logs.worlds.log_tables import Array, LogTable, parse_numbers, swap_frd_rfu
 from pfbench.nav import attitude, earth
 
-DEGREE = math.pi / 180.0
 GEODETIC_COLUMNS, LOCAL_COLUMNS = ("lat_deg", "lon_deg", "h_m"), ("pn", "pe", "pd")
 
 

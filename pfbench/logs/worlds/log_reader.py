@@ -16,19 +16,30 @@ A table can contain several flights and sensors. The columns `path` and `imu` id
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.reader_notes import announce_notes
 from pfbench.logs.doctor.checks import run_checks
 from pfbench.logs.doctor.finding import REFUSE, Finding
-from pfbench.logs.doctor.raw_log import RawLog, take_log
+from pfbench.logs.doctor.raw_log import (
+    NO_REFERENCE,
+    RawFixes,
+    RawImu,
+    RawLog,
+    RawReference,
+    take_rows,
+)
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
-from pfbench.logs.worlds.corrections import LogCorrections
+from pfbench.logs.units import DEGREE
+from pfbench.logs.worlds.corrections import LogCorrections, LogTables
 from pfbench.logs.worlds.fix_codes import FixCodes, select_usable
 from pfbench.logs.worlds.imu_gaps import GAP_SAMPLES, LONGEST_BRIDGE, bridge_gaps
 from pfbench.logs.worlds.log_agreement import (
@@ -40,6 +51,8 @@ from pfbench.logs.worlds.log_agreement import (
 )
 from pfbench.logs.worlds.log_checks import check_overlap
 from pfbench.logs.worlds.log_frames import (
+    GEODETIC_COLUMNS,
+    LOCAL_COLUMNS,
     find_origin,
     gravity_at,
     quaternion_of_angles,
@@ -56,130 +69,191 @@ from pfbench.logs.worlds.log_tables import (
     check_changes,
     check_increasing,
     check_seconds,
+    convert_column,
     parse_numbers,
     read_table,
     read_times,
     swap_frd_rfu,
 )
+from pfbench.nav import earth
 
 _OF_FIXES = ("lever arm", "fix shift")  # a reference that also gives the fixes has none
+_FORCE, _RATE, _ANGLES = ("fx", "fy", "fz"), ("wx", "wy", "wz"), ("roll", "pitch", "yaw")
 _VELOCITY, _DERIVED = ("vn", "ve", "vd"), ("vn_d", "ve_d", "vd_d")
+_REMEDY = "Leave these out. A lever arm is a key of scenario.constraints, too."
 
 
-def read_log(
-    folder: str | Path,
-    files: LogFiles | None = None,
-    path: int | None = None,
-    imu: int | None = None,
-    origin: Sequence[float] | None = None,
-    limits: PlausibleLimits | None = None,
-    fix_codes: FixCodes = None,
-    corrections: LogCorrections | None = None,
-) -> NavigationLog:
-    """Read and check the log in a folder.
+@dataclass(frozen=True)
+class LogSource:
+    """Place of a log, and how it is read.
 
-    Args:
-        folder: Folder of the three tables.
-        files: Names of the tables.
+    Attributes:
+        folder: Folder of the tables.
+        files: Names of the tables; the reference can be missing.
         path: Number of the flight, for tables with a column `path`.
         imu: Number of the sensor, for tables with a column `imu`.
         origin: lat_deg, lon_deg, h_m of pn = pe = pd = 0. Required only if one table has lat_deg,
             another has pn, and the metadata of the files do not contain it.
         limits: Limits of the platform. None for the default limits.
         fix_codes: Meaning of the column `fix` of the fixes: the program that wrote it (nmea, rtklib,
-            ublox), the codes of the fixes to use, or None for 1 (use) and 0.
+            mavlink, ublox), the codes of the fixes to use, or None for 1 (use) and 0.
         corrections: Corrections that are applied before the checks. None for none.
+        has_attitude: Whether the reference has an attitude. Without one it gives positions at most.
+    """
+
+    folder: Path
+    files: LogFiles = field(default_factory=LogFiles)
+    path: int | None = None
+    imu: int | None = None
+    origin: Sequence[float] | None = None
+    limits: PlausibleLimits | None = None
+    fix_codes: FixCodes = None
+    corrections: LogCorrections | None = None
+    has_attitude: bool = True
+
+    @property
+    def mending(self) -> LogCorrections:
+        """Corrections; none by default."""
+        return self.corrections or LogCorrections()
+
+    def with_settings(self, settings: Mapping[str, Any]) -> LogSource:
+        """Return the source with settings of a finding."""
+        corrections = replace(self.mending, **settings.get("corrections", {}))
+        return replace(self, fix_codes=settings.get("fix_codes", self.fix_codes), corrections=corrections)  # fmt: skip
+
+    def read_tables(self) -> LogTables:
+        """Read the tables, without a check of their contents."""
+        names, select = self.files, {"path": self.path, "imu": self.imu}
+        names_read = [names.imu, names.gnss, names.reference]
+        if names.reference is None and not self.has_attitude:
+            names_read.pop()
+        inertial, gnss, *truth = (
+            read_table(self.folder, n, select, self.limits) for n in names_read
+        )
+        return inertial, gnss, truth[0] if truth else None
+
+    def read(self) -> NavigationLog:
+        """Read and check the log, and announce its notes."""
+        log = self.check(*self.mending.correct_tables(*self.read_tables()))
+        announce_notes(self.folder, log.notes)
+        return log
+
+    def take(self, tables: LogTables) -> RawLog:
+        """Convert corrected tables without checks of their contents."""
+        inertial, gnss, truth = tables
+        centre = find_origin(self.origin, gnss, truth or gnss)
+        imu = RawImu(_columns(inertial, ("t",))[:, 0], _columns(inertial, _FORCE), _columns(inertial, _RATE), np.arange(len(inertial.rows)))  # fmt: skip
+        time, position, codes = _columns(gnss, ("t",))[:, 0], _positions(gnss, centre), None
+        if "fix" in gnss.rows and self.fix_codes is None:
+            codes = convert_column(gnss, "fix")
+        elif "fix" in gnss.rows:
+            position[~select_usable(gnss, self.fix_codes)[0]] = np.nan
+        reference = NO_REFERENCE
+        if truth and self.has_attitude:
+            columns = _VELOCITY if "vn" in truth.rows else _DERIVED
+            values = np.hstack([_columns(truth, ("t", *_ANGLES, *columns)), _positions(truth, centre)])  # fmt: skip
+            rows = np.flatnonzero(np.isfinite(values).all(1))
+            t, angles, velocity, track = np.split(values[rows], [1, 4, 7], axis=1)
+            reference = RawReference(t[:, 0], angles, velocity, track, rows)
+        if len(reference.time) > 1:
+            motion = ReferenceLog(reference.time, quaternion_of_angles(*angles.T), swap_frd_rfu(velocity), swap_frd_rfu(track))  # fmt: skip
+            fixes = GnssLog(time, swap_frd_rfu(position), np.full_like(position, np.nan))
+            position = swap_frd_rfu(self.mending.correct_fixes(fixes, motion, gnss.name)[0].position)  # fmt: skip
+        usable = np.flatnonzero(np.isfinite(position).all(1))
+        return RawLog(
+            RawImu(*take_rows(imu, np.isfinite(imu.time))), RawFixes(time[usable], position[usable], usable), reference,
+            gravity_at(centre)[0], (inertial.name, gnss.name, (truth or gnss).name),
+            (inertial.row, gnss.row, (truth or gnss).row), codes,
+        )  # fmt: skip
+
+    def check(
+        self,
+        tables: LogTables,
+        mended: tuple[str, ...],
+        findings: Sequence[Finding] | None = None,
+    ) -> NavigationLog:
+        """Check corrected tables, and correct their fixes.
+
+        Returns the log. `mended` are the notes of the corrections, and `findings` those of the same tables, which are
+        then not looked for again.
+        """
+        inertial, gnss, truth = tables
+        limits = self.limits or PlausibleLimits()
+        sensors, notes = read_samples(inertial)
+        if not self.has_attitude:
+            check_corrections(self.mending, truth is not None)
+            check_level(sensors.force, inertial.name)
+        centre = find_origin(self.origin, gnss, truth or gnss)
+        usable, usable_notes = select_usable(gnss, self.fix_codes)
+        fixes = read_fixes(gnss, centre, usable)
+        motion = _motion(truth, centre) if truth and self.has_attitude else None
+        fixes, mended_fixes = self.mending.correct_fixes(fixes, motion, gnss.name)
+        spans = [(inertial.name, sensors.time), (gnss.name, fixes.time)]
+        spans += [(truth.name, motion.time)] if truth and motion else []
+        for name, time in spans[1:]:
+            check_overlap(inertial.name, sensors.time, name, time)
+        gravity, gravity_notes = gravity_at(centre)
+        rows: tuple[str, ...] = ()
+        left_out: tuple[str, ...] = ()
+        if truth and motion:
+            rows = compare_velocities(truth, motion)
+            fixes, left_out = drop_fixes(gnss, fixes, motion, limits)
+        # faults of a whole table first: they spoil single rows, too
+        if findings is None or left_out:
+            raw = self.take(tables)
+            keep = np.isfinite(fixes.position[raw.fixes.rows, 0])
+            findings, _, _ = run_checks(raw._replace(fixes=RawFixes(*take_rows(raw.fixes, keep))))
+        diagnosed = judge_findings(findings, has_own_fixes=truth is None or gnss.name != truth.name)
+        if truth and motion:
+            rows += compare_inertial(truth, sensors, motion, gravity)
+            rows += compare_fixes(gnss, fixes, motion, limits)
+            rows += (*diagnosed, *compare_times(tuple(spans)))
+        dropped = dict.fromkeys(note for table in tables if table for note in table.notes)
+        notes = (*dropped, *mended, *mended_fixes, *usable_notes, *notes, *gravity_notes, *left_out, *(rows or diagnosed))  # fmt: skip
+        reference = motion or (read_track(truth, centre) if truth else _join_fixes(fixes))
+        return NavigationLog(sensors, fixes, reference, gravity, notes, centre)
+
+
+def read_log(folder: str | Path, files: LogFiles | None = None, **options: Any) -> NavigationLog:
+    """Read and check the log in a folder.
+
+    Args:
+        folder: Folder of the three tables.
+        files: Names of the tables.
+        **options: Other attributes of a source: path, imu, origin, limits, fix_codes, corrections, has_attitude.
 
     Returns:
-        The log in right-forward-up and East-North-Up axes.
+        The log in right-forward-up and East-North-Up axes. Without an attitude its reference has none, and without a
+        reference it is the track of the fixes.
 
     Raises:
         ValueError: If a check or the diagnosis refuses the log. The message names file, column, row, value and remedy.
     """
-    tables = read_tables(folder, files or LogFiles(), path, imu, limits)
-    mending = corrections or LogCorrections()
-    log = check_tables(*mending.correct_tables(*tables), mending, origin, limits, fix_codes)
-    announce_notes(folder, log.notes)
-    return log
+    return LogSource(Path(folder), files or LogFiles(), **options).read()
 
 
-def read_tables(
-    folder: str | Path,
-    files: LogFiles,
-    path: int | None = None,
-    imu: int | None = None,
-    limits: PlausibleLimits | None = None,
-) -> tuple[LogTable, LogTable, LogTable]:
-    """Read the tables of IMU, fixes and reference without a check of their contents; the arguments are those of `read_log`.
-
-    Returns the tables.
-    """
-    inertial, gnss, truth = (
-        read_table(Path(folder), name, {"path": path, "imu": imu}, limits)
-        for name in (files.imu, files.gnss, files.reference)
-    )
-    return inertial, gnss, truth
+def _columns(table: LogTable, columns: Sequence[str]) -> Array:
+    """Convert columns to numbers, [n, k], NaN where there is none."""
+    missing = [column for column in columns if column not in table.rows]
+    if missing:
+        raise ValueError(
+            f"{table.name} must have a column {', '.join(missing)}, got "
+            f"{', '.join(map(str, table.rows.columns))}. Rename the columns, or map them with pfbench import."
+        )
+    return np.stack([convert_column(table, column) for column in columns], -1)
 
 
-def check_tables(
-    tables: tuple[LogTable, LogTable, LogTable],
-    mended: tuple[str, ...],
-    mending: LogCorrections,
-    origin: Sequence[float] | None = None,
-    limits: PlausibleLimits | None = None,
-    fix_codes: FixCodes = None,
-    diagnosis: Diagnosed | None = None,
-) -> NavigationLog:
-    """Check corrected tables, and correct their fixes; the other arguments are those of `read_log`.
-
-    Returns the log. `mended` are the notes of the corrections, and `diagnosis` are findings of the same rows, which
-    are then not looked for again.
-    """
-    inertial, gnss, truth = tables
-    sensors, notes = read_samples(inertial)
-    centre = find_origin(origin, gnss, truth)
-    usable, usable_notes = select_usable(gnss, fix_codes)
-    fixes, reference = read_fixes(gnss, centre, usable), _motion(truth, centre)
-    fixes, mended_fixes = mending.correct_fixes(fixes, reference, gnss.name)
-    for name, time in ((gnss.name, fixes.time), (truth.name, reference.time)):
-        check_overlap(inertial.name, sensors.time, name, time)
-    gravity, gravity_notes = gravity_at(centre)
-    rows = compare_velocities(truth, reference)
-    fixes, left_out = drop_fixes(gnss, fixes, reference, limits or PlausibleLimits())
-    # faults of a whole table first: they spoil single rows, too
-    raw = take_log((inertial, gnss, truth), sensors, fixes, reference, gravity)
-    angles = parse_numbers(truth, ("roll", "pitch", "yaw"))  # not within a turn, as degrees are not
-    raw = raw._replace(reference=raw.reference._replace(angles=angles))
-    diagnosed = diagnose(raw, has_own_fixes=gnss.name != truth.name, diagnosis=diagnosis)
-    rows += compare_inertial(truth, sensors, reference, gravity)
-    rows += compare_fixes(gnss, fixes, reference, limits or PlausibleLimits())
-    dropped = dict.fromkeys(note for table in (inertial, gnss, truth) for note in table.notes)
-    notes = (*dropped, *mended, *mended_fixes, *usable_notes, *notes, *gravity_notes, *left_out)
-    spans = ((inertial.name, sensors.time), (gnss.name, fixes.time), (truth.name, reference.time))
-    notes = (*notes, *rows, *diagnosed, *compare_times(spans))
-    return NavigationLog(sensors, fixes, reference, gravity, notes, centre)
+def _positions(table: LogTable, centre: tuple[float, ...] | None) -> Array:
+    """Convert positions to North, East, Down, m, [n, 3]."""
+    if table.has(LOCAL_COLUMNS) or not table.has(GEODETIC_COLUMNS):
+        return _columns(table, LOCAL_COLUMNS)
+    scale = np.array([DEGREE, DEGREE, 1.0])
+    at = torch.from_numpy(_columns(table, GEODETIC_COLUMNS) * scale)
+    return swap_frd_rfu(earth.local_enu(at, torch.from_numpy(np.array(centre) * scale)).numpy())
 
 
-class Diagnosed(NamedTuple):
-    """A log and what its checks found."""
-
-    log: RawLog
-    findings: Sequence[Finding]
-
-    def has_rows_of(self, log: RawLog) -> bool:
-        """Return whether another reading of the tables has the same samples and fixes."""
-        pairs = zip(self.log.imu[:3] + self.log.fixes[:2], log.imu[:3] + log.fixes[:2], strict=True)
-        same = all(np.array_equal(a, b) for a, b in pairs)
-        return same and np.array_equal(self.log.reference.time, log.reference.time)
-
-
-def diagnose(
-    log: RawLog, *, has_own_fixes: bool, diagnosis: Diagnosed | None = None
-) -> tuple[str, ...]:
-    """Return the findings of the quick checks as notes; raise those that refuse the log."""
-    findings = (
-        diagnosis.findings if diagnosis and diagnosis.has_rows_of(log) else run_checks(log)[0]
-    )
+def judge_findings(findings: Sequence[Finding], *, has_own_fixes: bool) -> tuple[str, ...]:
+    """Return findings as notes; raise the first that refuses the log. The reader itself tells of gaps that it bridges."""
     refused = [finding for finding in findings if finding.level == REFUSE]
     if refused:
         raise ValueError(
@@ -188,7 +262,7 @@ def diagnose(
     return tuple(
         f"{finding.check}: {finding.text}"
         for finding in findings
-        if has_own_fixes or finding.check not in _OF_FIXES
+        if (has_own_fixes or finding.check not in _OF_FIXES) and finding.check != "imu gap"
     )
 
 
@@ -278,3 +352,58 @@ def _motion(table: LogTable, origin: tuple[float, ...] | None) -> ReferenceLog:
         velocity,
         read_positions(table, origin),
     )
+
+
+# --------------------------------------------------------------------------------------------------
+# Logs without an attitude of the reference.
+
+
+def check_level(force: Array, name: str) -> None:
+    """Check that the specific force is upward for most of the time, which a course cannot show.
+
+    Shapes: force [n, 3], right, forward, up.
+    """
+    middle, names = swap_frd_rfu(np.median(force, axis=0)), "xyz"
+    axis, typical = int(np.abs(middle).argmax()), float(np.median(np.linalg.norm(force, axis=1)))
+    down = f"{'-' * bool(middle[axis] > 0.0)}{names[axis]}"
+    remedy = f"Gravity lies on f{names[axis]}: set +scenario.corrections.mounting.imu with {down} as its third axis, which is down."
+    if down == "-z":
+        remedy = "Axes forward, left, up need +scenario.corrections.mounting.imu=[x,-y,-z]; see pfbench inspect."
+    must = "be about -9.8 on fz for most of the time, in axes forward, right, down"
+    require(middle[2] < -0.5 * typical, f"{name}: the specific force", must, f"a median of {middle[2]:.3g}", remedy)  # fmt: skip
+
+
+def check_corrections(corrections: LogCorrections, has_positions: bool) -> None:
+    """Check that no correction needs a reference that the log does not have."""
+    tables = {
+        key: getattr(corrections, key) or {}
+        for key in ("times", "scale", "bias", "shift_s", "level_axes")
+    }
+    unusable = [
+        f"{key}.{name}"
+        for key, names in tables.items()
+        for name in names
+        if name.startswith("reference") and not has_positions
+    ]
+    unusable += [
+        name for name in ("attitude", "lever_arm") if getattr(corrections, name) is not None
+    ]
+    unusable += [
+        f"drop={name}" for name in corrections.drop or () if name in ("outliers", "frozen")
+    ]
+    require(not unusable, "scenario.corrections", "not need a reference that the log lacks", ", ".join(unusable), _REMEDY)  # fmt: skip
+
+
+def _join_fixes(fixes: GnssLog) -> ReferenceLog:
+    """Return the usable fixes as a track without attitude, for the map and the start of the steps."""
+    usable = np.isfinite(fixes.position).all(1)
+    time, position = fixes.time[usable], fixes.position[usable]
+    require(len(time) > 1, "the log", "have at least 2 usable fixes", len(time), "Check the column fix.")  # fmt: skip
+    return ReferenceLog(time, np.full((len(time), 4), np.nan), np.gradient(position, time, axis=0), position)  # fmt: skip
+
+
+def read_track(table: LogTable, centre: tuple[float, ...] | None) -> ReferenceLog:
+    """Read a reference of positions; its velocities are those of the table, or the change of the positions."""
+    time, position = read_times(table, longest=100.0), read_positions(table, centre)
+    velocity = swap_frd_rfu(parse_numbers(table, _VELOCITY)) if table.has(_VELOCITY) else np.gradient(position, time, axis=0)  # fmt: skip
+    return ReferenceLog(time, np.full((len(time), 4), np.nan), velocity, position)

@@ -16,6 +16,7 @@ from pfbench.core.parameter_checks import require
 from pfbench.files.limits import find_input
 from pfbench.files.table_file import Array as Array, read_table_file
 from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, PlausibleLimits, Quantity
+from pfbench.logs.units import UNITS
 from pfbench.logs.worlds.time_order import find_order_remedy
 
 # --------------------------------------------------------------------------------------------------
@@ -235,12 +236,11 @@ def check_seconds(table: LogTable, time: Array, longest: float) -> None:
     typical = float(np.median(np.diff(time)))
     if typical <= longest:
         return
-    units = (("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9))
     # the largest unit that gives a usual interval, else one that is accepted at all
     usual = [
         (u, f)
         for limit in (min(longest, _USUAL_INTERVAL), longest)
-        for u, f in units
+        for u, f in UNITS["time"].items()
         if typical * f <= limit
     ]
     remedy = f"Use a table with an interval of at most {longest:g} s."
@@ -423,7 +423,7 @@ def _conversions(
         return []
     return [
         f"If in {unit}, multiply by {factor:.9g}."
-        for unit, factor in quantity.units
+        for unit, factor in quantity.units.items()
         if accepts(factor * values).all()
     ]
 

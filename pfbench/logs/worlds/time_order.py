@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pfbench.files.table_file import Array
 from pfbench.logs.sky.ephemeris import WEEK
+from pfbench.logs.units import UNITS
 
 DAY = 86400.0  # s
 UNIX_TO_GPS = -315964782.0  # s; GPS time of 1980-01-06 in Unix time, and 18 leap seconds since 2017
@@ -21,7 +22,6 @@ _PERIODS = {
     "a 32-bit counter of milliseconds": 2**32 * 1e-3,
     "a 32-bit counter of microseconds": 2**32 * 1e-6,
 }
-_UNITS = (1.0, 1e3, 1e6, 1e9)  # of t in s, ms, us, ns
 _REGULAR = (0.5, 1.9)  # shortest and longest usual step, in median steps
 _FEW_REPEATS = 0.2  # share of rows that can be removed because they repeat a time
 _FEW_ROWS = 0.01  # share of rows with a wrong time
@@ -71,7 +71,7 @@ def _find_period(time: Array, back: NDArray[np.intp]) -> tuple[str, float] | Non
     typical = float(np.median(forward))
     longest = max(_REGULAR[1] * typical, float(forward.max()))
     for name, period in _PERIODS.items():
-        for unit in _UNITS:
+        for unit in (1.0, *(1.0 / f for f in UNITS["time"].values() if f < 1.0)):
             fixed = time + period * unit * np.cumsum(restarts)
             new = np.diff(fixed)
             if (new >= 0.0).all() and ((new[back - 1] > 0.0) & (new[back - 1] <= longest)).all():
@@ -85,10 +85,12 @@ def _is_regular(in_order: Array, time: Array) -> bool:
     # a jump next to a step back is that of a row in the wrong place
     beside_back = np.convolve(before <= 0.0, np.ones(3), "same") > 0.0
     usual = before[~beside_back]
-    if not (usual.size and step.size):
+    if not step.size:
         return False
-    shortest, longest = _REGULAR[0] * np.median(usual), _REGULAR[1] * np.median(usual)
-    return bool(step.min() >= shortest and step.max() <= max(longest, usual.max()))
+    # of rows without any order, the steps once they are sorted
+    limits = [(_REGULAR[1] * np.median(step), np.median(step))]
+    limits += [(max(_REGULAR[1] * np.median(usual), usual.max()), np.median(usual))] if usual.size else []  # fmt: skip
+    return any(step.min() >= _REGULAR[0] * median and step.max() <= most for most, median in limits)
 
 
 def _fewest_wrong(time: Array) -> NDArray[np.intp]:

@@ -27,11 +27,9 @@ class UserLog(ConstrainedDrive):
 
     @override
     def _read_log(self, folder: Path) -> NavigationLog:
-        return read_log(
-            folder,
-            self.files,
-            origin=self.origin,
-            limits=self.limits,
-            fix_codes=self.fix_codes,
-            corrections=self.corrections,
-        )
+        return self.read_tables(folder)
+
+    def read_tables(self, folder: Path, *, has_attitude: bool = True) -> NavigationLog:
+        """Read and check the log in a folder as the keys of the scenario say."""
+        keys = ("files", "origin", "limits", "fix_codes", "corrections")
+        return read_log(folder, has_attitude=has_attitude, **{key: getattr(self, key) for key in keys})  # fmt: skip

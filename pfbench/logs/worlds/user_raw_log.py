@@ -18,11 +18,11 @@ from pfbench.core.record import Episode, MeasuredTruth, Record
 from pfbench.files.reader_notes import announce_notes
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
 from pfbench.logs.sky.raw_gnss import RawGnss, RawGnssInputs, RawGnssTuning
-from pfbench.logs.worlds.aligned_reader import read_track
+from pfbench.logs.units import DEGREE
 from pfbench.logs.worlds.corrections import LogCorrections
 from pfbench.logs.worlds.drive import FixHoldout
-from pfbench.logs.worlds.log_frames import DEGREE, find_origin
-from pfbench.logs.worlds.log_reader import read_log
+from pfbench.logs.worlds.log_frames import find_origin
+from pfbench.logs.worlds.log_reader import read_log, read_track
 from pfbench.logs.worlds.log_tables import (
     Array,
     GnssLog,

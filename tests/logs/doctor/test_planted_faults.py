@@ -19,14 +19,16 @@ from log_faults import (  # fmt: skip
 )
 from recorded_data import recorded
 
-# what a short or noisy log does not show; 44 of 51 faults must be named on all six logs
+# what a short or noisy log does not show; 53 of 60 faults must be named on all six logs
 HIDDEN = {
     "imu clock +0.03 s": {"wing"},  # whose own offset is -0.011 s
     "imu clock 1000 ppm fast": {"quad 2", "quad 17"},  # of 18 s
+    "fixes turned 12 deg": {"walk"},  # of 15 m, on which it moves fixes by less than 3 m
+    "axes of ROS": {"wing"},  # with an attitude of an on-board filter
     "force sample +150": {"quad 2"},  # vibration of 100 m/s^2
     "force sample +30": {"quad 2", "quad 13", "quad 17"},
 }
-FEWEST_ON_ALL = 44
+FEWEST_ON_ALL = 53
 PAIRS = [
     ("car", "forward-left-up", "gnss clock +1 s"),
     ("car", "gyro in deg/s", "imu clock +0.1 s"),
@@ -47,6 +49,7 @@ BESIDE = {
     ("quad 17", "imu clock jump 1 s"): {"imu clock"},
     ("quad 17", "reference ENU"): {"fix axes"},
     ("wing", "fixes frozen 3 s"): {"fix outliers"},
+    ("wing", "axes of ROS"): {"accelerometer bias"},
 }
 # Its remedy exchanges North and East and leaves the vertical, so that the fixes seem to be upside down: a fault of the check.
 HALF_MENDED = {("quad 17", "reference ENU")}
@@ -105,20 +108,8 @@ def test_each_fault_is_named_on_six_logs_and_mended(log: str, fault: str) -> Non
 
 
 def test_enough_faults_are_named_on_all_logs_and_have_a_remedy() -> None:
-    assert len(FAULTS) == 51
+    assert len(FAULTS) == 60
     assert sum(not hidden for hidden in HIDDEN.values()) + len(FAULTS) - len(HIDDEN) >= FEWEST_ON_ALL  # fmt: skip
-
-
-@recorded
-@pytest.mark.slow
-def test_forty_faults_carry_a_remedy_by_keys() -> None:
-    log = tables("quad 13")
-    with_keys = [
-        fault
-        for fault in FAULTS
-        if any(f.settings for f in findings_of(planted(log, fault)) if f.check == FAULTS[fault].named)
-    ]  # fmt: skip
-    assert len(with_keys) >= 40
 
 
 @recorded

@@ -96,6 +96,9 @@ def test_import_and_python_take_a_log_without_a_reference(
     main(["import", "copy", "imu=log/imu.csv", "gnss=log/gnss.csv"])
     assert {file.name for file in (tmp_path / "copy").iterdir()} == {"imu.csv", "gnss.csv"}
     assert "no reference. These checks work" in capsys.readouterr().out
+    names = {f"{k}{a}": f"{n}[{i}]" for k, n in (("w", "gyro_rad"), ("f", "acc_m_s2")) for i, a in enumerate("xyz")}  # fmt: skip
+    with pytest.raises(ValueError, match=r"'gyro_rad\[0\]': 'wx'.*'acc_m_s2\[2\]': 'fz'"):
+        pfbench.log(pd.read_csv("log/imu.csv").rename(columns=names)[["t", *sorted(names.values())[::-1]]], "log/gnss.csv")  # fmt: skip
     part = pfbench.log("log/imu.csv", "log/gnss.csv")
     assert part.name == "user_log_aligned"
     scenario = pfbench.job.build_plan(

@@ -54,7 +54,7 @@ FAULTS: dict[str, tuple[Change, Change, str]] = {  # of the program, of the refe
     "ns since 1970": (lambda d: d.assign(t=1e9 * (d.t + 1.4e9)), unharmed, "mine.scale=t:1e-09"),
     "ns since 1970 in both": (lambda d: d.assign(t=1e9 * (d.t + 1.4e9)),) * 2 + ("reference.scale=t:1e-09",),
     "minutes": (scale(1 / 60, "t"), unharmed, "mine.scale=t:60"),
-    "ms in both": (scale(1e3, "t"), scale(1e3, "t"), "t in milliseconds: set reference.scale=t:0.001"),
+    "ms in both": (scale(1e3, "t"), scale(1e3, "t"), "t in ms: set reference.scale=t:0.001"),
     "reference in ms": (places, lambda d: scale(1e3, "t")(places(d)), "reference.scale=t:0.001"),
     "offset": (lambda d: d.assign(t=d.t + 18), unharmed, "mine.shift=-18"),
     "feet": (scale(3.28084, *POSITION), unharmed, "mine.scale=pn:0.3048,pe:0.3048,pd:0.3048"),
@@ -65,16 +65,18 @@ FAULTS: dict[str, tuple[Change, Change, str]] = {  # of the program, of the refe
     "degrees in both": (noisy_degrees, noisy_degrees, "direction of motion in degrees. Set reference.scale"),
     "turned degrees in both": (lambda d: d.assign(yaw=DEGREE * d.yaw + 30),) * 2 + ("in degrees. Set reference.scale",),
     "rad converted twice": (scale(1 / DEGREE, "yaw"), unharmed, "mine.scale=yaw:57.2958"),
+    "tenths of degrees": (scale(10 * DEGREE, "yaw"), unharmed, "mine.scale=yaw:0.00174533"),
+    "gon": (scale(200 / np.pi, "yaw"), unharmed, "mine.scale=yaw:0.015708"),
     "all angles": (scale(DEGREE, "roll", "pitch", "yaw"), unharmed, "If in degrees, set mine.scale=pitch:0.01745"),
     "cm/s": (scale(1e2, *VELOCITY), unharmed, "If in cm/s, set mine.scale=vn:0.01; if in mm/s"),
     "opposite yaw": (scale(-1, "yaw"), unharmed, "Multiply the column by -1"),
-    "week": (counter(604800.0), unharmed, "add 604800 to column t from line 102"),
-    "midnight": (counter(86400.0), unharmed, "add 86400 to column t from line 102"),
-    "ms of the week": (counter(604800e3, 1e3), unharmed, "add 604800000 to column t from line 102"),
-    "32 bits of us": (counter(2.0**32, 1e6), unharmed, "add 4294967296 to column t from line 102"),
-    "repeated rows": (lambda d: pd.concat([d[:5], d[4:]]), unharmed, "Remove the repeated rows: line 7"),
+    "week": (counter(604800.0), unharmed, "add 604800 to t from line 102"),
+    "midnight": (counter(86400.0), unharmed, "add 86400 to t from line 102"),
+    "ms of the week": (counter(604800e3, 1e3), unharmed, "add 604800000 to t from line 102"),
+    "32 bits of us": (counter(2.0**32, 1e6), unharmed, "add 4294967296 to t from line 102"),
+    "repeated rows": (lambda d: pd.concat([d[:5], d[4:]]), unharmed, "Keep one row for each time"),
     "lost order": (lambda d: d.sample(frac=1.0, random_state=0), unharmed, "Sort the rows by t"),
-    "two runs": (lambda d: pd.concat([d, d]), unharmed, "split before line 203"),
+    "two runs": (lambda d: pd.concat([d, d]), unharmed, "Keep one part: the longest is line 2 to line 202"),
     "missing values": (lambda d: d.assign(vn=d.vn.where(d.t > 3)), unharmed, "Remove these rows"),
     "no velocity": (lambda d: d.assign(vn=np.nan), unharmed, "Remove or rename the columns of its group"),
 }  # fmt: skip
@@ -107,21 +109,20 @@ def follow_option(message: str, options: dict[str, dict[str, object]]) -> bool:
 def follow_edit(message: str, table: pd.DataFrame) -> pd.DataFrame:
     """Change the table as a message without an option says; line 2 is row 0."""
     table = table.reset_index(drop=True)
-    line = int((re.search(r"line (\d+)[^,\d]*[.,]", message[message.index(". ") :]) or [0, 2])[1])
-    if match := re.search(r"add (\d+) to column t from line (\d+)", message):
+    if match := re.search(r"add (\d+) to t from line (\d+)", message):
         return table.assign(t=table.t + float(match[1]) * (table.index >= int(match[2]) - 2))
     if "Multiply the column by -1" in message:
         return table.assign(yaw=-table.yaw)
     if "Sort the rows" in message:
         return table.sort_values("t")
-    if "split before" in message:
-        return table[: line - 2]
+    if "Keep one part" in message:
+        return table[: int(message.rstrip(".").split()[-1]) - 1]
     if "Remove these rows" in message:
         return table.dropna()
     if "Remove or rename the columns" in message:
         return table.drop(columns=VELOCITY)
-    assert "Remove the repeated rows" in message
-    return table.drop(index=line - 2)
+    assert "Keep one row for each time" in message
+    return table.drop_duplicates("t")
 
 
 @pytest.mark.parametrize("case", FAULTS)

@@ -21,15 +21,15 @@ def scale(columns: list[str], factor: float) -> Change:
 
 BAD: dict[str, tuple[Change, str, str]] = {
     "no overlap": (lambda d: d.assign(t=d.t + 1e5), "column t must overlap truth.csv", "mine.shift=-100000"),
-    "milliseconds": (lambda d: d.assign(t=d.t * 1e3 + 1e6), "column t must overlap", "in milliseconds"),
-    "milliseconds from 0": (lambda d: d.assign(t=d.t * 1e3), "column t must overlap", "in milliseconds"),
+    "milliseconds": (lambda d: d.assign(t=d.t * 1e3 + 1e6), "column t must overlap", "in ms"),
+    "milliseconds from 0": (lambda d: d.assign(t=d.t * 1e3), "column t must overlap", "in ms"),
     "minutes": (lambda d: d.assign(t=d.t / 60), "column t must overlap", "in minutes"),
     "leap seconds": (lambda d: d.assign(t=d.t + 18), "must have the clock of truth.csv", "mine.shift=-1"),
     "unknown column": (lambda d: d.rename(columns={"pe": "east"}), "without pe", "Add the missing columns"),
     "no time": (lambda d: d.rename(columns={"t": "time"}), "must have the column t", "mine.columns=t:"),
     "NaN": (lambda d: d.assign(pe=d.pe.where(d.index != 7)), "line 9, column pe must be a finite", "Remove these rows"),
     "text": (lambda d: d.assign(pe=d.pe.astype(object).where(d.index != 7, "x")), "line 9, column pe must be a number", "Repair"),
-    "repeated time": (lambda d: pd.concat([d[:5], d[4:]]), "line 7, column t must be later", "Remove the repeated rows: line 7."),
+    "repeated time": (lambda d: pd.concat([d[:5], d[4:]]), "line 7, column t must be later", "Keep one row for each time."),
     "feet": (scale(POSITION, 3.28084), "column pn must be in m", "Multiply the column by 0.3048"),
     "km/h": (scale(["vn", "ve", "vd"], 3.6), "column vn must be in m/s", "0.277778"),
     "degrees": (scale(["roll", "pitch", "yaw"], 180 / np.pi), "column pitch must be", "0.017453"),

@@ -86,6 +86,8 @@ def test_nmea_with_a_wrong_checksum(tmp_path: Path) -> None:
     (tmp_path / "log.nmea").write_text(text.replace(",N,", ",S,", 1))
     with pytest.raises(ValueError, match=r"log.nmea: line 1 must have the checksum"):
         read(tmp_path / "log.nmea")
+    (tmp_path / "log.nmea").write_text("$GPGSV,1,1,01,09*00\r\n" + text)
+    assert "1 damaged sentences of kinds that are not read" in read(tmp_path / "log.nmea").notes
 
 
 def test_local_frame_is_that_of_the_ellipsoid() -> None:

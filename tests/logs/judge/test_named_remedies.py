@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import judge_cases as cases
-import numpy as np
 import pandas as pd
 import pytest
 from command_line import pfbench
@@ -95,15 +94,11 @@ def test_names_of_columns_can_be_exchanged(home: Path) -> None:
     assert said.code == 0, said.err
 
 
-def test_wrong_axes_of_a_tum_file_name_the_frame(home: Path) -> None:
-    truth = cases.drive()
-    zero = np.zeros(len(truth))
-    rows = np.column_stack([truth.t, truth[POSITION], zero, zero, zero, zero + 1])
-    np.savetxt(home / "mine.tum", rows)
-    said = judge(home, f"mine={home / 'mine.tum'}", "mine.frame=enu")
-    assert said.code == 2
-    assert "Set mine.frame=ned." in said.err
-    assert judge(home, f"mine={home / 'mine.tum'}", "mine.frame=ned").code == 0
+def test_tabs_are_named_beside_a_comma_in_a_name(home: Path) -> None:
+    full(cases.drive()).rename(columns={"yaw": "yaw, deg"}).to_csv(
+        home / "mine.csv", sep="\t", index=False
+    )
+    assert "got tabs as separators" in judge(home).err
 
 
 def test_trajectories_that_all_stop_early_are_named(home: Path) -> None:

@@ -231,3 +231,8 @@ def test_repeated_times_are_refused_or_the_first_is_kept(tmp_path: Path) -> None
     kept = import_table("imu", tmp_path / "a.csv", ImportOptions(repeats="first"))
     assert len(kept.rows) == 4
     assert "1 rows that repeat a time left out" in kept.notes
+    options = ImportOptions(repeats="first", scale={"fz": "-2"})
+    assert np.allclose(import_table("imu", tmp_path / "a.csv", options).rows["fz"], -2.0 * kept.rows["fz"])  # fmt: skip
+    table(IMU).iloc[[0, 0, 0, 0, 1]].to_csv(tmp_path / "b.csv", index=False)
+    with pytest.raises(ValueError, match="have lost digits"):
+        import_table("imu", tmp_path / "b.csv", options)

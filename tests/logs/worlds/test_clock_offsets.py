@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from log_faults import SHARED, findings_of, late, shared_tables
-from recorded_data import recorded
+from log_faults import findings_of
 from synthetic_log import tables, write
 
 from pfbench.logs.worlds.log_reader import read_log
@@ -57,10 +56,6 @@ def test_a_late_table_is_named_and_the_named_change_removes_it(
     assert not LATE.search(said_of(tmp_path, log))
 
 
-def test_no_offset_is_named_without_one(tmp_path: Path) -> None:
-    assert not LATE.search(said_of(tmp_path, noisy()))
-
-
 def turning(yaw: np.ndarray, speed: np.ndarray, arm: float, delay: float) -> Log:
     """A level drive at 10 Hz with fixes of 0.3 m, of an antenna ahead of the reference point."""
     rng, time = np.random.default_rng(2), np.arange(len(yaw)) / 10
@@ -90,19 +85,6 @@ def test_a_straight_drive_at_constant_speed_shows_no_offset(delay: float) -> Non
     """A delay of 2 s is 20 m along the track there, which a constant error of the fixes explains as well."""
     level = np.zeros(1801)
     assert offset_of(turning(level, level + 10.0, 0.0, delay), "gnss") is None
-
-
-@recorded
-@pytest.mark.parametrize("name", SHARED)
-def test_clean_logs_show_none_and_delayed_ones_theirs(name: str) -> None:
-    log = shared_tables(name)
-    own = offset_of(log, "gnss") or 0.0  # of the fixed wing, whose reference is a filter
-    assert offset_of(log, "imu") is None
-    assert own == 0.0 or name == "wing"
-    late("imu", -5.0)(log)
-    late("gnss", 1.0)(log)
-    assert offset_of(log, "imu") == pytest.approx(-5.0, abs=0.03)
-    assert offset_of(log, "gnss") == pytest.approx(1.0 + own, abs=0.1)
 
 
 @pytest.mark.parametrize("arm", [0.0, 3.0])

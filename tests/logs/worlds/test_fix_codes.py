@@ -98,7 +98,9 @@ def test_a_table_without_a_usable_fix_is_refused(
 
 @pytest.mark.parametrize("codes", ["novatel", [], [-1], [1.5], ["4"], [True]])
 def test_other_values_of_the_key_are_refused(codes: Any) -> None:
-    with pytest.raises(ValueError, match=r"scenario\.fix_codes must be nmea, rtklib, ublox, null"):
+    with pytest.raises(
+        ValueError, match=r"scenario\.fix_codes must be nmea, rtklib, mavlink, ublox, null"
+    ):
         check_fix_codes(codes)
 
 

@@ -13,6 +13,12 @@ import pytest
 import torch
 from checkout import ROOT
 from hydra import compose, initialize_config_dir
+from pfbench.experiments.urban_error_fit import (
+    RangeResiduals,
+    estimate_mixture,
+    estimate_normal,
+    range_residuals,
+)
 from recorded_data import DATA, recorded
 
 from pfbench import job
@@ -29,12 +35,6 @@ from pfbench.logs.worlds.urban import (
     read_drive,
     select_epochs,
     select_stretch,
-)
-from pfbench.logs.worlds.urban_error_fit import (
-    RangeResiduals,
-    estimate_mixture,
-    estimate_normal,
-    range_residuals,
 )
 from pfbench.model.urban_gnss import (
     LosNlosRangeError,

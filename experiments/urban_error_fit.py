@@ -1,6 +1,6 @@
 """Maximum-likelihood fit of range error distributions to a recorded city drive.
 
-`PFBENCH_DATA=... python -m pfbench.logs.worlds.urban_error_fit` prints the distributions of
+`PFBENCH_DATA=... python -m pfbench.experiments.urban_error_fit` prints the distributions of
 the model YAML files.
 """
 
