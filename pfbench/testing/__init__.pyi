@@ -12,7 +12,9 @@ from pfbench.testing.filters import (
 )
 from pfbench.testing.models import (
     check_jacobians as check_jacobians,
+    check_noise as check_noise,
     check_proposal as check_proposal,
+    check_scenario as check_scenario,
 )
 from pfbench.testing.moves import (
     PathPosterior as PathPosterior,
