@@ -30,7 +30,9 @@ COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 PUBLISHED = [
     f"reports/{name}"
     for name in (*json.loads(PUBLISHED_FILES.read_text())["files"], "published.json")
-    if re.search(rf"{RUNS_FILE}|figures/|claims_2/[vw]|published.json|robust_car/", name)
+    if re.search(
+        rf"{RUNS_FILE}|results.json|figures/|claims_2/[vw]|published.json|robust_car/", name
+    )
 ]
 
 # a project of somebody else, in two files and a folder

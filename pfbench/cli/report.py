@@ -88,10 +88,11 @@ def make_report_options(config: JobConfig) -> Any:
 
     values = config.values.get("report")
     names = [field.name for field in fields(ReportOptions)]
-    if not isinstance(values, Mapping) or not set(values) <= {*names}:
-        text = ", ".join(map(str, values)) if isinstance(values, Mapping) else str(values)
+    unknown = sorted({*values} - {*names}) if isinstance(values, Mapping) else [str(values)]
+    if unknown:
         raise ValueError(
-            f"report must have keys of {', '.join(names)}, got {text}. Choose a file: pfbench list report"
+            f"report must have keys of {', '.join(names)}, got {', '.join(unknown)}.{suggest_similar(unknown[0], names)} "
+            "Choose a file: pfbench list report"
         )
     options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     return ReportOptions(**options, planned=count_planned_jobs(config.values["study"]))

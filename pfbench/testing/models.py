@@ -235,9 +235,14 @@ def check_noise(noise: Any, runs: int = 2000) -> Mapping[str, LawCheck]:
         "Leave the method out for nominal process noise"
     )
     try:
-        family, shift, scale = noise.error_distribution(channels, time)
+        stated_errors = noise.error_distribution(channels, time)
     except ValueError:
         return results
+    assert isinstance(stated_errors, tuple) and len(stated_errors) == 3, (  # noqa: PT018
+        f"{name}.error_distribution must return a family, shift and scale, got {type(stated_errors).__name__}. "
+        "Return for example (make_normal, shift, scale) with pfbench.noise.make_normal"
+    )
+    family, shift, scale = stated_errors
     errors, stated = draw(torch.arange(runs)), family(shift, scale)
     ratio = (make_normal(shift, 0.7 * scale).log_prob(errors) - stated.log_prob(errors)).exp()
     statement = "error_distribution is that of the errors"
