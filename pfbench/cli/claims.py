@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from pfbench.files.recorded_folder import copy_published, describe_missing, find_published_file
+from pfbench.files.recorded_folder import copy_published, describe_missing
 from pfbench.job.config import compose
 
 if TYPE_CHECKING:
@@ -69,14 +69,10 @@ def _take_published(places: Mapping[str, str]) -> None:
     """Copy the published values of the claims to the folder of the page, if there are none of the user's own."""
     from pfbench.claims.claim_runs import CLAIMS_STUDY, PUBLISHED_VALUES, VALUES_SUFFIX
 
-    page = Path(places["reports_dir"]) / CLAIMS_STUDY
     own = (Path(places["results_dir"]) / CLAIMS_STUDY).glob(f"*{VALUES_SUFFIX}")
-    if any(own) or (page / PUBLISHED_VALUES).is_file():
-        return
-    if find_published_file(f"{CLAIMS_STUDY}/{PUBLISHED_VALUES}"):
-        copy_published(page)
-    elif missing := describe_missing():
-        print(f"claims: all are open.{missing}")
+    if not any(own):
+        copy_published(Path(places["reports_dir"]) / CLAIMS_STUDY, PUBLISHED_VALUES)
+        print(describe_missing(), end="")
 
 
 class RunRequest(NamedTuple):

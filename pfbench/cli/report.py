@@ -75,7 +75,7 @@ def check_has_results(study: str, results: Path) -> None:
     raise ValueError(
         f"study must be a study with results, got {study}.{similar}{failed} "
         f"Studies with results in {results}: {', '.join(available) or 'none'}. "
-        f"Run its jobs first: {name_run_command(study)}{describe_missing()}"
+        f"Run its jobs first: {name_run_command(study)}{describe_missing().rstrip()}"
     )
 
 
@@ -128,8 +128,7 @@ def find_page_data(config: JobConfig, words: Sequence[str] = ()) -> Path | None:
             f"options of the report need results, got {', '.join(options)} and no results in {results}. "
             f"Leave them out to use {data}, or run: {name_run_command(study)}"
         )
-    if not data.is_file():
-        copy_published(data.parent)
+    copy_published(data.parent, RUNS_FILE)
     return data
 
 

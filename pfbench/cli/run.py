@@ -85,9 +85,10 @@ def run_jobs(words: Sequence[str]) -> None:
         print_dry_run(plan or plan_study(overrides, first), is_sweep=bool(flags))
         return
     if plan and not is_printed:
-        from pfbench.cli.dry_run import try_own_parts
+        if configs := list(plan.compose_parts()):
+            from pfbench.cli.dry_run import try_own_parts
 
-        try_own_parts(plan.compose_parts())
+            try_own_parts(configs)
         print_surprise(plan, overrides, is_sweep=bool(flags))
     if plan and wants_until_decided(plan):
         _run_until_decided(flags, overrides, plan)

@@ -255,12 +255,15 @@ def list_published(file: str) -> list[str]:
     ]
 
 
-def copy_published(folder: Path) -> None:
-    """Copy the published files of a study to a folder of reports.
+def copy_published(folder: Path, needed: str) -> None:
+    """Copy the published files of a study to a folder of reports that lacks one of them.
 
     Args:
         folder: Folder of the report, with the name of the study.
+        needed: Name of the file without which a page is not written.
     """
+    if (folder / needed).is_file() or not find_published_file(f"{folder.name}/{needed}"):
+        return
     with RecordedFolder(folder, is_complete=False) as target:
         for name in _read_manifest(PUBLISHED_FILES):
             study, _, file = name.partition("/")
@@ -270,5 +273,5 @@ def copy_published(folder: Path) -> None:
 
 def describe_missing() -> str:
     """Return what to install where the published runs are missing; empty where they are not."""
-    text = f" Published runs are not installed. Install them: {_INSTALL}"
-    return "" if PUBLISHED_FILES.is_file() else text
+    is_there = PUBLISHED_FILES.is_file()
+    return "" if is_there else f" Published runs are not installed. Install them: {_INSTALL}\n"

@@ -144,7 +144,7 @@ def find_published(name: str, reports: Path) -> Path:
     raise ValueError(
         f"published must be a report with {RUNS_FILE}, got {name!r}. In {reports}: {', '.join(own) or 'none'}. "
         f"Published: {', '.join(list_published(RUNS_FILE))}. "
-        f"Set reports_dir, or the path of its folder.{describe_missing()}"
+        f"Set reports_dir, or the path of its folder.{describe_missing().rstrip()}"
     )
 
 

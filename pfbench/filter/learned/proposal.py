@@ -417,31 +417,6 @@ class SpreadFeature(Feature):
 
 
 @dataclass(frozen=True)
-class InputFeature(Feature):
-    """Inputs of the step by name, each divided by its scale.
-
-    Attributes:
-        input_scales: {name of an input tensor: value that is scaled to 1}.
-    """
-
-    input_scales: Mapping[str, float]
-
-    @override
-    def __call__(self, context: FeatureContext) -> Tensor:
-        u, values = context.record.u, []
-        for name, scale in self.input_scales.items():
-            names = getattr(u, "_fields", ())
-            if name not in names:
-                raise ValueError(
-                    "features.input_scales must be names of inputs "
-                    f"({', '.join(names) or 'this model has none'}), got {name}. Remove it."
-                )
-            value = getattr(u, name)
-            values.append((value.flatten(1) if value.dim() > 1 else value[:, None]) / scale)
-        return torch.cat(values, -1).unsqueeze(1)
-
-
-@dataclass(frozen=True)
 class FeatureStack(Feature):
     """All features [R, N, F], limited to +-`feature_limit`, with 0 for non-finite values.
 
