@@ -88,8 +88,8 @@ def write_claims(results: str | Path = "results", out: str | Path = "reports") -
 
 def _count_worlds(study: Path) -> dict[str, tuple[int, int]]:
     """Count the worlds in which each method beats every single Kalman filter; empty without the stored runs of the study."""
-    own = study / RUNS_FILE
-    path = own if own.is_file() else find_published_file(f"{study.name}/{RUNS_FILE}")
+    runs = study / RUNS_FILE
+    path = runs if runs.is_file() else find_published_file(f"{study.name}/{RUNS_FILE}")
     if path is None:
         return {}
     overviews = find_overviews(*read_stored_study(path.parent, decides=False))

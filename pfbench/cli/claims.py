@@ -69,8 +69,8 @@ def _take_published(places: Mapping[str, str]) -> None:
     """Copy the published values of the claims to the folder of the page, if there are none of the user's own."""
     from pfbench.claims.claim_runs import CLAIMS_STUDY, PUBLISHED_VALUES, VALUES_SUFFIX
 
-    own = (Path(places["results_dir"]) / CLAIMS_STUDY).glob(f"*{VALUES_SUFFIX}")
-    if not any(own):
+    results = (Path(places["results_dir"]) / CLAIMS_STUDY).glob(f"*{VALUES_SUFFIX}")
+    if not any(results):
         copy_published(Path(places["reports_dir"]) / CLAIMS_STUDY, PUBLISHED_VALUES)
         print(describe_missing(), end="")
 

@@ -205,18 +205,18 @@ def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:
         return
     plan = build_plan(config)
     groups = ("scenario", "noise", "filter")
-    own = {g for g in groups if list_user_packages(config.values[g], trusted)}
+    own_groups = {g for g in groups if list_user_packages(config.values[g], trusted)}
     world = json.dumps([plan.values[name] for name in ("scenario", "noise", "seed")], default=str)
     if world not in episodes:
-        if "noise" in own:
+        if "noise" in own_groups:
             testing.check_noise(plan.recording_regime.regime, runs=2)
-        if "scenario" in own:
+        if "scenario" in own_groups:
             testing.check_scenario(plan.scenario)
         episodes[world] = plan.draw_episode(plan.runs[:2])
     episode = episodes[world]
     model = plan.make_filter_model(episode).to("cpu", torch.float64)
     model.assemble(episode.truth)
-    method = plan.method if "filter" in own else ParticleFilter(20)
+    method = plan.method if "filter" in own_groups else ParticleFilter(20)
     draws = PhiloxStream(plan.values["seed"], plan.runs[:2])
     try:
         with torch.no_grad():

@@ -140,9 +140,9 @@ def find_published(name: str, reports: Path) -> Path:
             return folder
     if path := find_published_file(f"{name}/{RUNS_FILE}"):
         return path.parent
-    own = sorted(path.parent.name for path in reports.glob(f"*/{RUNS_FILE}"))
+    stored = sorted(path.parent.name for path in reports.glob(f"*/{RUNS_FILE}"))
     raise ValueError(
-        f"published must be a report with {RUNS_FILE}, got {name!r}. In {reports}: {', '.join(own) or 'none'}. "
+        f"published must be a report with {RUNS_FILE}, got {name!r}. In {reports}: {', '.join(stored) or 'none'}. "
         f"Published: {', '.join(list_published(RUNS_FILE))}. "
         f"Set reports_dir, or the path of its folder.{describe_missing().rstrip()}"
     )
