@@ -89,7 +89,7 @@ def make_report_options(config: JobConfig) -> Any:
     values = config.values.get("report")
     names = [field.name for field in fields(ReportOptions)]
     unknown = sorted({*values} - {*names}) if isinstance(values, Mapping) else [str(values)]
-    if unknown:
+    if unknown or values is None:
         raise ValueError(
             f"report must have keys of {', '.join(names)}, got {', '.join(unknown)}.{suggest_similar(unknown[0], names)} "
             "Choose a file: pfbench list report"
