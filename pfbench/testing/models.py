@@ -183,7 +183,14 @@ def check_proposal(
 
 
 def check_scenario(scenario: Any) -> Mapping[str, LawCheck]:
-    """Check that an episode has the axes of its runs and steps, and that a run is the same alone and among others."""
+    """Check that an episode has the axes of its runs and steps, and that a run is the same alone and among others.
+
+    Args:
+        scenario: Scenario.
+
+    Raises:
+        AssertionError: If one does not hold.
+    """
     name = type(scenario).__name__
 
     def draw(numbers: Any) -> Any:
@@ -214,7 +221,15 @@ def check_scenario(scenario: Any) -> Mapping[str, LawCheck]:
 
 
 def check_noise(noise: Any, runs: int = 2000) -> Mapping[str, LawCheck]:
-    """Check that the errors of a run are the same alone and among others, and have the distribution that is stated."""
+    """Check that the errors of a run are the same alone and among others, and have the distribution that is stated.
+
+    Args:
+        noise: Noise regime.
+        runs: Number of runs; 2 leave out the test of the distribution.
+
+    Raises:
+        AssertionError: If one does not hold.
+    """
     channels = MeasurementChannels.of_one_kind(torch.ones(2, dtype=torch.float64), "position")
     time, name = torch.arange(1, 201, dtype=torch.float64), type(noise).__name__
 
@@ -243,8 +258,13 @@ def check_noise(noise: Any, runs: int = 2000) -> Mapping[str, LawCheck]:
         "Return for example (make_normal, shift, scale) with pfbench.noise.make_normal"
     )
     family, shift, scale = stated_errors
-    errors, stated = draw(torch.arange(runs)), family(shift, scale)
-    ratio = (make_normal(shift, 0.7 * scale).log_prob(errors) - stated.log_prob(errors)).exp()
+    errors = draw(torch.arange(runs))
+    density, narrow = family(shift, scale).log_prob(errors), make_normal(shift, 0.7 * scale)
+    assert list(density.shape) == [runs, 200], (
+        f"{name}.error_distribution must make a distribution of all components of a measurement, with log_prob [R, T] = "
+        f"[{runs}, 200], got {list(density.shape)}. Return for example lambda shift, scale: Independent(Laplace(shift, scale), 1)"
+    )
+    ratio = (narrow.log_prob(errors) - density).exp()
     statement = "error_distribution is that of the errors"
     means = {
         "the ratio of a narrow normal density to it - 1": ratio.nan_to_num(1.0).mean(1).numpy()
