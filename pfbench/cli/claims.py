@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from pfbench.files.recorded_folder import copy_published, describe_missing
+from pfbench.files.recorded_folder import copy_published, describe_missing_runs
 from pfbench.job.config import compose
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ def _take_published(places: Mapping[str, str]) -> None:
     results = (Path(places["results_dir"]) / CLAIMS_STUDY).glob(f"*{VALUES_SUFFIX}")
     if not any(results):
         copy_published(Path(places["reports_dir"]) / CLAIMS_STUDY, PUBLISHED_VALUES)
-        print(describe_missing(), end="")
+        print(describe_missing_runs(), end="")
 
 
 class RunRequest(NamedTuple):

@@ -209,7 +209,7 @@ def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:
     world = json.dumps([plan.values[name] for name in ("scenario", "noise", "seed")], default=str)
     if world not in episodes:
         if "noise" in own_groups:
-            testing.check_noise(plan.recording_regime.regime, runs=2)
+            testing.check_regime(plan.recording_regime.regime, runs=2)
         if "scenario" in own_groups:
             testing.check_scenario(plan.scenario)
         episodes[world] = plan.draw_episode(plan.runs[:2])

@@ -11,7 +11,7 @@ from typing import Any
 from pfbench.cli.compose import compose_study, count_planned_jobs, given_keys
 from pfbench.cli.messages import format_error, suggest_similar
 from pfbench.files.command_start import start_work
-from pfbench.files.recorded_folder import copy_published, describe_missing, find_published_file
+from pfbench.files.recorded_folder import copy_published, describe_missing_runs, find_published_file
 from pfbench.job.config import JobConfig, compose
 from pfbench.results.paper_block import experiments_dir, name_run_command
 
@@ -75,7 +75,7 @@ def check_has_results(study: str, results: Path) -> None:
     raise ValueError(
         f"study must be a study with results, got {study}.{similar}{failed} "
         f"Studies with results in {results}: {', '.join(available) or 'none'}. "
-        f"Run its jobs first: {name_run_command(study)}{describe_missing().rstrip()}"
+        f"Run its jobs first: {name_run_command(study)}{describe_missing_runs().rstrip()}"
     )
 
 

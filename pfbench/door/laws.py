@@ -107,7 +107,7 @@ def check_laws(thing: Any, runs: int = 200, inputs: Any = ()) -> LawTable:
     checks: Mapping[str, Callable[[], Mapping[str, LawCheck]]] = {
         "model": lambda: _check_model(subject, inputs),
         "scenario": lambda: testing.check_scenario(subject),
-        "noise": lambda: testing.check_noise(subject),
+        "noise": lambda: testing.check_regime(subject),
     }
     try:
         with _watched_files(subject) as opened:

@@ -211,9 +211,9 @@ def _list_names(names: Sequence[str]) -> str:
 
 _PLACES = (Path(__file__).parents[1] / "published", Path(__file__).parents[2] / "reports")
 #: Published runs: package data of the wheel, and `reports/` of a checkout.
-PUBLISHED = next((folder for folder in _PLACES if folder.is_dir()), _PLACES[0])
+PUBLISHED_RUNS = next((folder for folder in _PLACES if folder.is_dir()), _PLACES[0])
 #: Digests of published files, which a clone has without the manifests of their folders.
-PUBLISHED_FILES = PUBLISHED / "published.json"
+PUBLISHED_FILES = PUBLISHED_RUNS / "published.json"
 _INSTALL = "pip install --force-reinstall --no-deps pfbench"
 
 
@@ -232,7 +232,7 @@ def find_published_file(name: str) -> Path | None:
     Raises:
         ValueError: If its content is not what was published.
     """
-    path, digest = PUBLISHED / name, _read_manifest(PUBLISHED_FILES).get(name)
+    path, digest = PUBLISHED_RUNS / name, _read_manifest(PUBLISHED_FILES).get(name)
     if digest is None or not path.is_file():
         return None
     if _hash_file(path) != digest:
@@ -271,7 +271,7 @@ def copy_published(folder: Path, needed: str) -> None:
                 target.write(file, path.read_bytes())
 
 
-def describe_missing() -> str:
+def describe_missing_runs() -> str:
     """Return what to install where the published runs are missing; empty where they are not."""
     is_there = PUBLISHED_FILES.is_file()
     return "" if is_there else f" Published runs are not installed. Install them: {_INSTALL}\n"

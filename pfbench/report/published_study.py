@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from pfbench.files.recorded_folder import describe_missing, find_published_file, list_published
+from pfbench.files.recorded_folder import describe_missing_runs, find_published_file, list_published
 from pfbench.report.board import build_run_table
 from pfbench.report.board.pack import StudyFacts
 from pfbench.report.overview.figures import HEAT_FORMATS, draw_heat_map
@@ -144,7 +144,7 @@ def find_published(name: str, reports: Path) -> Path:
     raise ValueError(
         f"published must be a report with {RUNS_FILE}, got {name!r}. In {reports}: {', '.join(stored) or 'none'}. "
         f"Published: {', '.join(list_published(RUNS_FILE))}. "
-        f"Set reports_dir, or the path of its folder.{describe_missing().rstrip()}"
+        f"Set reports_dir, or the path of its folder.{describe_missing_runs().rstrip()}"
     )
 
 

@@ -220,7 +220,7 @@ def check_scenario(scenario: Any) -> Mapping[str, LawCheck]:
     return _check_alone("the data of a run do not depend on other runs", draw)
 
 
-def check_noise(noise: Any, runs: int = 2000) -> Mapping[str, LawCheck]:
+def check_regime(noise: Any, runs: int = 2000) -> Mapping[str, LawCheck]:
     """Check that the errors of a run are the same alone and among others, and have the distribution that is stated.
 
     Args:

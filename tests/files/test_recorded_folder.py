@@ -285,14 +285,14 @@ def test_published_files_are_found_by_name_and_digest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     published, name = tmp_path / "published", "study/runs.parquet"
-    monkeypatch.setattr(recorded_folder, "PUBLISHED", published)
+    monkeypatch.setattr(recorded_folder, "PUBLISHED_RUNS", published)
     monkeypatch.setattr(recorded_folder, "PUBLISHED_FILES", published / "published.json")
     assert recorded_folder.find_published_file(name) is None
-    assert "pip install" in recorded_folder.describe_missing()
+    assert "pip install" in recorded_folder.describe_missing_runs()
     (published / "study").mkdir(parents=True)
     (published / name).write_bytes(b"runs")
     recorded_folder.write_manifest(published / "published.json", {name: hash_content(b"runs")})
-    assert (recorded_folder.describe_missing(), recorded_folder.list_published("runs.parquet")) == ("", ["study"])  # fmt: skip
+    assert (recorded_folder.describe_missing_runs(), recorded_folder.list_published("runs.parquet")) == ("", ["study"])  # fmt: skip
     own = tmp_path / "reports" / "study"
     recorded_folder.copy_published(own, "runs.parquet")
     assert (own / "runs.parquet").read_bytes() == b"runs"
