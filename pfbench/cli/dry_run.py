@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from traceback import walk_tb
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import torch
-
-from pfbench import testing
 from pfbench.cli.compose import StudyPlan
 from pfbench.cli.messages import format_error, notes_of
 from pfbench.cli.progress import format_duration
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode, map_inputs
-from pfbench.filter import ParticleFilter, run_filter
-from pfbench.job.budget import EpisodeSource, apply_budget, estimate_job_memory
 from pfbench.job.config import JobConfig
-from pfbench.job.filter_pass import choose_engine
-from pfbench.job.inputs import find_inputs
-from pfbench.job.memory import first_steps
-from pfbench.job.plan import JobPlan, build_plan
-from pfbench.job.run_job import find_result_path, list_used_packages
-from pfbench.job.trust import list_user_packages, trusted_packages
-from pfbench.kernels import dispatch
+
+if TYPE_CHECKING:
+    from pfbench.core.record import Episode
+    from pfbench.job.budget import EpisodeSource
+    from pfbench.job.plan import JobPlan
 
 _STEPS = 10  # of the trial of a filter
 
@@ -90,6 +79,10 @@ class DrawnWorlds:
 
         The time is that of what all runs share, such as a trajectory, and a part for each run.
         """
+        from dataclasses import replace
+
+        from pfbench.job.budget import EpisodeSource
+
         names = ("scenario", "noise", "model", "seed", "first_run", "runs", "oracle_noise", "dtype")
         key = json.dumps([plan.values[name] for name in names], sort_keys=True)
         if key in self._sources:
@@ -103,6 +96,13 @@ class DrawnWorlds:
 
 def estimate_job(config: JobConfig, worlds: DrawnWorlds) -> JobEstimate:
     """Estimate a job by a trial: all runs of the filter take a few steps of the data of two runs."""
+    from dataclasses import replace
+
+    from pfbench.job.budget import apply_budget, estimate_job_memory
+    from pfbench.job.inputs import find_inputs
+    from pfbench.job.plan import build_plan
+    from pfbench.job.run_job import find_result_path
+
     values = config.values
     file = find_result_path(values, find_inputs(values, config.trusted))
     if file.is_file() and not values["overwrite"]:
@@ -118,6 +118,8 @@ def estimate_job(config: JobConfig, worlds: DrawnWorlds) -> JobEstimate:
 
 def _without_cache(config: JobConfig) -> JobConfig:
     """Return a configuration that stores no episodes."""
+    from dataclasses import replace
+
     scenario = config.values["scenario"]
     changes = {"cache_dir": None} if "cache_dir" in scenario else {}
     return replace(config, values={**config.values, "scenario": {**scenario, **changes}})
@@ -125,6 +127,17 @@ def _without_cache(config: JobConfig) -> JobConfig:
 
 def _time_filter(plan: JobPlan, episode: Episode) -> float:
     """Measure some steps of all runs, whose data are copies of those of the episode; return the time of all steps [s]."""
+    import time
+
+    import torch
+
+    from pfbench.core.random_stream import PhiloxStream
+    from pfbench.core.record import map_inputs
+    from pfbench.filter.loop import run_filter
+    from pfbench.job.filter_pass import choose_engine
+    from pfbench.job.memory import first_steps
+    from pfbench.kernels import dispatch
+
     model, runs = plan.make_filter_model(episode), len(plan.runs)
     steps = episode.record.y.shape[1]
     short = first_steps(model, episode.record, min(_STEPS, steps))
@@ -167,6 +180,8 @@ def try_own_parts(configs: Iterable[JobConfig]) -> None:
     Raises:
         ValueError: If parts break their contracts.
     """
+    from pfbench.job.run_job import list_used_packages
+
     episodes: dict[str, Episode] = {}
     errors: dict[str, Exception] = {}
     for config in configs:
@@ -200,6 +215,17 @@ def _is_of_user(error: BaseException | None, packages: Sequence[str]) -> bool:
 
 def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:
     """Try the parts of a job without a result; its world only if no job before has the same."""
+    import torch
+
+    from pfbench import testing
+    from pfbench.core.random_stream import PhiloxStream
+    from pfbench.filter import ParticleFilter, run_filter
+    from pfbench.job.inputs import find_inputs
+    from pfbench.job.memory import first_steps
+    from pfbench.job.plan import build_plan
+    from pfbench.job.run_job import find_result_path
+    from pfbench.job.trust import list_user_packages, trusted_packages
+
     trusted = (*config.trusted, *trusted_packages())
     if find_result_path(config.values, find_inputs(config.values, trusted)).is_file():
         return
