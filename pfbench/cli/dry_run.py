@@ -215,13 +215,8 @@ def _is_of_user(error: BaseException | None, packages: Sequence[str]) -> bool:
 
 def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:
     """Try the parts of a job without a result; its world only if no job before has the same."""
-    import torch
-
     from pfbench import testing
-    from pfbench.core.random_stream import PhiloxStream
-    from pfbench.filter import ParticleFilter, run_filter
     from pfbench.job.inputs import find_inputs
-    from pfbench.job.memory import first_steps
     from pfbench.job.plan import build_plan
     from pfbench.job.run_job import find_result_path
     from pfbench.job.trust import list_user_packages, trusted_packages
@@ -239,10 +234,20 @@ def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:
         if "scenario" in own_groups:
             testing.check_scenario(plan.scenario)
         episodes[world] = plan.draw_episode(plan.runs[:2])
-    episode = episodes[world]
+    _take_steps(config, plan, episodes[world], is_own="filter" in own_groups)
+
+
+def _take_steps(config: JobConfig, plan: JobPlan, episode: Episode, *, is_own: bool) -> None:
+    """Take three steps of a filter of the user, else of a bootstrap filter."""
+    import torch
+
+    from pfbench.core.random_stream import PhiloxStream
+    from pfbench.filter import ParticleFilter, run_filter
+    from pfbench.job.memory import first_steps
+
     model = plan.make_filter_model(episode).to("cpu", torch.float64)
     model.assemble(episode.truth)
-    method = plan.method if "filter" in own_groups else ParticleFilter(20)
+    method = plan.method if is_own else ParticleFilter(20)
     draws = PhiloxStream(plan.values["seed"], plan.runs[:2])
     try:
         with torch.no_grad():
