@@ -98,6 +98,7 @@ wheel: $(VENV)/.release         ## a wheel in dist/ with a manylinux tag; upload
 	PATH="$(BIN):$$PATH" $(BIN)/auditwheel repair --exclude 'libtorch*.so' --exclude 'libc10*.so' --wheel-dir dist build/wheel/*.whl
 
 release: wheel                  ## wheel and source archive in dist/, with checked metadata; uploads nothing
+	@grep -q '^date-released: ' CITATION.cff && grep -q '^repository-code: ' CITATION.cff || { echo "CITATION.cff must state date-released and repository-code: docs/release.md, step 1"; exit 1; }
 	$(BIN)/python -m build --no-isolation --sdist --outdir dist
 	$(BIN)/python -m twine check --strict dist/*
 

@@ -20,9 +20,20 @@ from checkout import ROOT
 from command_line import Said, environment, process
 
 from pfbench import job
+from pfbench.files import PUBLISHED_FILES
 from pfbench.kernels import library_build
+from pfbench.report import RUNS_FILE
 
 COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+
+# runs of published studies, which the wheel has, and two files that it leaves
+PUBLISHED = [
+    f"reports/{name}"
+    for name in (*json.loads(PUBLISHED_FILES.read_text())["files"], "published.json")
+    if re.search(
+        rf"{RUNS_FILE}|results.json|figures/|claims_2/[vw]|published.json|robust_car/", name
+    )
+]
 
 # a project of somebody else, in two files and a folder
 
@@ -125,7 +136,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     leave = shutil.ignore_patterns("__pycache__")
     for name in ("pfbench", "conf", "experiments"):
         shutil.copytree(ROOT / name, source / name, ignore=leave)
-    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE"):
+    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", *PUBLISHED):
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, source / name)
     if shutil.which("git") is not None:  # setuptools-scm offers every file in git to the wheel
         mine = ("git", "-C", str(source), "-c", "user.name=a", "-c", "user.email=a@b")
@@ -188,6 +200,8 @@ def engine_of_job(home: Path) -> str:
 def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as opened:
         names = set(opened.namelist())
+        built = b"".join(opened.read(name) for name in names if name.endswith(".so"))
+        stated = [opened.read(name) for name in names if name.endswith("/COMMIT")]
     wanted = {
         f"pfbench/{file.relative_to(ROOT / 'pfbench')}" for file in (ROOT / "pfbench").rglob("*.py")
     }
@@ -203,7 +217,10 @@ def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
     ]
     assert len(data) > 10
     wanted |= {f"pfbench/{file.relative_to(ROOT / 'pfbench')}" for file in data}
-    wanted |= {"pfbench/py.typed"}
+    wanted |= {
+        "pfbench/py.typed",
+        *(f"pfbench/published{n[7:]}" for n in PUBLISHED if not n.endswith(("md", "headline.svg"))),
+    }
     if COMPILER is not None:
         wanted |= {
             f"pfbench/kernels/{library_build.name_library(variant)}"
@@ -213,6 +230,13 @@ def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
         f"pfbench/{file.relative_to(ROOT)}" for file in (ROOT / "experiments").glob("*.py")
     }
     assert wanted <= names
+    head = subprocess.run(
+        ["git", "-C", str(wheel.parents[1] / "source"), "rev-parse", "--short", "HEAD"], capture_output=True, check=True
+    )  # fmt: skip
+    assert stated == [head.stdout]
+    oldest = max((int(n) for n in re.findall(rb"GLIBC_2\.(\d+)", built)), default=0)
+    page = (ROOT / "docs" / "start" / "install.md").read_text()
+    assert not built or re.findall(r"manylinux_2_(\d+)", page) == [str(oldest)]
     assert wheel.name.split("-")[2:4] == ["py3", "none"]  # for every version of Python
     rest = {name for name in names - wanted if ".dist-info/" not in name}
     assert rest == set()  # no tests, no results, no caches
@@ -363,6 +387,35 @@ def test_the_installed_package_needs_no_checkout(installed: Path, tmp_path: Path
     assert (tmp_path / "reports" / "adhoc" / "index.html").is_file()
     files = [*job.conf_dir().glob("*/*.yaml"), *job.experiments_dir().glob("*.yaml")]
     assert re.search(rf"configurations +{len(files)} of {len(files)} +ok", checked)
+
+
+READ = """
+import webbrowser
+import pfbench
+from pfbench import cli
+
+webbrowser.open = bool
+study = pfbench.run("growth", ["ekf", "ckf"], seed=112, particles=100, runs=5, study="mine")
+print(study.against("all_seven"))
+for words in ("claims", "open study=recorded_car"):
+    cli.main(words.split())
+"""
+
+
+@pytest.mark.slow
+def test_published_studies_are_read_from_the_wheel(installed: Path, tmp_path: Path) -> None:
+    env = os.environ | environment(tmp_path) | {"PYTHONPATH": str(installed)}
+    said = subprocess.run([sys.executable, "-c", READ], env=env, cwd=tmp_path, capture_output=True, text=True, check=False)  # fmt: skip
+    assert said.returncode == 0, said.stderr
+    assert re.search(r"ckf.* against \d+ filters", said.stdout), said.stdout
+    claims, car = tmp_path / "reports" / "claims_2", tmp_path / "reports" / "recorded_car"
+    published = ROOT / "reports"
+    assert (claims / "words.json").read_bytes() == (published / "claims_2" / "words.json").read_bytes()  # fmt: skip
+    assert (car / "verdicts.csv").is_file()
+    assert (car / RUNS_FILE).read_bytes() == (published / "recorded_car" / RUNS_FILE).read_bytes()
+    shutil.rmtree(installed / "pfbench" / "published")
+    said = elsewhere(installed, tmp_path, "open", "study=paper_001")
+    assert "Published runs are not installed. Install them: pip install" in said.err
 
 
 @pytest.mark.slow

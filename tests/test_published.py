@@ -260,6 +260,12 @@ def test_the_readme_has_no_measured_number_outside_the_blocks() -> None:
     number = r"[1-9]\d*|two|three|four|five|six|seven|eight|nine|ten|twelve|twenty"
     assert re.findall(rf"\b(?:{number}) (?:\w+ )?(?:{counted})\b", prose, re.IGNORECASE) == []
     assert re.findall(r"\b00\d-\w+", prose) == []  # a claim
+    counts = re.findall(
+        r"\b\d+ (?:scenarios|models|noise regimes|filters and forms of filters)", text
+    )
+    changes = (ROOT / "CHANGELOG.md").read_text()
+    assert len(counts) == 4
+    assert all(count in changes for count in counts)  # which the blocks of the README compute
 
 
 def test_studies_run_cheapest_first_and_within_a_limit() -> None:

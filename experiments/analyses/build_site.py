@@ -11,6 +11,7 @@ accordingly. A file that a page links to, and that is not a page, is copied.
 from __future__ import annotations
 
 import argparse
+import ast
 import os
 import re
 import shutil
@@ -40,6 +41,40 @@ def list_pages() -> list[Path]:
         *filter(Path.is_file, published),
         *others,
     ]
+
+
+COMPARISON = re.compile(
+    r"\b(paid|pays?|better|worse|best|worst|smaller|larger|smallest|largest|equal|more|less|fewer|faster|slower|higher|lower|"
+    r"wins?|loses?|beats?|half|twice|most|least|narrower|wider|longer|shorter|order|others|does(?: not)? reach|reaches|\d+ of \d+)\b"
+)
+# sentences about words and settings, not about results
+DEFINITIONS = (
+    "- Use one thread, `torch.set_num_threads(1)`: a step of one run is too short for more.",
+    "`ratio` is its error divided by that of the baseline, with an interval, and the verdict is one of better, worse, equal and not decided.",
+    "This one raises the likelihood to a power, so that an outlier has less weight.",
+    "The laws that fit the class are tested: it uses no later measurement, runs do not influence each other, and more.",
+    "Check these lines: a wrong axis is the most common error of a log.",
+    "This is the mean effective sample size: more of it is a closer proposal, and not yet a smaller error.",
+    "A fair rival has about the time of the network, so more particles:",
+    "`pfbench datasheet scenario=NAME` writes more of a scenario: sensors, residuals at the truth, spread of the runs, and the bound of the error.",
+)
+
+
+def list_unchecked(text: str) -> list[str]:
+    """List the comparisons of a notebook that no cell asserts: its cells have them as keys of `said`, with their truth.
+
+    Args:
+        text: Page of the notebook.
+    """
+    cells = re.findall(r"```\{code-cell\} ipython3\n(?::tags:[^\n]*\n)?(.*?)```", text, re.DOTALL)
+    said = set(DEFINITIONS)
+    for cell in cells:
+        for node in ast.walk(ast.parse(re.sub(r"^%.*$", "", cell, flags=re.M))):
+            if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "said":
+                said |= {ast.literal_eval(key) for key in node.value.keys}
+    prose = re.sub(r"\A---.*?\n---|```.*?```|^#[^\n]*$", "\n", text, flags=re.DOTALL | re.M)
+    sentences = [" ".join(s.split()) for s in re.split(r"(?<=[.?!])\s|\n\n", prose)]
+    return [s for s in sentences if COMPARISON.search(s) and s not in said]
 
 
 def place(path: Path) -> Path:
@@ -86,7 +121,12 @@ def write_source(source: Path) -> None:
     pages = list_pages()
     files: set[Path] = {TOP / "docs" / "conf.py"}
     for page in pages:
-        text, targets = change_links(page, page.read_text(encoding="utf-8"))
+        content = page.read_text(encoding="utf-8")
+        if "{code-cell}" in content and (unchecked := list_unchecked(content)):
+            raise ValueError(
+                f"{page.name} must assert its comparisons in `said`, got {unchecked[0]!r}. Add it with its truth."
+            )
+        text, targets = change_links(page, content)
         files |= targets
         _write(source / place(page), text)
     for file in files - {*pages, TOP / "README.md"}:

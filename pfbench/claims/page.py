@@ -43,7 +43,7 @@ from pfbench.claims.ledger import (
 )
 from pfbench.claims.run_claims import Decisions, Task, describe_words, price_claims
 from pfbench.claims.words import NOT_RUN, OPEN, WORDS, ClaimDecision
-from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.files.recorded_folder import RecordedFolder, find_published_file
 from pfbench.report import RUNS_FILE, count_better_worlds, find_overviews, read_stored_study
 from pfbench.report.writers import render_template
 
@@ -88,9 +88,11 @@ def write_claims(results: str | Path = "results", out: str | Path = "reports") -
 
 def _count_worlds(study: Path) -> dict[str, tuple[int, int]]:
     """Count the worlds in which each method beats every single Kalman filter; empty without the stored runs of the study."""
-    if not (study / RUNS_FILE).is_file():
+    runs = study / RUNS_FILE
+    path = runs if runs.is_file() else find_published_file(f"{study.name}/{RUNS_FILE}")
+    if path is None:
         return {}
-    overviews = find_overviews(*read_stored_study(study, decides=False))
+    overviews = find_overviews(*read_stored_study(path.parent, decides=False))
     return count_better_worlds(overviews) if overviews else {}
 
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from pfbench.files.recorded_folder import copy_published, describe_missing_runs
 from pfbench.job.config import compose
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ pfbench claims run [ID ...] [hours=H] [readings=NAME,...] [dry=true]
 pfbench claims verify [seed=N]
 
 Write the page of the 88 claims of the five papers, with a word on each over all plausible
-readings of its paper. A claim without runs is open, with the price of its runs.
+readings of its paper, from the published runs. A claim without runs is open, with the price of its runs.
 
   pfbench claims
   pfbench claims run                     a plan with prices, then the cheapest undecided claims first
@@ -60,7 +61,18 @@ def write_claims_page(words: Sequence[str]) -> Path:
     from pfbench.claims.page import write_claims
 
     values = compose(words).values
+    _take_published(values)
     return write_claims(values["results_dir"], values["reports_dir"])
+
+
+def _take_published(places: Mapping[str, str]) -> None:
+    """Copy the published values of the claims to the folder of the page, if there are none of the user's own."""
+    from pfbench.claims.claim_runs import CLAIMS_STUDY, PUBLISHED_VALUES, VALUES_SUFFIX
+
+    results = (Path(places["results_dir"]) / CLAIMS_STUDY).glob(f"*{VALUES_SUFFIX}")
+    if not any(results):
+        copy_published(Path(places["reports_dir"]) / CLAIMS_STUDY, PUBLISHED_VALUES)
+        print(describe_missing_runs(), end="")
 
 
 class RunRequest(NamedTuple):
@@ -267,6 +279,7 @@ def verify_claims(words: Sequence[str]) -> None:
 
     values = split_words(words, ("seed", *_PLACES), (), "pfbench claims verify")
     places, plans = _read_places(values), select_plans(())
+    _take_published(places)
     seed = int(values.get("seed", secrets.randbelow(10**6)))
     runs, measures = (
         ClaimRuns.read(Path(places["results_dir"]), Path(places["reports_dir"])),

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice, product
 from pathlib import Path
 from typing import Any, NoReturn
 
 from pfbench.cli.messages import format_flag, suggest_similar
-from pfbench.job.config import JobConfig, compose, compose_tree, expand_filter_sets
-from pfbench.job.trust import UntrustedConfigError, check_study
+from pfbench.job.config import CHOICES, JobConfig, compose, compose_tree, expand_filter_sets
+from pfbench.job.trust import UntrustedConfigError, check_study, trusted_packages
 from pfbench.results.paper_block import PAPER, conf_dir, experiments_dir
 
 # --------------------------------------------------------------------------------------------------
@@ -341,6 +342,21 @@ class StudyPlan:
     def compose_jobs(self) -> list[JobConfig]:
         """Compose the configurations of all jobs."""
         return [compose_words(words) for words in product(*self.alternatives)]
+
+    def compose_parts(self) -> Iterator[JobConfig]:
+        """Compose a job of each combination of parts with classes of the user; a job that does not compose says so itself."""
+        if not (self.first.trusted or trusted_packages()):
+            return
+        several = [
+            options
+            if {key.split(".")[0] for key in given_keys(options[:1])} <= {*CHOICES}
+            else options[:1]
+            for options in self.alternatives
+        ]
+        runs = ("runs=2",) if wants_until_decided(self) else ()
+        for words in product(*several):
+            with suppress(Exception):
+                yield compose_words([*words, *runs])
 
     def describe_size(self) -> str:
         """Describe what the chosen runs and worlds can show; empty if the runs are not one number."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable, Sequence
+from traceback import walk_tb
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pfbench.cli.compose import StudyPlan
-from pfbench.cli.messages import format_error
+from pfbench.cli.messages import format_error, notes_of
 from pfbench.cli.progress import format_duration
 from pfbench.job.config import JobConfig
 
@@ -163,3 +165,92 @@ def _time_filter(plan: JobPlan, episode: Episode) -> float:
             )
         times.append(time.perf_counter() - begin)
     return min(times) / record.y.shape[1] * steps
+
+
+# --------------------------------------------------------------------------------------------------
+# Trial of own parts: errors of a class of the user come before the first job, and once.
+
+
+def try_own_parts(configs: Iterable[JobConfig]) -> None:
+    """Try the own parts of jobs before the first one starts, so that an error of a part comes at once and once.
+
+    Each world gives two runs. A filter of your own takes three steps of them, else a bootstrap filter does. Errors of other
+    parts, such as missing data, are those of their jobs.
+
+    Raises:
+        ValueError: If parts break their contracts.
+    """
+    from pfbench.job.run_job import list_used_packages
+
+    episodes: dict[str, Episode] = {}
+    errors: dict[str, Exception] = {}
+    for config in configs:
+        packages = list_used_packages(config)
+        try:
+            if packages:
+                _try_job(config, episodes)
+        except AssertionError as error:
+            errors[f"the part must keep its contract: {error}."] = error
+        except Exception as error:
+            if _is_of_user(error, packages):
+                errors[format_error(error, config.words)] = error
+    if errors:
+        first = next(iter(errors.values()))
+        refusal = ValueError("\n".join(errors))
+        for note in notes_of(first):
+            refusal.add_note(note)
+        raise refusal from first
+
+
+def _is_of_user(error: BaseException | None, packages: Sequence[str]) -> bool:
+    """Return whether code of the user raised an error, or got what it does not take."""
+    while error is not None:
+        modules = (str(f.f_globals.get("__name__")) for f, _ in walk_tb(error.__traceback__))
+        is_own = any(name.startswith(tuple(packages)) for name in modules)
+        if is_own or isinstance(error, TypeError):
+            return True
+        error = error.__cause__
+    return False
+
+
+def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:
+    """Try the parts of a job without a result; its world only if no job before has the same."""
+    from pfbench import testing
+    from pfbench.job.inputs import find_inputs
+    from pfbench.job.plan import build_plan
+    from pfbench.job.run_job import find_result_path
+    from pfbench.job.trust import list_user_packages, trusted_packages
+
+    trusted = (*config.trusted, *trusted_packages())
+    if find_result_path(config.values, find_inputs(config.values, trusted)).is_file():
+        return
+    plan = build_plan(config)
+    groups = ("scenario", "noise", "filter")
+    own_groups = {g for g in groups if list_user_packages(config.values[g], trusted)}
+    world = json.dumps([plan.values[name] for name in ("scenario", "noise", "seed")], default=str)
+    if world not in episodes:
+        if "noise" in own_groups:
+            testing.check_regime(plan.recording_regime.regime, runs=2)
+        if "scenario" in own_groups:
+            testing.check_scenario(plan.scenario)
+        episodes[world] = plan.draw_episode(plan.runs[:2])
+    _take_steps(config, plan, episodes[world], is_own="filter" in own_groups)
+
+
+def _take_steps(config: JobConfig, plan: JobPlan, episode: Episode, *, is_own: bool) -> None:
+    """Take three steps of a filter of the user, else of a bootstrap filter."""
+    import torch
+
+    from pfbench.core.random_stream import PhiloxStream
+    from pfbench.filter import ParticleFilter, run_filter
+    from pfbench.job.memory import first_steps
+
+    model = plan.make_filter_model(episode).to("cpu", torch.float64)
+    model.assemble(episode.truth)
+    method = plan.method if is_own else ParticleFilter(20)
+    draws = PhiloxStream(plan.values["seed"], plan.runs[:2])
+    try:
+        with torch.no_grad():
+            run_filter(method, model, first_steps(model, episode.record, 3), draws)
+    except Exception as error:  # a model or a filter of the user took part
+        raise AssertionError(format_error(error, config.words).rstrip(".")) from error

@@ -11,6 +11,7 @@ from typing import Any
 from pfbench.cli.compose import compose_study, count_planned_jobs, given_keys
 from pfbench.cli.messages import format_error, suggest_similar
 from pfbench.files.command_start import start_work
+from pfbench.files.recorded_folder import copy_published, describe_missing_runs, find_published_file
 from pfbench.job.config import JobConfig, compose
 from pfbench.results.paper_block import experiments_dir, name_run_command
 
@@ -74,7 +75,7 @@ def check_has_results(study: str, results: Path) -> None:
     raise ValueError(
         f"study must be a study with results, got {study}.{similar}{failed} "
         f"Studies with results in {results}: {', '.join(available) or 'none'}. "
-        f"Run its jobs first: {name_run_command(study)}"
+        f"Run its jobs first: {name_run_command(study)}{describe_missing_runs().rstrip()}"
     )
 
 
@@ -87,10 +88,11 @@ def make_report_options(config: JobConfig) -> Any:
 
     values = config.values.get("report")
     names = [field.name for field in fields(ReportOptions)]
-    if not isinstance(values, Mapping) or not set(values) <= {*names}:
-        text = ", ".join(map(str, values)) if isinstance(values, Mapping) else str(values)
+    unknown = sorted({*values} - {*names}) if isinstance(values, Mapping) else [str(values)]
+    if unknown or values is None:
         raise ValueError(
-            f"report must have keys of {', '.join(names)}, got {text}. Choose a file: pfbench list report"
+            f"report must have keys of {', '.join(names)}, got {', '.join(unknown)}.{suggest_similar(unknown[0], names)} "
+            "Choose a file: pfbench list report"
         )
     options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     return ReportOptions(**options, planned=count_planned_jobs(config.values["study"]))
@@ -110,7 +112,7 @@ def _write_page(config: JobConfig) -> Path:
 
 
 def find_page_data(config: JobConfig, words: Sequence[str] = ()) -> Path | None:
-    """Return the stored data of the page of a study without results, if there are any."""
+    """Return the stored data of the page of a study without results, if it has any or is published: then with a copy."""
     from pfbench.report.stored_study import RUNS_FILE
 
     study, results = (
@@ -118,13 +120,15 @@ def find_page_data(config: JobConfig, words: Sequence[str] = ()) -> Path | None:
         Path(config.values["results_dir"]) / config.values["study"],
     )
     data = Path(config.values["reports_dir"]) / study / RUNS_FILE
-    if any(results.glob("*.npz")) or not data.is_file():
+    is_stored = data.is_file() or find_published_file(f"{study}/{RUNS_FILE}") is not None
+    if any(results.glob("*.npz")) or not is_stored:
         return None
     if options := [word for word in words if word.lstrip("+").startswith(("report.", "report="))]:
         raise ValueError(
             f"options of the report need results, got {', '.join(options)} and no results in {results}. "
             f"Leave them out to use {data}, or run: {name_run_command(study)}"
         )
+    copy_published(data.parent, RUNS_FILE)
     return data
 
 

@@ -85,7 +85,7 @@ def run_jobs(words: Sequence[str]) -> None:
         print_dry_run(plan or plan_study(overrides, first), is_sweep=bool(flags))
         return
     if plan and not is_printed:
-        print_surprise(plan, overrides, is_sweep=bool(flags))
+        print_surprise(_try_parts(plan), overrides, is_sweep=bool(flags))
     if plan and wants_until_decided(plan):
         _run_until_decided(flags, overrides, plan)
     elif flags:
@@ -93,6 +93,14 @@ def run_jobs(words: Sequence[str]) -> None:
         run_sweep(make_application(run_task), [*flags, *overrides], plan)
     else:
         _run_alone(overrides, plan)
+
+
+def _try_parts(plan: StudyPlan) -> StudyPlan:
+    """Try the own parts of a plan before its first job, and return the plan."""
+    from pfbench.cli.dry_run import try_own_parts
+
+    try_own_parts(plan.compose_parts())
+    return plan
 
 
 def _run_until_decided(flags: Sequence[str], overrides: Sequence[str], plan: StudyPlan) -> None:

@@ -22,6 +22,7 @@ from pfbench.results.plotting import (
     line_styles,
     use_log_if_wide,
 )
+from pfbench.results.step_times import STEP_TIME, WARM_UP
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -96,8 +97,15 @@ class _Scene:
 def _draw_cost(ax: Axes, scene: _Scene) -> None:
     """Draw the error of each filter, geometric mean over runs that keep track with 95 % interval, against its cost."""
     rows = scene.rows("rmse")
+    by_label = {job.label: job.meta for job in scene.condition.jobs}
+    if not all({WARM_UP, STEP_TIME} & {*meta, *meta["seconds"]} for meta in by_label.values()):
+        raise ValueError(
+            "a cost must be a time after warm-up steps, got jobs of an earlier version without. "
+            f"Measure it: pfbench cost study={scene.study.name}"
+        )
     costs = {
-        job.label: 1e3 * float(job.meta["seconds"]["per_step"]) for job in scene.condition.jobs
+        label: 1e3 * float(meta.get(STEP_TIME, {}).get("median", meta["seconds"]["per_step"]))
+        for label, meta in by_label.items()
     }
     for label, of_label in rows.groupby("label", observed=True, sort=False):
         values = of_label.loc[of_label["keeps_track"], "value"].to_numpy(dtype=float)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -16,21 +15,16 @@ import torch
 
 from pfbench import testing
 from pfbench.cli.messages import format_error
-from pfbench.core import Episode, MeasurementChannels, PhiloxStream
-from pfbench.core.record import EACH_SATELLITE, map_inputs
+from pfbench.core import PhiloxStream
+from pfbench.core.record import map_inputs
 from pfbench.door.own_parts import find_group
-from pfbench.door.parts import PART_GROUPS, Part, format_html_table, place_words, plain_errors
+from pfbench.door.parts import Part, format_html_table, place_words, plain_errors
 from pfbench.filter import EssResampler, ParticleFilter, run_filter
-from pfbench.job import build_plan, instantiate
-from pfbench.job.config import JobConfig, compose
-from pfbench.job.inputs import find_inputs
-from pfbench.job.memory import first_steps
-from pfbench.job.run_job import find_result_path, list_used_packages
-from pfbench.job.trust import list_user_packages
-from pfbench.noise import NominalNoise, make_normal
-from pfbench.scenario import ModelSimulation, RecordingRegime
+from pfbench.job import instantiate
+from pfbench.job.config import compose
+from pfbench.noise import NominalNoise
+from pfbench.scenario import ModelSimulation
 from pfbench.testing import LawCheck
-from pfbench.testing.results import check_means
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -112,8 +106,8 @@ def check_laws(thing: Any, runs: int = 200, inputs: Any = ()) -> LawTable:
         )
     checks: Mapping[str, Callable[[], Mapping[str, LawCheck]]] = {
         "model": lambda: _check_model(subject, inputs),
-        "scenario": lambda: _check_scenario(subject),
-        "noise": lambda: _check_noise(subject),
+        "scenario": lambda: testing.check_scenario(subject),
+        "noise": lambda: testing.check_regime(subject),
     }
     try:
         with _watched_files(subject) as opened:
@@ -170,48 +164,6 @@ def _check_declared(subject: Any, opened: set[str]) -> None:
         f"files that it reads are stated: {type(subject).__name__} opens {', '.join(hidden)}. Return their paths from a method "
         "input_files(self), so that a changed file is a new job"
     )
-
-
-def try_own_parts(configs: Sequence[JobConfig]) -> None:
-    """Try the own parts of jobs before the first one starts, so that an error of a part comes at once and once.
-
-    Each world gives two runs. A filter of your own takes three steps of them, else a bootstrap filter does.
-
-    Raises:
-        ValueError: If a part breaks its contract.
-    """
-    episodes: dict[str, Episode] = {}
-    for config in configs:
-        inputs = find_inputs(config.values, config.trusted)
-        is_finished = find_result_path(config.values, inputs).is_file()
-        if not is_finished and list_used_packages(config):
-            with plain_errors(config.words):
-                try:
-                    _try_job(config, episodes)
-                except AssertionError as error:
-                    raise ValueError(f"the part must keep its contract: {error}.") from error
-
-
-def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:
-    """Try the parts of a job; its world only if no job before has the same."""
-    plan = build_plan(config)
-    own_groups = {
-        name for name in PART_GROUPS if list_user_packages(config.values[name], config.trusted)
-    }
-    world = json.dumps([plan.values[name] for name in ("scenario", "noise", "seed")], default=str)
-    if world not in episodes:
-        if "noise" in own_groups:
-            _check_noise(plan.recording_regime.regime, runs=2)
-        if "scenario" in own_groups:
-            _check_scenario(plan.scenario)
-        episodes[world] = plan.draw_episode(plan.runs[:2])
-    episode = episodes[world]
-    model = plan.make_filter_model(episode).to("cpu", torch.float64)
-    model.assemble(episode.truth)
-    method = plan.method if "filter" in own_groups else ParticleFilter(20)
-    draws = PhiloxStream(plan.values["seed"], plan.runs[:2])
-    with torch.no_grad():
-        run_filter(method, model, first_steps(model, episode.record, 3), draws)
 
 
 def _build(thing: Any) -> tuple[Any, str, str]:
@@ -282,81 +234,3 @@ def _check_model(model: Any, inputs: Any) -> Mapping[str, LawCheck]:
                 f"stated derivatives are those of the maps, worst {worst}", errors[worst], 1e-5
             )
     return results
-
-
-def _check_scenario(scenario: Any) -> Mapping[str, LawCheck]:
-    """Check that an episode has the axes of its runs and steps, and that a run is the same alone and among others."""
-    name = type(scenario).__name__
-
-    def draw(numbers: Any) -> Any:
-        episode = scenario.draw(RecordingRegime(NominalNoise()), numbers, 1)
-        assert isinstance(episode, Episode), (
-            f"{name}.draw must return an Episode, got {type(episode).__name__}. Return Episode(Record(y), time, truth)"
-        )
-        runs, steps = len(numbers), len(episode.time)
-        values = {"record.y": episode.record.y}
-        values |= {f"truth[{group!r}]": value for group, value in episode.truth.items()}
-        for key, value in values.items():
-            assert list(value.shape[:-1]) == [runs, steps], (
-                f"{name}.draw must return {key} with the axes of runs, steps and components, [{runs}, {steps}, ...], got "
-                f"{list(value.shape)}. Add the axis that it lacks, or let `time` have as many steps"
-            )
-        stated, width = getattr(scenario, "channel_names", ()), episode.record.y.shape[-1]
-        assert len(stated) in (0, width) or any(EACH_SATELLITE in text for text in stated), (
-            f"{name}.channel_names must be {width}, as the components of record.y, got {len(stated)}. Name each one"
-        )
-        inputs = getattr(scenario, "input_type", None) or type(episode.record.u)
-        assert isinstance(episode.record.u, inputs), (
-            f"{name}.draw must return the inputs {inputs.__name__}, which input_type states, got "
-            f"{type(episode.record.u).__name__}. Return Record(y, {inputs.__name__}(...))"
-        )
-        return episode.record.y
-
-    return _check_alone("the data of a run do not depend on other runs", draw)
-
-
-def _check_noise(noise: Any, runs: int = 2000) -> Mapping[str, LawCheck]:
-    """Check that the errors of a run are the same alone and among others, and have the distribution that is stated."""
-    channels = MeasurementChannels.of_one_kind(torch.ones(2, dtype=torch.float64), "position")
-    time, name = torch.arange(1, 201, dtype=torch.float64), type(noise).__name__
-
-    def draw(numbers: Any) -> Any:
-        errors = noise.draw_errors(PhiloxStream(1, numbers), channels, time)
-        shape = [len(numbers), 200, 2]
-        got = list(getattr(errors, "shape", ())) or type(errors).__name__
-        assert got == shape, (
-            f"{name}.draw_errors must return errors [R, T, Dy] = {shape}, got {got}. Draw them by draws.normal(name, T, Dy)"
-        )
-        return errors
-
-    results = _check_alone("the errors of a run do not depend on other runs", draw)
-    factors = noise.process_factors(time)
-    got = list(factors.shape) if float(factors.min()) >= 0.0 else "a negative one"
-    assert got == [200], (
-        f"{name}.process_factors must return a factor of at least 0 for each time, [200], got {got}. "
-        "Leave the method out for nominal process noise"
-    )
-    try:
-        family, shift, scale = noise.error_distribution(channels, time)
-    except ValueError:
-        return results
-    errors, stated = draw(torch.arange(runs)), family(shift, scale)
-    ratio = (make_normal(shift, 0.7 * scale).log_prob(errors) - stated.log_prob(errors)).exp()
-    statement = "error_distribution is that of the errors"
-    means = {
-        "the ratio of a narrow normal density to it - 1": ratio.nan_to_num(1.0).mean(1).numpy()
-        - 1.0
-    }
-    check = check_means(statement, means, 4.5) if runs > 2 else LawCheck(statement, 0.0, 4.5)
-    return {**results, "distribution": check}
-
-
-def _check_alone(statement: str, draw: Callable[[Any], Any]) -> Mapping[str, LawCheck]:
-    """Compare the draw of a run alone with that among others."""
-    several, alone = draw(torch.arange(2)), draw(torch.tensor([1]))
-    difference = float((several[1] - alone[0]).abs().nan_to_num().max())
-    assert difference <= 1e-12, (
-        f"{statement}: run 1 alone must be as among others, got a difference of {difference:.3g}. "
-        "Draw all random numbers from PhiloxStream(seed, runs), none from torch or NumPy"
-    )
-    return {"alone": LawCheck(statement, difference, 1e-12)}

@@ -88,9 +88,9 @@ def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
     jobs = [_list_words(choice, words) for choice in product(*parts, models)]
     configs = [_compose_job(list(job)) for job in dict.fromkeys(map(tuple, jobs))]
     if any(map(list_used_packages, configs)):
-        from pfbench.door.laws import try_own_parts
+        from pfbench.cli.dry_run import try_own_parts
 
-        with preserved_process():
+        with preserved_process(), plain_errors(words):
             try_own_parts(configs)
     _run_jobs(configs, workers, progress)
     values = configs[0].values

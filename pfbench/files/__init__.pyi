@@ -15,5 +15,6 @@ from pfbench.files.escapes import (
 from pfbench.files.recorded_folder import (
     PUBLISHED_FILES as PUBLISHED_FILES,
     RecordedFolder as RecordedFolder,
+    find_published_file as find_published_file,
     write_manifest as write_manifest,
 )

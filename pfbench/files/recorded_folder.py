@@ -209,11 +209,69 @@ def _list_names(names: Sequence[str]) -> str:
 # --------------------------------------------------------------------------------------------------
 # Files that this project has published
 
+_PLACES = (Path(__file__).parents[1] / "published", Path(__file__).parents[2] / "reports")
+#: Published runs: package data of the wheel, and `reports/` of a checkout.
+PUBLISHED_RUNS = next((folder for folder in _PLACES if folder.is_dir()), _PLACES[0])
 #: Digests of published files, which a clone has without the manifests of their folders.
-PUBLISHED_FILES = Path(__file__).parents[2] / "reports" / "published.json"
+PUBLISHED_FILES = PUBLISHED_RUNS / "published.json"
+_INSTALL = "pip install --force-reinstall --no-deps pfbench"
 
 
 @cache
 def read_published() -> frozenset[str]:
-    """Read the digests of the published files of a checkout; none where pfbench is installed without it."""
+    """Read the digests of the published files; none where they are not installed."""
     return frozenset(_read_manifest(PUBLISHED_FILES).values())
+
+
+def find_published_file(name: str) -> Path | None:
+    """Find a published file by name and digest; None if none of that name is installed.
+
+    Args:
+        name: Study and file, such as `all_seven/runs.parquet`.
+
+    Raises:
+        ValueError: If its content is not what was published.
+    """
+    path, digest = PUBLISHED_RUNS / name, _read_manifest(PUBLISHED_FILES).get(name)
+    if digest is None or not path.is_file():
+        return None
+    if _hash_file(path) != digest:
+        raise ValueError(
+            f"{path} must have the digest in {PUBLISHED_FILES.name}, got another. Install it again: {_INSTALL}"
+        )
+    return path
+
+
+def list_published(file: str) -> list[str]:
+    """List the published studies that have a file of this name.
+
+    Args:
+        file: Name of the file.
+    """
+    return [
+        name.partition("/")[0]
+        for name in _read_manifest(PUBLISHED_FILES)
+        if name.endswith(f"/{file}")
+    ]
+
+
+def copy_published(folder: Path, needed: str) -> None:
+    """Copy the published files of a study to a folder of reports that lacks one of them.
+
+    Args:
+        folder: Folder of the report, with the name of the study.
+        needed: Name of the file without which a page is not written.
+    """
+    if (folder / needed).is_file() or not find_published_file(f"{folder.name}/{needed}"):
+        return
+    with RecordedFolder(folder, is_complete=False) as target:
+        for name in _read_manifest(PUBLISHED_FILES):
+            study, _, file = name.partition("/")
+            if study == folder.name and (path := find_published_file(name)):
+                target.write(file, path.read_bytes())
+
+
+def describe_missing_runs() -> str:
+    """Return what to install where the published runs are missing; empty where they are not."""
+    is_there = PUBLISHED_FILES.is_file()
+    return "" if is_there else f" Published runs are not installed. Install them: {_INSTALL}\n"

@@ -17,6 +17,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from pfbench.files.recorded_folder import describe_missing_runs, find_published_file, list_published
 from pfbench.report.board import build_run_table
 from pfbench.report.board.pack import StudyFacts
 from pfbench.report.overview.figures import HEAT_FORMATS, draw_heat_map
@@ -128,20 +129,23 @@ def _word_filter(label: str, verdicts: Sequence[Verdict]) -> Iterator[str]:
 
 
 def find_published(name: str, reports: Path) -> Path:
-    """Return the folder of a published study: one of the reports, or a folder or file by its path.
+    """Return the folder of a published study: of the reports, by its path, or of this version of pfbench.
 
     Raises:
         ValueError: If runs.parquet is missing in it.
     """
     candidates = (reports / name, Path(name), Path(name).parent)
-    folders = [folder for folder in candidates if (folder / RUNS_FILE).is_file()]
-    if not folders:
-        stored = sorted(path.parent.name for path in reports.glob(f"*/{RUNS_FILE}"))
-        raise ValueError(
-            f"published must be a report with {RUNS_FILE}, got {name!r}. In {reports}: {', '.join(stored) or 'none'}. "
-            "Set reports_dir, or the path of its folder."
-        )
-    return folders[0]
+    for folder in candidates:
+        if (folder / RUNS_FILE).is_file():
+            return folder
+    if path := find_published_file(f"{name}/{RUNS_FILE}"):
+        return path.parent
+    stored = sorted(path.parent.name for path in reports.glob(f"*/{RUNS_FILE}"))
+    raise ValueError(
+        f"published must be a report with {RUNS_FILE}, got {name!r}. In {reports}: {', '.join(stored) or 'none'}. "
+        f"Published: {', '.join(list_published(RUNS_FILE))}. "
+        f"Set reports_dir, or the path of its folder.{describe_missing_runs().rstrip()}"
+    )
 
 
 def compare_with_published(conditions: Sequence[Condition], folder: Path) -> PublishedComparison:

@@ -13,6 +13,8 @@ from pfbench.testing.filters import (
 from pfbench.testing.models import (
     check_jacobians as check_jacobians,
     check_proposal as check_proposal,
+    check_regime as check_regime,
+    check_scenario as check_scenario,
 )
 from pfbench.testing.moves import (
     PathPosterior as PathPosterior,

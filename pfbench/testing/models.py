@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core.record import EACH_SATELLITE, Episode, MeasurementChannels, Record
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.linearisation import find_observation_jacobian, find_propagation_jacobian
 from pfbench.filter.particle.stages import Proposal
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import linear_walk
+from pfbench.noise import NominalNoise, make_normal
+from pfbench.scenario import RecordingRegime
 from pfbench.testing.results import (
     LawCheck,
     check_count,
@@ -178,3 +180,106 @@ def check_proposal(
         for i in range(value.shape[-1])
     }
     return check_means(_STATEMENT, deviations, limit)
+
+
+def check_scenario(scenario: Any) -> Mapping[str, LawCheck]:
+    """Check that an episode has the axes of its runs and steps, and that a run is the same alone and among others.
+
+    Args:
+        scenario: Scenario.
+
+    Raises:
+        AssertionError: If one does not hold.
+    """
+    name = type(scenario).__name__
+
+    def draw(numbers: Any) -> Any:
+        episode = scenario.draw(RecordingRegime(NominalNoise()), numbers, 1)
+        assert isinstance(episode, Episode), (
+            f"{name}.draw must return an Episode, got {type(episode).__name__}. Return Episode(Record(y), time, truth)"
+        )
+        runs, steps = len(numbers), len(episode.time)
+        values = {"record.y": episode.record.y}
+        values |= {f"truth[{group!r}]": value for group, value in episode.truth.items()}
+        for key, value in values.items():
+            assert list(value.shape[:-1]) == [runs, steps], (
+                f"{name}.draw must return {key} with the axes of runs, steps and components, [{runs}, {steps}, ...], got "
+                f"{list(value.shape)}. Add the axis that it lacks, or let `time` have as many steps"
+            )
+        stated, width = getattr(scenario, "channel_names", ()), episode.record.y.shape[-1]
+        assert len(stated) in (0, width) or any(EACH_SATELLITE in text for text in stated), (
+            f"{name}.channel_names must be {width}, as the components of record.y, got {len(stated)}. Name each one"
+        )
+        inputs = getattr(scenario, "input_type", None) or type(episode.record.u)
+        assert isinstance(episode.record.u, inputs), (
+            f"{name}.draw must return the inputs {inputs.__name__}, which input_type states, got "
+            f"{type(episode.record.u).__name__}. Return Record(y, {inputs.__name__}(...))"
+        )
+        return episode.record.y
+
+    return _check_alone("the data of a run do not depend on other runs", draw)
+
+
+def check_regime(noise: Any, runs: int = 2000) -> Mapping[str, LawCheck]:
+    """Check that the errors of a run are the same alone and among others, and have the distribution that is stated.
+
+    Args:
+        noise: Noise regime.
+        runs: Number of runs; 2 leave out the test of the distribution.
+
+    Raises:
+        AssertionError: If one does not hold.
+    """
+    channels = MeasurementChannels.of_one_kind(torch.ones(2, dtype=torch.float64), "position")
+    time, name = torch.arange(1, 201, dtype=torch.float64), type(noise).__name__
+
+    def draw(numbers: Any) -> Any:
+        errors = noise.draw_errors(PhiloxStream(1, numbers), channels, time)
+        shape = [len(numbers), 200, 2]
+        got = list(getattr(errors, "shape", ())) or type(errors).__name__
+        assert got == shape, (
+            f"{name}.draw_errors must return errors [R, T, Dy] = {shape}, got {got}. Draw them by draws.normal(name, T, Dy)"
+        )
+        return errors
+
+    results = _check_alone("the errors of a run do not depend on other runs", draw)
+    factors = noise.process_factors(time)
+    got = list(factors.shape) if float(factors.min()) >= 0.0 else "a negative one"
+    assert got == [200], (
+        f"{name}.process_factors must return a factor of at least 0 for each time, [200], got {got}. "
+        "Leave the method out for nominal process noise"
+    )
+    try:
+        stated_errors = noise.error_distribution(channels, time)
+    except ValueError:
+        return results
+    assert isinstance(stated_errors, tuple) and len(stated_errors) == 3, (  # noqa: PT018
+        f"{name}.error_distribution must return a family, shift and scale, got {type(stated_errors).__name__}. "
+        "Return for example (make_normal, shift, scale) with pfbench.noise.make_normal"
+    )
+    family, shift, scale = stated_errors
+    errors = draw(torch.arange(runs))
+    density, narrow = family(shift, scale).log_prob(errors), make_normal(shift, 0.7 * scale)
+    assert list(density.shape) == [runs, 200], (
+        f"{name}.error_distribution must make a distribution of all components of a measurement, with log_prob [R, T] = "
+        f"[{runs}, 200], got {list(density.shape)}. Return for example lambda shift, scale: Independent(Laplace(shift, scale), 1)"
+    )
+    ratio = (narrow.log_prob(errors) - density).exp()
+    statement = "error_distribution is that of the errors"
+    means = {
+        "the ratio of a narrow normal density to it - 1": ratio.nan_to_num(1.0).mean(1).numpy()
+        - 1.0
+    }
+    check = check_means(statement, means, 4.5) if runs > 2 else LawCheck(statement, 0.0, 4.5)
+    return {**results, "distribution": check}
+
+
+def _check_alone(statement: str, draw: Callable[[Any], Any]) -> Mapping[str, LawCheck]:
+    """Compare the draw of a run alone with that among others."""
+    several, alone = draw(torch.arange(2)), draw(torch.tensor([1]))
+    difference = float((several[1] - alone[0]).abs().nan_to_num().max())
+    assert difference <= 1e-12, (
+        f"{statement}: run 1 alone must be as among others, got a difference of {difference:.3g}. "
+        "Draw all random numbers from PhiloxStream(seed, runs), none from torch or NumPy"
+    )
+    return {"alone": LawCheck(statement, difference, 1e-12)}

@@ -99,15 +99,17 @@ def test_data_that_cannot_be_drawn_are_refused(
     assert files(tmp_path) == []
 
 
-def test_a_sweep_fails_wherever_its_job_does(own: tuple[str, ...], tmp_path: Path) -> None:
-    for place in ("constructor", "run"):
-        home = tmp_path / place
+def test_a_sweep_tries_own_parts_before_its_first_job(own: tuple[str, ...], tmp_path: Path) -> None:
+    """An error of the first steps is said once and no job runs; one of a later step is that of its job."""
+    for place, ends in {
+        "constructor": (2, "", []),
+        "run": (1, "1 finished, 0 skipped, 1 failed", [True]),
+    }.items():
         own_words = (*own, "+filter.kind=ValueError", f"+filter.place={place},nowhere")
-        words = ("run", "-m", *WALK, *own_words, "study=mine")
-        said = pfbench(*words, home=home)
-        assert said.code == 1, said.err
-        assert "1 finished, 0 skipped, 1 failed" in said.out
-        assert ["own reason" in note["message"] for note in notes(home)] == [True]
+        said = pfbench("run", "-m", *WALK, *own_words, "study=mine", home=tmp_path / place)
+        reasons = ["own reason" in note["message"] for note in notes(tmp_path / place)]
+        assert (said.code, ends[1] in said.out, reasons) == (ends[0], True, ends[2]), said.err
+        assert said.err.count("own reason") == (place == "constructor")
 
 
 def test_a_result_that_cannot_be_stored_is_a_failure(

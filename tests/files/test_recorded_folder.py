@@ -11,6 +11,7 @@ import pytest
 from checkout import ROOT
 from command_line import plant_programs, run_git
 
+from pfbench.files import recorded_folder
 from pfbench.files.atomic_write import DIGEST, hash_content, remove_temporary_files
 from pfbench.files.recorded_folder import MANIFEST, RecordedFolder
 
@@ -278,3 +279,23 @@ def test_a_published_file_is_replaced_without_copy_and_no_repository_runs_a_prog
     assert "changed.md.kept" in caplog.text
     assert "report.md" not in caplog.text
     assert "headline.svg" not in caplog.text
+
+
+def test_published_files_are_found_by_name_and_digest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    published, name = tmp_path / "published", "study/runs.parquet"
+    monkeypatch.setattr(recorded_folder, "PUBLISHED_RUNS", published)
+    monkeypatch.setattr(recorded_folder, "PUBLISHED_FILES", published / "published.json")
+    assert recorded_folder.find_published_file(name) is None
+    assert "pip install" in recorded_folder.describe_missing_runs()
+    (published / "study").mkdir(parents=True)
+    (published / name).write_bytes(b"runs")
+    recorded_folder.write_manifest(published / "published.json", {name: hash_content(b"runs")})
+    assert (recorded_folder.describe_missing_runs(), recorded_folder.list_published("runs.parquet")) == ("", ["study"])  # fmt: skip
+    own = tmp_path / "reports" / "study"
+    recorded_folder.copy_published(own, "runs.parquet")
+    assert (own / "runs.parquet").read_bytes() == b"runs"
+    (published / name).write_bytes(b"other runs")
+    with pytest.raises(ValueError, match=r"must have the digest in published\.json, got another"):
+        recorded_folder.find_published_file(name)

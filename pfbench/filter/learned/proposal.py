@@ -8,7 +8,7 @@ effective sample size. `networks` contains networks.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -414,31 +414,6 @@ class SpreadFeature(Feature):
     @override
     def __call__(self, context: FeatureContext) -> Tensor:
         return torch.log(context.sd / context.scale) / _LOG_SCALE
-
-
-@dataclass(frozen=True)
-class InputFeature(Feature):
-    """Inputs of the step by name, each divided by its scale.
-
-    Attributes:
-        input_scales: {name of an input tensor: value that is scaled to 1}.
-    """
-
-    input_scales: Mapping[str, float]
-
-    @override
-    def __call__(self, context: FeatureContext) -> Tensor:
-        u, values = context.record.u, []
-        for name, scale in self.input_scales.items():
-            names = getattr(u, "_fields", ())
-            if name not in names:
-                raise ValueError(
-                    "features.input_scales must be names of inputs "
-                    f"({', '.join(names) or 'this model has none'}), got {name}. Remove it."
-                )
-            value = getattr(u, name)
-            values.append((value.flatten(1) if value.dim() > 1 else value[:, None]) / scale)
-        return torch.cat(values, -1).unsqueeze(1)
 
 
 @dataclass(frozen=True)

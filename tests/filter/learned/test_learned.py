@@ -44,7 +44,6 @@ from pfbench.filter.learned.networks import (
 from pfbench.filter.learned.proposal import (
     PAST,
     InnovationFeature,
-    InputFeature,
     LearnedProposal,
     ParentFeature,
     SpreadFeature,
@@ -359,14 +358,6 @@ def test_a_unit_of_measure_changes_nothing() -> None:
 
     torch.testing.assert_close(told(1.0), told(1e-6))
     assert told(1.0).abs().max() < 5.0
-
-
-def test_an_input_is_asked_for_by_name() -> None:
-    cloud = ParticleFilter(5).init(WALK, 1, PhiloxStream(1, torch.arange(1)))
-    with pytest.raises(
-        ValueError, match=r"features\.input_scales must be names of inputs .*, got speed"
-    ):
-        InputFeature({"speed": 1.0})(make_feature_context(WALK, cloud, Record(WALK_Y[:1])))
 
 
 # draws of any law
