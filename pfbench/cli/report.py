@@ -118,7 +118,7 @@ def find_page_data(config: JobConfig, words: Sequence[str] = ()) -> Path | None:
         Path(config.values["results_dir"]) / config.values["study"],
     )
     data = Path(config.values["reports_dir"]) / study / RUNS_FILE
-    if any(results.glob("*.npz")) or not data.is_file():
+    if any(results.glob("*.npz")) or not data.is_file() or data.parent.is_symlink():
         return None
     if options := [word for word in words if word.lstrip("+").startswith(("report.", "report="))]:
         raise ValueError(

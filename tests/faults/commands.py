@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import chdir
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -138,14 +139,10 @@ def template() -> Path:
 @cache
 def load_libraries() -> None:
     """Run most commands once in this process, so that its copies import and compose little."""
-    before = os.getcwd()
     for command, words in COMMANDS.items():
         if SHARES[command] >= 1:
-            with new_home() as path:
-                home = Home(path)
-                os.chdir(home.place)
+            with new_home() as path, chdir((home := Home(path)).place):
                 pfbench(*words.split(), home=home.place)
-                os.chdir(before)
     gc.freeze()
 
 
@@ -209,13 +206,9 @@ def plant_caches(home: Home, rng: random.Random) -> None:
 
 def plant_configuration(home: Home, rng: random.Random) -> None:
     """Files of groups, of which the experiments choose a launcher."""
-    key = rng.choice(["a", '"\\e[31m"', "trust", "'proposal.checkpoint'", "reading", "checkpoint"])
-    key = (
-        rng.choice(
-            ["", "filter: {", "noise: {", "scenario: {model: {", "hydra: {", "hydra: {launcher: {"]
-        )
-        + key
-    )
+    key = rng.choice(
+        ["", "filter: {", "noise: {", "scenario: {model: {", "hydra: {", "hydra: {launcher: {"]
+    ) + rng.choice(["a", '"\\e[31m"', "trust", "'proposal.checkpoint'", "reading", "checkpoint"])
     value = rng.choice(["1", "'['", "../outside/secret.csv", "${oc.env:HOME}", "{_target_: os.system}"])  # fmt: skip
     home.write(
         "conf/experiment/mine.yaml",
@@ -283,8 +276,9 @@ def run(count: int, seed: int) -> Tally:
     """Run commands, drawn by their shares, in folders of their own; `seed` is the number of the batch."""
     tally = Tally("hostile commands")
     load_libraries()
-    shares = [SHARES[command] for command in COMMANDS]
     for number in range(seed * 100_000, seed * 100_000 + count):
-        command = random.Random(number).choices(list(COMMANDS), shares)[0]
+        command = random.Random(number).choices(
+            list(COMMANDS), [SHARES[name] for name in COMMANDS]
+        )[0]
         tally.add(*attempt(command, number, in_process=bool(number % NEW_PROCESS)))
     return tally
