@@ -394,9 +394,9 @@ class CompiledStep:
             )
             results[k] = belief, expected
         last = results[rows[-1]][0] if rows else None
-        kept = {k: value for k, value in results.items() if k in selection}
+        selected = {k: value for k, value in results.items() if k in selection}
         return TakenSteps(
-            mean, variance, log_evidence, dict(zip(self.trace, trace, strict=True)), kept, last
+            mean, variance, log_evidence, dict(zip(self.trace, trace, strict=True)), selected, last
         )
 
 
