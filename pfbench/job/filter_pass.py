@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -84,30 +83,18 @@ class TimedFilterPass(NamedTuple):
             "pareto_k": estimate.pareto_k.float(),
             **{name: a if a.dtype == torch.bool else a.float() for name, a in trace.items()},
         }
-        outputs |= {
-            name: a.float() if a.is_floating_point() else a
-            for name, a in self.recorder.arrays().items()
-        }
+        scores = self.recorder.arrays()
+        outputs |= {name: a.float() if a.is_floating_point() else a for name, a in scores.items()}
         optional = {"track": episode.track, "pcrb": pcrb, "range": episode.datasheet.get("range")}
         outputs |= {name: a.float() for name, a in optional.items() if a is not None}
         return {name: a.cpu().numpy() for name, a in outputs.items()}
 
 
 def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> TimedFilterPass:
-    """Run the filter of a plan over an episode and measure errors, time and memory; by kernels if a stored step was false.
+    """Run the filter of a plan over an episode and measure errors, time and memory.
 
     Returns the results. Shapes: runs [R].
     """
-    try:
-        return _pass_once(plan, episode, runs, label)
-    except step_store.StaleStepError:
-        log.warning("engine=kernels: the job is repeated, since a stored step gave other numbers")
-        config = replace(plan.config, values={**plan.values, "engine": "kernels"})
-        return _pass_once(replace(plan, config=config), episode, runs, label)
-
-
-def _pass_once(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> TimedFilterPass:
-    """Run the filter of a plan as `pass_filter` does."""
     values, method, clock = plan.values, plan.method, plan.choose_timer()
     device = values["device"]
     model, steps = plan.make_filter_model(episode), episode.record.y.shape[1]
@@ -123,7 +110,8 @@ def _pass_once(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Tim
     draws = PhiloxStream(values["seed"], runs.to(device), plan.dtype)
     with _prepare_torch(plan, engine), _show_progress(steps, label) as tick:
         step = _compile_step(engine, method, counter, clock, _may_load_steps(plan))
-        baseline, start_time = start_peak_measurement(device), clock()
+        baseline = start_peak_measurement(device)
+        start_time = clock()
         method, batch = _warm_up(plan, step, model, episode.record, draws)
         warm_up_seconds = clock() - start_time - (step.seconds if step else 0.0)
         counter.count = 0
@@ -138,28 +126,25 @@ def _pass_once(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Tim
             values["threads"] if device == "cpu" else 1,
         )
         wait_for(device)
-    of_step = step.seconds if step else 0.0
-    filter_seconds = clock() - start_time - warm_up_seconds - recorder.seconds - of_step
+    step_compile_seconds = step.seconds if step else 0.0
+    filter_seconds = (
+        clock() - start_time - warm_up_seconds - recorder.seconds - step_compile_seconds
+    )
     seconds = {
         "scores": recorder.seconds,
-        "compile": compile_seconds + of_step,
+        "compile": compile_seconds + step_compile_seconds,
         WARM_UP: warm_up_seconds,
         "filter": filter_seconds,
         "per_step": filter_seconds / steps,
     }
-    return TimedFilterPass(
-        model,
-        estimate,
-        recorder,
-        seconds,
-        {
-            "engine": "eager"
-            if engine == "eager"
-            else ("compiled" if step and step.is_active else "kernels"),
-            "memory": peak_above(baseline, device),
-            "likelihoods_per_step": counter.count / (len(runs) * steps),
-        },
-    )
+    cost = {
+        "engine": "eager"
+        if engine == "eager"
+        else ("compiled" if step and step.is_active else "kernels"),
+        "memory": peak_above(baseline, device),
+        "likelihoods_per_step": counter.count / (len(runs) * steps),
+    }
+    return TimedFilterPass(model, estimate, recorder, seconds, cost)
 
 
 def _time_choice(plan: JobPlan, model: StateSpaceModel, runs: int, steps: int) -> tuple[str, float]:
@@ -167,7 +152,8 @@ def _time_choice(plan: JobPlan, model: StateSpaceModel, runs: int, steps: int) -
     engine, start = plan.values["engine"], time.perf_counter()
     if engine == "auto" and plan.values["budget"] != store.SAME_N:
         engine = "kernels"  # as the trials that gave the number of particles
-    return choose_engine(engine, plan.method, model, runs, steps), time.perf_counter() - start
+    engine = choose_engine(engine, plan.method, model, runs, steps)
+    return engine, time.perf_counter() - start
 
 
 @contextmanager
@@ -195,11 +181,8 @@ def _may_load_steps(plan: JobPlan) -> bool:
 
     In single precision engines agree to Monte Carlo error only. Trials of times use kernels.
     """
-    return (plan.values["engine"], plan.values["budget"], plan.dtype) == (
-        "auto",
-        store.SAME_N,
-        torch.float64,
-    )
+    is_auto = plan.values["engine"] == "auto" and plan.values["budget"] == store.SAME_N
+    return is_auto and plan.dtype == torch.float64
 
 
 def _warm_up(
@@ -216,10 +199,9 @@ def _warm_up(
 
     Returns the filter, with compiled steps if there are, and the runs of a batch.
     """
-    by_kernels, batch = (
-        plan.choose_run_batch(plan.method, len(draws.runs), is_compiled=is_compiled)
-        for is_compiled in (False, step is not None)
-    )
+    runs = len(draws.runs)
+    by_kernels = plan.choose_run_batch(plan.method, runs)
+    batch = plan.choose_run_batch(plan.method, runs, is_compiled=step is not None)
     first = slice(0, batch)
     run_filter(
         step or plan.method,
@@ -296,8 +278,8 @@ def _predict_saving(method: ParticleFilter, model: StateSpaceModel, runs: int, s
     """Return what a compiled step saves in place of kernels, s."""
     dimension = model.chart.size
     batches = -(-runs // choose_run_batch(runs, method.particles, dimension))
-    particles = runs * method.particles if dimension < _MANY_COMPONENTS else 0
-    return steps * (_SAVED_PER_STEP * batches + _SAVED_PER_PARTICLE * particles)
+    per_particle = _SAVED_PER_PARTICLE if dimension < _MANY_COMPONENTS else 0.0
+    return steps * (_SAVED_PER_STEP * batches + per_particle * runs * method.particles)
 
 
 def _count_numbers(method: Any, model: StateSpaceModel) -> int:

@@ -9,7 +9,6 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 from config_cases import truncated
@@ -27,17 +26,6 @@ JOB = ["scenario=growth", "filter=sir", "runs=3", "particles=50"]
 def settings(tmp_path: Path, *words: str) -> Any:
     """A job with results and episodes of its own."""
     return compose([*JOB, f"results_dir={tmp_path}/results", "episode_cache_dir=null", *words])
-
-
-def test_a_job_whose_stored_step_was_false_is_repeated_by_kernels(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    passes = Mock(side_effect=[step_store.StaleStepError(""), "repeated"])
-    monkeypatch.setattr(filter_pass, "_pass_once", passes)
-    plan: Any = build_plan(resolve_config(settings(tmp_path)))
-    assert filter_pass.pass_filter(plan, plan, plan.runs, "") == "repeated"
-    assert passes.call_args.args[0].values["engine"] == "kernels"
-    assert "the job is repeated" in caplog.text
 
 
 @pytest.mark.parametrize("is_stored", [False, True])

@@ -117,9 +117,8 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     def step(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> tuple[ParticleBelief, StepInfo]:
-        with_time_axis = record._replace(
-            y=record.y.unsqueeze(1), u=map_inputs(lambda a: a.unsqueeze(1), record.u)
-        )
+        u = map_inputs(lambda a: a.unsqueeze(1), record.u)
+        with_time_axis = record._replace(y=record.y.unsqueeze(1), u=u)
         block, belief, _ = self._take_steps(
             model, belief, with_time_axis, 0, draws, 1, KeptSteps(frozenset())
         )
@@ -136,9 +135,10 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         limit: int,
         selection: KeptSteps,
     ) -> tuple[StepBlock, ParticleBelief, int]:
+        stream = draws.at_step(t + 1)
         with _ONE_AT_A_TIME:
             model = model.at_step(t)
-        return self._take_steps(model, belief, record, t, draws.at_step(t + 1), limit, selection)
+        return self._take_steps(model, belief, record, t, stream, limit, selection)
 
     def _take_steps(
         self,
@@ -154,15 +154,6 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         step_record = record.at_step(t)
         with _ONE_AT_A_TIME:
             graph = self._graph(model, belief, step_record, draws)
-            if (
-                graph
-                and graph.is_stored
-                and isinstance(draws, PhiloxStream)
-                and int(draws.step) in _COMPARED_STEPS
-            ):
-                self._compare(
-                    graph, StepParts(self.method, model, belief, step_record, draws, self.counter)
-                )
         if graph is not None and isinstance(draws, PhiloxStream) and limit:
             steps = min(limit, graph.choose_steps(selection), record.y.shape[1] - t)
             rows = selection.select_rows(t, steps)
@@ -178,25 +169,6 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         with _ONE_AT_A_TIME:
             belief, info = self.method.step(model, belief, step_record, draws)
         return StepBlock.of_step(t, belief, info), belief, 1 if graph is not None else limit
-
-    def _compare(self, graph: CompiledStep, step: StepParts) -> None:
-        """Compare a loaded step with the uncompiled one: the comparison at load has not seen what acts later only.
-
-        Its time is that of compilation.
-
-        Raises:
-            StaleStepError: If numbers differ. The step is removed from the store.
-        """
-        start_time = self.clock()
-        with _keep_count(self.counter):
-            expected = step.make([], record_step=False)(*step.example())
-            if not _has_numbers(
-                graph.entry, step.example(), expected, _CARRIED + len(graph.memory)
-            ):
-                raise step_store.StaleStepError(
-                    "a stored step must give the numbers of the uncompiled one."
-                )
-        self.seconds += self.clock() - start_time
 
     def _make_block(
         self,
@@ -214,14 +186,14 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
             for k, (belief, _) in outcome.selection.items()
         }
         checked = [k for k in outcome.selection if first + k in selection.checked]
-        if (
-            len(outcome.mean) == 1 and len(checked) * outcome.last.x.numel() <= _MAX_NUMBERS
-        ):  # as `may_join_steps`
+        x = outcome.last.x
+        if len(x) == 1 and len(checked) * x.numel() <= _MAX_NUMBERS:  # as `may_join_steps`
             pairs = _compute_nis_together(model, record, {k: outcome.selection[k] for k in checked})
             for k, nis in zip(checked, pairs, strict=True):
                 infos[first + k] = infos[first + k]._replace(nis=nis)
         beliefs = {first + k: (belief,) for k, (belief, _) in outcome.selection.items()}
-        return StepBlock(first, *outcome[:4], beliefs, infos)
+        moments = outcome.mean, outcome.variance, outcome.log_evidence
+        return StepBlock(first, *moments, outcome.trace, beliefs, infos)
 
     def _graph(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
@@ -246,9 +218,10 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
             parts = StepParts(self.method, model, belief, record, draws, self.counter)
             graph = compile_step(parts, self.loads_only)
         except Exception as error:  # torch raises many kinds
+            reason = f"{type(error).__name__}: {error}".splitlines()[0]
             log.warning(
                 "engine=compiled: this step cannot be compiled (%s). Using compiled kernels only",
-                f"{type(error).__name__}: {error}".splitlines()[0],
+                reason,
             )
             log.debug("compilation failed", exc_info=True)
             return None
@@ -266,7 +239,6 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
 # A step is a pure function of belief, record, seed, runs and step number. It is recorded once as the
 # operations that it consists of, and torch's compiler makes one function of them.
 
-_COMPARED_STEPS = {4, 5, 16, 17, 64, 65}  # of these, groups of steps begin with one of each pair
 _MAX_NUMBERS = 1 << 20  # results of steps taken together; they share the overhead of a call
 # tensors without memory that a step carries: particles, log weights, log evidence, weights
 _CARRIED = 4
@@ -326,6 +298,7 @@ class CompiledStep:
         shared = [to_storage(a) for a in tensors_in((record.start, record.spread))]
         shared += [torch.as_tensor(draws.seed), draws.runs]
         if self.entry is not None:
+            kept_steps = torch.tensor(selection, dtype=torch.int64)
             flat = step_compiler.run_steps(
                 self.entry.step,
                 self.entry.constants,
@@ -333,16 +306,18 @@ class CompiledStep:
                 inputs,
                 shared,
                 self._joined,
-                torch.tensor(selection, dtype=torch.int64),
+                kept_steps,
             )
-            return self._unpack(flat[: len(self._joined)], flat[len(self._joined) :], selection)
+            count = len(self._joined)
+            return self._unpack(flat[:count], flat[count:], selection)
         return self._run_from_python(state, inputs, shared, selection)
 
     @cached_property
     def _joined(self) -> Tensor:
         """Numbers of the results without an axis of particles: mean (the first that is checked), variance, evidence and trace."""
-        first = _CARRIED + len(self.memory)
-        return torch.tensor([first, first + 1, 2, *range(first + 3, first + 3 + len(self.trace))])
+        carried = _CARRIED + len(self.memory)
+        trace = range(carried + 3, carried + 3 + len(self.trace))
+        return torch.tensor([carried, carried + 1, 2, *trace])
 
     def _run_from_python(
         self,
@@ -394,10 +369,9 @@ class CompiledStep:
             )
             results[k] = belief, expected
         last = results[rows[-1]][0] if rows else None
-        selected = {k: value for k, value in results.items() if k in selection}
-        return TakenSteps(
-            mean, variance, log_evidence, dict(zip(self.trace, trace, strict=True)), selected, last
-        )
+        kept_results = {k: value for k, value in results.items() if k in selection}
+        named_trace = dict(zip(self.trace, trace, strict=True))
+        return TakenSteps(mean, variance, log_evidence, named_trace, kept_results, last)
 
 
 class TakenSteps(NamedTuple):
@@ -421,8 +395,8 @@ class TakenSteps(NamedTuple):
 
     def summarise(self, k: int) -> StepSummary:
         """Return the summary of a kept step."""
-        moments = self.mean[:, k], self.variance[:, k], self.selection[k][1]
-        return StepSummary(*moments, {name: a[:, k] for name, a in self.trace.items()})
+        trace = {name: a[:, k] for name, a in self.trace.items()}
+        return StepSummary(self.mean[:, k], self.variance[:, k], self.selection[k][1], trace)
 
 
 def _compute_nis_together(
@@ -432,11 +406,9 @@ def _compute_nis_together(
 
     @compute_once
     def compute() -> tuple[Tensor, Tensor]:
-        x, log_w = zip(
-            *((belief.x.permute(2, 0, 1), w) for belief, w in steps.values()), strict=True
-        )
-        clouds = torch.cat(x, 1).permute(1, 2, 0)
-        return compute_nis(model, clouds, torch.cat(log_w), record.steps_as_runs(list(steps)))
+        x = torch.cat([belief.x.permute(2, 0, 1) for belief, _ in steps.values()], 1)
+        log_w = torch.cat([expected for _, expected in steps.values()])
+        return compute_nis(model, x.permute(1, 2, 0), log_w, record.steps_as_runs(list(steps)))
 
     def select(index: int) -> tuple[Tensor, Tensor]:
         nis, observed = compute()
@@ -460,21 +432,6 @@ class StepParts(NamedTuple):
         arguments = self.belief, self.record, self.draws.dtype, self.draws.runs
         return step_store.name_step((self.method, self.model), arguments, self.counter)
 
-    def make(self, names: list[list[str]], record_step: bool = True) -> Callable[..., list[Tensor]]:
-        """Return the step as a function of tensors, see `_make_tensor_function`."""
-        return _make_tensor_function(*self[:-1], names, record_step)
-
-    def example(self) -> list[Tensor]:
-        """Return the arguments of the function."""
-        draws, inputs = self.draws, map(to_storage, tensors_in(self.record))
-        return [
-            *_belief_to_storage(self.belief),
-            torch.as_tensor(draws.step),
-            *inputs,
-            torch.as_tensor(draws.seed),
-            draws.runs,
-        ]
-
 
 def compile_step(parts: StepParts, loads_only: bool = False) -> CompiledStep | None:
     """Load a filter's step from the store, or record and compile it.
@@ -483,26 +440,31 @@ def compile_step(parts: StepParts, loads_only: bool = False) -> CompiledStep | N
 
     Returns the compiled step. None if it is not stored and only loaded.
     """
+    method, model, belief, record, draws, counter = parts
     names: list[list[str]] = []
-    example, state = parts.example(), _belief_to_storage(parts.belief)
+    make = partial(_make_tensor_function, method, model, belief, record, draws)
+    state, inputs = _belief_to_storage(belief), [to_storage(a) for a in tensors_in(record)]
+    shared = [torch.as_tensor(draws.seed), draws.runs]
+    example = [*state, torch.as_tensor(draws.step), *inputs, *shared]
     name = None if example[0].is_cuda else parts.name()
     if loads_only and not (name and step_store.has_step(name)):
         return None
-    with _keep_count(parts.counter) as count:
-        expected = parts.make(names, record_step=False)(*example)
+    with _keep_count(counter) as count:
+        expected = make(names, record_step=False)(*example)
         evaluations = count()
         run, entry = None, _load_step(name, example, expected, len(state))
         is_stored = entry is not None
         if not is_stored and loads_only:
             return None
         if not is_stored:
-            run, entry = _compile_and_store(name, parts.make([]), example, expected, len(state))
-    shapes = [[a.shape for a in tensors] for tensors in (expected[: len(state)], state)]
-    keeps_shapes = len(names[0]) + _CARRIED == len(state) and shapes[0] == shapes[1]
+            run, entry = _compile_and_store(name, make([]), example, expected, len(state))
+    memory, trace = names
+    carried_shapes = [a.shape for a in expected[: len(state)]]
+    keeps_shapes = len(memory) + _CARRIED == len(state) and carried_shapes == [
+        a.shape for a in state
+    ]
     max_steps = _choose_max_steps(expected) if keeps_shapes else 1
-    return CompiledStep(
-        run, entry, names[0], names[1], evaluations, max_steps, parts.model, is_stored
-    )
+    return CompiledStep(run, entry, memory, trace, evaluations, max_steps, model, is_stored)
 
 
 @contextmanager
@@ -534,24 +496,18 @@ def _compile_and_store(
 def _load_step(
     name: str | None, example: list[Tensor], expected: Sequence[Tensor], carried: int
 ) -> NativeEntry | None:
-    """Load a step from the store; return None if its numbers are not those of the uncompiled one."""
+    """Load a step from the store; remove it and return None if its numbers are not those of the uncompiled one."""
     entry = step_store.load_step(name, example) if name else None
-    return entry if entry and _has_numbers(entry, example, expected, carried) else None
-
-
-def _has_numbers(
-    entry: Any, example: list[Tensor], expected: Sequence[Tensor], carried: int
-) -> bool:
-    """Return whether a stored step gives the numbers of the uncompiled one; if not, remove it from the store."""
+    if entry is None:
+        return None
     try:
-        _check_agreement(
-            [*map(to_storage, step_compiler.run_once(entry, example))], expected, carried
-        )
+        out = [to_storage(a) for a in step_compiler.run_once(entry, example)]
+        _check_agreement(out, expected, carried)
     except (ArithmeticError, RuntimeError) as error:
         log.warning("engine=compiled: a stored step is removed (%s)", error)
         step_store.remove_step(Path(entry.library).parent.name)
-        return False
-    return True
+        return None
+    return entry
 
 
 def _make_tensor_function(
@@ -639,22 +595,21 @@ def replace_tensors(tree: Any, tensors: Iterator[Tensor]) -> Any:
 def _belief_to_storage(belief: ParticleBelief) -> list[Tensor]:
     """Return the tensors that a step carries, in storage layout."""
     w = exponentiate(belief.log_w, belief.weights)
-    tree = belief.x, belief.log_w, belief.log_evidence, w, belief.memory
-    return [*map(to_storage, tensors_in(tree))]
+    carried = tensors_in((belief.x, belief.log_w, belief.log_evidence, w, belief.memory))
+    return [to_storage(a) for a in carried]
 
 
 def _choose_max_steps(out: Sequence[Tensor]) -> int:
     """Return how many steps of this size may be taken together, by memory."""
     if not out[0].is_cuda:
         return max(1, _MAX_NUMBERS // sum(a.numel() for a in out))
-    most = torch.cuda.mem_get_info(out[0].device)[0] // 8 // sum(a.nbytes for a in out)
-    return max(1, min(_MAX_STEPS_CUDA, most))
+    free = torch.cuda.mem_get_info(out[0].device)[0]
+    return max(1, min(_MAX_STEPS_CUDA, free // 8 // sum(a.nbytes for a in out)))
 
 
 def _count_finite(means: list[Tensor]) -> int:
     """Return how many means [R, D] precede the first one that is not finite."""
     if math.isfinite(float(torch.stack(means).sum())):
         return len(means)
-    return next(
-        (t for t, mean in enumerate(means) if not math.isfinite(float(mean.sum()))), len(means)
-    )
+    sums = [float(mean.sum()) for mean in means]
+    return next((t for t, total in enumerate(sums) if not math.isfinite(total)), len(means))

@@ -38,10 +38,6 @@ _NAME_LENGTH = 40
 _SHIPPED = {"pfbench", *sys.stdlib_module_names, *BROAD} - {"__main__"}
 
 
-class StaleStepError(ArithmeticError):
-    """A stored step gives other numbers than the uncompiled one at a later step."""
-
-
 # --------------------------------------------------------------------------------------------------
 # Name of a step
 
@@ -148,9 +144,8 @@ def save_step(name: str, entry: NativeEntry, outputs: int) -> None:
             shutil.copyfile(entry.library, folder / _LIBRARY)
             torch.save([a.clone() for a in entry.constants], folder / _CONSTANTS)
             record = {"name": name, "outputs": outputs}
-            (folder / _RECORD).write_text(
-                json.dumps({**record, DIGEST: hash_content({**record, **_read_files(folder)})})
-            )
+            digest = hash_content({**record, **_read_files(folder)})
+            (folder / _RECORD).write_text(json.dumps({**record, DIGEST: digest}))
             for file in folder.iterdir():
                 file.chmod(0o600)  # whatever the mask of the user is
             try:
