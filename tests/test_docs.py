@@ -47,6 +47,15 @@ def heading_anchors(page):
     return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
+@pytest.mark.parametrize("name", ["trust.md", "reliability.md"])
+def test_each_test_that_a_page_names_exists(name):
+    named = re.findall(r"`(\w+/[\w/]+\.py)(?:::(\w+))?`", (ROOT / "docs" / name).read_text())
+    assert len(named) > 10
+    assert [
+        n for n in named if f"def {n[1] or 'test_'}" not in (ROOT / "tests" / n[0]).read_text()
+    ] == []
+
+
 def test_links_and_images_exist():
     for page in LINKING_PAGES:
         for target, anchor in re.findall(r"\]\((?!http)([^)#\s]*)#?([^)]*)\)", page.read_text()):

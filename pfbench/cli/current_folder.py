@@ -10,13 +10,13 @@ _CHOICE = re.compile(r"\+?(\w+)=([\w,]+)")
 
 
 def list_own_files(group: str) -> list[Path]:
-    """List the files of a group in `conf` of the current folder, unless that is the folder of pfbench."""
+    """List the files of a group in `conf` of the current folder, unless that is the folder of pfbench. A link may lead out of it."""
     from pfbench.results.paper_block import conf_dir
 
     folder = Path("conf")
     if not folder.is_dir() or folder.resolve() == conf_dir().resolve():
         return []
-    return sorted((folder / group).glob("*.yaml"))
+    return sorted(p for p in (folder / group).glob("*.yaml") if p.is_file() and not p.is_symlink())
 
 
 def add_search_path(words: Sequence[str]) -> list[str]:
@@ -27,8 +27,7 @@ def add_search_path(words: Sequence[str]) -> list[str]:
         return list(words)
     from pfbench.job.config import list_groups
 
-    choices = [match for word in words if (match := _CHOICE.fullmatch(word))]
-    for match in choices:
+    for match in filter(None, map(_CHOICE.fullmatch, words)):
         names = set(match[2].split(",")) - {path.stem for path in list_groups().get(match[1], ())}
         has_knobs = match[1] == "filter" and re.search(r"_tuned\b|tuned_baselines", match[2])
         if names & {path.stem for path in list_own_files(match[1])} or (

@@ -43,6 +43,7 @@ def write_study_paper(words: Sequence[str]) -> None:
     from pfbench.report.study_report import format_verdicts
 
     study, reports = config.values["study"], Path(config.values["reports_dir"])
+    RecordedFolder(reports / study, is_complete=False)  # refuses a link
     stored = find_page_data(config, words)
     if stored is None:
         check_has_results(study, Path(config.values["results_dir"]))

@@ -121,7 +121,7 @@ def find_page_data(config: JobConfig, words: Sequence[str] = ()) -> Path | None:
     )
     data = Path(config.values["reports_dir"]) / study / RUNS_FILE
     is_stored = data.is_file() or find_published_file(f"{study}/{RUNS_FILE}") is not None
-    if any(results.glob("*.npz")) or not is_stored:
+    if any(results.glob("*.npz")) or not is_stored or data.parent.is_symlink():
         return None
     if options := [word for word in words if word.lstrip("+").startswith(("report.", "report="))]:
         raise ValueError(

@@ -41,6 +41,10 @@ class RecordedFolder:
 
     def __init__(self, path: str | Path, is_complete: bool = True) -> None:
         self.path = Path(path)
+        if self.path.is_symlink():  # in a folder of another person it may lead to files of the user
+            raise ValueError(
+                f"{path} must be a folder, got a link. Remove the link, or choose another folder."
+            )
         self._is_complete = is_complete
         self._previous = _read_manifest(self.path / MANIFEST)
         self._written: dict[str, str] = {}
@@ -191,8 +195,7 @@ def _is_plain_name(name: str) -> bool:
 
 def _has_own_parents(folder: Path, name: str) -> bool:
     """Return whether no folder between a folder and a file in it is a link."""
-    parents = [folder / parent for parent in PurePosixPath(name).parents if parent.name]
-    return not any(parent.is_symlink() for parent in parents)
+    return not any((folder / p).is_symlink() for p in PurePosixPath(name).parents if p.name)
 
 
 def _hash_file(path: Path) -> str:
@@ -202,8 +205,9 @@ def _hash_file(path: Path) -> str:
 
 def _list_names(names: Sequence[str]) -> str:
     """Format the first names and the number of the others."""
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return f"{', '.join(names[:_SHOWN])}{more}"
+    return ", ".join(names[:_SHOWN]) + (
+        f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    )
 
 
 # --------------------------------------------------------------------------------------------------

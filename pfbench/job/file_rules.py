@@ -68,15 +68,16 @@ def check_content(file: Path, values: Mapping[str, Any], *, is_own: bool) -> Non
         _check_sweep(file, params, is_own)
 
 
-def check_defaults(file: Path, defaults: Sequence[Any]) -> None:
-    """Check the defaults list of a file as Hydra parses it."""
+def check_defaults(file: Path, defaults: Sequence[Any], *, is_own: bool) -> None:
+    """Check the defaults list of a file as Hydra parses it. Only a file of the user's own chooses a launcher, which starts processes."""
     for entry in defaults:
         group, value = getattr(entry, "group", None), getattr(entry, "value", None)
         names = [group, getattr(entry, "path", None), entry.package]
         names += value if isinstance(value, list) else [value]
         texts = [name for name in names if isinstance(name, str)]
         is_launcher = (
-            group is not None
+            is_own
+            and group is not None
             and group.strip("/") == "hydra/launcher"
             and value in launchers()
             and entry.package is None
@@ -86,8 +87,9 @@ def check_defaults(file: Path, defaults: Sequence[Any]) -> None:
         if leaves or (in_hydra and not is_launcher):
             choice = "@".join(filter(None, [group or texts[0], entry.package]))
             raise UntrustedConfigError(
-                f"{file}: defaults must name files of a group directly and outside hydra, or one of the "
-                f"launchers {', '.join(launchers())}, got {choice}: {value}. Choose it on the command line."
+                f"{file}: defaults must name files of a group directly and outside hydra, got {choice}: {value}. Choose it on "
+                "the command line. In a folder of your own (own://) they may choose a launcher: "
+                f"{', '.join(launchers())}."
             )
 
 
@@ -106,7 +108,7 @@ def check_group(file: Path, config_path: str, *, is_own: bool) -> None:
     is_launcher = is_own and config_path.startswith("hydra/launcher/")
     if config_path.lstrip("./").startswith("hydra") and not is_launcher:
         raise UntrustedConfigError(
-            f"{file} must not be a setting of hydra. Choose a launcher of pfbench "
+            f"{file} must not be a setting of hydra. Choose a launcher of pfbench on the command line "
             f"({', '.join(launchers())}), or write own:// before a folder of your own launchers."
         )
 

@@ -275,7 +275,9 @@ class _SharedRepository(CachingConfigRepository):
             check_group(folder.file_of(config_path), config_path, is_own=folder.is_own)
         result = self.delegate.load_config(config_path)
         if folder is not None and result is not None:
-            check_defaults(folder.file_of(config_path), result.defaults_list or ())
+            check_defaults(
+                folder.file_of(config_path), result.defaults_list or (), is_own=folder.is_own
+            )
         return result
 
     def _find_source(self, config_path: str) -> ConfigSource | None:

@@ -387,6 +387,20 @@ def test_list_of_a_group_says_what_each_one_is(tmp_path: Path) -> None:
     assert len(said.out.splitlines()) == len(list((job.conf_dir() / "filter").glob("*.yaml")))
 
 
+def test_a_link_of_a_stranger_s_folder_is_neither_listed_nor_written_through(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("conf/noise", "reports"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "conf" / "noise" / "theirs.yaml").symlink_to(__file__)
+    (tmp_path / "reports" / "adhoc").symlink_to(tmp_path / "conf")
+    monkeypatch.chdir(tmp_path)
+    assert "theirs" not in pfbench("list", "noise", home=tmp_path).out
+    assert (
+        "adhoc must be a folder, got a link" in pfbench("paper", "width=120mm", home=tmp_path).err
+    )
+
+
 def test_list_of_the_models_that_fit_a_recorded_scenario(tmp_path: Path) -> None:
     said = pfbench("list", "model", "scenario=recorded_berlin", home=tmp_path)
     assert said.code == 0, said.err

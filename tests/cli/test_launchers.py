@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -14,13 +13,11 @@ import pytest
 from command_line import environment
 from hydra import compose, initialize_config_dir
 
-from pfbench import cli, job
+from pfbench import job
 from pfbench.cli.messages import format_error
 from pfbench.cli.run import run_with_retries
 from pfbench.door import worker
 from pfbench.files.foreign_folder import start_python
-
-main_module = import_module("pfbench.cli.main")
 
 
 def launcher(name: str, *words: str) -> Any:
@@ -30,24 +27,6 @@ def launcher(name: str, *words: str) -> Any:
 
 
 # presets
-
-
-def test_every_core_gets_a_cell_by_joblib() -> None:
-    preset = launcher("cores")
-    assert (preset.n_jobs, preset.batch_size) == (-1, "1")
-
-
-def test_slurm_gets_what_the_job_needs() -> None:
-    pytest.importorskip(
-        "hydra_plugins.hydra_submitit_launcher",
-        reason='needs submitit: pip install "pfbench[slurm]"',
-    )
-    preset = launcher("slurm", "threads=4", "hydra.launcher.partition=short")
-    assert (preset.cpus_per_task, preset.partition, preset.additional_parameters.requeue) == (
-        4,
-        "short",
-        True,
-    )
 
 
 def test_the_script_for_slurm_is_one_array_that_is_queued_again(tmp_path: Path) -> None:
@@ -194,20 +173,6 @@ def test_a_child_imports_libraries_and_trusted_packages(
     assert (said, (hostile / "ran").exists()) == ("trusted", False)
 
 
-def test_the_processes_of_joblib_import_nothing_of_the_current_folder(
-    hostile: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: dict[str, str] = {}
-    monkeypatch.setattr(main_module, "_dispatch", lambda words: seen.update(os.environ))
-    before = dict(os.environ)
-    cli.main(["run"])
-    assert dict(os.environ) == before
-    program = "import joblib; print(joblib.Parallel(2)(joblib.delayed(str)(x) for x in 'ab'))"
-    command = [sys.executable, "-P", "-c", program]
-    done = subprocess.run(command, env=seen, capture_output=True, text=True, check=True)
-    assert (done.stdout, (hostile / "ran").exists()) == ("['a', 'b']\n", False)
-
-
 def test_figures_have_the_settings_of_the_user_and_not_of_the_current_folder(
     hostile: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -217,15 +182,6 @@ def test_figures_have_the_settings_of_the_user_and_not_of_the_current_folder(
     guard = "from pfbench import cli; cli.main(['--version']); "
     assert [ask(text).split()[-1] for text in (show, guard + show)] == ["red", "white"]
     assert ask(guard + show, MATPLOTLIBRC=str(own)).endswith("blue")
-
-
-def test_ray_puts_no_current_folder_before_the_libraries_of_its_workers(hostile: Path) -> None:
-    pytest.importorskip("ray", reason='needs Ray: pip install "pfbench[ray]"')
-    program = (
-        "from pfbench import job; job.compose(['hydra/launcher=ray_local']); "
-        "from ray.job_config import JobConfig; print(JobConfig()._runtime_env_has_working_dir())"
-    )
-    assert (ask(program), (hostile / "ran").exists()) == ("True", False)
 
 
 @pytest.mark.parametrize(

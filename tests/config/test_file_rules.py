@@ -81,7 +81,6 @@ def test_a_file_that_breaks_a_rule_is_refused(tmp_path: Path, name: str) -> None
 ACCEPTED: dict[str, tuple[str, str]] = {
     "package": ("train/a", "#  @package   b\nc: 1\n"),
     "sweep": ("experiment/a", SWEEP + "filter: ekf,sir\n"),
-    "launcher by name": ("experiment/a", "# @package _global_\ndefaults: [override /hydra/launcher: cores]\n"),
     "what the user gives": ("train/a", "root: ${data.root}\ncheckpoint_path: ${results_dir}/a/b.pt\n"),
     "a file that builds on another": ("noise/a", "defaults: [outliers, _self_]\nb: ${.probability}\nprobability: 0.1\n"),
 }  # fmt: skip
@@ -101,6 +100,10 @@ def test_only_files_of_the_user_s_own_folder_name_data(tmp_path: Path) -> None:
     (tmp_path / "hydra" / "launcher").mkdir(parents=True)
     (tmp_path / "hydra" / "launcher" / "mine.yaml").write_text("defaults: [joblib]\nn_jobs: 3\n")
     assert compose(tmp_path, "noise/a", text, "hydra/launcher=mine", scheme="own").values
+    choice = "# @package _global_\ndefaults: [override /hydra/launcher: cores]\n"
+    assert compose(tmp_path, "experiment/a", choice, scheme="own").values
+    with pytest.raises(UntrustedConfigError, match="may choose a launcher: basic, cores"):
+        compose(tmp_path, "experiment/b", choice)
     with pytest.raises(UntrustedConfigError, match="must not be a setting of hydra"):
         compose(tmp_path, "noise/a", NOISE, "hydra/launcher=mine")
 

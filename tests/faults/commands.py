@@ -1,5 +1,7 @@
 """Whole commands in the folder of a stranger, each process of them under an audit hook.
 
+Most commands run in a copy of this process, which has run each of them once and so has its libraries. Others are new processes.
+
 The folder has programs where git, Python, matplotlib, Hydra and pytest look, and results, caches, links and configuration
 files that lead to them or to a secret. Each program leaves a mark. The hook records what is opened, imported or started
 undeclared (`watched/sitecustomize.py`), in the processes that a command starts too.
@@ -8,6 +10,7 @@ undeclared (`watched/sitecustomize.py`), in the processes that a command starts 
 from __future__ import annotations
 
 import copy
+import gc
 import importlib
 import json
 import os
@@ -17,11 +20,13 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from contextlib import chdir
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from unittest import mock
 
+import synthetic_log
 from checkout import ROOT
 from command_line import environment, pfbench
 from judge_cases import drive, estimate, write
@@ -64,10 +69,17 @@ COMMANDS: dict[str, str] = {
     "paper": f"paper study={STUDY} width=120mm",
     "inspect": "inspect log",
     "open": f"open study={STUDY}",
+    "status": f"status study={STUDY}",
+    "list": "list noise",
+    "data": "data log",
+    "run, slurm": f"{SWEEP} hydra/launcher=slurm",
     **({"run, ray": f"{SWEEP} hydra/launcher=ray_local"} if find_spec("ray") else {}),
 }
-HEAVY, SELDOM = ("run, ray",), 50  # starts of a service, one in so many turns
-NEW_PROCESS = 25  # one in so many trials is a process of its own, which imports all its libraries
+SHARES: dict[str, float] = {
+    "run": 18, "run, own experiment": 20, "inspect": 15, "status": 10, "judge": 10, "report": 7, "replay": 7, "list": 5, "data": 4,
+    "run, serial": 1, "open": 1, "run, slurm": 0.5, "paper": 0.5, "run, cores": 0.3, "run, cores by a file": 0.3, "run, ray": 0.1,
+}  # fmt: skip
+NEW_PROCESS = 80  # one in so many trials is a process of its own, which imports all its libraries
 
 
 class Home:
@@ -118,11 +130,20 @@ def template() -> Path:
     truth = drive(30.0)
     write(truth, folder / "truth.csv")
     write(estimate(truth, 1.0, 1), folder / "mine.csv")
-    (folder / "log").mkdir()
-    write(truth, folder / "log" / "reference.csv")
+    synthetic_log.write(folder / "log", synthetic_log.tables(5.0))
     for name in ("conf", "reports", "worlds"):
         (folder / name).mkdir()
     return folder
+
+
+@cache
+def load_libraries() -> None:
+    """Run most commands once in this process, so that its copies import and compose little."""
+    for command, words in COMMANDS.items():
+        if SHARES[command] >= 1:
+            with new_home() as path, chdir((home := Home(path)).place):
+                pfbench(*words.split(), home=home.place)
+    gc.freeze()
 
 
 def plant_modules(home: Home, rng: random.Random) -> None:
@@ -185,9 +206,14 @@ def plant_caches(home: Home, rng: random.Random) -> None:
 
 def plant_configuration(home: Home, rng: random.Random) -> None:
     """Files of groups, of which the experiments choose a launcher."""
-    key = rng.choice(["a", '"\\e[31m"', "trust", "'proposal.checkpoint'", "reading", "checkpoint"])
+    key = rng.choice(
+        ["", "filter: {", "noise: {", "scenario: {model: {", "hydra: {", "hydra: {launcher: {"]
+    ) + rng.choice(["a", '"\\e[31m"', "trust", "'proposal.checkpoint'", "reading", "checkpoint"])
     value = rng.choice(["1", "'['", "../outside/secret.csv", "${oc.env:HOME}", "{_target_: os.system}"])  # fmt: skip
-    home.write("conf/experiment/mine.yaml", f"# @package _global_\nstudy: new\n{key}: {value}\n")
+    home.write(
+        "conf/experiment/mine.yaml",
+        f"# @package _global_\nstudy: new\n{key}: {value}{'}' * key.count('{')}\n",
+    )
     home.write("conf/experiment/cores.yaml", "# @package _global_\ndefaults:\n  - override /hydra/launcher: cores\nstudy: new\n")  # fmt: skip
     home.write("conf/noise/theirs.yaml", "_target_: mylab.Noise\n")
 
@@ -247,12 +273,12 @@ def attempt(command: str, number: int, in_process: bool = True) -> list[str]:
 
 
 def run(count: int, seed: int) -> Tally:
-    """Run each command in turn in folders of its own; `seed` is the number of the batch."""
+    """Run commands, drawn by their shares, in folders of their own; `seed` is the number of the batch."""
     tally = Tally("hostile commands")
+    load_libraries()
     for number in range(seed * 100_000, seed * 100_000 + count):
-        turn, place = divmod(number, len(COMMANDS))
-        command = list(COMMANDS)[place]
-        if command in HEAVY and turn % SELDOM:
-            command = "report"
+        command = random.Random(number).choices(
+            list(COMMANDS), [SHARES[name] for name in COMMANDS]
+        )[0]
         tally.add(*attempt(command, number, in_process=bool(number % NEW_PROCESS)))
     return tally

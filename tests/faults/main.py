@@ -61,7 +61,7 @@ CLASSES: dict[str, FaultClass] = {
     },
     "hostile files": FaultClass(hostile.run, hostile.CASES, hostile.BATCH),
     "hostile folders": FaultClass(folders.run, 10_000, 100, 2 * len(folders.KINDS)),
-    "hostile commands": FaultClass(commands.run, 10_000, 20, len(commands.COMMANDS)),
+    "hostile commands": FaultClass(commands.run, 10_000, 100, len(commands.COMMANDS)),
     **{
         f"extreme numbers, {engine}": FaultClass(
             partial(numerics.run, engine), numerics.number_of_trials(engine), numerics.BATCH

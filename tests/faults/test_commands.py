@@ -21,7 +21,7 @@ def loaded() -> None:
     commands.template()
 
 
-@pytest.mark.parametrize("command", ["report", "replay", "judge"])
+@pytest.mark.parametrize("command", ["run", "report", "replay", "judge"])
 def test_a_command_opens_and_starts_nothing_undeclared(command: str) -> None:
     outcome, _, example = commands.attempt(command, 1)
     assert outcome == FINE, example
@@ -86,7 +86,3 @@ def test_an_opened_door_is_seen(
     monkeypatch.setattr("pfbench.cli.run.check_words", open_door)
     outcome, _, example = commands.attempt("run", 1)
     assert outcome == DOORS[door], example
-
-
-def test_a_command_without_a_door_is_fine() -> None:
-    assert commands.attempt("run", 1)[0] == FINE
