@@ -160,6 +160,7 @@ function drawBoard() {
   const shown = view();
   const several = cellsInView().length > 1;
   find("#answer").innerHTML = strong(shown.sentence);
+  find("#answer").hidden = find("p.answer:not(#answer)") !== null && state.world === data.opening[1];
   find("#small").textContent = shown.small_print;
   const scope = (axis, items, noun) =>
     state[axis] !== "all"
