@@ -12,10 +12,10 @@ import io
 import json
 import math
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 import pytest
 from checkout import ROOT, list_published
@@ -226,107 +226,59 @@ def compare_in_console(pack: dict[str, Any], table: pd.DataFrame) -> list[str]:
     return problems
 
 
-def check_ratios(pack: dict[str, Any], table: pd.DataFrame) -> list[str]:
-    """Ratios of a study of one condition by hand: Hodges and Lehmann of the log errors, a lost run infinite."""
-    if table.groupby(["scenario", "regime"]).ngroups > 1:
-        return []
-    errors = table["rmse"].where(table["keeps_track"], math.inf)
-    wide = table.assign(log=np.log(errors.astype(float))).pivot_table(
-        "log", ["seed", "run"], "filter"
-    )
-    problems = []
-    for row in pack["decisions"]:
-        first, second = wide[row["a"]].to_numpy(), wide[row["b"]].to_numpy()
-        lost = np.isinf(first) | np.isinf(second)
-        if math.isnan(row["ratio"]) != (lost.mean() > 0.2):
-            problems.append(
-                f"{row['a']} {row['b']}: ratio {row['ratio']} with {lost.sum()} lost pairs"
-            )
-        elif not lost.any():
-            means = np.add.outer(first - second, first - second)[np.triu_indices(len(first))] / 2
-            if not math.isclose(math.exp(np.median(means)), row["ratio"], rel_tol=1e-4):
-                problems.append(f"{row['a']} {row['b']}: {row['ratio']} is not that of the errors")
-    return problems
+def compute_again(study: str, texts: dict[str, str], folder: Path) -> list[str]:
+    """Compute the tables of a study again from its stored runs by scipy alone, without any code of pfbench."""
+    for name in ("decisions.csv", "verdicts.csv"):
+        (folder / name).write_text(texts[name])
+    shutil.copy(ROOT / "reports" / study / RUNS_FILE, folder)
+    (rows, problems), (pairs, others) = compare_rows(folder), compare_pairs(folder, 10**6)
+    return problems + others if rows and pairs else [f"{study}: nothing was computed"]
 
 
-@pytest.fixture(scope="module")
-def growth() -> tuple[dict[str, Any], dict[str, str]]:
-    return read_texts(FEW[0])
-
-
-@pytest.mark.parametrize("study", FEW)
-def test_a_pair_has_one_word_and_one_ratio(study: str) -> None:
+def check_study(study: str, folder: Path) -> None:
     pack, texts = read_texts(study)
     count, problems = crawl(pack, texts)
     assert count > 20
-    assert problems == []
-    stored = read_stored_study(ROOT / "reports" / study)
-    assert compare_in_console(*stored) == check_ratios(*stored) == []
+    console = compare_in_console(*read_stored_study(ROOT / "reports" / study))
+    assert problems == console == compute_again(study, texts, folder) == []
 
 
-def plant_in_html(text: str, column: str, change: Any) -> str:
+@pytest.mark.parametrize("study", FEW)
+def test_a_pair_has_one_word_and_one_ratio(study: str, tmp_path: Path) -> None:
+    check_study(study, tmp_path)
+
+
+def plant_in_html(text: str, column: str, value: Any) -> str:
     data = read_html(text)
-    place = data["views"]["columns"].index(column)
-    row = next(
-        r
-        for r in data["views"]["rows"][0]
-        if r[data["views"]["columns"].index("verdict")] not in OTHERS
-    )
-    row[place] = change(row[place])
+    columns = data["views"]["columns"]
+    row = next(r for r in data["views"]["rows"][0] if r[columns.index("verdict")] not in OTHERS)
+    row[columns.index(column)] = value
     packed = base64.b64encode(gzip.compress(json.dumps(data).encode())).decode()
     return re.sub(r'(id="data">)[^<]*<', lambda m: f"{m[1]}{packed}<", text)
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        "word in html",
-        "ratio in html",
-        "number in report.md",
-        "word in report.md",
-        "word in a table",
-        "first filter",
-    ],
-)
-def test_a_planted_contradiction_is_found(
-    kind: str, growth: tuple[dict[str, Any], dict[str, str]]
-) -> None:
-    pack, texts = growth
-    planted = dict(texts)
-    if kind == "word in html":
-        planted["index.html"] = plant_in_html(
-            texts["index.html"], "verdict", lambda v: "equal" if v != "equal" else "worse"
-        )
-    elif kind == "ratio in html":
-        planted["index.html"] = plant_in_html(texts["index.html"], "ratio", lambda v: 1.1 * v)
-    elif kind == "number in report.md":
-        planted["report.md"] = re.sub(
-            r"(\| 1 \| [^|]*\| )([\d.]+)",
-            lambda m: f"{m[1]}{1.2 * float(m[2]):.2f}",
-            texts["report.md"],
-            count=1,
-        )
-    elif kind == "word in report.md":
-        planted["report.md"] = re.sub(r"(\| \W*)equal within", r"\1better within", texts["report.md"], count=1)  # fmt: skip
-    elif kind == "word in a table":
-        planted["decisions.csv"] = re.sub(r",equal,", ",worse,", texts["decisions.csv"], count=1)
-    else:
-        planted["report.md"] = re.sub(
-            r"^(\| 1 \| )[^|]* \|", r"\1Another |", texts["report.md"], count=1, flags=re.MULTILINE
-        )
-    changed = [name for name in texts if texts[name] != planted[name]]
-    assert len(changed) == 1
-    assert crawl(pack, planted)[1] != []
+PLANTED = {
+    "word in html": ("index.html", lambda text: plant_in_html(text, "verdict", "worse")),
+    "ratio in html": ("index.html", lambda text: plant_in_html(text, "ratio", 1.234)),
+    "number in report.md": ("report.md", lambda text: text.replace("| 0.998 [", "| 0.898 [", 1)),
+    "word in report.md": ("report.md", lambda text: text.replace("equal within", "better within", 1)),
+    "word in a table": ("decisions.csv", lambda text: text.replace(",equal,", ",worse,", 1)),
+    "sentence": ("report.md", lambda text: text.replace("first in the table: ", "first in the table: Another ", 1).replace("Of ", "Of all ", 1)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", PLANTED)
+def test_a_planted_contradiction_is_found(kind: str) -> None:
+    pack, texts = read_texts(FEW[0])
+    name, change = PLANTED[kind]
+    changed = change(texts[name])
+    assert changed != texts[name]
+    assert crawl(pack, {**texts, name: changed})[1] != []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("study", [p.name for p in list_published() if (p / RUNS_FILE).is_file()])
+@pytest.mark.parametrize(
+    "study", [p.name for p in list_published() if (p / RUNS_FILE).is_file() and p.name not in FEW]
+)
 def test_a_pair_has_one_word_and_one_ratio_in_every_study(study: str, tmp_path: Path) -> None:
-    pack, texts = read_texts(study)
-    stored = read_stored_study(ROOT / "reports" / study)
-    assert crawl(pack, texts)[1] == compare_in_console(*stored) == check_ratios(*stored) == []
-    for name in ("decisions.csv", "verdicts.csv"):
-        (tmp_path / name).write_text(texts[name])
-    (tmp_path / RUNS_FILE).write_bytes((ROOT / "reports" / study / RUNS_FILE).read_bytes())
-    metric = pack["facts"]["options"]["metric"]
-    assert compare_rows(tmp_path, metric)[1] == compare_pairs(tmp_path, 10**6)[1] == []
+    check_study(study, tmp_path)
