@@ -6,7 +6,7 @@ kept one, and two lost runs tie. Ranks, signs and means of pairs need no number 
 A verdict needs three tests that agree: Wilcoxon's signed-rank test, whose estimate is that of Hodges and Lehmann and
 whose interval is printed, the t test of the trimmed mean, and the sign test. Each holds the error rate of the family by
 Holm's correction. With skewed differences the first two reject although each filter has the smaller error in half of the
-runs; the sign test does not. It is of one side, that of the ratio, since the word has no other. Lost runs have a word of
+runs; the sign test does not. It is of one side, that of the ratio. Lost runs have a word of
 their own, by McNemar's exact test.
 
 References:

@@ -251,8 +251,8 @@ def describe_view(
         first = better[0]
         size = _word_ratio(first)
         text = f", {size} of its {metric}" if size else ""
-        place = "first in the table" if first is rows[0] else "the first of them"
-        head += f" ({place}: [[{looks[first['filter']].name}]]{text})"
+        position = "first in the table" if first is rows[0] else "the first of them"
+        head += f" ({position}: [[{looks[first['filter']].name}]]{text})"
     head = f"{head}; {rest}." if rest else f"{head}."
     if f"[[{looks[rows[0]['filter']].name}]]" not in head:
         head += f" First in the table: [[{looks[rows[0]['filter']].name}]], {rows[0]['verdict']}."

@@ -264,8 +264,8 @@ def plan_world_pairs(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> di
     for name, rows in table.groupby("scenario", observed=True, sort=False):
         facts = _find_facts(central_rows(rows), str(name))
         bases = {PLAIN, facts.reference if facts else PLAIN}
-        named = [label for label in looks if parse_label(label)[0] in bases]
-        pairs[str(name)] = [*methods, *((a, b) for b in named for a in looks if a != b)]
+        references = [label for label in looks if parse_label(label)[0] in bases]
+        pairs[str(name)] = [*methods, *((a, b) for b in references for a in looks if a != b)]
     return pairs
 
 
@@ -511,7 +511,7 @@ def _build_tab(
     court: Court,
     is_shown: Callable[[MethodLook], bool] = is_method,
 ) -> Overview:
-    """Collect the tables of some filters, named without their numbers of particles."""
+    """Collect the tables of some filters under names without their numbers of particles."""
     names = {label: name_without_level(label) for label in labels}
     rows = table[table["filter"].isin(labels)]
     swept = [
@@ -605,15 +605,15 @@ def build_world(
     """
     (court, labels), present = judged, set(rows["filter"])
     name, regime = str(rows["scenario"].iloc[0]), rows["regime"].iloc[0]
-    named = {parse_label(label)[0]: label for label in labels if label in present}
-    if facts.reference not in named:
+    by_name = {parse_label(label)[0]: label for label in labels if label in present}
+    if facts.reference not in by_name:
         raise ValueError(
             f"{name} must have runs of its reference {facts.reference}, got none. Run filter={facts.reference} in this study."
         )
     conditions = court.runs.conditions
     mask = ((conditions["scenario"] == name) & (conditions["regime"] == regime)).to_numpy()
     present_labels = {key: label for key, label in labels.items() if key in present}
-    return World(name, named[facts.reference], facts.kalman_fits, court, mask, present_labels)
+    return World(name, by_name[facts.reference], facts.kalman_fits, court, mask, present_labels)
 
 
 def describe_world(world: World, name: PartName, looks: Mapping[str, MethodLook]) -> WorldRow:
