@@ -125,6 +125,13 @@ def sign_test(more: int, fewer: int) -> float:
     return float(stats.binomtest(more, more + fewer).pvalue) if more + fewer else 1.0
 
 
+def side_test(d: np.ndarray) -> float:
+    """Exact p-value of equal chances, of the side on which the median of the means of pairs is."""
+    side = -1 if estimate(d, 0.5)[0] < 0 else 1
+    count = int((np.sign(d) == side).sum())
+    return float(stats.binomtest(count, int((d != 0).sum()), alternative="greater").pvalue)
+
+
 def decide_family(
     family: Sequence[np.ndarray], margin: float, alpha: float
 ) -> list[dict[str, Any]]:
@@ -138,6 +145,7 @@ def decide_family(
         sign_test(*counts) if yes else 1.0 for counts, yes in zip(alone, tested, strict=True)
     ]
     p, q, r = correct(signed), correct(trimmed), correct(mcnemar)
+    s = correct([side_test(d) if yes else 1.0 for d, yes in zip(differences, tested, strict=True)])
     rows = []
     for k, (losses, d) in enumerate(zip(family, differences, strict=True)):
         n, lost = len(d), np.isinf(losses)
@@ -155,14 +163,10 @@ def decide_family(
         else:
             low, high = min(low, 0.0), max(high, 0.0)
         word, side = "not decided", np.sign(location)
-        signs = int((d > 0).sum()), int((d < 0).sum())
         if -margin < low and high < margin:
             bounds = [stats.beta.ppf(0.95, count + 1, n - count) for count in alone[k]]
             word = "equal" if max(bounds) < 0.1 else "equal in kept runs"
-        elif (
-            p[k] < alpha and q[k] < alpha and side * trimmed_test(d)[0] > 0
-            and sign_test(*signs) < 0.05 and side * (signs[0] - signs[1]) > 0
-        ):  # fmt: skip
+        elif max(p[k], q[k], s[k]) < alpha and side * trimmed_test(d)[0] > 0:
             word = "better" if location < 0 else "worse"
         loses = (
             "" if r[k] >= alpha else "loses more" if alone[k][0] > alone[k][1] else "loses fewer"
@@ -224,11 +228,14 @@ def flip(row: Mapping[str, Any]) -> dict[str, Any]:
     return {**row, **turned, **{k: swap.get(row[k], row[k]) for k in ("word", "loses") if k in row}}
 
 
-def read_fixed(folder: Path) -> set[frozenset[str]]:
-    """Pairs that decisions.csv calls fixed in advance."""
+def read_fixed(folder: Path) -> dict[str, set[frozenset[str]]]:
+    """Pairs that decisions.csv calls fixed in advance, over all conditions and in each world that has its own."""
     table = pd.read_csv(folder / "decisions.csv")
     rows = table[table["family"] == "fixed in advance"]
-    return {frozenset(pair) for pair in zip(rows["a"], rows["b"], strict=True)}
+    return {
+        world: {frozenset(pair) for pair in zip(some["a"], some["b"], strict=True)}
+        for world, some in rows.groupby("world")
+    }
 
 
 def compare_rows(folder: Path, metric: str = "") -> tuple[int, list[str]]:
@@ -244,7 +251,9 @@ def compare_rows(folder: Path, metric: str = "") -> tuple[int, list[str]]:
         if key[:3] not in scopes:
             present = set(view[view["verdict"] != "missing"]["filter"])
             runs = select_complete(stored.runs, key[1], key[2], present)
-            scopes[key[:3]] = decide_scope(runs, fixed, key[0], levels)
+            scopes[key[:3]] = decide_scope(
+                runs, fixed.get(key[1], fixed.get("all", set())), key[0], levels
+            )
         for row in view.to_dict("records"):
             expected = scopes[key[:3]].get((row["filter"], key[3]))
             if expected is not None and row["verdict"] != "missing":
@@ -297,7 +306,7 @@ def compare_pairs(folder: Path, most: int = 100) -> tuple[int, list[str]]:
             view = views[(views["world"] == world) & (views["regime"] == "all")]
             present = set(view[view["verdict"] != "missing"]["filter"])
         runs = select_complete(stored.runs, world, "all", present)
-        wanted = decide_scope(runs, fixed, options["metric"], levels)
+        wanted = decide_scope(runs, fixed.get(world, set()), options["metric"], levels)
         for row in rows.to_dict("records")[: most - count]:
             shown = {"verdict": row["word"], "ratio": row["ratio"], "ratio_low": row["low"], "ratio_high": row["high"], "p": row["p"], "loses": row["loses"]}  # fmt: skip
             problems += _compare_row(f"{folder.name} {world} {row['a']} {row['b']}", shown, wanted[row["a"], row["b"]])  # fmt: skip

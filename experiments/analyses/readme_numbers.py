@@ -19,8 +19,6 @@ from runpy import run_path
 from types import ModuleType
 from typing import Any
 
-import yaml
-
 from pfbench.files import markdown_bullets
 from pfbench.report import find_overviews, read_stored_study, tabulate_heat_map
 
@@ -198,13 +196,16 @@ def claims() -> str:
     return f"{format_table(('paper', *verdicts, 'claims'), rows)}\n\n{sentence}"
 
 
+@cache
+def read_overviews() -> Any:
+    """Tables of the first page of the study of all methods."""
+    return find_overviews(*read_stored_study(TOP / "reports" / "all_seven", decides=False))
+
+
 def all_seven() -> str:
     """First sentences of the study of all methods, and its heat map as a table."""
     folder = TOP / "reports" / "all_seven"
-    pack, table = read_stored_study(folder)
-    overviews = find_overviews(pack, table)
-    assert overviews is not None
-    head, rows = tabulate_heat_map(overviews)
+    head, rows = tabulate_heat_map(read_overviews())
     legend = (
         "Ratio of errors to the best Kalman filter of the world. Bold: shown to be better. Plain: shown to be worse. In brackets: not decided. "
         "=: within 5 %. A percentage is the share of runs that keep track, where it is shown to be below 80 %."
@@ -354,38 +355,43 @@ def tuned_worlds() -> str:
     return table
 
 
-_WINNERS = {  # worlds in the table of the README, by the file of their tuning
+_WINNERS = {  # worlds of all_seven in the table of the README
     "terrain": "Terrain-referenced navigation without a fix",
-    "passive_1_printed_nominal": "An emitter located by bearings alone, at 20 m/s",
-    "growth_nominal": "Growth model, two modes",
-    "flight_500s_with_ins_gnss_inflated_nominal": "Flight with GNSS fixes",
-    "recorded_car_drive_nominal": "Recorded car drive with GNSS fixes",
+    "passive_1_printed": "An emitter located by bearings alone, at 20 m/s",
+    "growth": "Growth model, two modes",
+    "gps_ins_inflated": "Flight with GNSS fixes",
+    "recorded_car_drive": "Recorded car drive with GNSS fixes",
 }
 
 
 def winners() -> str:
-    """Table of the ratio of SIR and RPF to the best Kalman filter in five worlds, from the files of their tunings."""
+    """Table of the ratio of SIR and RPF to the best Kalman filter in five worlds, from the first page of `all_seven`."""
+    overview = read_overviews()[1000]
+    cells = {(cell.world, cell.filter): cell for cell in overview.cells}
     rows = []
-    for name, words in _WINNERS.items():
-        content = yaml.safe_load((TOP / "conf" / "tuned" / f"{name}.yaml").read_text())
-        ratios = content["fit"]["ratios"]
-        cells = ("{:.2f} [{:.2f}, {:.2f}]".format(*ratios[key]) for key in ("sir", "rpf"))
-        verdict = "a Kalman filter" if content["kalman_fits"] else "a particle filter"
-        rows.append((words, f"`{content['best']}`", *cells, verdict))
-    return format_table(("world", "best Kalman filter", "SIR", "RPF", "use"), rows)
+    for world in (w for key in _WINNERS for w in overview.worlds if w.key == key):
+        texts = [word_verdict(cells[world.key, name].verdict) for name in ("sir", "rpf")]
+        rows.append((_WINNERS[world.key], world.reference, str(world.runs), *texts))
+    return format_table(("world", "best Kalman filter", "runs", "SIR", "RPF"), rows)
+
+
+def word_verdict(verdict: Any) -> str:
+    """Word a verdict with its ratio and interval, or with the runs that are lost."""
+    a, b, both, _ = verdict.lost
+    lost = f"loses {a + both} of {verdict.n} runs, the Kalman filter {b + both}"
+    size = "{:.2f} [{:.2f}, {:.2f}]".format(*verdict[3:6]).replace("inf", "∞")
+    return f"{size if verdict.ratio > 0 else lost}: {verdict.word}"
 
 
 def tie() -> str:
-    """Sentence on the world of the quickstart at ten times the speed, in which no filter wins."""
-    content = yaml.safe_load((TOP / "conf" / "tuned" / "passive_1_nominal.yaml").read_text())
-    sir, rpf = (
-        "{:.2f} [{:.2f}, {:.2f}]".format(*content["fit"]["ratios"][key]) for key in ("sir", "rpf")
-    )
-    is_tie = all(low < 1 < high for _, low, high in content["fit"]["ratios"].values())
-    verdict = "the same scene shows no difference" if is_tie else "one side wins the same scene"
+    """Sentence on the world of the quickstart at ten times the speed: a row of a view of `robust_simulated`."""
+    views = read_stored_study(TOP / "reports" / "robust_simulated").pack["views"]
+    rows = views["rmse", "passive_1", "nominal", "ekf_scaled_tuned"]["rows"]
+    row = next(row for row in rows if row["filter"] == "rpf")
+    size = f"{row['ratio']:.2f} [{row['ratio_low']:.2f}, {row['ratio_high']:.2f}]"
     return (
-        f"At 200 m/s in place of 20 m/s {verdict}: SIR has {sir} and RPF {rpf} times the error of `{content['best']}`, "
-        "with ten thousand particles."
+        f"At 200 m/s in place of 20 m/s RPF has {size} times the error of the same tuned EKF in [50 paired runs](reports/robust_simulated/report.md): "
+        f"{row['words']}."
     )
 
 

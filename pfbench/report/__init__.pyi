@@ -5,7 +5,6 @@ from pfbench.report.board.pack import (
     StudyFacts as StudyFacts,
     decide_parts as decide_parts,
 )
-from pfbench.report.board.view import find_lost_conditions as find_lost_conditions
 from pfbench.report.journal.figure_style import find_page_format as find_page_format
 from pfbench.report.journal.ratio_figures import (
     is_equal_drawing as is_equal_drawing,
@@ -47,3 +46,4 @@ from pfbench.results.plotting import (
     render_palette_png as render_palette_png,
     stacked_axes as stacked_axes,
 )
+from pfbench.stats.court import find_lost_conditions as find_lost_conditions

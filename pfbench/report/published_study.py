@@ -22,20 +22,23 @@ from pfbench.report.board import build_run_table
 from pfbench.report.board.pack import StudyFacts
 from pfbench.report.overview.figures import HEAT_FORMATS, draw_heat_map
 from pfbench.report.overview.page import choose_level
-from pfbench.report.overview.tables import CENTRAL, has_overview, read_world_facts
+from pfbench.report.overview.tables import (
+    CENTRAL,
+    METRIC,
+    World,
+    WorldResult,
+    decide_cells,
+    has_overview,
+    read_world_facts,
+)
 from pfbench.report.stored_study import RUNS_FILE, StoredStudy, read_stored_study
 from pfbench.report.study_report import find_overviews
 from pfbench.results.conditions import Condition, parse_label
 from pfbench.results.looks import study_looks
 from pfbench.stats.comparison import Verdict
+from pfbench.stats.court import Court, Pair
 from pfbench.stats.sentences import format_with_interval
-from pfbench.stats.world_table import (
-    World,
-    WorldResult,
-    build_world,
-    compare_with_each,
-    decide_cells,
-)
+from pfbench.stats.study_runs import arrange_runs
 
 _TOLERANCE = (
     1e-3  # relative difference of errors that agree up to rounding on another machine [ours]
@@ -48,7 +51,7 @@ class PublishedComparison(NamedTuple):
     """Own filters against each filter of a published study.
 
     Attributes:
-        verdicts: Verdicts of one family of tests, by the name of the condition.
+        verdicts: Verdicts of one family of tests in each condition, by its name.
         witnesses: A filter of each condition that ran in both studies, with equal errors.
         left_out: Conditions of the own study that are not compared, with the reason.
         cells: Own filters against the reference of each world, for the heat map; of these verdicts.
@@ -188,41 +191,49 @@ def compare_tables(table: pd.DataFrame, study: StoredStudy) -> PublishedComparis
             left_out[name] = str(error)
             continue
         members.append((name, rows, stored[stored["seed"] == rows["seed"].iloc[0]]))
-    pairs = [_make_pairs(*member) for member in members]
-    verdicts = dict(zip([m[0] for m in members], compare_with_each(pairs), strict=True))
+    joined, pairs = [], {}
+    for name, rows, stored in members:
+        both, pairs[name] = _make_pairs(rows, stored)
+        joined.append(both.assign(family=name, scenario=name, regime=""))
+    worlds = _open_worlds(joined, pairs)
+    verdicts = {name: [worlds[name].find(*pair) for pair in some] for name, some in pairs.items()}
     counts = {int(n) for _, rows, _ in members for n in rows["particles"].dropna()}
     return PublishedComparison(
         verdicts, witnesses, left_out,
-        _list_cells([w for w, _ in pairs], verdicts) if has_overview(study.table, facts.looks) else (),
+        _list_cells(worlds, pairs) if has_overview(study.table, facts.looks) else (),
         particles=counts.pop() if len(counts) == 1 else 0, study=study,
     )  # fmt: skip
 
 
+def _open_worlds(
+    joined: Sequence[pd.DataFrame], pairs: Mapping[str, Sequence[Pair]]
+) -> dict[str, World]:
+    """Open the court of own and stored runs, whose pairs are fixed in advance; return its conditions by name."""
+    if not joined:
+        return {}
+    table = pd.concat(joined)
+    labels = {str(v): str(v) for v in table["filter"].unique()}
+    court = Court(arrange_runs(table, tuple(labels)), (), fixed_in=pairs)
+    names = court.runs.conditions["scenario"]
+    return {name: World(name, "", None, court, (names == name).to_numpy(), labels) for name in pairs}  # fmt: skip
+
+
 def _list_cells(
-    worlds: Sequence[World], verdicts: Mapping[str, list[Verdict]]
+    worlds: Mapping[str, World], pairs: Mapping[str, Sequence[Pair]]
 ) -> list[WorldResult]:
-    """List the own filters against the reference of each world in nominal noise, with the verdicts that are decided.
+    """List the own filters against the reference of each world in nominal noise, for the heat map.
 
     A world without a stated reference, or whose reference did not run in the published study, has none.
     """
-    members: list[World] = []
-    decided: dict[tuple[str, str], Verdict] = {}
-    for world in worlds:
-        scenario, regime, model = world.name.split(" / ")
+    cells = []
+    for name, world in worlds.items():
+        scenario, regime, model = name.split(" / ")
         facts = read_world_facts(scenario, model)
-        if regime != CENTRAL or facts is None:
-            continue
-        against = {v.a: v for v in verdicts[world.name] if parse_label(v.b)[0] == facts.reference}
-        if against:
-            reference = next(iter(against.values())).b
-            members.append(world._replace(name=scenario, reference=reference))
-            decided |= {(scenario, label): verdict for label, verdict in against.items()}
-    labels = list(dict.fromkeys(label for _, label in decided))
-    return [
-        cell._replace(verdict=decided[cell.world, cell.filter])
-        for cell in decide_cells(members, labels)
-        if (cell.world, cell.filter) in decided
-    ]
+        against = {a: b for a, b in pairs[name] if facts and parse_label(b)[0] == facts.reference}
+        if regime == CENTRAL and against:
+            reference = next(iter(against.values()))
+            cells += decide_cells([world._replace(name=scenario, reference=reference)], list(against))  # fmt: skip
+    return cells
 
 
 def find_witness(rows: pd.DataFrame, stored: pd.DataFrame) -> str:
@@ -272,10 +283,8 @@ def _pair(rows: pd.DataFrame, stored: pd.DataFrame) -> pd.DataFrame:
     return plain[0].merge(plain[1], on=keys, suffixes=("", "_stored"))
 
 
-def _make_pairs(
-    name: str, rows: pd.DataFrame, stored: pd.DataFrame
-) -> tuple[World, list[tuple[str, str]]]:
-    """Make the world of a condition with the filters of both studies, and the pairs of own and published filters."""
+def _make_pairs(rows: pd.DataFrame, stored: pd.DataFrame) -> tuple[pd.DataFrame, list[Pair]]:
+    """Make the runs of a condition with the filters of both studies, and the pairs of own and published filters."""
     published = {str(v): parse_label(str(v))[0] for v in stored["filter"].unique()}
     labels = [
         str(v) for v in rows["filter"].unique() if parse_label(str(v))[0] not in published.values()
@@ -291,5 +300,5 @@ def _make_pairs(
         for b in published
         if pd.isna(counts[a]) or pd.isna(counts[b]) or counts[a] == counts[b]
     ]
-    joined = pd.concat([rows[rows["filter"].isin(labels)], stored]).assign(scenario=name)
-    return build_world(joined, next(iter(published))), pairs
+    columns = ["filter", "seed", "run", METRIC, "keeps_track"]
+    return pd.concat([rows[rows["filter"].isin(labels)], stored])[columns], pairs

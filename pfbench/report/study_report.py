@@ -15,7 +15,7 @@ from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import provenance, provenance as cost, writers
 from pfbench.report.board import build_pack, read_study
 from pfbench.report.board.entries import ViewKey
-from pfbench.report.board.pack import StudyFacts
+from pfbench.report.board.pack import StudyFacts, open_court
 from pfbench.report.board.study_views import DECISION_COLUMNS
 from pfbench.report.journal.ratio_figures import HEADLINE, render_headline
 from pfbench.report.options import ReportOptions
@@ -24,6 +24,7 @@ from pfbench.report.overview.tables import (
     FEWEST_WORLDS,
     Overview,
     TabKey,
+    add_levels,
     build_overviews,
     has_overview,
 )
@@ -163,7 +164,7 @@ def render_study(
 
 
 def find_overviews(pack: Mapping[str, Any], table: pd.DataFrame) -> dict[TabKey, Overview] | None:
-    """Decide the first page of a study with several proposed methods in several worlds.
+    """Collect the first page of a study with several proposed methods in several worlds, from the court of the study.
 
     Args:
         pack: Data of the page.
@@ -175,7 +176,9 @@ def find_overviews(pack: Mapping[str, Any], table: pd.DataFrame) -> dict[TabKey,
     facts = StudyFacts.from_pack(pack)
     if not has_overview(table, facts.looks):
         return None
-    overviews = build_overviews(table, facts.looks, facts.worlds)
+    table = add_levels(table, facts.looks)
+    court = open_court(table, facts.looks, facts.options)
+    overviews = build_overviews(table, facts.looks, facts.worlds, court)
     enough = all(len(overview.worlds) >= FEWEST_WORLDS for overview in overviews.values())
     return overviews if enough else None  # without references of worlds there is nothing to show
 

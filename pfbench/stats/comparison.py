@@ -4,9 +4,10 @@ All pages decide here. The loss of a run is the logarithm of its error, infinite
 kept one, and two lost runs tie. Ranks, signs and means of pairs need no number for it, so no error is replaced.
 
 A verdict needs three tests that agree: Wilcoxon's signed-rank test, whose estimate is that of Hodges and Lehmann and
-whose interval is printed, the t test of the trimmed mean, and the sign test. The first two hold the error rate of the
-family. With skewed differences the first rejects although each filter has the smaller error in half of the runs;
-the sign test, without a correction, does not. Lost runs have a word of their own, by McNemar's exact test.
+whose interval is printed, the t test of the trimmed mean, and the sign test. Each holds the error rate of the family by
+Holm's correction. With skewed differences the first two reject although each filter has the smaller error in half of the
+runs; the sign test does not. It is of one side, that of the ratio. Lost runs have a word of
+their own, by McNemar's exact test.
 
 References:
     F. Wilcoxon (1945), Individual comparisons by ranking methods.
@@ -89,7 +90,7 @@ class Evidence(NamedTuple):
         smaller: Share of the runs in which the first filter has the smaller error.
         larger: Share of the runs in which it has the larger one.
         p_trimmed: p-value of the trimmed mean with Holm's correction.
-        p_sign: p-value of the sign test, without a correction.
+        p_sign: p-value of the sign test on the side of the ratio with Holm's correction.
         p_lost: p-value of McNemar's test with Holm's correction.
         pairs: Number of pairs of the family.
     """
@@ -113,7 +114,7 @@ class Effect(NamedTuple):
             lost, 0 where both are.
         p: p-value of the signed-rank test, two-sided; 1 without a difference.
         p_trimmed: p-value of the trimmed mean.
-        p_sign: p-value of the sign test, two-sided.
+        p_sign: p-value of the sign test, of the side on which the log ratio is.
         lost: Runs that are lost.
         mean: Log ratio of the mean errors over the runs that both keep; NaN without one.
     """
@@ -232,8 +233,9 @@ def compare_all(
     p = _signed_rank_p(differences)
     effects = []
     for (a, b), d, value in zip(pairs, differences, p, strict=True):
-        tests = (float(value), _trimmed_p(d), _sign_p(int((d > 0).sum()), int((d < 0).sum())))
-        effects.append(Effect(a[0], b[0], unit, d, *tests, *_describe_losses(a[1], b[1])))
+        tests = (float(value), _trimmed_p(d), math.nan)
+        effect = Effect(a[0], b[0], unit, d, *tests, *_describe_losses(a[1], b[1]))
+        effects.append(effect._replace(p_sign=_side_p(d if d.any() and effect.is_smaller else -d)))
     return effects
 
 
@@ -262,8 +264,8 @@ def decide(
         alpha: Error rate of the family.
 
     Returns:
-        A verdict for each effect. "better" and "worse" need the signed-rank test and the trimmed mean after Holm's
-        correction, and the sign test without one. The word "equal" needs the interval within the margin, and bounds on the
+        A verdict for each effect. "better" and "worse" need the signed-rank test, the trimmed mean and the sign test, each
+        after Holm's correction. The word "equal" needs the interval within the margin, and bounds on the
         runs that one filter loses alone.
     """
     return [verdict() for verdict in open_family(effects, margin, alpha)]
@@ -278,17 +280,17 @@ def open_family(
     ]  # the others cannot be decided, but stay in the family
     corrected = [
         holm([getattr(e, name) if yes else 1.0 for e, yes in zip(effects, tested, strict=True)])
-        for name in ("p", "p_trimmed", "p_lost")
+        for name in ("p", "p_trimmed", "p_sign", "p_lost")
     ]
     return [
         partial(
             _decide_one,
             effect,
             float(p),
-            Evidence(*_share_signs(effect), float(q), effect.p_sign, float(r), len(effects)),
+            Evidence(*_share_signs(effect), float(q), float(s), float(r), len(effects)),
             (alpha / len(effects), margin, alpha),
         )
-        for effect, p, q, r in zip(effects, *corrected, strict=True)
+        for effect, p, q, s, r in zip(effects, *corrected, strict=True)
     ]
 
 
@@ -304,20 +306,17 @@ def is_testable(effect: Effect) -> bool:
 
 
 def find_largest_p(pairs: Sequence[tuple[Array, Array]]) -> float:
-    """Return the largest one-sided p-value of both tests: whether a filter is better than all others.
+    """Return the largest one-sided p-value of all three tests: whether a filter is better than all others.
 
     Each pair has the losses of the filter and of one other in their common runs. The test of the union of the
-    hypotheses needs no correction for their number; 1 unless the sign test agrees in each pair, as in `decide`.
+    hypotheses needs no correction for their number.
     Shapes: losses [n] of a pair.
     """
     differences = [subtract_losses(first, second) for first, second in pairs]
     if not differences or not all(map(_varies, differences)):
         return 1.0
-    counts = [(int((d > 0).sum()), int((d < 0).sum())) for d in differences]
-    if any(more >= fewer or _sign_p(more, fewer) >= ALPHA for more, fewer in counts):
-        return 1.0
     signed = map(float, _signed_rank_p(differences, "less"))
-    return max(*signed, *(_trimmed_p(d, "less") for d in differences))
+    return max(*signed, *(max(_trimmed_p(d, "less"), _side_p(d)) for d in differences))
 
 
 def _signed_rank_p(differences: Sequence[Array], alternative: Alternative = "two-sided") -> Array:
@@ -341,6 +340,12 @@ def _sign_p(more: int, fewer: int) -> float:
     """Return the p-value of the exact test that two counts have the same expectation, two-sided."""
     least, total = min(more, fewer), more + fewer
     return min(1.0, 2 * float(scipy.special.bdtr(least, total, 0.5))) if total else 1.0
+
+
+def _side_p(d: Array) -> float:
+    """Return the p-value of the sign test against a smaller error in most units: of one side; 1 without a difference."""
+    more, fewer = int((d > 0).sum()), int((d < 0).sum())
+    return float(scipy.special.bdtr(more, more + fewer, 0.5)) if more + fewer else 1.0
 
 
 def _varies(d: Array) -> bool:
@@ -401,7 +406,7 @@ def _choose_word(
     side = math.copysign(1.0, location)
     if evidence.p_trimmed >= alpha or _trimmed_mean(effect.differences)[0] * side <= 0:
         return NO_DECISION, "the trimmed mean does not agree"
-    if evidence.p_sign >= ALPHA or np.sign(effect.differences).sum() * side <= 0:
+    if evidence.p_sign >= alpha:
         return NO_DECISION, "the sign test does not agree"
     is_opposite = effect.unit == "run" and effect.mean * side < 0
     first, second = (effect.a, effect.b) if side < 0 else (effect.b, effect.a)
@@ -511,9 +516,9 @@ def _trimmed_p(d: Array, alternative: str = "two-sided") -> float:
         return 1.0
     value, error, df = _trimmed_mean(d)
     if math.isnan(error):
-        more, fewer = int((d > 0).sum()), int((d < 0).sum())
-        one_sided = float(scipy.special.bdtr(more, more + fewer, 0.5))
-        return one_sided if alternative == "less" else _sign_p(more, fewer)
+        return (
+            _side_p(d) if alternative == "less" else _sign_p(int((d > 0).sum()), int((d < 0).sum()))
+        )
     if value == 0:
         return 1.0
     t = value / error if error > 0 else math.copysign(math.inf, value)

@@ -2,14 +2,18 @@
 
 Two families of tests share the pairs of a selection: those that are fixed before the results, and all others. A pair
 is in one of them, so that pages, tables and consoles have the same word for it. They select verdicts, and compute none.
+A selection of one world has the pairs that are fixed in that world among the first, such as those with its reference.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from itertools import combinations
+
+import numpy as np
+import scipy  # scipy.stats is imported at its first use
 
 from pfbench.stats.comparison import (
     ALPHA,
@@ -20,6 +24,7 @@ from pfbench.stats.comparison import (
     open_family,
 )
 from pfbench.stats.error_measures import Array, Flags
+from pfbench.stats.rank_tests import holm
 from pfbench.stats.study_runs import (
     StudyRuns,
     compare_filters,
@@ -28,7 +33,9 @@ from pfbench.stats.study_runs import (
     share_conditions,
 )
 
+TRACK_SHARE = 0.8  # a filter that keeps track in a smaller share of runs loses track [ours]
 Pair = tuple[str, str]
+FAMILIES = ("fixed in advance", "all other pairs")
 _Family = dict[Pair, Callable[[], Verdict]]
 
 
@@ -39,6 +46,7 @@ class Court:
         runs: Runs of the study.
         margin: Log ratio within which two filters are equal.
         alpha: Error rate of each family.
+        fixed_in: Pairs that are fixed in one scenario besides the others.
     """
 
     def __init__(
@@ -47,12 +55,14 @@ class Court:
         fixed: Iterable[Pair],
         margin: float = EQUALITY_MARGIN,
         alpha: float = ALPHA,
+        fixed_in: Mapping[str, Iterable[Pair]] | None = None,
     ) -> None:
         self.runs, self.margin, self.alpha = runs, margin, alpha
         self._fixed = set(map(frozenset, fixed))
+        self.fixed_in = {k: set(map(frozenset, some)) for k, some in (fixed_in or {}).items()}
         self._pairs = list(combinations(sorted(runs.filters, key=natural_sort_key), 2))
         self._losses: dict[str, Array] = {}
-        self._families: dict[tuple[str, bytes, bool], _Family] = {}
+        self._families: dict[tuple[str, bytes], tuple[_Family, _Family]] = {}
 
     def find(self, metric: str, mask: Flags, a: str, b: str) -> Verdict:
         """Return the verdict on the first of two filters in a selection of conditions.
@@ -63,36 +73,65 @@ class Court:
             a: Label of the first filter.
             b: Label of the second filter.
         """
-        family = self._decide(metric, mask, frozenset((a, b)) in self._fixed)
-        if (a, b) in family:
-            return family[a, b]()
-        if (b, a) in family:
-            return flip(family[b, a]())
+        for family in self._decide(metric, mask):
+            if (a, b) in family:
+                return family[a, b]()
+            if (b, a) in family:
+                return flip(family[b, a]())
         reason = "no common runs"
         return Verdict(a, b, NO_DECISION, math.nan, 0.0, math.inf, math.nan, 0, reason=reason)
 
-    def list_verdicts(self, metric: str, mask: Flags) -> list[tuple[str, Verdict]]:
-        """List the verdicts on all pairs with common runs in a selection, each with the name of its family."""
-        both = {
+    def list_verdicts(
+        self, metric: str, mask: Flags, has_others: bool = True
+    ) -> list[tuple[str, Verdict]]:
+        """List the verdicts on all pairs with common runs in a selection, or on those fixed in advance, each with its family."""
+        both = dict(zip(FAMILIES, self._decide(metric, mask), strict=True))
+        some = {
             pair: (name, verdict())
-            for name, is_fixed in (("fixed in advance", True), ("all other pairs", False))
-            for pair, verdict in self._decide(metric, mask, is_fixed).items()
-        }
-        return [both[pair] for pair in self._pairs if pair in both]
+            for name in FAMILIES[: 1 + has_others] for pair, verdict in both[name].items()
+        }  # fmt: skip
+        return [some[pair] for pair in self._pairs if pair in some]
 
-    def _decide(self, metric: str, mask: Flags, is_fixed: bool) -> _Family:
-        """Decide a family, once."""
-        key = metric, mask.tobytes(), is_fixed
+    def losses(self, metric: str, mask: Flags) -> Array:
+        """Return the losses of all filters in a selection of conditions, [F, C, N]: infinite if lost, NaN without a run."""
+        if metric not in self._losses:
+            self._losses[metric] = compute_losses(self.runs, metric)
+        return self._losses[metric][:, mask]
+
+    def find_lost(self, mask: Flags) -> set[str]:
+        """Find the filters that lose track in each condition of a selection, by the tests of `find_lost_conditions`."""
+        is_lost = find_lost_conditions(self.runs.select(mask), self.alpha)
+        return {label for label, lost in zip(self.runs.filters, is_lost, strict=True) if lost.all()}
+
+    def _decide(self, metric: str, mask: Flags) -> tuple[_Family, _Family]:
+        """Decide both families of a selection, once."""
+        key = metric, mask.tobytes()
         if key not in self._families:
-            if metric not in self._losses:
-                self._losses[metric] = compute_losses(self.runs, metric)
-            selected, losses = self.runs.select(mask), self._losses[metric][:, mask]
-            pairs = [p for p in self._pairs if (frozenset(p) in self._fixed) == is_fixed]
-            pairs = [p for p in pairs if share_conditions(selected, *p)]
-            effects = compare_filters(selected, losses, pairs)
-            verdicts = map(cache, open_family(effects, self.margin, self.alpha))
-            self._families[key] = dict(zip(pairs, verdicts, strict=True))
+            selected, losses = self.runs.select(mask), self.losses(metric, mask)
+            scenarios = selected.conditions["scenario"].unique()
+            more = self.fixed_in.get(str(scenarios[0]), set()) if len(scenarios) == 1 else set()
+            pairs = [p for p in self._pairs if share_conditions(selected, *p)]
+            effects = dict(zip(pairs, compare_filters(selected, losses, pairs), strict=True))
+            families: list[_Family] = []
+            for is_fixed in (True, False):
+                some = [p for p in pairs if (frozenset(p) in self._fixed | more) == is_fixed]
+                opened = open_family([effects[p] for p in some], self.margin, self.alpha)
+                families.append(dict(zip(some, map(cache, opened), strict=True)))
+            self._families[key] = families[0], families[1]
         return self._families[key]
+
+
+def find_lost_conditions(runs: StudyRuns, alpha: float) -> Flags:
+    """Find where it is shown that a filter keeps track in fewer than 80 % of runs, by exact binomial tests, [F, C].
+
+    Args:
+        runs: Runs of a study.
+        alpha: Error rate of all filters and conditions together.
+    """
+    number = runs.present.sum(axis=2)
+    successes = (runs.keeps & runs.present).sum(axis=2)
+    p = np.where(number > 0, scipy.stats.binom.cdf(successes, number, TRACK_SHARE), 1.0)
+    return np.asarray(holm(p.ravel()).reshape(p.shape) < alpha)
 
 
 def fix_pairs(filters: Sequence[str], planned: Iterable[Pair], baseline: str) -> list[Pair]:

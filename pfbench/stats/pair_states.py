@@ -23,9 +23,10 @@ from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from pfbench.files.atomic_write import DIGEST, has_valid_digest, hash_content, write_atomically
-from pfbench.stats.comparison import ALPHA, EQUALITY_MARGIN, NO_DECISION, Verdict, decide
+from pfbench.stats.comparison import ALPHA, EQUALITY_MARGIN, NO_DECISION, Verdict
+from pfbench.stats.court import Court
 from pfbench.stats.error_measures import Array
-from pfbench.stats.study_runs import StudyRuns, compare_filters, compute_losses
+from pfbench.stats.study_runs import StudyRuns
 
 _NODES = 121
 _LARGEST = 37.0  # standard score beyond which a normal tail is zero in double precision
@@ -75,11 +76,14 @@ def decide_at_looks(
         raise ValueError(
             f"runs must be at least {schedule.runs[0]}, got {runs.present.shape[-1]}. Add runs."
         )
-    losses, levels = compute_losses(runs, metric), look_levels(schedule.runs, alpha / len(pairs))
+    levels = look_levels(schedule.runs, alpha / len(pairs))
+    everywhere = np.ones(len(runs.conditions), dtype=bool)
     states: list[PairState] = []
     for number, level in zip(looks, levels, strict=False):
-        effects = compare_filters(runs, losses[..., :number], pairs)
-        verdicts = decide(effects, margin, level * len(pairs))  # whose first step is the level
+        court = Court(
+            runs.take_first(number), pairs, margin, level * len(pairs)
+        )  # whose first step is the level
+        verdicts = [court.find(metric, everywhere, *pair) for pair in pairs]
         earlier = states or [PairState(v, True) for v in verdicts]
         states = [
             state if not state.is_open else PairState(v, v.word == NO_DECISION)

@@ -46,6 +46,13 @@ class StudyRuns(NamedTuple):
     keeps: Flags
     present: Flags
 
+    def take_first(self, number: int) -> StudyRuns:
+        """Take the first runs."""
+        values = {name: value[..., :number] for name, value in self.values.items()}
+        return self._replace(
+            values=values, keeps=self.keeps[..., :number], present=self.present[..., :number]
+        )
+
     def select(self, mask: Flags) -> StudyRuns:
         """Select conditions.
 

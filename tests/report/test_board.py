@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from checkout import ROOT
-from scipy import stats
 
 from pfbench.report import RUNS_FILE, read_stored_study
 from pfbench.report.board.entries import StudyNames, metric_entries
@@ -81,30 +80,6 @@ def differences(data: pd.DataFrame, a: str, b: str) -> np.ndarray:
     return (wide[a] - wide[b]).to_numpy()
 
 
-def test_ratio_interval_and_p_of_a_row_are_those_of_scipy() -> None:
-    """An end of the interval is where the p-value of the shifted differences crosses the level of the family."""
-    data = table({"mcmc_rpf": -0.3, "sir": 0.0, "ukf": 0.03, "rpf": 0.01})
-    rows, p = board(data), {}
-    for label in ("mcmc_rpf", "ukf", "rpf"):
-        d = differences(data, label, "sir")
-        means = np.add.outer(d, d)[np.triu_indices(len(d))] / 2
-        assert rows[label]["ratio"] == pytest.approx(math.exp(np.median(means)))
-        p[label] = stats.wilcoxon(d).pvalue
-    order = sorted(p, key=lambda label: p[label])
-    largest = 0.0
-    for k, label in enumerate(order):
-        largest = max(largest, min(1.0, (3 - k) * p[label]))
-        assert rows[label]["p"] == pytest.approx(largest)
-    for label in ("ukf", "rpf"):
-        d = differences(data, label, "sir")
-        for end, sign in (("ratio_low", -1), ("ratio_high", 1)):
-            if rows[label][end] == 1.0:
-                continue  # of a rejection by Holm's later steps
-            log = math.log(rows[label][end])
-            outside, inside = (stats.wilcoxon(d - log - sign * s).pvalue for s in (1e-6, -1e-6))
-            assert outside < 0.05 / 3 < inside
-
-
 def test_the_interval_of_a_median_has_the_order_statistics_of_the_level() -> None:
     data = table(worlds=1)
     data = data[data["regime"] == "nominal"]
@@ -157,22 +132,6 @@ def test_word_interval_and_p_of_a_row_agree(lost: int) -> None:
                 assert p >= 0.05 or "does not agree" in row["words"]
                 assert low <= 1 / 1.05 or high >= 1.05
     assert set(words) >= {"better", "worse", "equal", "not decided"}
-
-
-def test_equal_filters_are_rarely_called_better_or_worse() -> None:
-    """A/A studies of three equal filters with lost runs: at the level within 2.5 standard errors, and with power."""
-    studies, wrong, found = 300, 0, 0
-    for seed in range(studies):
-        for effect in (0.0, -0.15):
-            data = table({"sir": 0.0, "ukf": effect, "gpf": 0.0}, 1, 24, seed)
-            rng = np.random.default_rng([7, seed])
-            data["keeps_track"] = rng.uniform(size=len(data)) > 0.05
-            words = {k: row["verdict"] for k, row in board(data).items()}
-            said = [words[k] in ("better", "worse") for k in ("ukf", "gpf")]
-            wrong += effect == 0 and any(said)
-            found += effect != 0 and words["ukf"] == "better"
-    assert wrong / studies <= 0.05 + 2.5 * math.sqrt(0.05 * 0.95 / studies)
-    assert found / studies > 0.5
 
 
 def test_verdicts_of_few_equal_and_missing_filters() -> None:
@@ -305,6 +264,14 @@ def test_sentences_of_small_studies(runs: int, labels: list[str], is_lost: bool)
         )
 
 
+def test_a_sentence_names_the_first_filter_of_its_table_even_if_it_is_not_better() -> None:
+    rows = list(board(table({"sir": 0.0, "mcmc_rpf": -0.5, "ckf": -0.6}, worlds=1, runs=30)).values())  # fmt: skip
+    rows.sort(key=lambda row: row["filter"] != "ckf")
+    text = describe_view([{**rows[0], "verdict": "not decided"}, *rows[1:]], find_looks(["sir", "mcmc_rpf", "ckf"]), "sir", "", "error")  # fmt: skip
+    assert "(the first of them: [[MCMC-RPF]]" in text
+    assert "First in the table: [[CKF]], not decided." in text
+
+
 def test_the_counts_of_a_sentence_are_those_of_its_rows() -> None:
     effects = {
         "sir": 0.0,
@@ -370,39 +337,6 @@ def test_sentences_of_published_studies_have_at_most_55_words(study: str) -> Non
 
 
 # pairs that are compared in advance
-
-
-def test_planned_pairs_have_the_numbers_of_the_board() -> None:
-    """One family of all planned pairs; each scenario has its own interval."""
-    data = table({"mcmc_rpf": -0.3, "sir": 0.0, "rpf": 0.1})
-    looks, options = find_looks(sorted(data["filter"].unique())), ReportOptions(alpha=0.1)
-    worlds = {k: PartName(k, f"World {k}", "", "m", CAP, k) for k in ("w0", "w1")}
-    court = Court(arrange_runs(data, looks), plan_look_pairs(looks), MARGIN, options.alpha)
-    entries = planned_entries(court, looks, worlds, options)
-    assert [(entry["a"], entry["b"]) for entry in entries] == [
-        ("mcmc_rpf", "sir"),
-        ("mcmc_rpf", "rpf"),
-    ]
-    for entry in entries:
-        pair = data[data["filter"].isin([entry["a"], entry["b"]])]
-        # level 0.1 / 2: the family has two pairs
-        rows = build_rows(make_view(pair, True, 0.05, entry["b"]), entry["b"])
-        row = next(row for row in rows if row["filter"] == "mcmc_rpf")
-        shown = [entry[name] for name in ("estimate", "low", "high")]
-        assert shown == pytest.approx(
-            [row[name] for name in ("ratio", "ratio_low", "ratio_high")], rel=1e-3
-        )
-        assert entry["word"] == "better"
-        assert (
-            f"[[MCMC-RPF]] has a smaller error than [[{looks[entry['b']].name}]] in most runs"
-            in entry["sentence"]
-        )
-        assert "30 paired runs" in entry["sentence"]
-        assert entry["new_world"] is None  # ten worlds are required
-        for cell in entry["cells"]:
-            own = board(pair[pair["scenario"] == cell["world"]], entry["b"])["mcmc_rpf"]
-            assert cell["estimate"] == pytest.approx(own["ratio"], rel=1e-3)
-            assert cell["name"] == f"World {cell['world']}"
 
 
 def test_the_interval_of_a_new_world_needs_ten_worlds() -> None:

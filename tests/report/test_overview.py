@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 import math
 import re
 import subprocess
@@ -15,12 +14,12 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
-import statsmodels.api
-import statsmodels.formula.api
 from checkout import ROOT
 from scipy import stats
 
 from pfbench.report import study_report
+from pfbench.report.board.pack import open_court
+from pfbench.report.options import ReportOptions
 from pfbench.report.overview import figures
 from pfbench.report.overview.page import (
     choose_level,
@@ -37,32 +36,31 @@ from pfbench.report.overview.tables import (
     PRINTED,
     Overview,
     TabKey,
-    build_overview,
+    Winner,
+    World,
+    WorldFacts,
+    add_levels,
     build_overviews,
+    build_world,
     central_rows,
+    count_recorded_drives,
+    count_wins,
+    decide_cells,
+    find_winners,
     has_overview,
     is_worse,
     list_levels,
     list_rivals,
+    list_world_notes,
     name_without_level,
     read_world_facts,
     tell_story,
 )
-from pfbench.report.overview.world_notes import count_recorded_drives, list_world_notes
 from pfbench.results.conditions import make_distinct_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.stats.comparison import EQUAL_WORDS
-from pfbench.stats.world_table import (
-    SHARED_SEEDS,
-    Winner,
-    World,
-    build_world,
-    compare_methods,
-    count_wins,
-    decide_cells,
-    find_winners,
-    rank_methods,
-)
+from pfbench.stats.court import FAMILIES, Court
+from pfbench.stats.study_runs import StudyRuns, arrange_runs
 
 RUNS, FAR = ROOT / "tests" / "all_seven_runs.parquet", 1e6
 WORLDS = ("azimuth", "passive_1", "sar_flight_short")
@@ -92,6 +90,19 @@ def parts(table: pd.DataFrame) -> dict[str, PartName]:
     return {key: PartName(key, key, key, "m", float(limits[key])) for key in WORLDS}
 
 
+def build_tabs(
+    table: pd.DataFrame, looks: dict[str, MethodLook], parts: dict[str, PartName]
+) -> dict[TabKey, Overview]:
+    table = add_levels(table, looks)
+    return build_overviews(table, looks, parts, open_court(table, looks, ReportOptions()))
+
+
+def build_overview(
+    table: pd.DataFrame, looks: dict[str, MethodLook], parts: dict[str, PartName]
+) -> Overview:
+    return build_tabs(table, looks, parts)[0]
+
+
 @pytest.fixture(scope="module")
 def overview(
     table: pd.DataFrame, looks: dict[str, MethodLook], parts: dict[str, PartName]
@@ -112,49 +123,35 @@ def adjust(p: list[float]) -> np.ndarray:
     return np.minimum(steps, 1.0)[np.argsort(order)]
 
 
-def test_pairs_of_methods_are_those_of_scipy(table: pd.DataFrame, overview: Overview) -> None:
+def test_pairs_of_methods_are_those_of_scipy(
+    table: pd.DataFrame, looks: dict[str, MethodLook], overview: Overview
+) -> None:
+    """All pairs that a world fixes in advance are one family; the page shows those of methods and of the reference."""
     assert len(overview.methods) == 7
     assert len(overview.pairs) == len(WORLDS) * 21
-    p = []
-    for pair in overview.pairs:
-        both = [losses(table, pair.world, label) for label in (pair.verdict.a, pair.verdict.b)]
-        d, has_lost = both[0] - both[1], np.maximum(*both) == FAR
-        d = np.where(np.abs(d) > FAR / 2, np.sign(d) * FAR, np.where(np.abs(d) <= 1e-6, 0.0, d))
-        p.append(float(stats.wilcoxon(d, zero_method="zsplit").pvalue) if d.any() else 1.0)
-        i, j = np.triu_indices(len(d))
-        ratio = math.nan if has_lost.mean() > 0.2 else math.exp(np.median((d[i] + d[j]) / 2))
-        assert pair.verdict.ratio == pytest.approx(ratio, nan_ok=True)
-    corrected = adjust(p)
-    stated = np.array([pair.verdict.p for pair in overview.pairs])
-    tested = ~np.isnan(stated)
-    assert stated[tested] == pytest.approx(corrected[tested], rel=1e-6, abs=1e-12)
-    decided = np.array([pair.verdict.word in ("better", "worse") for pair in overview.pairs])
-    assert decided.sum() > 20
-    assert (corrected[decided] < 0.05).all()
-
-
-def test_the_pairs_of_the_old_study_are_those_of_scipy(parts: dict[str, PartName]) -> None:
-    """Its lost runs have the largest ranks; with the cap that once replaced them 400 of 588 rejected."""
-    runs = pd.read_parquet(RUNS)
-    methods = [
-        "mcmc_rpf", "qmc_polymerised", "fm_mssrckf", "cofm_mssrckf", "cofm_amssrcpf", "dmc_reconstructed",
-        "cpso_escape",
-    ]  # fmt: skip
-    runs = runs[runs["filter"].isin([*methods, "ekf"])]
-    worlds = [build_world(rows, "ekf") for _, rows in runs.groupby(["scenario", "regime"], observed=True)]  # fmt: skip
-    p = []
-    for _, rows in runs.groupby(["scenario", "regime"], observed=True):
-        logs = np.log(rows["rmse"].astype(float)).where(rows["keeps_track"], 1e6)
-        wide = rows.assign(log=logs).pivot_table("log", "run", "filter", observed=True)
-        for a, b in itertools.combinations(methods, 2):
-            d = (wide[a] - wide[b]).to_numpy()
-            d = np.where(np.abs(d) > 1e5, np.sign(d) * 1e6, np.where(np.abs(d) < 1e-6, 0.0, d))
-            p.append(stats.wilcoxon(d, zero_method="zsplit").pvalue if d.any() else 1.0)
-    found = compare_methods(worlds, methods)
-    rejected = sum(pair.verdict.p < 0.05 for pair in found)
-    assert rejected == (adjust(np.array(p)) < 0.05).sum()
-    assert 380 < rejected < 420
-    assert rank_methods(worlds, methods).reason == SHARED_SEEDS
+    court, decided = open_court(table, looks, ReportOptions()), 0
+    for world in WORLDS:
+        mask = (court.runs.conditions["scenario"] == world).to_numpy()
+        family = [v for name, v in court.list_verdicts("rmse", mask) if name == FAMILIES[0]]
+        p = [1.0] * len(family)
+        for k, verdict in enumerate(family):
+            both = [losses(table, world, label) for label in (verdict.a, verdict.b)]
+            d = both[0] - both[1]
+            d = np.where(np.abs(d) > FAR / 2, np.sign(d) * FAR, np.where(np.abs(d) <= 1e-6, 0.0, d))
+            p[k] = float(stats.wilcoxon(d, zero_method="zsplit").pvalue) if d.any() else 1.0
+            i, j = np.triu_indices(len(d))
+            has_ratio = (np.maximum(*both) == FAR).mean() <= 0.2
+            if has_ratio and d.any():
+                assert verdict.ratio == pytest.approx(math.exp(np.median((d[i] + d[j]) / 2)))
+        corrected = {frozenset((v.a, v.b)): q for v, q in zip(family, adjust(p), strict=True)}
+        shown = [q.verdict for q in overview.pairs if q.world == world]
+        shown += [c.verdict for c in overview.cells if c.world == world and c.filter in overview.methods]  # fmt: skip
+        for verdict in shown:
+            stated = corrected[frozenset((verdict.a, verdict.b))]
+            assert math.isnan(verdict.p) or verdict.p == pytest.approx(stated, rel=1e-6, abs=1e-12)
+            assert verdict.word not in ("better", "worse") or stated < 0.05
+            decided += verdict.word in ("better", "worse")
+    assert decided > 20
 
 
 def test_another_filter_changes_no_number(
@@ -165,111 +162,76 @@ def test_another_filter_changes_no_number(
 ) -> None:
     fewer = table[table["filter"] != "gpf"]
     second = build_overview(fewer, {k: v for k, v in looks.items() if k != "gpf"}, parts)
-    assert [p.verdict for p in overview.pairs] == [p.verdict for p in second.pairs]
+    for pair, other in zip(overview.pairs, second.pairs, strict=True):
+        np.testing.assert_equal(pair.verdict.ratio, other.verdict.ratio)
     ratios = {(c.world, c.filter): (c.verdict.ratio, c.track_share) for c in overview.cells}
-    assert all(ratios[c.world, c.filter] == (c.verdict.ratio, c.track_share) for c in second.cells)
+    for c in second.cells:
+        np.testing.assert_equal((c.verdict.ratio, c.track_share), ratios[c.world, c.filter])
+
+
+def judge(rows: pd.DataFrame, fixed: list[tuple[str, str]] | None = None) -> list[World]:
+    """Worlds of a table, whose reference is the EKF and whose pairs are all fixed in advance."""
+    rows = rows.assign(family=rows["scenario"], regime="nominal")
+    labels = {str(v): str(v) for v in rows["filter"].unique()}
+    court = Court(arrange_runs(rows, tuple(labels)), fixed or combinations(labels, 2))
+    facts = WorldFacts("ekf", None)
+    return [build_world(part, facts, (court, labels)) for _, part in rows.groupby("scenario", sort=False)]  # fmt: skip
 
 
 def test_a_lost_run_is_worse_than_any_kept_one() -> None:
     rng = np.random.default_rng(1)
-    rows = pd.DataFrame({
-        "scenario": "w", "filter": np.repeat(["a", "b"], 20), "run": np.tile(np.arange(20), 2), "seed": 1,
-        "rmse": np.exp(rng.normal(size=40)), "keeps_track": True, "lost": False,
-    })  # fmt: skip
+    rows = make_rows(rng, "w", {"m": 0.0, "ekf": 0.0})
     large, lost = rows.copy(), rows.copy()
     large.loc[3, "rmse"] = 1e7
-    lost.loc[3, "lost"] = True
-    cells = [decide_cells([build_world(table, "b")], ["a"])[0] for table in (large, lost)]
+    lost.loc[3, "keeps_track"] = False
+    cells = [decide_cells(judge(table), ["m"])[0] for table in (large, lost)]
     assert cells[0].verdict[:7] == cells[1].verdict[:7]
-    assert (cells[0].track_share, cells[1].track_share) == (1.0, 0.95)
+    assert (cells[0].track_share, cells[1].track_share) == (1.0, 39 / 40)
     with pytest.raises(ValueError, match=r"w must have runs of its reference ekf, got none"):
-        build_world(rows, "ekf")
+        judge(rows[rows["filter"] == "m"], [("m", "ekf")])
 
 
-def make_world(rng: np.random.Generator, name: str, shifts: dict[str, float], seed: int) -> World:
+def make_rows(rng: np.random.Generator, name: str, shifts: dict[str, float]) -> pd.DataFrame:
     base = rng.normal(size=40)
-    losses = {k: pd.Series(base + v + rng.normal(0, 0.2, 40)) for k, v in shifts.items()}
-    kept = {k: pd.Series(np.ones(40, bool)) for k in shifts}
-    return World(name, "ekf", None, losses, kept, seed)
+    parts = [
+        pd.DataFrame({
+            "scenario": name, "filter": k, "run": np.arange(40), "seed": 1, "keeps_track": True,
+            "rmse": np.exp(base + v + rng.normal(0, 0.2, 40)),
+        })
+        for k, v in shifts.items()
+    ]  # fmt: skip
+    return pd.concat(parts, ignore_index=True)
 
 
 def test_runs_are_paired_by_their_numbers() -> None:
-    world = make_world(np.random.default_rng(6), "w", {"m": -0.3, "ekf": 0.0}, 1)
-    turned = world._replace(losses={**world.losses, "m": world.losses["m"].iloc[::-1]})
-    other = world._replace(losses={**world.losses, "m": world.losses["m"].iloc[1:]})
-    found = [decide_cells([w], ["m"])[0].verdict for w in (world, turned, other)]
-    assert found[0] == found[1]
+    rows = make_rows(np.random.default_rng(6), "w", {"m": -0.3, "ekf": 0.0})
+    fewer = rows[~((rows["filter"] == "m") & (rows["run"] == 0))]
+    found = [decide_cells(judge(some), ["m"])[0].verdict for some in (rows, rows[::-1], fewer)]
+    assert found[0][:8] == found[1][:8]
     assert [verdict.n for verdict in found] == [40, 40, 39]
 
 
 def test_a_winner_is_better_than_every_baseline() -> None:
     rng = np.random.default_rng(2)
-    clear = make_world(rng, "clear", {"m": -0.8, "ekf": 0.0, "sir": 0.2}, 1)
-    tied = make_world(rng, "tied", {"m": -0.8, "ekf": 0.0, "sir": -0.8}, 2)
-    found = find_winners([clear, tied], ["m"], ["ekf", "sir"])
+    clear = make_rows(rng, "clear", {"m": -0.8, "ekf": 0.0, "sir": 0.2})
+    tied = make_rows(rng, "tied", {"m": -0.8, "ekf": 0.0, "sir": -0.8})
+    found = find_winners(judge(pd.concat([clear, tied])), ["m"], ["ekf", "sir"])
     assert [winner.wins for winner in found] == [True, False]
-
-
-def test_a_method_with_the_same_errors_is_called_a_winner_at_the_level() -> None:
-    rng = np.random.default_rng(3)
-    names = ["m", "ekf", "sir"]
-    false = 0
-    for _ in range(150):
-        worlds = [make_world(rng, str(k), dict.fromkeys(names, 0.0), k) for k in range(4)]
-        false += any(winner.wins for winner in find_winners(worlds, ["m"], names[1:]))
-        cells = decide_cells(worlds, ["m", "sir"])
-        false += any(cell.verdict.word in ("better", "worse") for cell in cells)
-    assert false / 300 <= 0.05 + 2.5 * math.sqrt(0.05 * 0.95 / 300)
 
 
 def test_a_filter_loses_track_where_fewer_than_80_percent_of_runs_are_shown_to_keep_it() -> None:
     rng = np.random.default_rng(4)
+    conditions = pd.DataFrame({"family": ["w"], "scenario": ["w"], "regime": ["nominal"]})
     said = []
     for share in (0.5, 0.8):
         words = 0
         for _ in range(200):
-            world = make_world(rng, "w", {"m": 0.0, "ekf": 0.0}, 1)
-            world.keeps_track["m"].iloc[:] = rng.uniform(size=40) < share  # type: ignore[index]
-            words += decide_cells([world], ["m"])[0].loses_track
+            keeps = np.stack([rng.uniform(size=(1, 40)) < share, np.ones((1, 40), dtype=bool)])
+            runs = StudyRuns(("m", "ekf"), conditions, {}, keeps, np.ones((2, 1, 40), dtype=bool))
+            words += bool(Court(runs, ()).find_lost(np.ones(1, dtype=bool)))
         said.append(words / 200)
     assert said[0] > 0.9
     assert said[1] <= 0.05 + 2.5 * math.sqrt(0.05 * 0.95 / 200)
-
-
-def test_ranks_are_those_of_scipy() -> None:
-    rng = np.random.default_rng(5)
-    methods = ["a", "b", "c"]
-    worlds = [
-        make_world(rng, str(k), {"a": 0.0, "b": 0.3, "c": 0.6, "ekf": 0.0}, k) for k in range(6)
-    ]
-    ranks = rank_methods(worlds, methods)
-    assert ranks.means == {"a": 1.0, "b": 2.0, "c": 3.0}
-    levels = np.array([[w.losses[m].mean() for m in methods] for w in worlds])
-    chi = stats.friedmanchisquare(*levels.T).statistic
-    assert chi == pytest.approx(12)
-    assert ranks.p < 1e-6
-    assert ranks.critical_difference == pytest.approx(2.343 * math.sqrt(3 * 4 / 36), rel=1e-3)
-    assert rank_methods(worlds[:1], methods).reason == "ranks need two worlds and three methods"
-
-
-@pytest.mark.parametrize(("count", "methods"), [(5, "abcd"), (9, "abc")])
-def test_the_p_value_of_ranks_is_that_of_their_analysis_of_variance(
-    count: int, methods: str
-) -> None:
-    """By statsmodels: F of Iman and Davenport is that of ranks by worlds and methods, with both degrees of freedom."""
-    rng = np.random.default_rng(8)
-    worlds = [
-        make_world(rng, str(k), dict.fromkeys(methods, 0.0) | {"ekf": 0.0}, k) for k in range(count)
-    ]
-    levels = np.array([[w.losses[m].median() for m in methods] for w in worlds])
-    rows = pd.DataFrame(
-        {"rank": stats.rankdata(levels, axis=1).ravel()}
-        | {"world": np.repeat(range(count), len(methods)), "method": list(methods) * count}
-    )
-    fit = statsmodels.formula.api.ols("rank ~ C(world) + C(method)", rows).fit()
-    wanted = statsmodels.api.stats.anova_lm(fit).loc["C(method)", "PR(>F)"]
-    assert 0.01 < wanted < 0.99
-    assert rank_methods(worlds, list(methods)).p == pytest.approx(wanted)
 
 
 def test_the_reference_is_that_of_the_tuning_and_not_of_the_runs(
@@ -376,6 +338,7 @@ def test_a_win_against_kalman_filters_is_one_against_each_of_them(
     for world, method in won:
         for other in single:
             d = losses(strong, world, method) - losses(strong, world, other)
+            assert stats.binomtest(int((d < 0).sum()), len(d)).pvalue < 0.1
             assert stats.wilcoxon(d, alternative="less").pvalue < 0.05, (world, method, other)
     better = table.copy()
     better.loc[better["filter"] == "ukf", "rmse"] *= 0.001
@@ -388,39 +351,18 @@ def test_a_win_against_kalman_filters_is_one_against_each_of_them(
     assert not any(won for won, _ in count_better_worlds({0: changed}).values())
 
 
-def test_losses_against_an_untuned_filter_are_those_of_scipy(
+def test_losses_against_an_untuned_filter_are_worse_than_it(
     table: pd.DataFrame, overview: Overview
 ) -> None:
-    """The cells that are worse than a tuned reference, and than the plain UKF too, by both tests with Holm's correction."""
-    pairs = [
-        (world.key, cell.filter) for world in overview.worlds for cell in overview.cells
-        if cell.world == world.key and is_worse(cell) and cell.filter in overview.methods
-    ]  # fmt: skip
-    differences = [losses(table, world, m) - losses(table, world, "ukf") for world, m in pairs]
-    plain = [k for k, d in enumerate(differences) if overview.names["ukf"] != {w.key: w for w in overview.worlds}[pairs[k][0]].reference]  # fmt: skip
-    signed = adjust([stats.wilcoxon(differences[k]).pvalue for k in plain])
-    trimmed = adjust([trimmed_p(differences[k]) for k in plain])
-    expected = {pairs[k] for k in range(len(pairs)) if k not in plain}
-    for k, p, q in zip(plain, signed, trimmed, strict=True):
-        middle = np.median(np.add.outer(differences[k], differences[k])[np.tril_indices(len(differences[k]))]) / 2  # fmt: skip
-        if p < 0.05 and q < 0.05 and middle > math.log(1.05):
-            expected.add(pairs[k])
+    """The cells that are worse than a tuned reference, and in most runs than the plain UKF too."""
+    worse = {(c.world, c.filter) for c in overview.cells if is_worse(c) and c.filter in overview.methods}  # fmt: skip
     found = {(w.key, m) for w in overview.worlds for m in w.plain_losses or ()}
-    assert found == expected
-    assert 0 < len(found) < len(pairs)
-    text = f"Of the {len(pairs)} worse cells, {len(found)} are worse also than the UKF, which is not tuned either."
+    assert found < worse
+    for world, m in found:
+        d = losses(table, world, m) - losses(table, world, "ukf")
+        assert stats.wilcoxon(d, alternative="greater").pvalue < 0.05, (world, m)
+    text = f"Of the {len(worse)} worse cells, {len(found)} are worse also than the UKF, which is not tuned either."
     assert text in describe_setting(overview)
-
-
-def trimmed_p(d: np.ndarray) -> float:
-    """t test of the mean without a fifth at each end [Tukey and McLaughlin 1963]; the sign test where a lost run is in it."""
-    cut = int(0.2 * len(d))
-    middle = np.sort(d)[cut : len(d) - cut]
-    if np.abs(middle).max() > 1e3:
-        return float(stats.binomtest(int((d > 0).sum()), int((d != 0).sum())).pvalue)
-    spread = np.clip(d, middle[0], middle[-1]).std(ddof=1)
-    t = middle.mean() / (spread / (1 - 2 * cut / len(d)) / math.sqrt(len(d)))
-    return float(2 * stats.t.sf(abs(t), len(middle) - 1))
 
 
 def test_worlds_have_notes_on_what_their_numbers_mean(
@@ -463,15 +405,15 @@ def test_recordings_are_counted_by_the_files_of_their_scenarios(
     own = tmp_path / "conf" / "scenario" / "a_scenario_of_another_folder.yaml"
     own.write_text("defaults: [recorded_quad_flights, _self_]\nflights: [1, 2]\n")
     assert count_recorded_drives(own.stem) == 2
-    frame = pd.DataFrame({"scenario": "recorded_quad_flights", "filter": "ekf", "run": range(9), "rmse": 1.0, "keeps_track": True, "lost": False, "seed": 1})  # fmt: skip
-    world = build_world(frame, "ekf")
-    (same,) = list_world_notes([world], {world.name: False})[world.name]
+    frame = pd.DataFrame({"scenario": "recorded_quad_flights", "filter": "ekf", "run": range(9), "rmse": 1.0, "keeps_track": True, "seed": 1})  # fmt: skip
+    (world,) = judge(frame, [("ekf", "m")])
+    (same,) = list_world_notes(world, False)
     assert (
         same
         == "the best Kalman filter was tuned on the same 20 recordings, with other random numbers"
     )
     drive = world._replace(name="recorded_canyon")
-    single, part = list_world_notes([drive], {drive.name: True})[drive.name]
+    single, part = list_world_notes(drive, True)
     assert single.startswith("one recording: ")
     assert part == "the best Kalman filter was tuned on a part of it"
 
@@ -491,7 +433,7 @@ def test_a_method_with_another_number_of_particles_than_its_table_is_named(
         for n in (100, 1000)
     ]
     joined = pd.concat([both[0], both[1][both[1]["filter"].astype(str).str.contains("particles=")]])
-    overviews = build_overviews(joined, find_looks(sorted(set(joined["filter"]))), parts)
+    overviews = build_tabs(joined, find_looks(sorted(set(joined["filter"]))), parts)
     assert overviews[1000].numbers["cofm_amssrcpf"] == 200.0
     assert "mcmc_rpf" not in overviews[1000].numbers
     name = overviews[1000].names["cofm_amssrcpf"]
@@ -570,7 +512,7 @@ def test_a_study_without_references_keeps_its_first_page(
     parts: dict[str, PartName],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    facts = SimpleNamespace(looks=looks, worlds=parts)
+    facts = SimpleNamespace(looks=looks, worlds=parts, options=ReportOptions())
     monkeypatch.setattr(study_report.StudyFacts, "from_pack", lambda pack: facts)
     assert study_report.find_overviews({}, table) is not None
     assert study_report.find_overviews({}, table.assign(model="other")) is None
@@ -595,6 +537,8 @@ def test_ink_has_contrast_on_every_ground() -> None:
 
 def test_undecided_cells_have_no_colour_and_lost_tracks_are_grey(overview: Overview) -> None:
     words = {(c.world, c.filter): c for c in overview.cells}
+    first = next(key for key, c in words.items() if c.verdict.word == "not decided")
+    words[first] = words[first]._replace(verdict=words[first].verdict._replace(word="equal"))
     drawn = {
         key: figures.describe_cell(words, world, key[1], overview)
         for key in words
@@ -656,7 +600,7 @@ def levels(table: pd.DataFrame, parts: dict[str, PartName]) -> dict[TabKey, Over
         filter=swept["filter"] + "[particles=1000]", rmse=swept["rmse"] / 2, ms=swept["ms"] * 9
     )
     both = pd.concat([table[~table["filter"].isin(particle)], few, many])
-    return build_overviews(both, find_looks(sorted(both["filter"].unique())), parts)
+    return build_tabs(both, find_looks(sorted(both["filter"].unique())), parts)
 
 
 def test_each_number_of_particles_has_its_tables(
@@ -708,7 +652,7 @@ def tabs(table: pd.DataFrame, parts: dict[str, PartName]) -> dict[TabKey, Overvi
     printed = swept[swept["filter"].isin(particle[1:4]) & (swept["scenario"] != "azimuth")]
     kinds.append(printed.assign(filter=printed["filter"] + "_printed", particles=100))
     both = pd.concat([table[~table["filter"].isin(particle)].assign(particles=pd.NA), *kinds])
-    return build_overviews(both, find_looks(sorted(both["filter"].unique())), parts)
+    return build_tabs(both, find_looks(sorted(both["filter"].unique())), parts)
 
 
 def test_filters_at_equal_time_and_as_printed_have_tables_of_their_own(
@@ -718,7 +662,8 @@ def test_filters_at_equal_time_and_as_printed_have_tables_of_their_own(
     assert list(tabs) == [100, 1000, EQUAL_TIME, PRINTED]
     plain = {(c.world, c.filter): c.verdict.ratio for c in overview.cells}
     for key in (100, 1000):
-        assert {(c.world, c.filter): c.verdict.ratio for c in tabs[key].cells} == plain
+        found = {(c.world, c.filter): c.verdict.ratio for c in tabs[key].cells}
+        np.testing.assert_equal(found, plain)
     timed = {(c.world, c.filter): c.verdict.ratio for c in tabs[EQUAL_TIME].cells}
     assert timed["azimuth", "fm_mssrckf"] == plain["azimuth", "fm_mssrckf"]
     assert timed["azimuth", "mcmc_rpf"] == pytest.approx(2 * plain["azimuth", "mcmc_rpf"], rel=0.1)
@@ -756,7 +701,7 @@ def test_a_method_that_sets_its_number_itself_is_once_in_the_table_of_equal_time
         filter=rows["filter"] + "[budget=time,particles=1000]", rmse=3 * rows["rmse"]
     )
     both = pd.concat([table[~table["filter"].isin(timed[:3])], rows])
-    found = build_overviews(both, find_looks(sorted(both["filter"].unique())), parts)[EQUAL_TIME]
+    found = build_tabs(both, find_looks(sorted(both["filter"].unique())), parts)[EQUAL_TIME]
     ratios = {c.filter: c.verdict.ratio for c in found.cells if c.world == "azimuth"}
     plain = {c.filter: c.verdict.ratio for c in overview.cells if c.world == "azimuth"}
     assert ratios["cofm_amssrcpf"] == pytest.approx(3 * plain["cofm_amssrcpf"], rel=0.1)
@@ -777,10 +722,10 @@ def test_a_world_with_one_number_of_particles_stands_in_its_table(
         ),
     ]
     both = pd.concat([table[~table["filter"].isin(particle)].assign(particles=pd.NA), *kinds])
-    found = build_overviews(both, find_looks(sorted(both["filter"].unique())), parts)
+    found = build_tabs(both, find_looks(sorted(both["filter"].unique())), parts)
     assert [len(found[n].worlds) for n in (100, 1000)] == [3, 2]
     ratios = {(c.world, c.filter): c.verdict.ratio for c in found[100].cells}
-    assert ratios == {(c.world, c.filter): c.verdict.ratio for c in tabs[100].cells}
+    np.testing.assert_equal(ratios, {(c.world, c.filter): c.verdict.ratio for c in tabs[100].cells})
 
 
 def test_the_first_sentence_says_what_holds_at_equal_time(tabs: dict[TabKey, Overview]) -> None:

@@ -56,26 +56,6 @@ def decide(stored: Stored, table: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(decide_parts(table, facts)["decisions"]).set_index(["a", "b"])
 
 
-def test_all_pairs_are_decided_in_one_family(stored: Stored) -> None:
-    """Holm over all pairs: the corrected p-values are those of scipy, and words and intervals agree with them."""
-    from scipy import stats
-
-    table = stored[1]
-    found = decide(stored, table)
-    assert len(found) == 3
-    wide = table.assign(log=np.log(table["rmse"])).pivot_table("log", ["regime", "run"], "filter")
-    p = {}
-    for a, b in found.index:
-        if "sir" in (a, b):
-            continue  # it lost a run
-        p[a, b] = stats.wilcoxon((wide[a] - wide[b]).unstack("regime").mean(axis=1)).pvalue
-    ((pair, alone),) = p.items()
-    assert found.loc[pair, "p"] in (pytest.approx(k * alone) for k in (1, 2, 3))
-    for row in found.itertuples():
-        assert (row.p < 0.05) == (row.high <= 1 or row.low >= 1)
-        assert row.n == 16
-
-
 def test_the_order_of_rows_changes_no_verdict(stored: Stored) -> None:
     table = stored[1]
     mixed = decide(stored, table.sample(frac=1, random_state=1))

@@ -8,11 +8,11 @@ import pytest
 from decision_cases import make_study
 
 from pfbench.report.board.view import View, build_rows, describe_filters
+from pfbench.report.overview.tables import WorldFacts, build_world, compare_methods, decide_cells
 from pfbench.stats.comparison import compare, decide
 from pfbench.stats.court import Court
 from pfbench.stats.pair_states import LookSchedule, decide_at_looks
 from pfbench.stats.study_runs import arrange_runs, compare_filters, compute_losses
-from pfbench.stats.world_table import build_world, compare_methods, decide_cells
 
 
 def page_verdict(table: pd.DataFrame) -> tuple[str, float]:
@@ -32,7 +32,8 @@ def test_all_callers_agree(effect: float, lost: float) -> None:
     losses = compute_losses(runs, "rmse")
     (pair,) = decide(compare_filters(runs, losses, [("A", "B")]))
     (direct,) = decide([compare(("A", losses[0, 0]), ("B", losses[1, 0]))])
-    world = build_world(table, "B")
+    facts, labels = WorldFacts("B", None), {"A": "A", "B": "B"}
+    world = build_world(table, facts, (Court(runs, [("A", "B")]), labels))
     (cell,) = decide_cells([world], ["A"])
     (method,) = compare_methods([world], ["A", "B"])
     (state,) = decide_at_looks(runs, [("A", "B")], LookSchedule(40))

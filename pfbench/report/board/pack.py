@@ -49,6 +49,7 @@ from pfbench.report.board.study_views import (
 from pfbench.report.board.view import shorten_view
 from pfbench.report.methods_text import collect_methods_facts
 from pfbench.report.options import ReportOptions
+from pfbench.report.overview.tables import plan_world_pairs
 from pfbench.report.provenance import format_bibliography
 from pfbench.results.conditions import Condition, differing_settings, parse_label
 from pfbench.results.frame import drop_before, to_long_rows
@@ -359,7 +360,8 @@ def open_court(
     baseline = select_baselines(looks, options.baseline)[0]
     fixed = fix_pairs(list(looks), plan_look_pairs(looks), baseline)
     margin = math.log1p(options.equivalence_margin)
-    return Court(arrange_runs(table, tuple(looks)), fixed, margin, options.alpha)
+    runs, in_worlds = arrange_runs(table, tuple(looks)), plan_world_pairs(table, looks)
+    return Court(runs, fixed, margin, options.alpha, in_worlds)
 
 
 def _count_failures(number: int) -> str:

@@ -277,15 +277,19 @@ DECISION_COLUMNS = ("world", "family", *_NO_VERDICT.to_row())  #: of the table o
 
 
 def list_decisions(court: Court, metric: str) -> list[dict[str, Any]]:
-    """List the verdicts on all pairs with their families: over all conditions, and in each of a few scenarios."""
+    """List the verdicts on all pairs with their families: over all conditions, and in each of a few scenarios.
+
+    Of a scenario with pairs of its own that are fixed in advance, these pairs are listed.
+    """
     scenarios = court.runs.conditions["scenario"]
+    is_few = 1 < scenarios.nunique() <= MOST_WORLDS  # whose page has the order of each world
     scopes = [(ALL, select_everywhere(court.runs))]
-    if 1 < scenarios.nunique() <= MOST_WORLDS:  # whose page has the order of each world
+    if is_few or court.fixed_in:
         scopes += [(str(name), select_common(court.runs, (scenarios == name).to_numpy())) for name in scenarios.unique()]  # fmt: skip
     return [
         {"world": world, "family": family, **verdict.to_row()}
         for world, mask in scopes
-        for family, verdict in court.list_verdicts(metric, mask)
+        for family, verdict in court.list_verdicts(metric, mask, world == ALL or is_few)
     ]
 
 

@@ -15,12 +15,11 @@ import scipy  # scipy.stats is imported at its first use
 from pfbench.results.looks import MethodLook
 from pfbench.results.step_times import StepTimes, describe_costs
 from pfbench.stats.comparison import EQUAL_WORDS, MIN_RUNS, Verdict, estimate_mean
-from pfbench.stats.court import Court
+from pfbench.stats.court import Court, find_lost_conditions
 from pfbench.stats.error_measures import Array, Flags
 from pfbench.stats.rank_tests import holm
 from pfbench.stats.sentences import format_with_interval
 from pfbench.stats.study_runs import StudyRuns, compute_losses, weigh_conditions
-from pfbench.stats.world_table import TRACK_SHARE
 
 BASE, MISSING, LOSES_TRACK = "baseline", "missing", "loses track"
 _SAME_LEVEL = 1e-6
@@ -200,19 +199,6 @@ def describe_filters(runs: StudyRuns, alpha: float = 0.05) -> dict[str, BoardRow
     }  # fmt: skip
 
 
-def find_lost_conditions(runs: StudyRuns, alpha: float) -> Flags:
-    """Find where it is shown that a filter keeps track in fewer than 80 % of runs, by exact binomial tests, [F, C].
-
-    Args:
-        runs: Runs of a study.
-        alpha: Error rate of all filters and conditions together.
-    """
-    number = runs.present.sum(axis=2)
-    successes = (runs.keeps & runs.present).sum(axis=2)
-    p = np.where(number > 0, scipy.stats.binom.cdf(successes, number, TRACK_SHARE), 1.0)
-    return np.asarray(holm(p.ravel()).reshape(p.shape) < alpha)
-
-
 def word_calibration(coverage: Array, alpha: float) -> list[str]:
     """Return "too low" or "too high" where the mean coverage [F, N] of 90 % intervals is shown to differ; else empty."""
     estimates = [estimate_mean(row[~np.isnan(row)] - _INTERVAL_LEVEL) for row in coverage]
@@ -265,8 +251,11 @@ def describe_view(
         first = better[0]
         size = _word_ratio(first)
         text = f", {size} of its {metric}" if size else ""
-        head += f" (first in the table: [[{looks[first['filter']].name}]]{text})"
+        position = "first in the table" if first is rows[0] else "the first of them"
+        head += f" ({position}: [[{looks[first['filter']].name}]]{text})"
     head = f"{head}; {rest}." if rest else f"{head}."
+    if f"[[{looks[rows[0]['filter']].name}]]" not in head:
+        head += f" First in the table: [[{looks[rows[0]['filter']].name}]], {rows[0]['verdict']}."
     texts = [f"{head} {text}".rstrip() for text in _describe_proposed(others, better, looks)]
     return next((text for text in texts if len(text.split()) <= _MOST_WORDS), head)
 
@@ -296,5 +285,7 @@ def shorten_view(sentence: str) -> str:
     return (
         sentence
         if len(sentence.split()) <= _MOST_WORDS
-        else sentence.replace("(first in the table: ", "(first: ")
+        else sentence.replace("(first in the table: ", "(first: ").replace(
+            "First in the table: ", "First: "
+        )
     )

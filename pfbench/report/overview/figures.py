@@ -17,10 +17,9 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from pfbench.report.overview.tables import Overview, WorldRow
+from pfbench.report.overview.tables import Overview, WorldResult, WorldRow, count_wins
 from pfbench.results.plotting import RC, line_styles, set_plain_ticks
 from pfbench.stats.comparison import EQUAL_WORDS
-from pfbench.stats.world_table import WorldResult, count_wins
 
 BLUE, ORANGE, GREY, INK = "#2166ac", "#c4561a", "#d4d4d4", "#1b1b1b"
 _SCALE = math.log(3.0)  # log ratio of the strongest colour

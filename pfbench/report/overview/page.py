@@ -19,6 +19,7 @@ from pfbench.report.overview.tables import (
     SIR,
     Overview,
     TabKey,
+    WorldResult,
     WorldRow,
     is_worse,
     list_rivals,
@@ -32,7 +33,6 @@ from pfbench.results.looks import find_looks
 from pfbench.results.paper_block import read_paper_block
 from pfbench.stats.comparison import EQUAL_WORDS, TRIM_SHARE, Verdict
 from pfbench.stats.sentences import format_with_interval
-from pfbench.stats.world_table import WorldResult
 
 BOARD_PAGE = "worlds.html"  # the page of each world, which is the first page of other studies
 _HERE = Path(__file__).parent

@@ -1,4 +1,4 @@
-"""Tables of the first page: worlds, cells, pairs, winners and ranks, decided once from the table of runs."""
+"""Tables of the first page: worlds, cells, pairs and winners, selected from the court of the study."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import combinations
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -16,35 +17,102 @@ import pandas as pd
 import yaml
 
 from pfbench.files import limits
-from pfbench.report.overview.world_notes import find_plain_losses, list_world_notes
 from pfbench.results.conditions import parse_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.results.paper_block import conf_dir, read_paper_block
 from pfbench.results.store import SAME_TIME
-from pfbench.stats.comparison import EQUAL_WORDS, Verdict
-from pfbench.stats.world_table import (
-    MeanRanks,
-    Winner,
-    World,
-    WorldPair,
-    WorldResult,
-    build_world,
-    compare_methods,
-    compare_with_each,
-    decide_cells,
-    find_winners,
-    rank_methods,
-)
+from pfbench.stats.comparison import EQUAL_WORDS, Verdict, find_largest_p
+from pfbench.stats.court import TRACK_SHARE, Court, Pair
+from pfbench.stats.error_measures import Array, Flags
+from pfbench.stats.rank_tests import holm
 
 FEWEST_METHODS, FEWEST_WORLDS = 3, 2  # from which a study has this page
 CENTRAL = "nominal"  # regime of the page, if a world has several
 SIR = "sir"
 CONVENTIONAL = (SIR, "rpf", "rpf_tuned", "ekf_bank")  # that stand next to the methods
+METRIC = "rmse"  # of all words of the page
+DEAD_RECKONING, PLAIN = "dead_reckoning", "ukf"  # the second is as little tuned as the methods
 TabKey = int | str  # a number of particles, 0 for a study of one number, or one of the two below
 EQUAL_TIME, PRINTED = "equal time", "as printed"
 _TUNING_BYTES = 1_000_000
 _WORDS = ("better", "worse", *EQUAL_WORDS, "not decided")
 _FAMILIES = ("particle", "guided", "swarm", "gaussian", "learned", "kalman", "")
+
+
+class World(NamedTuple):
+    """A world of the page, and where the court of the study has it.
+
+    Attributes:
+        name: Name of the scenario.
+        reference: Conventional filter with which all others are compared, fixed before the study.
+        kalman_fits: Whether Kalman filters fit the world, by a rule on another seed; None if unknown.
+        court: Court of the study.
+        mask: Condition of the world, [C].
+        labels: Labels of the study, by the names of the filters in their table.
+    """
+
+    name: str
+    reference: str
+    kalman_fits: bool | None
+    court: Court
+    mask: Flags
+    labels: Mapping[str, str]
+
+    def find(self, a: str, b: str) -> Verdict:
+        """Return the verdict of the study on two filters of the table."""
+        verdict = self.court.find(METRIC, self.mask, self.labels[a], self.labels[b])
+        return verdict._replace(a=a, b=b)
+
+    def losses(self, *names: str) -> Array:
+        """Return the losses of some filters in the runs that all of them have, [F, n]; infinite for a lost run."""
+        index = [self.court.runs.filters.index(self.labels[name]) for name in names]
+        losses = self.court.losses(METRIC, self.mask)[index, 0]
+        return np.asarray(losses[:, ~np.isnan(losses).any(axis=0)])
+
+    def share_track(self, name: str) -> float:
+        """Return the share of runs in which a filter keeps track."""
+        return float(np.isfinite(self.losses(name)).mean())
+
+
+class WorldResult(NamedTuple):
+    """A filter in a world.
+
+    Attributes:
+        world: Name of the world.
+        filter: Label of the filter.
+        verdict: Verdict on the filter against the reference of the world.
+        track_share: Share of runs that keep track.
+        loses_track: Whether it is shown that this share is below 0.8.
+    """
+
+    world: str
+    filter: str
+    verdict: Verdict
+    track_share: float
+    loses_track: bool
+
+
+class WorldPair(NamedTuple):
+    """A pair of methods in a world."""
+
+    world: str
+    verdict: Verdict
+
+
+class Winner(NamedTuple):
+    """Test of a method against all baselines of a world.
+
+    Attributes:
+        world: Name of the world.
+        filter: Label of the method.
+        p: Largest p-value of all baselines and tests, with Holm's correction.
+        wins: Whether it is better than all of them.
+    """
+
+    world: str
+    filter: str
+    p: float
+    wins: bool
 
 
 class WorldRow(NamedTuple):
@@ -90,7 +158,6 @@ class Overview(NamedTuple):
         cells: Methods and conventional filters against the reference of each world.
         pairs: All pairs of methods in each world.
         winners: Methods that are better than every conventional filter of a world.
-        ranks: Mean ranks over the worlds.
         times: Median time of a step [ms] by world and filter.
         left_out: Worlds that are not on the page, with the reason.
         kalman_winners: Methods that are better than each single Kalman filter of a world.
@@ -104,7 +171,6 @@ class Overview(NamedTuple):
     cells: Sequence[WorldResult]
     pairs: Sequence[WorldPair]
     winners: Sequence[Winner]
-    ranks: MeanRanks
     times: Mapping[tuple[str, str], float]
     left_out: Mapping[str, str]
     kalman_winners: Sequence[Winner]
@@ -179,16 +245,48 @@ def _read_form(look: MethodLook) -> Mapping[str, Any]:
     return read_paper_block("filter", parse_label(look.key)[0])
 
 
+def plan_world_pairs(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> dict[str, list[Pair]]:
+    """List the pairs that the first page of a study fixes in each world, before its results; nothing for other studies.
+
+    They are all filters with the reference of the world and with the plain UKF, and all methods of one table.
+    """
+    if not has_overview(table, looks):
+        return {}
+    keys = {
+        label: PRINTED if is_printed(look) else EQUAL_TIME if _has_equal_time(label) else _level(label)
+        for label, look in looks.items() if is_method(look) or is_printed(look)
+    }  # fmt: skip
+    methods = [
+        (a, b) for a, b in combinations(keys, 2)
+        if keys[a] == keys[b] or (None in (keys[a], keys[b]) and PRINTED not in (keys[a], keys[b]))
+    ]  # fmt: skip
+    pairs = {}
+    for name, rows in table.groupby("scenario", observed=True, sort=False):
+        facts = _find_facts(central_rows(rows), str(name))
+        bases = {PLAIN, facts.reference if facts else PLAIN}
+        references = [label for label in looks if parse_label(label)[0] in bases]
+        pairs[str(name)] = [*methods, *((a, b) for b in references for a in looks if a != b)]
+    return pairs
+
+
 def build_overview(
     table: pd.DataFrame,
     looks: Mapping[str, MethodLook],
     parts: Mapping[str, PartName],
+    judged: tuple[Court, Mapping[str, str]],
     is_shown: Callable[[MethodLook], bool] = is_method,
 ) -> Overview:
-    """Decide all that the first page shows.
+    """Collect all that the first page shows.
 
-    Returns tables of one study. A world without a stated reference, or without runs of it, is left out with the
-    reason.
+    Args:
+        table: Runs of the filters of the page.
+        looks: Looks of the filters, by their names in the table.
+        parts: Names of the scenarios by key.
+        judged: Court of the study, and the labels that it has for the names of the table.
+        is_shown: Whether a filter is one of the methods of the page.
+
+    Returns:
+        Tables of one study. A world without a stated reference, or without runs of it, is left out with the reason.
     """
     methods = order_methods([label for label in looks if is_shown(looks[label])], looks)
     by_name = {parse_label(label)[0]: label for label in looks}
@@ -199,13 +297,13 @@ def build_overview(
     for key, group in table.groupby("scenario", observed=True, sort=False):
         try:
             facts = _read_facts(central_rows(group), parts[str(key)])
-            world = _build_world(central_rows(group), facts, by_name)
+            world = build_world(central_rows(group), facts, judged)
         except ValueError as error:
             left_out[parts[str(key)].name] = str(error)
             continue
         worlds.append(world)
         has_part[world.name] = facts.has_part
-        rows.append(_describe_world(world, parts[str(key)], looks))
+        rows.append(describe_world(world, parts[str(key)], looks))
     order = sorted(range(len(worlds)), key=lambda k: worlds[k].kalman_fits is False)
     worlds, rows = [worlds[k] for k in order], [rows[k] for k in order]
     baselines = [label for label, look in looks.items() if not look.proposed]
@@ -215,25 +313,17 @@ def build_overview(
         if looks[v].family == "kalman" and parse_label(v)[0] not in CONVENTIONAL
     ]
     cells = decide_cells(worlds, [*methods, *conventional])
-    worse = {
-        world.name: [
-            c.filter for c in cells if c.world == world.name and c.filter in methods and is_worse(c)
-        ]
-        for world in worlds
-    }
-    outdone, notes = _find_outdone(worlds, single), list_world_notes(worlds, has_part)
-    plain_losses = find_plain_losses(worlds, worse)
     rows = [
         row._replace(
-            outdone=outdone.get(row.key),
-            notes=notes[row.key],
-            plain_losses=plain_losses.get(row.key),
+            outdone=find_outdone(world, single),
+            notes=list_world_notes(world, has_part[world.name]),
+            plain_losses=_find_plain_losses(world, [c.filter for c in cells if c.world == world.name and c.filter in methods and is_worse(c)]),
         )
-        for row in rows
-    ]
+        for row, world in zip(rows, worlds, strict=True)
+    ]  # fmt: skip
     return Overview(
         tuple(rows), methods, conventional, {label: look.name for label, look in looks.items()},
-        cells, compare_methods(worlds, methods), find_winners(worlds, methods, baselines), rank_methods(worlds, methods),
+        cells, compare_methods(worlds, methods), find_winners(worlds, methods, baselines),
         _list_times(table, [row.key for row in rows]), left_out, find_winners(worlds, methods, single),
     )  # fmt: skip
 
@@ -243,32 +333,124 @@ def is_worse(cell: WorldResult) -> bool:
     return cell.verdict.word == "worse" and not cell.loses_track
 
 
-def _find_outdone(worlds: Sequence[World], single: Sequence[str]) -> dict[str, Verdict]:
-    """Find worlds whose reference, chosen on another seed, is worse than another single Kalman filter in these runs."""
-    pairs = [
-        [(w.reference, v) for v in single if v in w.losses and v != w.reference] for w in worlds
+def decide_cells(worlds: Sequence[World], filters: Sequence[str]) -> list[WorldResult]:
+    """Select the verdicts on filters against the reference of each world, without it and without absent filters."""
+    cells = []
+    for world in worlds:
+        lost = world.court.find_lost(world.mask)
+        cells += [
+            WorldResult(world.name, name, world.find(name, world.reference), world.share_track(name), world.labels[name] in lost)
+            for name in filters if name in world.labels and name != world.reference
+        ]  # fmt: skip
+    return cells
+
+
+def compare_methods(worlds: Sequence[World], methods: Sequence[str]) -> list[WorldPair]:
+    """Select the verdicts on all pairs of methods in all worlds."""
+    return [
+        WorldPair(world.name, world.find(a, b))
+        for world in worlds for a, b in combinations(methods, 2) if {a, b} <= set(world.labels)
+    ]  # fmt: skip
+
+
+def find_winners(
+    worlds: Sequence[World], methods: Sequence[str], baselines: Sequence[str]
+) -> list[Winner]:
+    """Find methods that are better than every baseline of a world, with Holm's correction over worlds and methods."""
+    keys = [(w, m) for w in worlds for m in methods if m in w.labels]
+    largest = [
+        find_largest_p([(both[0], both[1]) for b in baselines if b in w.labels for both in [w.losses(m, b)]])
+        for w, m in keys
+    ]  # fmt: skip
+    return [
+        Winner(w.name, m, float(p), bool(p < w.court.alpha))
+        for (w, m), p in zip(keys, holm(largest), strict=True)
     ]
-    verdicts = compare_with_each(list(zip(worlds, pairs, strict=True)))
-    worse = {
-        world.name: [verdict for verdict in some if verdict.word == "worse"]
-        for world, some in zip(worlds, verdicts, strict=True)
-    }
-    return {
-        name: max(some, key=lambda v: v.ratio if v.ratio > 0 else math.inf)
-        for name, some in worse.items()
-        if some
-    }
+
+
+def count_wins(pairs: Sequence[WorldPair], worlds: Sequence[str]) -> Counter[Pair]:
+    """Count the worlds in which the first method of a pair is better than the second."""
+    verdicts = [pair.verdict for pair in pairs if pair.world in worlds]
+    wins = [(v.a, v.b) for v in verdicts if v.word == "better"]
+    return Counter([*wins, *((v.b, v.a) for v in verdicts if v.word == "worse")])
+
+
+def find_outdone(world: World, single: Sequence[str]) -> Verdict | None:
+    """Find the single Kalman filter than which the reference, chosen on another seed, is worst in these runs."""
+    others = [name for name in single if name in world.labels and name != world.reference]
+    verdicts = [world.find(world.reference, name) for name in others]
+    worse = [verdict for verdict in verdicts if verdict.word == "worse"]
+    return max(worse, key=lambda v: v.ratio if v.ratio > 0 else math.inf, default=None)
+
+
+def _find_plain_losses(world: World, worse: Sequence[str]) -> tuple[str, ...] | None:
+    """Find those of the worse methods that are worse than the plain UKF too; None without a UKF."""
+    if PLAIN not in world.labels:
+        return None
+    is_same = world.reference == PLAIN
+    return tuple(name for name in worse if is_same or world.find(name, PLAIN).word == "worse")
+
+
+def list_world_notes(world: World, has_part: bool) -> tuple[str, ...]:
+    """List what must be known before a number of a world is quoted.
+
+    Args:
+        world: World of the page.
+        has_part: Whether its tuning had a part of its recording.
+    """
+    texts, drives = [], count_recorded_drives(parse_label(world.name)[0])
+    if drives == 1:
+        texts.append("one recording: words are about other starts and random numbers on it")
+    if drives and has_part:
+        texts.append("the best Kalman filter was tuned on a part of it")
+    elif drives:
+        same = "it" if drives == 1 else f"the same {drives} recordings"
+        texts.append(f"the best Kalman filter was tuned on {same}, with other random numbers")
+    idle = [name for name in world.labels if parse_label(name)[0] == DEAD_RECKONING]
+    if idle and world.find(world.reference, idle[0]).word != "better":
+        texts.append("the best Kalman filter is not shown to be better than dead reckoning")
+    if (share := world.share_track(world.reference)) < TRACK_SHARE:
+        texts.append(f"the best Kalman filter keeps track in {100 * share:.0f} % of runs")
+    return tuple(texts)
+
+
+def count_recorded_drives(scenario: str) -> int:
+    """Count the recorded drives of a scenario by its file; 0 for simulated data or without a file."""
+    node = _read_scenario(scenario)
+    return len(node.get("flights") or (1,)) if "root" in node else 0
+
+
+def _read_scenario(name: str) -> dict[str, Any]:
+    """Read the file of a scenario, in pfbench or in `conf` of the current folder, with those on which it is based."""
+    for folder in (conf_dir(), Path("conf")):
+        path = folder / "scenario" / f"{name}.yaml"
+        if path.is_file():
+            content = yaml.safe_load(path.read_text(encoding="utf-8"))
+            bases = [base for base in content.get("defaults", ()) if isinstance(base, str)]
+            values: dict[str, Any] = {}
+            for base in bases:
+                values |= {} if base == "_self_" else _read_scenario(base)
+            return values | content
+    return {}
 
 
 def build_overviews(
-    table: pd.DataFrame, looks: Mapping[str, MethodLook], parts: Mapping[str, PartName]
+    table: pd.DataFrame,
+    looks: Mapping[str, MethodLook],
+    parts: Mapping[str, PartName],
+    court: Court,
 ) -> dict[TabKey, Overview]:
-    """Decide the tables of each number of particles, with the key 0 for a study of one number.
+    """Collect the tables of each number of particles, with the key 0 for a study of one number.
 
     A filter without a number of particles is in all of them. Filters at equal time, and methods as printed,
     have tables of their own. A table has the worlds in which it has other runs than the others.
+
+    Args:
+        table: Runs of a study, as `add_levels` returns them.
+        looks: Looks by label.
+        parts: Names of the scenarios by key.
+        court: Court of these runs.
     """
-    table = _add_levels(table, looks)
     levels: list[TabKey] = [*list_levels(looks)]
     timed = [label for label in looks if _has_equal_time(label)]
     printed = [label for label, look in looks.items() if is_printed(look)]
@@ -276,17 +458,17 @@ def build_overviews(
     for key in levels or [0]:
         labels = [label for label in looks if label not in timed and _level(label) in (None, key)]
         alone = labels if levels else [label for label in looks if label not in timed]
-        tab = _build_tab(table, looks, parts, alone)
+        tab = _build_tab(table, looks, parts, alone, court)
         overviews[key] = _count_particles(tab, table, labels, int(key)) if key else tab
     if sum(is_method(looks[label]) for label in timed) >= FEWEST_METHODS:
         names = {name_without_level(label) for label in timed}
         fixed = [label for label in looks if _level(label) is None and label not in names]
-        overviews[EQUAL_TIME] = _build_tab(table, looks, parts, [*timed, *fixed])
+        overviews[EQUAL_TIME] = _build_tab(table, looks, parts, [*timed, *fixed], court)
     if len(printed) >= FEWEST_METHODS:
         number = table.loc[table["filter"].isin(printed), "particles"].dropna().median()
         same = [label for label in looks if label not in timed and _level(label) in (None, number)]
         others = [label for label in same if not is_method(looks[label])]
-        tab = _build_tab(table, looks, parts, others, is_printed)
+        tab = _build_tab(table, looks, parts, others, court, is_printed)
         overviews[PRINTED] = _count_particles(tab, table, others)
     return overviews
 
@@ -304,7 +486,7 @@ def _count_particles(
     return tab._replace(numbers=others)
 
 
-def _add_levels(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> pd.DataFrame:
+def add_levels(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> pd.DataFrame:
     """Name the filters of worlds with one number of particles as those of worlds with several."""
     swept = {
         (parse_label(label)[0], _level(label)): label
@@ -326,9 +508,10 @@ def _build_tab(
     looks: Mapping[str, MethodLook],
     parts: Mapping[str, PartName],
     labels: Sequence[str],
+    court: Court,
     is_shown: Callable[[MethodLook], bool] = is_method,
 ) -> Overview:
-    """Decide the tables of some filters, present_looks without their numbers of particles."""
+    """Collect the tables of some filters under names without their numbers of particles."""
     names = {label: name_without_level(label) for label in labels}
     rows = table[table["filter"].isin(labels)]
     swept = [
@@ -343,7 +526,8 @@ def _build_tab(
     plain = find_looks(present)
     kinds = {names[label]: looks[label] for label in labels}
     present_looks = {k: plain[k] if plain[k].family else replace(kinds[k], key=k) for k in present}
-    return build_overview(rows, present_looks, parts, is_shown)
+    judged = court, {name: label for label, name in names.items()}
+    return build_overview(rows, present_looks, parts, judged, is_shown)
 
 
 def list_levels(looks: Mapping[str, MethodLook]) -> list[int]:
@@ -387,26 +571,56 @@ def central_rows(rows: pd.DataFrame) -> pd.DataFrame:
 
 def _read_facts(rows: pd.DataFrame, name: PartName) -> WorldFacts:
     """Read the facts that the tuning of a world states."""
-    models = rows["model"].unique() if "model" in rows else [""]
-    facts = read_world_facts(name.key, str(models[0]))
+    facts = _find_facts(rows, name.key)
     if facts is None:
         raise ValueError(
             f"{name.key} must have a tuning that states its best conventional filter, got none. "
-            f"Run pfbench tune scenario={name.key} model={models[0]}."
+            f"Run pfbench tune scenario={name.key} model={_find_model(rows)}."
         )
     return facts
 
 
-def _build_world(rows: pd.DataFrame, facts: WorldFacts, labels: Mapping[str, str]) -> World:
-    """Build a world with the reference that its tuning states."""
-    return build_world(rows, labels.get(facts.reference, facts.reference), facts.kalman_fits)
+def _find_facts(rows: pd.DataFrame, scenario: str) -> WorldFacts | None:
+    """Find the facts that the tuning of a world states; None without one."""
+    return read_world_facts(scenario, _find_model(rows))
 
 
-def _describe_world(world: World, name: PartName, looks: Mapping[str, MethodLook]) -> WorldRow:
+def _find_model(rows: pd.DataFrame) -> str:
+    """Return the model of a world, empty if the table has none."""
+    return str(rows["model"].iloc[0]) if "model" in rows else ""
+
+
+def build_world(
+    rows: pd.DataFrame, facts: WorldFacts, judged: tuple[Court, Mapping[str, str]]
+) -> World:
+    """Build a world with the reference that its tuning states.
+
+    Args:
+        rows: Runs of one condition.
+        facts: Facts of the world.
+        judged: Court of the study, and the labels that it has for the names of the table.
+
+    Raises:
+        ValueError: If runs of the reference are missing.
+    """
+    (court, labels), present = judged, set(rows["filter"])
+    name, regime = str(rows["scenario"].iloc[0]), rows["regime"].iloc[0]
+    by_name = {parse_label(label)[0]: label for label in labels if label in present}
+    if facts.reference not in by_name:
+        raise ValueError(
+            f"{name} must have runs of its reference {facts.reference}, got none. Run filter={facts.reference} in this study."
+        )
+    conditions = court.runs.conditions
+    mask = ((conditions["scenario"] == name) & (conditions["regime"] == regime)).to_numpy()
+    present_labels = {key: label for key, label in labels.items() if key in present}
+    return World(name, by_name[facts.reference], facts.kalman_fits, court, mask, present_labels)
+
+
+def describe_world(world: World, name: PartName, looks: Mapping[str, MethodLook]) -> WorldRow:
     """Return the row of a world."""
-    losses = world.losses[world.reference]
+    losses = world.losses(world.reference)[0]
     return WorldRow(
-        world.name, name.name, looks[world.reference].name, float(np.exp(losses.median())), name.unit,
+        world.name, name.name, looks[world.reference].name, float(np.exp(np.median(losses))), name.unit,
         len(losses), world.kalman_fits, name.words, math.nan if name.limit is None else name.limit,
     )  # fmt: skip
 

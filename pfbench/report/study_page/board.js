@@ -159,7 +159,7 @@ function sortedRows() {
 function drawBoard() {
   const shown = view();
   const several = cellsInView().length > 1;
-  find("#answer").innerHTML = strong(shown.sentence);
+  Object.assign(find("#answer"), { innerHTML: strong(shown.sentence), hidden: !!find("p.answer:not(#answer)") && state.world === data.opening[1] });
   find("#small").textContent = shown.small_print;
   const scope = (axis, items, noun) =>
     state[axis] !== "all"

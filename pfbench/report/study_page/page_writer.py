@@ -183,9 +183,16 @@ def format_sentence(text: str) -> Markup:
     return Markup(re.sub(r"\[\[(.*?)\]\](?!\])", r"<b>\1</b>", str(escape(text))))
 
 
+def find_opening(pack: Mapping[str, Any]) -> Any:
+    """Find the view that opens a page: of all worlds, or of the first of a few that have orders of their own."""
+    first, orders = next(iter(pack["views"])), pack.get("world_orders")
+    return first._replace(world=orders[0]["world"]) if orders else first
+
+
 def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
     """Return the sentence and the table of the opening view."""
-    key, view = next(iter(pack["views"].items()))
+    key = find_opening(pack)
+    view, everywhere = pack["views"][key], next(iter(pack["views"].values()))
     metric, world, regime, baseline = key
     names = {f["key"]: f for f in pack["filters"]}
     parts = (
@@ -202,7 +209,7 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
         "worlds": [format_sentence(order["sentence"]) for order in orders],
         "texts": (texts := [_remove_marks(order["sentence"]) for order in orders or [view]]),
         "text": "\n".join(texts),
-        "small_print": view["small_print"],
+        "small_print": everywhere["small_print"],
         "warnings": " ".join(pack.get("warnings", ())),
         "foreign_knobs": describe_page_knobs(pack),
         "overconfidence": describe_overconfidence(pack),
@@ -384,7 +391,7 @@ def encode_pack(pack: Mapping[str, Any], limit: int) -> str:
     """
     base = {
         **pack,
-        "opening": list(next(iter(pack["views"]))),
+        "opening": list(find_opening(pack)),
         "views": _encode_views(pack["views"]),
         "planned": _encode(pack["planned"]),
         "curves": _nest(pack["curves"]),

@@ -13,7 +13,8 @@ from pfbench.logs.judge.judgement import judge_programs
 from pfbench.report.board import build_run_table
 from pfbench.results.conditions import load_conditions
 from pfbench.results.store import write_result
-from pfbench.stats.world_table import build_world, decide_cells
+from pfbench.stats.court import Court
+from pfbench.stats.study_runs import arrange_runs
 
 RUNS = 30
 NAMES = ["position_E", "position_N", "position_U"]
@@ -48,10 +49,11 @@ def test_a_study_and_a_judgement_agree(tmp_path: Path, effect: float, word: str)
         "b": str(write_filter(tmp_path, "b", shared, 2)),
     }
     rows = build_run_table(load_conditions("s", tmp_path))
-    (cell,) = decide_cells([build_world(rows, "b", 1000.0)], ["a"])
+    court = Court(arrange_runs(rows, ("a", "b")), [("a", "b")])
+    verdict = court.find("rmse", np.ones(1, dtype=bool), "a", "b")
     reference = cases.write(cases.drive(20.0), tmp_path / "truth.csv")
     (pair,) = judge_programs(str(reference), files, JudgeOptions(limit=1000.0)).pairs
     assert pair.unit == "run"
-    assert pair.verdict.word == cell.verdict.word == word
+    assert pair.verdict.word == verdict.word == word
     for name in ("ratio", "low", "high", "p", "n"):
-        assert getattr(pair.verdict, name) == pytest.approx(getattr(cell.verdict, name), rel=1e-4)
+        assert getattr(pair.verdict, name) == pytest.approx(getattr(verdict, name), rel=1e-4)
