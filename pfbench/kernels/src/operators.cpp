@@ -81,9 +81,9 @@ Tensor log_normal(const Tensor& y, const Tensor& mean, const Tensor& scale, cons
 
 Tensor log_observed_normal(const Tensor& y, const Tensor& mean, const Tensor& sd) {
     ArgumentCheck check("log_observed_normal");
-    check.number("y", y, "rk");
+    check.number("y", y, "rK");
     check.real("mean", mean, "RNK");
-    check.number("sd", sd, "rk");
+    check.number("sd", sd, "rK");
     return operators::log_observed_normal(y, mean, sd);
 }
 
