@@ -129,20 +129,32 @@ def _filled(distribution: Any, y: Tensor, observed_mask: Tensor) -> Tensor:
     return torch.where(observed_mask, y, inside)
 
 
-def log_normal_density(y: Tensor, mean: Tensor, sd: Tensor, observed_mask: Tensor) -> Tensor:
+def log_normal_density(y: Tensor, mean: Tensor, sd: Tensor) -> Tensor:
     """Compute the log density of observed independent normal components.
 
     It replaces torch's `log_prob`, which passes over the particles eight times and took half of a
     step of a bootstrap filter.
 
-    Returns log density, [R, N]. Shapes: y [R, 1, Dy], mean [R, N, Dy], sd [R or 1, 1, Dy],
-    observed_mask [R, 1, Dy].
+    Returns log density, [R, N]. Shapes: y [R, Dy], NaN where missing, mean [R, N, Dy], sd [R or 1, 1
+    or N, Dy].
     """
-    scale = observed_mask / sd
-    constant = ((torch.log(sd) + _HALF_LOG_2PI) * observed_mask).sum(-1)
-    if scale.shape[1] == 1:
-        return _quadratic(y[:, 0], mean, scale[:, 0], constant[:, 0])
+    if sd.shape[1] == 1:
+        return _density(y, mean, sd[:, 0])
+    y, scale, constant = _observe(y.unsqueeze(1), sd)
     return _particle_quadratic(y, mean, scale) - constant
+
+
+def _observe(y: Tensor, sd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return measurements, inverse standard deviations, 0 where missing, [..., Dy], and the constant of the density [...]."""
+    observed_mask = y == y
+    constant = ((torch.log(sd) + _HALF_LOG_2PI) * observed_mask).sum(-1)
+    return y.nan_to_num(), observed_mask / sd, constant
+
+
+def _run_density(y: Tensor, mean: Tensor, sd: Tensor) -> Tensor:
+    """Compute the log density [R, N] for standard deviations [R or 1, Dy] of runs."""
+    y, scale, constant = _observe(y, sd)
+    return _quadratic(y, mean, scale, constant)
 
 
 def _run_quadratic(y: Tensor, mean: Tensor, scale: Tensor, constant: Tensor) -> Tensor:
@@ -159,6 +171,12 @@ def _particle_quadratic(y: Tensor, mean: Tensor, scale: Tensor) -> Tensor:
 
 
 _quadratic = compilable(_run_quadratic, operator=dispatch.log_normal, keep_in_graph=False)
+_density = compilable(
+    _run_density,
+    operator=dispatch.log_observed_normal,
+    keep_in_graph=False,
+    use_torch_compiler=False,
+)
 
 
 class StandardNormal(pyro.Normal):

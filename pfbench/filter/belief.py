@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import torch
@@ -135,10 +135,24 @@ class StepBlock(NamedTuple):
     @staticmethod
     def of_step(t: int, belief: Any, info: StepInfo) -> StepBlock:
         """Return the block of a single step."""
-        trace = {name: a.unsqueeze(1) for name, a in info.trace.items()}
-        moments = info.mean.unsqueeze(1), info.variance.unsqueeze(1)
-        log_evidence = belief.log_evidence.unsqueeze(1)
-        return StepBlock(t, *moments, log_evidence, trace, {t: (belief,)}, {t: info})
+        return StepBlock.of_steps(
+            t, [(*info[:2], belief.log_evidence, info.trace)], {t: (belief, info)}
+        )
+
+    @staticmethod
+    def of_steps(
+        first: int,
+        steps: Sequence[tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]],
+        kept: dict[int, tuple[Any, StepInfo]],
+    ) -> StepBlock:
+        """Return the block of mean, variance, log evidence and trace of each step, with belief and information of the kept ones."""
+        *numbers, traces = zip(*steps, strict=True)
+        trace = {name: torch.stack([a[name] for a in traces], 1) for name in traces[0]}
+        beliefs, infos = ({t: pair[k] for t, pair in kept.items()} for k in (0, 1))
+        moments = (torch.stack(a, 1) for a in numbers)
+        return StepBlock(
+            first, *moments, trace, {t: (belief,) for t, belief in beliefs.items()}, infos
+        )
 
     @property
     def steps(self) -> range:
@@ -201,7 +215,10 @@ class Filter(Protocol):
 
 
 def gather_ancestors(
-    belief: ParticleBelief, ancestors: Tensor, log_w: Tensor | None = None
+    belief: ParticleBelief,
+    ancestors: Tensor,
+    log_w: Tensor | None = None,
+    x: Tensor | None = None,
 ) -> ParticleBelief:
     """Copy particles by their ancestors, with weights, window and memory.
 
@@ -209,12 +226,13 @@ def gather_ancestors(
         belief: Weighted particles.
         ancestors: Slots, [R, M].
         log_w: Log weights of the copies, [R, M]. Those of the ancestors by default.
+        x: The copied states, [R, M, D], if they are known.
 
     Returns:
         Particles, [R, M, D].
     """
     return belief._replace(
-        x=_gather_states(belief.x, ancestors),
+        x=_gather_states(belief.x, ancestors) if x is None else x,
         log_w=belief.log_w.gather(1, ancestors) if log_w is None else log_w,
         window={k: _gather_rows(v, ancestors) for k, v in belief.window.items()},
         memory={k: _gather_rows(v, ancestors) for k, v in belief.memory.items()},

@@ -125,6 +125,9 @@ class PassStep(NamedTuple):
     draws: RandomStream
 
 
+_JOINED = 32  # steps; more save nothing, and a batch of runs waits in the cache for as long
+
+
 class FilterPass:
     """One pass of a filter over a record, step by step.
 
@@ -171,8 +174,7 @@ class FilterPass:
         The caller must not change belief or model.
         """
         if self.feedback is not None or not isinstance(self.method, MultiStepFilter):
-            for step in self:
-                yield StepBlock.of_step(step.t, self.belief, step.info)
+            yield from self._join_steps(selection)
             return
         t, steps = 0, self.record.y.shape[1]
         limit = steps
@@ -182,6 +184,17 @@ class FilterPass:
             )
             t += block.mean.shape[1]
             yield block
+
+    def _join_steps(self, selection: KeptSteps) -> Iterator[StepBlock]:
+        """Take the steps one by one, and join some of them, whose beliefs are not kept unless they are read."""
+        last, numbers, kept = self.record.y.shape[1] - 1, [], {}
+        for t, _, _, info, _ in self:
+            numbers.append((info.mean, info.variance, self.belief.log_evidence, info.trace))
+            if selection.all_steps or t in selection.checked:
+                kept[t] = self.belief, info
+            if selection.all_steps or t == last or len(numbers) == _JOINED:
+                yield StepBlock.of_steps(t + 1 - len(numbers), numbers, kept)
+                numbers, kept = [], {}
 
 
 def _start(method: Filter, model: StateSpaceModel, record: Record, draws: RandomStream) -> Any:

@@ -92,6 +92,13 @@ def _plain(args: tuple[Any, ...]) -> bool:
     return True
 
 
+def runs_operators(*args: Tensor) -> bool:
+    """Return whether C++ operators take these tensors now, so that one may stand for several functions."""
+    if _graph.get() or _fused.get() is False or not _plain(args) or _on_cuda(args):
+        return False
+    return is_library_loaded()
+
+
 def _on_cuda(args: tuple[Any, ...]) -> bool:
     """Return whether an argument is on a CUDA device."""
     return cuda.is_cuda_available() and any(isinstance(a, torch.Tensor) and a.is_cuda for a in args)
@@ -298,7 +305,9 @@ philox_normals_float64 = _make_function("philox_normals_float64")
 philox_uniforms = _make_function("philox_uniforms")
 resample_systematic = _make_function("resample_systematic")
 gather_particles = _make_function("gather_particles")
+resample_particles = _make_function("resample_particles")
 log_normal = _make_function("log_normal")
+log_observed_normal = _make_function("log_observed_normal")
 propagate_affine = _make_function("propagate_affine")
 gather_propagate = _make_function("gather_propagate")
 sir_step = _make_function("sir_step")
@@ -308,6 +317,7 @@ sum_log_weights = _make_function("sum_log_weights")
 normalise_weights = _make_function("normalise_weights")
 log_mixture = _make_function("log_mixture")
 weighted_moments = _make_function("weighted_moments")
+weigh_particles = _make_function("weigh_particles")
 cholesky_factor = _make_function("cholesky_factor")
 kalman_update = _make_function("kalman_update")
 fit_affine = _make_function("fit_affine")

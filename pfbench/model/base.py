@@ -266,16 +266,17 @@ class StateSpaceModel(nn.Module, ABC):
                 without a mean meets a residual.
         """
         distribution: Any = self.observation(x, u)
-        observed_mask = ~torch.isnan(y).unsqueeze(1)  # [R, 1, Dy]
         base = distribution.base_dist if isinstance(distribution, Independent) else None
         if isinstance(base, torch.distributions.Normal):
             sd = base.scale
             if sd.stride(1) == 0:  # torch has expanded one scale to all particles
                 sd = sd[:, :1] if sd.stride(0) else sd[:1, :1]
-            y, y_hat = y.nan_to_num().unsqueeze(1), base.loc
+            y_hat = base.loc
             if self.has_residual:  # the fused loop computes a plain difference itself
-                y, y_hat = torch.zeros_like(y), -self.residual(y, y_hat)
-            return log_normal_density(y, y_hat, sd, observed_mask)
+                y_hat = -self.residual(y.nan_to_num().unsqueeze(1), y_hat)
+                y = torch.where(y == y, 0.0, y)
+            return log_normal_density(y, y_hat, sd)
+        observed_mask = ~torch.isnan(y).unsqueeze(1)  # [R, 1, Dy]
         name = f"{type(self).__name__}.observation"
         if not self.has_residual:
             return log_density(distribution, y.unsqueeze(1), observed_mask, name)

@@ -78,8 +78,8 @@ def results(x: Tensor, z: Tensor) -> list[Any]:
     dtype = x.dtype
     hidden = z.clone()
     hidden[0] = -torch.inf  # a run of which nothing is left
-    seen = torch.ones(RUNS, 1, D, dtype=torch.bool)
-    seen[1, 0, 2] = False
+    y = 0.1 * x[:, 0]
+    y[1, 2] = torch.nan
     a, n, u = (
         torch.softmax(3.0 * z, -1),
         torch.full((RUNS, 1), N),
@@ -88,9 +88,7 @@ def results(x: Tensor, z: Tensor) -> list[Any]:
     return [
         belief._flat_moments(1e3 + x, torch.softmax(z, 1)),
         belief.normalise_updated_weights(hidden),
-        density.log_normal_density(
-            0.1 * x[:, :1], x, torch.full((1, 1, D), 0.7, dtype=dtype), seen
-        ),
+        density.log_normal_density(y, x, torch.full((1, 1, D), 0.7, dtype=dtype)),
         stages._systematic(a, n, u.double()),
     ]
 

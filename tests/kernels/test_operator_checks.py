@@ -106,6 +106,38 @@ def gather_and_propagate(*args: Any) -> Tensor:
     return linear_algebra._affine(phi, parents, gain, noise.to(x.dtype))
 
 
+class GivenUniform(random_stream.PhiloxStream):
+    """A stream whose uniform numbers are given, as `seed`."""
+
+    def __post_init__(self) -> None:
+        """Take any seed."""
+
+    def uniform(self, purpose: str, n: int, w: int) -> Tensor:
+        return torch.as_tensor(self.seed).unsqueeze(1)
+
+
+def resample_by_parts(*args: Any) -> Any:
+    """The stage of the particle filter without operators."""
+    check_arguments("resample_particles", args)
+    x, log_w, w, n, u, threshold = args
+    cloud = belief.ParticleBelief(
+        x.permute(1, 2, 0), log_w, log_w[:, 0], weights=belief.ComputedWeights(log_w, w)
+    )
+    resampler = stages.EssResampler(stages.Systematic(), float(threshold))
+    n, draws = n.to(w.dtype).expand(len(w), 1), GivenUniform(u, torch.arange(len(w)))
+    with dispatch.use_kernels(False):
+        new, mask = resampler(None, cloud, log_w, n, draws)  # type: ignore[arg-type]
+    return new.x.permute(2, 0, 1), new.log_w, new.ancestors, mask
+
+
+def weigh_by_parts(*args: Any) -> Any:
+    """The two functions that one operator stands for."""
+    check_arguments("weigh_particles", args)
+    x, log_w = args
+    weights = belief.normalise_updated_weights(log_w)
+    return *weights, *belief._flat_moments(x, weights[2])
+
+
 def eager_function(name: str) -> Callable[..., Any]:
     """The function that pfbench calls for an operator."""
     return {
@@ -114,7 +146,10 @@ def eager_function(name: str) -> Callable[..., Any]:
         "philox_uniforms": random_stream.draw_uniforms,
         "resample_systematic": stages._systematic,
         "gather_particles": belief._gather_components,
+        "resample_particles": resample_by_parts,
+        "weigh_particles": weigh_by_parts,
         "log_normal": density._quadratic,
+        "log_observed_normal": density._density,
         "propagate_affine": linear_algebra._affine,
         "gather_propagate": gather_and_propagate,
         "count_unique": belief.count_distinct_ancestors,
@@ -145,6 +180,8 @@ def valid_numbers(name: str, rng: random.Random) -> list[Any]:
             if argument.name in ("covariance", "omega"):
                 eye = torch.eye(value.shape[-1], dtype=value.dtype)
                 call[place] = value @ value.mT + 0.5 * eye
+            if argument.name == "sd":
+                call[place] = value + 0.5
             if argument.name in ("w", "a") and value.dim() == 2:
                 call[place] = torch.softmax(value, 1)
     return call

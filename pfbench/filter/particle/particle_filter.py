@@ -53,6 +53,7 @@ from pfbench.filter.particle.stages import (
     count_particles,
     deactivate_invalid_particles,
 )
+from pfbench.kernels import dispatch
 from pfbench.model.base import StateSpaceModel, initial_law
 
 if TYPE_CHECKING:
@@ -245,13 +246,19 @@ class ParticleFilter(Filter):
         log_w, carried, counts = compute_updated_weights(
             self.weight_update, model, parents.log_w, x, log_ratio, record, parents.memory
         )
-        x, log_w = deactivate_invalid_particles(x, log_w, parents.x)
+        fused = model.chart.flat and dispatch.runs_operators(x, log_w)
+        if fused:
+            *weights, mean, variance = dispatch.weigh_particles(x, log_w)
+            fused = math.isfinite(float(mean.sum()))  # NaN of a particle is NaN of the mean
+        if not fused:
+            x, log_w = deactivate_invalid_particles(x, log_w, parents.x)
+            weights = normalise_updated_weights(log_w)
         # not normalised: a ratio that is equal for all particles changes nothing
         predicted_log_w = (
             parents.log_w if is_equal_for_all(log_ratio) else parents.log_w + log_ratio
         )
         # a lost run keeps an evidence of -inf and continues with equal weights
-        log_w, total, normalised_w, trace["ess"] = normalise_updated_weights(log_w)
+        log_w, total, normalised_w, trace["ess"] = weights
         if not isinstance(self.particle_count, FixedCount):
             trace["particles"] = (parents.log_w > -torch.inf).sum(1).to(log_w)
         children = parents._replace(
@@ -264,8 +271,11 @@ class ParticleFilter(Filter):
         )
         if (history := self.history) is not None:
             children = history.append(model, parents, children, w, record)
-        moments = weighted_mean_variance(model, children, normalised_w)
-        return children, StepSummary(*moments, predicted_log_w, trace | proposal_trace | counts)
+        if not fused:
+            mean, variance = weighted_mean_variance(model, children, normalised_w)
+        return children, StepSummary(
+            mean, variance, predicted_log_w, trace | proposal_trace | counts
+        )
 
     def _resample_and_move(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple, Protocol
 
 import torch
@@ -177,6 +178,12 @@ class Resampler(Protocol):
         """
 
 
+@cache
+def _as_tensor(threshold: float) -> Tensor:
+    """Return a threshold as an operator takes it, once for all steps."""
+    return torch.tensor([[threshold]], dtype=torch.float64)
+
+
 @dataclass(frozen=True)
 class EssResampler(Resampler):
     """Resample the runs with a small effective sample size.
@@ -211,6 +218,14 @@ class EssResampler(Resampler):
         draws: RandomStream,
     ) -> tuple[ParticleBelief, Tensor]:
         a = exponentiate(log_a, belief.weights)
+        is_plain = type(self.scheme) is Systematic and log_a is belief.log_w
+        if is_plain and dispatch.runs_operators(belief.x, a):
+            x, u = belief.x.permute(2, 0, 1), self.scheme.draw_uniform(draws)
+            limit = _as_tensor(self.ess_threshold)
+            x, log_w, ancestors, resampled_mask = dispatch.resample_particles(
+                x, log_a, a, n, u, limit
+            )
+            return gather_ancestors(belief, ancestors, log_w, x.permute(1, 2, 0)), resampled_mask
         resampled_mask = torch.ones_like(belief.log_evidence, dtype=torch.bool)
         ancestors = self.scheme(a, n, draws)
         slots = torch.arange(a.shape[1], device=a.device)
@@ -248,7 +263,11 @@ class Systematic(ResamplingScheme):
 
     @override
     def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
-        return _systematic(a, n, draws.uniform("resample", 1, 1).squeeze(1))
+        return _systematic(a, n, self.draw_uniform(draws))
+
+    def draw_uniform(self, draws: RandomStream) -> Tensor:
+        """Draw the uniform number of each run, [R, 1]."""
+        return draws.uniform("resample", 1, 1).squeeze(1)
 
 
 def _eager_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:
@@ -380,7 +399,7 @@ class BootstrapProposal(Proposal):
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
         w = draw_noise(model, belief.x.shape[1], draws)
-        log_ratio = torch.zeros_like(belief.log_w[:, :1]).expand_as(belief.log_w)
+        log_ratio = belief.log_w.new_zeros(()).expand_as(belief.log_w)
         return ProposalSample(model.propagate(belief.x, record.u, w), log_ratio, belief.memory, w)
 
 

@@ -56,6 +56,20 @@ Tensor gather_particles(const Tensor& x, const Tensor& ancestors) {
     return operators::gather_particles(x, ancestors);
 }
 
+std::tuple<Tensor, Tensor, Tensor, Tensor> resample_particles(const Tensor& x, const Tensor& log_w, const Tensor& w, const Tensor& n, const Tensor& u, const Tensor& threshold) {
+    ArgumentCheck check("resample_particles");
+    check.real("x", x, "DRN", "N");
+    check.real("log_w", log_w, "RN");
+    check.real("w", w, "RN");
+    check.number("n", n, "r1");
+    check.number("u", u, "R1");
+    check.number("threshold", threshold, "11");
+    check.range("n", n, 1, 'N', 0);
+    check.range("u", u, 1, '1', 0);
+    check.range("threshold", threshold, 1, '1', 0);
+    return operators::resample_particles(x, log_w, w, n, u, threshold);
+}
+
 Tensor log_normal(const Tensor& y, const Tensor& mean, const Tensor& scale, const Tensor& constant) {
     ArgumentCheck check("log_normal");
     check.number("y", y, "rk");
@@ -63,6 +77,14 @@ Tensor log_normal(const Tensor& y, const Tensor& mean, const Tensor& scale, cons
     check.number("scale", scale, "rk");
     check.number("constant", constant, "r");
     return operators::log_normal(y, mean, scale, constant);
+}
+
+Tensor log_observed_normal(const Tensor& y, const Tensor& mean, const Tensor& sd) {
+    ArgumentCheck check("log_observed_normal");
+    check.number("y", y, "rK");
+    check.real("mean", mean, "RNK");
+    check.number("sd", sd, "rK");
+    return operators::log_observed_normal(y, mean, sd);
 }
 
 Tensor propagate_affine(const Tensor& phi, const Tensor& x, const Tensor& gain, const Tensor& w) {
@@ -131,6 +153,13 @@ std::tuple<Tensor, Tensor> weighted_moments(const Tensor& x, const Tensor& w) {
     return operators::weighted_moments(x, w);
 }
 
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> weigh_particles(const Tensor& x, const Tensor& log_w) {
+    ArgumentCheck check("weigh_particles");
+    check.real("x", x, "RND", "N");
+    check.real("log_w", log_w, "RN");
+    return operators::weigh_particles(x, log_w);
+}
+
 std::tuple<Tensor, Tensor> cholesky_factor(const Tensor& covariance) {
     ArgumentCheck check("cholesky_factor");
     check.real("covariance", covariance, "BDD");
@@ -190,7 +219,9 @@ const pfbench::Registration registration(
     pfbench::entry<&philox_uniforms>("philox_uniforms"),
     pfbench::entry<&resample_systematic>("resample_systematic"),
     pfbench::entry<&gather_particles>("gather_particles"),
+    pfbench::entry<&resample_particles>("resample_particles"),
     pfbench::entry<&log_normal>("log_normal"),
+    pfbench::entry<&log_observed_normal>("log_observed_normal"),
     pfbench::entry<&propagate_affine>("propagate_affine"),
     pfbench::entry<&gather_propagate>("gather_propagate"),
     pfbench::entry<&count_unique>("count_unique"),
@@ -199,6 +230,7 @@ const pfbench::Registration registration(
     pfbench::entry<&normalise_weights>("normalise_weights"),
     pfbench::entry<&log_mixture>("log_mixture"),
     pfbench::entry<&weighted_moments>("weighted_moments"),
+    pfbench::entry<&weigh_particles>("weigh_particles"),
     pfbench::entry<&cholesky_factor>("cholesky_factor"),
     pfbench::entry<&kalman_update>("kalman_update"),
     pfbench::entry<&fit_affine>("fit_affine"),
@@ -228,8 +260,16 @@ DIRECT_CALL aoti_torch_cpu_gather_particles(AtenTensorHandle x, AtenTensorHandle
     return call_directly<&gather_particles>({result_0}, x, ancestors);
 }
 
+DIRECT_CALL aoti_torch_cpu_resample_particles(AtenTensorHandle x, AtenTensorHandle log_w, AtenTensorHandle w, AtenTensorHandle n, AtenTensorHandle u, AtenTensorHandle threshold, AtenTensorHandle* result_0, AtenTensorHandle* result_1, AtenTensorHandle* result_2, AtenTensorHandle* result_3) {
+    return call_directly<&resample_particles>({result_0, result_1, result_2, result_3}, x, log_w, w, n, u, threshold);
+}
+
 DIRECT_CALL aoti_torch_cpu_log_normal(AtenTensorHandle y, AtenTensorHandle mean, AtenTensorHandle scale, AtenTensorHandle constant, AtenTensorHandle* result_0) {
     return call_directly<&log_normal>({result_0}, y, mean, scale, constant);
+}
+
+DIRECT_CALL aoti_torch_cpu_log_observed_normal(AtenTensorHandle y, AtenTensorHandle mean, AtenTensorHandle sd, AtenTensorHandle* result_0) {
+    return call_directly<&log_observed_normal>({result_0}, y, mean, sd);
 }
 
 DIRECT_CALL aoti_torch_cpu_propagate_affine(AtenTensorHandle phi, AtenTensorHandle x, AtenTensorHandle gain, AtenTensorHandle w, AtenTensorHandle* result_0) {
@@ -262,6 +302,10 @@ DIRECT_CALL aoti_torch_cpu_log_mixture(AtenTensorHandle a, AtenTensorHandle cent
 
 DIRECT_CALL aoti_torch_cpu_weighted_moments(AtenTensorHandle x, AtenTensorHandle w, AtenTensorHandle* result_0, AtenTensorHandle* result_1) {
     return call_directly<&weighted_moments>({result_0, result_1}, x, w);
+}
+
+DIRECT_CALL aoti_torch_cpu_weigh_particles(AtenTensorHandle x, AtenTensorHandle log_w, AtenTensorHandle* result_0, AtenTensorHandle* result_1, AtenTensorHandle* result_2, AtenTensorHandle* result_3, AtenTensorHandle* result_4, AtenTensorHandle* result_5) {
+    return call_directly<&weigh_particles>({result_0, result_1, result_2, result_3, result_4, result_5}, x, log_w);
 }
 
 DIRECT_CALL aoti_torch_cpu_cholesky_factor(AtenTensorHandle covariance, AtenTensorHandle* result_0, AtenTensorHandle* result_1) {

@@ -6,7 +6,9 @@
 #include <array>
 #include <cmath>
 #include <cstdint>
+#include <limits>
 #include <memory>
+#include <numeric>
 #include <tuple>
 #include <vector>
 
@@ -354,6 +356,36 @@ Tensor operators::resample_systematic(const Tensor& a, const Tensor& n, const Te
     return out;
 }
 
+std::tuple<Tensor, Tensor, Tensor, Tensor> operators::resample_particles(const Tensor& x, const Tensor& log_w, const Tensor& w, const Tensor& n,
+                                                                         const Tensor& u, const Tensor& threshold) {
+    const int64_t components = x.size(0), runs = x.size(1), slots = x.size(2);
+    const Tensor ancestors = fresh<int64_t>({runs, slots}), mask = fresh<bool>({runs});
+    const auto wanted = few<double>(n, runs), uniform = few<double>(u, runs);
+    return by_type(x, [&](auto one) {
+        using T = decltype(one);
+        const Tensor out = fresh<T>({components, runs, slots}), log_out = fresh<T>({runs, slots});
+        const Packed<T> weight(w), before(log_w);
+        const T limit = few<T>(threshold, 1)[0];
+        for (int64_t r = 0; r < runs; ++r) {
+            const T* from = weight.data + r * slots;
+            T *const to = numbers<T>(log_out) + r * slots, whole, square;
+            totals(&whole, &square, from, 1, slots);
+            int64_t* const ancestor = numbers<int64_t>(ancestors) + r * slots;
+            if ((numbers<bool>(mask)[r] = limit >= 1 || 1 / square < limit * static_cast<T>(wanted[r]))) {
+                systematic(ancestor, from, &wanted[r], &uniform[r], 1, slots);
+                const int64_t many = static_cast<int64_t>(std::ceil(wanted[r]));  // slots below n
+                std::fill(to, to + many, -std::log(static_cast<T>(wanted[r])));
+                std::fill(to + many, to + slots, -std::numeric_limits<T>::infinity());
+            } else {
+                std::iota(ancestor, ancestor + slots, 0);
+                std::copy_n(before.data + r * slots, slots, to);
+            }
+        }
+        copied(numbers<T>(out), Packed<T>(x).data, numbers<int64_t>(ancestors), components, runs, slots, slots);
+        return std::make_tuple(out, log_out, ancestors, mask);
+    });
+}
+
 Tensor operators::gather_particles(const Tensor& x, const Tensor& ancestors) {
     const int64_t components = x.size(0), runs = x.size(1), wanted = ancestors.size(1);
     const Packed<int64_t> from(ancestors);
@@ -372,6 +404,25 @@ Tensor operators::log_normal(const Tensor& y, const Tensor& mean, const Tensor& 
         const Tensor out = fresh<T>({runs, particles});
         ::log_normal(numbers<T>(out), few<T>(y, runs, components).data(), numbers<T>(mean), few<T>(scale, runs, components).data(),
                    few<T>(constant, runs).data(), mean.strides(), runs, particles, components);
+        return out;
+    });
+}
+
+Tensor operators::log_observed_normal(const Tensor& y, const Tensor& mean, const Tensor& sd) {
+    const int64_t runs = mean.size(0), particles = mean.size(1), components = mean.size(2);
+    return by_type(mean, [&](auto one) {
+        using T = decltype(one);
+        const Tensor out = fresh<T>({runs, particles});
+        auto seen = few<T>(y, runs, components), scale = few<T>(sd, runs, components);
+        std::vector<T> constant(runs);
+        for (int64_t i = 0; i < runs * components; ++i) {
+            const bool missing = seen[i] != seen[i];
+            constant[i / components] += missing ? T(0) : std::log(scale[i]) + T(0.91893853320467274178);  // log sqrt(2 pi)
+            scale[i] = missing ? T(0) : 1 / scale[i];
+            seen[i] = missing ? T(0) : seen[i];
+        }
+        ::log_normal(numbers<T>(out), seen.data(), numbers<T>(mean), scale.data(), constant.data(), mean.strides(), runs, particles,
+                     components);
         return out;
     });
 }
@@ -451,6 +502,11 @@ std::tuple<Tensor, Tensor> operators::weighted_moments(const Tensor& x, const Te
                 x.size(1));
         return std::make_tuple(mean, variance);
     });
+}
+
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> operators::weigh_particles(const Tensor& x, const Tensor& log_w) {
+    const auto weights = operators::normalise_weights(log_w);
+    return std::tuple_cat(weights, operators::weighted_moments(x, std::get<2>(weights)));
 }
 
 Tensor operators::group_covariance(const Tensor& x, const Tensor& mean, const Tensor& w, const Tensor& groups) {
