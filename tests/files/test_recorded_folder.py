@@ -153,6 +153,14 @@ def test_names_outside_of_the_folder_are_refused(
         write(folder, {name: "x"})
 
 
+def test_an_absolute_name_is_refused(folder: Path) -> None:
+    outside = folder.parent / "x"
+    outside.write_text("mine")
+    write_manifest(folder, {str(outside): hash_content(b"mine")})
+    write(folder, {"page.md": "new page"})
+    assert outside.read_text() == "mine"
+
+
 DAMAGED = (
     "",
     "{",
