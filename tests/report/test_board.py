@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from checkout import ROOT
+from scipy import stats
 
 from pfbench.report import RUNS_FILE, read_stored_study
 from pfbench.report.board.entries import StudyNames, metric_entries
