@@ -135,10 +135,8 @@ from pfbench.filter.particle.regularised_resampling import (
     ThompsonTaylorResampler as ThompsonTaylorResampler,
 )
 from pfbench.filter.particle.resampling import (
-    Killing as Killing,
     Multinomial as Multinomial,
     Residual as Residual,
-    Ssp as Ssp,
     Stratified as Stratified,
 )
 from pfbench.filter.particle.sqmc import (
@@ -168,7 +166,6 @@ from pfbench.filter.particle.stages import (
 )
 from pfbench.filter.particle.weights import (
     AdditiveTempering as AdditiveTempering,
-    FlooredWeightUpdate as FlooredWeightUpdate,
     LookAheadWeights as LookAheadWeights,
     PowerLikelihoodUpdate as PowerLikelihoodUpdate,
     PowerTempering as PowerTempering,
@@ -241,9 +238,7 @@ from pfbench.filter.robust.multiple_models import (
 )
 from pfbench.filter.robust.noise_learning import (
     SageHusaAdaptation as SageHusaAdaptation,
-    VariationalCovarianceAdaptation as VariationalCovarianceAdaptation,
     VariationalNoiseAdaptation as VariationalNoiseAdaptation,
-    WindowedNoiseAdaptation as WindowedNoiseAdaptation,
 )
 from pfbench.filter.robust.observation_updates import (
     MixtureObservationUpdate as MixtureObservationUpdate,

@@ -35,7 +35,7 @@ def make_sources() -> dict[str, str]:
     shims = [_direct_call(operator) for operator in operators]
     return {
         "operators.h": "\n".join([*declarations, "}  // namespace operators", ""]),
-        "operators.cpp": "\n".join([*definitions, "}  // namespace", "", *shims]),
+        "operators.cpp": "\n".join([*definitions, "}  // namespace", "", *shims, ""]),
     }
 
 
@@ -76,10 +76,8 @@ def _direct_call(operator: Operator) -> str:
     results = [f"result_{k}" for k in range(len(operator.results))]
     parameters = ", ".join([*inputs, *(f"AtenTensorHandle* {result}" for result in results)])
     values = ", ".join([f"{{{', '.join(results)}}}", *(a.name for a in operator.arguments)])
-    return (
-        f"DIRECT_CALL aoti_torch_cpu_{operator.name}({parameters}) {{\n"
-        f"    return call_directly<&{operator.name}>({values});\n}}\n"
-    )
+    name = operator.name
+    return f"DIRECT_CALL aoti_torch_cpu_{name}({parameters}) {{ return call_directly<&{name}>({values}); }}"
 
 
 if __name__ == "__main__":

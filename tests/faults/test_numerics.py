@@ -20,7 +20,6 @@ POINTS = (("ekf_pf", "H of 1e100"), ("dmc_noise", "R of 1e-24"), ("dmc_optimal",
     ("name", "case", "remark"),
     [
         *((name, case, "marked") for name, case in POINTS),
-        ("sir_copied", "measurement of 1e200", "marked"),
         ("mcmc_flow_stat", "zero Q and P0", "clear error"),
     ],
 )

@@ -21,8 +21,6 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.moves.metropolis import MetropolisHastings
 from pfbench.filter.moves.path_kernels import NoiseFlowStatKernel
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.stages import BayesWeightUpdate
-from pfbench.filter.particle.weights import FlooredWeightUpdate
 from pfbench.kernels import dispatch
 from pfbench.model.base import ModelWrapper
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
@@ -255,14 +253,11 @@ def test_a_wrapper_gives_its_inputs_to_its_own_observation() -> None:
     assert not result.lost.any()
 
 
-@pytest.mark.parametrize(
-    "update", [BayesWeightUpdate(), FlooredWeightUpdate()], ids=["bayes", "floor"]
-)
-def test_weights_below_the_precision_of_their_logarithms_lose_the_run(update: Any) -> None:
+def test_weights_below_the_precision_of_their_logarithms_lose_the_run() -> None:
     """At 1e8 standard deviations log weights are noise; 1e5 are resolved."""
     y = Y.clone()
     y[0, 2], y[1, 2], y[2, 2] = 1e200, 1e9, 1e5
-    result = run_filter(ParticleFilter(20, weight_update=update), MODEL, Record(y), DRAWS)
+    result = run_filter(ParticleFilter(20), MODEL, Record(y), DRAWS)
     assert result.lost.tolist() == [True, True, False]
     assert torch.isneginf(result.log_evidence[:2]).all()
 

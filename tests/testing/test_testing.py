@@ -36,7 +36,7 @@ from pfbench.filter.moves.path_kernels import (
 from pfbench.filter.moves.path_proposals import SmoothedSegment
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import Multinomial, Residual, Ssp
+from pfbench.filter.particle.resampling import Multinomial, Residual
 from pfbench.filter.particle.sqmc import HilbertSortedResampler, SqmcProposal, SqmcScheme
 from pfbench.filter.particle.stages import (
     BayesWeightUpdate,
@@ -182,7 +182,7 @@ def peek(method: Any, model: StateSpaceModel, y: Tensor) -> FilterResult:
 @pytest.mark.parametrize(
     "stage",
     [
-        Systematic(), Residual(), EssResampler(Ssp(), 0.5), EssResampler(Multinomial(), 0.0), SoftResampler(0.5), StopGradientResampler(),
+        Systematic(), Residual(), EssResampler(Residual(), 0.5), EssResampler(Multinomial(), 0.0), SoftResampler(0.5), StopGradientResampler(),
         HilbertSortedResampler(EssResampler(SqmcScheme(), 1.0)), SortedResampler(EssResampler(Systematic(), 1.0)),
     ],
     ids=lambda s: type(s).__name__,

@@ -399,7 +399,7 @@ class BootstrapProposal(Proposal):
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
     ) -> ProposalSample:
         w = draw_noise(model, belief.x.shape[1], draws)
-        log_ratio = belief.log_w.new_zeros(()).expand_as(belief.log_w)
+        log_ratio = torch.zeros_like(belief.log_w[:, :1]).expand_as(belief.log_w)
         return ProposalSample(model.propagate(belief.x, record.u, w), log_ratio, belief.memory, w)
 
 

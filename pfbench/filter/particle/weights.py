@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief, add_log_weights, is_resolved
+from pfbench.filter.belief import ParticleBelief, add_log_weights
 from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
 from pfbench.filter.particle.stages import (
     AuxiliaryWeights,
@@ -267,40 +267,3 @@ class PowerLikelihoodUpdate(WeightUpdate):
     ) -> Tensor:
         log_likelihood = model.log_likelihood(record.y, x, record.u).expand_as(log_w).to(log_w)
         return add_log_weights(log_likelihood / self.r_factor, log_w, log_ratio)
-
-
-@dataclass(frozen=True)
-class FlooredWeightUpdate(WeightUpdate):
-    """Weights as plain numbers plus a floor, as in much code, for comparison [ours].
-
-    The smallest double is e^-745. A particle 38 standard deviations from the measurement gets
-    weight 0, so only the floor remains. If all particles are that far away, all weights become
-    equal. A run is lost if not even the logarithms distinguish its particles, see `is_resolved`.
-
-    Attributes:
-        weight_floor: Number added to each particle's weight before normalisation.
-
-    Raises:
-        ValueError: If the floor is not positive.
-    """
-
-    weight_floor: float = 1e-300
-    is_exact = False
-
-    def __post_init__(self) -> None:
-        require_ranges(
-            "weight_update",
-            self,
-            weight_floor="(0, inf] Choose a small number, or BayesWeightUpdate, which needs none.",
-        )
-
-    @override
-    def __call__(
-        self, model: StateSpaceModel, log_w: Tensor, x: Tensor, log_ratio: Tensor, record: Record
-    ) -> Tensor:
-        log_likelihood = model.log_likelihood(record.y, x, record.u) + log_ratio
-        likelihood = torch.exp(log_likelihood.double()).nan_to_num(nan=0.0)
-        weight = torch.log(torch.exp(log_w.double()) * likelihood + self.weight_floor)
-        comparable = torch.where(log_likelihood == log_likelihood, log_likelihood, -torch.inf)
-        empty = torch.isneginf(log_w) | ~is_resolved(comparable.amax(1, keepdim=True))
-        return torch.where(empty, -torch.inf, weight).to(log_w)

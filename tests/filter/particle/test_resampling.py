@@ -24,7 +24,7 @@ from pfbench.filter.belief import (
 )
 from pfbench.filter.particle import resampling
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import Killing, Multinomial, Residual, Ssp, Stratified
+from pfbench.filter.particle.resampling import Multinomial, Residual, Stratified
 from pfbench.filter.particle.stages import EssResampler, ResamplingScheme, Systematic
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.testing import check_resampling
@@ -38,9 +38,6 @@ SCHEMES: list[ResamplingScheme] = [
     ),
 ]
 every_scheme = pytest.mark.parametrize("scheme", SCHEMES, ids=lambda s: type(s).__name__)
-resizing = pytest.mark.parametrize(
-    "scheme", [s for s in SCHEMES if not isinstance(s, Killing)], ids=lambda s: type(s).__name__
-)
 MODEL = linear_walk(1.0, 0.3, 1.0)
 
 
@@ -69,7 +66,7 @@ def test_average_copies(scheme: ResamplingScheme) -> None:
     check_resampling(scheme)
 
 
-@resizing
+@every_scheme
 @pytest.mark.parametrize("wanted", [1, 2, 17])
 def test_average_copies_of_a_smaller_cloud(scheme: ResamplingScheme, wanted: int) -> None:
     check_resampling(scheme, slots=wanted)
@@ -110,7 +107,9 @@ MISTAKES = {
     "residual without its residue": lambda a, n, d: Residual()(
         normalised(torch.floor(a * n)), n, d
     ),
-    "weights above 0 taken as equal": lambda a, n, d: Killing()(normalised((a > 0).double()), n, d),
+    "weights above 0 taken as equal": lambda a, n, d: Multinomial()(
+        normalised((a > 0).double()), n, d
+    ),
     "no resampling of nearly equal weights": lambda a, n, d: torch.where(
         a.amax(1, keepdim=True) < 1.2 * a.mean(1, keepdim=True),
         torch.arange(a.shape[1]),
@@ -143,16 +142,6 @@ def test_residual_copies_are_at_least_the_whole_part() -> None:
     assert np.all(counts >= np.floor(expected + 1e-9))
 
 
-def test_ssp_copies_are_the_whole_part_or_one_more_and_repel() -> None:
-    counts, expected = copies(Ssp(), uneven(24), 24, 20_000), 24 * uneven(24)
-    assert np.abs(counts - expected).max() < 1.0
-    covariance = np.cov(counts.T)
-    rest = covariance - np.diag(np.diag(covariance))
-    assert rest.max() < 4 * 0.25 / math.sqrt(
-        20_000
-    )  # negative association: no pair helps each other
-
-
 def test_stratified_copies_are_within_two() -> None:
     counts, expected = copies(Stratified(), uneven(24), 24, 2000), 24 * uneven(24)
     assert np.abs(counts - expected).max() < 2.0
@@ -171,22 +160,13 @@ def test_multinomial_variance() -> None:
 def test_low_variance_schemes_vary_less_than_multinomial() -> None:
     a = uneven(24)
     multinomial = copies(Multinomial(), a, 24, 5000).var(0).sum()
-    for scheme in (Systematic(), Stratified(), Residual(), Ssp(), Killing()):
+    for scheme in (Systematic(), Stratified(), Residual()):
         assert copies(scheme, a, 24, 5000).var(0).sum() < multinomial, scheme
-
-
-def test_killing_keeps_survivors_in_their_slots() -> None:
-    a = torch.tensor(uneven(24)).expand(4000, -1)
-    ancestors = Killing()(a, torch.full((4000, 1), 24.0), PhiloxStream(1, torch.arange(4000)))
-    kept = (ancestors == torch.arange(24)).double().mean(0).numpy()
-    survives = uneven(24) / uneven(24).max()
-    expected = survives + (1 - survives) * uneven(24)  # killed, and replaced by itself
-    assert np.all(np.abs(kept - expected) < 4.5 * np.sqrt(expected * (1 - expected) / 4000) + 1e-12)
 
 
 @pytest.mark.parametrize(
     "scheme",
-    [Systematic(), Stratified(), Residual(), Ssp(), Killing()],
+    [Systematic(), Stratified(), Residual()],
     ids=lambda s: type(s).__name__,
 )
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -225,7 +205,7 @@ def test_a_million_particles(scheme: ResamplingScheme, dtype: torch.dtype) -> No
     assert torch.all(ancestors[1] == 123_456)
     exact = a[0].double()
     expected = n * exact / exact.sum()
-    if isinstance(scheme, Systematic | Ssp):
+    if isinstance(scheme, Systematic):
         assert float((counts - expected).abs().max()) < 1.0 + 1e-3
     # a block of a thousand neighbours has a thousandth of the mass, plus or minus at most multinomial noise
     block = (counts - expected).reshape(1000, 1000).sum(1) / expected.reshape(1000, 1000).sum(
@@ -337,7 +317,7 @@ def test_threshold_is_a_ratio_of_the_effective_sample_size() -> None:
         )
 
 
-@resizing
+@every_scheme
 def test_empty_slots_of_a_smaller_cloud(scheme: ResamplingScheme) -> None:
     before = cloud(uneven_runs=6)
     after, _ = refresh(EssResampler(scheme, 1.0), before, n=20)
