@@ -30,6 +30,11 @@ from hydra import compose, initialize_config_module
 from matplotlib import ticker
 from matplotlib.figure import Figure
 from pfbench.experiments.study_parts import ResumableResults
+from pfbench.experiments.urban_error_fit import (
+    estimate_mixture,
+    estimate_normal,
+    range_residuals,
+)
 from pyro.distributions import Independent, LogNormal, Normal, TransformedDistribution
 from torch import Tensor, nn
 from torch.distributions.transforms import SigmoidTransform
@@ -63,10 +68,7 @@ from pfbench.report import COLUMN, RC, add_legend, line_styles, render_palette_p
 from pfbench.results import holm, wilcoxon_signed_rank
 from pfbench.scenario import (
     UrbanDrive,
-    estimate_mixture,
-    estimate_normal,
     find_dataset,
-    range_residuals,
     read_drive,
     select_stretch,
 )

@@ -251,9 +251,13 @@ def _words(d: np.ndarray, ratio: np.ndarray, margin: float = EQUALITY_MARGIN) ->
         t = np.where((error == 0.0) & (trimmed == 0.0), 0.0, trimmed / error)
     equal = (np.minimum(low, np.where(p < 0.05, low, 0)) > -margin) & (np.maximum(high, np.where(p < 0.05, high, 0)) < margin)  # fmt: skip
     more, fewer = (d > LOG_TOLERANCE).sum(axis=1), (d < -LOG_TOLERANCE).sum(axis=1)
-    agree = (p < 0.05) & (2 * stdtr(h - 1, -np.abs(t)) < 0.05) & (2 * bdtr(np.minimum(more, fewer), more + fewer, 0.5) < 0.05)  # fmt: skip
-    sides = (trimmed * location[:, 0] > 0) & ((more - fewer) * location[:, 0] > 0)
-    sign = np.where(agree & ~equal & sides, np.sign(location[:, 0]), 0)
+    against = np.where(location[:, 0] < 0, more, fewer)
+    agree = (
+        (p < 0.05)
+        & (2 * stdtr(h - 1, -np.abs(t)) < 0.05)
+        & (bdtr(against, more + fewer, 0.5) < 0.05)
+    )
+    sign = np.where(agree & ~equal & (trimmed * location[:, 0] > 0), np.sign(location[:, 0]), 0)
     return Words(sign, equal, n / ratio)
 
 

@@ -37,11 +37,12 @@ DOTTED = re.compile(r"(?<![\w/.])pfbench(?:\.[A-Za-z_]\w*)+")
 COMMAND = re.compile(r"-m pfbench[\w.]*")
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
 YAML = [file for folder in ("conf", "experiments") for file in (ROOT / folder).rglob("*.yaml")]
-# the pictures of methods and the page of commands show internals, which have no public name
+# they show, check or fit internals, which have no public name
 SCRIPTS = [
     file
     for file in (ROOT / "experiments").rglob("*.py")
-    if file.name not in ("method_pictures.py", "site_pages.py")
+    if file.name
+    not in ("method_pictures.py", "site_pages.py", "word_rates.py", "urban_error_fit.py")
 ]
 
 

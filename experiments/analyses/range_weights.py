@@ -16,15 +16,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from pfbench.experiments.urban_error_fit import estimate_normal, range_residuals
 
 from pfbench import job
 from pfbench.core import PhiloxStream
 from pfbench.files import markdown_head, markdown_row
 from pfbench.filter import run_filter
 from pfbench.scenario import (
-    estimate_normal,
     find_dataset,
-    range_residuals,
     read_drive,
     select_stretch,
 )

@@ -330,16 +330,14 @@ def _conclude(
 
 def _name_outcome(dot: ReadingDot, decided: set[str]) -> str:
     """Name the outcome of a reading; open if both looks differ."""
+    is_lost = any(
+        (c.lost_a & c.lost_b).mean() > _MOST_LOST for c in dot.comparisons
+    )  # in most runs, both
     if not is_counted(dot):
-        return dot.state or (CANNOT_RUN if _is_lost(dot) else VACUOUS)
+        return dot.state or (CANNOT_RUN if is_lost else VACUOUS)
     if len(decided) == 1:
         return next(iter(decided))
     return UNDECIDED if dot.comparisons else NOT_RUN
-
-
-def _is_lost(dot: ReadingDot) -> bool:
-    """Return whether both filters lose most runs of a comparison."""
-    return any((c.lost_a & c.lost_b).mean() > _MOST_LOST for c in dot.comparisons)
 
 
 def _find_factors(dots: Mapping[str, ReadingDot], outcomes: Mapping[str, str]) -> tuple[str, ...]:

@@ -143,16 +143,15 @@ class StepBlock(NamedTuple):
     def of_steps(
         first: int,
         steps: Sequence[tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]],
-        kept: dict[int, tuple[Any, StepInfo]],
+        clouds: dict[int, tuple[Any, StepInfo]],
     ) -> StepBlock:
-        """Return the block of mean, variance, log evidence and trace of each step, with belief and information of the kept ones."""
+        """Return the block of mean, variance, log evidence and trace of each step, with belief and information of those that are read."""
         *numbers, traces = zip(*steps, strict=True)
         trace = {name: torch.stack([a[name] for a in traces], 1) for name in traces[0]}
-        beliefs, infos = ({t: pair[k] for t, pair in kept.items()} for k in (0, 1))
-        moments = (torch.stack(a, 1) for a in numbers)
-        return StepBlock(
-            first, *moments, trace, {t: (belief,) for t, belief in beliefs.items()}, infos
-        )
+        beliefs, infos = ({t: pair[k] for t, pair in clouds.items()} for k in (0, 1))
+        mean, variance, log_evidence = (torch.stack(a, 1) for a in numbers)
+        single = {t: (belief,) for t, belief in beliefs.items()}
+        return StepBlock(first, mean, variance, log_evidence, trace, single, infos)
 
     @property
     def steps(self) -> range:

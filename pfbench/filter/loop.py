@@ -186,15 +186,16 @@ class FilterPass:
             yield block
 
     def _join_steps(self, selection: KeptSteps) -> Iterator[StepBlock]:
-        """Take the steps one by one, and join some of them, whose beliefs are not kept unless they are read."""
-        last, numbers, kept = self.record.y.shape[1] - 1, [], {}
+        """Take the steps one by one, and join some of them, whose beliefs are not held unless they are read."""
+        last, numbers, clouds = self.record.y.shape[1] - 1, [], {}
         for t, _, _, info, _ in self:
             numbers.append((info.mean, info.variance, self.belief.log_evidence, info.trace))
             if selection.all_steps or t in selection.checked:
-                kept[t] = self.belief, info
-            if selection.all_steps or t == last or len(numbers) == _JOINED:
-                yield StepBlock.of_steps(t + 1 - len(numbers), numbers, kept)
-                numbers, kept = [], {}
+                clouds[t] = self.belief, info
+            # the reader of a block holds its cloud, which the next step needs anyway, and later ones do not
+            if clouds or t - 1 in selection.checked or t == last or len(numbers) == _JOINED:
+                yield StepBlock.of_steps(t + 1 - len(numbers), numbers, clouds)
+                numbers, clouds = [], {}
 
 
 def _start(method: Filter, model: StateSpaceModel, record: Record, draws: RandomStream) -> Any:

@@ -13,7 +13,7 @@ from typing import IO, TYPE_CHECKING, Any
 from pfbench.door.parts import Part, describe_value, format_words, plain_errors
 from pfbench.files.atomic_write import write_atomically
 from pfbench.job.trust import WRITTEN
-from pfbench.logs.units import UNITS
+from pfbench.logs.units import UNIT_FACTORS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,7 +40,7 @@ _POSITION = (("lat_deg", "lon_deg", "h_m"), ("pn", "pe", "pd"))
 _UNITS = re.compile(
     r"(?<=[a-z0-9])[_ .\[(]*(m/?s\^?2|mps2|rad/?s|radps|m/?s|mps|rad|deg|s|m)[\])]*$", re.IGNORECASE
 )
-_SECONDS = {"s": 1.0, **UNITS["time"]}
+_SECONDS = {"s": 1.0, **UNIT_FACTORS["time"]}
 _SIGNS = {"frd": (1.0, 1.0, 1.0), "flu": (1.0, -1.0, -1.0)}
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 DEGREE = math.pi / 180.0
+WEEK = 604800.0  # s
 # factors that convert to the unit of a table: s, m, m/s, m/s^2, rad, rad/s, deg (of places), kPa, gauss
-UNITS: dict[str, dict[str, float]] = {
+UNIT_FACTORS: dict[str, dict[str, float]] = {
     "time": {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "minutes": 60.0, "hours": 3600.0},
     "length": {"cm": 1e-2, "mm": 1e-3, "km": 1e3, "feet": 0.3048},
     "velocity": {"cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6, "knots": 1852.0 / 3600.0, "feet/s": 0.3048},
@@ -27,5 +28,5 @@ ALIASES = {
 
 def find_units(dimension: str, ratio: float, error: float) -> dict[str, float]:
     """Return the units, with their factors, in which values are a ratio too large, to a relative error."""
-    units = UNITS[dimension].items()
+    units = UNIT_FACTORS[dimension].items()
     return {name: factor for name, factor in units if abs(ratio * factor - 1.0) < error}

@@ -504,7 +504,9 @@ def make_laplace(loc: Tensor, scale: Tensor) -> Distribution:
 
     Shapes: loc [..., Dy], scale [..., Dy].
     """
-    return Independent(_laplace(loc, scale), 1, validate_args=False)
+    return Independent(
+        Laplace(loc, scale / math.sqrt(2.0), validate_args=False), 1, validate_args=False
+    )
 
 
 def contaminated_normal(probability: float, sd_factor: float, joint: bool, heavy: Family) -> Family:
@@ -541,7 +543,3 @@ def normal_to_laplace(z: Tensor) -> Tensor:
     The transformation is monotone: minus the log of twice the normal tail is exponential.
     """
     return torch.sign(z) * -(torch.special.log_ndtr(-z.abs()) + math.log(2.0)) / math.sqrt(2.0)
-
-
-def _laplace(loc: Tensor, scale: Tensor) -> Laplace:
-    return Laplace(loc, scale / math.sqrt(2.0), validate_args=False)

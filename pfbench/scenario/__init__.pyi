@@ -34,11 +34,6 @@ from pfbench.logs.worlds.urban import (
     read_drive as read_drive,
     select_stretch as select_stretch,
 )
-from pfbench.logs.worlds.urban_error_fit import (
-    estimate_mixture as estimate_mixture,
-    estimate_normal as estimate_normal,
-    range_residuals as range_residuals,
-)
 from pfbench.logs.worlds.user_log import UserLog as UserLog
 from pfbench.logs.worlds.user_raw_log import (
     UserInsLog as UserInsLog,

@@ -35,7 +35,7 @@ from pfbench.stats.study_runs import (
 
 TRACK_SHARE = 0.8  # a filter that keeps track in a smaller share of runs loses track [ours]
 Pair = tuple[str, str]
-FAMILIES = ("fixed in advance", "all other pairs")
+PAIR_FAMILIES = ("fixed in advance", "all other pairs")
 _Family = dict[Pair, Callable[[], Verdict]]
 
 
@@ -85,10 +85,10 @@ class Court:
         self, metric: str, mask: Flags, has_others: bool = True
     ) -> list[tuple[str, Verdict]]:
         """List the verdicts on all pairs with common runs in a selection, or on those fixed in advance, each with its family."""
-        both = dict(zip(FAMILIES, self._decide(metric, mask), strict=True))
+        both = dict(zip(PAIR_FAMILIES, self._decide(metric, mask), strict=True))
         some = {
             pair: (name, verdict())
-            for name in FAMILIES[: 1 + has_others] for pair, verdict in both[name].items()
+            for name in PAIR_FAMILIES[: 1 + has_others] for pair, verdict in both[name].items()
         }  # fmt: skip
         return [some[pair] for pair in self._pairs if pair in some]
 

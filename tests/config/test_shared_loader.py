@@ -122,7 +122,7 @@ def test_a_composition_changes_no_kept_file() -> None:
 
 
 def test_a_changed_file_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shared_loader, "check_defaults", lambda *_: None)  # of interpolations
+    monkeypatch.setattr(shared_loader, "check_defaults", lambda *_, **__: None)  # of interpolations
     (tmp_path / "noise").mkdir()
     file = tmp_path / "noise" / "mine.yaml"
     words = [f"hydra.searchpath=[file://{tmp_path}]", "scenario=linear_walk", "noise=mine"]
@@ -146,7 +146,7 @@ def test_a_changed_file_is_read_again(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_an_error_of_a_file_is_that_of_hydra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shared_loader, "check_defaults", lambda *_: None)  # of interpolations
+    monkeypatch.setattr(shared_loader, "check_defaults", lambda *_, **__: None)  # of interpolations
     (tmp_path / "noise").mkdir()
     file = tmp_path / "noise" / "mine.yaml"
     words = [f"hydra.searchpath=[file://{tmp_path}]", "scenario=linear_walk", "noise=mine"]

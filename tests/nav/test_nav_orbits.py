@@ -17,7 +17,8 @@ from refusals import check_refused
 from torch import Tensor
 
 from pfbench.logs.sky.broadcast_orbits import BroadcastConstellation
-from pfbench.logs.sky.ephemeris import GM_GPS, WEEK, read_rinex
+from pfbench.logs.sky.ephemeris import GM_GPS, read_rinex
+from pfbench.logs.units import WEEK
 from pfbench.nav import earth
 from pfbench.nav.orbits import (
     GPS_OMEGA,

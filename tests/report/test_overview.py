@@ -59,7 +59,7 @@ from pfbench.report.overview.tables import (
 from pfbench.results.conditions import make_distinct_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.stats.comparison import EQUAL_WORDS
-from pfbench.stats.court import FAMILIES, Court
+from pfbench.stats.court import PAIR_FAMILIES, Court
 from pfbench.stats.study_runs import StudyRuns, arrange_runs
 
 RUNS, FAR = ROOT / "tests" / "all_seven_runs.parquet", 1e6
@@ -132,7 +132,7 @@ def test_pairs_of_methods_are_those_of_scipy(
     court, decided = open_court(table, looks, ReportOptions()), 0
     for world in WORLDS:
         mask = (court.runs.conditions["scenario"] == world).to_numpy()
-        family = [v for name, v in court.list_verdicts("rmse", mask) if name == FAMILIES[0]]
+        family = [v for name, v in court.list_verdicts("rmse", mask) if name == PAIR_FAMILIES[0]]
         p = [1.0] * len(family)
         for k, verdict in enumerate(family):
             both = [losses(table, world, label) for label in (verdict.a, verdict.b)]

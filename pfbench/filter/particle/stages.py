@@ -220,7 +220,7 @@ class EssResampler(Resampler):
         a = exponentiate(log_a, belief.weights)
         is_plain = type(self.scheme) is Systematic and log_a is belief.log_w
         if is_plain and dispatch.runs_operators(belief.x, a):
-            x, u = belief.x.permute(2, 0, 1), self.scheme.draw_uniform(draws)
+            x, u = belief.x.permute(2, 0, 1), _draw_offset(draws)
             limit = _as_tensor(self.ess_threshold)
             x, log_w, ancestors, resampled_mask = dispatch.resample_particles(
                 x, log_a, a, n, u, limit
@@ -263,11 +263,12 @@ class Systematic(ResamplingScheme):
 
     @override
     def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
-        return _systematic(a, n, self.draw_uniform(draws))
+        return _systematic(a, n, _draw_offset(draws))
 
-    def draw_uniform(self, draws: RandomStream) -> Tensor:
-        """Draw the uniform number of each run, [R, 1]."""
-        return draws.uniform("resample", 1, 1).squeeze(1)
+
+def _draw_offset(draws: RandomStream) -> Tensor:
+    """Draw the uniform number u of each run, [R, 1]."""
+    return draws.uniform("resample", 1, 1).squeeze(1)
 
 
 def _eager_systematic(a: Tensor, n: Tensor, u: Tensor) -> Tensor:

@@ -150,8 +150,7 @@ def _check_frame(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
         return
     for _ in range(3):
         fixes, error = (a[used, :2] @ [1.0, 1j] for a in (log.fixes.position, plain.error))
-        true = fixes - error
-        measured, expected = fixes - fixes.mean(), true - true.mean()
+        measured, expected = (z - z.mean() for z in (fixes, fixes - error))
         factor = np.vdot(expected, measured) / max(np.vdot(expected, expected).real, 1e-9)
         rest = np.abs(measured - factor * expected)
         keep = rest <= 4.0 * np.median(rest) + 1e-9
@@ -161,18 +160,14 @@ def _check_frame(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
     facts["turn and scale of fixes"] = [round(turn, 3), round(scale, 4)]
     quarter = abs((turn + 45.0) % 90.0 - 45.0)  # orders of axes have their own check
     is_turned, is_scaled = quarter > limit_of("fix turn"), abs(scale - 1.0) > limit_of("fix scale")
-    if (
-        after > _FRAME * before
-        or before < limit_of("fix shift") * _FRAME
-        or not (is_turned or is_scaled)
-    ):
+    if after > _FRAME * before or before < limit_of("fix shift") * _FRAME:
         return
     name, units = log.names[1], find_units("length", scale, limit_of("fix scale"))
     picture = Picture("North [m]", "East [m]", tuple(
         thin_curve(label, z.real, z.imag) for label, z in ((name, measured), (log.names[2], expected))
     ))  # fmt: skip
+    unit, value = next(iter(units.items()), ("another unit or map", 1.0 / scale))
     if is_scaled:
-        unit, value = next(iter(units.items()), ("another unit or map", 1.0 / scale))
         yield Finding(
             "fix scale", REFUSE, scale - 1.0, limit_of("fix scale"), "1",
             f"{name}: the fixes move {scale:.4g} times as far as {log.names[2]}: {'they are in ' + unit if units else unit}",

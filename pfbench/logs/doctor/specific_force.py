@@ -248,7 +248,6 @@ def _describe_axes(state: ForceState, is_rate: bool, ratio: float) -> tuple[Find
 def _list_causes(state: ForceState, is_rate: bool) -> Iterator[Cause]:
     """Yield the explanations, simple ones first."""
     log, limit = state.aligned.log, _EQUAL * state.least
-    imu = log.imu
     ros = _ros_cause(state)
     if not is_rate and ros:
         yield ros
@@ -257,23 +256,25 @@ def _list_causes(state: ForceState, is_rate: bool) -> Iterator[Cause]:
             yield _convention_cause(log, name)
     axes = _find_mounting(state)
     if is_rate and fit_force(state.windows, axes).cost < limit:
-        mended = imu._replace(force=imu.force @ axes.T, rate=imu.rate @ axes.T)
-        text = f"{log.names[0]}: forward, right, down are the axes {_join(axes)}"
-        yield Cause(text, {"mounting": {"imu": name_axes(axes)}}, log._replace(imu=mended))
+        yield _axes_cause(log, "imu", "forward, right, down are the axes", axes)
     if is_rate and state.fit.cost < limit:
         axes = state.aligned.rate_axes.T
-        mended = imu._replace(rate=imu.rate @ axes.T)
-        text = f"{log.names[0]}: wx, wy, wz alone have other axes, {_join(axes)}"
-        yield Cause(text, {"mounting": {"gyroscope": name_axes(axes)}}, log._replace(imu=mended))
+        yield _axes_cause(log, "gyroscope", "wx, wy, wz alone have other axes,", axes)
     if is_rate:
         return
     if state.level[0] < limit and not np.array_equal(state.level[1], np.eye(3)):
         yield _level_cause(log, state.level[1])
     if state.body[0] < limit and not np.array_equal(state.body[1], np.eye(3)):
-        mended = imu._replace(force=imu.force @ state.body[1].T)
-        text = f"{log.names[0]}: fx, fy, fz alone have other axes, {_join(state.body[1])}"
-        corrections = {"mounting": {"accelerometer": name_axes(state.body[1])}}
-        yield Cause(text, corrections, log._replace(imu=mended))
+        yield _axes_cause(log, "accelerometer", "fx, fy, fz alone have other axes,", state.body[1])
+
+
+def _axes_cause(log: RawLog, sensor: str, text: str, axes: Array) -> Cause:
+    """Explain by the axes of the whole IMU, or of one of its sensors."""
+    force = log.imu.force if sensor == "gyroscope" else log.imu.force @ axes.T
+    rate = log.imu.rate if sensor == "accelerometer" else log.imu.rate @ axes.T
+    mended = log._replace(imu=log.imu._replace(force=force, rate=rate))
+    text = f"{log.names[0]}: {text} {_join(axes)}"
+    return Cause(text, {"mounting": {sensor: name_axes(axes)}}, mended)
 
 
 def _convention_cause(log: RawLog, name: str) -> Cause:

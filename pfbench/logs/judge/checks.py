@@ -22,7 +22,7 @@ from pfbench.logs.judge.trajectory_table import (
     TrajectoryTable,
 )
 from pfbench.logs.judge.unit_checks import find_angle_factor, settle
-from pfbench.logs.units import UNITS
+from pfbench.logs.units import UNIT_FACTORS
 from pfbench.stats.error_measures import Array
 
 CLOCK_LIMIT = 0.5  # s, offset above which clocks are refused
@@ -139,7 +139,7 @@ def _find_time_unit(table: TrajectoryTable, reference: ReferenceTrack) -> str:
 
     A trajectory that shares 20 rows with the reference needs a motion that agrees in the unit alone.
     """
-    clock, units = reference.table.time, UNITS["time"].items()
+    clock, units = reference.table.time, UNIT_FACTORS["time"].items()
     ratio = (table.time[-1] - table.time[0]) / (clock[-1] - clock[0])
     choices = [(f, f"The column is in {u}: set NAME.scale=t:{f:.6g}") for u, f in units]
     choices += [(1 / f, f"That of the reference is in {u}: set reference.scale=t:{f:.6g}") for u, f in units if f < 1]  # fmt: skip
@@ -248,7 +248,10 @@ def _check_units(table: TrajectoryTable, reference: ReferenceTrack) -> Iterator[
             yield Finding("unit of attitude", TELL, 1.0, 1.0, "1", note)
             return
         unit, dimension = _DIMENSIONS[pair.name]
-        units = {**UNITS[dimension], **(UNITS["rare angle"] if dimension == "angle" else {})}
+        units = {
+            **UNIT_FACTORS[dimension],
+            **(UNIT_FACTORS["rare angle"] if dimension == "angle" else {}),
+        }
         ratio = _find_ratio(pair, dimension)
         names = [u for u, f in units.items() if abs(ratio * f - 1) < _CLOSE]
         others = [u for u, f in units.items() if abs(ratio / f - 1) < _CLOSE]

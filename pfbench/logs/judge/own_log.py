@@ -24,7 +24,7 @@ from pfbench.logs.judge.trajectory_table import (
     euler_angles,
     rotation_from_quaternion,
 )
-from pfbench.logs.units import UNITS
+from pfbench.logs.units import UNIT_FACTORS, WEEK
 from pfbench.stats.error_measures import Array
 
 ROLES = {
@@ -33,9 +33,8 @@ ROLES = {
     "reference": ("t", *GEODETIC, *LOCAL, *VELOCITY_COLUMNS, *ATTITUDE_COLUMNS),
 }
 LAYOUTS = ("", "table", "tum", "nmea", "kf_gins", "rtklib", "euroc", "kitti")
-_UNITS_OF_TIME = {"s": 1.0, **UNITS["time"]}
+_UNITS_OF_TIME = {"s": 1.0, **UNIT_FACTORS["time"]}
 _REPEATS, _MOST_REPEATS = ("refuse", "first"), 0.5  # share of rows that another sampling explains
-_WEEK = 604800.0  # s
 _FLIP = np.diag([1.0, -1.0, -1.0])  # forward-left-up and forward-right-down
 _FROM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 _EUROC = re.compile(r"^#? ?timestamp ?\[ns\]", re.IGNORECASE)
@@ -295,10 +294,10 @@ def _read_rtklib(path: Path, options: ImportOptions) -> ImportedTable:
     if len(stamps) == len(fields):
         seconds = (stamps - pd.Timestamp("1980-01-06")).total_seconds().to_numpy(float)
     else:
-        seconds = np.array([float(row[0]) * _WEEK + float(row[1]) for row in fields])
-    week = np.floor(seconds[0] / _WEEK) if len(seconds) else 0.0
+        seconds = np.array([float(row[0]) * WEEK + float(row[1]) for row in fields])
+    week = np.floor(seconds[0] / WEEK) if len(seconds) else 0.0
     numbers = np.array([row[2:6] for row in fields], float).reshape(-1, 4)
-    rows = pd.DataFrame(numbers, columns=[*GEODETIC, "fix"]).assign(t=seconds - week * _WEEK)
+    rows = pd.DataFrame(numbers, columns=[*GEODETIC, "fix"]).assign(t=seconds - week * WEEK)
     note = f"t is the second of GPS week {int(week)}; the column fix has the codes of RTKLIB"
     return ImportedTable(rows, (note,))
 

@@ -31,13 +31,12 @@ from pfbench.logs.judge.trajectory_table import (
     rotation_from_quaternion,
 )
 from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, QUANTITIES
-from pfbench.logs.units import ALIASES
+from pfbench.logs.units import ALIASES, WEEK
 from pfbench.stats.error_measures import Array
 
 _TUM_COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _KF_GINS_COLUMNS = ("week", "t", *GEODETIC, *VELOCITY_COLUMNS, "roll", "pitch", "yaw")
 KF_GINS_SD = 22  # columns of the file of standard deviations: time, 9 of navigation, 12 of sensors
-_WEEK = 604800.0  # s
 _TO_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # from East, North, Up
 _TO_FRD = np.diag([1.0, -1.0, -1.0])  # a body with forward, left, up
 _COMMENTS, _BOM = ("#", "%"), "\ufeff"
@@ -110,7 +109,7 @@ def read_kf_gins_trajectory(
     )
     second = numbers[:, 1]
     time = (
-        second if (np.diff(second) > 0).all() else second + _WEEK * (numbers[:, 0] - numbers[0, 0])
+        second if (np.diff(second) > 0).all() else second + WEEK * (numbers[:, 0] - numbers[0, 0])
     )
     if sd is not None:
         names = ("t", *(f"column {k}" for k in range(2, KF_GINS_SD + 1)))

@@ -20,7 +20,7 @@ from pfbench.logs.judge.trajectory_table import (
     TrajectoryTable,
     to_north_east_down,
 )
-from pfbench.logs.units import DEGREE, UNITS
+from pfbench.logs.units import DEGREE, UNIT_FACTORS
 from pfbench.stats.error_measures import Array
 
 _LATEST, _SINCE_1970 = 1e11, (1e8, 1e10)  # s: above GPS and Unix times; from 1973 to 2286
@@ -78,7 +78,7 @@ def find_angle_factor(mine: Array, theirs: Array) -> tuple[float, bool]:
     """
     scatter, zero = _scatter(mine - theirs)
     nothing, _ = _scatter(theirs)
-    factors = (*UNITS["angle"].values(), *UNITS["rare angle"].values(), 1 / DEGREE)
+    factors = (*UNIT_FACTORS["angle"].values(), *UNIT_FACTORS["rare angle"].values(), 1 / DEGREE)
     (rest, offset), factor = min((_scatter(factor * mine - theirs), factor) for factor in factors)
     if rest < _SCATTER and max(rest, 1e-4) < _SHARE * min(scatter, nothing):
         return factor, True
@@ -98,7 +98,7 @@ def _check_largest_time(table: TrajectoryTable) -> Iterator[Finding]:
     """Refuse a count of ms, us or ns since 1970."""
     largest = float(np.abs(table.time).max())
     if largest > _LATEST:
-        fits = [(u, f) for u, f in UNITS["time"].items() if _SINCE_1970[0] < f * largest < _SINCE_1970[1]]  # fmt: skip
+        fits = [(u, f) for u, f in UNIT_FACTORS["time"].items() if _SINCE_1970[0] < f * largest < _SINCE_1970[1]]  # fmt: skip
         texts = [f"It is in {u} since 1970: set NAME.scale=t:{f:g}" for u, f in fits]
         remedy = next(iter(texts), "Set NAME.scale=t:FACTOR, so that it is in s")
         evidence = f"{table.file}: column t must be in s, got {largest:.10g}"
@@ -157,7 +157,7 @@ def _list_units(table: TrajectoryTable) -> Iterator[tuple[str, Mapping[str, floa
         columns["place"] = list(GEODETIC[:2])
     columns["velocity"] = [name for name in VELOCITY_COLUMNS if name in table.values]
     for dimension, names in columns.items():
-        yield from ((unit, dict.fromkeys(names, f)) for unit, f in UNITS[dimension].items())
+        yield from ((unit, dict.fromkeys(names, f)) for unit, f in UNIT_FACTORS[dimension].items())
 
 
 def _check_yaw(table: TrajectoryTable, position: Array) -> Iterator[Finding]:
@@ -168,7 +168,7 @@ def _check_yaw(table: TrajectoryTable, position: Array) -> Iterator[Finding]:
         return
     factor, is_certain = find_angle_factor(yaw[is_moving], direction[is_moving])
     if factor != 1 and is_certain:
-        units = {**UNITS["angle"], **UNITS["rare angle"]}
+        units = {**UNIT_FACTORS["angle"], **UNIT_FACTORS["rare angle"]}
         unit = next((u for u, f in units.items() if f == factor), "rad, converted twice")
         if table.angle_unit == "deg":  # the reader has converted it
             unit = "rad" if factor > 1 else "degrees, in 1/57.3 of its unit"
@@ -206,7 +206,7 @@ def _list_doubts(table: TrajectoryTable, position: Array) -> Iterator[Finding]:
     if table.has(GEODETIC) and not table.has(LOCAL):
         lat, lon = np.abs(table.select(GEODETIC[:2])).max(0)
         if _EQUATOR < lat <= math.pi / 2 and _EQUATOR < lon <= math.pi:
-            factor = UNITS["place"]["radians"]
+            factor = UNIT_FACTORS["place"]["radians"]
             text = (
                 "latitude and longitude may be in rad, since they are within a quarter and half a turn. "
                 f"NAME.scale=lat_deg:{factor:.6g},lon_deg:{factor:.6g} converts them"
@@ -214,7 +214,9 @@ def _list_doubts(table: TrajectoryTable, position: Array) -> Iterator[Finding]:
             yield Finding("unit of place", TELL, lat, math.pi / 2, "deg", text)
     text = f"the largest speed is {speed:.4g} m/s. Check the units of t and of the positions"
     if speed < _SLOW:
-        fits = [(u, f) for u, f in UNITS["time"].items() if _USUAL[0] < speed / f < _USUAL[1]]
+        fits = [
+            (u, f) for u, f in UNIT_FACTORS["time"].items() if _USUAL[0] < speed / f < _USUAL[1]
+        ]
         hints = [f". If t is in {u}, set NAME.scale=t:{f:g}" for u, f in fits]
         text = f"the largest speed is {speed:.3g} m/s{''.join(hints) or '. Check the unit of t'}"
     if speed > _FAST or (speed < _SLOW and np.ptp(position, axis=0).max() > _LONG):

@@ -20,6 +20,7 @@ from pfbench.core.parameter_checks import require
 from pfbench.files.limits import find_input, read_text
 from pfbench.files.table_file import read_table_file
 from pfbench.logs.sky.rinex_blocks import find_ionosphere, unfold_blocks
+from pfbench.logs.units import WEEK
 from pfbench.nav import earth
 from pfbench.nav.orbits import GPS_OMEGA, OrbitalElements, eccentric_anomaly
 
@@ -156,7 +157,6 @@ def broadcast_elements(eph: Mapping[str, Tensor]) -> OrbitalElements:
 # --------------------------------------------------------------------------------------------------
 # Ephemerides from RINEX 2, 3 and 4 navigation files. A record that cannot be read is dropped with a note.
 
-WEEK = 604800.0  # s
 EPOCH = datetime(1980, 1, 6)
 _ORBIT_SHAPE = ("crs", "deltan", "M0", "cuc", "e", "cus", "sqrtA", "toe")
 ORBIT = (*_ORBIT_SHAPE, "cic", "Omega0", "cis", "i0", "crc", "omega", "Omegadot", "idot")

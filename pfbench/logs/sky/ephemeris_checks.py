@@ -12,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pfbench.logs.sky.ephemeris import CLOCK, ORBIT, WEEK, broadcast_elements
+from pfbench.logs.sky.ephemeris import CLOCK, ORBIT, broadcast_elements
+from pfbench.logs.units import WEEK
 from pfbench.nav import earth
 
 # --------------------------------------------------------------------------------------------------

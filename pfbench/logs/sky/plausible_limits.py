@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 from pfbench.core.parameter_checks import require_ranges
-from pfbench.logs.units import UNITS
+from pfbench.logs.units import UNIT_FACTORS
 
 
 class Quantity(NamedTuple):
@@ -20,7 +20,7 @@ class Quantity(NamedTuple):
         rate: Largest rate of change, unit/s. Infinite if the change is not limited.
         allowance: Change that is accepted in any time, for noise.
         source: Source of the numbers.
-        dimension: Key of the other units of such columns in `UNITS`.
+        dimension: Key of the other units of such columns in `UNIT_FACTORS`.
         key: Field of `PlausibleLimits` that replaces `largest`.
     """
 
@@ -36,7 +36,7 @@ class Quantity(NamedTuple):
     @property
     def units(self) -> dict[str, float]:
         """Other units of such columns, with the factors that convert them."""
-        return UNITS.get(self.dimension, {})
+        return UNIT_FACTORS.get(self.dimension, {})
 
 
 _HALF_TURN, _QUARTER_TURN = 1.001 * math.pi, 1.001 * math.pi / 2

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from pfbench.files import write_atomically
 from pfbench.logs.sky.broadcast_orbits import BroadcastConstellation
-from pfbench.logs.sky.ephemeris import EPOCH, LINES, WEEK
+from pfbench.logs.sky.ephemeris import EPOCH, LINES
+from pfbench.logs.units import WEEK
 from pfbench.nav import earth
 from pfbench.nav.atmosphere import Sight, delay_in_ionosphere, delay_in_troposphere
 from pfbench.nav.orbits import LIGHT, azimuth_elevation, receive_signals

@@ -74,9 +74,11 @@ def read_observations(file: Path, signals: Mapping[str, Sequence[str]]) -> Obser
     ]
     rows: list[tuple[object, ...]] = []
     for time, satellites in _epochs(file.name, lines, header.end, notes):
-        for text in satellites:
-            if text[0] in columns:
-                rows.append((time, text[0], text[1:3], *_values(text, columns[text[0]])))
+        rows += [
+            (time, text[0], text[1:3], *_values(text, columns[text[0]]))
+            for text in satellites
+            if text[0] in columns
+        ]
     names = ("time", "sys", "svid", "pr", "doppler", "cn0")
     table = pd.DataFrame(rows, columns=list(names))
     bad = int((~table["svid"].str.strip().str.isdigit()).sum())

@@ -95,8 +95,8 @@ class LogSource:
         origin: lat_deg, lon_deg, h_m of pn = pe = pd = 0. Required only if one table has lat_deg,
             another has pn, and the metadata of the files do not contain it.
         limits: Limits of the platform. None for the default limits.
-        fix_codes: Meaning of the column `fix` of the fixes: the program that wrote it (nmea, rtklib,
-            mavlink, ublox), the codes of the fixes to use, or None for 1 (use) and 0.
+        fix_codes: Meaning of the column `fix` of the fixes. It is the program that wrote it (nmea, rtklib,
+            mavlink, ublox), or the codes of the fixes to use. None for 1 (use) and 0.
         corrections: Corrections that are applied before the checks. None for none.
         has_attitude: Whether the reference has an attitude. Without one it gives positions at most.
     """
@@ -178,7 +178,6 @@ class LogSource:
         then not looked for again.
         """
         inertial, gnss, truth = tables
-        limits = self.limits or PlausibleLimits()
         sensors, notes = read_samples(inertial)
         if not self.has_attitude:
             check_corrections(self.mending, truth is not None)
@@ -193,12 +192,29 @@ class LogSource:
         for name, time in spans[1:]:
             check_overlap(inertial.name, sensors.time, name, time)
         gravity, gravity_notes = gravity_at(centre)
+        fixes, rows = self._compare_tables(tables, (sensors, fixes, motion), gravity, findings)
+        if motion:
+            rows += compare_times(tuple(spans))
+        dropped = dict.fromkeys(note for table in tables if table for note in table.notes)
+        notes = (*dropped, *mended, *mended_fixes, *usable_notes, *notes, *gravity_notes, *rows)
+        reference = motion or (read_track(truth, centre) if truth else _join_fixes(fixes))
+        return NavigationLog(sensors, fixes, reference, gravity, notes, centre)
+
+    def _compare_tables(
+        self,
+        tables: LogTables,
+        read: tuple[ImuLog, GnssLog, ReferenceLog | None],
+        gravity: float,
+        findings: Sequence[Finding] | None,
+    ) -> tuple[GnssLog, tuple[str, ...]]:
+        """Return the fixes to use, and notes of what disagrees: in a whole table first, since it spoils single rows, too."""
+        (_, gnss, truth), (sensors, fixes, motion) = tables, read
+        limits = self.limits or PlausibleLimits()
         rows: tuple[str, ...] = ()
         left_out: tuple[str, ...] = ()
         if truth and motion:
             rows = compare_velocities(truth, motion)
             fixes, left_out = drop_fixes(gnss, fixes, motion, limits)
-        # faults of a whole table first: they spoil single rows, too
         if findings is None or left_out:
             raw = self.take(tables)
             keep = np.isfinite(fixes.position[raw.fixes.rows, 0])
@@ -207,11 +223,7 @@ class LogSource:
         if truth and motion:
             rows += compare_inertial(truth, sensors, motion, gravity)
             rows += compare_fixes(gnss, fixes, motion, limits)
-            rows += (*diagnosed, *compare_times(tuple(spans)))
-        dropped = dict.fromkeys(note for table in tables if table for note in table.notes)
-        notes = (*dropped, *mended, *mended_fixes, *usable_notes, *notes, *gravity_notes, *left_out, *(rows or diagnosed))  # fmt: skip
-        reference = motion or (read_track(truth, centre) if truth else _join_fixes(fixes))
-        return NavigationLog(sensors, fixes, reference, gravity, notes, centre)
+        return fixes, (*left_out, *rows, *diagnosed)
 
 
 def read_log(folder: str | Path, files: LogFiles | None = None, **options: Any) -> NavigationLog:

@@ -16,7 +16,7 @@ from pfbench.core.parameter_checks import require
 from pfbench.files.limits import find_input
 from pfbench.files.table_file import Array as Array, read_table_file
 from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, PlausibleLimits, Quantity
-from pfbench.logs.units import UNITS
+from pfbench.logs.units import UNIT_FACTORS
 from pfbench.logs.worlds.time_order import find_order_remedy
 
 # --------------------------------------------------------------------------------------------------
@@ -240,7 +240,7 @@ def check_seconds(table: LogTable, time: Array, longest: float) -> None:
     usual = [
         (u, f)
         for limit in (min(longest, _USUAL_INTERVAL), longest)
-        for u, f in UNITS["time"].items()
+        for u, f in UNIT_FACTORS["time"].items()
         if typical * f <= limit
     ]
     remedy = f"Use a table with an interval of at most {longest:g} s."

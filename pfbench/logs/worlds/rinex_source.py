@@ -16,8 +16,8 @@ from pfbench.core.parameter_checks import require
 from pfbench.files.limits import find_input
 from pfbench.files.reader_notes import skip_notes
 from pfbench.logs.sky.broadcast_orbits import BroadcastConstellation, Transmission, parse_gps_time
-from pfbench.logs.sky.ephemeris import WEEK
 from pfbench.logs.sky.rinex_observations import SIGNALS, check_version, read_observations
+from pfbench.logs.units import WEEK
 from pfbench.logs.worlds.log_frames import GEODETIC_COLUMNS
 from pfbench.logs.worlds.log_tables import Array, LogTable, ReferenceLog
 from pfbench.nav import earth

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pfbench.files.table_file import Array
-from pfbench.logs.sky.ephemeris import WEEK
-from pfbench.logs.units import UNITS
+from pfbench.logs.units import UNIT_FACTORS, WEEK
 
 DAY = 86400.0  # s
 UNIX_TO_GPS = -315964782.0  # s; GPS time of 1980-01-06 in Unix time, and 18 leap seconds since 2017
@@ -71,7 +70,7 @@ def _find_period(time: Array, back: NDArray[np.intp]) -> tuple[str, float] | Non
     typical = float(np.median(forward))
     longest = max(_REGULAR[1] * typical, float(forward.max()))
     for name, period in _PERIODS.items():
-        for unit in (1.0, *(1.0 / f for f in UNITS["time"].values() if f < 1.0)):
+        for unit in (1.0, *(1.0 / f for f in UNIT_FACTORS["time"].values() if f < 1.0)):
             fixed = time + period * unit * np.cumsum(restarts)
             new = np.diff(fixed)
             if (new >= 0.0).all() and ((new[back - 1] > 0.0) & (new[back - 1] <= longest)).all():

@@ -22,7 +22,7 @@ from pfbench.logs.sky.plausible_limits import PlausibleLimits
 from pfbench.logs.worlds.log_agreement import (
     check_orbits,
     compare_ranges,
-    compare_reference,
+    compare_velocities,
     compare_wheels,
 )
 from pfbench.logs.worlds.log_checks import check_geocentric, check_wheel_direction
@@ -267,7 +267,7 @@ def _check_drive(drive: UrbanLog, tables: tuple[LogTable, LogTable, LogTable]) -
     motion = ReferenceLog(drive.time, level, velocity, enu.numpy())
     return (
         *(note for table in tables for note in table.notes),
-        *compare_reference(truth, motion),
+        *compare_velocities(truth, motion),
         *check_wheel_direction(wheels, drive.time, drive.speed),
         *compare_wheels(wheels, drive.speed, drive.yaw_rate, motion),
         *compare_ranges(

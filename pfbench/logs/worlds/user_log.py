@@ -30,6 +30,11 @@ class UserLog(ConstrainedDrive):
         return self.read_tables(folder)
 
     def read_tables(self, folder: Path, *, has_attitude: bool = True) -> NavigationLog:
-        """Read and check the log in a folder as the keys of the scenario say."""
+        """Read and check the log in a folder as the keys of the scenario say.
+
+        Args:
+            folder: Folder of the tables.
+            has_attitude: Whether the log must have a reference with an attitude.
+        """
         keys = ("files", "origin", "limits", "fix_codes", "corrections")
         return read_log(folder, has_attitude=has_attitude, **{key: getattr(self, key) for key in keys})  # fmt: skip

@@ -128,10 +128,10 @@ def _make_head(
         first.append(text_cell(_name_world(pack, members[0]), span=span))
         rules.append((start, start + span - 1))
         start += span
-    second = [text_cell("Method")]
-    for column in columns:
-        second.append(text_cell(name_of(pack, "regimes", column.regime), span=per_cell))
-    return [first, second], rules
+    second = [
+        text_cell(name_of(pack, "regimes", column.regime), span=per_cell) for column in columns
+    ]
+    return [first, [text_cell("Method"), *second]], rules
 
 
 def _make_world_head(

@@ -303,7 +303,7 @@ def build_overview(
             continue
         worlds.append(world)
         has_part[world.name] = facts.has_part
-        rows.append(describe_world(world, parts[str(key)], looks))
+        rows.append(_describe_world(world, parts[str(key)], looks))
     order = sorted(range(len(worlds)), key=lambda k: worlds[k].kalman_fits is False)
     worlds, rows = [worlds[k] for k in order], [rows[k] for k in order]
     baselines = [label for label, look in looks.items() if not look.proposed]
@@ -616,7 +616,7 @@ def build_world(
     return World(name, by_name[facts.reference], facts.kalman_fits, court, mask, present_labels)
 
 
-def describe_world(world: World, name: PartName, looks: Mapping[str, MethodLook]) -> WorldRow:
+def _describe_world(world: World, name: PartName, looks: Mapping[str, MethodLook]) -> WorldRow:
     """Return the row of a world."""
     losses = world.losses(world.reference)[0]
     return WorldRow(

@@ -98,15 +98,10 @@ def _describe_page(pack: Mapping[str, Any]) -> dict[str, Any]:
         "planned": describe_pairs(pack),
         "records": describe_records(pack),
         "questions": list(list_questions(pack)),
-        "level": _format_level(pack),
+        "level": f"{100 * (1 - pack['alpha']):g}",
         "choices": pack["choices"],
         "figures": list_page_figures(pack["study"], pack["paper_figures"]),
     }
-
-
-def _format_level(pack: Mapping[str, Any]) -> str:
-    """Return the level of intervals in percent."""
-    return f"{100 * (1 - pack['alpha']):g}"
 
 
 def _read_script(name: str) -> str:

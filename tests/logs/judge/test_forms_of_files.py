@@ -174,7 +174,7 @@ def test_the_week_continues_the_second_of_kf_gins(tmp_path: Path) -> None:
     file = kf_gins(tmp_path / "a.txt", second, 2300 + second // 604800)  # which needs no week
     assert np.allclose(read(file).time, second)
     file = kf_gins(tmp_path / "a.txt", second % 604800, 2300 + 0 * second)
-    with pytest.raises(ValueError, match=r"line 21, .* add 604800 to column t from line 21"):
+    with pytest.raises(ValueError, match=r"line 21, .* add 604800 to t from line 21 on"):
         read(file)
 
 
@@ -243,7 +243,6 @@ WRONG = {
     "one checksum": ([SENTENCES[0].replace(",N,", ",S,"), *SENTENCES[1:]], r"line 1 .*\(1 of 122 .* Remove these lines"),
     "one without": ([SENTENCES[0][:-3], *SENTENCES[1:]], "line 1 .* got none .* Remove these lines, or all checksums"),
     "all checksums": ([line.replace(",", ", ", 1) for line in SENTENCES], r"\(122 of 122 .* remove all checksums with their \*"),
-    "kind of a damaged one": ([SENTENCES[0].replace("GGA", "GGB"), *SENTENCES[1:]], "line 1 must have the checksum"),
     "no sign": ([SENTENCES[0][1:], *SENTENCES[1:]], r"line 1 must start with \$"),
     "two in a line": ([SENTENCES[0][:40] + SENTENCES[1], *SENTENCES[2:]], "line 1 .* got none"),
     "RMC alone": ([line for line in SENTENCES if "RMC" in line], "must have GGA or GNS .* got 61 RMC sentences"),

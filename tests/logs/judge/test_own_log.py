@@ -206,7 +206,7 @@ def test_the_command_writes_the_log_and_inspects_it(
 BAD = {
     "file": (["imu=none.csv"], "imu must be a file, got none at none.csv"),
     "column": (["imu.columns=t:clock"], "got t (clock)"),
-    "unit": (["imu.time=min"], "NAME.time must be one of s, ms, us, ns, got min"),
+    "unit": (["imu.time=min"], "NAME.time must be one of s, ms, us, ns, minutes, hours, got min"),
     "kind": (["gnss.format=euroc"], "gnss must be of a format with such data, got euroc"),
     "word": (["imu.sd=1"], "words must be FOLDER, imu=, gnss=, reference="),
 }

@@ -29,8 +29,13 @@ def write_codes(folder: Path, codes: list[float]) -> Path:
     return write(folder, log)
 
 
-# the codes of usable fixes, from the description of each format [NMEA 0183 GGA; RTKLIB manual 2.4.2, B.1; u-blox UBX-NAV-PVT]
-USED = {"nmea": {1, 2, 3, 4, 5}, "rtklib": {1, 2, 3, 4, 5, 6}, "ublox": {3, 4}}
+# the codes of usable fixes, from the description of each format [NMEA 0183 GGA; RTKLIB manual 2.4.2, B.1; MAVLink GPS_FIX_TYPE; u-blox UBX-NAV-PVT]
+USED = {
+    "nmea": {1, 2, 3, 4, 5},
+    "rtklib": {1, 2, 3, 4, 5, 6},
+    "mavlink": {3, 4, 5, 6, 8},
+    "ublox": {3, 4},
+}
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
@@ -58,9 +63,9 @@ def test_0_and_1_need_no_program(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("codes", "remedies"),
     [
-        ([4.0], ["nmea", "rtklib", "ublox", [4]]),
-        ([4.0, 0.0, 5.0], ["nmea", "rtklib", "ublox", [4, 5]]),
-        ([6.0, 1.0], ["nmea", "rtklib", [1, 6]]),
+        ([4.0], ["nmea", "rtklib", "mavlink", "ublox", [4]]),
+        ([4.0, 0.0, 5.0], ["nmea", "rtklib", "mavlink", "ublox", [4, 5]]),
+        ([6.0, 1.0], ["nmea", "rtklib", "mavlink", [1, 6]]),
         ([2.0, 1.0], ["nmea", "rtklib", [1, 2]]),
         ([9.0], [[9]]),
     ],

@@ -23,8 +23,9 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
 from pfbench.logs.sky import raw_log
-from pfbench.logs.sky.ephemeris import GM_GPS, WEEK, read_rinex
+from pfbench.logs.sky.ephemeris import GM_GPS, read_rinex
 from pfbench.logs.sky.rinex_observations import SIGNALS, read_observations
+from pfbench.logs.units import WEEK
 from pfbench.logs.worlds.log_frames import DEGREE
 from pfbench.logs.worlds.log_tables import ReferenceLog
 from pfbench.logs.worlds.raw_gnss import remove_clock_jumps
