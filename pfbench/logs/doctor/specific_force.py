@@ -388,7 +388,7 @@ def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Fi
             f"{name}: accelerometer bias {bias.round(2).tolist()} m/s^2, forward, right, down, within "
             f"{(2.0 * error).round(2).tolist()}",
             "Set scenario.corrections.bias, or the nominal bias scenario.tuning.accelerometer_bias",
-            # more than half of gravity is no bias, and to subtract it would hide other axes
+            # more than half of gravity is not a bias: subtracting it would hide other axes
             {"corrections": {"bias": {"imu": _by_column("f", bias)}}} if np.linalg.norm(bias) < 5.0 else {},
             ("a bias", "an attitude of the sensor that differs from that of the reference"), _force_picture(windows),
         )  # fmt: skip

@@ -196,7 +196,7 @@ class _Pair(NamedTuple):
 
 
 def _pair_columns(table: TrajectoryTable, reference: ReferenceTrack, fewest: int) -> list[_Pair]:
-    """Pair the columns that both have where the reference has no hole; none of few rows."""
+    """Pair the columns of both tables outside holes of the reference, if they have enough rows."""
     rows, recorded, clock = reference.is_bridged(table.time), reference.table.values, reference.table.time  # fmt: skip
     if rows.sum() < fewest:
         return []

@@ -265,7 +265,7 @@ def _positions(table: LogTable, centre: tuple[float, ...] | None) -> Array:
 
 
 def judge_findings(findings: Sequence[Finding], *, has_own_fixes: bool) -> tuple[str, ...]:
-    """Return findings as notes; raise the first that refuses the log. The reader itself tells of gaps that it bridges."""
+    """Return findings as notes; raise the first that refuses the log. The reader notes the gaps that it bridges."""
     refused = [finding for finding in findings if finding.level == REFUSE]
     if refused:
         raise ValueError(
