@@ -182,8 +182,10 @@ def valid_numbers(name: str, rng: random.Random) -> list[Any]:
                 call[place] = value @ value.mT + 0.5 * eye
             if argument.name == "sd":
                 call[place] = value + 0.5
+            if name == "log_observed_normal" and argument.name == "y":
+                call[place] = value.masked_fill(value > 0.5, torch.nan)
             if argument.name in ("w", "a") and value.dim() == 2:
-                call[place] = torch.softmax(value, 1)
+                call[place] = torch.softmax(5.0 * value, 1)
     return call
 
 
