@@ -102,8 +102,9 @@ def gather_and_propagate(*args: Any) -> Tensor:
     )
     wanted = ancestors.shape[1]
     noise = draw(*key, gain.shape[-1], -(-wanted // 4))[..., :wanted].permute(1, 2, 0)
-    parents = belief._gather_components(x, ancestors).permute(1, 2, 0)
-    return linear_algebra._affine(phi, parents, gain, noise.to(x.dtype))
+    return linear_algebra._affine(
+        phi, belief._gather_components(x, ancestors).permute(1, 2, 0), gain, noise.to(x.dtype)
+    )
 
 
 class GivenUniform(random_stream.PhiloxStream):
@@ -178,8 +179,7 @@ def valid_numbers(name: str, rng: random.Random) -> list[Any]:
         if argument.kind in ("real", "number") and argument.limit is None:
             call[place] = value = value.nan_to_num(0.5, 0.5, 0.5).clamp(0.0, 1.0)
             if argument.name in ("covariance", "omega"):
-                eye = torch.eye(value.shape[-1], dtype=value.dtype)
-                call[place] = value @ value.mT + 0.5 * eye
+                call[place] = value @ value.mT + 0.5 * torch.eye(value.shape[-1], dtype=value.dtype)
             if argument.name == "sd":
                 call[place] = value + 0.5
             if name == "log_observed_normal" and argument.name == "y":
