@@ -32,8 +32,8 @@ from compare import (
     DEFAULT,
     DEFAULT32,
     FLOAT32,
+    FLOAT64,
     NUMBA,
-    STORED,
     disagreements,
     fastest,
     peer,
@@ -77,12 +77,12 @@ class Study(NamedTuple):
     goals: tuple[Goal, ...]
 
 
-LARGE = (DEFAULT, STORED, DEFAULT32, FLOAT32, PARTICLES, COUNT, RUN_BY_RUN)
-ONE_JOB = (DEFAULT, STORED, DEFAULT32, FLOAT32, NUMBA, COUNT, RUN_BY_RUN)
+LARGE = (DEFAULT, FLOAT64, DEFAULT32, FLOAT32, PARTICLES, COUNT, RUN_BY_RUN)
+ONE_JOB = (DEFAULT, FLOAT64, DEFAULT32, FLOAT32, NUMBA, COUNT, RUN_BY_RUN)
 GOALS = (
-    Goal(DEFAULT.label, "particles"), Goal(STORED.label, "particles", 2.0, 3.0), Goal(STORED.label, "JAX", 3.0, 4.0),
+    Goal(DEFAULT.label, "particles", 2.0, 3.0), Goal(DEFAULT.label, "JAX", 3.0, 4.0),
 )  # fmt: skip
-FASTEST = (Goal(DEFAULT.label, ""), Goal(STORED.label, "", 1.5, 2.0))
+FASTEST = (Goal(DEFAULT.label, "", 1.5, 2.0),)
 STUDIES = (
     Study("six campaigns of W4", "15-state INS error model", "ins", 200, 500, 6, LARGE, GOALS),
     Study("W1, one job", "growth model", "growth", 100, 10_000, 1, ONE_JOB, FASTEST),
@@ -305,9 +305,7 @@ def main() -> None:
         "SIR. Each contestant is a fresh process on one thread that imports, compiles or finds on disk what was compiled, filters "
         f"and ends; {' or '.join(map(str, rounds))} interleaved rounds after a pass that filled the caches; CPU time of the process. "
         "Ratios are taken round by round, against the fastest form of a library. Other processes may share the machine: times compare "
-        "within a study. The default settings of pfbench are float64; "
-        f"`{STORED.label}`: the store has their compiled step, from one run with "
-        "`engine=compiled`; an empty one does not, and kernels are taken. "
+        "within a study. The default settings of pfbench are float64 and kernels. "
         "`particles float32` and JAX compute in float32, `particles` in float64. The log evidence of W4 is minus the exact one. "
         "Written by `benchmarks/campaigns.py` from campaigns.json.", "", least, *lines, "",
         ", ".join([f"{cpu_name()}; Python {platform.python_version()}", *map(" ".join, versions.items())]) + ".", "",

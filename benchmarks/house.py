@@ -141,6 +141,4 @@ def contestant(work: Any) -> tuple[Filter, dict[str, str]]:
 
 
 if __name__ == "__main__":
-    from house import contestant as imported  # a step with a class of a script is not stored
-
-    serve(imported)
+    serve(contestant)

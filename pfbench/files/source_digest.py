@@ -1,6 +1,6 @@
 """Digests of source code: of folders, and of modules with all that they import; and of the values that code reaches.
 
-They enter the key of a job, the record of its build, and the names of compiled steps.
+They enter the key of a job and the record of its build.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ _DERIVED = (
     "__dict__", "__weakref__", "__doc__", "__module__", "__annotations__", "__abstractmethods__", "_abc_impl",
     "__dataclass_fields__", "__firstlineno__", "__static_attributes__",
 )  # fmt: skip
-UNDESCRIBED = pickle.PicklingError, AttributeError, TypeError, ValueError, RecursionError
+_UNDESCRIBED = pickle.PicklingError, AttributeError, TypeError, ValueError, RecursionError
 _ENVIRONMENT = {"environ", "environb", "getenv", "getenvb"}
 
 
@@ -152,7 +152,7 @@ def hash_reached(target: str, thing: Any) -> str:
     stream = ReachedStream(target.partition(".")[0])
     try:
         stream.dump(thing)
-    except UNDESCRIBED as error:
+    except _UNDESCRIBED as error:
         raise ValueError(
             f"{target} must reach values that the key of a job can contain, as numbers, arrays, functions and classes, "
             f"got another kind ({error}). Make such a value inside of the function that uses it."
@@ -167,23 +167,18 @@ class ReachedStream(pickle.Pickler):
     """Digest of a pickle that is never read, which follows the code of a user. The module `pickle` handles all other kinds of values.
 
     Args:
-        package: Package of the user. Empty to follow none.
-        uncounted: Object that does not count.
+        package: Package of the user.
 
     Attributes:
         sha256: The digest.
-        modules: Modules that define the values.
         words: Texts in the code, which may name variables of the environment.
         reads_environment: Whether the code names the environment.
-        has_values: Whether the numbers of tensors count.
     """
 
-    def __init__(self, package: str = "", uncounted: object = None) -> None:
-        self.sha256, self.package, self.uncounted = hashlib.sha256(), package, uncounted
+    def __init__(self, package: str) -> None:
+        self.sha256, self.reads_environment = hashlib.sha256(), False
         super().__init__(types.SimpleNamespace(write=self.sha256.update), protocol=5)
         self.words: set[str] = set()
-        self.modules: set[str] = set()
-        self.reads_environment, self.has_values = False, True
         self._tensors: dict[
             int, tuple[int, Any]
         ] = {}  # keeps them, so that no number is given twice
@@ -200,14 +195,10 @@ class ReachedStream(pickle.Pickler):
             return value.encode(errors="surrogatepass")
         if isinstance(value, set | frozenset):
             return "set", sorted(value, key=repr)
-        if value is self.uncounted and value is not None:
-            return "uncounted"
         if isinstance(value, getattr(sys.modules.get("torch"), "Tensor", ())):
             index, _ = self._tensors.setdefault(id(value), (len(self._tensors), value))
             a: Any = value
             kind = index, str(a.dtype), str(a.device), tuple(a.shape), a.requires_grad
-            if not self.has_values:  # strides of a record depend on its length
-                return kind
             flat = a.detach().cpu().contiguous().reshape(-1).view(sys.modules["torch"].uint8)
             return kind, a.stride(), flat.numpy().tobytes()
         return None
@@ -229,8 +220,6 @@ class ReachedStream(pickle.Pickler):
             )
         if isinstance(value, _HOLDERS):
             return str, (kind.__name__,), [getattr(value, name, None) for name in _HELD]
-        if isinstance(value, types.FunctionType | type):
-            self.modules.add(str(value.__module__))
         if isinstance(value, types.ModuleType | types.FunctionType | type):
             return str, (_name(value),), self._list_content(value)
         is_named = (
@@ -252,10 +241,8 @@ class ReachedStream(pickle.Pickler):
         if isinstance(value, types.FunctionType):
             reached = [value.__defaults__, value.__kwdefaults__, vars(value)]
             reached += [cell.cell_contents for cell in value.__closure__ or ()]
-            if not self.is_own(
-                value.__module__
-            ):  # with the line, two functions without a name differ
-                return reached if self.package else [*reached, value.__code__.co_firstlineno]
+            if not self.is_own(value.__module__):
+                return reached
             names = sorted(_list_names(value.__code__) & set(value.__globals__))
             return [*reached, value.__code__, {name: value.__globals__[name] for name in names}]
         is_class = isinstance(value, type)

@@ -18,7 +18,6 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record
 from pfbench.filter.belief import StepInfo
 from pfbench.filter.loop import FilterResult, choose_run_batch, run_filter
-from pfbench.filter.particle import step_store
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.memory import MemoryTrimmer, first_steps, peak_above, start_peak_measurement
 from pfbench.job.plan import JobPlan
@@ -109,7 +108,7 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     engine, compile_seconds = _time_choice(plan, model, len(runs), steps)
     draws = PhiloxStream(values["seed"], runs.to(device), plan.dtype)
     with _prepare_torch(plan, engine), _show_progress(steps, label) as tick:
-        step = _compile_step(engine, method, counter, clock, _may_load_steps(plan))
+        step = _compile_step(engine, method, counter, clock)
         baseline = start_peak_measurement(device)
         start_time = clock()
         method, batch = _warm_up(plan, step, model, episode.record, draws)
@@ -176,15 +175,6 @@ def _prepare_torch(plan: JobPlan, engine: str) -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _may_load_steps(plan: JobPlan) -> bool:
-    """Return whether a job takes stored steps: by `auto`, in double precision.
-
-    In single precision engines agree to Monte Carlo error only. Trials of times use kernels.
-    """
-    is_auto = plan.values["engine"] == "auto" and plan.values["budget"] == store.SAME_N
-    return is_auto and plan.dtype == torch.float64
-
-
 def _warm_up(
     plan: JobPlan,
     step: CompiledParticleFilter | None,
@@ -194,25 +184,21 @@ def _warm_up(
 ) -> tuple[Any, int]:
     """Take two steps of the first batch of runs, whose results are not used.
 
-    What a process loads once is not in the time of its first job then, and the store is asked for compiled steps. Without
-    one the larger batches of kernels are faster.
+    What a process loads once is not in the time of its first job then, nor is the time of compiling.
 
     Returns the filter, with compiled steps if there are, and the runs of a batch.
     """
-    runs = len(draws.runs)
-    by_kernels = plan.choose_run_batch(plan.method, runs)
-    batch = plan.choose_run_batch(plan.method, runs, is_compiled=step is not None)
+    method = step or plan.method
+    batch = plan.choose_run_batch(plan.method, len(draws.runs), is_compiled=step is not None)
     first = slice(0, batch)
     run_filter(
-        step or plan.method,
+        method,
         model,
         first_steps(model, record.select_runs(first), _WARM_UP_STEPS),
         draws.select_runs(first),
     )
     wait_for(plan.values["device"])
-    if step is None or (step.loads_only and not step.is_active and batch != by_kernels):
-        return plan.method, by_kernels
-    return step, batch
+    return method, batch
 
 
 def wait_for(device: str) -> None:
@@ -240,7 +226,7 @@ def choose_engine(
     """Choose how the steps of a job are executed, and load the C++ operators.
 
     On the CPU `auto` takes the operators always, and compiles the step where that is predicted to save twice the
-    time that it takes. A smaller job takes a compiled step that is stored (`_compile_step`). On a CUDA device it takes kernels for large jobs. Numbers of all engines agree to rounding; a
+    time that it takes. On a CUDA device it takes kernels for large jobs. Numbers of all engines agree to rounding; a
     result states its engine.
 
     Returns the engine: `eager` if the operators cannot be loaded.
@@ -293,25 +279,16 @@ def _count_numbers(method: Any, model: StateSpaceModel) -> int:
 
 
 def _compile_step(
-    engine: str,
-    method: Any,
-    counter: LikelihoodCounter,
-    clock: Callable[[], float],
-    may_load: bool,
+    engine: str, method: Any, counter: LikelihoodCounter, clock: Callable[[], float]
 ) -> CompiledParticleFilter | None:
-    """Return the filter with its step compiled as a whole, if requested and possible.
-
-    A job with `kernels` that may load stored steps compiles none.
-    """
-    is_step = isinstance(method, ParticleFilter) and not method.obstacle
-    takes_stored = engine == "kernels" and may_load and is_step and step_store.has_steps()
-    if engine != "compiled" and not takes_stored:
+    """Return the filter with its step compiled as a whole, if requested and possible."""
+    if engine != "compiled":
         return None
-    if not is_step:
+    if not isinstance(method, ParticleFilter) or method.obstacle:
         is_other = not isinstance(method, ParticleFilter)
         reason = f"it is a {type(method).__name__}" if is_other else method.obstacle
         log.info("engine=compiled: only inner loops are compiled, not the step (%s)", reason)
         return None
     from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 
-    return CompiledParticleFilter(method, counter, clock, takes_stored)
+    return CompiledParticleFilter(method, counter, clock)

@@ -36,12 +36,10 @@ class NativeEntry(NamedTuple):
     Attributes:
         step: Number of the function, see `register_step`.
         constants: Tensors that it takes before the arguments.
-        library: File of its code.
     """
 
     step: int
     constants: list[Tensor]
-    library: str
 
 
 class OperatorRegistry(dict[str, list[str]]):
@@ -352,7 +350,7 @@ def _register_entry(
 ) -> NativeEntry:
     """Return the entry of a library, after registering what it takes."""
     path = encode_path(library)
-    return NativeEntry(register_step(path, outputs, [*constants, *example]), constants, library)
+    return NativeEntry(register_step(path, outputs, [*constants, *example]), constants)
 
 
 def _find_entry(artefacts: list[Any], run: Any, example: list[Tensor]) -> NativeEntry | None:

@@ -245,7 +245,6 @@ def test_only_own_temporary_files_are_removed(tmp_path: Path) -> None:
 # removals of the package: each is of a file whose exact name the function gave or recorded
 REMOVALS = {
     "files/atomic_write.py": 2,
-    "filter/particle/step_store.py": 2,  # old and damaged steps
     "files/recorded_folder.py": 1,
     "results/store.py": 2,  # a damaged result, and the note of a failure of earlier inputs
     "learn/training_job.py": 2,

@@ -21,7 +21,7 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import StepInfo
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle import compiled_filter, step_store
+from pfbench.filter.particle import compiled_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.proposed.swarm import SwarmProposal
@@ -144,7 +144,6 @@ def test_a_filter_is_recorded_or_the_page_says_why_not(
     if name in NAMES and refusal(name, model, record):
         pytest.skip("refuses this model")
     monkeypatch.setattr(compiled_filter, "compile_function", record_only)
-    monkeypatch.setattr(step_store, "name_step", lambda *_: None)
     step, draws = CompiledParticleFilter(method), PhiloxStream(5, torch.arange(len(record.y)))
     with dispatch.use_kernels(), torch.no_grad():
         compiled = run_filter(step, model, record, draws)

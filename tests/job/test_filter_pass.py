@@ -14,8 +14,7 @@ import pytest
 from config_cases import truncated
 
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle import step_store
-from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
+from pfbench.filter.particle import compiled_filter
 from pfbench.job import compose, filter_pass
 from pfbench.job.config import resolve_config
 from pfbench.job.plan import build_plan
@@ -28,11 +27,11 @@ def settings(tmp_path: Path, *words: str) -> Any:
     return compose([*JOB, f"results_dir={tmp_path}/results", "episode_cache_dir=null", *words])
 
 
-@pytest.mark.parametrize("is_stored", [False, True])
-def test_a_job_without_its_step_takes_the_batches_of_kernels(
-    is_stored: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("engine", "batch"), [("auto", 4), ("compiled", 2)])
+def test_a_job_takes_the_batches_of_its_engine(
+    engine: str, batch: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those of a compiled step are smaller where the state has many components, and slower without it."""
+    """Those of a compiled step are smaller where the state has many components. By default no small step is compiled."""
     passes: list[tuple[int, int | None]] = []
 
     def spy(method: Any, model: Any, record: Any, draws: Any, *more: Any) -> Any:
@@ -40,13 +39,14 @@ def test_a_job_without_its_step_takes_the_batches_of_kernels(
         return run_filter(method, model, record, draws, *more)
 
     monkeypatch.setattr(filter_pass, "run_filter", spy)
-    monkeypatch.setattr(CompiledParticleFilter, "is_active", is_stored)
-    monkeypatch.setattr(step_store, "has_steps", lambda: True)
-    words = ["scenario=flight_300s", "runs=4", "particles=8000", "engine=auto"]
+    compiled: list[Any] = []
+    monkeypatch.setattr(compiled_filter, "compile_step", compiled.append)  # no step of any kind
+    words = ["scenario=flight_300s", "runs=4", "particles=8000", f"engine={engine}"]
     plan = build_plan(resolve_config(settings(tmp_path, *words)))
     episode = truncated(plan.draw_episode(plan.runs), 3)
     result = filter_pass.pass_filter(plan, episode, plan.runs, "")
-    assert passes == [(2, None), (3, 2 if is_stored else 4)]
+    assert passes == [(2, None), (3, batch)]
+    assert bool(compiled) == (engine == "compiled")
     assert result.cost["likelihoods_per_step"] == 8000.0
     # 15 components: the overhead of calls alone, in one batch
     assert filter_pass._predict_saving(plan.method, plan.model, 4, 1000) == pytest.approx(0.3)

@@ -366,7 +366,7 @@ def test_a_compiled_step_takes_the_arguments_that_it_was_compiled_for() -> None:
     example = [torch.rand(3, 2), torch.rand(4, dtype=torch.float64)]
     _, entry = compile_function(lambda a, b: [a + 1.0, b * 2.0], example)
     assert entry is not None
-    number, constants, _ = entry
+    number, constants = entry
     good = [torch.rand(1, 3, 2), torch.rand(1, 4).double()]
     first, second = step_compiler.run_once(entry, example)
     assert torch.equal(first, example[0] + 1.0)
@@ -402,7 +402,7 @@ def test_steps_end_before_the_first_result_that_is_not_finite() -> None:
         lambda a, x, t: [a + t, x - t, (a + t).log().sum().reshape(1), (x + t).sum(-1)], example
     )
     assert entry is not None
-    number, constants, _ = entry
+    number, constants = entry
 
     def run(steps: list[float], kept: list[int]) -> list[torch.Tensor]:
         joined = torch.tensor([2, 3])

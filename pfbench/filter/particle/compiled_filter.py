@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -33,7 +32,6 @@ from pfbench.filter.belief import (
 )
 from pfbench.filter.linearisation import compute_nis
 from pfbench.filter.loop import MultiStepFilter, RecordStartedFilter
-from pfbench.filter.particle import step_store
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.kernels import dispatch, step_compiler
 from pfbench.kernels.step_compiler import (
@@ -69,7 +67,6 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
         method: The filter. It runs uncompiled if it states an obstacle.
         counter: Counter of likelihood evaluations, which compiled steps cannot increment.
         clock: Clock that measures the time of compilation, s.
-        loads_only: Whether a step that is not stored runs uncompiled.
         seconds: Time of compilation so far, s.
         graphs: Compiled step by kind of step; None if that kind runs uncompiled.
     """
@@ -77,7 +74,6 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     method: ParticleFilter
     counter: CallCounter | None = None
     clock: Callable[[], float] = time.perf_counter
-    loads_only: bool = False
     seconds: float = 0.0
     graphs: dict[Any, CompiledStep | None] = field(default_factory=dict)
 
@@ -212,11 +208,11 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
     def _compile(
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: PhiloxStream
     ) -> CompiledStep | None:
-        """Load or compile a step; log a warning and return None if that fails."""
+        """Compile a step; log a warning and return None if that fails."""
         start_time = self.clock()
         try:
             parts = StepParts(self.method, model, belief, record, draws, self.counter)
-            graph = compile_step(parts, self.loads_only)
+            graph = compile_step(parts)
         except Exception as error:  # torch raises many kinds
             reason = f"{type(error).__name__}: {error}".splitlines()[0]
             log.warning(
@@ -227,9 +223,7 @@ class CompiledParticleFilter(Filter, MultiStepFilter, RecordStartedFilter):
             return None
         elapsed = self.clock() - start_time
         self.seconds += elapsed
-        if graph is not None:
-            done = "was loaded" if graph.is_stored else "compiled"
-            log.info("engine=compiled: the step %s in %.1f s", done, elapsed)
+        log.info("engine=compiled: the step compiled in %.1f s", elapsed)
         return graph
 
 
@@ -260,24 +254,22 @@ class CompiledStep:
 
     Attributes:
         run: (belief, step number, record, seed, runs) -> next belief with its weights, mean, variance, predicted log
-            weights, trace. None for a step from the store.
+            weights, trace.
         entry: C++ entry of the step, or None.
         memory: Names of the tensors in the belief's memory.
         trace: Names of the step's diagnostics.
         evaluations: Likelihood evaluations of a step.
         max_steps: Steps that may be taken together.
         model: Model of the step. Its identity is the key of the step, so it must stay alive.
-        is_stored: Whether the step comes from the store on disk.
     """
 
-    run: TensorFunction | None
+    run: TensorFunction
     entry: NativeEntry | None
     memory: list[str]
     trace: list[str]
     evaluations: int
     max_steps: int
     model: StateSpaceModel
-    is_stored: bool = False
 
     def choose_steps(self, selection: KeptSteps) -> int:
         """Return how many steps may be taken together: fewer where all of them are kept, and where the device is a GPU."""
@@ -330,7 +322,6 @@ class CompiledStep:
         carried, joined = _CARRIED + len(self.memory), self._joined.tolist()
         results: list[Sequence[Tensor]] = []
         for step_inputs in zip(*(a.unbind() for a in inputs), strict=True):
-            assert self.run is not None
             results.append(self.run([*state, *step_inputs, *shared]))
             state = list(results[-1][:carried])
         valid = _count_finite([result[carried] for result in results])
@@ -427,44 +418,27 @@ class StepParts(NamedTuple):
     draws: PhiloxStream
     counter: CallCounter | None = None
 
-    def name(self) -> str | None:
-        """Return the name of the step in the store."""
-        arguments = self.belief, self.record, self.draws.dtype, self.draws.runs
-        return step_store.name_step((self.method, self.model), arguments, self.counter)
 
-
-def compile_step(parts: StepParts, loads_only: bool = False) -> CompiledStep | None:
-    """Load a filter's step from the store, or record and compile it.
-
-    Its numbers are compared with those of the uncompiled step.
-
-    Returns the compiled step. None if it is not stored and only loaded.
-    """
+def compile_step(parts: StepParts) -> CompiledStep:
+    """Record and compile a filter's step. Its numbers are compared with those of the uncompiled step."""
     method, model, belief, record, draws, counter = parts
     names: list[list[str]] = []
     make = partial(_make_tensor_function, method, model, belief, record, draws)
     state, inputs = _belief_to_storage(belief), [to_storage(a) for a in tensors_in(record)]
     shared = [torch.as_tensor(draws.seed), draws.runs]
     example = [*state, torch.as_tensor(draws.step), *inputs, *shared]
-    name = None if example[0].is_cuda else parts.name()
-    if loads_only and not (name and step_store.has_step(name)):
-        return None
     with _keep_count(counter) as count:
         expected = make(names, record_step=False)(*example)
         evaluations = count()
-        run, entry = None, _load_step(name, example, expected, len(state))
-        is_stored = entry is not None
-        if not is_stored and loads_only:
-            return None
-        if not is_stored:
-            run, entry = _compile_and_store(name, make([]), example, expected, len(state))
+        run, entry = compile_function(make([]), example)
+        _check_agreement(run(example), expected, len(state))
     memory, trace = names
     carried_shapes = [a.shape for a in expected[: len(state)]]
     keeps_shapes = len(memory) + _CARRIED == len(state) and carried_shapes == [
         a.shape for a in state
     ]
     max_steps = _choose_max_steps(expected) if keeps_shapes else 1
-    return CompiledStep(run, entry, memory, trace, evaluations, max_steps, model, is_stored)
+    return CompiledStep(run, entry, memory, trace, evaluations, max_steps, model)
 
 
 @contextmanager
@@ -476,38 +450,6 @@ def _keep_count(counter: CallCounter | None) -> Iterator[Callable[[], int]]:
     finally:
         if counter:
             counter.count = before
-
-
-def _compile_and_store(
-    name: str | None,
-    step: Callable[..., list[Tensor]],
-    example: list[Tensor],
-    expected: Sequence[Tensor],
-    carried: int,
-) -> tuple[TensorFunction, NativeEntry | None]:
-    """Compile a step, compare it with the uncompiled one, and store it if it has a name."""
-    run, entry = compile_function(step, example)
-    _check_agreement(run(example), expected, carried)
-    if name and entry:
-        step_store.save_step(name, entry, len(expected))
-    return run, entry
-
-
-def _load_step(
-    name: str | None, example: list[Tensor], expected: Sequence[Tensor], carried: int
-) -> NativeEntry | None:
-    """Load a step from the store; remove it and return None if its numbers are not those of the uncompiled one."""
-    entry = step_store.load_step(name, example) if name else None
-    if entry is None:
-        return None
-    try:
-        out = [to_storage(a) for a in step_compiler.run_once(entry, example)]
-        _check_agreement(out, expected, carried)
-    except (ArithmeticError, RuntimeError) as error:
-        log.warning("engine=compiled: a stored step is removed (%s)", error)
-        step_store.remove_step(Path(entry.library).parent.name)
-        return None
-    return entry
 
 
 def _make_tensor_function(

@@ -22,7 +22,7 @@ from pfbench.filter import loop
 from pfbench.filter.belief import StepInfo
 from pfbench.filter.health import HealthMonitor
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle import compiled_filter, step_store
+from pfbench.filter.particle import compiled_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
 from pfbench.filter.particle.particle_filter import ParticleFilter
@@ -35,12 +35,6 @@ from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.model.textbook import UnivariateGrowth
 from pfbench.results import store
-
-
-@pytest.fixture(autouse=True)
-def empty_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let no step of an earlier test or of a user be loaded."""
-    monkeypatch.setattr(step_store, "_folder", lambda: tmp_path / "steps")
 
 
 class Failing(UnivariateGrowth):
