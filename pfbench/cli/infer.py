@@ -14,10 +14,11 @@ HELP = """\
 pfbench infer model=NAME method=nuts|svi|pmmh|smc2 'parameters={KEY:[LOW,HIGH]}' [key=value ...]
 
 Infer numbers of a model from measurements of a scenario, by the likelihood of a filter. LOW and HIGH are the 5 % and the
-95 % quantile of a log-normal prior. The result has the posterior table and all draws; a finished one is not computed again.
+95 % quantile of a prior on the values that the model accepts. A prior can have a name instead. The result has the posterior table and all draws; a finished one is not computed again.
 
   pfbench infer model=local_level method=nuts 'parameters={level_sd:[10,100],measurement_sd:[50,300]}'
   pfbench infer model=stochastic_volatility method=pmmh 'parameters={sigma:[0.1,1]}' particles=200 infer.chains=16
+  pfbench infer model=stochastic_volatility method=smc2 filter=sir 'parameters={rho:{beta:[20,1.5],on:[-1,1]}}'
 
   scenario=NAME              where the measurements come from; that of the model's name by default
   runs=1 seed=1 noise=NAME   runs that share the parameters
@@ -84,18 +85,26 @@ def _find_scenario(model: str) -> str:
 
 
 def _build(node: Any, **changed: Any) -> Any:
-    """Build the object of a node, with other values as arguments; the node alone is what is checked."""
-    import hydra
-
+    """Build the object of a node, with other numbers by name; the node alone is what is checked."""
     from pfbench import job
 
-    if not changed:
-        return job.instantiate(node)
-    rest = {key: value for key, value in node.items() if key not in changed}
-    return _get_target(str(rest.pop("_target_")))(
-        **{key: hydra.utils.instantiate(v, _convert_="all") if isinstance(v, dict) else v for key, v in rest.items()},
-        **changed,
-    )  # fmt: skip
+    return _build_changed(node, "", changed) if changed else job.instantiate(node)
+
+
+def _build_changed(node: Any, path: str, changed: dict[str, Any]) -> Any:
+    """Build a part of a node at a path, such as `tuning.position_sd[0]`."""
+    import hydra
+
+    if path in changed:
+        return changed[path]
+    if isinstance(node, list):
+        return [_build_changed(value, f"{path}[{i}]", changed) for i, value in enumerate(node)]
+    if not isinstance(node, dict):
+        return node
+    if not any(name.startswith(path) for name in changed):
+        return hydra.utils.instantiate(node, _convert_="all")
+    parts = {k: _build_changed(v, f"{path}.{k}".lstrip("."), changed) for k, v in node.items()}
+    return _get_target(str(parts.pop("_target_")))(**parts)
 
 
 @functools.cache

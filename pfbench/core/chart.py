@@ -243,7 +243,9 @@ class Chart:
 
 def _log_turn_volume(r: Tensor) -> Tensor:
     """Return log (2 sin(a / 2) / a)^2 of rotation vectors [..., 3] with the angle a: det of their left Jacobian."""
-    return 2.0 * torch.log(torch.sinc(r.norm(dim=-1) / (2.0 * torch.pi)))
+    square, small, angle = _angles(r, _TINY)
+    chord = torch.where(small, 1.0 - square / 24, torch.sinc(angle / (2.0 * torch.pi)))
+    return 2.0 * torch.log(chord[..., 0])
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
@@ -264,8 +266,12 @@ for _i, _row in enumerate(((+1, +2, +3, +4), (+2, -1, +4, -3), (+3, -4, -1, +2),
 
 def quaternion_from_rotation_vector(r: Tensor) -> Tensor:
     """Convert rotation vectors [..., 3] to unit quaternions [..., 4]."""
-    angle = torch.linalg.vector_norm(r, dim=-1, keepdim=True)
-    return torch.cat([torch.cos(angle / 2), 0.5 * torch.sinc(angle / (2 * torch.pi)) * r], dim=-1)
+    square, small, angle = _angles(r, _TINY)
+    cosine = torch.where(small, 1.0 - square / 8 + square**2 / 384, torch.cos(angle / 2))
+    sine = torch.where(
+        small, 0.5 - square / 48 + square**2 / 3840, torch.sinc(angle / (2 * torch.pi)) / 2
+    )
+    return torch.cat([cosine, sine * r], dim=-1)
 
 
 def rotation_vector_from_quaternion(q: Tensor) -> Tensor:
@@ -275,10 +281,11 @@ def rotation_vector_from_quaternion(q: Tensor) -> Tensor:
     """
     q = torch.where(q[..., :1] < 0, -q, q)
     w, v = q[..., :1], q[..., 1:]
-    half_sine = torch.linalg.vector_norm(v, dim=-1, keepdim=True)
-    small = half_sine < torch.finfo(q.dtype).tiny
-    divisor = torch.where(small, torch.ones_like(half_sine), half_sine)
-    return torch.where(small, 2 / w, 2 * torch.atan2(half_sine, w) / divisor) * v
+    square, small, half_sine = _angles(v, _TINY)
+    w_near = torch.where(small, w, torch.ones_like(w))  # at half a turn w is 0
+    ratio = square / w_near.square()  # squared tangent of half the angle
+    near = 2 / w_near * (1 - ratio / 3 + ratio.square() / 5)
+    return torch.where(small, near, 2 * torch.atan2(half_sine, w) / half_sine) * v
 
 
 def quaternion_multiply(p: Tensor, q: Tensor) -> Tensor:
@@ -402,6 +409,7 @@ def _rotate(q: Tensor, a: Tensor) -> Tensor:
 # Below theta = 0.5 the closed forms cancel, and power series in theta^2 replace them. The branch depends on
 # theta^2, since the derivative of theta at 0 is not a number.
 
+_TINY = 1e-8  # theta^2 below which two terms of a series have all digits; its second derivative at 0 is finite
 _SWITCH = 0.25  # theta^2 at which the closed forms replace the series
 _A = (1 / 2, -1 / 24, 1 / 720, -1 / 40320, 1 / 3628800, -1 / 479001600)
 _B = (1 / 6, -1 / 120, 1 / 5040, -1 / 362880, 1 / 39916800, -1 / 6227020800)
@@ -456,10 +464,10 @@ def apply_inverse_left_jacobian(phi: Tensor, a: Tensor) -> Tensor:
     return a - 0.5 * once + c * torch.linalg.cross(phi, once)
 
 
-def _angles(phi: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _angles(phi: Tensor, switch: float = _SWITCH) -> tuple[Tensor, Tensor, Tensor]:
     """Return theta^2, whether the series holds, and theta with 1 in place of small angles."""
     square = phi.square().sum(-1, keepdim=True)
-    small = square < _SWITCH
+    small = square < switch
     # a derivative of the branch that is not taken must be finite
     return square, small, torch.where(small, torch.ones_like(square), square).sqrt()
 

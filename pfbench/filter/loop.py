@@ -484,7 +484,7 @@ def _join_blocks(blocks: Sequence[StepBlock], axis: int = 0) -> StepBlock:
     trace = {
         name: torch.cat([block.trace[name] for block in blocks], axis) for name in blocks[0].trace
     }
-    steps = blocks[0].infos
+    steps = [t for t in blocks[0].infos if all(t in block.infos for block in blocks)]
     beliefs = {t: tuple(belief for block in blocks for belief in block.beliefs[t]) for t in steps}
     infos = {t: _join_infos([block.infos[t] for block in blocks]) for t in steps}
     return StepBlock(blocks[0].first, mean, variance, log_evidence, trace, beliefs, infos)

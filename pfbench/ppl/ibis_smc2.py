@@ -115,7 +115,7 @@ class _ParameterSampler:
     def run(self, moves: int, threshold: float) -> Smc2Result:
         """Process the record."""
         log_evidence, rows, resamplings = torch.zeros((), dtype=torch.float64), [], 0
-        filters = self._start_filters(self.z, self._stream(""))
+        filters = self._start_filters(self._models(), self._stream(""))
         before = self._log_likelihood(filters.belief)
         for t, *_ in filters:
             gain = self._log_likelihood(filters.belief) - before
@@ -135,7 +135,7 @@ class _ParameterSampler:
                 filters.belief, accepted = self._resample_move(
                     filters.belief, t, moves, resamplings
                 )
-                filters.model = self._models(self.z)
+                filters.model = self._models()
             before = self._log_likelihood(filters.belief)
             rows.append((mean, sd, log_evidence, ess, accepted))
         means, sds, *columns = zip(*rows, strict=True)
@@ -185,23 +185,21 @@ class _ParameterSampler:
     def _run_filters(self, z: Tensor, t: int, draws: RandomStream) -> tuple[Any, Tensor]:
         """Return beliefs given y_1:t, and log p(z) + log p(y_1:t | z) [M]."""
         values, log_prior = self.unknown.constrained(z)
-        valid = self.unknown.in_support(values) & torch.isfinite(log_prior)
-        z = torch.where(valid.unsqueeze(-1), z, self.z)  # rejected below
-        filters = self._start_filters(z, draws)
+        model, valid = self.unknown.models_per_run(values, self.runs)
+        filters = self._start_filters(model, draws)
         for _ in islice(filters, t + 1):
             pass
         log_likelihood = self._log_likelihood(filters.belief)
-        valid = valid & torch.isfinite(log_likelihood)
+        valid = valid & torch.isfinite(log_prior) & torch.isfinite(log_likelihood)
         return filters.belief, torch.where(valid, log_prior + log_likelihood, -torch.inf)
 
-    def _start_filters(self, z: Tensor, draws: RandomStream) -> FilterPass:
-        """Start the filters of these parameters."""
-        model = self._models(z)
+    def _start_filters(self, model: StateSpaceModel, draws: RandomStream) -> FilterPass:
+        """Start the filters of a batch of models."""
         return FilterPass(self.method, model, prepare_record(model, self.record), draws)
 
-    def _models(self, z: Tensor) -> StateSpaceModel:
+    def _models(self) -> StateSpaceModel:
         """Return a batch of models, one for each run of each parameter particle."""
-        return self.unknown.models_per_run(self.unknown.constrained(z)[0], self.runs)
+        return self.unknown.models_per_run(self.unknown.constrained(self.z)[0], self.runs)[0]
 
     def _log_likelihood(self, belief: Any) -> Tensor:
         """Return log p(y_1:t | z) [M] from the evidence of all runs."""

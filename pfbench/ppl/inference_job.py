@@ -1,17 +1,17 @@
-"""Inference of the parameters of a model from a configuration: data of a scenario, priors by their quantiles, a result as JSON."""
+"""Inference of the parameters of a model from a configuration: data of a scenario, priors by quantiles or names, a result as JSON."""
 
 from __future__ import annotations
 
 import json
-import math
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from pyro.distributions import LogNormal
 
+from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record
 from pfbench.files.atomic_write import write_atomically
 from pfbench.files.command_start import start_work
@@ -22,13 +22,13 @@ from pfbench.ppl.ibis_smc2 import Smc2Result, smc2
 from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood, MarginalLikelihood
 from pfbench.ppl.nuts_svi import normal_guide, nuts, svi
 from pfbench.ppl.parameter_posterior import ParameterPosterior
-from pfbench.ppl.parameterised_model import ParameterisedModel
+from pfbench.ppl.parameterised_model import ParameterisedModel, Prior
 from pfbench.ppl.particle_mcmc import pmmh
+from pfbench.ppl.priors import find_range, prior_by_name, prior_by_quantiles
 from pfbench.ppl.pyro_program import program
 from pfbench.results.store import compute_config_key, extend_key
 
 _BY_GRADIENT = ("nuts", "svi")
-_Z_95 = 1.6448536269514722  # 95 % quantile of the standard normal distribution
 _KEYS = ("model", "scenario", "noise", "filter", "infer", "seed", "runs", "first_run")
 
 
@@ -40,31 +40,49 @@ class InferenceTask(NamedTuple):
     record: Record
 
 
-def make_priors(parameters: Any, node: Mapping[str, Any]) -> dict[str, LogNormal]:
-    """Make log-normal priors by their 5 % and 95 % quantiles. Raises ValueError for a parameter that the model has not."""
-    numbers = [key for key, value in node.items() if type(value) in (int, float)]
-    example = numbers[0] if numbers else "KEY"
-    if not isinstance(parameters, Mapping) or not parameters:
-        raise ValueError(
-            f"parameters must name at least one unknown key of the model, got {parameters or 'none'}. "
-            f"Choose from {', '.join(numbers) or 'none'}: parameters={{{example}:[0.1,10]}}."
-        )
+def list_numbers(node: Any, path: str = "") -> dict[str, float]:
+    """List the numbers of a configuration, nested ones and those of lists too, by name: `tuning.gyro_density`, `measurement_sd[0]`."""
+    if type(node) in (int, float):
+        return {path: node}
+    if isinstance(node, Mapping):
+        inner = [(f"{path}.{key}".lstrip("."), value) for key, value in node.items()]
+    else:
+        inner = [(f"{path}[{i}]", v) for i, v in enumerate(node if isinstance(node, list) else [])]
+    return {name: v for key, value in inner for name, v in list_numbers(value, key).items()}
+
+
+def make_priors(
+    parameters: Any, node: Mapping[str, Any], build: Callable[..., Any]
+) -> dict[str, Prior]:
+    """Make priors of numbers of a model, by name or by quantiles on the range that the model accepts.
+
+    `build` makes the object of a node, with other arguments as keywords. Raises ValueError for a parameter that the model has not.
+    """
+    numbers = list_numbers(node)
+    choice = f"Choose from {', '.join(numbers) or 'none'}"
+    remedy = f"{choice}: parameters={{{next(iter(numbers), 'KEY')}:[0.1,10]}}."
+    ok = isinstance(parameters, Mapping) and parameters
+    require(ok, "parameters", "name at least one unknown key of the model", parameters or "none", remedy)  # fmt: skip
     priors = {}
-    for name, ends in parameters.items():
-        if name not in numbers:
-            raise ValueError(
-                f"parameters must name numbers of the model, got {name}. Choose from {', '.join(numbers) or 'none'}."
-            )
-        is_pair = isinstance(ends, list | tuple) and len(ends) == 2
-        if not (is_pair and all(type(v) in (int, float) for v in ends) and 0 < ends[0] < ends[1] < math.inf):  # fmt: skip
-            raise ValueError(
-                f"parameters.{name} must be two positive numbers, the 5 % and the 95 % quantile of its prior, got {ends}. "
-                f"Set parameters.{name}=[{abs(node[name]) / 3:.3g},{abs(node[name]) * 3:.3g}]."
-            )
-        low, high = (math.log(float(value)) for value in ends)
-        loc, scale = torch.tensor([(low + high) / 2, (high - low) / (2 * _Z_95)]).double()
-        priors[str(name)] = LogNormal(loc, scale)
+    for name, words in parameters.items():
+        require(name in numbers, "parameters", "name numbers of the model", name, f"{choice}.")
+        if isinstance(words, Mapping):
+            priors[name] = prior_by_name(name, words)
+        else:
+            ends = find_range(partial(_is_accepted, build, node, name))
+            priors[name] = prior_by_quantiles(name, words, numbers[name], ends)
     return priors
+
+
+def _is_accepted(
+    build: Callable[..., Any], node: Mapping[str, Any], name: str, value: float
+) -> bool:
+    """Return whether a model accepts a value of a number."""
+    try:
+        build(node, **{name: torch.tensor(value, dtype=torch.float64)})
+    except ValueError:
+        return False
+    return True
 
 
 def infer(
@@ -113,7 +131,7 @@ def infer(
 def _make_task(values: Mapping[str, Any], build: Callable[..., Any]) -> InferenceTask:
     """Build model, filter and data of a configuration."""
     node = values["model"]
-    priors = make_priors(values["infer"]["parameters"], node)
+    priors = make_priors(values["infer"]["parameters"], node, build)
     unknown = ParameterisedModel(lambda **changed: build(node, **changed), priors)
     numbers = torch.arange(values["first_run"], values["first_run"] + values["runs"])
     episode = build(values["scenario"]).draw(build(values["noise"]), numbers, int(values["seed"]))
@@ -130,7 +148,7 @@ def _check_gradient(name: str, task: InferenceTask, model: str) -> None:
     missing = list(values)
     if likelihood.requires_grad:
         gradients = torch.autograd.grad(likelihood.sum(), list(values.values()), allow_unused=True)
-        missing = [key for key, g in zip(values, gradients, strict=True) if g is None]
+        missing = [k for k, g in zip(values, gradients, strict=True) if g is None or not g.any()]
     if missing:
         raise ValueError(
             f"method={name} must have a likelihood with a gradient, got model={model}, whose {', '.join(missing)} "
@@ -140,7 +158,7 @@ def _check_gradient(name: str, task: InferenceTask, model: str) -> None:
 
 def choose_likelihood(task: InferenceTask) -> MarginalLikelihood:
     """Choose the likelihood of a method with gradients: of a linear model Pyro's, which is exact and takes less time."""
-    model = task.unknown.model({key: v[0] for key, v in task.unknown.sample(1, 0).items()})
+    model = task.unknown.some_model()
     is_kalman = isinstance(task.method, GaussianFilter) and isinstance(model, LinearGaussian)
     is_plain = is_kalman and not getattr(task.method, "noise_adaptations", ())
     return GaussianHmmLikelihood() if is_plain else FilterLikelihood(task.method)

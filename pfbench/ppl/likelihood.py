@@ -19,7 +19,7 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.stages import Resampler
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.ppl.model_batch import ModelBatch
-from pfbench.ppl.parameterised_model import ParameterisedModel, Values
+from pfbench.ppl.parameterised_model import ParameterisedModel
 
 # --------------------------------------------------------------------------------------------------
 # Marginal likelihoods of models: by a filter, or by Pyro's GaussianHMM.
@@ -161,15 +161,12 @@ class PosteriorEstimator:
         Returns log density [C, Q], and the correlated stream or None. Shapes: z [C, Q, P].
         """
         values, log_prior = self.unknown.constrained(z.flatten(0, 1))
-        is_valid = self.unknown.in_support(values) & torch.isfinite(log_prior)
-        if not bool(is_valid.all()):  # any valid value serves: the proposal is rejected anyway
-            medians = self._prior_medians()
-            values = {name: torch.where(is_valid, a, medians[name]) for name, a in values.items()}
+        model, is_possible = self.unknown.models_per_run(values, self.runs_per_model)
+        is_valid = is_possible & torch.isfinite(log_prior)
         runs = torch.arange(is_valid.numel() * self.runs_per_model)
         source = relabel(PhiloxStream(self.seed, runs), f"pmmh_{iteration}.")
         correlated = CorrelatedStream(source, self.rho, self._stored) if self.rho else None
         stream: Any = correlated or source
-        model = self.unknown.models_per_run(values, self.runs_per_model)
         log_z = run_filter(self.method, model, self.record, stream).log_evidence
         log_z = log_z.view(-1, self.runs_per_model).sum(1)
         total = torch.where(is_valid & torch.isfinite(log_z), log_prior + log_z, -torch.inf)
@@ -206,16 +203,13 @@ class PosteriorEstimator:
 
     def start_covariance(self, start: ParameterisedModel) -> Tensor:
         """Return the covariance of the starts, [Q, P, P]."""
-        z = self.unknown.unconstrained(start.sample(1000, self.seed))
+        z = self.unknown.unconstrained(start.draw(1000, self.seed))
         p = z.shape[-1]
         return torch.cov(z.T).view(1, p, p).repeat(self.shape[1], 1, 1)
 
     def _sample(self, start: ParameterisedModel, attempt: int) -> Tensor:
-        values = start.sample(self.shape[0] * self.shape[1], self.seed + 7919 * (attempt + 1))
+        values = start.draw(self.shape[0] * self.shape[1], self.seed + 7919 * (attempt + 1))
         return self.unknown.unconstrained(values).view(*self.shape, -1)
-
-    def _prior_medians(self) -> Values:
-        return {name: a.median() for name, a in self.unknown.sample(101, self.seed).items()}
 
 
 def repeat_runs(record: Record, copies: int) -> Record:

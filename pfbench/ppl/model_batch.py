@@ -11,6 +11,7 @@ from pyro.distributions import Independent
 from torch import Tensor, nn
 from torch.distributions import Distribution, MixtureSameFamily, MultivariateNormal, Normal
 from torch.func import functional_call
+from torch.utils._pytree import tree_map
 from typing_extensions import override
 
 from pfbench.core.density import dense_normal, independent_normal
@@ -21,8 +22,9 @@ from pfbench.model.base import ModelWrapper, StateSpaceModel
 class ModelBatch(ModelWrapper):
     """A batch of models: run r has models[r // runs_per_model].
 
-    Each method is mapped over the runs with the buffers in which the models differ. It works for
-    every model that stores its parameters in buffers. Gradients reach the buffers.
+    Each method is mapped over the runs with the buffers in which the models differ. Models that
+    differ in other attributes too are evaluated one by one, which takes more time. Gradients reach
+    the buffers.
     """
 
     def __init__(self, models: Sequence[StateSpaceModel], runs_per_model: int = 1) -> None:
@@ -33,6 +35,7 @@ class ModelBatch(ModelWrapper):
         self.models, self.runs_per_model = tuple(models), runs_per_model
         self.size = len(models) * runs_per_model
         self._call = _Call(first)
+        self._is_mapped = not any(list_non_buffers(first, model) for model in models[1:])
         self._buffers_by_run = {
             f"model.{name}": value.repeat_interleave(runs_per_model, 0)
             for name, value in _differing(models).items()
@@ -93,7 +96,14 @@ class ModelBatch(ModelWrapper):
             return functional_call(self._call, buffers, (f, *batched))
 
         expanded = [_map_leaves(lambda a: a.expand(self.size, *a.shape[1:]), a) for a in args]
-        return torch.vmap(call_run)(self._buffers_by_run, *expanded)
+        if self._is_mapped:
+            return torch.vmap(call_run)(self._buffers_by_run, *expanded)
+
+        def call_alone(r: int) -> Any:
+            run_args = (_map_leaves(lambda a: a[r : r + 1], value) for value in expanded)
+            return f(self.models[r // self.runs_per_model], *run_args)
+
+        return tree_map(lambda *a: torch.stack(a), *map(call_alone, range(self.size)))
 
     def _map_distribution(self, f: Callable[..., Any], *args: Any) -> Distribution:
         """Map the parameters of a distribution over the runs and build it again."""
@@ -154,12 +164,6 @@ def _differing(models: Sequence[StateSpaceModel]) -> dict[str, Tensor]:
     """Return buffers that differ between models, stacked [len(models), ...]."""
     first, kind = models[0], type(models[0]).__name__
     for model in models[1:]:
-        changed = list_non_buffers(first, model)
-        if changed:
-            raise ValueError(
-                f"{kind} must register {changed[0]} as a buffer, got models that differ in it. Call "
-                "register_buffer in its constructor."
-            )
         if not torch.equal(first.origin, model.origin):
             raise ValueError(
                 f"{kind} must have one origin in a batch of models, got different ones. Put the "

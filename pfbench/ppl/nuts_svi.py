@@ -153,7 +153,7 @@ def normal_guide(
         Guide of a record.
     """
     p = len(unknown.prior)
-    medians = unknown.unconstrained(unknown.sample(1001, 0)).median(0).values
+    medians = unknown.unconstrained(unknown.draw(1001, 0)).median(0).values
 
     def sample_parameters(runs: torch.Size) -> Values:
         loc = pyro.param("loc", lambda: medians.expand(*runs, p).clone())

@@ -291,7 +291,7 @@ def simulation_based_calibration(
     check_kinds("simulation_based_calibration", {**kinds, "infer": (infer, Callable)})
     check_counts("simulation_based_calibration", {"draws": (draws, 1), "seed": (seed, 0)})
     truth = unknown.sample(len(template.y), seed)
-    record, _ = simulate(unknown.models_per_run(truth), template, seed)
+    record, _ = simulate(unknown.models_per_run(truth)[0], template, seed)
     posterior = infer(record)
     ranks = {}
     for name, value in truth.items():

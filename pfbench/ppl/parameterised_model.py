@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import torch
-from pyro.distributions.torch_distribution import TorchDistributionMixin
 from torch import Tensor
 from torch.distributions import Distribution, Independent, biject_to
 
-from pfbench.core.parameter_checks import require_range
+from pfbench.core.parameter_checks import require, require_range
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.simulate import draw_values
 from pfbench.model.base import StateSpaceModel
 from pfbench.ppl.model_batch import ModelBatch, list_non_buffers
+from pfbench.ppl.priors import as_prior
 
 Values: TypeAlias = dict[str, Tensor]
-Prior: TypeAlias = (
-    Any  # a distribution of pyro.distributions; their stubs share no useful base type
-)
+Prior: TypeAlias = Any  # a distribution of torch or Pyro; their stubs share no useful base type
 
 
 @dataclass(frozen=True)
@@ -30,34 +28,34 @@ class ParameterisedModel:
     Attributes:
         make: Model constructor with the parameters as keyword arguments, tensors []. A gradient
             reaches them if the constructor keeps them as tensors.
-        prior: Distribution of each parameter by name, scalar and from pyro.distributions.
+        prior: Distribution of each parameter by name, scalar, of torch or Pyro. Values that the
+            constructor refuses with a ValueError are impossible, their density is 0.
 
     Raises:
-        ValueError: If `prior` is empty, a distribution is not scalar or not from Pyro, or a
-            parameter does not change the model.
+        ValueError: If `prior` is empty, a distribution is not scalar, the model refuses all draws,
+            or a parameter does not change the model.
     """
 
     make: Callable[..., StateSpaceModel]
     prior: Mapping[str, Prior]
 
     def __post_init__(self) -> None:
-        if not self.prior:
-            raise ValueError(
-                "prior must have at least one parameter, got none. Name a parameter and its "
-                "distribution."
-            )
-        for name, distribution in self.prior.items():
-            _check_prior(name, distribution)
+        remedy = "Name a parameter and its distribution."
+        require(self.prior, "prior", "have at least one parameter", "none", remedy)
+        priors = {name: as_prior(name, prior) for name, prior in self.prior.items()}
+        object.__setattr__(self, "prior", priors)
         samples = self.sample(2, 0)
         values = {name: sample[0] for name, sample in samples.items()}
         first = self.model(values)
         for name in self.prior:
-            second = self.model({**values, name: samples[name][1]})
-            same = all(map(torch.equal, first.buffers(), second.buffers()))
-            if same and not list_non_buffers(first, second):
-                raise ValueError(
-                    f"prior[{name}] must change the model, got a {type(first).__name__} whose buffers "
-                    f"do not depend on it. Check that `make` uses `{name}`."
+            second = self.find_model({**values, name: samples[name][1]})
+            if second is not None and all(map(torch.equal, first.buffers(), second.buffers())):
+                require(
+                    list_non_buffers(first, second),
+                    f"prior[{name}]",
+                    "change the model",
+                    f"a {type(first).__name__} whose buffers do not depend on it",
+                    f"Check that `make` uses `{name}`.",
                 )
 
     @property
@@ -69,9 +67,28 @@ class ParameterisedModel:
         """Build the model with these parameters, tensors []."""
         return self.make(**{name: values[name].double() for name in self.prior})
 
+    def find_model(self, values: Mapping[str, Tensor]) -> StateSpaceModel | None:
+        """Build the model with these parameters, tensors [], or return None where they are impossible.
+
+        Parameters are impossible outside the support of their prior, and where the constructor
+        refuses them with a ValueError. Their density is 0.
+        """
+        if not all(
+            d.support.check(values[k]) & values[k].isfinite() for k, d in self.prior.items()
+        ):
+            return None
+        try:
+            return self.model(values)
+        except ValueError:
+            return None
+
+    def some_model(self) -> StateSpaceModel:
+        """Build the model with a draw of the prior."""
+        return self.model({name: value[0] for name, value in self.sample(1, 0).items()})
+
     def models_per_run(
         self, values: Mapping[str, Tensor], runs_per_model: int = 1
-    ) -> StateSpaceModel:
+    ) -> tuple[StateSpaceModel, Tensor]:
         """Build one model for each parameter value.
 
         Args:
@@ -79,17 +96,36 @@ class ParameterisedModel:
             runs_per_model: Number of consecutive runs that share a model.
 
         Returns:
-            Model of G `runs_per_model` runs.
+            Model of G `runs_per_model` runs, and a mask of the values that are possible, [G].
+            The runs of the others have any model.
+        """
+        models = [self.find_model(row) for row in self._rows(values)]
+        spare = next((model for model in models if model is not None), None) or self.some_model()
+        is_possible = torch.tensor([model is not None for model in models])
+        return ModelBatch([model or spare for model in models], runs_per_model), is_possible
+
+    def draw(self, count: int, seed: int, attempt: int = 0) -> Values:
+        """Draw parameters from the prior by counters, whether the model accepts them or not.
+
+        Args:
+            count: Number of values; value i does not depend on it.
+            seed: Seed.
+            attempt: Number of the draw of each value.
+
+        Returns:
+            Values by name, [count].
 
         Raises:
-            ValueError: If the model stores a parameter outside its buffers.
+            ValueError: If a prior cannot be drawn, see `draw_values`.
         """
-        rows = zip(*(values[name].unbind(0) for name in self.prior), strict=True)
-        models = [self.model(dict(zip(self.prior, row, strict=True))) for row in rows]
-        return ModelBatch(models, runs_per_model)
+        stream, use = PhiloxStream(seed, torch.arange(count)), f"prior{attempt or ''}"
+        return {
+            name: draw_values(_as_event(distribution), stream, f"{use}.{name}", 1)[:, 0, 0].double()
+            for name, distribution in self.prior.items()
+        }
 
     def sample(self, count: int, seed: int) -> Values:
-        """Draw parameters from the prior by counters.
+        """Draw parameters from the prior that the model accepts, as `draw` does.
 
         Args:
             count: Number of values; value i does not depend on it.
@@ -99,24 +135,22 @@ class ParameterisedModel:
             Values by name, [count].
 
         Raises:
-            ValueError: If a prior cannot be drawn, see `draw_values`.
+            ValueError: If the model refuses a hundred draws of a value; that of the last one.
         """
-        stream = PhiloxStream(seed, torch.arange(count))
-        return {
-            name: draw_values(_as_event(distribution), stream, f"prior.{name}", 1)[:, 0, 0].double()
-            for name, distribution in self.prior.items()
-        }
+        values = self.draw(count, seed)
+        for attempt in range(1, 100):
+            refused = torch.tensor([self.find_model(row) is None for row in self._rows(values)])
+            if not bool(refused.any()):
+                return values
+            again = self.draw(count, seed, attempt)
+            values = {name: torch.where(refused, again[name], a) for name, a in values.items()}
+        self.model(next(self._rows({name: a[refused] for name, a in values.items()})))  # raises
+        return values
 
-    def in_support(self, values: Mapping[str, Tensor]) -> Tensor:
-        """Return a mask of the values that are finite and inside their support.
-
-        A long step of a sampler can overflow and leave the support.
-        """
-        valid_masks = [
-            torch.isfinite(values[name]) & distribution.support.check(values[name])
-            for name, distribution in self.prior.items()
-        ]
-        return torch.stack(valid_masks).all(0)
+    def _rows(self, values: Mapping[str, Tensor]) -> Iterator[Values]:
+        """Yield the parameters of each value."""
+        for row in zip(*(values[name].unbind(0) for name in self.prior), strict=True):
+            yield dict(zip(self.prior, row, strict=True))
 
     def constrained(self, z: Tensor) -> tuple[Values, Tensor]:
         """Map unconstrained numbers to parameters.
@@ -139,21 +173,6 @@ class ParameterisedModel:
         """Map parameters to unconstrained numbers [..., P]; the inverse of `constrained`."""
         columns = [biject_to(d.support).inv(values[name]) for name, d in self.prior.items()]
         return torch.stack(columns, -1)
-
-
-def _check_prior(name: str, distribution: Prior) -> None:
-    """Raise ValueError if a prior is not a scalar distribution of Pyro."""
-    if not isinstance(distribution, TorchDistributionMixin):
-        raise ValueError(
-            f"prior[{name}] must be a distribution of pyro.distributions, got {distribution}. "
-            "Import the distribution of that name from pyro.distributions."
-        )
-    if distribution.batch_shape or distribution.event_shape:
-        shape = tuple(distribution.batch_shape + distribution.event_shape)
-        raise ValueError(
-            f"prior[{name}] must be a scalar distribution, got shape {shape}. Give several "
-            "parameters several names."
-        )
 
 
 def _as_event(distribution: Prior) -> Distribution:

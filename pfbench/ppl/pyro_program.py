@@ -48,16 +48,18 @@ def program(
 
     def sample_shared(record: Record) -> Values:
         values = _sample_prior(unknown)
-        log_evidence = torch.tensor(-torch.inf)
-        if bool(unknown.in_support(values)):
-            log_evidence = likelihood(unknown.model(values), record).sum()
+        model, log_evidence = unknown.find_model(values), torch.tensor(-torch.inf)
+        if model is not None:
+            log_evidence = likelihood(model, record).sum()
         pyro.factor("evidence", log_evidence)
         return values
 
     def sample_by_run(record: Record) -> Values:
         with pyro.plate("runs", len(record.y)):
             values = _sample_prior(unknown)
-            pyro.factor("evidence", likelihood(unknown.models_per_run(values), record))
+            model, is_possible = unknown.models_per_run(values)
+            log_evidence = likelihood(model, record)
+            pyro.factor("evidence", torch.where(is_possible, log_evidence, -torch.inf))
         return values
 
     return sample_by_run if separate_parameters else sample_shared
@@ -90,14 +92,15 @@ def latent_program(unknown: ParameterisedModel) -> Callable[[Record], Values]:
 
     def run(record: Record) -> Values:
         values = _sample_prior(unknown)
-        model = unknown.model(values)
+        possible = unknown.find_model(values)
+        model = unknown.some_model() if possible is None else possible
         runs, steps = record.y.shape[:2]
         initial = initial_law(model, runs, record.to(model.anchor).spread)
         shift = _sample_site("initial_state", initial, (runs,))
         w = _sample_site("driving_noise", model.noise, (runs, steps))
         states, log_like = compute_path(model, record, shift, w)
         pyro.deterministic("path", states)
-        pyro.factor("seen", log_like.sum())
+        pyro.factor("seen", torch.tensor(-torch.inf) if possible is None else log_like.sum())
         return values
 
     return run

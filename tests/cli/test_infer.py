@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import yaml
 from checkout import ROOT
 from command_line import pfbench as command
-from pyro.distributions import LogNormal
+from scipy.stats import beta, halfcauchy
 
 from pfbench.job import compose, instantiate
+from pfbench.model.textbook import StochasticVolatility
 from pfbench.ppl.inference_job import make_priors
+from pfbench.ppl.parameterised_model import ParameterisedModel
+from pfbench.ppl.priors import find_range
 
 PARAMETERS = "parameters={level_sd:[10,100]}"
 WORLD = ("model=local_level", PARAMETERS, "scenario.steps=25", "study=s")
@@ -112,18 +118,91 @@ def test_bad_words_are_answered_by_a_sentence(
     assert not (tmp_path / "results").exists()
 
 
-def test_a_prior_has_the_stated_quantiles() -> None:
-    prior = make_priors({"level_sd": [10, 100]}, {"level_sd": 38.0})["level_sd"]
-    assert isinstance(prior, LogNormal)
-    assert prior.cdf(prior.loc.new_tensor(10.0)) == pytest.approx(0.05, abs=1e-6)
-    assert prior.cdf(prior.loc.new_tensor(100.0)) == pytest.approx(0.95, abs=1e-6)
+def volatility(node: Any = None, /, **changed: Any) -> StochasticVolatility:
+    return StochasticVolatility(**({"mu": -1.0, "rho": 0.95, "sigma": 0.3} | changed))
 
 
-def test_the_page_shows_a_command_that_runs(tmp_path: Path) -> None:
-    """The first command of the page, with fewer values."""
+NODE = {"mu": -1.0, "rho": 0.95, "sigma": 0.3, "_target_": "here", "of": {"sd": [0.1, 2]}}
+PRIORS: dict[str, tuple[str, Any, tuple[float, float]]] = {  # law of SciPy, and the ends of its quantiles
+    "positive": ("sigma", [0.1, 1], (0.1, 1.0)),
+    "bounded": ("rho", [0.5, 0.99], (0.5, 0.99)),
+    "free": ("mu", [-3, 2], (-3.0, 2.0)),
+    "beta": ("rho", {"beta": [20, 1.5], "on": [-1, 1]}, tuple(beta(20, 1.5, -1, 2).ppf([0.05, 0.95]))),
+    "half Cauchy": ("sigma", {"half_cauchy": 2}, tuple(halfcauchy(0, 2).ppf([0.05, 0.95]))),
+    "YAML": ("rho", {"uniform": [0, 1], True: [-1, 1]}, (-0.9, 0.9)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", PRIORS)
+def test_a_prior_has_the_stated_quantiles_and_ends(case: str) -> None:
+    """Of its draws, and of its density over the whole line; SciPy has the quantiles of named ones."""
+    name, words, ends = PRIORS[case]
+    unknown = ParameterisedModel(volatility, make_priors({name: words}, NODE, volatility))
+    draws = unknown.sample(1500, 1)[name].numpy()
+    shares = [(draws < end).mean() for end in ends]
+    assert shares == pytest.approx([0.05, 0.95], abs=4.5 * np.sqrt(0.05 * 0.95 / 1500))
+    z = torch.linspace(-40.0, 40.0, 20001, dtype=torch.float64)[:, None]
+    values, log_density = unknown.constrained(z)
+    for end, share in zip(ends, (0.05, 0.95), strict=True):
+        below = log_density.exp()[values[name] < end].sum() * float(z[1] - z[0])
+        assert float(below) == pytest.approx(share, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "sentence"),
+    [
+        ({"rho": [0.5, 1]}, r"rho must be two increasing numbers in \(-1, 1\), .* got \[0.5, 1\]. Set parameters.rho=\[0.45,0.975\]"),
+        ({"mu": [2, 1]}, r"mu must be two increasing numbers, the"),
+        ({"of.sd[2]": [1, 2]}, r"got of.sd\[2\]. Choose from mu, rho, sigma, of.sd\[0\], of.sd\[1\]"),
+        ({"rho": {"bta": [1, 2]}}, r"rho must name one distribution of pyro.distributions, got \['bta'\]"),
+        ({"rho": {"beta": [1, -2]}}, r"rho.beta must be a scalar distribution of Pyro with its numbers \(Expected parameter"),
+        ({"rho": {"beta": 1}}, r"rho.beta must be .* missing 1 required"),
+        ({"rho": {"normal": [0, 1], "on": [-1, 1]}}, r"rho.on must be two increasing numbers, for a distribution on \[0, 1\]"),
+    ],
+)  # fmt: skip
+def test_a_wrong_prior_is_answered_by_a_sentence(parameters: Any, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        make_priors(parameters, NODE, volatility)
+
+
+def test_ends_of_numbers_are_those_that_models_check() -> None:
+    """Of the constructors, by trial: nothing else states them."""
+    for words, ends in (
+        (lambda v: v > 0, (0.0, np.inf)),
+        (lambda v: -90 <= v <= 90, (-90.0, 90.0)),
+        (lambda v: v > -1, (-1.0, np.inf)),
+        (lambda v: 0 < v < 1, (0.0, 1.0)),
+        (lambda v: True, (-np.inf, np.inf)),
+    ):
+        assert find_range(words) == ends
+
+
+def test_the_page_shows_commands_that_run(tmp_path: Path) -> None:
+    """The commands of the page, with fewer values; the table has only priors that are made."""
     page = (ROOT / "docs" / "parameter_inference.md").read_text()
-    words = re.search(r"^pfbench infer (model=local_level .*)$", page, re.MULTILINE)
-    assert words is not None
-    names = [word.strip("'") for word in words[1].split()]
-    said = command("infer", *names, "scenario.steps=10", "infer.values=8", home=tmp_path)
+    commands = re.findall(r"^pfbench infer (.*)$", page, re.MULTILINE)
+    assert len(commands) == 2
+    for words in commands:
+        few = ("scenario.steps=10", "infer.values=8", "particles=20")
+        said = command("infer", *shlex.split(words), *few, home=tmp_path)
+        assert said.code == 0, said.err
+    rows = re.findall(r"^\| `([\[{].*)` \|", page, re.MULTILINE)
+    assert len(rows) == 5
+    for name, row in zip(("sigma", "rho", "mu", "sigma", "rho"), rows, strict=True):
+        make_priors({name: yaml.safe_load(row)}, NODE, volatility)
+
+
+def test_draws_that_a_model_refuses_are_no_errors_and_a_blind_filter_is_refused(
+    tmp_path: Path,
+) -> None:
+    """A third of the prior of rho is beyond 1; the likelihood of an EKF does not depend on rho."""
+    words = ("infer", "model=stochastic_volatility", "scenario.steps=5", "study=s")
+    prior = "parameters={rho:{normal:[0.9,0.25]}}"
+    few = ("infer.draws=10", "infer.warmup=5", "infer.chains=8", "particles=20")
+    said = command(*words, "method=pmmh", prior, *few, home=tmp_path)
     assert said.code == 0, said.err
+    (path,) = (tmp_path / "results" / "s" / "inference").glob("*.json")
+    draws = np.array(json.loads(path.read_text())["posterior"]["draws"]["rho"])
+    assert np.abs(draws).max() < 1.0
+    said = command(*words, "method=nuts", prior, *few[:2], "infer.chains=1", home=tmp_path)
+    assert "whose rho has none with this filter" in said.err

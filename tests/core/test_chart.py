@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -15,6 +16,8 @@ from pfbench.core.chart import (
     EuclideanBlock,
     LieGroupBlock,
     QuaternionBlock,
+    quaternion_from_rotation_vector,
+    rotation_vector_from_quaternion,
     wrap_angle,
 )
 from pfbench.core.random_stream import PhiloxStream
@@ -143,3 +146,26 @@ def test_volumes_are_those_of_small_boxes_of_differences(block: ChartBlock) -> N
         d = 0.6 * normal(1, 3, block.dimension, purpose="d")[0, k]
         slopes = torch.func.jacfwd(move)(d, x, block.add(x, d))
         assert float(block.log_volume(d)) == pytest.approx(float(torch.linalg.slogdet(slopes)[1]), abs=1e-7)  # fmt: skip
+
+
+@pytest.mark.parametrize("length", [0.0, 1e-7, 9e-5, 1.1e-4, 0.3])
+@pytest.mark.parametrize(
+    "f",
+    [
+        quaternion_from_rotation_vector,
+        lambda r: rotation_vector_from_quaternion(torch.cat([1.0 - 2.0 * r.square().sum(-1, keepdim=True), r], -1)),
+        lambda r: QuaternionBlock().log_volume(r)[..., None],
+    ],
+    ids=["to_quaternion", "from_quaternion", "volume"],
+)  # fmt: skip
+def test_slopes_and_bends_of_turns_are_finite_differences_at_no_turn_too(
+    f: Callable[[torch.Tensor], torch.Tensor], length: float
+) -> None:
+    """The EKF differentiates a step and its likelihood again. Steps of 1e-4 span both branches; errors of differences are below 1e-8."""
+    at = length * torch.tensor([0.6, -0.48, 0.64], dtype=torch.float64)
+    h = 1e-4 * torch.eye(3, dtype=torch.float64)
+    slope = torch.func.jacrev(f)
+    torch.testing.assert_close(slope(at), ((f(at + h) - f(at - h)) / 2e-4).mT, rtol=0, atol=1e-6)
+    bends = torch.stack([(slope(at + e) - slope(at - e)) / 2e-4 for e in h], -1)
+    for bend in (torch.func.jacfwd(slope), torch.func.jacrev(torch.func.jacfwd(f))):
+        torch.testing.assert_close(bend(at), bends, rtol=0, atol=1e-6)

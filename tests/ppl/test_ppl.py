@@ -15,6 +15,8 @@ from scipy.stats import f as f_law, kstest, multivariate_t
 from torch import Tensor
 from torch.distributions import Independent
 
+from pfbench.core.density import independent_normal
+from pfbench.core.parameter_checks import check_positive
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
@@ -92,6 +94,17 @@ class Tailed(ModelWrapper):
         )
 
 
+class Plain(ModelWrapper):
+    """Keeps a number outside its buffers."""
+
+    def __init__(self, noise: Any, gain: Any) -> None:
+        super().__init__(walk(noise, 1.0))
+        self.gain = float(gain)
+
+    def observation(self, x: Tensor, u: Any) -> Any:
+        return independent_normal(self.gain * x[..., :1], torch.full_like(x[..., :1], 0.7))
+
+
 MAKE: dict[str, Callable[..., StateSpaceModel]] = {
     "walk": walk,
     "at_rest": level,
@@ -100,6 +113,7 @@ MAKE: dict[str, Callable[..., StateSpaceModel]] = {
     "volatility": lambda a, b: StochasticVolatility(mu=-a, sigma=b),
     "location": lambda a, b: located(3e-3 * a, 0.3 * b),
     "tailed": Tailed,
+    "plain": Plain,
 }
 
 
@@ -165,14 +179,6 @@ def test_a_model_serves_consecutive_runs() -> None:
     torch.testing.assert_close(found, torch.cat(alone))
 
 
-class Plain(ModelWrapper):
-    """Keeps a number outside its buffers."""
-
-    def __init__(self, gain: Any) -> None:
-        super().__init__(walk(1.0, 1.0))
-        self.gain = gain
-
-
 ZEROS, FAR = torch.zeros(1, 3, 1, dtype=torch.float64), torch.tensor([[[0.5], [1e200]]]).double()
 LOG = LogNormal(0.0, 1.0)
 
@@ -187,14 +193,15 @@ def leaping(**settings: Any) -> Any:
 
 REFUSED: dict[str, list[Refusal]] = {
     "batches": [
-        (r"must register gain as a buffer.*register_buffer", lambda: ModelBatch([Plain(1.0), Plain(2.0)])),
         ("one origin", lambda: ModelBatch([emitter(1.0), emitter(2.0)])),
     ],
     "unknown numbers": [
         (r"names of path sites, got \['path'\]", lambda: latent_program(ParameterisedModel(lambda path: walk(path, 1.0), {"path": LOG}))),
         (r"prior\[c\] must change the model, got a LinearGaussian", lambda: ParameterisedModel(lambda a, c: walk(a, 1.0), {"a": LOG, "c": LOG})),
         ("scalar distribution", lambda: ParameterisedModel(lambda a: walk(a, 1.0), {"a": LogNormal(torch.zeros(2), 1.0)})),
-        (r"pyro\.distributions", lambda: ParameterisedModel(lambda a: walk(a, 1.0), {"a": torch.distributions.LogNormal(0.0, 1.0)})),
+        (r"pyro\.distributions", lambda: ParameterisedModel(lambda a: walk(a, 1.0), {"a": "log_normal"})),
+        (r"continuous scalar distribution, got Poisson", lambda: ParameterisedModel(lambda a: walk(a, 1.0), {"a": torch.distributions.Poisson(3.0)})),
+        (r"a must be .*positive", lambda: ParameterisedModel(lambda a: walk(check_positive("a", a), 1.0), {"a": Normal(-9.0, 1.0)})),
         ("at least one parameter", lambda: ParameterisedModel(lambda: walk(1.0, 1.0), {})),
     ],
     "pmmh": [
