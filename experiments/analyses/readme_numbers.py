@@ -390,7 +390,7 @@ def tie() -> str:
     row = next(row for row in rows if row["filter"] == "rpf")
     size = f"{row['ratio']:.2f} [{row['ratio_low']:.2f}, {row['ratio_high']:.2f}]"
     return (
-        f"At 200 m/s in place of 20 m/s RPF has {size} times the error of the same tuned EKF in [50 paired runs](reports/robust_simulated/report.md): "
+        f"At 200 m/s in place of 20 m/s, in nominal noise, RPF has {size} times the error of the same tuned EKF in [50 paired runs](reports/robust_simulated/report.md): "
         f"{row['words']}."
     )
 

@@ -137,8 +137,13 @@ def _start_watching() -> None:
         if event != "open" or not _watched or not isinstance(values[0], str):
             return
         frame: FrameType | None = sys._getframe(1)
-        while frame is not None and frame.f_code.co_filename.startswith(_LIBRARIES):
-            frame = frame.f_back  # who asked the library; an import is frozen code
+        # who asked the library; an import is frozen code, and an installed pfbench asks for itself
+        while (
+            frame is not None
+            and frame.f_code.co_filename.startswith(_LIBRARIES)
+            and not str(frame.f_globals.get("__name__")).startswith("pfbench.")
+        ):
+            frame = frame.f_back
         if frame is not None and frame.f_globals.get("__name__") == _watched[-1][0]:
             _watched[-1][1].add(os.path.realpath(values[0]))
 

@@ -258,8 +258,8 @@ def _describe_decisions(facts: MethodsFacts, pairs: int) -> list[str]:
         "Ratios are those of Hodges and Lehmann over paired runs, from logarithms that are averaged over the conditions, "
         f"with simultaneous intervals ({level}).",
         "There is no ratio where more than a fifth of the pairs has a lost run.",
-        "Better and worse: Wilcoxon's signed-rank test and the t test of the 20 % trimmed mean both reject after Holm's "
-        "correction, the sign test rejects without one, and all agree in sign. Equal: the interval lies within "
+        "Better and worse: Wilcoxon's signed-rank test, the t test of the 20 % trimmed mean and the sign test reject, each after "
+        "Holm's correction, and all agree in sign. Equal: the interval lies within "
         f"{100 * facts.margin:g} %, and fewer than 10 % of the runs are lost by one filter alone, by the bounds of Clopper "
         "and Pearson. Loses more: McNemar's exact test with Holm's correction.",
         f"Two families share the pairs of a table: {planned}the filters against the first baseline, and all other pairs.",

@@ -22,7 +22,7 @@ from notebook_cells import MODEL, PROPOSAL, WORLD, Notebook
 
 import pfbench
 from pfbench.cli.compose import plan_study
-from pfbench.door import own_source
+from pfbench.door import laws, own_source
 from pfbench.job import IGNORED_IN_KEY, compose, job_key
 from pfbench.job.trust import FOLDERS
 from pfbench.results import main_component_group, store
@@ -219,17 +219,20 @@ def test_a_regime_that_states_another_distribution_is_found(notebook: Notebook) 
     assert not pfbench.run(WALK, "ekf", noise=notebook["Slips"](), study="n", **SMALL).failed()
 
 
-def test_a_file_that_an_own_stage_reads_must_be_stated(notebook: Notebook) -> None:
-    Path("gain.txt").write_text("0.8")
+def test_a_file_that_an_own_stage_reads_must_be_stated(
+    notebook: Notebook, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # and not those that pfbench itself opens meanwhile, also where it is installed as other libraries are
+    monkeypatch.setattr(laws, "_LIBRARIES", (*laws._LIBRARIES, str(Path(laws.__file__).parents[1])))
     notebook.run(
-        "from pathlib import Path\nclass Reads:\n    is_exact = False\n    def __call__(self, model, log_w, x, log_ratio, record):\n"
-        "        gain = float(Path('gain.txt').read_text())\n"
+        "from pathlib import Path\nPath('gain.txt').write_text('0.8')\nfrom pfbench.kernels.library_build import name_library\nclass Reads:\n    is_exact = False\n    def __call__(self, model, log_w, x, log_ratio, record):\n"
+        "        gain = float(Path('gain.txt').read_text())\n        name_library.__wrapped__('baseline')\n"
         "        return log_w + gain * model.log_likelihood(record.y, x, record.u) + log_ratio\n"
         "class Says(Reads):\n    def input_files(self):\n        return ['gain.txt']"
     )
-    (hidden,) = (row for row in pfbench.check(notebook["Reads"](), runs=20).rows if not row.holds)
+    (row,) = (row for row in pfbench.check(notebook["Reads"](), runs=20).rows if not row.holds)
     assert re.search(
-        r"Reads opens .*gain\.txt\. Return their paths from .*input_files", hidden.message
+        r"Reads opens [^,]*gain\.txt\. Return their paths from .*input_files", row.message
     )
     assert "input_files" not in repr(pfbench.check(notebook["Says"](), runs=20))
 

@@ -145,7 +145,7 @@ def test_the_paragraph_has_the_words_of_the_tests_that_decide(pack: dict[str, An
         "Wilcoxon's signed-rank test",
         "trimmed mean",
         "Holm's correction",
-        "the sign test rejects without one, and all agree in sign",
+        "and the sign test reject, each after Holm's correction, and all agree in sign",
         "the bounds of Clopper and Pearson",
         "Loses more: McNemar's exact test",
         "There is no ratio where more than a fifth of the pairs has a lost run.",
