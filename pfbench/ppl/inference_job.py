@@ -69,7 +69,7 @@ def make_priors(
         if isinstance(words, Mapping):
             priors[name] = prior_by_name(name, words)
         else:
-            ends = find_range(partial(_is_accepted, build, node, name))
+            ends = find_range(partial(_is_accepted, build, node, name), float(numbers[name]))
             priors[name] = prior_by_quantiles(name, words, numbers[name], ends)
     return priors
 

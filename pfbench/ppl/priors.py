@@ -54,18 +54,19 @@ def as_prior(name: str, distribution: Any) -> Any:
     return prior
 
 
-def find_range(accepts: Callable[[float], bool]) -> tuple[float, float]:
+def find_range(accepts: Callable[[float], bool], value: float) -> tuple[float, float]:
     """Find the ends of the range of a number by trying values: the checks of a model alone state what it accepts.
 
     Args:
         accepts: Whether a value is accepted.
+        value: A value that is, such as that of the configuration.
 
     Returns:
-        Ends of a range that has 0 inside or as an end; infinite where 1e15 is accepted.
+        Ends of the range about this value; infinite where 1e15 is accepted.
     """
     ends = []
     for side in (-1.0, 1.0):
-        inside, outside = 0.0, side * _FAR
+        inside, outside = value, side * _FAR
         has_end = not accepts(outside)
         for _ in range(100 * has_end):
             middle = (inside + outside) / 2

@@ -167,14 +167,15 @@ def test_a_wrong_prior_is_answered_by_a_sentence(parameters: Any, sentence: str)
 
 def test_ends_of_numbers_are_those_that_models_check() -> None:
     """Of the constructors, by trial: nothing else states them."""
-    for words, ends in (
-        (lambda v: v > 0, (0.0, np.inf)),
-        (lambda v: -90 <= v <= 90, (-90.0, 90.0)),
-        (lambda v: v > -1, (-1.0, np.inf)),
-        (lambda v: 0 < v < 1, (0.0, 1.0)),
-        (lambda v: True, (-np.inf, np.inf)),
+    for words, value, ends in (
+        (lambda v: v > 0, 1e-6, (0.0, np.inf)),
+        (lambda v: -90 <= v <= 90, 45.0, (-90.0, 90.0)),
+        (lambda v: v > -1, 0.0, (-1.0, np.inf)),
+        (lambda v: 0 < v < 1, 0.5, (0.0, 1.0)),
+        (lambda v: 5 < v < 10, 7.0, (5.0, 10.0)),
+        (lambda v: True, -3.0, (-np.inf, np.inf)),
     ):
-        assert find_range(words) == ends
+        assert find_range(words, value) == ends
 
 
 def test_the_page_shows_commands_that_run(tmp_path: Path) -> None:
