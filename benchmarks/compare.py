@@ -333,8 +333,8 @@ def main() -> None:
     page = [
         "# pfbench and its peers", "",
         *summary(found), "", *missing, "",
-        f"`{DEFAULT.label}`: float64 and `engine=auto`, which takes kernels for jobs of this size. `{FLOAT64.label}`: "
-        "the same job with `engine=compiled`. Its s until warm contain the compilation. "
+        f"`{DEFAULT.label}`: float64 and `engine=auto`, which took kernels when this was measured, before there was a tape. `{FLOAT64.label}`: "
+        "the same job with `engine=compiled`. C++ called its steps, as it no longer does. Its s until warm contain the compilation. "
         "Below 5 s they are of an edition that stored compiled steps on disk, as pfbench no longer does.", "",
         f"One thread each, one process at a time, {' or '.join(map(str, sorted(rounds)))} interleaved rounds after a warm-up; "
         "CPU time of the process; systematic resampling at every step. Every contestant delivers mean, variance and effective "

@@ -27,9 +27,8 @@ from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.linear_algebra import affine_map
 from pfbench.filter import EssResampler, ParticleFilter, Systematic, run_filter
 from pfbench.filter.loop import choose_run_batch
-from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
 from pfbench.job import memory as process_memory
-from pfbench.job.filter_pass import choose_engine
+from pfbench.job.filter_pass import choose_engine, wrap_steps
 from pfbench.kernels import dispatch
 from pfbench.model import StateSpaceModel, StochasticVolatility, UnivariateGrowth
 from pfbench.model.ins_gnss import LooseStep
@@ -111,16 +110,11 @@ def ckf(work: Any, dtype: torch.dtype, engine: str = "eager") -> Filter:
 def of(method: Any, particles: int, work: Any, dtype: torch.dtype, engine: str) -> Filter:
     """A filter in the project's time loop, in blocks of runs as a job makes them."""
     model, record = model_and_record(work, dtype)
-    if engine == "auto":
+    if engine in ("auto", "tape"):
         engine = choose_engine(engine, method, model, *work.y.shape[:2])
-    method = (
-        CompiledParticleFilter(method)
-        if engine == "compiled" and isinstance(method, ParticleFilter)
-        else method
-    )
+    method = wrap_steps(engine, method) or method
     runs = torch.arange(len(work.y))
-    compiled_type = dtype if isinstance(method, CompiledParticleFilter) else None
-    block = choose_run_batch(len(runs), particles, model.chart.size, compiled_type)
+    block = choose_run_batch(len(runs), particles, model.chart.size)
 
     def run(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
         with dispatch.use_kernels(engine != "eager"), torch.no_grad():

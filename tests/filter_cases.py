@@ -15,7 +15,6 @@ from pfbench import job
 from pfbench.core.record import Record
 from pfbench.filter.gaussian.linearisation_rules import SigmaPointLinearisation
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
-from pfbench.filter.linearisation import compute_additive_gain
 from pfbench.model.base import StateSpaceModel
 
 SLOTS = 30
@@ -75,8 +74,6 @@ def refusal(name: str, model: StateSpaceModel, record: Record) -> str:
         return "must have equations to run"
     if name in DENSE and model.transition(x, first.u) is None:
         return "density of x_t given x_t-1"
-    if name.startswith("gauss_hermite") and _needs_many_points(name, model, first.u):
-        return "at most 20000 points"
     if name == "invariant_ekf" and not hasattr(model, "group_chart"):
         return "filter.chart must be an invariant chart of the model"
     if name == "rbpf_heading" and "attitude_yaw" not in model.names:
@@ -108,15 +105,6 @@ def _has_density_in_chart(model: StateSpaceModel, x: torch.Tensor, u: Any) -> bo
     return is_square or (chart.flat and model.transition(x, u) is not None)
 
 
-def _needs_many_points(name: str, model: StateSpaceModel, u: Any) -> bool:
-    """Return whether the tensor product of points is too large for a model."""
-    d = model.chart.dimension
-    root = torch.eye(d, dtype=model.origin.dtype)[None]
-    if compute_additive_gain(model, model.origin.expand(1, -1), root, u) is None:
-        d += model.noise_dim
-    return int(name[-1]) ** d > 20_000
-
-
 def _has_far_points(part: Any, model: StateSpaceModel, record: Record) -> bool:
     """Return whether a rule in a filter or its guide has an initial point beyond 2 rad in an angle."""
     if isinstance(part, SigmaPointLinearisation):
@@ -142,5 +130,5 @@ def method_past(name: str) -> bool:
     return (
         bool(getattr(method_of(name), "moves", ()))
         or name.startswith(("cpso", "pso"))
-        or name in (*REMEMBERING, "guided_start", "interval_pf")
+        or name in (*REMEMBERING, "guided_start")
     )

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from command_line import pfbench
 from scipy.signal import lfilter
 
 ORIGIN = (48.0, 11.0, 500.0)
@@ -56,6 +57,19 @@ def geodetic(table: pd.DataFrame) -> np.ndarray:
     for _ in range(30):
         guess += scale * (target - to_north_east_down(guess, np.array(ORIGIN)))
     return guess
+
+
+def full(truth: pd.DataFrame) -> pd.DataFrame:
+    """Position with errors and SD, velocity and attitude without."""
+    rest = truth.drop(columns=["t", "pn", "pe", "pd"])
+    return pd.concat([estimate(truth, 1.0, 1), rest], axis=1)
+
+
+def judge(home: Path, *words: str):
+    names = {"reference": "truth.csv", "mine": "mine.csv", "theirs": "theirs.csv"}
+    given = {word.partition("=")[0] for word in words}
+    files = [f"{name}={home / file}" for name, file in names.items() if name not in given]
+    return pfbench("judge", *files, f"reports_dir={home / 'reports'}", *words, home=home)
 
 
 def sentence(body: str) -> str:

@@ -192,6 +192,27 @@ def drifting(log: Tables) -> None:
     log["gnss"]["pe"] += 20.0 * (t - t.iloc[0]) / np.ptp(t)
 
 
+def bias_drift(log: Tables) -> None:
+    t = log["imu"]["t"]
+    log["imu"]["wz"] += np.radians(3.0) * ((t - t.iloc[0]) / np.ptp(t) - 0.5)
+
+
+def force_late(log: Tables) -> None:
+    t = log["imu"]["t"]
+    for column in FORCE:
+        log["imu"][column] = np.interp(t - 0.2, t, log["imu"][column])
+
+
+def shifted(table: str, column: str, metres: float, seconds: float) -> Callable[[Tables], None]:
+    """Shift a column for some time from the middle of the log on."""
+
+    def plant(log: Tables) -> None:
+        after = log[table]["t"] - log[table]["t"].median()
+        log[table][column] += metres * ((after >= 0.0) & (after < seconds))
+
+    return plant
+
+
 def without_gravity(log: Tables) -> None:
     truth, t = log["reference"], log["imu"]["t"]
     turns = Rotation.from_euler(
@@ -273,6 +294,13 @@ FAULTS = {
     ),
     "fixes turned 12 deg": Fault(turned("gnss", 12.0, POSITION), "fix turn"),
     "fixes drift 20 m": Fault(drifting, "slow errors", ("fix shift", "gnss clock")),
+    "fixes off 15 m for 10 s": Fault(shifted("gnss", "pn", 15.0, 10.0), "slow errors"),
+    "reference jumps 8 m": Fault(
+        shifted("reference", "pn", 8.0, np.inf), "slow errors", ("fix shift",)
+    ),
+    "gyro bias drifts 3 deg/s": Fault(bias_drift, "gyro bias drift"),
+    "force late 0.2 s": Fault(force_late, "force clock"),
+    "fy of zero": Fault(scaled("imu", ["fy"], 0.0), "dead axis", ("accelerometer bias", "axes")),
     "fixes in feet": Fault(scaled("gnss", POSITION, 1 / 0.3048), "fix scale"),
     "reference turned 12 deg": Fault(
         both(

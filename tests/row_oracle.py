@@ -165,7 +165,7 @@ def decide_family(
         word, side = "not decided", np.sign(location)
         if -margin < low and high < margin:
             bounds = [stats.beta.ppf(0.95, count + 1, n - count) for count in alone[k]]
-            word = "equal" if max(bounds) < 0.1 else "equal in kept runs"
+            word = "equal" if not lost.any() or max(bounds) < 0.1 else "equal in kept runs"
         elif max(p[k], q[k], s[k]) < alpha and side * trimmed_test(d)[0] > 0:
             word = "better" if location < 0 else "worse"
         loses = (

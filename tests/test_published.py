@@ -14,7 +14,6 @@ from types import ModuleType
 
 import pandas as pd
 import pytest
-import yaml
 from checkout import PUBLISHED_FILE, ROOT, list_published, refuse_own_files
 from markupsafe import escape
 from pyarrow import parquet
@@ -142,16 +141,6 @@ def test_published_pages_are_decided_by_the_present_rules(study: str, tmp_path: 
 @pytest.mark.slow
 def test_the_largest_published_page_is_decided_by_the_present_rules(tmp_path: Path) -> None:
     check_published_page(ROOT / "reports" / LARGE, tmp_path / LARGE)
-
-
-def test_the_page_of_version_1_of_the_ledger_is_stored() -> None:
-    """Its verdicts are those that the page of the claims compares with its words."""
-    folder = ROOT / "reports" / "claims"
-    records = json.loads((folder / "verdicts.json").read_text())
-    stated = yaml.safe_load((ROOT / "pfbench" / "claims" / "ledger_1.yaml").read_text())
-    assert stated == {record["id"]: record["verdict"] for record in records}
-    text = (folder / "report.md").read_text()
-    assert all(f"### {name}: {verdict}" in text for name, verdict in stated.items())
 
 
 def test_the_page_of_the_claims_is_made_of_its_values(tmp_path: Path) -> None:

@@ -269,7 +269,7 @@ limit: backward sampling with {particles} particles where the transition has a d
 
 | column | content |
 |---|---|
-| error | main group of the model; errors are root mean squares over all runs and steps |
+| error | main group of the model; errors are root mean squares over all runs and steps, which a few bad runs raise above the median over runs that pages of studies show |
 | NEES | normalised squared error of the iterated smoother per component, 1 if its covariance is right |
 | change | largest shift of its last pass in standard deviations; above {converged:g} it has not converged |
 | sampled | error of the mean of the sampled paths, empty if these are too few or do not move enough |

@@ -19,6 +19,7 @@ from runpy import run_path
 from types import ModuleType
 from typing import Any
 
+import pfbench
 from pfbench.files import markdown_bullets
 from pfbench.report import find_overviews, read_stored_study, tabulate_heat_map
 
@@ -367,19 +368,24 @@ _WINNERS = {  # worlds of all_seven in the table of the README
 def winners() -> str:
     """Table of the ratio of SIR and RPF to the best Kalman filter in five worlds, from the first page of `all_seven`."""
     overview = read_overviews()[1000]
-    cells = {(cell.world, cell.filter): cell for cell in overview.cells}
     rows = []
     for world in (w for key in _WINNERS for w in overview.worlds if w.key == key):
-        texts = [word_verdict(cells[world.key, name].verdict) for name in ("sir", "rpf")]
-        rows.append((_WINNERS[world.key], world.reference, str(world.runs), *texts))
+        texts = [word_verdict(overview.find(world, name).verdict) for name in ("sir", "rpf")]
+        rows.append((_WINNERS[world.key], overview.names[world.reference], str(world.runs), *texts))
     return format_table(("world", "best Kalman filter", "runs", "SIR", "RPF"), rows)
+
+
+def format_with_interval(ratio: float, low: float, high: float) -> str:
+    """Format a ratio with its interval; an end that is exactly 1 is written so."""
+    ends = (f"{end:.2f}".replace("inf", "∞") if end != 1.0 else "1" for end in (low, high))
+    return f"{ratio:.2f} [{', '.join(ends)}]"
 
 
 def word_verdict(verdict: Any) -> str:
     """Word a verdict with its ratio and interval, or with the runs that are lost."""
     a, b, both, _ = verdict.lost
     lost = f"loses {a + both} of {verdict.n} runs, the Kalman filter {b + both}"
-    size = "{:.2f} [{:.2f}, {:.2f}]".format(*verdict[3:6]).replace("inf", "∞")
+    size = format_with_interval(*verdict[3:6])
     return f"{size if verdict.ratio > 0 else lost}: {verdict.word}"
 
 
@@ -388,7 +394,7 @@ def tie() -> str:
     views = read_stored_study(TOP / "reports" / "robust_simulated").pack["views"]
     rows = views["rmse", "passive_1", "nominal", "ekf_scaled_tuned"]["rows"]
     row = next(row for row in rows if row["filter"] == "rpf")
-    size = f"{row['ratio']:.2f} [{row['ratio_low']:.2f}, {row['ratio_high']:.2f}]"
+    size = format_with_interval(row["ratio"], row["ratio_low"], row["ratio_high"])
     return (
         f"At 200 m/s in place of 20 m/s, in nominal noise, RPF has {size} times the error of the same tuned EKF in [50 paired runs](reports/robust_simulated/report.md): "
         f"{row['words']}."
@@ -401,12 +407,18 @@ def contents() -> str:
     def count(group: str) -> int:
         return len(list((TOP / "conf" / group).glob("*.yaml")))
 
+    sets = [
+        name
+        for name in pfbench.names("filter")
+        if not (TOP / "conf" / "filter" / f"{name}.yaml").is_file()
+    ]
+
     decided = re.findall(
         r"(\d+) (confirmed|refuted|depends|untestable|open|not run)", claims_2().split("\n")[0]
     )
     words = ", ".join(f"{number} {word}" for number, word in decided)
     return "\n".join(markdown_bullets(
-        f"{count('filter')} filters and forms of filters: Kalman, particle, guided, swarm, robust, adaptive, smoothing and learned ones.",
+        f"{count('filter')} filters and forms of filters, besides the set `{'`, `'.join(sets)}` in the list of `pfbench.names(\"filter\")`: Kalman, particle, guided, swarm, robust, adaptive, smoothing and learned ones.",
         f"Seven methods, literal and repaired; 88 claims: {words}.",
         f"{count('scenario')} scenarios, simulated and recorded, {count('model')} models and {count('noise')} noise regimes; own ones are one class.",
         "All Monte Carlo runs of a job are one tensor axis; each random number is a function of seed, run, step and use.",

@@ -14,6 +14,7 @@ import yaml
 
 from pfbench.claims.claim_list import PrintedClaim, read_printed_claims
 from pfbench.claims.measures import Measure
+from pfbench.core.parameter_checks import require
 from pfbench.job.readings import CENTRAL_READING, read_reading_table
 
 # --------------------------------------------------------------------------------------------------
@@ -182,11 +183,13 @@ def _parse_plan(path: Path, claim: PrintedClaim, entry: Mapping[str, Any]) -> Cl
     """Parse the entry of a claim."""
     rows = entry.get("compare", ())
     wrong = sorted({*entry} - _KEYS) + sorted({key for row in rows for key in row} - _ENTRY_KEYS)
-    if wrong or bool(rows) == ("word" in entry):
-        raise ValueError(
-            f"{path.name}: {claim.id} must have comparisons or a word, and other keys, got {wrong or sorted(entry)}. "
-            "Correct them."
-        )
+    require(
+        not wrong and bool(rows) != ("word" in entry),
+        f"{path.name}: {claim.id}",
+        "have comparisons or a word, and other keys",
+        wrong or sorted(entry),
+        "Correct them.",
+    )
     forms = entry.get("method", read_paper_settings()[claim.paper]["method"])
     has_forms = METHOD in str(rows) or "form" in str(rows)
     parts: dict[tuple[str, str], tuple[LineComparison, ...]] = {}
@@ -308,9 +311,7 @@ def make_cell(plan: ClaimPlan, reading: str, side: Side) -> tuple[str, ...]:
 
 def apply_window(measure: Measure, window: tuple[float, float] | None) -> Measure:
     """Replace the times of a measure by those of a window."""
-    if window is None:
-        return measure
-    return replace(measure, start=window[0], end=window[1])
+    return measure if window is None else replace(measure, start=window[0], end=window[1])
 
 
 # --------------------------------------------------------------------------------------------------

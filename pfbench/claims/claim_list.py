@@ -10,6 +10,8 @@ from typing import Any
 
 import yaml
 
+from pfbench.core.parameter_checks import require
+
 _DATA = Path(__file__).with_name("claims_2.yaml")
 
 #: ratio of a to b below which a claim of a kind is true, and above which it is false. "same" is symmetric in logs. The
@@ -89,10 +91,13 @@ def _parse(path: Path, row: Mapping[str, Any]) -> PrintedClaim:
         raise ValueError(
             f"{path.name}: {name} must have other keys, got or missing {wrong}. Correct them."
         )
-    if row["kind"] not in KINDS:
-        raise ValueError(
-            f"{path.name}: {name}.kind must be one of {', '.join(KINDS)}, got {row['kind']!r}. Choose one."
-        )
+    require(
+        row["kind"] in KINDS,
+        f"{path.name}: {name}.kind",
+        f"be one of {', '.join(KINDS)}",
+        f"{row['kind']!r}",
+        "Choose one.",
+    )
     if row.get("mark", _MARKS[0]).split(":")[0] not in _MARKS:
         raise ValueError(
             f"{path.name}: {name}.mark must begin with {', '.join(_MARKS)}, got {row['mark']!r}. Choose one."

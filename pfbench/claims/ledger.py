@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
-
-import yaml
 
 from pfbench.claims.claim_lines import (
     COLUMNS,
@@ -38,7 +34,6 @@ from pfbench.claims.words import (
 from pfbench.job.readings import CENTRAL_READING, read_reading_table
 from pfbench.stats.sentences import format_count
 
-_OLD = Path(__file__).with_name("ledger_1.yaml")
 _KIND_TEXTS = {
     "better": "a smaller figure than the other one",
     "much better": "a figure at least a fifth smaller",
@@ -199,60 +194,6 @@ def list_choices(plan: ClaimPlan) -> list[str]:
     names = [name for name, _ in list_dots(plan).values() if name in read_readings(paper)]
     ours = [read_readings(paper)[name] for name in dict.fromkeys(names)]
     return [*completed, *(f"{r.text} {r.reason}" for r in ours if r.grade in ("ours", "fitted"))]
-
-
-class OldClaim(NamedTuple):
-    """Verdict of version 1 of the ledger, and the word of this one.
-
-    Attributes:
-        id: Claim; version 1 has the same ids.
-        verdict: Verdict of version 1.
-        word: Word now.
-        turned: What turned: "yes", "no", "open now" or "was open".
-        reason: Its reason, or the outcomes of its readings.
-    """
-
-    id: str
-    verdict: str
-    word: str
-    turned: str
-    reason: str
-
-
-_AGREES = {"reproduced": CONFIRMED, "reproduced only as printed": CONFIRMED, "not reproduced": REFUTED, "reproduced only as repaired": REFUTED}  # fmt: skip
-
-
-def compare_versions(lines: Sequence[ClaimWord]) -> list[OldClaim]:
-    """Compare the 71 verdicts of version 1 with the words of this one."""
-    old: Mapping[str, str] = yaml.safe_load(_OLD.read_text(encoding="utf-8"))
-    words = {line.plan.claim.id: line for line in lines}
-    return [
-        OldClaim(
-            name,
-            verdict,
-            words[name].label,
-            _compare_word(verdict, words[name].word),
-            _count_outcomes(words[name]),
-        )
-        for name, verdict in old.items()
-    ]
-
-
-def _count_outcomes(line: ClaimWord) -> str:
-    """Count the outcomes of the readings after the reason of a word that has one."""
-    counts = Counter(line.decision.outcomes.values() if line.decision else ())
-    outcomes = [f"{outcome} in {n}" for outcome, n in counts.most_common()]
-    reason = "" if line.reason.endswith(NOT_RUN) else line.reason
-    return ", ".join(filter(None, [reason, *outcomes]))
-
-
-def _compare_word(verdict: str, word: str) -> str:
-    """Compare a verdict of version 1 with a word: only as repaired is refuted as published."""
-    if word == OPEN:
-        return "open now"
-    if verdict not in _AGREES:
-        return "was open"
-    return "no" if _AGREES[verdict] == word else "yes"
 
 
 def count_by_paper(lines: Sequence[ClaimWord]) -> dict[str, dict[str, int]]:

@@ -33,7 +33,6 @@ from pfbench.claims.claim_runs import (
 )
 from pfbench.claims.ledger import (
     ClaimWord,
-    compare_versions,
     conclude,
     count_by_paper,
     describe_kind,
@@ -132,7 +131,6 @@ def make_context(
         "total": total,
         "rules": (*RULES, _say_error_rates()),
         "proofs": read_proofs(),
-        "old": compare_versions(lines),
         "n": len(lines),
         "jobs": len(runs.records),
         "hours": sum(record.seconds for record in runs.records) / 3600,

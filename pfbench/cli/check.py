@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 
 from pfbench.cli.messages import format_error
+from pfbench.core.parameter_checks import require
 from pfbench.files.command_start import collect_rarely, start_work
 from pfbench.job.config import compose, list_groups
 
@@ -18,8 +19,7 @@ The exit code is 1 if a configuration does not compose."""
 
 def check_installation(words: Sequence[str]) -> None:
     """Print the state of the installation as a table of item, value and status."""
-    if words:
-        raise ValueError(f"check must be without words, got {' '.join(words)}. Use: pfbench check")
+    require(not words, "check", "be without words", " ".join(words), "Use: pfbench check")
     import torch
 
     from pfbench import job

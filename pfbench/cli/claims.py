@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.recorded_folder import copy_published, describe_missing_runs
 from pfbench.job.config import compose
 
@@ -127,8 +128,7 @@ def read_request(words: Sequence[str]) -> RunRequest:
     keys = ("hours", "workers", "readings", "dry", "uncommitted", *_PLACES)
     values = split_words([w for w in words if "=" in w], keys, (), "pfbench claims run")
     workers = int(_read_number(values, "workers", WORKERS))
-    if not 1 <= workers <= WORKERS:
-        raise ValueError(f"workers must be 1 or 2, got {workers}. Set workers={WORKERS}.")
+    require(1 <= workers <= WORKERS, "workers", "be 1 or 2", workers, f"Set workers={WORKERS}.")
     places = _read_places(values)
     return RunRequest(
         select_plans([word for word in words if "=" not in word]),
@@ -235,11 +235,13 @@ def check_committed(is_allowed: bool) -> None:
     from pfbench.job.plan import read_versions
 
     commit = read_versions()["commit"]
-    if commit.endswith("-dirty") and not is_allowed:
-        raise ValueError(
-            f"the code must be committed before runs of the record, got {commit}. Commit it, or set "
-            "uncommitted=true: each result then says so."
-        )
+    require(
+        not commit.endswith("-dirty") or is_allowed,
+        "the code",
+        "be committed before runs of the record",
+        commit,
+        "Commit it, or set uncommitted=true: each result then says so.",
+    )
 
 
 def _describe_task(task: Task, record: StoredValues) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pfbench.cli.compose import compose_study
 from pfbench.cli.report import check_has_results
+from pfbench.core.parameter_checks import require
 from pfbench.files.atomic_write import write_atomically
 
 HELP = """\
@@ -32,10 +33,13 @@ def compare_study(words: Sequence[str]) -> None:
     from pfbench.results.conditions import load_conditions
 
     references = [word for word in words if word.partition("=")[0] == "published"]
-    if len(references) != 1 or not references[0].partition("=")[2]:
-        raise ValueError(
-            f"published must be one name of a report, got {' '.join(references) or 'none'}. Add published=all_seven."
-        )
+    require(
+        len(references) == 1 and references[0].partition("=")[2],
+        "published",
+        "be one name of a report",
+        " ".join(references) or "none",
+        "Add published=all_seven.",
+    )
     config = compose_study([word for word in words if word not in references])
     study, results = config.values["study"], Path(config.values["results_dir"])
     check_has_results(study, results)

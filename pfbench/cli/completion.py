@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pfbench.cli.list import describe_choices
+from pfbench.core.parameter_checks import require
 
 HELP = """\
 pfbench completion bash|zsh
@@ -40,10 +41,13 @@ complete -o nospace -F _pfbench pfbench
 def print_completion(words: Sequence[str]) -> None:
     """Print the script of a shell."""
     shell = words[0] if words else ""
-    if len(words) != 1 or shell not in _SHELLS:
-        raise ValueError(
-            f"shell must be one of {', '.join(_SHELLS)}, got {' '.join(words) or 'none'}. Use: pfbench completion bash"
-        )
+    require(
+        len(words) == 1 and shell in _SHELLS,
+        "shell",
+        f"be one of {', '.join(_SHELLS)}",
+        " ".join(words) or "none",
+        "Use: pfbench completion bash",
+    )
     print(make_script(shell))
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from pfbench.cli.messages import format_flag, suggest_similar
+from pfbench.core.parameter_checks import require
 from pfbench.job.config import CHOICES, JobConfig, compose, compose_tree, expand_filter_sets
 from pfbench.job.trust import UntrustedConfigError, check_study, trusted_packages
 from pfbench.results.paper_block import PAPER, conf_dir, experiments_dir
@@ -51,8 +52,13 @@ def split_words(
         key, equals, value = word.partition("=")
         if key == "hydra.searchpath":  # a word of the run: a result stores the configuration itself
             continue
-        if not equals or not value or key in values:
-            raise ValueError(f"words must be key=value, each key once, got {word}. {advice}")
+        require(
+            equals and value and (key not in values),
+            "words",
+            "be key=value, each key once",
+            word,
+            advice,
+        )
         if key not in keys:
             raise ValueError(
                 f"key must be one of {', '.join(keys)}, got {key}.{suggest_similar(key, keys)} {advice}"
@@ -136,11 +142,13 @@ def replace_config_dir(words: Sequence[str]) -> list[str]:
     folder = folder or "".join(words[index + 1 : after])
     others = [*words[:index], *words[after:]]
     is_twice = any(re.match(r"[+~]*hydra\.searchpath\b|--config-dir\b|-cd\b", w) for w in others)
-    if not folder or is_twice:
-        raise ValueError(
-            f"--config-dir must be given once, with a folder and without hydra.searchpath, got {folder!r}. "
-            "Write several folders as hydra.searchpath=[file://A,file://B]."
-        )
+    require(
+        folder and (not is_twice),
+        "--config-dir",
+        "be given once, with a folder and without hydra.searchpath",
+        f"{folder!r}",
+        "Write several folders as hydra.searchpath=[file://A,file://B].",
+    )
     path = f"file://{folder}".replace("'", "\\'")
     return [*others, f"hydra.searchpath=['{path}']"]
 

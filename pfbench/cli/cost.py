@@ -9,6 +9,7 @@ from typing import Any
 
 from pfbench.cli.compose import split_words
 from pfbench.cli.report import check_has_results
+from pfbench.core.parameter_checks import require
 from pfbench.job.config import compose
 from pfbench.job.file_rules import FOLDER_KEYS
 
@@ -43,10 +44,13 @@ def measure_cost(words: Sequence[str]) -> None:
     rounds, seconds = _read_numbers(values)
     composed = [f"{key}={values[key]}" for key in _KEYS if key in values and key not in ("rounds", "seconds")]  # fmt: skip
     config = compose(composed).values
-    if type(config["overwrite"]) is not bool:
-        raise ValueError(
-            f"overwrite must be true or false, got {config['overwrite']}. Set overwrite=true."
-        )
+    require(
+        type(config["overwrite"]) is bool,
+        "overwrite",
+        "be true or false",
+        config["overwrite"],
+        "Set overwrite=true.",
+    )
     study, results = config["study"], Path(config["results_dir"])
     check_has_results(study, results)
     changes: dict[str, Any] = {
@@ -107,10 +111,13 @@ def _read_numbers(values: dict[str, str]) -> tuple[int, float]:
     from pfbench.results.step_times import FEWEST_ROUNDS
 
     text = values.get("rounds", "7")
-    if not text.isdecimal() or not FEWEST_ROUNDS <= int(text) <= 1000:
-        raise ValueError(
-            f"rounds must be a whole number from {FEWEST_ROUNDS} to 1000, got {text}. Set rounds=7."
-        )
+    require(
+        text.isdecimal() and FEWEST_ROUNDS <= int(text) <= 1000,
+        "rounds",
+        f"be a whole number from {FEWEST_ROUNDS} to 1000",
+        text,
+        "Set rounds=7.",
+    )
     try:
         seconds = float(values.get("seconds", "0.05"))
     except ValueError:

@@ -16,7 +16,11 @@ def list_own_files(group: str) -> list[Path]:
     folder = Path("conf")
     if not folder.is_dir() or folder.resolve() == conf_dir().resolve():
         return []
-    return sorted(p for p in (folder / group).glob("*.yaml") if p.is_file() and not p.is_symlink())
+    return sorted(
+        p
+        for p in (folder / group).glob("*.yaml")
+        if p.is_file() and not p.is_symlink() and p.name.isprintable()
+    )
 
 
 def add_search_path(words: Sequence[str]) -> list[str]:

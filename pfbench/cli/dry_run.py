@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pfbench.core.record import Episode
     from pfbench.job.budget import EpisodeSource
     from pfbench.job.plan import JobPlan
+    from pfbench.scenario import RecordingRegime
 
 _STEPS = 10  # of the trial of a filter
 
@@ -134,7 +135,7 @@ def _time_filter(plan: JobPlan, episode: Episode) -> float:
     from pfbench.core.random_stream import PhiloxStream
     from pfbench.core.record import map_inputs
     from pfbench.filter.loop import run_filter
-    from pfbench.job.filter_pass import choose_engine
+    from pfbench.job.filter_pass import choose_engine, wrap_steps
     from pfbench.job.memory import first_steps
     from pfbench.kernels import dispatch
 
@@ -157,7 +158,7 @@ def _time_filter(plan: JobPlan, episode: Episode) -> float:
         begin = time.perf_counter()
         with torch.no_grad(), dispatch.use_kernels(engine != "eager"):
             run_filter(
-                plan.method,
+                wrap_steps("tape" if engine == "tape" else "", plan.method) or plan.method,
                 model,
                 record,
                 draws,
@@ -229,12 +230,22 @@ def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:
     own_groups = {g for g in groups if list_user_packages(config.values[g], trusted)}
     world = json.dumps([plan.values[name] for name in ("scenario", "noise", "seed")], default=str)
     if world not in episodes:
-        if "noise" in own_groups:
-            testing.check_regime(plan.recording_regime.regime, runs=2)
         if "scenario" in own_groups:
             testing.check_scenario(plan.scenario)
-        episodes[world] = plan.draw_episode(plan.runs[:2])
+        try:
+            episodes[world] = plan.draw_episode(plan.runs[:2])
+        finally:
+            if "noise" in own_groups:
+                _try_regime(plan.recording_regime)
     _take_steps(config, plan, episodes[world], is_own="filter" in own_groups)
+
+
+def _try_regime(source: RecordingRegime) -> None:
+    """Try a noise regime of the user with the channels and times that a scenario gave it."""
+    from pfbench.testing.models import check_regime_in
+
+    if source.channels is not None and source.time is not None:
+        check_regime_in(source.regime, source.channels, source.time)
 
 
 def _take_steps(config: JobConfig, plan: JobPlan, episode: Episode, *, is_own: bool) -> None:

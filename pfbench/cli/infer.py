@@ -3,19 +3,32 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from pfbench.cli.compose import given_keys
 from pfbench.cli.messages import suggest_similar
+from pfbench.cli.noise_scenario import (
+    check_scenario_name,
+    format_noise,
+    list_places,
+    write_scenario,
+)
+from pfbench.core.parameter_checks import require
 from pfbench.job.config import compose, is_simulated_from, list_groups
 
 HELP = """\
 pfbench infer model=NAME method=nuts|svi|pmmh|smc2 'parameters={KEY:[LOW,HIGH]}' [key=value ...]
+pfbench infer scenario=NAME [key=value ...]
 
 Infer numbers of a model from measurements of a scenario, by the likelihood of a filter. LOW and HIGH are the 5 % and the
 95 % quantile of a prior on the values that the model accepts. A prior can have a name instead. The result has the posterior table and all draws; a finished one is not computed again.
 
+Without a method and parameters: all noise numbers of an inertial log (IMU, bias walks, fixes), lever arm and delay, with priors
+from data sheets (method=noise). The numbers become a scenario that run, tune and estimate know by its name.
+
+  pfbench infer scenario=user_log scenario.folder=drive infer.sheet.gyro_deg_s=0.0038 infer.sheet.accelerometer_ug=70
   pfbench infer model=local_level method=nuts 'parameters={level_sd:[10,100],measurement_sd:[50,300]}'
   pfbench infer model=stochastic_volatility method=pmmh 'parameters={sigma:[0.1,1]}' particles=200 infer.chains=16
   pfbench infer model=stochastic_volatility method=smc2 filter=sir 'parameters={rho:{beta:[20,1.5],on:[-1,1]}}'
@@ -25,9 +38,11 @@ Infer numbers of a model from measurements of a scenario, by the likelihood of a
   filter=NAME                filter of the likelihood: ekf, and sir for pmmh
   infer.draws=500            settings of the method: pfbench list infer
   overwrite=true             infer again
+  name=SCENARIO_noise        of the scenario of method=noise, a file of folder=conf
 
 Python: pfbench.ppl, docs/parameter_inference.md"""
 
+NOISE = "noise"  # method without named parameters
 _USAGE = "Use: pfbench infer model=NAME method=nuts 'parameters={KEY:[LOW,HIGH]}'"
 
 
@@ -37,16 +52,35 @@ def infer_parameters(words: Sequence[str]) -> None:
     from pfbench.job.inputs import find_inputs
     from pfbench.ppl.inference_job import infer
 
-    method, composed = _read_words(words)
+    options = {"name": "", "folder": "conf"}
+    options |= {k: v for k, _, v in (word.partition("=") for word in words) if k in options}
+    method, composed = _read_words([w for w in words if w.partition("=")[0] not in options])
     config = compose(composed)
     values, choices = config.values, config.choices
     job.apply_global_settings(values)
     is_simulated = is_simulated_from(values["scenario"], choices["scenario"])
     truth = values["model"] if is_simulated and choices["noise"] == "nominal" else {}
     about = {"versions": job.read_versions(), "inputs": find_inputs(values, config.trusted)}
+    scenario_file = None
+    if method == NOISE:
+        name = options["name"] or f"{choices['scenario']}_noise"
+        scenario_file = check_scenario_name(name, options["folder"])
     path, content = infer(method, values, choices, _build, about, truth)
-    print(format_posterior(content))
+    print(format_noise(content) if scenario_file else format_posterior(content))
     print(f"inference: {path.resolve()}")
+    if scenario_file:
+        _keep_scenario(scenario_file, words, values, content)
+
+
+def _keep_scenario(
+    path: Path, words: Sequence[str], values: Mapping[str, Any], content: Mapping[str, Any]
+) -> None:
+    """Write the scenario with the inferred numbers, if they are reliable, and say how it is used."""
+    remedy = "Use more draws: infer.draws=2000 infer.rounds=6."
+    require(content["converged"], "Pareto k", "be below 0.7 for numbers that a filter may use", f"{content['pareto_k']:.2f}", remedy)  # fmt: skip
+    left_out = write_scenario(path, content["choices"]["scenario"], words, values["scenario"], content)  # fmt: skip
+    use = " ".join(["Use: pfbench run", f"scenario={path.stem}", *list_places(words)])
+    print("\n".join(filter(None, (left_out, f"scenario={path.stem}: {path.resolve()}", use))))
 
 
 def _read_words(words: Sequence[str]) -> tuple[str, list[str]]:
@@ -54,6 +88,8 @@ def _read_words(words: Sequence[str]) -> tuple[str, list[str]]:
     if {"-m", "--multirun"} & set(words):
         raise ValueError("pfbench infer must be run without -m, got a sweep. Repeat the command for each choice.")  # fmt: skip
     keys = given_keys(words)
+    if "scenario" in keys and not keys & {"method", "parameters"}:
+        words, keys = [*words, f"method={NOISE}"], keys | {"method"}
     if not {"model", "scenario"} & keys or "method" not in keys:
         missing = "method" if {"model", "scenario"} & keys else "model"
         raise ValueError(f"{missing} must be set. {_USAGE}")
@@ -64,6 +100,8 @@ def _read_words(words: Sequence[str]) -> tuple[str, list[str]]:
         raise ValueError(
             f"method must be one of {', '.join(methods)}, got {method}.{suggest_similar(method, methods)} {_USAGE}"
         )
+    remedy = "Leave it out, or use method=pmmh."
+    require(method != NOISE or "particles" not in keys, "particles", "be left out for method=noise, a Kalman filter", words_by_key.get("particles"), remedy)  # fmt: skip
     others = [
         f"++infer.{word}" if word.startswith("parameters") else word
         for word in words

@@ -9,6 +9,7 @@ from typing import Any
 
 from pfbench.cli.compose import split_words
 from pfbench.cli.report import check_has_results
+from pfbench.core.parameter_checks import require
 from pfbench.job.config import compose
 from pfbench.job.file_rules import FOLDER_KEYS
 
@@ -73,8 +74,7 @@ def replay_run(words: Sequence[str]) -> None:
 
 def _run_number(text: str) -> int:
     """Convert the number of a run."""
-    if not text.isdecimal():
-        raise ValueError(f"run must be a whole number of at least 0, got {text}. Set run=0.")
+    require(text.isdecimal(), "run", "be a whole number of at least 0", text, "Set run=0.")
     return int(text)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 from pfbench.cli.compose import compose_study, count_planned_jobs, given_keys
 from pfbench.cli.messages import format_error, suggest_similar
+from pfbench.core.parameter_checks import require
 from pfbench.files.command_start import start_work
 from pfbench.files.recorded_folder import copy_published, describe_missing_runs, find_published_file
 from pfbench.job.config import JobConfig, compose
@@ -47,12 +48,14 @@ def report_study(words: Sequence[str]) -> None:
         )
     config = compose_study(words)
     study = config.values["study"]
-    if study in ("claims", CLAIMS):
-        raise ValueError(f"study must be a study, got {study}. Use: pfbench claims")
-    if study == "datasheets":
-        raise ValueError(
-            "study must be a study, got datasheets. Use: pfbench datasheet scenario=NAME"
-        )
+    require(study not in ("claims", CLAIMS), "study", "be a study", study, "Use: pfbench claims")
+    require(
+        study != "datasheets",
+        "study",
+        "be a study",
+        "datasheets",
+        "Use: pfbench datasheet scenario=NAME",
+    )
     if not find_page_data(config, words):
         check_has_results(study, Path(config.values["results_dir"]))
     print(f"report: {_write_page(config).resolve()}")

@@ -219,7 +219,7 @@ def run_task(
 ) -> float:
     """Run one job of a Hydra application, by its configuration that is resolved and checked if there is one.
 
-    Returns the root mean square error of the main group, for sweepers that optimise.
+    Returns the median over runs of the RMS error of the main group, for sweepers that optimise.
     """
     from hydra.core.hydra_config import HydraConfig
     from omegaconf import OmegaConf

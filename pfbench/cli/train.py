@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from pfbench.core.parameter_checks import require
 from pfbench.job.config import compose
 
 HELP = """\
@@ -22,11 +23,13 @@ _NOT_OF_A_JOB = ("train.", "train=", "overwrite=", "checkpoint=")
 
 def train_network(words: Sequence[str]) -> None:
     """Train the network of a filter and print the command that uses it."""
-    if {"-m", "--multirun"} & set(words):
-        raise ValueError(
-            "pfbench train must be run without -m, got a sweep: it trains one network. "
-            "Set train.noise_regimes=[a,b] to train on several noise regimes."
-        )
+    require(
+        not {"-m", "--multirun"} & set(words),
+        "pfbench train",
+        "be run without -m",
+        "a sweep: it trains one network",
+        "Set train.noise_regimes=[a,b] to train on several noise regimes.",
+    )
     path = fit_network(words, print)
     shared = [word for word in words if not word.startswith(_NOT_OF_A_JOB)]
     command = shlex.join(["pfbench", "run", *shared, f"checkpoint={path}"])  # brackets for zsh
@@ -48,11 +51,13 @@ def fit_network(words: Sequence[str], tell: Callable[[str], object]) -> Path:
     config = compose(words)
     values, choices = config.values, config.choices
     job.apply_global_settings(values)
-    if values["oracle_noise"]:
-        raise ValueError(
-            "oracle_noise must be false for training, got true. Set oracle_noise=true when the "
-            "filter runs."
-        )
+    require(
+        not values["oracle_noise"],
+        "oracle_noise",
+        "be false for training",
+        "true",
+        "Set oracle_noise=true when the filter runs.",
+    )
     names = list(values["train"]["noise_regimes"]) or [choices["noise"]]
     regimes = {
         name: job.instantiate(compose([*words, f"noise={name}"]).values["noise"]) for name in names

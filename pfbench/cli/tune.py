@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pfbench.core.parameter_checks import require
 from pfbench.job.config import TUNED_METHODS, JobConfig, compose
 from pfbench.job.tuned_knobs import AUTO, NOMINAL, SEED_SHIFT
 
@@ -178,20 +179,24 @@ def _check_new_name(name: str, folder: Path) -> None:
     """Check that the name of a file of a user's own folder differs from those of pfbench, since a run refuses it."""
     from pfbench.results.paper_block import conf_dir
 
-    if folder.resolve() != conf_dir() and (conf_dir() / "tuned" / f"{name}.yaml").is_file():
-        raise ValueError(
-            f"name must differ from pfbench's own tuned={name}, got the same for a file of {folder}. "
-            f"Add name=my_{name}, and tuned=my_{name} to the words of the run."
-        )
+    require(
+        folder.resolve() == conf_dir() or not (conf_dir() / "tuned" / f"{name}.yaml").is_file(),
+        "name",
+        f"differ from pfbench's own tuned={name}",
+        f"the same for a file of {folder}",
+        f"Add name=my_{name}, and tuned=my_{name} to the words of the run.",
+    )
 
 
 def _check_choices(name: str, runs: int) -> None:
     """Check the name of the file, and that there are runs for a median."""
-    if not re.fullmatch(r"\w+", name) or name in _TAKEN:
-        raise ValueError(
-            f"name must consist of letters, digits and underscores and not be {' or '.join(_TAKEN)}, got {name!r}. "
-            "It is a file of folder=."
-        )
+    require(
+        re.fullmatch("\\w+", name) and name not in _TAKEN,
+        "name",
+        f"consist of letters, digits and underscores and not be {' or '.join(_TAKEN)}",
+        f"{name!r}",
+        "It is a file of folder=.",
+    )
     _count("runs", str(runs))
 
 

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from pfbench.core.parameter_checks import require
 from pfbench.job.config import JobConfig
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from pfbench.results.conditions import Condition
-    from pfbench.stats.pair_states import LookRecord, LookSchedule, PairState
+    from pfbench.stats.pair_states import LookRecord, LookSchedule, PairStates
 
 from pfbench.cli.compose import UNTIL_DECIDED, StudyPlan
 
@@ -73,29 +74,38 @@ class GrowingSweep:
 
         values = plan.first.values
         settings = values["until_decided"]
-        if not isinstance(settings, Mapping):
-            raise ValueError(
-                f"until_decided must have the keys max_runs and max_hours, got {settings}. Leave it out."
-            )
+        require(
+            isinstance(settings, Mapping),
+            "until_decided",
+            "have the keys max_runs and max_hours",
+            settings,
+            "Leave it out.",
+        )
         hours = settings["max_hours"]
-        if hours is not None and (type(hours) not in (int, float) or not 0 < hours < math.inf):
-            raise ValueError(
-                f"until_decided.max_hours must be positive or null, got {hours}. Use null for no limit."
-            )
-        if not plan.has_one_study:
-            raise ValueError("study must be one name, got several. Run each study by itself.")
-        if values["budget"] != "particles":
-            raise ValueError(
-                "budget must be particles with runs=until-decided, since a budget would set another "
-                f"number of particles at each look, got {values['budget']}. Use budget=particles."
-            )
+        require(
+            hours is None or (type(hours) in (int, float) and 0 < hours < math.inf),
+            "until_decided.max_hours",
+            "be positive or null",
+            hours,
+            "Use null for no limit.",
+        )
+        require(plan.has_one_study, "study", "be one name", "several", "Run each study by itself.")
+        require(
+            values["budget"] == "particles",
+            "budget",
+            "be particles with runs=until-decided, since a budget would set another number of particles at each look",
+            values["budget"],
+            "Use budget=particles.",
+        )
         check_page_metric(values["report"]["metric"])
         schedule, jobs = LookSchedule(settings["max_runs"]), plan.compose_jobs()
-        if all(config.values["filter"] == jobs[0].values["filter"] for config in jobs):
-            raise ValueError(
-                "filter must be at least two filters with runs=until-decided, got one per condition. "
-                "Add a filter (filter=ekf,sir), or set a number of runs."
-            )
+        require(
+            not all(config.values["filter"] == jobs[0].values["filter"] for config in jobs),
+            "filter",
+            "be at least two filters with runs=until-decided",
+            "one per condition",
+            "Add a filter (filter=ekf,sir), or set a number of runs.",
+        )
         return cls(
             str(values["study"]), Path(values["results_dir"]), tuple(jobs),
             schedule, hours, values["overwrite"] or values["pcrb"] is True, values["report"],
@@ -149,7 +159,7 @@ class GrowingSweep:
             print(f"study {self.study} is finished: {record.state}\n{self._next_command()}")
             return
         lines: list[str] = []
-        states: list[PairState] = []
+        states: PairStates = []
         seconds = 0.0
         for number in numbers:
             if number > 1 and (reason := self._exceeds_time(seconds, number)):
@@ -198,18 +208,20 @@ class GrowingSweep:
             data = self.read(number)
         return data
 
-    def _decide(self, data: LookResults) -> list[PairState]:
+    def _decide(self, data: LookResults) -> PairStates:
         """Decide the pairs that were fixed in advance with the runs so far."""
         from pfbench.results.paper_block import plan_installed_pairs
         from pfbench.stats.pair_states import decide_at_looks
         from pfbench.stats.study_runs import arrange_runs, share_conditions
 
         count, required = len(data.table[["seed", "run"]].drop_duplicates()), self.schedule.runs[0]
-        if count < required:
-            raise ValueError(
-                f"runs must be at least {required} independent ones, got {count}. {data.warning} Use a "
-                "scenario whose data differ from run to run, or set a number of runs."
-            )
+        require(
+            not count < required,
+            "runs",
+            f"be at least {required} independent ones",
+            count,
+            f"{data.warning} Use a scenario whose data differ from run to run, or set a number of runs.",
+        )
         labels = sorted(data.table["filter"].unique())
         runs = arrange_runs(data.table, labels)
         pairs = [pair for pair in plan_installed_pairs(labels) if share_conditions(runs, *pair)]
@@ -237,8 +249,10 @@ class GrowingSweep:
 
 def check_has_sweep(flags: Sequence[str]) -> None:
     """Check that `runs=until-decided` is used for a sweep."""
-    if not flags:
-        raise ValueError(
-            f"runs={UNTIL_DECIDED} must be a sweep over at least two filters, got one job. "
-            "Add -m and filter=NAME,NAME."
-        )
+    require(
+        flags,
+        f"runs={UNTIL_DECIDED}",
+        "be a sweep over at least two filters",
+        "one job",
+        "Add -m and filter=NAME,NAME.",
+    )

@@ -6,6 +6,7 @@ from pfbench.core.chart import (
     EuclideanBlock as EuclideanBlock,
     LieGroupBlock as LieGroupBlock,
     QuaternionBlock as QuaternionBlock,
+    wrap_angle as wrap_angle,
 )
 from pfbench.core.parameter_checks import (
     require as require,

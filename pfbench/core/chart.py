@@ -249,7 +249,14 @@ def _log_turn_volume(r: Tensor) -> Tensor:
 
 
 def wrap_angle(angle: Tensor) -> Tensor:
-    """Wrap an angle to [-pi, pi], rad; an angle in this interval is unchanged."""
+    """Wrap an angle to [-pi, pi]; an angle in this interval is unchanged.
+
+    Args:
+        angle: Angles [...], rad.
+
+    Returns:
+        Angles [...], rad.
+    """
     # remainder(angle + pi, 2 pi) - pi would leave two digits of an arcsecond in float32
     return angle - 2 * torch.pi * torch.round(angle / (2 * torch.pi))
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from pfbench.core.parameter_checks import require
 from pfbench.door.parts import format_html_table
 from pfbench.report.board import build_pack, build_run_table
 from pfbench.report.board.entries import name_regimes
@@ -27,6 +28,7 @@ from pfbench.stats.sentences import format_with_interval
 _HEADS = (
     "#",
     "filter",
+    "median error",
     "ratio",
     "verdict",
     "track kept",
@@ -43,7 +45,7 @@ class Summary:
     Attributes:
         sentence: Result in words.
         caption: Metric, worlds and baseline of the leaderboard.
-        rows: Rows of the leaderboard: rank, filter, ratio with interval, words, track kept, coverage, ms/step.
+        rows: Rows of the leaderboard: rank, filter, median error of a single condition, ratio with interval, words, track kept, coverage, ms/step.
         failures: Filter, scenario and message of each failed job, which the leaderboard lacks.
     """
 
@@ -84,7 +86,8 @@ def summarise_study(
     opening = describe_opening(build_pack(study, conditions, ReportOptions(**options)))
     rows = tuple(
         (
-            str(row["rank"]), str(row["name"]), f"{row['ratio']} {row['interval']}".strip(), str(row["words"]),
+            str(row["rank"]), str(row["name"]), str(row["value"]).partition(" [")[0].strip(), f"{row['ratio']} {row['interval']}".strip(),
+            str(row["words"]),
             str(row["track"]), str(row["calibration"]), str(row["ms"]),
         )
         for row in opening["rows"]
@@ -127,10 +130,13 @@ class Comparison:
 
     def _single(self) -> Verdict:
         """Return the only verdict."""
-        if len(self.verdicts) != 1:
-            raise ValueError(
-                f"the study must have one condition, got {len(self.verdicts)}. Use comparison.table() or comparison.verdicts."
-            )
+        require(
+            len(self.verdicts) == 1,
+            "the study",
+            "have one condition",
+            len(self.verdicts),
+            "Use comparison.table() or comparison.verdicts.",
+        )
         return next(iter(self.verdicts.values()))
 
     def __repr__(self) -> str:
@@ -162,12 +168,14 @@ def compare_in_conditions(conditions: Sequence[Condition], a: str, b: str) -> Co
     """Select the verdicts on two filters in all conditions that have both, as the page of the study has them."""
     labels = sorted({job.label for condition in conditions for job in condition.jobs})
     for label in (a, b):
-        if label not in labels:
-            raise ValueError(
-                f"filter must be a filter of the study, got {label!r}. Choose from {', '.join(labels)}."
-            )
-    if a == b:
-        raise ValueError(f"filters must be two, got {a} twice. Choose from {', '.join(labels)}.")
+        require(
+            label in labels,
+            "filter",
+            "be a filter of the study",
+            f"{label!r}",
+            f"Choose from {', '.join(labels)}.",
+        )
+    require(a != b, "filters", "be two", f"{a} twice", f"Choose from {', '.join(labels)}.")
     table = build_run_table(conditions)
     table = drop_runs(table, assess_runs(table, "rmse", RUN).copies, RUN)
     court = open_court(table, study_looks(conditions), ReportOptions())
@@ -177,10 +185,9 @@ def compare_in_conditions(conditions: Sequence[Condition], a: str, b: str) -> Co
         mask = (present["scenario"] == condition.scenario) & (present["regime"] == regime)
         if {a, b} <= {job.label for job in condition.jobs}:
             verdicts[condition.name] = court.find("rmse", mask.to_numpy(), a, b)
-    if not verdicts:
-        raise ValueError(
-            f"{a} and {b} must have a condition in common, got none. Run both in one scenario."
-        )
+    require(
+        verdicts, f"{a} and {b}", "have a condition in common", "none", "Run both in one scenario."
+    )
     recorded = {c.scenario: c.jobs[0].meta for c in conditions if is_recorded(c.jobs[0].meta)}
     drives = (describe_drives(name, count_drives(meta)) for name, meta in recorded.items())
     reach = " ".join(

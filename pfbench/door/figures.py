@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from pfbench.core.parameter_checks import require
 from pfbench.results.conditions import Condition, main_component_group
 from pfbench.results.frame import list_main_groups
 from pfbench.results.looks import study_looks
@@ -40,10 +41,13 @@ def draw_study(study: Study, kind: str, ax: Axes | None, choice: Mapping[str, An
         "calibration": _draw_calibration,
         "run": _draw_run,
     }
-    if kind not in drawings:
-        raise ValueError(
-            f"kind must be one of {', '.join(drawings)}, got {kind!r}. Choose one of them."
-        )
+    require(
+        kind in drawings,
+        "kind",
+        f"be one of {', '.join(drawings)}",
+        f"{kind!r}",
+        "Choose one of them.",
+    )
     scene = _Scene(study, select_condition(study.conditions(), choice), choice)
     with matplotlib.rc_context(RC):
         if ax is None:
@@ -98,11 +102,13 @@ def _draw_cost(ax: Axes, scene: _Scene) -> None:
     """Draw the error of each filter, geometric mean over runs that keep track with 95 % interval, against its cost."""
     rows = scene.rows("rmse")
     by_label = {job.label: job.meta for job in scene.condition.jobs}
-    if not all({WARM_UP, STEP_TIME} & {*meta, *meta["seconds"]} for meta in by_label.values()):
-        raise ValueError(
-            "a cost must be a time after warm-up steps, got jobs of an earlier version without. "
-            f"Measure it: pfbench cost study={scene.study.name}"
-        )
+    require(
+        all({WARM_UP, STEP_TIME} & {*meta, *meta["seconds"]} for meta in by_label.values()),
+        "a cost",
+        "be a time after warm-up steps",
+        "jobs of an earlier version without",
+        f"Measure it: pfbench cost study={scene.study.name}",
+    )
     costs = {
         label: 1e3 * float(meta.get(STEP_TIME, {}).get("median", meta["seconds"]["per_step"]))
         for label, meta in by_label.items()

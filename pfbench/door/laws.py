@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -16,9 +17,10 @@ import torch
 from pfbench import testing
 from pfbench.cli.messages import format_error
 from pfbench.core import PhiloxStream
+from pfbench.core.parameter_checks import require
 from pfbench.core.record import map_inputs
 from pfbench.door.own_parts import find_group
-from pfbench.door.parts import Part, format_html_table, place_words, plain_errors
+from pfbench.door.parts import Part, format_html_table, get_part, place_words, plain_errors
 from pfbench.filter import EssResampler, ParticleFilter, run_filter
 from pfbench.job import instantiate
 from pfbench.job.config import compose
@@ -82,7 +84,7 @@ def _numbers(row: LawRow) -> str:
     return "" if row.statistic is None else f" ({row.statistic:.3g}, limit {row.limit:.3g})"
 
 
-def check_laws(thing: Any, runs: int = 200, inputs: Any = ()) -> LawTable:
+def check_laws(thing: Any, runs: int = 200, inputs: Any = (), scenario: Any = None) -> LawTable:
     """Check the laws that fit a part. A law that does not hold is a row and no error.
 
     `pfbench.run` tries an own part by the same contract before any job starts, with two runs and without the statistical laws.
@@ -91,6 +93,7 @@ def check_laws(thing: Any, runs: int = 200, inputs: Any = ()) -> LawTable:
         thing: Part, object or class of your own: filter, stage, model, scenario or noise regime.
         runs: Number of runs of the statistical checks of a filter.
         inputs: Inputs of a model that reads some: its NamedTuple of tensors with the axes [1, T, ...] of all runs and steps.
+        scenario: Name, part or object of a scenario, with whose channels and times a noise regime is checked, too.
 
     Returns:
         The laws with their results.
@@ -100,14 +103,23 @@ def check_laws(thing: Any, runs: int = 200, inputs: Any = ()) -> LawTable:
     """
     with plain_errors():
         subject, group, stage = _build(thing)
-    if group != "model" and inputs != ():
-        raise ValueError(
-            f"inputs must be those of a model, got some for a {group}. Leave them out."
+        choice = get_part("scenario", scenario) if isinstance(scenario, str) else scenario
+        world = None if choice is None else _build(choice)[0]
+    for name, is_set, owner in (
+        ("inputs", inputs != (), "model"),
+        ("scenario", choice is not None, "noise"),
+    ):
+        require(
+            not is_set or group == owner,
+            name,
+            f"be given for a {owner} only",
+            f"some for a {group}",
+            "Leave it out.",
         )
     checks: Mapping[str, Callable[[], Mapping[str, LawCheck]]] = {
         "model": lambda: _check_model(subject, inputs),
         "scenario": lambda: testing.check_scenario(subject),
-        "noise": lambda: testing.check_regime(subject),
+        "noise": lambda: testing.check_regime(subject, scenario=world),
     }
     try:
         with _watched_files(subject) as opened:
@@ -208,14 +220,33 @@ class _GivenInputs(ModelSimulation):
         return self.inputs
 
 
+def _check_turns(model: Any, y: torch.Tensor) -> Mapping[str, LawCheck]:
+    """Check that measurements [R, T, Dy] which jump by a turn, as measured angles do, have a residual that wraps them."""
+    if model.has_residual or y.shape[1] < 3:
+        return {}
+    steps = y.diff(dim=1).abs()
+    usual = steps.nanmedian(dim=1, keepdim=True).values
+    is_turn = ((steps - math.tau).abs() < 3.0 * usual) & (usual < 0.5)
+    share = is_turn.to(y.dtype).mean(dim=(0, 1))
+    places = ", ".join(str(i + 1) for i in share.nonzero().flatten().tolist())
+    statement = "measurements that jump by a turn have a residual"
+    assert not places, (
+        f"{statement}: channel {places} of {type(model).__name__} jumps by 2 pi. Define residual(self, y, y_hat), which returns "
+        "pfbench.core.wrap_angle(y - y_hat) for angles"
+    )
+    return {"turns": LawCheck(statement, 0.0, 0.0)}
+
+
 def _check_model(model: Any, inputs: Any) -> Mapping[str, LawCheck]:
     """Check that a filter can follow data of a model, and the Jacobians that it states."""
     needed = model.input_type
-    if needed is not None and not isinstance(inputs, needed):
-        raise ValueError(
-            f"inputs must be {needed.__name__} for {type(model).__name__}, got {type(inputs).__name__ if inputs else 'none'}. "
-            f"Use pfbench.check(model, inputs={needed.__name__}(...)) with tensors [1, T, ...]."
-        )
+    require(
+        needed is None or isinstance(inputs, needed),
+        "inputs",
+        f"be {getattr(needed, '__name__', '')} for {type(model).__name__}",
+        type(inputs).__name__ if inputs else "none",
+        f"Use pfbench.check(model, inputs={getattr(needed, '__name__', '')}(...)) with tensors [1, T, ...].",
+    )
     lengths = [10]
     map_inputs(lambda a: lengths.insert(0, a.shape[1]), inputs)
     numbers = torch.arange(20)
@@ -226,7 +257,7 @@ def _check_model(model: Any, inputs: Any) -> Mapping[str, LawCheck]:
     assert lost == 0, (
         f"{statement}: {lost:g} of 20 runs were lost. Check the scale of the noise and of the measurement"
     )
-    results = {"data": LawCheck(statement, lost, 0.0)}
+    results = {"data": LawCheck(statement, lost, 0.0), **_check_turns(model, episode.record.y)}
     names = ("propagation_jacobian", "observation_jacobian", "noise_gain")
     if any(hasattr(model, name) for name in names[:2]) or model.has_noise_gain:
         x = result.mean[:, -1:, :]

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pfbench.core.parameter_checks import require
 from pfbench.door.own_source import write_module
 from pfbench.door.parts import Part, describe_value, place_words, plain_errors
 from pfbench.files.atomic_write import write_atomically
@@ -70,7 +71,7 @@ def make_own(
                 f"own must receive a class or an object, got the part {thing}. Pass it to run unchanged."
             )
         group, stage = find_group(thing)
-        title = name or (thing if isinstance(thing, type) else type(thing)).__name__
+        title = name or _name_thing(thing, arguments)
         limit = arguments.pop("divergence_threshold", None) if group == "scenario" else None
         writer = _NodeWriter()
         if stage == "network":
@@ -90,6 +91,17 @@ def make_own(
         return writer.store(group, title, node)
 
 
+def _name_thing(thing: Any, arguments: Mapping[str, Any]) -> str:
+    """Name an object or a class by its class, a plain simulation of a model by its model."""
+    from pfbench.scenario import ModelSimulation
+
+    cls = thing if isinstance(thing, type) else type(thing)
+    model = arguments.get("model", getattr(thing, "model", None))
+    if cls is not ModelSimulation or model is None:
+        return cls.__name__
+    return model.name if isinstance(model, Part) else _name_thing(model, {})
+
+
 def find_group(thing: Any) -> tuple[str, str]:
     """Find the group of an object or a class by its methods, and its stage of a particle filter, if it is one."""
     from pfbench.model.base import StateSpaceModel
@@ -97,10 +109,13 @@ def find_group(thing: Any) -> tuple[str, str]:
     cls = thing if isinstance(thing, type) else type(thing)
     if issubclass(cls, StateSpaceModel):
         missing = sorted(getattr(cls, "__abstractmethods__", ()))
-        if missing:
-            raise ValueError(
-                f"{cls.__name__} must define {', '.join(missing)} to be a model, got a class without them. Add them."
-            )
+        require(
+            not missing,
+            cls.__name__,
+            f"define {', '.join(missing)} to be a model",
+            "a class without them",
+            "Add them.",
+        )
         return "model", ""
     for method, (base, role, inherited) in _BASES.items():
         if callable(getattr(cls, method, None)) and not all(hasattr(cls, n) for n in inherited):
@@ -291,8 +306,7 @@ class _NodeWriter:
         base = "neural_sir" if stage == "network" and base == "sir" else base
         config = compose([f"filter={base}"])
         values = {key: value for key, value in config.values["filter"].items() if key != "paper"}
-        if "particles" not in values:
-            raise ValueError(f"base must be a particle filter, got {base}. Use base='sir'.")
+        require("particles" in values, "base", "be a particle filter", base, "Use base='sir'.")
         if config.uses_shared_particles:
             values["particles"] = "${particles}"
         if stage == "network":

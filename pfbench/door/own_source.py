@@ -22,6 +22,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.atomic_write import write_atomically
 from pfbench.job.trust import FOLDERS, WRITTEN, split_trust
 
@@ -59,14 +60,20 @@ def write_module(cls: type) -> str:
         )
     values = vars(sys.modules[_MAIN])
     statements = read_statements(values)
-    if cls.__name__ not in statements:
-        raise ValueError(
-            f"{cls.__name__} must be in a file or a notebook, got a class without a source. Save it in a module."
-        )
-    if values.get(cls.__name__) is not cls:
-        raise ValueError(
-            f"{cls.__name__} must be the class of that name, got one that was defined before. Make the object again."
-        )
+    require(
+        cls.__name__ in statements,
+        cls.__name__,
+        "be in a file or a notebook",
+        "a class without a source",
+        "Save it in a module.",
+    )
+    require(
+        values.get(cls.__name__) is cls,
+        cls.__name__,
+        "be the class of that name",
+        "one that was defined before",
+        "Make the object again.",
+    )
     return _Script(values, statements).write(cls.__name__)
 
 
@@ -196,10 +203,13 @@ class _Collector:
         """Check that a name is collected, a built-in one or only an annotation."""
         if name in self.lines or hasattr(builtins, name) or name in ("__name__", "__file__"):
             return
-        if name in _evaluated_names(user):
-            raise ValueError(
-                f"{name} must be defined before the class is passed, got a name that does not exist. Define or import it."
-            )
+        require(
+            name not in _evaluated_names(user),
+            name,
+            "be defined before the class is passed",
+            "a name that does not exist",
+            "Define or import it.",
+        )
 
 
 def read_statements(values: Mapping[str, Any]) -> dict[str, list[_Statement]]:

@@ -11,6 +11,7 @@ from typing import Any
 
 from pfbench.cli.list import list_files
 from pfbench.cli.messages import format_error, format_unknown_choice, is_named, notes_of
+from pfbench.core.parameter_checks import require
 
 PART_GROUPS = ("scenario", "noise", "filter", "model")
 _PLAIN_TEXT = re.compile(r"[A-Za-z_][\w./-]*")
@@ -120,10 +121,13 @@ def get_part(group: str, name: str, /, **changes: Any) -> Part:
     Raises:
         ValueError: If the group or the name does not exist.
     """
-    if group not in PART_GROUPS:
-        raise ValueError(
-            f"group must be one of {', '.join(PART_GROUPS)}, got {group!r}. List the names: pfbench.names('filter')."
-        )
+    require(
+        group in PART_GROUPS,
+        "group",
+        f"be one of {', '.join(PART_GROUPS)}",
+        f"{group!r}",
+        "List the names: pfbench.names('filter').",
+    )
     if not isinstance(name, str):
         raise TypeError(
             f"{group} must be a name, got {describe_value(name)}. List the names: pfbench.names({group!r})."

@@ -15,6 +15,7 @@ from typing import Any
 
 from pfbench.cli.current_folder import add_search_path
 from pfbench.cli.progress import SweepCounter, SweepProgress, list_repeats, note_outcome
+from pfbench.core.parameter_checks import require
 from pfbench.door.own_parts import find_group, make_own
 from pfbench.door.parts import (
     Part,
@@ -74,10 +75,13 @@ def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
         ValueError: If a name, a value or a class is not valid. Nothing was run.
         RuntimeError: If no job finished.
     """
-    if type(workers) is not int or workers < 1:
-        raise ValueError(
-            f"workers must be a whole number of at least 1, got {workers!r}. Set workers=2."
-        )
+    require(
+        type(workers) is int and (not workers < 1),
+        "workers",
+        "be a whole number of at least 1",
+        f"{workers!r}",
+        "Set workers=2.",
+    )
     parts = [
         list_parts(group, value)
         for group, value in (("scenario", scenario), ("noise", noise), ("filter", filters))
@@ -103,10 +107,13 @@ def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
 def list_parts(group: str, value: Any) -> list[Part]:
     """Return the parts of a group that a name, a part, an object or a list of them means."""
     items = list(value) if isinstance(value, list | tuple | set) else [value]
-    if not items:
-        raise ValueError(
-            f"{group} must be at least one, got an empty list. List the names: pfbench.names({group!r})."
-        )
+    require(
+        items,
+        group,
+        "be at least one",
+        "an empty list",
+        f"List the names: pfbench.names({group!r}).",
+    )
     names = [name for item in items for name in _expand(group, item)]
     return [_make_part(group, item) for item in names]
 
@@ -139,17 +146,13 @@ def _make_part(group: str, item: Any) -> Part:
     return item if isinstance(item, Part) else make_own(item)
 
 
-def simulate_model(item: Any, **arguments: Any) -> Part:
-    """Make the scenario that simulates a model; 100 steps unless they are given."""
+def simulate_model(item: Any) -> Part:
+    """Make the scenario that simulates a model for 100 steps."""
     from pfbench.scenario import ModelSimulation
 
-    if isinstance(item, Part):
-        title = item.name
-    else:
-        title = (item if isinstance(item, type) else type(item)).__name__
     if isinstance(item, Part) and not item.folders:
         return add_changes(get_part("scenario", item.name), item.changes)
-    return make_own(ModelSimulation, title, model=item, **{"steps": 100, **arguments})
+    return make_own(ModelSimulation, model=item, steps=100)
 
 
 def _list_words(choice: Sequence[Part | None], words: Sequence[str]) -> list[str]:
@@ -217,6 +220,8 @@ def _run_jobs(configs: Sequence[JobConfig], workers: int, progress: bool) -> Non
                 log.info("%s", line)
     if len(failed) == total:
         raise RuntimeError(failed[0])
+    if failed and not progress:
+        log.warning("%d of %d jobs failed: %s. List them: study.failed()", len(failed), total, failed[0].rstrip("."))  # fmt: skip
 
 
 def _replies(configs: Sequence[JobConfig], workers: int) -> Iterator[tuple[int, JobReply]]:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pfbench.cli.progress import StudyState, format_repeat, read_state
+from pfbench.core.parameter_checks import require
 from pfbench.door.parts import plain_errors
 from pfbench.job.trust import trusting
 
@@ -50,10 +51,13 @@ class Study:
         with plain_errors():
             frame = load_frame(self.name, self.results)
         names = sorted(frame["metric"].unique())
-        if metric is not None and metric not in names:
-            raise ValueError(
-                f"metric must be one of {', '.join(names)}, got {metric!r}. Leave it out for all."
-            )
+        require(
+            metric is None or metric in names,
+            "metric",
+            f"be one of {', '.join(names)}",
+            f"{metric!r}",
+            "Leave it out for all.",
+        )
         return frame if metric is None else frame[frame["metric"] == metric].reset_index(drop=True)
 
     def errors(self, group: str | None = None) -> pd.DataFrame:
@@ -70,10 +74,13 @@ class Study:
         frame = self.table("rmse")
         mains = list_main_groups(self.conditions())
         names = sorted(set(frame["group"]))
-        if group is not None and group not in names:
-            raise ValueError(
-                f"group must be one of {', '.join(names)}, got {group!r}. Leave it out for the main group."
-            )
+        require(
+            group is None or group in names,
+            "group",
+            f"be one of {', '.join(names)}",
+            f"{group!r}",
+            "Leave it out for the main group.",
+        )
         keys = zip(frame["scenario"], frame["noise"], frame["model"], strict=True)
         selected = [group or mains[key] for key in keys]
         rows = frame[(frame["group"] == selected) & (frame["component"] == "norm")]

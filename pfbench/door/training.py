@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from pfbench.core.parameter_checks import require
 from pfbench.door.parts import Part, add_changes, format_words, place_words, plain_errors
 from pfbench.door.running import list_parts, preserved_process
 from pfbench.job.trust import trusting
@@ -57,8 +58,11 @@ def train_filter(
 def _find_part(group: str, value: Any) -> Part:
     """Return the part of a group that is trained with; several are refused."""
     parts = list_parts(group, value)
-    if len(parts) > 1:
-        raise ValueError(
-            f"{group} must be one {group}, got {len(parts)}. Train with each in a call of its own."
-        )
+    require(
+        not len(parts) > 1,
+        group,
+        f"be one {group}",
+        len(parts),
+        "Train with each in a call of its own.",
+    )
     return parts[0]

@@ -144,7 +144,7 @@ class RecordedFolder:
 
 def _read_manifest(path: Path) -> dict[str, str]:
     """Read the digests by name. A manifest that is damaged or names other folders is renamed."""
-    if not path.is_symlink() and not path.exists():
+    if not path.is_symlink() and not path.is_file():  # a pipe would be waited for
         return {}
     reason = "it is a link"
     if not path.is_symlink():

@@ -248,7 +248,12 @@ class ReachedStream(pickle.Pickler):
         is_class = isinstance(value, type)
         if not self.is_own(value.__module__ if is_class else value.__name__):
             return None
-        content = {name: item for name, item in vars(value).items() if name not in _DERIVED}
+        content = {
+            name: item
+            for name, item in vars(value).items()
+            # a protocol writes object.__init__ into a class when its first object is made
+            if name not in _DERIVED and item is not vars(object).get(name, value)
+        }
         if is_class:
             return [value.__mro__[1:], content]
         return {name: item for name, item in content.items() if not name.startswith("__")}

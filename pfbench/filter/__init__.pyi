@@ -29,7 +29,6 @@ from pfbench.filter.gaussian.linearisation_rules import (
     AxisDegree3 as AxisDegree3,
     AxisDegree5 as AxisDegree5,
     CubaturePoints as CubaturePoints,
-    GaussHermitePoints as GaussHermitePoints,
     LinearisationRule as LinearisationRule,
     RadialDegree3 as RadialDegree3,
     RadialDegree5 as RadialDegree5,
@@ -37,7 +36,6 @@ from pfbench.filter.gaussian.linearisation_rules import (
     SigmaPointLinearisation as SigmaPointLinearisation,
     SimplexDegree3 as SimplexDegree3,
     SimplexDegree5 as SimplexDegree5,
-    SparseGridPoints as SparseGridPoints,
     SphericalRadialPoints as SphericalRadialPoints,
     SphericalRule as SphericalRule,
     TaylorLinearisation as TaylorLinearisation,
@@ -56,9 +54,6 @@ from pfbench.filter.guided.guides import (
     SharedGuideProposal as SharedGuideProposal,
 )
 from pfbench.filter.guided.initial_guide import GuidedInitialProposal as GuidedInitialProposal
-from pfbench.filter.guided.interval_guide import (
-    GuidedIntervalProposal as GuidedIntervalProposal,
-)
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal as GuidedNoiseProposal
 from pfbench.filter.learned.differentiable_resampling import (
     SoftResampler as SoftResampler,
@@ -75,7 +70,6 @@ from pfbench.filter.learned.networks import (
     NormalMixtureHead as NormalMixtureHead,
     SkipMlp as SkipMlp,
     SplineFlowHead as SplineFlowHead,
-    ZukoFlowHead as ZukoFlowHead,
 )
 from pfbench.filter.learned.objectives import (
     EvidenceLowerBound as EvidenceLowerBound,
@@ -117,7 +111,6 @@ from pfbench.filter.moves.path_proposals import (
     SegmentProposal as SegmentProposal,
     SmoothedSegment as SmoothedSegment,
 )
-from pfbench.filter.particle.compiled_filter import CallCounter as CallCounter
 from pfbench.filter.particle.gaussian_particle_filter import (
     GaussianPredictionProposal as GaussianPredictionProposal,
     GaussianResampler as GaussianResampler,
@@ -164,6 +157,7 @@ from pfbench.filter.particle.stages import (
     Systematic as Systematic,
     WeightUpdate as WeightUpdate,
 )
+from pfbench.filter.particle.taken_steps import CallCounter as CallCounter
 from pfbench.filter.particle.weights import (
     AdditiveTempering as AdditiveTempering,
     LookAheadWeights as LookAheadWeights,

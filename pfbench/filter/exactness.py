@@ -8,6 +8,8 @@ from __future__ import annotations
 import warnings
 from dataclasses import fields, is_dataclass
 
+from pfbench.core.parameter_checks import require
+
 _BEHAVIOUR = ("__call__", "__getattr__", "__getattribute__")  # other dunder names are data
 _STATEMENTS = ("is_exact", "has_bounded_weights", "has_evidence", "has_covariance")
 _OF_THE_TYPE_SYSTEM = ("_abc_impl", "_is_protocol", "_is_runtime_protocol")
@@ -105,9 +107,10 @@ def has_covariance(method: object) -> bool:
 
 def check_has_evidence(method: object, user: str) -> None:
     """Check that a filter may serve a parameter inference."""
-    if not has_evidence(method):
-        raise ValueError(
-            f"{user} must have a filter whose evidence is a density of the measurements, got "
-            f"{type(method).__name__} with weights or noise that depend on the measurement. "
-            "Remove its adaptation, or use a model with another noise distribution."
-        )
+    require(
+        has_evidence(method),
+        user,
+        "have a filter whose evidence is a density of the measurements",
+        f"{type(method).__name__} with weights or noise that depend on the measurement",
+        "Remove its adaptation, or use a model with another noise distribution.",
+    )

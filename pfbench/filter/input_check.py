@@ -54,20 +54,29 @@ def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) ->
             "y.double()."
         )
     require(y.shape[1] != 0, "record.y", "have at least one time step", "0", "Add measurements.")
-    if bool(torch.isinf(y).any()):
-        raise ValueError("record.y must be finite, got infinity. Mark a missing component as NaN.")
+    require(
+        not bool(torch.isinf(y).any()),
+        "record.y",
+        "be finite",
+        "infinity",
+        "Mark a missing component as NaN.",
+    )
     runs, steps, _ = y.shape
     numbers: Any = getattr(draws, "runs", None)
-    if isinstance(numbers, Tensor) and numbers.shape != (runs,):
-        raise ValueError(
-            f"draws must be of {runs} runs, as record.y is, got {len(numbers)}. "
-            f"Use PhiloxStream(seed, torch.arange({runs}))."
-        )
-    if not isinstance(record.u, tuple):
-        raise ValueError(
-            f"record.u must be a NamedTuple of tensors [R, T, ...], got {type(record.u).__name__}. "
-            "Define a NamedTuple with a field for each input."
-        )
+    require(
+        not isinstance(numbers, Tensor) or numbers.shape == (runs,),
+        "draws",
+        f"be of {runs} runs, as record.y is",
+        list(getattr(numbers, "shape", ())),
+        f"Use PhiloxStream(seed, torch.arange({runs})).",
+    )
+    require(
+        isinstance(record.u, tuple),
+        "record.u",
+        "be a NamedTuple of tensors [R, T, ...]",
+        type(record.u).__name__,
+        "Define a NamedTuple with a field for each input.",
+    )
     for name, value in _named_inputs(record.u):
         if value.dim() < 2 or value.shape[0] not in (1, runs) or value.shape[1] != steps:
             raise ValueError(
@@ -292,11 +301,13 @@ def _named_inputs(u: Any, name: str = "") -> list[tuple[str, Tensor]]:
     """Return the input tensors with the names of their fields."""
     if isinstance(u, Tensor):
         return [(name, u)]
-    if not isinstance(u, tuple):
-        raise ValueError(
-            f"record.u{name} must be a tensor or a tuple of tensors, got {type(u).__name__}. "
-            "Convert it, for instance by torch.as_tensor."
-        )
+    require(
+        isinstance(u, tuple),
+        f"record.u{name}",
+        "be a tensor or a tuple of tensors",
+        type(u).__name__,
+        "Convert it, for instance by torch.as_tensor.",
+    )
     fields = getattr(u, "_fields", range(len(u)))
     return [
         pair

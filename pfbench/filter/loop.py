@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import BatchRandomStream, RandomStream
 from pfbench.core.record import FeedbackRun, Record, iterate_steps, take_groups
 from pfbench.filter.belief import (
@@ -329,24 +330,26 @@ def apply_feedback(
     if isinstance(belief, ParticleBelief):
         # the memory of a weight update counts measurements of a run; it holds no states
         past = [name for name in belief.memory if not name.startswith(WEIGHT_UPDATE_MEMORY)]
-        if belief.window or past:
-            raise ValueError(
-                "filter must not store a particle's past in a scenario with feedback, got one with "
-                "moves, a guided start or a proposal's memory. Choose another filter, or set "
-                "scenario.closed_loop=false."
-            )
+        require(
+            not belief.window and (not past),
+            "filter",
+            "not store a particle's past in a scenario with feedback",
+            "one with moves, a guided start or a proposal's memory",
+            "Choose another filter, or set scenario.closed_loop=false.",
+        )
         return belief._replace(x=correct(belief.x)), info
     if any(name.startswith("branch_") for name in belief.memory):
         raise ValueError(
             "filter must not have several hypotheses in a scenario with feedback, which corrects one "
             "estimate. Choose another filter, or set scenario.closed_loop=false."
         )
-    if any(name.startswith(LEARNED_GAIN_MEMORY) for name in belief.memory):
-        raise ValueError(
-            "filter must not have a learned gain in a scenario with feedback, got one: its memory "
-            "refers to the uncorrected process. Choose another filter, or set "
-            "scenario.closed_loop=false."
-        )
+    require(
+        not any(name.startswith(LEARNED_GAIN_MEMORY) for name in belief.memory),
+        "filter",
+        "not have a learned gain in a scenario with feedback",
+        "one: its memory refers to the uncorrected process",
+        "Choose another filter, or set scenario.closed_loop=false.",
+    )
     from pfbench.filter.gaussian.linearisation_rules import DifferenceSpace, TaylorLinearisation
 
     chart, centre = model.chart, belief.mean.unsqueeze(1)
@@ -368,17 +371,9 @@ def correctable_groups(model: StateSpaceModel) -> dict[str, tuple[int, ...]]:
 # Batches of runs, which a filter takes together.
 
 _BATCH_NUMBERS = 600_000  # numbers (runs x particles x components) of a batch of runs
-_COMPILED_BYTES = 1_500_000  # of the particles of a batch, for compiled steps of many components
-_MANY_COMPONENTS = 10
 
 
-def choose_run_batch(
-    runs: int,
-    particles: int,
-    dimension: int,
-    compiled_type: torch.dtype | None = None,
-    threads: int = 1,
-) -> int:
+def choose_run_batch(runs: int, particles: int, dimension: int, threads: int = 1) -> int:
     """Choose how many runs a step takes together on the CPU.
 
     Batches have about equal sizes of some 600 000 numbers, so memory depends on the size of a batch
@@ -388,19 +383,11 @@ def choose_run_batch(
     4.1, 3.1, 3.0, 3.2 s, in float32 2.2, 2.3, 2.3, 2.5 s. 15-state INS, 500 particles, float64: 100 and
     50 runs took 2.0 and 2.4 s.]
 
-    A compiled step has little overhead, so that with ten components or more its batches are smaller:
-    particles, noise and results of a batch then stay in the cache. `compiled_type` is the number type
-    of a compiled step. [Measured: 15-state INS, 500 particles, float64, 40 steps: batches of 100 and
-    25 runs took 360 and 306 ms.]
-
     With several threads the number of batches is a multiple of theirs, so that all have work.
 
     Returns runs per batch.
     """
-    numbers = _BATCH_NUMBERS
-    if compiled_type is not None and dimension >= _MANY_COMPONENTS:
-        numbers = min(numbers, _COMPILED_BYTES // compiled_type.itemsize)
-    batches = max(1, round(runs * particles * dimension / numbers))
+    batches = max(1, round(runs * particles * dimension / _BATCH_NUMBERS))
     return -(-runs // (-(-batches // threads) * threads))
 
 

@@ -237,10 +237,10 @@ def apply_budget(plan: JobPlan, episodes: EpisodeSource) -> tuple[JobPlan, Budge
     values = plan.values
     if values["budget"] == store.SAME_N or not plan.config.uses_shared_particles:
         return plan, None
-    if values["engine"] == "compiled":
+    if values["engine"] in ("tape", "compiled"):
         raise ValueError(
-            f"engine must be auto, eager or kernels with budget={values['budget']}, got compiled. "
-            f"Use engine=auto or budget={store.SAME_N}: trials are not compiled."
+            f"engine must be auto, eager or kernels with budget={values['budget']}, got "
+            f"{values['engine']}. Use engine=auto or budget={store.SAME_N}: trials take kernels."
         )
     episode = episodes.sample()
     model = plan.make_filter_model(episode)

@@ -12,6 +12,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pfbench.core.parameter_checks import require
 from pfbench.files import limits
 from pfbench.job.readings import make_reading, read_reading_table
 from pfbench.job.trust import (
@@ -66,11 +67,13 @@ class JobConfig:
 
     def __post_init__(self) -> None:
         missing = [group for group in CHOICES if group not in self.choices]
-        if missing:
-            raise ValueError(
-                f"choices must name {', '.join(CHOICES)}, got {sorted(self.choices)}. Add "
-                f"{', '.join(missing)}, or build the configuration with job.compose([...])."
-            )
+        require(
+            not missing,
+            "choices",
+            f"name {', '.join(CHOICES)}",
+            sorted(self.choices),
+            f"Add {', '.join(missing)}, or build the configuration with job.compose([...]).",
+        )
         check_groups(self.values, CHOICES)
         check_configuration(self.values, self.trusted)
         check_simulated_model(self.values, self.choices)
@@ -416,12 +419,13 @@ def check_groups(values: Mapping[str, Any], groups: Sequence[str]) -> None:
 def check_simulated_model(values: Mapping[str, Any], choices: Mapping[str, str]) -> None:
     """Check that a shipped world that is simulated from its model has this model, since it is named by it."""
     scenario, model = choices.get("scenario", ""), choices.get("model", "")
-    if is_simulated_from(values.get("scenario"), scenario) and model != scenario:
-        raise ValueError(
-            f"model must be {scenario} for scenario={scenario}, which is simulated from it, got {model}. "
-            f"Choose scenario={model} if it exists (pfbench list scenario), or write a scenario of your own with "
-            "_target_: pfbench.scenario.ModelSimulation."
-        )
+    require(
+        not is_simulated_from(values.get("scenario"), scenario) or model == scenario,
+        "model",
+        f"be {scenario} for scenario={scenario}, which is simulated from it",
+        model,
+        f"Choose scenario={model} if it exists (pfbench list scenario), or write a scenario of your own with _target_: pfbench.scenario.ModelSimulation.",
+    )
 
 
 def is_simulated_from(scenario: Any, name: str) -> bool:
@@ -484,11 +488,13 @@ def apply_readings(tree: Any, choices: Mapping[str, str]) -> None:
     if READING not in tree:
         return
     node: Any = tree[READING]
-    if not OmegaConf.is_dict(node):
-        raise ValueError(
-            f"{READING} must be papers with their readings, got {node!r:.80}. Choose one by "
-            f"{READING}/NUMBER=NAME: pfbench list {READING}"
-        )
+    require(
+        OmegaConf.is_dict(node),
+        READING,
+        "be papers with their readings",
+        f"{node!r:.80}",
+        f"Choose one by {READING}/NUMBER=NAME: pfbench list {READING}",
+    )
     node = OmegaConf.to_container(node, resolve=False)
     with flag_override(tree, ["struct", "readonly"], [False, False]):
         del tree[READING]
@@ -502,20 +508,25 @@ def apply_readings(tree: Any, choices: Mapping[str, str]) -> None:
 def check_reading(paper: str, stated: Any) -> None:
     """Check what a reading states of itself."""
     key = f"{READING}.{paper}"
-    if not isinstance(stated, Mapping) or not {"factor", "class", "why"} <= set(stated) <= _STATED:
-        raise ValueError(
-            f"{key} must state factor, class and why, perhaps filters, cites, completions and claims, got {stated!r:.120}. "
-            "Correct the file."
-        )
-    if stated["class"] not in CLASSES:
-        raise ValueError(
-            f"{key}.class must be one of {', '.join(CLASSES)}, got {stated['class']!r}. Choose one."
-        )
+    require(
+        isinstance(stated, Mapping) and {"factor", "class", "why"} <= set(stated) <= _STATED,
+        key,
+        "state factor, class and why, perhaps filters, cites, completions and claims",
+        f"{stated!r:.120}",
+        "Correct the file.",
+    )
+    require(
+        stated["class"] in CLASSES,
+        f"{key}.class",
+        f"be one of {', '.join(CLASSES)}",
+        f"{stated['class']!r}",
+        "Choose one.",
+    )
     filters = stated.get("filters") or {}
-    if not isinstance(filters, Mapping) or not all(
-        isinstance(v, Mapping) for v in filters.values()
-    ):
-        raise ValueError(
-            f"{key}.filters must give keys and values to names of filters, got {filters!r:.80}. "
-            "Write sir: {resampler.ess_threshold: 0.5}."
-        )
+    require(
+        isinstance(filters, Mapping) and all(isinstance(v, Mapping) for v in filters.values()),
+        f"{key}.filters",
+        "give keys and values to names of filters",
+        f"{filters!r:.80}",
+        "Write sir: {resampler.ess_threshold: 0.5}.",
+    )

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -17,8 +17,9 @@ from tqdm import tqdm
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record
 from pfbench.filter.belief import StepInfo
-from pfbench.filter.loop import FilterResult, choose_run_batch, run_filter
+from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.taped_filter import TapedParticleFilter, find_obstacle
 from pfbench.job.memory import MemoryTrimmer, first_steps, peak_above, start_peak_measurement
 from pfbench.job.plan import JobPlan
 from pfbench.job.scoring import LikelihoodCounter, ScoreRecorder
@@ -35,13 +36,7 @@ log = logging.getLogger("pfbench")
 
 # normal numbers of a job: on a CUDA device compiling costs seconds and saves 15 ms per million [measured]
 _CUDA_NUMBERS = 5e8
-_LEAST_SAVING = 20.0  # s: twice what compiling takes [measured: 10 to 14 s]
-# a compiled step of a batch of runs saves this in place of C++ operators [measured in float64: growth model 3e-4 and 0.3e-8,
-# stochastic volatility 0.5e-8, constant velocity in the plane 1.1e-8, 15 states nothing]
-_SAVED_PER_STEP = 3e-4  # s
-_SAVED_PER_PARTICLE = 0.6e-8  # s per particle and step
 _WARM_UP_STEPS = 2  # the second of a compiled filter is recorded
-_MANY_COMPONENTS = 10  # with these a step saves nothing per particle
 
 
 class TimedFilterPass(NamedTuple):
@@ -108,7 +103,7 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
     engine, compile_seconds = _time_choice(plan, model, len(runs), steps)
     draws = PhiloxStream(values["seed"], runs.to(device), plan.dtype)
     with _prepare_torch(plan, engine), _show_progress(steps, label) as tick:
-        step = _compile_step(engine, method, counter, clock)
+        step = wrap_steps(engine, method, counter, clock)
         baseline = start_peak_measurement(device)
         start_time = clock()
         method, batch = _warm_up(plan, step, model, episode.record, draws)
@@ -137,9 +132,7 @@ def pass_filter(plan: JobPlan, episode: Episode, runs: Tensor, label: str) -> Ti
         "per_step": filter_seconds / steps,
     }
     cost = {
-        "engine": "eager"
-        if engine == "eager"
-        else ("compiled" if step and step.is_active else "kernels"),
+        "engine": engine if engine == "eager" or (step and step.is_active) else "kernels",
         "memory": peak_above(baseline, device),
         "likelihoods_per_step": counter.count / (len(runs) * steps),
     }
@@ -177,7 +170,7 @@ def _prepare_torch(plan: JobPlan, engine: str) -> Iterator[None]:
 
 def _warm_up(
     plan: JobPlan,
-    step: CompiledParticleFilter | None,
+    step: TapedParticleFilter | CompiledParticleFilter | None,
     model: StateSpaceModel,
     record: Record,
     draws: PhiloxStream,
@@ -189,7 +182,7 @@ def _warm_up(
     Returns the filter, with compiled steps if there are, and the runs of a batch.
     """
     method = step or plan.method
-    batch = plan.choose_run_batch(plan.method, len(draws.runs), is_compiled=step is not None)
+    batch = plan.choose_run_batch(plan.method, len(draws.runs), is_shared=step is not None)
     first = slice(0, batch)
     run_filter(
         method,
@@ -222,12 +215,11 @@ def _show_progress(steps: int, label: str) -> Iterator[Callable[[], None]]:
 
 def choose_engine(
     engine: str, method: Any, model: StateSpaceModel, runs: int, steps: int
-) -> Literal["eager", "kernels", "compiled"]:
+) -> Literal["eager", "kernels", "tape", "compiled"]:
     """Choose how the steps of a job are executed, and load the C++ operators.
 
-    On the CPU `auto` takes the operators always, and compiles the step where that is predicted to save twice the
-    time that it takes. On a CUDA device it takes kernels for large jobs. Numbers of all engines agree to rounding; a
-    result states its engine.
+    On the CPU `auto` takes a tape for a bootstrap filter, and the operators for all others. On a CUDA device it takes kernels for
+    large jobs. Numbers of all engines agree to rounding; a result states its engine.
 
     Returns the engine: `eager` if the operators cannot be loaded.
     """
@@ -242,30 +234,20 @@ def choose_engine(
             )
     elif not is_library_loaded():
         return "eager"
-    if engine != "auto":
-        return "compiled" if engine == "compiled" else "kernels"
-    saved = 0.0
-    if isinstance(method, ParticleFilter) and not method.obstacle:
-        saved = _predict_saving(method, model, runs, steps)
-    if saved < _LEAST_SAVING:
-        _say_once("engine=auto: C++ operators")
+    if engine in ("kernels", "compiled"):
+        return cast(Literal["kernels", "compiled"], engine)
+    obstacle = "the device is a GPU" if model.anchor.is_cuda else find_obstacle(method, model)
+    if obstacle:
+        _say_once(f"engine={engine}: C++ operators, step by step ({obstacle})")
         return "kernels"
-    _say_once(f"engine=auto: the step is compiled, which saves about {saved:.0f} s")
-    return "compiled"
+    _say_once(f"engine={engine}: all steps in C++, with a tape of the model")
+    return "tape"
 
 
 @cache
 def _say_once(line: str) -> None:
     """Log a line, once in a process."""
     log.info(line)
-
-
-def _predict_saving(method: ParticleFilter, model: StateSpaceModel, runs: int, steps: int) -> float:
-    """Return what a compiled step saves in place of kernels, s."""
-    dimension = model.chart.size
-    batches = -(-runs // choose_run_batch(runs, method.particles, dimension))
-    per_particle = _SAVED_PER_PARTICLE if dimension < _MANY_COMPONENTS else 0.0
-    return steps * (_SAVED_PER_STEP * batches + per_particle * runs * method.particles)
 
 
 def _count_numbers(method: Any, model: StateSpaceModel) -> int:
@@ -278,10 +260,15 @@ def _count_numbers(method: Any, model: StateSpaceModel) -> int:
     return 8 * model.chart.dimension**2 if isinstance(method, GaussianFilter) else 0
 
 
-def _compile_step(
-    engine: str, method: Any, counter: LikelihoodCounter, clock: Callable[[], float]
-) -> CompiledParticleFilter | None:
-    """Return the filter with its step compiled as a whole, if requested and possible."""
+def wrap_steps(
+    engine: str,
+    method: Any,
+    counter: LikelihoodCounter | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+) -> TapedParticleFilter | CompiledParticleFilter | None:
+    """Return the filter whose steps an engine takes as a whole; None where they are taken as they are."""
+    if engine == "tape":
+        return TapedParticleFilter(method, counter)
     if engine != "compiled":
         return None
     if not isinstance(method, ParticleFilter) or method.obstacle:

@@ -14,6 +14,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.atomic_write import hash_file
 from pfbench.files.source_digest import find_module, hash_reached
 from pfbench.job.config import CHOICES
@@ -73,11 +74,13 @@ def check_unchanged(before: Inputs, values: Mapping[str, Any], trusted: Sequence
         return
     changed = list_changed(before, after)
     files = [name for name in changed if not name.startswith(CODE_OF)]  # loaded before
-    if files:
-        raise ValueError(
-            f"{' and '.join(files)} must not change while a job reads it, got other content at its end. "
-            "Run the job again."
-        )
+    require(
+        not files,
+        " and ".join(files),
+        "not change while a job reads it",
+        "other content at its end",
+        "Run the job again.",
+    )
 
 
 def names_checkpoint(node: Any) -> bool:

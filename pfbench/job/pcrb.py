@@ -28,6 +28,7 @@ from torch import Tensor
 from torch.distributions import Independent, MultivariateNormal, Normal
 
 from pfbench.core.linear_algebra import factor, jacobian
+from pfbench.core.parameter_checks import require
 from pfbench.core.record import Episode, Record, iterate_steps
 from pfbench.model.base import StateSpaceModel, StaticModel, initial_law
 from pfbench.noise.base import NominalNoise
@@ -87,11 +88,13 @@ def _states(model: StateSpaceModel, truth: Tensor, record: Record) -> Tensor:
         )
     if model.linear:
         return start[:, None].expand(-1, steps + 1, -1)
-    if bool(torch.isnan(truth).any()):
-        raise ValueError(
-            f"truth must be known at all steps for {type(model).__name__}, a nonlinear model, got "
-            "NaN. Leave the steps without truth out."
-        )
+    require(
+        not bool(torch.isnan(truth).any()),
+        "truth",
+        f"be known at all steps for {type(model).__name__}, a nonlinear model",
+        "NaN",
+        "Leave the steps without truth out.",
+    )
     return truth if truth.shape[1] > steps else torch.cat([start.unsqueeze(1), truth], 1)
 
 
@@ -113,10 +116,13 @@ def _initial_covariance(model: StateSpaceModel, record: Record, initial: Tensor 
 def _initial_root(covariance: Tensor, runs: int, separate: bool) -> Tensor:
     """Return the root of the inverse mean information of the runs, [R or 1, d, d]."""
     root, valid = factor(covariance)
-    if not bool((valid & (root.diagonal(dim1=-2, dim2=-1) > 0.0).all(-1)).all()):
-        raise ValueError(
-            "initial must be positive definite, got a covariance without square root. Give another."
-        )
+    require(
+        bool((valid & (root.diagonal(dim1=-2, dim2=-1) > 0.0).all(-1)).all()),
+        "initial",
+        "be positive definite",
+        "a covariance without square root",
+        "Give another.",
+    )
     if root.dim() == 2 or separate:
         return root.expand(runs if separate else 1, -1, -1)
     eye = torch.eye(root.shape[-1], dtype=root.dtype, device=root.device).expand_as(root)
@@ -130,11 +136,13 @@ def _predict(model: StateSpaceModel, root: Tensor, x: Tensor, u: Any) -> Tensor:
     """Return the root of the predicted bound [G, d, d], at states [R, D]."""
     chart, noise = model.chart, cast(Any, model.noise)
     gain = model.noise_gain(u)
-    if gain is None or not isinstance(noise.base_dist, Normal):
-        raise ValueError(
-            f"{type(model).__name__}: process noise must be additive and normal, got another. "
-            "The bound does not support this model."
-        )
+    require(
+        gain is not None and isinstance(noise.base_dist, Normal),
+        f"{type(model).__name__}: process noise",
+        "be additive and normal",
+        "another",
+        "The bound does not support this model.",
+    )
     gain = gain * noise.stddev
 
     def propagate(d: Tensor) -> Tensor:
@@ -151,13 +159,14 @@ def _predict(model: StateSpaceModel, root: Tensor, x: Tensor, u: Any) -> Tensor:
     deviation = (f - mean) @ root / sd  # [R, d, d] in predicted standard deviations
     inverse = torch.linalg.pinv(mean_gain / sd)
     unreached = deviation - (mean_gain / sd) @ (inverse @ deviation)
-    if bool((unreached.abs() > _TOLERANCE).any()) or bool(
-        (((gain - mean_gain) / sd).abs() > _TOLERANCE).any()
-    ):
-        raise ValueError(
-            f"{type(model).__name__}: Jacobians must differ between runs only where the noise "
-            "reaches, got other differences. Set run_by_run=True."
-        )
+    require(
+        not bool((unreached.abs() > _TOLERANCE).any())
+        and (not bool((((gain - mean_gain) / sd).abs() > _TOLERANCE).any())),
+        f"{type(model).__name__}: Jacobians",
+        "differ between runs only where the noise reaches",
+        "other differences",
+        "Set run_by_run=True.",
+    )
     if bool((deviation.abs() > _TOLERANCE).any()):
         root = _add_information(root, _pool(inverse @ ((f - mean) / sd), False))
         predicted = _root_of(torch.cat([mean @ root, mean_gain], -1))

@@ -93,21 +93,18 @@ class JobPlan:
             model = self.recording_regime.to_oracle_model(model, episode.time)
         return model.to(self.values["device"], self.dtype)
 
-    def choose_run_batch(self, method: Any, runs: int, is_compiled: bool = False) -> int:
+    def choose_run_batch(self, method: Any, runs: int, is_shared: bool = False) -> int:
         """Choose how many runs are stepped together. On a GPU all runs are.
-
-        Batches of a compiled step are shared among the threads of the job.
 
         Args:
             method: Filter.
             runs: Number of runs.
-            is_compiled: Whether its step may be compiled as a whole.
+            is_shared: Whether the threads of the job share the batches.
         """
         if self.values["device"] != "cpu" or not isinstance(method, ParticleFilter):
             return runs
-        compiled_type, threads = (self.dtype, self.values["threads"]) if is_compiled else (None, 1)
-        size = self.model.chart.size
-        return choose_run_batch(runs, method.particles, size, compiled_type, threads)
+        threads = self.values["threads"] if is_shared else 1
+        return choose_run_batch(runs, method.particles, self.model.chart.size, threads)
 
     def choose_timer(self) -> Callable[[], float]:
         """Choose processor time for one CPU thread, which other programs do not affect.

@@ -39,7 +39,7 @@ from pfbench.results.plotting import (
 from pfbench.results.status import count_statuses, divergence_threshold
 from pfbench.results.store import Inputs
 
-_ENGINES = ("kernels", "compiled")  # engines that a job may have used; the others are eager
+_ENGINES = ("kernels", "tape", "compiled")  # engines that a job may have used; the others are eager
 
 
 def replay_config(stored: StoredRun, changes: Mapping[str, Any]) -> JobConfig:
@@ -57,11 +57,13 @@ def stored_config(meta: Mapping[str, Any], path: Path, changes: Mapping[str, Any
     """
     parts = ("scenario", "noise", "filter", "model")
     values = copy.deepcopy(meta["config"])
-    if not all(isinstance(values.get(name), Mapping) for name in parts):
-        raise ValueError(
-            f"study must have results of pfbench run, got results without {', '.join(parts)} in "
-            f"{path}. Choose another study."
-        )
+    require(
+        all(isinstance(values.get(name), Mapping) for name in parts),
+        "study",
+        "have results of pfbench run",
+        f"results without {', '.join(parts)} in {path}",
+        "Choose another study.",
+    )
     values |= {
         "pcrb": False,
         "engine": meta["engine"] if meta.get("engine") in _ENGINES else "eager",
@@ -147,11 +149,13 @@ def _check_inputs(meta: Mapping[str, Any], present: Inputs) -> None:
     Another code of a user's classes is printed, since it may be a mended message.
     """
     changed = [name for name in _list_changed_inputs(meta, present) if not name.startswith(CODE_OF)]
-    if changed:
-        raise ValueError(
-            f"{' and '.join(changed)} must be as it was when the result was computed, got other content. "
-            "Run the job again, and replay the new result."
-        )
+    require(
+        not changed,
+        " and ".join(changed),
+        "be as it was when the result was computed",
+        "other content",
+        "Run the job again, and replay the new result.",
+    )
 
 
 def select_stored_scores(result: store.JobResult, stored: store.JobResult) -> store.JobResult:

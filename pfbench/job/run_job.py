@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.atomic_write import (
     set_aside,
 )
@@ -41,8 +42,8 @@ class JobOutcome(NamedTuple):
     Attributes:
         path: Result file, see `store.read_result`.
         status: `finished`, or `skipped` because the file exists.
-        rmse: Root mean square error of the main group (position if there is one) over all valid
-            runs, in its unit.
+        rmse: Median over runs of the RMS error of the main group (position if there is one), in its unit; infinite if
+            half of the runs keep no track.
     """
 
     path: Path
@@ -197,9 +198,11 @@ def _read_meta(path: Path) -> dict[str, Any]:
 def find_result_path(values: Mapping[str, Any], inputs: Inputs) -> Path:
     """Return the file of a job, whether it is finished or not."""
     study = values["study"]
-    if study in _RESERVED:
-        raise ValueError(
-            f"study must not be {' or '.join(_RESERVED)}, got {study}. These folders hold other "
-            "reports. Choose another name."
-        )
+    require(
+        study not in _RESERVED,
+        "study",
+        f"not be {' or '.join(_RESERVED)}",
+        study,
+        "These folders hold other reports. Choose another name.",
+    )
     return Path(values["results_dir"]) / study / f"{job_key(values, inputs)}.npz"

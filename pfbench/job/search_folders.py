@@ -18,6 +18,7 @@ from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from omegaconf import OmegaConf
 
+from pfbench.core.parameter_checks import require
 from pfbench.files import limits
 from pfbench.job.trust import UntrustedConfigError
 
@@ -84,10 +85,13 @@ def open_folder(provider: str, path: str, trusted: Sequence[str]) -> ForeignFold
             f"hydra.searchpath must have folders (file://FOLDER, own://FOLDER for files of your own) or "
             f"packages (pkg://MODULE), got {path}. Copy the files into a folder."
         )
-    if not os.path.isdir(folder):
-        raise ValueError(
-            f"hydra.searchpath must have existing folders, got {folder}. Use file:// and a full path."
-        )
+    require(
+        os.path.isdir(folder),
+        "hydra.searchpath",
+        "have existing folders",
+        folder,
+        "Use file:// and a full path.",
+    )
     kind = OwnFolder if scheme == "own" else ForeignFolder
     return kind(provider, f"{kind.scheme()}://{folder}")
 

@@ -11,7 +11,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from pfbench.core.parameter_checks import RUN_NUMBERS
+from pfbench.core.parameter_checks import RUN_NUMBERS, require
 from pfbench.job.inputs import find_inputs, names_checkpoint
 from pfbench.results import store
 from pfbench.results.paper_block import PAPER, PARTS
@@ -66,18 +66,20 @@ def check_settings(values: Mapping[str, Any]) -> None:
         "memory_limit_gib": _is_memory_limit(values["memory_limit_gib"]),
         "dtype": values["dtype"] in ("float32", "float64"),
         "budget": values["budget"] in store.BUDGETS,
-        "engine": values["engine"] in ("auto", "eager", "kernels", "compiled"),
+        "engine": values["engine"] in ("auto", "eager", "kernels", "tape", "compiled"),
         "device": re.fullmatch(r"cpu|cuda(:\d{1,3})?", str(values["device"])) is not None,
     }
     for key, (requirement, example) in _REQUIREMENTS.items():
         if not valid[key]:
             remedy = _advise_integer(key, values[key]) or f"Set {key}={example}."
             raise ValueError(f"{key} must be {requirement}, got {values.get(key)}. {remedy}")
-    if values["first_run"] + values["runs"] > RUN_NUMBERS:
-        raise ValueError(
-            f"first_run + runs must be at most 2**32 = {RUN_NUMBERS}, got {values['first_run']} + "
-            f"{values['runs']}. Larger run numbers would repeat random numbers: use another seed."
-        )
+    require(
+        not values["first_run"] + values["runs"] > RUN_NUMBERS,
+        "first_run + runs",
+        f"be at most 2**32 = {RUN_NUMBERS}",
+        f"{values['first_run']} + {values['runs']}",
+        "Larger run numbers would repeat random numbers: use another seed.",
+    )
     if values["device"] != "cpu":
         _check_device(values["device"])
 
@@ -87,10 +89,13 @@ def _check_device(device: str) -> None:
     import torch
 
     count = torch.cuda.device_count()
-    if (torch.device(device).index or 0) >= count:
-        raise ValueError(
-            f"device must be cpu or one of {count} CUDA devices, got {device}. Use device=cpu."
-        )
+    require(
+        not (torch.device(device).index or 0) >= count,
+        "device",
+        f"be cpu or one of {count} CUDA devices",
+        device,
+        "Use device=cpu.",
+    )
 
 
 _LARGEST = 1_000_000_000  # a number that is advised
@@ -120,7 +125,7 @@ _REQUIREMENTS = {  # requirement and valid value by key
     "memory_limit_gib": ("the GiB that the job may use, or null for most of the free memory", "null"),
     "dtype": ("float64 (default) or float32", "float64"),
     "budget": (f"one of {', '.join(store.BUDGETS)}", store.SAME_N),
-    "engine": ("auto, eager, kernels or compiled", "auto"),
+    "engine": ("auto, eager, kernels, tape or compiled", "auto"),
     "device": ("cpu, cuda, or one of several GPUs such as cuda:1", "cpu"),
 }  # fmt: skip
 

@@ -15,10 +15,8 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.files.command_start import start_work
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.budget import EpisodeSource, max_runs_in_memory
-from pfbench.job.filter_pass import choose_engine, wait_for
+from pfbench.job.filter_pass import choose_engine, wait_for, wrap_steps
 from pfbench.job.memory import first_steps
 from pfbench.job.plan import JobPlan, build_plan, make_provenance
 from pfbench.job.replay import stored_config
@@ -39,8 +37,8 @@ class TimingTask:
         plan: Plan of its job.
         model: Its model.
         record: First steps of the record of the runs that are in memory together.
-        engine: Engine of the job: eager, kernels or compiled.
-        method: The filter, with its step compiled where the job did so.
+        engine: Engine of the job: eager, kernels, tape or compiled.
+        method: The filter, with steps taken as a whole where the job did so.
     """
 
     plan: JobPlan
@@ -140,9 +138,7 @@ def _build_tasks(
         episode = episodes.batch(0, size)
         model = plan.make_filter_model(episode)
         engine = choose_engine(plan.values["engine"], plan.method, model, size, steps)
-        method = plan.method
-        if engine == "compiled" and isinstance(method, ParticleFilter) and method.history is None:
-            method = CompiledParticleFilter(method)
+        method = wrap_steps(engine, plan.method) or plan.method
         tasks.append(
             TimingTask(plan, model, first_steps(model, episode.record, steps), engine, method)
         )

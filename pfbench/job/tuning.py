@@ -16,6 +16,7 @@ import yaml
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require
 from pfbench.core.record import Episode, Record
 from pfbench.files.command_start import start_work
 from pfbench.filter.belief import GaussianBelief
@@ -98,11 +99,13 @@ class TuningResult:
 def choose_candidate(candidates: Sequence[Candidate]) -> Candidate:
     """Choose the candidate of the smallest error; within 1 % the best calibrated one."""
     least = min(c.log_ratio for c in candidates)
-    if not math.isfinite(least):
-        raise ValueError(
-            "the candidates must keep half of their runs, got none that does. Tune on another "
-            "scenario or model."
-        )
+    require(
+        math.isfinite(least),
+        "the candidates",
+        "keep half of their runs",
+        "none that does",
+        "Tune on another scenario or model.",
+    )
     near = [c for c in candidates if c.log_ratio <= least + math.log1p(TIE)]
     return min(near, key=lambda c: abs(math.log(c.nees_ratio)))
 
@@ -461,11 +464,13 @@ def list_candidates(method: str, r_factors: Sequence[float] = R_FACTORS) -> list
 
     Returns values by knob, `r_factor` first.
     """
-    if method not in KNOBS:
-        raise ValueError(
-            f"filter must be of {', '.join(KNOBS)}, got {method}. Only these have knobs that are "
-            "tuned alike."
-        )
+    require(
+        method in KNOBS,
+        "filter",
+        f"be of {', '.join(KNOBS)}",
+        method,
+        "Only these have knobs that are tuned alike.",
+    )
     knob = KNOBS[method]
     return [{"r_factor": r, knob.name: v} for r, v in product(r_factors, knob.values)]
 

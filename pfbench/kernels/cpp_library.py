@@ -39,7 +39,7 @@ def load_library() -> None:
             log.info("C++ operators: compiling them once for this computer, about 10 s")
             build_library(variant, built)
         check_private(built)
-    ctypes.CDLL(str(built), mode=ctypes.RTLD_GLOBAL)  # compiled steps call the operators by name
+    ctypes.CDLL(str(built))
 
 
 @cache
@@ -60,8 +60,6 @@ def is_library_loaded() -> bool:
 
 # --------------------------------------------------------------------------------------------------
 # Folder of compiled code. Code is loaded only from a folder that the user alone can write.
-
-_PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def code_folder() -> Path:
@@ -95,18 +93,3 @@ def check_private(path: Path) -> None:
             f"{path} must be a folder or file of this user that others cannot write. Compiled code "
             "is not loaded from it. Remove it, or set XDG_CACHE_HOME to a private folder."
         )
-
-
-def find_compiled_code(library: Path) -> Path:
-    """Return the file of a library, in the package, in `code_folder` or in a private folder of the user.
-
-    Others cannot reach the files in `code_folder`, whatever the mode of these is.
-    """
-    file = library.resolve(strict=True)
-    if _PACKAGE in file.parents:
-        return file
-    home = code_folder().resolve()
-    is_kept = home in file.parents and not home.stat().st_mode & (stat.S_IXGRP | stat.S_IXOTH)
-    for path in () if is_kept else (file.parent, file):
-        check_private(path)
-    return file

@@ -299,6 +299,7 @@ def _call_in_batches(operator: Operator, overload: Callable[..., Any], *args: An
 for _operator in read_operators().values():
     _operators.define(_operator.name + _operator.schema)
 cuda.register(_operators)
+_operators.define("run_tape(Tensor[] given) -> Tensor[]")
 
 philox_normals = _make_function("philox_normals")
 philox_normals_float64 = _make_function("philox_normals_float64")
@@ -325,3 +326,15 @@ group_covariance = _make_function("group_covariance")
 squared_mahalanobis = _make_function("squared_mahalanobis")
 marginal_scores = _make_function("marginal_scores")
 energy_score = _make_function("energy_score")
+
+
+def run_tape(arguments: list[Tensor]) -> list[Tensor]:
+    """Take steps of a bootstrap filter whose model is a tape.
+
+    Returns means and variances [T, R, D], log evidences, effective sample sizes, masks of resampling and counts of ancestors [T, R].
+    The others are of the kept steps: particles [K, D, R, N], log weights, weights and log weights before the measurement [K, R, N].
+    The arguments are those of `run_tape` in src/tape.cpp.
+    """
+    load_library()
+    results: list[Tensor] = torch.ops.pfbench.run_tape.default(arguments)
+    return results

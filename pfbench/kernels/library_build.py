@@ -28,7 +28,7 @@ FLAGS = {
     "random_normal": (*_COMMON, *_MATHS, "-ffp-contract=off"),
     "resampling": (*_COMMON, *_MATHS, "-ffp-contract=off"),
     "weights": (*_COMMON, *_MATHS),
-    "compiled_step": _COMMON,
+    "tape": (*_COMMON, *_MATHS),
     "operators": _COMMON,
     "particles": (*_COMMON, *_MATHS, *_SUMS),
     "linear_algebra": (*_COMMON, *_MATHS),

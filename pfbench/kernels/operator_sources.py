@@ -15,9 +15,8 @@ _DECLARATIONS = """\
 
 namespace operators {"""
 _CHECKS = """\
-// The operators as torch calls them: checks of the arguments, calls by compiled steps, registration.
+// The operators as torch calls them: checks of the arguments, registration.
 #include "argument_check.h"
-#include "direct_call.h"
 #include "operators.h"
 
 namespace {"""
@@ -32,10 +31,9 @@ def make_sources() -> dict[str, str]:
     declarations = [_HEAD, _DECLARATIONS, *(f"{_signature(operator)};" for operator in operators)]
     definitions = [_HEAD, _CHECKS, *(_checked(operator) for operator in operators)]
     definitions += [f"const pfbench::Registration registration(\n    {names});"]
-    shims = [_direct_call(operator) for operator in operators]
     return {
         "operators.h": "\n".join([*declarations, "}  // namespace operators", ""]),
-        "operators.cpp": "\n".join([*definitions, "}  // namespace", "", *shims, ""]),
+        "operators.cpp": "\n".join([*definitions, "}  // namespace", ""]),
     }
 
 
@@ -67,17 +65,6 @@ def _check(argument: Argument) -> str:
         return f'integer("{name}", {name})'
     more = f', "{positive}"' if positive else ""
     return f'{kind}("{name}", {name}, "{axes}"{more})'
-
-
-def _direct_call(operator: Operator) -> str:
-    """Return the C function of an operator for compiled steps."""
-    types = ("int64_t" if a.kind == "int" else "AtenTensorHandle" for a in operator.arguments)
-    inputs = [f"{t} {a.name}" for t, a in zip(types, operator.arguments, strict=True)]
-    results = [f"result_{k}" for k in range(len(operator.results))]
-    parameters = ", ".join([*inputs, *(f"AtenTensorHandle* {result}" for result in results)])
-    values = ", ".join([f"{{{', '.join(results)}}}", *(a.name for a in operator.arguments)])
-    name = operator.name
-    return f"DIRECT_CALL aoti_torch_cpu_{name}({parameters}) {{ return call_directly<&{name}>({values}); }}"
 
 
 if __name__ == "__main__":

@@ -208,6 +208,4 @@ def _polynomial(coefficients: Sequence[float], z: Tensor) -> Tensor:
 
 def _root(a: Tensor) -> Tensor:
     """Return the square root, rounded correctly."""
-    if a.device.type != "cpu":
-        return a.sqrt()
-    return torch.from_numpy(np.sqrt(a.numpy()))
+    return a.sqrt() if a.device.type != "cpu" else torch.from_numpy(np.sqrt(a.numpy()))

@@ -6,78 +6,32 @@ on disk. Operators of pfbench stay whole in the compiled function.
 
 from __future__ import annotations
 
-import inspect
 import logging
 import math
-import os
-import subprocess
 from collections.abc import Callable, Sequence
 from operator import getitem
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.fx import Graph as Operations, GraphModule, Node
 
 from pfbench.kernels import cuda
-from pfbench.kernels.cpp_library import find_compiled_code, load_library
 from pfbench.kernels.dispatch import kept_validation, mark_operators, prepare_compiler
-from pfbench.kernels.manifest import Operator, read_operators
 
 log = logging.getLogger("pfbench")
 
 TensorFunction = Callable[[list[Tensor]], Sequence[Tensor]]
 
 
-class NativeEntry(NamedTuple):
-    """Compiled function that C++ code can call.
-
-    Attributes:
-        step: Number of the function, see `register_step`.
-        constants: Tensors that it takes before the arguments.
-    """
-
-    step: int
-    constants: list[Tensor]
-
-
-class OperatorRegistry(dict[str, list[str]]):
-    """Operators by name, because the keys of torch's cache on disk cannot hold an operator."""
-
-    def __contains__(self, operator: object) -> bool:
-        return super().__contains__(str(operator))
-
-
-def declare_shims() -> OperatorRegistry:
-    """Return C declarations of the operators that compiled code calls directly."""
-
-    def declare(operator: Operator) -> str:
-        words = ["int64_t" if a.kind == "int" else "AtenTensorHandle" for a in operator.arguments]
-        words += ["AtenTensorHandle*"] * len(operator.results)
-        return f"AOTITorchError aoti_torch_cpu_{operator.name}({', '.join(words)})"
-
-    load_library()
-    return OperatorRegistry(
-        {
-            f"pfbench.{name}.default": [declare(operator)]
-            for name, operator in read_operators().items()
-            if operator.is_on_cpu
-        }
-    )
-
-
 def compile_function(
     function: Callable[..., list[Tensor]], example: list[Tensor]
-) -> tuple[TensorFunction, NativeEntry | None]:
-    """Compile a function of tensors for the shapes of an example.
-
-    Returns the compiled function, and its C++ entry if torch generated one.
-    """
+) -> TensorFunction:
+    """Compile a function of tensors for the shapes of an example."""
     prepare_compiler()  # before the imports, which choose a folder
     from torch._functorch.config import patch as patch_functorch
     from torch._guards import TracingContext, tracing
-    from torch._inductor.compile_fx import compile_fx, compile_fx_inner  # takes seconds to import
+    from torch._inductor.compile_fx import compile_fx  # takes seconds to import
     from torch._subclasses import FakeTensorMode
     from torch.fx.experimental.proxy_tensor import make_fx
     from torch.fx.experimental.symbolic_shapes import ShapeEnv
@@ -85,32 +39,22 @@ def compile_function(
     decompositions = {torch.ops.aten.stack.default: _stack_by_component}
     trace = make_fx(function, decomposition_table=decompositions)
     on_cpu = not any(a.is_cuda for a in example)
-    graph = _trace_for_host(trace, example) if on_cpu else _trace_for_device(trace, example)
-    # On the CPU the calls of the kernels are compiled with them: from Python they take 50 % longer.
-    shims = {"aot_inductor.custom_ops_to_c_shims": declare_shims()} if on_cpu else {}
-    # The shapes are those of the example, so their checks are left out.
-    options = {"cpp_wrapper": on_cpu, "size_asserts": False, **shims}
-    artefacts: list[Any] = []
-
-    def compile_inner(*args: Any, **settings: Any) -> Any:
-        artefacts.append(compile_fx_inner(*args, **settings))
-        return artefacts[-1]
-
+    graph = trace(*example) if on_cpu else _trace_for_device(trace, example)
+    options = {"size_asserts": False}  # the shapes are those of the example
     fake_mode = FakeTensorMode(shape_env=ShapeEnv(), allow_non_fake_inputs=True)
-    # The cache of autograd would return a function without its artefact.
+    # the cache of autograd would load whole steps
     with (
         tracing(TracingContext(fake_mode)),
         patch_functorch(enable_autograd_cache=False),
         kept_validation(),
     ):
         fakes = [fake_mode.from_tensor(a, static_shapes=True) for a in example]
-        run: Any = compile_fx(graph, fakes, inner_compile=compile_inner, config_patches=options)
-    entry = _find_entry(artefacts, run, example) if on_cpu else None
-    return lambda tensors: run(*tensors), entry
+        run: Any = compile_fx(graph, fakes, config_patches=options)
+    return lambda tensors: run(*tensors)
 
 
 def _fuse_propagation(graph: Operations) -> None:
-    """Fuse the copy of parents, their noise and `propagate_affine` into one operator.
+    """Fuse the copy of parents, their noise and `propagate_affine` into one operator of a CUDA device.
 
     The operator draws noise of the type of the particles.
     """
@@ -135,14 +79,6 @@ def _fuse_propagation(graph: Operations) -> None:
             )
         node.replace_all_uses_with(fused)
     graph.eliminate_dead_code()
-
-
-def _trace_for_host(trace: Callable[..., GraphModule], example: list[Tensor]) -> GraphModule:
-    """Record a step with one operator for propagation."""
-    graph = trace(*example)
-    _fuse_propagation(graph.graph)
-    graph.recompile()
-    return graph
 
 
 def _trace_for_device(trace: Callable[..., GraphModule], example: list[Tensor]) -> GraphModule:
@@ -345,49 +281,6 @@ def _stack_by_component(tensors: Sequence[Tensor], dim: int = 0) -> Tensor:
     return torch.cat([a.unsqueeze(0) for a in tensors]).permute(*range(1, last + 1), 0)
 
 
-def _register_entry(
-    library: str, constants: list[Tensor], example: list[Tensor], outputs: int
-) -> NativeEntry:
-    """Return the entry of a library, after registering what it takes."""
-    path = encode_path(library)
-    return NativeEntry(register_step(path, outputs, [*constants, *example]), constants)
-
-
-def _find_entry(artefacts: list[Any], run: Any, example: list[Tensor]) -> NativeEntry | None:
-    """Return the C++ function behind `run`; log a line and return None if it is not as expected."""
-    arguments: list[Tensor] = []
-    try:
-        (graph,) = artefacts
-        call = graph.current_callable
-
-        def record_arguments(args: list[Tensor]) -> Any:
-            arguments.extend(args)
-            return call(args)
-
-        graph.current_callable = record_arguments
-        try:
-            expected = run(*example)
-        finally:
-            graph.current_callable = call
-        constants, inputs = arguments[: -len(example)], arguments[-len(example) :]
-        if not all(a is b for a, b in zip(inputs, example, strict=True)):
-            raise TypeError("its arguments must be in the order of the example")
-        library = inspect.getclosurevars(call).nonlocals["f"].__self__.__file__
-        entry = _register_entry(library, constants, example, len(expected))
-        pairs = zip(run_once(entry, example), expected, strict=True)
-        if not all(
-            torch.allclose(a.double(), from_storage(b).double(), equal_nan=True) for a, b in pairs
-        ):
-            raise TypeError("its results must equal those of the Python call")
-    except (
-        AttributeError, KeyError, TypeError, ValueError, RuntimeError, OSError, subprocess.CalledProcessError,
-    ) as error:  # fmt: skip
-        name = type(error).__name__
-        log.info("engine=compiled: steps are called from Python (%s: %s)", name, error)
-        return None
-    return entry
-
-
 def to_storage(a: Tensor) -> Tensor:
     """Return [R, N, ...] as contiguous [..., R, N]; tensors of two axes or fewer keep their shape."""
     return (a.permute(*range(2, a.dim()), 0, 1) if a.dim() > 2 else a).contiguous()
@@ -401,82 +294,3 @@ def from_storage(a: Tensor) -> Tensor:
 def steps_to_storage(a: Tensor) -> Tensor:
     """Return inputs [R, T, ...] as [T, ...], each step in the layout of `to_storage`."""
     return a.permute(1, *range(3, a.dim()), 0, *range(2, min(a.dim(), 3))).contiguous()
-
-
-def steps_from_storage(a: Tensor) -> Tensor:
-    """Return results of steps [T, ..., R, N] as a view [R, T, N, ...]; [T, R] as [R, T]."""
-    if a.dim() < 4:
-        return a.transpose(0, 1)
-    return a.permute(a.dim() - 2, 0, a.dim() - 1, *range(1, a.dim() - 2))
-
-
-# --------------------------------------------------------------------------------------------------
-# Table of compiled steps: C++ code holds the addresses, and Python the numbers of the steps.
-#
-# A step checks nothing itself. `run_steps` compares type, shape and strides of each argument with those that
-# the step was compiled for.
-
-_operators = torch.library.Library("pfbench", "FRAGMENT")
-
-
-def run_steps(
-    step: int,
-    constants: list[Tensor],
-    state: list[Tensor],
-    inputs: list[Tensor],
-    shared: list[Tensor],
-    joined: Tensor,
-    kept_steps: Tensor,
-) -> list[Tensor]:
-    """Run a compiled step T times, or until output joined[0] of a step is not finite: S times.
-
-    Returns the outputs with the numbers `joined` of all steps, [S, ...] each. The other outputs of the
-    steps `kept_steps` (ascending) and of the last one follow, as views [R, N, ...] of [..., R, N]. Shapes:
-    inputs [T, ...], joined int64 [J], kept_steps int64 [K].
-    """
-    load_library()
-    results: list[Tensor] = torch.ops.pfbench.run_steps.default(
-        step, constants, state, inputs, shared, joined, kept_steps
-    )
-    return results
-
-
-def run_once(entry: NativeEntry, arguments: list[Tensor]) -> list[Tensor]:
-    """Run a compiled step once. Returns its outputs, as views [R, N, ...] of [..., R, N]."""
-    rows, none = [a.unsqueeze(0) for a in arguments], torch.zeros(0, dtype=torch.int64)
-    return run_steps(entry.step, entry.constants, [], rows, [], none, none)
-
-
-def register_step(library: Tensor, outputs: int, arguments: list[Tensor]) -> int:
-    """Load a compiled step, so that `run_steps` can call it and check its arguments.
-
-    The address of the step stays in C++: Python holds a number of a table.
-
-    Returns number of the step. Shapes: library [n].
-    """
-    load_library()
-    name = os.fsdecode(bytes(library.tolist())) if _is_path(library) else ""
-    if name:  # the operator refuses all else
-        try:
-            library = encode_path(find_compiled_code(Path(name)))
-        except PermissionError:
-            raise
-        except OSError as error:  # missing, or no possible name of a file
-            raise RuntimeError(
-                f"register_step: library must be a step of torch's compiler, got {name[:200]!r}."
-            ) from error
-    return int(torch.ops.pfbench.register_step.default(library, outputs, arguments))
-
-
-def encode_path(path: str | Path) -> Tensor:
-    """Return a path as bytes, uint8 [n], as an operator takes it."""
-    return torch.tensor(list(os.fsencode(path)), dtype=torch.uint8)
-
-
-def _is_path(a: Tensor) -> bool:
-    """Return whether a tensor can be a path as bytes."""
-    return a.dtype == torch.uint8 and a.dim() == 1 and 0 not in a
-
-
-for _kernel in (run_steps, register_step):
-    _operators.define(_kernel.__name__ + torch.library.infer_schema(_kernel, mutates_args=()))

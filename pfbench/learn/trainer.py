@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import PhiloxStream, RandomStream, relabel
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter, GaussianBelief, ParticleBelief, StepInfo
@@ -143,11 +143,13 @@ class TrainingState:
         content = checkpoint.read_checkpoint(path)
         for name, value in self._settings.items():
             stored = content.get("settings", {}).get(name)
-            if stored != value:
-                raise ValueError(
-                    f"{name} must be {stored} to resume the training stopped at {path}, got "
-                    f"{value}. Use its settings, another train.checkpoint_path, or overwrite=true."
-                )
+            require(
+                stored == value,
+                name,
+                f"be {stored} to resume the training stopped at {path}",
+                value,
+                "Use its settings, another train.checkpoint_path, or overwrite=true.",
+            )
         for name, module in self.parts.items():
             networks = dict(module.named_children())
             checkpoint.load_parameters(str(path), content["networks"][name], networks)
@@ -398,9 +400,11 @@ def set_up_filter(training: Training, method: TrainableFilter) -> TrainableFilte
     """Return a filter with the resampler and the number of particles of a training."""
     if isinstance(method, ParticleFilter):
         return replace(method, particles=training.particles, resampler=training.resampler)
-    if training.objective.needs_particles:
-        raise ValueError(
-            "train.objective must be defined without particles for a learned gain, got "
-            f"{type(training.objective).__name__}. Choose train=gain."
-        )
+    require(
+        not training.objective.needs_particles,
+        "train.objective",
+        "be defined without particles for a learned gain",
+        type(training.objective).__name__,
+        "Choose train=gain.",
+    )
     return method

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record, map_inputs
 from pfbench.model.base import StateSpaceModel
 from pfbench.noise.base import NoiseRegime
@@ -71,11 +72,13 @@ def draw_training_data(
     records, states = [], []
     for i, regime in enumerate(regimes):
         episode = scenario.draw(regime, torch.arange(i * runs, (i + 1) * runs), seed)
-        if episode.record.feedback is not None:
-            raise ValueError(
-                "scenario.closed_loop must be false for training, got true. A closed loop "
-                "depends on the filter. Set scenario.closed_loop=false."
-            )
+        require(
+            episode.record.feedback is None,
+            "scenario.closed_loop",
+            "be false for training",
+            "true",
+            "A closed loop depends on the filter. Set scenario.closed_loop=false.",
+        )
         converted = episode.record.to(model.anchor)
         record = model.prepare(episode.record).to(model.anchor)
         record = record._replace(start=converted.start, spread=converted.spread)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import re
 from collections.abc import Mapping, Sequence
-from functools import partial
+from operator import methodcaller
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 
+from pfbench.core.parameter_checks import require
 from pfbench.door.parts import Part, describe_value, format_words, plain_errors
 from pfbench.files.atomic_write import write_atomically
 from pfbench.job.trust import WRITTEN
-from pfbench.logs.units import UNIT_FACTORS
+from pfbench.logs.units import SECONDS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,7 +40,6 @@ _POSITION = (("lat_deg", "lon_deg", "h_m"), ("pn", "pe", "pd"))
 _UNITS = re.compile(
     r"(?<=[a-z0-9])[_ .\[(]*(m/?s\^?2|mps2|rad/?s|radps|m/?s|mps|rad|deg|s|m)[\])]*$", re.IGNORECASE
 )
-_SECONDS = {"s": 1.0, **UNIT_FACTORS["time"]}
 _SIGNS = {"frd": (1.0, 1.0, 1.0), "flu": (1.0, -1.0, -1.0)}
 
 
@@ -72,7 +71,7 @@ def make_log(
     Raises:
         ValueError: If a column is missing, or the log is not valid; the message has the mapping to complete.
     """
-    for key, value, options in (("axes", axes, _SIGNS), ("time", time, _SECONDS)):
+    for key, value, options in (("axes", axes, _SIGNS), ("time", time, SECONDS)):
         if value not in options:
             raise ValueError(
                 f"{key} must be one of {', '.join(options)}, got {value!r}. Set {key}={next(iter(options))!r}."
@@ -83,7 +82,7 @@ def make_log(
             {} if reference is None else {"reference": reference}
         )
         for name, source in sources.items():
-            tables[name], note = _convert(name, _read(name, source), columns or {}, _SECONDS[time])
+            tables[name], note = _convert(name, _read(name, source), columns or {}, SECONDS[time])
             notes.append(f"{name}: {note}")
         for column, sign in zip("xyz", _SIGNS[axes], strict=True):
             tables["imu"][[f"f{column}", f"w{column}"]] *= sign
@@ -107,8 +106,13 @@ def _read(name: str, source: Any) -> pd.DataFrame:
             f"{name} must be a file or a data frame, got {describe_value(source)}. Pass the path of a CSV file."
         )
     path = Path(source)
-    if not path.is_file():
-        raise ValueError(f"{name} must be an existing file, got {path}. Correct its name.")
+    require(
+        path.is_file(),
+        name,
+        "be an existing file",
+        path,
+        "Correct its name.",
+    )
     return (
         pd.read_parquet(path)
         if path.suffix == ".parquet"
@@ -173,23 +177,14 @@ def _guess(column: str, missing: Sequence[str]) -> str:
 
 def _store(tables: Mapping[str, pd.DataFrame]) -> Path:
     """Write the tables into a folder named by their content."""
-    texts = {}
-    for name, table in tables.items():
-        buffer = io.StringIO()
-        table.to_csv(buffer, index=False)
-        texts[name] = buffer.getvalue()
+    texts = {name: table.to_csv(index=False) for name, table in tables.items()}
     digest = hashlib.sha256("\n".join(texts.values()).encode()).hexdigest()[:10]
     folder = Path(WRITTEN).absolute() / f"log_{digest}"
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         if not (folder / f"{name}.csv").is_file():
-            write_atomically(folder / f"{name}.csv", partial(_write_text, text))
+            write_atomically(folder / f"{name}.csv", methodcaller("write", text.encode()))
     return folder
-
-
-def _write_text(text: str, file: IO[bytes]) -> None:
-    """Write a text into an open file."""
-    file.write(text.encode())
 
 
 def _check(folder: Path, settings: Mapping[str, Any], *, has_reference: bool) -> None:

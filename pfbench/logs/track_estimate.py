@@ -24,14 +24,13 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.smoothing.gaussian_smoother import smooth
 from pfbench.job.config import compose
 from pfbench.job.plan import JobPlan, build_plan
-from pfbench.logs.worlds.aligned_log import AlignedLog
-from pfbench.logs.worlds.log_tables import find_dataset
+from pfbench.logs.worlds.log_tables import find_dataset, swap_frd_rfu
+from pfbench.logs.worlds.user_log import AlignedLog
 from pfbench.nav import earth
 from pfbench.nav.attitude import dcm_from_quaternion, euler_from_dcm
 
 _DEGREE = np.pi / 180.0
-_SWAP = [1, 0, 2]  # from East, North, Up to North, East, Down; the last sign follows
-_DOWN = np.array([1.0, 1.0, -1.0])
+_SWAP = [1, 0, 2]  # deviations from East, North, Up to North, East, Down
 
 
 class MotionEstimate(NamedTuple):
@@ -117,8 +116,13 @@ class TrackEstimate:
         Raises:
             ValueError: If the log does not contain its place.
         """
-        remedy = "Set scenario.origin=[lat_deg,lon_deg,h_m] of pn = pe = pd = 0."
-        require(self.centre is not None, "the log", "contain its place for GPX and KML", "local positions", remedy)  # fmt: skip
+        require(
+            self.centre is not None,
+            "the log",
+            "contain its place for GPX and KML",
+            "local positions",
+            "Set scenario.origin=[lat_deg,lon_deg,h_m] of pn = pe = pd = 0.",
+        )
         scale = np.array([_DEGREE, _DEGREE, 1.0])
         at = torch.from_numpy(np.array(self.centre) * scale)
         enu = torch.from_numpy(np.ascontiguousarray(motion.state[:, 7:]))
@@ -134,7 +138,7 @@ class TrackEstimate:
             A row per step.
         """
         places = {} if self.centre is None else dict(zip(("lat_deg", "lon_deg", "h_m"), self.geodetic(motion).T, strict=True))  # fmt: skip
-        velocity, position = (motion.state[:, i][:, _SWAP] * _DOWN for i in (slice(4, 7), slice(7, 10)))  # fmt: skip
+        velocity, position = (swap_frd_rfu(motion.state[:, i]) for i in (slice(4, 7), slice(7, 10)))  # fmt: skip
         euler = euler_from_dcm(dcm_from_quaternion(torch.from_numpy(motion.state[:, :4]))).numpy()
         pitch, roll, yaw = euler.T
         sd = np.hstack([motion.sd[:, 6:][:, _SWAP], motion.sd[:, 3:6][:, _SWAP], motion.sd[:, [1, 0, 2]]])  # fmt: skip
@@ -190,7 +194,10 @@ def estimate_track(
     path = Path(folder).resolve()
     require(path.is_dir(), "the log", "be a folder with imu and gnss", folder, "Check the path.")
     location = [f"data.root={json.dumps(str(path.parent))}", f"scenario.folder={json.dumps(path.name)}"]  # fmt: skip
-    words = ["scenario=user_log_aligned", *location, *settings]
+    default = (
+        [] if any(w.startswith("scenario=") for w in settings) else ["scenario=user_log_aligned"]
+    )
+    words = [*default, *location, *settings]
     plans = {name: build_plan(compose([*words, f"filter={name}"])) for name in filters}
     require(plans, "filters", "name a filter", "none", "Use filter=ekf.")
     return _estimate(path.name, plans)
@@ -217,8 +224,13 @@ def _estimate(name: str, plans: dict[str, JobPlan]) -> TrackEstimate:
     plan = next(iter(plans.values()))
     scenario = plan.scenario
     holdout = getattr(scenario, "holdout", None)
-    remedy = "Keep scenario=user_log_aligned and its scenario.holdout."
-    require(isinstance(scenario, AlignedLog) and holdout is not None, "scenario", "be an own log with held-out fixes", scenario, remedy)  # fmt: skip
+    require(
+        isinstance(scenario, AlignedLog) and holdout is not None,
+        "scenario",
+        "be an own log with held-out fixes",
+        scenario,
+        "Keep scenario=user_log_aligned and its scenario.holdout.",
+    )
     assert isinstance(scenario, AlignedLog)
     assert holdout is not None
     period = holdout.used_fixes + holdout.withheld_fixes
@@ -273,7 +285,13 @@ def _answer(name: str, plan: JobPlan, passes: _Passes) -> FilterAnswer:
         else:
             draws = PhiloxStream(plan.values["seed"], torch.arange(runs))
             result = run_filter(plan.method, model, passes.record, draws, watch)
-        require(not bool(result.lost[-1]), f"filter {name}", "follow the log", "a lost run", "See its fixes with pfbench inspect, or choose another filter.")  # fmt: skip
+        require(
+            not bool(result.lost[-1]),
+            f"filter {name}",
+            "follow the log",
+            "a lost run",
+            "See its fixes with pfbench inspect, or choose another filter.",
+        )
     nis, dof = (result.trace[key][-1].numpy() for key in ("nis", "nis_dof")) if all(has_nis) else (np.zeros(0),) * 2  # fmt: skip
     return FilterAnswer(name, _describe(result.mean, result.variance, passes), smoothed, nis[dof > 0], dof[dof > 0])  # fmt: skip
 

@@ -6,12 +6,13 @@ import math
 
 DEGREE = math.pi / 180.0
 WEEK = 604800.0  # s
+STANDARD_GRAVITY = 9.80665  # m/s^2
 # factors that convert to the unit of a table: s, m, m/s, m/s^2, rad, rad/s, deg (of places), kPa, gauss
 UNIT_FACTORS: dict[str, dict[str, float]] = {
     "time": {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "minutes": 60.0, "hours": 3600.0},
     "length": {"cm": 1e-2, "mm": 1e-3, "km": 1e3, "feet": 0.3048},
     "velocity": {"cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6, "knots": 1852.0 / 3600.0, "feet/s": 0.3048},
-    "force": {"g": 9.80665, "mg": 9.80665e-3, "cm/s^2": 1e-2},
+    "force": {"g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY, "cm/s^2": 1e-2},
     "angle": {"degrees": DEGREE},
     "rare angle": {"0.1 degrees": 0.1 * DEGREE, "0.01 degrees": 0.01 * DEGREE, "gon": 0.9 * DEGREE},
     "rate": {"deg/s": DEGREE},
@@ -19,6 +20,7 @@ UNIT_FACTORS: dict[str, dict[str, float]] = {
     "pressure": {"hPa": 0.1, "Pa": 1e-3},
     "field": {"nT": 1e-5, "uT": 1e-2, "mgauss": 1e-3},
 }  # fmt: skip
+SECONDS = {"s": 1.0, **UNIT_FACTORS["time"]}  # units of the times of a table
 # other names, as in time [msec]
 ALIASES = {
     "msec": "ms", "µs": "us", "min": "minutes", "h": "hours", "ft": "feet", "kn": "knots", "ft/s": "feet/s",

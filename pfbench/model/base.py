@@ -19,6 +19,7 @@ from typing_extensions import override
 from pfbench.core.chart import Chart, EuclideanBlock
 from pfbench.core.density import StandardNormal, dense_normal, log_density, log_normal_density
 from pfbench.core.linear_algebra import gaussian_log_density
+from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record
 
 
@@ -222,11 +223,13 @@ class StateSpaceModel(nn.Module, ABC):
             ValueError: If no group of this model has a truth, or a truth has other components.
         """
         available = [name for name in self.groups if name in truth]
-        if not available:
-            raise ValueError(
-                f"truth must have at least one group of {list(self.groups)}, got {sorted(truth)}. "
-                "Choose a scenario that fits the model."
-            )
+        require(
+            available,
+            "truth",
+            f"have at least one group of {list(self.groups)}",
+            sorted(truth),
+            "Choose a scenario that fits the model.",
+        )
         check_truth_sizes(truth, {name: len(places) for name, places in self.groups.items()})
         first = truth[available[0]]
         state = first.new_full((*first.shape[:-1], self.chart.size), torch.nan)
@@ -324,9 +327,7 @@ class ModelWrapper(StateSpaceModel):
     @property
     @override
     def has_residual(self) -> bool:
-        if type(self).residual is ModelWrapper.residual:
-            return self.model.has_residual
-        return True
+        return self.model.has_residual if type(self).residual is ModelWrapper.residual else True
 
     @override
     def initial(self, runs: int) -> Distribution:

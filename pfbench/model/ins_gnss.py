@@ -12,6 +12,7 @@ from typing_extensions import override
 
 from pfbench.core.density import ChartNormal, dense_normal, independent_normal, normal_batch
 from pfbench.core.linear_algebra import affine_map, factor
+from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record, describe_misfit
 from pfbench.model.base import StateSpaceModel
 from pfbench.nav import attitude, error_dynamics
@@ -120,11 +121,13 @@ def inflate_noise(gain: Tensor, inflation: ProcessNoiseInflation, gyro: int) -> 
     """
     sd = [inflation.motion, *[inflation.gyro] * gyro, inflation.accelerometer]
     root, ok = factor(gain @ gain.mT + torch.diag(torch.cat(sd).to(gain).square()))
-    if not bool(ok.all()):
-        raise ValueError(
-            f"model.inflation must be positive for every state, got {inflation}. "
-            "Otherwise the noise covariance is singular."
-        )
+    require(
+        bool(ok.all()),
+        "model.inflation",
+        "be positive for every state",
+        inflation,
+        "Otherwise the noise covariance is singular.",
+    )
     return root
 
 

@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock, wrap_angle
 from pfbench.core.density import independent_normal
+from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record
 from pfbench.model.ins_gnss import (
     BIASES,
@@ -124,22 +125,28 @@ class SinsSar(InsErrorModel):
     ) -> None:
         super().__init__()
         self.check_receiver(receiver)
-        if imu.gyro_markov > 0 or imu.accelerometer_markov > 0:
-            raise ValueError(
-                f"model.imu must have constant biases, got gyro_markov_deg_h={imu.gyro_markov_deg_h}, "
-                f"accelerometer_markov_ug={imu.accelerometer_markov_ug}. Set both to 0."
-            )
+        require(
+            not imu.gyro_markov > 0 and (not imu.accelerometer_markov > 0),
+            "model.imu",
+            "have constant biases",
+            f"gyro_markov_deg_h={imu.gyro_markov_deg_h}, accelerometer_markov_ug={imu.accelerometer_markov_ug}",
+            "Set both to 0.",
+        )
         biases = [imu.gyro_bias] * 3 + [imu.accelerometer_bias] * 3
-        if min(biases) <= 0.0:
-            raise ValueError(
-                f"model.imu must have positive biases, got gyro_bias_deg_h={imu.gyro_bias_deg_h}, "
-                f"accelerometer_bias_ug={imu.accelerometer_bias_ug}. Change them."
-            )
-        if rotate_noise_by_error and inflation:
-            raise ValueError(
-                "model.rotate_noise_by_error must be false with model.inflation, got true. "
-                "Change one of them."
-            )
+        require(
+            not min(biases) <= 0.0,
+            "model.imu",
+            "have positive biases",
+            f"gyro_bias_deg_h={imu.gyro_bias_deg_h}, accelerometer_bias_ug={imu.accelerometer_bias_ug}",
+            "Change them.",
+        )
+        require(
+            not rotate_noise_by_error or not inflation,
+            "model.rotate_noise_by_error",
+            "be false with model.inflation",
+            "true",
+            "Change one of them.",
+        )
         self.names, self.units, self.groups = name_ins_components(NAVIGATION + BIASES)
         self.rotate_noise_by_error, self.inflation = rotate_noise_by_error, inflation
         density = [imu.gyro_random_walk] * 3 + [imu.accelerometer_random_walk] * 3
@@ -187,9 +194,7 @@ class SinsSar(InsErrorModel):
         gyro, accelerometer = self.density.to(dcm).split(3)
         gain = dcm.new_zeros(*dcm.shape[:-2], 15, 6)
         gain[..., 0:3, 0:3], gain[..., 3:6, 3:6] = -dcm * gyro * root, dcm * accelerometer * root
-        if self.inflation is None:
-            return gain
-        return inflate_noise(gain, self.inflation, 1)
+        return gain if self.inflation is None else inflate_noise(gain, self.inflation, 1)
 
     @override
     def propagate(self, x: Tensor, u: SarStep, w: Tensor) -> Tensor:

@@ -197,11 +197,13 @@ class StrapdownTotal(StrapdownModel):
         sizes = dict(zip(self.groups, _SIZES, strict=True))
         check_truth_sizes(truth, sizes)
         values = [truth[name] for name in self.groups if name in truth]
-        if not values:
-            raise ValueError(
-                f"truth must contain a group of the model, {sorted(self.groups)}, "
-                f"got {sorted(truth)}. Choose a scenario that fits the model."
-            )
+        require(
+            values,
+            "truth",
+            f"contain a group of the model, {sorted(self.groups)}",
+            sorted(truth),
+            "Choose a scenario that fits the model.",
+        )
         missing = values[0].new_full((*values[0].shape[:-1], 1), torch.nan)
         blocks = [
             truth.get(name, missing.expand(*missing.shape[:-1], size))
@@ -316,11 +318,13 @@ class StrapdownAided(StrapdownModel):
 
 
 def _field(values: Sequence[float]) -> Sequence[float]:
-    if len(values) != 3 or not any(values):
-        raise ValueError(
-            f"tuning.magnetic_field_gauss must be three numbers that are not all zero, got {list(values)}. "
-            "Give the Earth's field, North, East, Down, in gauss."
-        )
+    require(
+        len(values) == 3 and any(values),
+        "tuning.magnetic_field_gauss",
+        "be three numbers that are not all zero",
+        list(values),
+        "Give the Earth's field, North, East, Down, in gauss.",
+    )
     return values
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pfbench.core.parameter_checks import check_positive, check_three_positive
+from pfbench.core.parameter_checks import check_positive, check_three_positive, require
 from pfbench.nav.ranging import ReceiverClock
 
 
@@ -105,11 +105,13 @@ class RangeErrorModel:
 
     def __post_init__(self) -> None:
         check_positive("tuning.floor_sd", [self.floor_sd])
-        if not (self.stated_sd_factor >= 0.0 and self.added_sd >= 0.0):
-            raise ValueError(
-                "tuning.stated_sd_factor and tuning.added_sd must not be negative, "
-                f"got {self.stated_sd_factor} and {self.added_sd}. Use 0 to omit a term."
-            )
+        require(
+            self.stated_sd_factor >= 0.0 and self.added_sd >= 0.0,
+            "tuning.stated_sd_factor and tuning.added_sd",
+            "not be negative",
+            f"{self.stated_sd_factor} and {self.added_sd}",
+            "Use 0 to omit a term.",
+        )
 
     def sd(self, stated: Tensor) -> Tensor:
         """Compute the standard deviation from stated standard deviations [...]."""

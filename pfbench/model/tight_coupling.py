@@ -49,18 +49,21 @@ def predict_measurement(
 
 def compute_initial_sd(imu: ImuErrors, clock: ReceiverClock, initial: AlignmentErrors) -> Tensor:
     """Return the standard deviations of the initial errors, [17]."""
-    if imu.gyro_markov > 0.0 or imu.accelerometer_markov > 0.0:
-        raise ValueError(
-            f"model.imu must not have Markov parts, got {imu.gyro_markov_deg_h} deg/h and "
-            f"{imu.accelerometer_markov_ug} ug. Biases are constant in this model. "
-            "Set gyro_markov_deg_h and accelerometer_markov_ug to 0."
-        )
+    require(
+        not imu.gyro_markov > 0.0 and (not imu.accelerometer_markov > 0.0),
+        "model.imu",
+        "not have Markov parts",
+        f"{imu.gyro_markov_deg_h} deg/h and {imu.accelerometer_markov_ug} ug",
+        "Biases are constant in this model. Set gyro_markov_deg_h and accelerometer_markov_ug to 0.",
+    )
     sizes = [imu.gyro_bias] * 3 + [imu.accelerometer_bias] * 3 + [clock.bias_sd, clock.drift_sd]
-    if min(sizes) <= 0.0:
-        raise ValueError(
-            f"model.imu must have positive gyro and accelerometer biases, "
-            f"got {imu.gyro_bias_deg_h} deg/h and {imu.accelerometer_bias_ug} ug. Change them."
-        )
+    require(
+        not min(sizes) <= 0.0,
+        "model.imu",
+        "have positive gyro and accelerometer biases",
+        f"{imu.gyro_bias_deg_h} deg/h and {imu.accelerometer_bias_ug} ug",
+        "Change them.",
+    )
     return torch.cat([initial.sd, torch.tensor(sizes, dtype=torch.float64)])
 
 
@@ -197,11 +200,13 @@ class SinsGnssTight(_TightModel):
         if self.inflation is not None:
             noise = noise + torch.diag(self.inflation.motion.to(noise).square())
         root, ok = factor(noise)
-        if not bool(ok.all()):
-            raise ValueError(
-                f"model.imu must have random walks of both sensors, got {self.imu}. "
-                "Otherwise the noise covariance is singular."
-            )
+        require(
+            bool(ok.all()),
+            "model.imu",
+            "have random walks of both sensors",
+            self.imu,
+            "Otherwise the noise covariance is singular.",
+        )
         return torch.cat([phi, driven @ b * span], -1), root
 
     @staticmethod

@@ -25,6 +25,7 @@ from pfbench.core.parameter_checks import (
     check_positive,
     check_three_positive,
     check_tuning,
+    require,
     require_ranges,
 )
 from pfbench.core.record import EACH_SATELLITE
@@ -128,11 +129,13 @@ class LosNlosRangeError(PseudorangeError):
         require_ranges("model.range_error", self, share="(0, 1)")
         check_positive("model.range_error.sd", self.sd)
         check_positive("model.range_error.tail", self.tail)
-        if not math.isfinite(self.slope):
-            raise ValueError(
-                f"model.range_error.slope must be finite, got {self.slope}. "
-                "Use 0 for the same share at every carrier-to-noise density."
-            )
+        require(
+            math.isfinite(self.slope),
+            "model.range_error.slope",
+            "be finite",
+            self.slope,
+            "Use 0 for the same share at every carrier-to-noise density.",
+        )
 
     @override
     def __call__(self, mean: Tensor, u: UrbanInputs) -> Distribution:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels, fix_channels, name_channels
 from pfbench.nav import earth
@@ -268,23 +269,26 @@ class SarSensor(AidingSensor):
     input_type = InsIntervals
 
     def __post_init__(self) -> None:
-        if len(self.position_sd) != 2:
-            raise ValueError(
-                f"receiver.position_sd must be two standard deviations, "
-                f"got {list(self.position_sd)}. "
-                "Give North and East."
-            )
+        require(
+            len(self.position_sd) == 2,
+            "receiver.position_sd",
+            "be two standard deviations",
+            list(self.position_sd),
+            "Give North and East.",
+        )
         sizes = {
             "heading_sd_deg": [self.heading_sd_deg],
             "position_sd": self.position_sd,
             "height_sd": [self.height_sd],
         }
         for name, values in sizes.items():
-            if not all(value > 0.0 for value in values):
-                raise ValueError(
-                    f"receiver.{name} must be positive, got {list(values)}. "
-                    "Give standard deviations."
-                )
+            require(
+                all(value > 0.0 for value in values),
+                f"receiver.{name}",
+                "be positive",
+                list(values),
+                "Give standard deviations.",
+            )
 
     @property
     def sd(self) -> Tensor:

@@ -216,6 +216,4 @@ def _draw_constant(purpose: str, size: float, randomise: bool, draws: RandomStre
 
 
 def _apply_misalignment(increments: Tensor, m: Matrix) -> Tensor:
-    if m == _ZERO:
-        return increments
-    return increments + increments @ increments.new_tensor(m).T
+    return increments if m == _ZERO else increments + increments @ increments.new_tensor(m).T

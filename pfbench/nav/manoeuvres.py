@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.nav.trajectory import (
     NODES,
     MotionProfile,
@@ -237,11 +237,13 @@ class _Ramp(ABC):
     change: float
 
     def __post_init__(self) -> None:
-        if not self.end_s > self.start_s:
-            raise ValueError(
-                f"end_s must be later than start_s = {self.start_s}, got {self.end_s}. "
-                "Change one of them."
-            )
+        require(
+            self.end_s > self.start_s,
+            "end_s",
+            f"be later than start_s = {self.start_s}",
+            self.end_s,
+            "Change one of them.",
+        )
 
     @abstractmethod
     def evaluate(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -311,20 +313,24 @@ class RampTrajectory(TrajectorySource):
     climb_rate_changes: Sequence[_Ramp] = ()
 
     def __post_init__(self) -> None:
-        if self.climb_deg and self.climb_rate_changes:
-            raise ValueError(
-                "trajectory.climb_deg and trajectory.climb_rate_changes must not both be set, "
-                "got both. Give one of them."
-            )
+        require(
+            not self.climb_deg or not self.climb_rate_changes,
+            "trajectory.climb_deg and trajectory.climb_rate_changes",
+            "not both be set",
+            "both",
+            "Give one of them.",
+        )
 
     @override
     def generate(self, rate: float) -> TrajectoryData:
         n = round(self.duration_s * rate)
-        if n < 1 or abs(n - self.duration_s * rate) > 1e-6:
-            raise ValueError(
-                f"trajectory.duration_s must be a whole number of samples at rate={rate}, "
-                f"got {self.duration_s}. Change it."
-            )
+        require(
+            not n < 1 and (not abs(n - self.duration_s * rate) > 1e-06),
+            "trajectory.duration_s",
+            f"be a whole number of samples at rate={rate}",
+            self.duration_s,
+            "Change it.",
+        )
         for ramp in (*self.speed, *self.climb_deg, *self.heading_deg, *self.climb_rate_changes):
             if isinstance(ramp, CosineRamp):
                 _check_on_samples(ramp, self.duration_s, rate)

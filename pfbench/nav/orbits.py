@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require
 from pfbench.nav import earth
 
 # --------------------------------------------------------------------------------------------------
@@ -102,16 +103,20 @@ class WalkerConstellation(Constellation):
     argument_deg: float = 40.0
 
     def __post_init__(self) -> None:
-        if min(self.satellites, self.planes) < 1 or self.satellites % self.planes:
-            raise ValueError(
-                f"satellites must be a positive multiple of planes={self.planes}, "
-                f"got {self.satellites}. Give the same number for each plane."
-            )
-        if not self.semi_major_axis > earth.A:
-            raise ValueError(
-                f"semi_major_axis must be more than the Earth's radius {earth.A} m, "
-                f"got {self.semi_major_axis}. Give metres from the centre of the Earth."
-            )
+        require(
+            not min(self.satellites, self.planes) < 1 and (not self.satellites % self.planes),
+            "satellites",
+            f"be a positive multiple of planes={self.planes}",
+            self.satellites,
+            "Give the same number for each plane.",
+        )
+        require(
+            self.semi_major_axis > earth.A,
+            "semi_major_axis",
+            f"be more than the Earth's radius {earth.A} m",
+            self.semi_major_axis,
+            "Give metres from the centre of the Earth.",
+        )
 
     @property
     @override

@@ -127,17 +127,21 @@ class _State(NamedTuple):
 
 def _check_samples(n: int, n_dv: int, per_interval: int, per_step: int) -> None:
     """Raise ValueError unless the numbers of samples divide."""
-    if n != n_dv:
-        raise ValueError(
-            f"dtheta and dv must have the same number of samples, got {n} and {n_dv}. "
-            "Give one of each per sample."
-        )
+    require(
+        n == n_dv,
+        "dtheta and dv",
+        "have the same number of samples",
+        f"{n} and {n_dv}",
+        "Give one of each per sample.",
+    )
     require(per_step in (1, 2), "samples_per_step", "be 1 or 2", per_step)
-    if per_interval < 1 or per_interval % per_step:
-        raise ValueError(
-            f"samples_per_interval must be a positive multiple of samples_per_step={per_step}, "
-            f"got {per_interval}. Choose an even number of samples, or samples_per_step=1."
-        )
+    require(
+        not per_interval < 1 and (not per_interval % per_step),
+        "samples_per_interval",
+        f"be a positive multiple of samples_per_step={per_step}",
+        per_interval,
+        "Choose an even number of samples, or samples_per_step=1.",
+    )
     if n < 1 or n % per_interval:
         raise ValueError(
             f"the number of samples must be a multiple of samples_per_interval={per_interval}, "

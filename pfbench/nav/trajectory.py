@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.nav import attitude, earth
 
 G_TURN = 9.80665  # gravity of a coordinated turn [m/s^2], constant, independent of position
@@ -287,10 +287,13 @@ class MotionSpline(TrajectorySource):
         require_ranges("trajectory", self, **dict.fromkeys(names, "(0, inf]"))
         time = self.recorded.time
         step = time.diff()
-        if len(time) < 2 or not bool((step > 0.0).all()):
-            raise ValueError(
-                f"recorded times must increase, got {len(time)} rows. Sort at least 2 rows by time."
-            )
+        require(
+            not len(time) < 2 and bool((step > 0.0).all()),
+            "recorded times",
+            "increase",
+            f"{len(time)} rows",
+            "Sort at least 2 rows by time.",
+        )
         i = int(step.argmax())
         # splines need two instants between knots
         if float(step[i]) > 0.5 * self.knot_interval_s + 1e-9:
@@ -308,11 +311,13 @@ class MotionSpline(TrajectorySource):
     @override
     def generate(self, rate: float) -> TrajectoryData:
         samples = self.use_full_log * rate
-        if abs(samples - round(samples)) > 1e-6 or round(samples) < 1:
-            raise ValueError(
-                f"trajectory.use_full_log must be a whole number of samples at rate={rate}, "
-                f"got {self.use_full_log} ({samples:g} samples). Change it."
-            )
+        require(
+            not abs(samples - round(samples)) > 1e-06 and (not round(samples) < 1),
+            "trajectory.use_full_log",
+            f"be a whole number of samples at rate={rate}",
+            f"{self.use_full_log} ({samples:g} samples)",
+            "Change it.",
+        )
         start = float(self.recorded.time[0])
         n = int((float(self.recorded.time[-1]) - start) / self.use_full_log + 1e-6) * round(samples)
         steps = torch.arange(n + 1, dtype=torch.float64)

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, Laplace, Normal, StudentT, constraints
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
 
@@ -344,21 +344,26 @@ class AddedErrors(NoiseRegime):
         require_ranges(
             "noise", self, sd_m="[0, inf]", probability="[0, 1]", outlier_sd_m="[0, inf]"
         )
-        if not (self.sd_m or self.probability * self.outlier_sd_m):
-            raise ValueError(
-                "noise must add errors, got sd_m, probability or outlier_sd_m of 0. Set noise.sd_m, or both others."
-            )
+        require(
+            self.sd_m or self.probability * self.outlier_sd_m,
+            "noise",
+            "add errors",
+            "sd_m, probability or outlier_sd_m of 0",
+            "Set noise.sd_m, or both others.",
+        )
 
     @override
     def draw_errors(
         self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
     ) -> Tensor:
         kind = next((kind for kind in ("position", "range") if kind in channels.kind), None)
-        if kind is None:
-            raise ValueError(
-                "noise must add metres to positions or ranges, got a scenario without both. "
-                "Choose a regime in standard deviations, such as noise=outliers."
-            )
+        require(
+            kind is not None,
+            "noise",
+            "add metres to positions or ranges",
+            "a scenario without both",
+            "Choose a regime in standard deviations, such as noise=outliers.",
+        )
         is_changed = torch.tensor([k == kind for k in channels.kind])
         sources, source = torch.unique(torch.tensor(channels.source), return_inverse=True)
         t, k = len(time), len(channels.sd)

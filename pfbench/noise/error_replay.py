@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
 from pfbench.files.limits import find_input
@@ -115,11 +115,13 @@ class ErrorReplay(NoiseRegime):
                 f"to the folder that contains {self.folder}/."
             )
         path = self.input_files()[0]
-        if not path.is_file():
-            raise ValueError(
-                f"data.root must be the folder that contains {self.folder}/, got {self.root}. "
-                f"The file {path} does not exist."
-            )
+        require(
+            path.is_file(),
+            "data.root",
+            f"be the folder that contains {self.folder}/",
+            self.root,
+            f"The file {path} does not exist.",
+        )
         check_parquet(path)
         table = pd.read_parquet(path)
         columns = ["utc_s", *_TRUTH, *_RECEIVER]
@@ -143,21 +145,25 @@ class ErrorReplay(NoiseRegime):
             if len(error) >= need
             else np.array([], int)
         )
-        if len(starts) == 0:
-            raise ValueError(
-                f"noise.block_length_s must be shorter than the longest section without a gap, "
-                f"got {self.block_length_s}, which needs {need} s. Give shorter blocks."
-            )
+        require(
+            len(starts) != 0,
+            "noise.block_length_s",
+            "be shorter than the longest section without a gap",
+            f"{self.block_length_s}, which needs {need} s",
+            "Give shorter blocks.",
+        )
         return starts
 
     def _replayed_axes(self, channels: MeasurementChannels) -> Sequence[int | None]:
         """Return the axis of the record that each component replays, or None."""
         positions = "position" in channels.kind
-        if self.absolute_metres and not positions:
-            raise ValueError(
-                "noise.absolute_metres must be false in a scenario without positions, got true. "
-                "Then the errors are scaled."
-            )
+        require(
+            not self.absolute_metres or positions,
+            "noise.absolute_metres",
+            "be false in a scenario without positions",
+            "true",
+            "Then the errors are scaled.",
+        )
         counts: dict[int, int] = {}
         axes: list[int | None] = []
         for kind, source in zip(channels.kind, channels.source, strict=True):

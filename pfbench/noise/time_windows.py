@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import require_range, require_ranges
+from pfbench.core.parameter_checks import require, require_range, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
 from pfbench.noise.base import ErrorDistribution, LayeredRegime, NoiseRegime, NominalNoise
@@ -27,16 +27,20 @@ def check_windows(windows: Windows, span: float | None) -> None:
     last = -math.inf
     for window in windows:
         start, stop = window_edges(window)
-        if not start < stop:
-            raise ValueError(
-                "noise.windows_s must be windows [from, to] in seconds with from < to, "
-                f"got {list(window)}. Exchange or change its times."
-            )
-        if start < last:
-            raise ValueError(
-                f"noise.windows_s must be in order without overlap, got {list(window)}, which "
-                "starts before the previous window ends. Sort or join the windows."
-            )
+        require(
+            start < stop,
+            "noise.windows_s",
+            "be windows [from, to] in seconds with from < to",
+            list(window),
+            "Exchange or change its times.",
+        )
+        require(
+            not start < last,
+            "noise.windows_s",
+            "be in order without overlap",
+            f"{list(window)}, which starts before the previous window ends",
+            "Sort or join the windows.",
+        )
         last = stop
     require_range(
         "noise.reference_duration_s",
@@ -55,12 +59,13 @@ def window_index(windows: Windows, time: Tensor, span: float | None = None) -> T
     index = torch.full_like(time, -1, dtype=torch.int64)
     for k, window in enumerate(windows):
         start, stop = window_edges(window)
-        if start * stretch > end:
-            raise ValueError(
-                f"noise.windows_s must begin before the end of the record at {end:g} s, "
-                f"got {list(window)}. Give an earlier window, or stretch the windows by "
-                "noise.reference_duration_s, the duration for which they are written."
-            )
+        require(
+            not start * stretch > end,
+            "noise.windows_s",
+            f"begin before the end of the record at {end:g} s",
+            list(window),
+            "Give an earlier window, or stretch the windows by noise.reference_duration_s, the duration for which they are written.",
+        )
         index = torch.where((time >= start * stretch) & (time < stop * stretch), k, index)
     return index
 
@@ -111,11 +116,13 @@ class VarianceSurge(NoiseRegime):
             ("process_variance_factors", self.process_variance_factors),
         ):
             valid = all(0.0 < f < float("inf") for f in factors)
-            if len(factors) != len(self.windows_s) or not valid:
-                raise ValueError(
-                    f"noise.{key} must be {len(self.windows_s)} positive factors on the variance, "
-                    f"got {list(factors)}. Give one per window."
-                )
+            require(
+                len(factors) == len(self.windows_s) and valid,
+                f"noise.{key}",
+                f"be {len(self.windows_s)} positive factors on the variance",
+                list(factors),
+                "Give one per window.",
+            )
 
     @override
     def draw_errors(
@@ -234,11 +241,13 @@ class MeasurementOutage(LayeredRegime):
         self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
     ) -> Tensor:
         sources: Sequence[int] = sorted(set(channels.source))
-        if self.visible_sources >= len(sources):
-            raise ValueError(
-                f"noise.visible_sources must be less than the {len(sources)} sources of the scenario, "
-                f"got {self.visible_sources}. Otherwise no source is missing."
-            )
+        require(
+            not self.visible_sources >= len(sources),
+            "noise.visible_sources",
+            f"be less than the {len(sources)} sources of the scenario",
+            self.visible_sources,
+            "Otherwise no source is missing.",
+        )
         affected = torch.tensor(
             [source in sources[self.visible_sources :] for source in channels.source]
         )

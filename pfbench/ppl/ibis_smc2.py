@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from pfbench.core.parameter_checks import require_range
+from pfbench.core.parameter_checks import require, require_range
 from pfbench.core.random_stream import PhiloxStream, RandomStream, relabel
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
@@ -121,11 +121,13 @@ class _ParameterSampler:
             gain = self._log_likelihood(filters.belief) - before
             log_w = self.log_w + gain.nan_to_num(nan=-torch.inf, neginf=-torch.inf)
             total = log_w.logsumexp(0)
-            if not bool(torch.isfinite(total)):
-                raise ValueError(
-                    f"smc2.method must be valid for one particle at step {t}, got none. Use a wider "
-                    "prior or more particles."
-                )
+            require(
+                bool(torch.isfinite(total)),
+                "smc2.method",
+                f"be valid for one particle at step {t}",
+                "none",
+                "Use a wider prior or more particles.",
+            )
             self.log_w, log_evidence = log_w - total, log_evidence + total
             ess = 1.0 / self.log_w.exp().square().sum()
             mean, sd = self._moments()  # before resampling, which increases their variance

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record
@@ -18,14 +19,16 @@ from pfbench.files.command_start import start_work
 from pfbench.filter.belief import Filter
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.model.linear_gaussian import LinearGaussian
-from pfbench.ppl.ibis_smc2 import Smc2Result, smc2
+from pfbench.ppl.ibis_smc2 import smc2
 from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood, MarginalLikelihood
+from pfbench.ppl.noise_job import infer_noise
 from pfbench.ppl.nuts_svi import normal_guide, nuts, svi
 from pfbench.ppl.parameter_posterior import ParameterPosterior
 from pfbench.ppl.parameterised_model import ParameterisedModel, Prior
 from pfbench.ppl.particle_mcmc import pmmh
 from pfbench.ppl.priors import find_range, prior_by_name, prior_by_quantiles
 from pfbench.ppl.pyro_program import program
+from pfbench.results.plotting import FigureSpec, draw_figure
 from pfbench.results.store import compute_config_key, extend_key
 
 _BY_GRADIENT = ("nuts", "svi")
@@ -103,12 +106,16 @@ def infer(
     path = Path(values["results_dir"]) / values["study"] / "inference" / f"{name}_{key}.json"
     if path.is_file() and not values["overwrite"]:
         return path, json.loads(path.read_text())
-    task = _make_task(values, build)
-    if name in _BY_GRADIENT:
-        _check_gradient(name, task, choices["model"])
-    start_work()
     start = time.perf_counter()
-    posterior, extra = _METHODS[name](task, values["infer"], int(values["seed"]))
+    if name == "noise":
+        draws, weights, extra, figure = infer_noise(values, choices, build)
+        posterior = draw_equally(draws, weights, "importance sampling")
+        drawing = FigureSpec(path.stem, "Prior and posterior of noise numbers.", lambda: figure)
+        picture = draw_figure(drawing, ["svg"])["svg"]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path.with_suffix(".svg"), lambda file: file.write(picture))
+    else:
+        posterior, extra = _draw(name, values, choices, build)
     content = {
         "format": 1,
         "method": name,
@@ -126,6 +133,17 @@ def infer(
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda file: file.write(text.encode()))
     return path, json.loads(text)
+
+
+def _draw(
+    name: str, values: Mapping[str, Any], choices: Mapping[str, str], build: Callable[..., Any]
+) -> tuple[ParameterPosterior, dict[str, Any]]:
+    """Draw by a method from the posterior of the parameters that the configuration names."""
+    task = _make_task(values, build)
+    if name in _BY_GRADIENT:
+        _check_gradient(name, task, choices["model"])
+    start_work()
+    return _METHODS[name](task, values["infer"], int(values["seed"]))
 
 
 def _make_task(values: Mapping[str, Any], build: Callable[..., Any]) -> InferenceTask:
@@ -149,11 +167,13 @@ def _check_gradient(name: str, task: InferenceTask, model: str) -> None:
     if likelihood.requires_grad:
         gradients = torch.autograd.grad(likelihood.sum(), list(values.values()), allow_unused=True)
         missing = [k for k, g in zip(values, gradients, strict=True) if g is None or not g.any()]
-    if missing:
-        raise ValueError(
-            f"method={name} must have a likelihood with a gradient, got model={model}, whose {', '.join(missing)} "
-            "has none with this filter. Use filter=ekf and a model of tensors, or method=pmmh, which needs no gradient."
-        )
+    require(
+        not missing,
+        f"method={name}",
+        "have a likelihood with a gradient",
+        f"model={model}, whose {', '.join(missing)} has none with this filter",
+        "Use filter=ekf and a model of tensors, or method=pmmh, which needs no gradient.",
+    )
 
 
 def choose_likelihood(task: InferenceTask) -> MarginalLikelihood:
@@ -200,16 +220,16 @@ def _infer_by_smc2(
     counts = {"particles": settings["values"], "moves": settings["moves"]}
     result = smc2(task.unknown, task.method, task.record, seed=seed, **counts)
     extra = {"log_evidence": float(result.log_evidence[-1]), "ess": float(result.ess[-1])}
-    return draw_equally(result), extra
+    return draw_equally(result.values, result.weights, "SMC2"), extra
 
 
-def draw_equally(result: Smc2Result) -> ParameterPosterior:
-    """Resample the weighted values at equal quantiles, so that all have the same weight: as many as there are."""
-    count = len(result.weights)
+def draw_equally(values: Mapping[str, Tensor], weights: Tensor, method: str) -> ParameterPosterior:
+    """Resample weighted values at equal quantiles, so that all have the same weight: as many as there are."""
+    count = len(weights)
     levels = (torch.arange(count, dtype=torch.float64) + 0.5) / count
-    indices = torch.searchsorted(result.weights.cumsum(0), levels).clamp(max=count - 1)
-    draws = {key: value[indices].unsqueeze(0) for key, value in result.values.items()}
-    return ParameterPosterior(draws, method="SMC2")
+    indices = torch.searchsorted(weights.cumsum(0), levels).clamp(max=count - 1)
+    draws = {key: value[indices].unsqueeze(0) for key, value in values.items()}
+    return ParameterPosterior(draws, method=method)
 
 
 _METHODS = {

@@ -15,6 +15,7 @@ from torch.utils._pytree import tree_map
 from typing_extensions import override
 
 from pfbench.core.density import dense_normal, independent_normal
+from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record, map_inputs
 from pfbench.model.base import ModelWrapper, StateSpaceModel
 
@@ -164,16 +165,20 @@ def _differing(models: Sequence[StateSpaceModel]) -> dict[str, Tensor]:
     """Return buffers that differ between models, stacked [len(models), ...]."""
     first, kind = models[0], type(models[0]).__name__
     for model in models[1:]:
-        if not torch.equal(first.origin, model.origin):
-            raise ValueError(
-                f"{kind} must have one origin in a batch of models, got different ones. Put the "
-                "difference into the initial distribution."
-            )
-        if not _same_distribution(first.noise, model.noise):
-            raise ValueError(
-                f"{kind} must have one noise distribution in a batch of models, got different "
-                "ones. Scale the noise inside `propagate`."
-            )
+        require(
+            torch.equal(first.origin, model.origin),
+            kind,
+            "have one origin in a batch of models",
+            "different ones",
+            "Put the difference into the initial distribution.",
+        )
+        require(
+            _same_distribution(first.noise, model.noise),
+            kind,
+            "have one noise distribution in a batch of models",
+            "different ones",
+            "Scale the noise inside `propagate`.",
+        )
     names = [name for name, _ in first.named_buffers()]
     stacked = {name: [dict(model.named_buffers())[name] for model in models] for name in names}
     differing = {name: torch.stack(v) for name, v in stacked.items() if not _all_same(v)}

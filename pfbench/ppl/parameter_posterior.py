@@ -15,6 +15,7 @@ from pyro.ops.stats import effective_sample_size, hpdi, split_gelman_rubin
 from scipy.stats import binom, chisquare, gaussian_kde
 from torch import Tensor
 
+from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record
 from pfbench.ppl.parameterised_model import ParameterisedModel, check_counts, check_kinds
 from pfbench.ppl.pyro_program import simulate
@@ -259,11 +260,13 @@ class SbcRanks(NamedTuple):
             ValueError: If the bins do not divide the ranks evenly.
         """
         ranks = self.draws + 1
-        if ranks % bins:
-            raise ValueError(
-                f"bins must divide {ranks}, the number of ranks of {self.draws} draws, got {bins}. "
-                "Change bins or draws."
-            )
+        require(
+            not ranks % bins,
+            "bins",
+            f"divide {ranks}, the number of ranks of {self.draws} draws",
+            bins,
+            "Change bins or draws.",
+        )
         return torch.bincount(self.ranks[name] * bins // ranks, minlength=bins).numpy()
 
 

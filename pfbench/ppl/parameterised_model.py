@@ -8,10 +8,10 @@ from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
-from torch.distributions import Distribution, Independent, biject_to
+from torch.distributions import Independent, biject_to
 
 from pfbench.core.parameter_checks import require, require_range
-from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.simulate import draw_values
 from pfbench.model.base import StateSpaceModel
 from pfbench.ppl.model_batch import ModelBatch, list_non_buffers
@@ -120,7 +120,7 @@ class ParameterisedModel:
         """
         stream, use = PhiloxStream(seed, torch.arange(count)), f"prior{attempt or ''}"
         return {
-            name: draw_values(_as_event(distribution), stream, f"{use}.{name}", 1)[:, 0, 0].double()
+            name: draw_prior(distribution, stream, f"{use}.{name}", 1)[:, 0]
             for name, distribution in self.prior.items()
         }
 
@@ -161,13 +161,7 @@ class ParameterisedModel:
         Returns:
             Parameters by name, [...], and log prior density of z, [...].
         """
-        values, log_prior = {}, torch.zeros_like(z[..., 0])
-        for (name, distribution), column in zip(self.prior.items(), z.unbind(-1), strict=True):
-            to_support = biject_to(distribution.support)
-            values[name] = to_support(column)
-            log_det = to_support.log_abs_det_jacobian(column, values[name])
-            log_prior = log_prior + distribution.log_prob(values[name]) + log_det
-        return values, log_prior
+        return constrain(self.prior, z)
 
     def unconstrained(self, values: Mapping[str, Tensor]) -> Tensor:
         """Map parameters to unconstrained numbers [..., P]; the inverse of `constrained`."""
@@ -175,9 +169,21 @@ class ParameterisedModel:
         return torch.stack(columns, -1)
 
 
-def _as_event(distribution: Prior) -> Distribution:
-    """Return a scalar distribution as one with event [1]."""
-    return Independent(distribution.expand(torch.Size((1,))), 1)
+def constrain(prior: Mapping[str, Prior], z: Tensor) -> tuple[Values, Tensor]:
+    """Map unconstrained numbers [..., P] to values of a prior by name, and return the log prior density of z, [...]."""
+    values, log_prior = {}, torch.zeros_like(z[..., 0])
+    for (name, distribution), column in zip(prior.items(), z.unbind(-1), strict=True):
+        to_support = biject_to(distribution.support)
+        values[name] = to_support(column)
+        log_det = to_support.log_abs_det_jacobian(column, values[name])
+        log_prior = log_prior + distribution.log_prob(values[name]) + log_det
+    return values, log_prior
+
+
+def draw_prior(distribution: Prior, stream: RandomStream, use: str, n: int) -> Tensor:
+    """Draw n values of a scalar distribution for each run of a stream, [R, n]."""
+    event = Independent(distribution.expand(torch.Size((1,))), 1)
+    return draw_values(event, stream, use, n)[..., 0].double()
 
 
 # --------------------------------------------------------------------------------------------------

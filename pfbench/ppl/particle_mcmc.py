@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from pfbench.core.parameter_checks import require_range
+from pfbench.core.parameter_checks import require, require_range
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
@@ -107,11 +107,13 @@ def pmmh(
     check_counts("pmmh", counts)
     start = unknown
     if settings.start is not None:
-        if set(settings.start) != set(unknown.names):
-            raise ValueError(
-                f"pmmh.start must have a distribution for each of {sorted(unknown.names)}, got "
-                f"{sorted(settings.start)}. Name the same parameters."
-            )
+        require(
+            set(settings.start) == set(unknown.names),
+            "pmmh.start",
+            f"have a distribution for each of {sorted(unknown.names)}",
+            sorted(settings.start),
+            "Name the same parameters.",
+        )
         distributions = {name: settings.start[name] for name in unknown.names}
         start = ParameterisedModel(unknown.make, distributions)
     target = PosteriorEstimator(

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record, iterate_steps
 from pfbench.core.simulate import draw_initial_state, draw_measurements, simulate_steps
@@ -84,11 +85,13 @@ def latent_program(unknown: ParameterisedModel) -> Callable[[Record], Values]:
         ValueError: If a parameter has the name of a site.
     """
     reserved = {"initial_state", "driving_noise", "path", "seen"} & set(unknown.prior)
-    if reserved:
-        raise ValueError(
-            f"prior must not use the names of path sites, got {sorted(reserved)}. Rename these "
-            "parameters."
-        )
+    require(
+        not reserved,
+        "prior",
+        "not use the names of path sites",
+        sorted(reserved),
+        "Rename these parameters.",
+    )
 
     def run(record: Record) -> Values:
         values = _sample_prior(unknown)

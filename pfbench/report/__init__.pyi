@@ -1,10 +1,10 @@
 """Public names of `pfbench.report` and the modules that define them."""
 
-from pfbench.report.board.entries import cell_entries as cell_entries
-from pfbench.report.board.pack import (
+from pfbench.report.board.entries import (
     StudyFacts as StudyFacts,
-    decide_parts as decide_parts,
+    cell_entries as cell_entries,
 )
+from pfbench.report.board.pack import decide_parts as decide_parts
 from pfbench.report.journal.figure_style import find_page_format as find_page_format
 from pfbench.report.journal.ratio_figures import (
     is_equal_drawing as is_equal_drawing,

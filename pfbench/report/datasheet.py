@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,14 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import scenario_figures, writers
+from pfbench.report.page_kit import Block, render_blocks, with_heading
 from pfbench.report.writers import format_number
 from pfbench.results import status, store
 from pfbench.results.conditions import component_groups
 from pfbench.results.plotting import FigureSpec, format_slug
-
-_Figure = tuple[str, str, Callable[[store.JobResult], Figure]]  # name, caption, plot
 
 
 def write_datasheet(
@@ -32,91 +32,94 @@ def write_datasheet(
     Returns path of index.html.
     """
     sheet = store.read_result(file)
-    if "residual" not in sheet.data:
-        raise ValueError(
-            f"file must be a datasheet, got the job {file}. "
-            "Create one with: pfbench datasheet scenario=NAME"
-        )
+    require(
+        "residual" in sheet.data,
+        "file",
+        "be a datasheet",
+        f"the job {file}",
+        "Create one with: pfbench datasheet scenario=NAME",
+    )
     choices = sheet.meta["choices"]
+    title = f"{choices['scenario']} / {choices['noise']}"
     name = format_slug(f"{choices['scenario']}_{choices['noise']}")
     tables = {"residuals": whiteness_table(sheet), "spread": spread_table(sheet)}
-    context = {
-        "name": f"{choices['scenario']} / {choices['noise']}",
-        "meta": sheet.meta,
-        "facts": list_facts(sheet),
-        "missing": list_missing_figures(sheet),
-        **tables,
-        "settings": json.dumps(sheet.meta["config"]["scenario"], indent=1),
-    }
     with RecordedFolder(Path(out) / "datasheets" / name) as folder:
-        context["drawings"] = writers.write_figures(datasheet_figures(sheet), name, folder, formats)
+        drawings = writers.write_figures(datasheet_figures(sheet), name, folder, formats)
         for stem, table in tables.items():
             if len(table):
                 writers.write_table(folder, stem, table)
-        return writers.render_template("datasheet", folder, context)
+        pages = render_blocks(f"{title}: datasheet", list_blocks(title, sheet, drawings, tables))
+        for file_name, page in pages.items():
+            folder.write(file_name, page)
+        return folder.path / "index.html"
+
+
+def list_blocks(
+    title: str,
+    sheet: store.JobResult,
+    drawings: Sequence[Mapping[str, Any]],
+    tables: Mapping[str, pd.DataFrame],
+) -> list[Block]:
+    """List the blocks of the page."""
+    meta, versions, seconds = sheet.meta, sheet.meta["versions"], sheet.meta["seconds"]
+    last = meta["first_run"] + meta["runs"] - 1
+    return [
+        Block("title", title),
+        Block("text", f"Datasheet of a scenario: properties of its data, independent of filters. {meta.get('about') or ''}".rstrip()),
+        *with_heading(Block("heading", "Summary"), Block("list", list_facts(sheet))),
+        *with_heading(Block("heading", "Figures"), Block("figures", drawings)),
+        *with_heading(Block("part", "Missing figures"), Block("list", list_missing_figures(sheet))),
+        *with_heading(
+            Block("heading", "Residuals at the true state"), Block("table", tables["residuals"]),
+            Block("note", "The intervals contain an estimate with probability 95 % if the residuals are normal, white and independent with "
+                  "the variance of the model. The lag counts steps with a measurement."),
+        ),
+        *with_heading(
+            Block("heading", "Spread of the runs"), Block("table", tables["spread"]),
+            Block("note", "Standard deviation over runs of the norm of a group, at the first, middle and last step with truth."),
+        ),
+        Block("heading", "Provenance"),
+        Block("terms", [
+            ("scenario, noise, model", ", ".join(meta["choices"][key] for key in ("scenario", "noise", "model"))),
+            ("seed, runs", f"{meta['seed']}, {meta['first_run']} to {last}"),
+            ("pfbench, commit", f"{versions['pfbench']}, {versions.get('commit') or versions.get('build') or 'not recorded'}"),
+            ("time [s]", f"{format_number(seconds['world'])} for the data, {format_number(seconds['measures'])} for the datasheet"),
+        ]),
+        *with_heading(Block("part", "Modelling choices"), Block("list", meta.get("modelling_choices", ()))),
+        Block("code", json.dumps(meta["config"]["scenario"], indent=1), "Settings of the scenario"),
+    ]  # fmt: skip
 
 
 def datasheet_figures(sheet: store.JobResult) -> list[FigureSpec]:
     """List the figures that the data of the scenario allow."""
-    rows = (*_truth_figures(sheet), *_measurement_figures(sheet), *_statistics_figures(sheet))
-    return [FigureSpec(name, caption, partial(make, sheet)) for name, caption, make in rows]
-
-
-def _truth_figures(sheet: store.JobResult) -> Iterator[_Figure]:
-    """Yield the figures of track, range and inertial sensors."""
-    data = sheet.data
-    if "track" in data:
-        has_others = len(scenario_figures.select_tracks(data["track"])) > 1
-        others = " and of the other runs (grey)" if has_others else ""
-        text = f"True track of the first run{others}: plan view and height above the start."
-        yield "track", text, scenario_figures.plot_scenario_track
-    if "range" in data:
-        text = "Horizontal range from the observer to the target."
-        yield "range", text, scenario_figures.plot_distance
-    if "force" in data and "rate" in data:
-        text = (
-            "Specific force and angular rate in body axes, mean over each step. "
-            "Simulated scenarios show true values, recorded scenarios the IMU of the first run."
-        )
-        yield "sensors", text, scenario_figures.plot_sensors
-
-
-def _measurement_figures(sheet: store.JobResult) -> Iterator[_Figure]:
-    """Yield the figures of the satellites and of the number of measurements."""
-    has_satellites = "azimuth" in sheet.data
-    if has_satellites:
-        text = (
-            "Satellites above the horizon of the first run, zenith in the centre. "
-            "Arrows show the direction of motion."
-        )
-        yield "sky", text, scenario_figures.plot_sky
-    if has_satellites or not (sheet.data["seen"] == 1).all():
-        text = (
-            f"Number of {'satellites and of ' if has_satellites else ''}observed measurement "
-            "components over time, mean over runs."
-        )
-        yield "seen", text, scenario_figures.plot_measurements
-
-
-def _statistics_figures(sheet: store.JobResult) -> Iterator[_Figure]:
-    """Yield the figures of the residuals and of the spread of the runs."""
-    if scenario_figures.group_residuals(sheet):
-        text = (
-            "Residuals at the true state, in standard deviations of the model, and the standard "
-            "normal density. The outermost bins include all larger values."
-        )
-        yield "residuals", text, scenario_figures.plot_residuals
-        text = "Residuals of the first run over time, with lines at two standard deviations."
-        yield "residuals_time", text, scenario_figures.plot_residuals_over_time
-    if sheet.meta["runs"] > 1 and scenario_figures.compute_spreads(sheet):
-        text = "Spread of the true states over the runs (standard deviation of the norm)"
-        if "pcrb" in sheet.data:
-            text += (
-                ", and the posterior Cramér-Rao bound (PCRB), a lower bound of the root mean "
-                "square error. The bound exceeds the spread if the initial distribution of the "
-                "filters is wider than that of the scenario"
-            )
-        yield "spread", f"{text}.", scenario_figures.plot_error_spread
+    data, has_satellites = sheet.data, "azimuth" in sheet.data
+    tracks = scenario_figures.select_tracks(data["track"]) if "track" in data else ()
+    others = " and of the other runs (grey)" if len(tracks) > 1 else ""
+    has_residuals = bool(scenario_figures.group_residuals(sheet))
+    has_spread = sheet.meta["runs"] > 1 and bool(scenario_figures.compute_spreads(sheet))
+    bound = (
+        ", and the posterior Cramér-Rao bound (PCRB), a lower bound of the root mean "
+        "square error. The bound exceeds the spread if the initial distribution of the "
+        "filters is wider than that of the scenario"
+    )
+    rows: tuple[tuple[bool, str, str, Callable[[store.JobResult], Figure]], ...] = (
+        ("track" in data, "track", f"True track of the first run{others}: plan view and height above the start.",
+         scenario_figures.plot_scenario_track),
+        ("range" in data, "range", "Horizontal range from the observer to the target.", scenario_figures.plot_distance),
+        ("force" in data and "rate" in data, "sensors", "Specific force and angular rate in body axes, mean over each step. "
+         "Simulated scenarios show true values, recorded scenarios the IMU of the first run.", scenario_figures.plot_sensors),
+        (has_satellites, "sky", "Satellites above the horizon of the first run, zenith in the centre. Arrows show the direction of motion.",
+         scenario_figures.plot_sky),
+        (has_satellites or not (data["seen"] == 1).all(), "seen", f"Number of {'satellites and of ' if has_satellites else ''}observed "
+         "measurement components over time, mean over runs.", scenario_figures.plot_measurements),
+        (has_residuals, "residuals", "Residuals at the true state, in standard deviations of the model, and the standard "
+         "normal density. The outermost bins include all larger values.", scenario_figures.plot_residuals),
+        (has_residuals, "residuals_time", "Residuals of the first run over time, with lines at two standard deviations.",
+         scenario_figures.plot_residuals_over_time),
+        (has_spread, "spread", f"Spread of the true states over the runs (standard deviation of the norm){bound if 'pcrb' in data else ''}.",
+         scenario_figures.plot_error_spread),
+    )  # fmt: skip
+    return [FigureSpec(name, text, partial(make, sheet)) for is_there, name, text, make in rows if is_there]  # fmt: skip
 
 
 def list_facts(sheet: store.JobResult) -> list[str]:
@@ -159,41 +162,28 @@ def _describe_track(track: np.ndarray) -> str:
 
 def list_missing_figures(sheet: store.JobResult) -> list[str]:
     """List the missing figures with their reasons."""
-    a, meta = sheet.data, sheet.meta
-    reasons = []
-    if "track" not in a:
-        reasons.append("Track: the scenario does not use map coordinates.")
-    if "force" not in a:
-        reasons.append("Specific force and rates: not available in this scenario.")
-    if "azimuth" not in a:
-        reasons.append("Satellites: their directions are not available in this scenario.")
-    unknown = np.isnan(a["residual"]).all((0, 1)) & (a["seen"] > 0).any(0)
-    if unknown.any():
-        kinds = ", ".join(
-            f"{kind} ({n} of {meta['kinds'].count(kind)})"
-            for kind, n in _count_kinds(meta["kinds"], unknown).items()
-        )
-        reasons.append(f"Residuals of {kinds}: they depend on states without truth.")
-    if meta["runs"] < 2:
-        reasons.append("Spread: runs must be at least 2, got 1. Set runs=20.")
-    unknown_groups = [
-        block.group
-        for block in component_groups(meta["state"])
-        if np.isnan(a["error"][..., block.places]).all()
-    ]
-    if unknown_groups:
-        reasons.append(f"Spread of {', '.join(unknown_groups)}: the truth is not available.")
-    others = [
-        block for block in component_groups(meta["state"]) if block.group not in unknown_groups
-    ]
+    data, meta, groups = sheet.data, sheet.meta, component_groups(sheet.meta["state"])
+    unseen = np.isnan(data["residual"]).all((0, 1)) & (data["seen"] > 0).any(0)
+    flagged = [kind for kind, flag in zip(meta["kinds"], unseen, strict=True) if flag]
+    kinds = ", ".join(
+        f"{kind} ({flagged.count(kind)} of {meta['kinds'].count(kind)})"
+        for kind in dict.fromkeys(flagged)
+    )
+    unknown = [g.group for g in groups if np.isnan(data["error"][..., g.places]).all()]
     constant = [
-        block.group
-        for block in others
-        if not scenario_figures.compute_deviation(a, block.places).any()
-    ]
-    if constant and meta["runs"] > 1:
-        reasons.append(f"Spread of {', '.join(constant)}: equal in all runs.")
-    return reasons
+        g.group for g in groups
+        if g.group not in unknown and not scenario_figures.compute_deviation(data, g.places).any()
+    ]  # fmt: skip
+    reasons = (
+        ("track" not in data, "Track: the scenario does not use map coordinates."),
+        ("force" not in data, "Specific force and rates: not available in this scenario."),
+        ("azimuth" not in data, "Satellites: their directions are not available in this scenario."),
+        (bool(kinds), f"Residuals of {kinds}: they depend on states without truth."),
+        (meta["runs"] < 2, "Spread: runs must be at least 2, got 1. Set runs=20."),
+        (bool(unknown), f"Spread of {', '.join(unknown)}: the truth is not available."),
+        (bool(constant) and meta["runs"] > 1, f"Spread of {', '.join(constant)}: equal in all runs."),
+    )  # fmt: skip
+    return [text for is_so, text in reasons if is_so]
 
 
 def whiteness_table(sheet: store.JobResult) -> pd.DataFrame:
@@ -224,9 +214,3 @@ def spread_table(sheet: store.JobResult) -> pd.DataFrame:
                 row[f"PCRB, {name} step"] = float(bound[t])
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def _count_kinds(kinds: Sequence[str], flags: np.ndarray) -> dict[str, int]:
-    """Count the flagged components of each kind."""
-    flagged = [kind for kind, flag in zip(kinds, flags, strict=True) if flag]
-    return {kind: flagged.count(kind) for kind in dict.fromkeys(flagged)}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from types import SimpleNamespace
 from typing import Any
 
 from pfbench.report.journal.study_pack import Pack
@@ -13,6 +13,7 @@ from pfbench.results.conditions import Condition
 from pfbench.results.looks import count_tuned, describe_tuning, study_looks, study_part_names
 from pfbench.results.status import divergence_threshold, scenario_family
 from pfbench.results.step_times import STEP_TIME
+from pfbench.stats.sentences import format_count
 
 # --------------------------------------------------------------------------------------------------
 # Facts of a study from which its methods paragraph is written: numbers, words and lists, computed once.
@@ -24,65 +25,37 @@ _VERSIONS = ("pfbench", "commit", "python", "torch", "numpy")
 _PLACES = ("dtype", "device", "threads")
 
 
-@dataclass(frozen=True)
-class MethodsFacts:
-    """Facts of a methods paragraph.
+FACTS = {
+    "filters": "number of filters",
+    "scenarios": "names of the scenarios",
+    "worlds": "number of worlds; scenarios of one trajectory are one world",
+    "regimes": "names of the noise regimes",
+    "runs": "numbers of runs of a job, ascending",
+    "steps": "numbers of steps of a run, ascending",
+    "seeds": "seeds, ascending",
+    "particles": "numbers of particles of each particle filter, by label",
+    "budgets": "budgets of the jobs, such as `store.SAME_N`",
+    "metric": "name of the metric that decides",
+    "alpha": "level of the families of tests",
+    "margin": "relative margin of equivalence",
+    "rounds": "fewest rounds in which the times of a job were measured; 0 if a job has none",
+    "software": "versions, commit, number type, device and threads; an empty list is unknown",
+    "is_recorded": "whether a scenario reads recorded data",
+    "has_threshold": "whether a scenario states a divergence threshold",
+    "is_complete": "whether each filter was run in each condition",
+    "tuned": "numbers of filters with tuned parameters, by the data on which they were tuned",
+}
 
-    Attributes:
-        filters: Number of filters.
-        scenarios: Names of the scenarios.
-        worlds: Number of worlds; scenarios of one trajectory are one world.
-        regimes: Names of the noise regimes.
-        runs: Numbers of runs of a job, ascending.
-        steps: Numbers of steps of a run, ascending.
-        seeds: Seeds, ascending.
-        particles: Numbers of particles of each particle filter, by label.
-        budgets: Budgets of the jobs, such as `store.SAME_N`.
-        metric: Name of the metric that decides.
-        alpha: Level of the families of tests.
-        margin: Relative margin of equivalence.
-        rounds: Fewest rounds in which the times of a job were measured; 0 if a job has none.
-        software: Versions, commit, number type, device and threads; an empty list is unknown.
-        is_recorded: Whether a scenario reads recorded data.
-        has_threshold: Whether a scenario states a divergence threshold.
-        is_complete: Whether each filter was run in each condition.
-        tuned: Numbers of filters with tuned parameters, by the data on which they were tuned.
-    """
 
-    filters: int
-    scenarios: Sequence[str]
-    worlds: int
-    regimes: Sequence[str]
-    runs: Sequence[int]
-    steps: Sequence[int]
-    seeds: Sequence[int]
-    particles: Mapping[str, Sequence[int]]
-    budgets: Sequence[str]
-    metric: str
-    alpha: float
-    margin: float
-    rounds: int
-    software: Mapping[str, Sequence[str]]
-    is_recorded: bool
-    has_threshold: bool
-    is_complete: bool
-    tuned: Mapping[str, int]
-
-    def to_entries(self) -> dict[str, Any]:
-        """Return plain values, from which `from_entries` restores the facts."""
-        return asdict(self)
-
-    @classmethod
-    def from_entries(cls, entries: object, source: str = "methods") -> MethodsFacts:
-        """Restore the facts of a page."""
-        stored = entries if isinstance(entries, Mapping) else {}
-        names = [field.name for field in fields(cls)]
-        if missing := [name for name in names if name not in stored]:
-            raise ValueError(
-                f"{source} must have all facts of the methods paragraph, got none for "
-                f"{', '.join(missing)}. Run the study and write its report again."
-            )
-        return cls(**{name: stored[name] for name in names})
+def read_facts(entries: object, source: str = "methods") -> SimpleNamespace:
+    """Read the facts of a page; one that lacks a fact is refused."""
+    stored = entries if isinstance(entries, Mapping) else {}
+    if missing := [name for name in FACTS if name not in stored]:
+        raise ValueError(
+            f"{source} must have all facts of the methods paragraph, got none for "
+            f"{', '.join(missing)}. Run the study and write its report again."
+        )
+    return SimpleNamespace(**{name: stored[name] for name in FACTS})
 
 
 def collect_methods_facts(
@@ -91,34 +64,34 @@ def collect_methods_facts(
     alpha: float = 0.05,
     margin: float = 0.05,
     metric: str = "RMS error",
-) -> MethodsFacts:
-    """Collect the facts of a methods paragraph from the results of a study."""
+) -> dict[str, Any]:
+    """Collect the facts of a methods paragraph from the results of a study, see `FACTS`."""
     jobs = [job.meta for condition in conditions for job in condition.jobs]
     labels = [{job.label for job in condition.jobs} for condition in conditions]
     scenarios, regimes = (
         [name.name for name in study_part_names(conditions, group).values()]
         for group in ("scenario", "noise")
     )
-    return MethodsFacts(
-        filters=len(set.union(*labels)),
-        scenarios=scenarios,
-        worlds=len({scenario_family(c.jobs[0].meta, c.scenario) for c in conditions}),
-        regimes=regimes,
-        runs=_list_numbers(job["runs"] for job in jobs),
-        steps=_list_numbers(job["steps"] for job in jobs),
-        seeds=_list_numbers(job["seed"] for job in jobs),
-        particles=_list_particles(conditions),
-        budgets=sorted({str(job["config"].get("budget", store.SAME_N)) for job in jobs}),
-        metric=metric,
-        alpha=alpha,
-        margin=margin,
-        rounds=min(len(job.get(STEP_TIME, {}).get("rounds", ())) for job in jobs),
-        software=_list_software(jobs),
-        is_recorded=any(is_recorded(job) for job in jobs),
-        has_threshold=any(divergence_threshold(job) is not None for job in jobs),
-        is_complete=all(names == set.union(*labels) for names in labels),
-        tuned=count_tuned(study_looks(conditions)),
-    )
+    return {
+        "filters": len(set.union(*labels)),
+        "scenarios": scenarios,
+        "worlds": len({scenario_family(c.jobs[0].meta, c.scenario) for c in conditions}),
+        "regimes": regimes,
+        "runs": _list_numbers(job["runs"] for job in jobs),
+        "steps": _list_numbers(job["steps"] for job in jobs),
+        "seeds": _list_numbers(job["seed"] for job in jobs),
+        "particles": _list_particles(conditions),
+        "budgets": sorted({str(job["config"].get("budget", store.SAME_N)) for job in jobs}),
+        "metric": metric,
+        "alpha": alpha,
+        "margin": margin,
+        "rounds": min(len(job.get(STEP_TIME, {}).get("rounds", ())) for job in jobs),
+        "software": _list_software(jobs),
+        "is_recorded": any(is_recorded(job) for job in jobs),
+        "has_threshold": any(divergence_threshold(job) is not None for job in jobs),
+        "is_complete": all(names == set.union(*labels) for names in labels),
+        "tuned": count_tuned(study_looks(conditions)),
+    }
 
 
 def _list_numbers(values: Iterable[Any]) -> list[int]:
@@ -161,7 +134,7 @@ def write_methods(pack: Pack) -> list[str]:
 
     Returns two paragraphs of plain text: what was done, and what was not done.
     """
-    facts = MethodsFacts.from_entries(pack["methods"])
+    facts = read_facts(pack["methods"])
     names = {str(look["key"]): str(look["name"]) for look in pack["filters"]}
     done = [
         *_describe_design(facts),
@@ -173,51 +146,38 @@ def write_methods(pack: Pack) -> list[str]:
     return [" ".join(done), " ".join(["Not done:", *_list_limits(facts)])]
 
 
-def _list_limits(facts: MethodsFacts) -> list[str]:
+def _list_limits(facts: SimpleNamespace) -> list[str]:
     """List what a study did not do, as sentences."""
-    limits = []
-    if len(facts.seeds) == 1:
-        limits.append(
-            f"one seed ({facts.seeds[0]}) was used, so that no result was repeated with another."
-        )
-    if not facts.is_recorded:
-        limits.append("All worlds are simulated, and no recorded data were used.")
-    if facts.worlds < _FEW_WORLDS:
-        text = "One world says" if facts.worlds == 1 else f"{facts.worlds} worlds say"
-        limits.append(f"{text} little about another world.")
-    if min(facts.runs) < _FEW_RUNS:
-        limits.append(
-            f"{min(facts.runs)} runs per condition are fewer than the {_FEW_RUNS} that tests require."
-        )
-    if set(facts.budgets) == {store.SAME_N}:
-        limits.append(_describe_equal_particles(list(facts.particles.values())))
-    if not facts.has_threshold:
-        limits.append("No divergence threshold is stated, so only numerical failures count.")
-    if not facts.is_complete:
-        limits.append("Not every filter was run in every condition.")
+    worlds = "One world says" if facts.worlds == 1 else f"{facts.worlds} worlds say"
     tuning = describe_tuning(facts.tuned, facts.filters)
-    limits.append(
-        f"{tuning} Parameters of the {'other ' if tuning else ''}filters were not tuned for this comparison unless the paper says so.".lstrip()
-    )
-    if not facts.rounds:
-        limits.append("Times were measured once on a machine that may have been shared.")
-    return limits
+    limits = (
+        (len(facts.seeds) == 1, f"one seed ({facts.seeds[0]}) was used, so that no result was repeated with another."),
+        (not facts.is_recorded, "All worlds are simulated, and no recorded data were used."),
+        (facts.worlds < _FEW_WORLDS, f"{worlds} little about another world."),
+        (min(facts.runs) < _FEW_RUNS, f"{min(facts.runs)} runs per condition are fewer than the {_FEW_RUNS} that tests require."),
+        (set(facts.budgets) == {store.SAME_N}, _describe_equal_particles(list(facts.particles.values()))),
+        (not facts.has_threshold, "No divergence threshold is stated, so only numerical failures count."),
+        (not facts.is_complete, "Not every filter was run in every condition."),
+        (True, f"{tuning} Parameters of the {'other ' if tuning else ''}filters were not tuned for this comparison unless the paper says so.".lstrip()),
+        (not facts.rounds, "Times were measured once on a machine that may have been shared."),
+    )  # fmt: skip
+    return [text for is_so, text in limits if is_so]
 
 
-def _describe_design(facts: MethodsFacts) -> list[str]:
+def _describe_design(facts: SimpleNamespace) -> list[str]:
     """Describe filters, worlds, runs, seed and pairing."""
-    worlds = _count(facts.worlds, "world")
+    worlds = format_count(facts.worlds, "world")
     if len(facts.scenarios) > facts.worlds:
-        worlds = f"{_count(len(facts.scenarios), 'scenario')} of {worlds}"
+        worlds = f"{format_count(len(facts.scenarios), 'scenario')} of {worlds}"
     return [
-        f"This study compares {_count(facts.filters, 'filter')} with pfbench in {worlds} ({'; '.join(facts.scenarios)}) under {_count(len(facts.regimes), 'noise regime')} ({'; '.join(facts.regimes)}), with "
+        f"This study compares {format_count(facts.filters, 'filter')} with pfbench in {worlds} ({'; '.join(facts.scenarios)}) under {format_count(len(facts.regimes), 'noise regime')} ({'; '.join(facts.regimes)}), with "
         f"{_join(facts.runs, 'and')} Monte Carlo runs of {_join(facts.steps, 'and')} steps per condition.",
         "All filters of a condition receive the same truths, measurements and random numbers "
         f"(seed {', '.join(map(str, facts.seeds))}), so that comparisons are paired by run.",
     ]
 
 
-def _describe_particles(facts: MethodsFacts, names: Mapping[str, str]) -> list[str]:
+def _describe_particles(facts: SimpleNamespace, names: Mapping[str, str]) -> list[str]:
     """Describe the numbers of particles, with the names of filters that differ, and the budget."""
     if not facts.particles:
         return []
@@ -248,10 +208,10 @@ def _describe_equal_particles(numbers: Sequence[Sequence[int]]) -> str:
     return f"{text}: particle filters have {kind} numbers of particles."
 
 
-def _describe_decisions(facts: MethodsFacts, pairs: int) -> list[str]:
+def _describe_decisions(facts: SimpleNamespace, pairs: int) -> list[str]:
     """Describe metric, lost runs, intervals, tests and families."""
     level = f"{100 * (1 - facts.alpha):g} %"
-    planned = f"the {_count(pairs, 'planned pair')} and " if pairs else ""
+    planned = f"the {format_count(pairs, 'planned pair')} and " if pairs else ""
     return [
         f"The metric is the {facts.metric} over the time of a run; a run that is lost or diverges is worse than every other one, "
         "and two such runs tie.",
@@ -266,13 +226,13 @@ def _describe_decisions(facts: MethodsFacts, pairs: int) -> list[str]:
     ]
 
 
-def _describe_times(facts: MethodsFacts) -> list[str]:
+def _describe_times(facts: SimpleNamespace) -> list[str]:
     """Describe how times per step were measured in rounds; empty if they were not."""
     text = f"Times per step are medians of {facts.rounds} or more rounds in which the filters took turns."
     return [text] if facts.rounds else []
 
 
-def _describe_software(facts: MethodsFacts) -> list[str]:
+def _describe_software(facts: SimpleNamespace) -> list[str]:
     """Describe versions, commit, number type and device."""
     value = {name: ", ".join(values) or "unknown" for name, values in facts.software.items()}
     threads = f"{value['threads']} thread{'' if value['threads'] == '1' else 's'}"
@@ -280,11 +240,6 @@ def _describe_software(facts: MethodsFacts) -> list[str]:
         f"Software: pfbench {value['pfbench']} ({name_build(value['commit'])}), Python {value['python']}, torch "
         f"{value['torch']}, numpy {value['numpy']}; {value['dtype']} on {value['device']} ({threads}).",
     ]
-
-
-def _count(number: int, noun: str) -> str:
-    """Format a count with its noun."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _join(values: Sequence[object], word: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from pfbench.core.parameter_checks import require
 from pfbench.results.metrics import check_page_metric
 
 _FORMATS = ("svg", "png")
@@ -69,18 +70,28 @@ class ReportOptions:
 
     def __post_init__(self) -> None:
         for key, (requirement, is_valid) in _KINDS.items():
-            if not is_valid(getattr(self, key)):
-                raise ValueError(
-                    f"report.{key} must be {requirement}, got {getattr(self, key)!r}. Leave it out for the default."
-                )
-        check_page_metric(self.metric)
-        if not 0 < self.alpha < 1:
-            raise ValueError(f"report.alpha must be between 0 and 1, got {self.alpha}. Use 0.05.")
-        if not self.equivalence_margin > 0:
-            raise ValueError(
-                f"report.equivalence_margin must be positive, got {self.equivalence_margin}. "
-                "Use 0.05 for 5 %."
+            require(
+                is_valid(getattr(self, key)),
+                f"report.{key}",
+                f"be {requirement}",
+                f"{getattr(self, key)!r}",
+                "Leave it out for the default.",
             )
+        check_page_metric(self.metric)
+        require(
+            0 < self.alpha < 1,
+            "report.alpha",
+            "be between 0 and 1",
+            self.alpha,
+            "Use 0.05.",
+        )
+        require(
+            self.equivalence_margin > 0,
+            "report.equivalence_margin",
+            "be positive",
+            self.equivalence_margin,
+            "Use 0.05 for 5 %.",
+        )
         if not self.figure_formats or set(self.figure_formats) - set(_FORMATS):
             options = ", ".join(_FORMATS)
             raise ValueError(

@@ -17,16 +17,17 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.recorded_folder import describe_missing_runs, find_published_file, list_published
 from pfbench.report.board import build_run_table
-from pfbench.report.board.pack import StudyFacts
+from pfbench.report.board.entries import StudyFacts
 from pfbench.report.overview.figures import HEAT_FORMATS, draw_heat_map
 from pfbench.report.overview.page import choose_level
 from pfbench.report.overview.tables import (
     CENTRAL,
     METRIC,
     World,
-    WorldResult,
+    WorldCell,
     decide_cells,
     has_overview,
     read_world_facts,
@@ -63,7 +64,7 @@ class PublishedComparison(NamedTuple):
     verdicts: Mapping[str, list[Verdict]]
     witnesses: Mapping[str, str]
     left_out: Mapping[str, str]
-    cells: Sequence[WorldResult] = ()
+    cells: Sequence[WorldCell] = ()
     names: Mapping[str, str] = MappingProxyType({})
     particles: int = 0
     study: StoredStudy | None = None
@@ -173,9 +174,18 @@ def compare_with_published(conditions: Sequence[Condition], folder: Path) -> Pub
     if not compared.verdicts:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in compared.left_out.items())
         raise ValueError(
-            f"{folder / RUNS_FILE} must share a world with the study, got none. {reasons}"
+            f"{folder / RUNS_FILE} must share a world with the study, got none. {reasons}. Its worlds, for pfbench.run: "
+            f"{_describe_worlds(study.table)}"
         )
     return compared
+
+
+def _describe_worlds(table: pd.DataFrame) -> str:
+    """List the conditions of stored runs with the settings that a study next to them needs."""
+    return "; ".join(
+        f"{' / '.join(map(str, key[:-1]))} with seed={key[-1]}, up to {rows['run'].nunique()} runs"
+        for key, rows in table.groupby([*_CONDITION, "seed"], observed=True, sort=False)
+    )
 
 
 def compare_tables(table: pd.DataFrame, study: StoredStudy) -> PublishedComparison:
@@ -215,12 +225,12 @@ def _open_worlds(
     labels = {str(v): str(v) for v in table["filter"].unique()}
     court = Court(arrange_runs(table, tuple(labels)), (), fixed_in=pairs)
     names = court.runs.conditions["scenario"]
-    return {name: World(name, "", None, court, (names == name).to_numpy(), labels) for name in pairs}  # fmt: skip
+    return {name: World(name, court, (names == name).to_numpy(), labels) for name in pairs}
 
 
 def _list_cells(
     worlds: Mapping[str, World], pairs: Mapping[str, Sequence[Pair]]
-) -> list[WorldResult]:
+) -> list[WorldCell]:
     """List the own filters against the reference of each world in nominal noise, for the heat map.
 
     A world without a stated reference, or whose reference did not run in the published study, has none.
@@ -232,7 +242,7 @@ def _list_cells(
         against = {a: b for a, b in pairs[name] if facts and parse_label(b)[0] == facts.reference}
         if regime == CENTRAL and against:
             reference = next(iter(against.values()))
-            cells += decide_cells([world._replace(name=scenario, reference=reference)], list(against))  # fmt: skip
+            cells += decide_cells([world._replace(key=scenario, reference=reference)], list(against))  # fmt: skip
     return cells
 
 
@@ -244,13 +254,21 @@ def find_witness(rows: pd.DataFrame, stored: pd.DataFrame) -> str:
     Raises:
         ValueError: If the published study lacks such runs, the two have different filters, or errors differ.
     """
-    if stored.empty:
-        raise ValueError(
-            "its world must be one of the published study, got another. Choose one of its scenarios"
-        )
+    require(
+        not stored.empty,
+        "its world",
+        "be one of the published study",
+        "another",
+        "Choose one of its scenarios",
+    )
     seeds, stored_seeds = set(rows["seed"]), sorted(stored["seed"].unique())
-    if len(seeds) > 1 or not seeds <= set(stored_seeds):
-        raise ValueError(f"its runs must have seed={stored_seeds[0]}, got {sorted(seeds)}. Set it")
+    require(
+        len(seeds) == 1 and seeds <= set(stored_seeds),
+        "its runs",
+        f"have seed={stored_seeds[0]}",
+        sorted(seeds),
+        "Set it",
+    )
     stored = stored[stored["filter"] != _NO_WITNESS]
     both = _pair(rows, stored)
     if both.empty:

@@ -19,10 +19,12 @@ import pandas as pd
 import pyarrow as pa
 from pyarrow import parquet
 
+from pfbench.core.parameter_checks import require
 from pfbench.files import limits
 from pfbench.files.table_file import check_parquet
-from pfbench.report.board.pack import StudyFacts, decide_parts
-from pfbench.report.methods_text import MethodsFacts
+from pfbench.report.board.entries import StudyFacts
+from pfbench.report.board.pack import decide_parts
+from pfbench.report.methods_text import read_facts
 
 RUNS_FILE = "runs.parquet"  #: name of the file with the values of all runs of a study
 _KEY = b"pfbench"  # of the metadata of the file
@@ -99,12 +101,14 @@ def read_stored_study(folder: Path, decides: bool = True) -> StoredStudy:
             f"{path} must be the runs of a study with the data of its page, got {error}. "
             "Run the study and write its report again."
         ) from error
-    if missing:
-        raise ValueError(
-            f"{path} must have runs of all filters of the page, got none of "
-            f"{', '.join(sorted(missing))}. Run the study and write its report again."
-        )
-    MethodsFacts.from_entries(pack.get("methods"), str(path))
+    require(
+        not missing,
+        path,
+        "have runs of all filters of the page",
+        f"none of {', '.join(sorted(missing))}",
+        "Run the study and write its report again.",
+    )
+    read_facts(pack.get("methods"), str(path))
     foreign = [f["file"] for f in pack["paper_figures"] if not _FIGURE.fullmatch(f["file"])]
     if foreign:  # the file may come from a stranger, and the page shows what it names
         raise ValueError(

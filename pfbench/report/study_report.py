@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,8 +13,8 @@ import pandas as pd
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import provenance, provenance as cost, writers
 from pfbench.report.board import build_pack, read_study
-from pfbench.report.board.entries import ViewKey
-from pfbench.report.board.pack import StudyFacts, open_court
+from pfbench.report.board.entries import StudyFacts, ViewKey
+from pfbench.report.board.pack import open_court
 from pfbench.report.board.study_views import DECISION_COLUMNS
 from pfbench.report.journal.ratio_figures import HEADLINE, render_headline
 from pfbench.report.options import ReportOptions
@@ -126,7 +125,7 @@ def rebuild_page(folder: Path) -> Path:
         for entry in pack["paper_figures"]
     ]
     others = {name: (folder / name).read_bytes() for name in _TITLES if (folder / name).is_file()}
-    others |= {f"figures/{path.name}": path.read_bytes() for path in (folder / "figures").glob("paper_*.*")}  # fmt: skip
+    others |= {f"figures/{path.name}": path.read_bytes() for path in (folder / "figures").glob("paper_*.*") if path.is_file()}  # fmt: skip
     with RecordedFolder(folder, is_complete=False) as target:
         return _write_all(target, render_study(pack, table, folder, others))
 
@@ -147,7 +146,7 @@ def render_study(
     pack["headline"] = "Error of each filter relative to the baseline" if headline else ""
     if headline and pack.get("world_orders"):
         pack["headline"] += ", in each world"
-        pack["world_picture"] = f"data:image/svg+xml;base64,{base64.b64encode(headline).decode()}"
+        pack["world_picture"] = writers.format_data_address("svg", headline)
     files: Files = {
         "verdicts.csv": format_verdicts(pack),
         "decisions.csv": format_csv(

@@ -19,7 +19,6 @@ from pfbench.stats.comparison import (
 )
 from pfbench.stats.pair_states import (
     LookSchedule as LookSchedule,
-    PairState as PairState,
     decide_at_looks as decide_at_looks,
     describe_end as describe_end,
     format_look as format_look,

@@ -290,6 +290,13 @@ def parse_label(label: str) -> tuple[str, dict[str, str]]:
     return name, {key: value for key, _, value in (pair.partition("=") for pair in pairs)}
 
 
+def drop_settings(label: str, *dropped: str) -> str:
+    """Return a label without some of its settings."""
+    name, settings = parse_label(label)
+    others = [f"{key}={value}" for key, value in settings.items() if key not in dropped]
+    return f"{name}[{','.join(others)}]" if others else name
+
+
 def make_distinct_label(
     meta: Mapping[str, Any], twins: Sequence[Mapping[str, Any]], settings: Sequence[str] = ()
 ) -> str:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from pfbench.core.parameter_checks import require
 from pfbench.results import metrics, status, store
 from pfbench.results.conditions import (
     Condition,
@@ -45,12 +46,12 @@ def load_frame(
         for condition in conditions
         for job in condition.jobs
     ]
-    independent = select_independent_runs(
+    independent, sentence = select_independent_runs(
         pd.concat(rows, ignore_index=True), list_main_groups(conditions)
     )
-    if independent.sentence:
-        log.warning("warning  study %s: %s", study, independent.sentence)
-    return independent.rows
+    if sentence:
+        log.warning("warning  study %s: %s", study, sentence)
+    return independent
 
 
 def list_main_groups(conditions: Sequence[Condition]) -> dict[tuple[str, str, str], str]:
@@ -73,11 +74,13 @@ def drop_before(result: store.JobResult, start_time_s: float) -> store.JobResult
     """
     time = result.data["time"]
     mask = time >= start_time_s
-    if not mask.any():
-        raise ValueError(
-            f"report.start_time_s must be at most {time[-1]} s, the end of {result.meta['key']}, "
-            f"got {start_time_s} s. Use a smaller value."
-        )
+    require(
+        mask.any(),
+        "report.start_time_s",
+        f"be at most {time[-1]} s, the end of {result.meta['key']}",
+        f"{start_time_s} s",
+        "Use a smaller value.",
+    )
     return select_steps(result, mask)
 
 

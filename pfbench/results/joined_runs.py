@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pfbench.core.parameter_checks import require
 from pfbench.results import store
 from pfbench.results.store import PLACE_SETTINGS, compute_config_key
 
@@ -124,11 +125,13 @@ def read_joined(paths: Sequence[Path]) -> store.JobResult:
     first = parts[0]
     for path, piece in zip(paths, parts, strict=True):
         for name in _EQUAL:
-            if not np.array_equal(piece.data.get(name, 0), first.data.get(name, 0)):
-                raise ValueError(
-                    f"{name} must be equal in all parts of {first.meta['label']}, got another one "
-                    f"in {path.name} than in {paths[0].name}. Run all runs as one job (runs=...)."
-                )
+            require(
+                np.array_equal(piece.data.get(name, 0), first.data.get(name, 0)),
+                name,
+                f"be equal in all parts of {first.meta['label']}",
+                f"another one in {path.name} than in {paths[0].name}",
+                "Run all runs as one job (runs=...).",
+            )
     metadata = [piece.meta for piece in parts]
     return store.JobResult(
         join_metadata(metadata), join_arrays([piece.data for piece in parts], metadata)

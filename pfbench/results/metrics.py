@@ -19,6 +19,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from pfbench.core.parameter_checks import require
 from pfbench.results import store
 from pfbench.results.conditions import ComponentGroup, component_groups
 from pfbench.results.status import coverage_per_run, is_overconfident
@@ -329,11 +330,13 @@ def page_metrics() -> dict[str, Metric]:
 
 def check_page_metric(name: str) -> None:
     """Check the name of the metric that decides a study."""
-    if name not in page_metrics():
-        raise ValueError(
-            f"report.metric must be one of {', '.join(page_metrics())}, got {name}. "
-            "Choose rmse for estimates, or crps for posterior distributions."
-        )
+    require(
+        name in page_metrics(),
+        "report.metric",
+        f"be one of {', '.join(page_metrics())}",
+        name,
+        "Choose rmse for estimates, or crps for posterior distributions.",
+    )
 
 
 def scored_arrays() -> tuple[str, ...]:

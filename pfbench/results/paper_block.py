@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 import pfbench
+from pfbench.core.parameter_checks import require
 
 # --------------------------------------------------------------------------------------------------
 # The node `paper` of a configuration file: names and limits for reports, not for the computation.
@@ -52,8 +53,13 @@ def check_paper_blocks(values: Mapping[str, Any]) -> None:
         block = node.get(PAPER) if isinstance(node, Mapping) else None
         if block is None:
             continue
-        if not isinstance(block, Mapping):
-            raise ValueError(f"{group}.paper must be a dictionary, got {block!r}. Remove it.")
+        require(
+            isinstance(block, Mapping),
+            f"{group}.paper",
+            "be a dictionary",
+            f"{block!r}",
+            "Remove it.",
+        )
         for key, value in block.items():
             _check_key(group, key, value)
 
@@ -91,37 +97,36 @@ def _check_key(group: str, key: str, value: Any) -> None:
             f"{group}.paper must have keys of {names}, got {key!r}. Remove or rename it."
         )
     requirement = _requirement(group, key, value)
-    if requirement:
-        raise ValueError(f"{group}.paper.{key} must be {requirement}, got {value!r}. Change it.")
+    require(
+        not requirement,
+        f"{group}.paper.{key}",
+        f"be {requirement}",
+        f"{value!r}",
+        "Change it.",
+    )
 
 
 def _requirement(group: str, key: str, value: Any) -> str:
     """Return the requirement that a value does not meet, empty if it does."""
     if value is None:
         return ""
-    if key == "divergence_threshold" and not _is_positive(value):
-        return "finite and positive, or null for a scenario without this limit"
-    if key in _TEXTS and not isinstance(value, str):
-        return "a text"
-    if key in ("name", "family") and not value.strip():
-        return "a name"
-    if group == "filter" and key == "family" and value not in FAMILIES:
-        return f"one of {', '.join(FAMILIES)}"
-    if key == "proposed" and not isinstance(value, bool):
-        return "true or false"
-    if key == "marker" and value not in MARKERS:
-        return f"one of {' '.join(MARKERS)}"
-    if key == "colour" and not _is_colour_pair(value):
-        return "two colours such as '#0b4f8a', for white and for dark ground"
-    if key == "form" and value not in METHOD_FORMS:
-        return f"one of {', '.join(METHOD_FORMS)}"
-    if key in _ENTRIES and not _is_list_of_entries(value, *_ENTRIES[key]):
-        required, optional = _ENTRIES[key]
-        names = ", ".join(sorted(required)) + "".join(f", perhaps {name}" for name in optional)
-        return f"a list of entries with {names}: keys a list of names, all others texts"
-    if key == "baselines" and not _is_list_of_names(value):
-        return "a list of filters"
-    return ""
+    is_text = isinstance(value, str)
+    required, optional = _ENTRIES.get(key, (set(), set()))
+    entries = ", ".join(sorted(required)) + "".join(f", perhaps {name}" for name in optional)
+    is_list = key not in _ENTRIES or _is_list_of_entries(value, required, optional)
+    faults = (
+        (key == "divergence_threshold" and not _is_positive(value), "finite and positive, or null for a scenario without this limit"),
+        (key in _TEXTS and not is_text, "a text"),
+        (key in ("name", "family") and is_text and not value.strip(), "a name"),
+        (group == "filter" and key == "family" and value not in FAMILIES, f"one of {', '.join(FAMILIES)}"),
+        (key == "proposed" and not isinstance(value, bool), "true or false"),
+        (key == "marker" and value not in MARKERS, f"one of {' '.join(MARKERS)}"),
+        (key == "colour" and not _is_colour_pair(value), "two colours such as '#0b4f8a', for white and for dark ground"),
+        (key == "form" and value not in METHOD_FORMS, f"one of {', '.join(METHOD_FORMS)}"),
+        (not is_list, f"a list of entries with {entries}: keys a list of names, all others texts"),
+        (key == "baselines" and not _is_list_of_names(value), "a list of filters"),
+    )  # fmt: skip
+    return next((requirement for is_fault, requirement in faults if is_fault), "")
 
 
 def _is_colour_pair(value: Any) -> bool:

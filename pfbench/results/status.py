@@ -27,7 +27,7 @@ import numpy as np
 import scipy  # scipy.special is imported at its first use
 
 from pfbench.results.conditions import main_component_group
-from pfbench.stats.error_measures import Array, Flags, finite_mean
+from pfbench.stats.error_measures import Array, Flags, finite_mean, rmse_per_run
 
 DIVERGED_SHARE = 0.1  # of the steps with truth, beyond the threshold
 
@@ -232,11 +232,11 @@ def coverage_per_run(pit: Array, lost: Flags, level: float) -> Array:
 
 
 def main_rmse(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> float:
-    """Compute the RMSE of the main group over all valid runs."""
+    """Compute the median over runs of the RMS error of the main group, infinite in a run without track, as on pages."""
     group = main_component_group(meta["state"])
     errors = group.scale * outputs["error"][..., group.places].astype(float)
-    square = (errors**2).sum(-1)[~np.asarray(outputs["lost"], dtype=bool)]
-    return math.sqrt(np.nanmean(square)) if np.isfinite(square).any() else math.inf
+    of_runs = rmse_per_run(errors, ~keeps_track(outputs, meta))
+    return math.inf if np.isnan(of_runs).all() else float(np.nanmedian(of_runs))
 
 
 HINTS = {
@@ -250,7 +250,7 @@ HINTS = {
 
 
 def describe_runs(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> str:
-    """Describe error and status of the runs, such as "position RMSE 833 m; 100 of 100 runs diverged".
+    """Describe error and status of the runs, such as "position: median RMS error 833 m; 10 of 100 runs diverged".
 
     Returns magnitude with unit, counts of `count_statuses`, and the threshold.
     """
@@ -267,10 +267,10 @@ def describe_runs(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> str:
     present = {name: number for name, number in kinds.items() if number}
     value = main_rmse(outputs, meta)
     truth = meta.get("measured_truth", "")
-    kind = f"distance to {truth}, RMS" if truth else "RMSE"
-    rmse = f"{group.group} {kind} {value:.4g} {group.unit}".rstrip()
+    kind = f"median RMS distance to {truth}" if truth else "median RMS error"
+    rmse = f"{group.group}: {kind} {value:.4g} {group.unit}".rstrip()
     if not math.isfinite(value):
-        rmse = f"no finite {group.group} error"
+        rmse = f"{group.group}: no finite {kind}"
     if not present:
         ending = (
             "track kept in {0} of {0} runs" if threshold is not None else "{0} of {0} runs valid"

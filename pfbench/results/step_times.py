@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.atomic_write import DIGEST, has_valid_digest, hash_content, write_atomically
 from pfbench.stats.comparison import EffectEstimate
 from pfbench.stats.error_measures import Array
@@ -84,11 +85,13 @@ def read_step_times(folder: Path) -> Conditions:
         fault = fault or _find_fault(content)
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         fault = f"{type(error).__name__}: {error}"
-    if fault:
-        raise ValueError(
-            f"{path} must be the times of a study with a valid digest, got {fault}. Delete it and run: "
-            f"pfbench cost study={folder.name}"
-        )
+    require(
+        not fault,
+        path,
+        "be the times of a study with a valid digest",
+        fault,
+        f"Delete it and run: pfbench cost study={folder.name}",
+    )
     conditions: Conditions = content["conditions"]
     return conditions
 

@@ -16,6 +16,7 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.atomic_write import (
     DIGEST,
     has_valid_digest,
@@ -200,10 +201,13 @@ def _opened(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
             raise DamagedResultError(
                 f"{path} is damaged: it must be an npz file ({error}). Delete it and run the job again."
             ) from error
-        if not isinstance(file, np.lib.npyio.NpzFile):
-            raise ValueError(
-                f"{path} must be a result of pfbench, got a single array. Move it away."
-            )
+        require(
+            isinstance(file, np.lib.npyio.NpzFile),
+            path,
+            "be a result of pfbench",
+            "a single array",
+            "Move it away.",
+        )
         yield file
 
 
@@ -293,8 +297,13 @@ _KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
 def check_metadata(path: Path, meta: Any) -> None:
     """Check that the metadata have the format and all required keys."""
     version = meta.get("format") if isinstance(meta, dict) else None
-    if version != FORMAT:
-        raise ValueError(f"{path} must have format {FORMAT}, got {version}. Run the job again.")
+    require(
+        version == FORMAT,
+        path,
+        f"have format {FORMAT}",
+        version,
+        "Run the job again.",
+    )
     missing = [name for name in _META if name not in meta]
     if missing:
         raise ValueError(f"{path}: metadata must contain {', '.join(missing)}. Run the job again.")
@@ -338,14 +347,20 @@ def check_arrays(path: Path, meta: Mapping[str, Any], data: Mapping[str, np.ndar
         )
     for name, value in data.items():
         # the first three are arguments of numpy's savez
-        if name in ("file", "args", "allow_pickle", "meta", DIGEST):
-            raise ValueError(
-                f"{path}: name of an array must not be reserved, got {name!r}. Use another name."
-            )
-        if value.dtype.hasobject:
-            raise ValueError(
-                f"{path}: {name} must be numbers, booleans or texts, got Python objects. Convert them."
-            )
+        require(
+            name not in ("file", "args", "allow_pickle", "meta", DIGEST),
+            f"{path}: name of an array",
+            "not be reserved",
+            f"{name!r}",
+            "Use another name.",
+        )
+        require(
+            not value.dtype.hasobject,
+            f"{path}: {name}",
+            "be numbers, booleans or texts",
+            "Python objects",
+            "Convert them.",
+        )
     _check_run_numbers(path, meta, data)
     _check_values(path, data)
     size: dict[str, int] = {
@@ -379,20 +394,25 @@ def _check_values(path: Path, data: Mapping[str, np.ndarray]) -> None:
         ("sd", "not be negative", not bool((data["sd"] < 0.0).any())),
         ("health", f"be from 0 to {_HEALTH - 1}", bool(((health >= 0) & (health < _HEALTH)).all())),
     ):
-        if not is_valid:
-            raise ValueError(
-                f"{path}: {name} must {requirement}, got other values. Run the job again."
-            )
+        require(
+            is_valid,
+            f"{path}: {name}",
+            requirement,
+            "other values",
+            "Run the job again.",
+        )
 
 
 def _check_run_numbers(path: Path, meta: Mapping[str, Any], data: Mapping[str, np.ndarray]) -> None:
     """Check that each run has a number of its own: a repeated run would count twice."""
     first = meta.get("first_run", 0)
-    if type(first) is not int or first < 0 or first + int(meta["runs"]) > 1 << 32:
-        raise ValueError(
-            f"{path}: first_run must be a whole number from 0 to 2**32 - runs, got {first}. "
-            "Run the job again."
-        )
+    require(
+        type(first) is int and first >= 0 and first + int(meta["runs"]) <= 1 << 32,
+        f"{path}: first_run",
+        "be a whole number from 0 to 2**32 - runs",
+        first,
+        "Run the job again.",
+    )
     if "run" in data:
         numbers, counts = np.unique(data["run"], return_counts=True)
         if (counts > 1).any():

@@ -2,7 +2,6 @@
 
 from pfbench.logs.doctor.finding import Finding as Finding, LogDiagnosis as LogDiagnosis
 from pfbench.logs.doctor.inspection import inspect_log as inspect_log
-from pfbench.logs.worlds.aligned_log import AlignedLog as AlignedLog
 from pfbench.logs.worlds.constrained import ConstrainedDrive as ConstrainedDrive
 from pfbench.logs.worlds.corrections import LogCorrections as LogCorrections
 from pfbench.logs.worlds.drive import (
@@ -34,7 +33,7 @@ from pfbench.logs.worlds.urban import (
     read_drive as read_drive,
     select_stretch as select_stretch,
 )
-from pfbench.logs.worlds.user_log import UserLog as UserLog
+from pfbench.logs.worlds.user_log import AlignedLog as AlignedLog, UserLog as UserLog
 from pfbench.logs.worlds.user_raw_log import (
     UserInsLog as UserInsLog,
     UserRawLog as UserRawLog,

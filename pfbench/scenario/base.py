@@ -58,10 +58,12 @@ class RecordingRegime:
     Attributes:
         regime: Inner regime.
         channels: Latest measurement channels. None before the first draw.
+        time: Their times [T], s.
     """
 
     regime: NoiseRegime
     channels: MeasurementChannels | None = None
+    time: Tensor | None = None
 
     def draw_errors(
         self, draws: RandomStream, channels: MeasurementChannels, time: Tensor
@@ -76,7 +78,7 @@ class RecordingRegime:
         Returns:
             Errors, [R, T, Dy].
         """
-        self.channels = channels
+        self.channels, self.time = channels, time
         return self.regime.draw_errors(draws, channels, time)
 
     def process_factors(self, time: Tensor) -> Tensor:

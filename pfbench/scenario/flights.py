@@ -11,7 +11,7 @@ from torch import Tensor
 from tqdm import tqdm
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import check_positive
+from pfbench.core.parameter_checks import check_positive, require
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.model.terrain import RandomTerrain, TerrainAided, TerrainInputs, compute_elevation
@@ -85,17 +85,20 @@ class SimulatedFlight(Scenario):
 
     def __post_init__(self) -> None:
         samples = self.imu_rate_hz * self.filter_interval_s
-        if samples < 2 or abs(samples / 2 - round(samples / 2)) > 1e-9:
-            raise ValueError(
-                "scenario.filter_interval_s must be an even number of samples, "
-                f"got {self.filter_interval_s} ({samples:g} samples at {self.imu_rate_hz} Hz). "
-                "Change scenario.filter_interval_s or scenario.imu_rate_hz."
-            )
-        if self.closed_loop and not isinstance(self.receiver, GnssReceiver):
-            raise ValueError(
-                "scenario.closed_loop must be false without a GnssReceiver, "
-                f"got true with {type(self.receiver).__name__}. Set scenario.closed_loop=false."
-            )
+        require(
+            not samples < 2 and (not abs(samples / 2 - round(samples / 2)) > 1e-09),
+            "scenario.filter_interval_s",
+            "be an even number of samples",
+            f"{self.filter_interval_s} ({samples:g} samples at {self.imu_rate_hz} Hz)",
+            "Change scenario.filter_interval_s or scenario.imu_rate_hz.",
+        )
+        require(
+            not self.closed_loop or isinstance(self.receiver, GnssReceiver),
+            "scenario.closed_loop",
+            "be false without a GnssReceiver",
+            f"true with {type(self.receiver).__name__}",
+            "Set scenario.closed_loop=false.",
+        )
 
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:

@@ -13,7 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.chart import wrap_angle
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.model.passive_location import (
@@ -201,33 +201,45 @@ class PassiveLocationScenario(Scenario):
         sizes |= {"measurement_sd": 5, "ownship_position_sd": 3, "range_limits": 2}
         for name, size in sizes.items():
             values = getattr(self, name)
-            if len(values) != size or not all(map(math.isfinite, values)):
-                raise ValueError(
-                    f"scenario.{name} must have {size} finite numbers, got {list(values)}. "
-                    "Correct the list."
-                )
+            require(
+                len(values) == size and all(map(math.isfinite, values)),
+                f"scenario.{name}",
+                f"have {size} finite numbers",
+                list(values),
+                "Correct the list.",
+            )
         for name in ("carrier_frequency", "velocity_sd", "interval_s", "measurement_sd"):
             values = getattr(self, name)
-            if not min(values if isinstance(values, Sequence) else [values]) > 0.0:
-                raise ValueError(
-                    f"scenario.{name} must be positive, got {values}. Increase scenario.{name}."
-                )
+            require(
+                min(values if isinstance(values, Sequence) else [values]) > 0.0,
+                f"scenario.{name}",
+                "be positive",
+                values,
+                f"Increase scenario.{name}.",
+            )
         for name in ("carrier_frequency_sd", "acceleration_sd", "ownship_position_sd"):
             values = getattr(self, name)
-            if min(values if isinstance(values, Sequence) else [values]) < 0.0:
-                raise ValueError(
-                    f"scenario.{name} must be at least 0, got {values}. Use 0 for no error."
-                )
-        if not 0.0 < self.range_limits[0] < self.range_limits[1]:
-            raise ValueError(
-                "scenario.range_limits must be [nearest, farthest] with 0 < nearest < farthest, "
-                f"got {list(self.range_limits)}. Correct the limits."
+            require(
+                not min(values if isinstance(values, Sequence) else [values]) < 0.0,
+                f"scenario.{name}",
+                "be at least 0",
+                values,
+                "Use 0 for no error.",
             )
-        if not math.hypot(*self.aircraft_velocity[:2]) > 0.0:
-            raise ValueError(
-                "scenario.aircraft_velocity must have a horizontal component, "
-                f"got {list(self.aircraft_velocity)}. Set an East or North velocity."
-            )
+        require(
+            0.0 < self.range_limits[0] < self.range_limits[1],
+            "scenario.range_limits",
+            "be [nearest, farthest] with 0 < nearest < farthest",
+            list(self.range_limits),
+            "Correct the limits.",
+        )
+        require(
+            math.hypot(*self.aircraft_velocity[:2]) > 0.0,
+            "scenario.aircraft_velocity",
+            "have a horizontal component",
+            list(self.aircraft_velocity),
+            "Set an East or North velocity.",
+        )
         require_ranges("scenario", self, steps="[1, inf]")
 
     @override

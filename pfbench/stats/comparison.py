@@ -28,6 +28,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 import scipy  # scipy.special is imported at its first use, which takes a tenth of the start of a job
 
+from pfbench.core.parameter_checks import require
 from pfbench.stats.error_measures import Array
 from pfbench.stats.rank_tests import (
     EXACT_DIFFERENCES,
@@ -224,11 +225,13 @@ def compare_all(
     """Compare several pairs, those of equal length in one call of the test."""
     differences = []
     for (name, first), (name_b, second) in pairs:
-        if np.shape(first) != np.shape(second) or np.ndim(first) != 1:
-            raise ValueError(
-                f"{name} and {name_b} must have losses of the same {unit}s, got {np.shape(first)} and "
-                f"{np.shape(second)}. Select common {unit}s."
-            )
+        require(
+            np.shape(first) == np.shape(second) and np.ndim(first) == 1,
+            f"{name} and {name_b}",
+            f"have losses of the same {unit}s",
+            f"{np.shape(first)} and {np.shape(second)}",
+            f"Select common {unit}s.",
+        )
         differences.append(subtract_losses(first, second))
     p = _signed_rank_p(differences)
     effects = []
@@ -399,8 +402,9 @@ def _choose_word(
     """Return the word on the errors of a pair, with the reason of a word that needs one."""
     (p, evidence), (location, low, high), (margin, alpha) = tests, ends, levels
     if -margin < low and high < margin:
+        is_kept = not any(effect.lost[:3])
         is_bounded = all(_bound_lost(count, effect) < TRACK_BOUND for count in effect.lost[:2])
-        return (EQUAL_WORD if is_bounded else EQUAL_KEPT), ""
+        return (EQUAL_WORD if is_kept or is_bounded else EQUAL_KEPT), ""
     if p >= alpha:
         return NO_DECISION, ""
     side = math.copysign(1.0, location)

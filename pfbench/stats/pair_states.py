@@ -16,38 +16,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.atomic_write import DIGEST, has_valid_digest, hash_content, write_atomically
 from pfbench.stats.comparison import ALPHA, EQUALITY_MARGIN, NO_DECISION, Verdict
 from pfbench.stats.court import Court
 from pfbench.stats.error_measures import Array
 from pfbench.stats.study_runs import StudyRuns
 
+PairStates = list[Verdict]  # those that are not decided are open
 _NODES = 121
 _LARGEST = 37.0  # standard score beyond which a normal tail is zero in double precision
-
-
-class PairState(NamedTuple):
-    """State of one pair after a look.
-
-    Attributes:
-        verdict: Verdict at the look that decided it, or at the last one.
-        is_open: Whether the pair requires more runs.
-    """
-
-    verdict: Verdict
-    is_open: bool
-
-    def __str__(self) -> str:
-        v = self.verdict
-        relation = f"{v.word} than" if v.word in ("better", "worse") else "/"
-        ending = f" {v.word}" if v.word in ("equal", "identical") else ""
-        return f"{v.a} {relation} {v.b}{ending} (ratio {v.low:.3g} to {v.high:.3g})"
 
 
 def decide_at_looks(
@@ -57,8 +41,8 @@ def decide_at_looks(
     metric: str = "rmse",
     margin: float = EQUALITY_MARGIN,
     alpha: float = ALPHA,
-) -> list[PairState]:
-    """Decide pairs with all looks that the runs allow. A pair keeps the verdict of the look that decides it.
+) -> PairStates:
+    """Decide pairs with all looks that the runs allow. A pair keeps the verdict of the look that decides it; else it is open.
 
     Args:
         runs: Runs so far.
@@ -72,22 +56,24 @@ def decide_at_looks(
         ValueError: If the runs do not reach the first look.
     """
     looks = [n for n in schedule.runs if n <= runs.present.shape[-1]]
-    if not looks:
-        raise ValueError(
-            f"runs must be at least {schedule.runs[0]}, got {runs.present.shape[-1]}. Add runs."
-        )
+    require(
+        looks,
+        "runs",
+        f"be at least {schedule.runs[0]}",
+        runs.present.shape[-1],
+        "Add runs.",
+    )
     levels = look_levels(schedule.runs, alpha / len(pairs))
     everywhere = np.ones(len(runs.conditions), dtype=bool)
-    states: list[PairState] = []
+    states: PairStates = []
     for number, level in zip(looks, levels, strict=False):
         court = Court(
             runs.take_first(number), pairs, margin, level * len(pairs)
         )  # whose first step is the level
         verdicts = [court.find(metric, everywhere, *pair) for pair in pairs]
-        earlier = states or [PairState(v, True) for v in verdicts]
         states = [
-            state if not state.is_open else PairState(v, v.word == NO_DECISION)
-            for state, v in zip(earlier, verdicts, strict=True)
+            new if old.word == NO_DECISION else old
+            for old, new in zip(states or verdicts, verdicts, strict=True)
         ]
     return states
 
@@ -156,11 +142,13 @@ class LookSchedule:
     max_runs: int = 320
 
     def __post_init__(self) -> None:
-        if type(self.max_runs) is not int or self.max_runs < FIRST_LOOK:
-            raise ValueError(
-                f"until_decided.max_runs must be a whole number of at least {FIRST_LOOK}, got "
-                f"{self.max_runs}. Use 320."
-            )
+        require(
+            type(self.max_runs) is int and self.max_runs >= FIRST_LOOK,
+            "until_decided.max_runs",
+            f"be a whole number of at least {FIRST_LOOK}",
+            self.max_runs,
+            "Use 320.",
+        )
 
     @property
     def runs(self) -> tuple[int, ...]:
@@ -200,12 +188,13 @@ class LookRecord:
             return
         stored = _read_record(path)
         for key, value in self.request.items():
-            if stored["request"].get(key) != value:
-                raise ValueError(
-                    f"{key} must be {_shorten(stored['request'].get(key))}, as at the first look of "
-                    f"this study, got {_shorten(value)}. Use another study=NAME, or delete the "
-                    f"folder {path.parent}."
-                )
+            require(
+                stored["request"].get(key) == value,
+                key,
+                f"be {_shorten(stored['request'].get(key))}, as at the first look of this study",
+                _shorten(value),
+                f"Use another study=NAME, or delete the folder {path.parent}.",
+            )
         self.looks, self.state = list(stored["looks"]), str(stored["state"])
 
     def write(self, looks: Sequence[str], state: str = "") -> None:
@@ -222,11 +211,13 @@ def _read_record(path: Path) -> dict[str, Any]:
         stored = json.loads(path.read_text())
     except ValueError:
         stored = None
-    if not isinstance(stored, dict) or not has_valid_digest(stored):
-        raise ValueError(
-            f"{path} must be the record of a study, got a damaged file. Delete it: the results are "
-            "kept, and all looks are repeated from them."
-        )
+    require(
+        isinstance(stored, dict) and has_valid_digest(stored),
+        path,
+        "be the record of a study",
+        "a damaged file",
+        "Delete it: the results are kept, and all looks are repeated from them.",
+    )
     return stored
 
 
@@ -245,8 +236,8 @@ _LISTED = 6  # pairs in a line
 def format_look(
     number: int,
     schedule: LookSchedule,
-    states: Sequence[PairState],
-    earlier: Sequence[PairState] = (),
+    states: Sequence[Verdict],
+    earlier: Sequence[Verdict] = (),
     warning: str = "",
 ) -> str:
     """Format what is decided and what is open after a look.
@@ -254,16 +245,16 @@ def format_look(
     Args:
         number: Number of the look, from 1.
         schedule: Looks of the study.
-        states: State of each pair.
+        states: Verdict on each pair; those that are not decided are open.
         earlier: States at the look before.
         warning: Sentence on runs that are not independent; empty without one.
 
     Returns:
         One line.
     """
-    unresolved = [state for state in states if state.is_open]
-    decided = {state.verdict[:2] for state in earlier if not state.is_open}
-    new = [s for s in states if not s.is_open and s.verdict[:2] not in decided]
+    unresolved = [v for v in states if v.word == NO_DECISION]
+    decided = {v[:2] for v in earlier if v.word != NO_DECISION}
+    new = [v for v in states if v.word != NO_DECISION and v[:2] not in decided]
     runs, count = schedule.runs[number - 1], len(states) - len(unresolved)
     parts = [f"look {number}, {runs} runs: {count} of {len(states)} pairs decided"]
     parts += [f"new: {_list_states(new)}"] if new else []
@@ -271,15 +262,15 @@ def format_look(
     return ". ".join(filter(None, ("; ".join(parts), warning)))
 
 
-def describe_end(number: int, schedule: LookSchedule, states: Sequence[PairState]) -> str:
+def describe_end(number: int, schedule: LookSchedule, states: Sequence[Verdict]) -> str:
     """Return why a study ends with a look, empty if more runs follow.
 
     Args:
         number: Number of the look, from 1.
         schedule: Looks of the study.
-        states: State of each pair.
+        states: Verdict on each pair; those that are not decided are open.
     """
-    runs, count = schedule.runs[number - 1], sum(state.is_open for state in states)
+    runs, count = schedule.runs[number - 1], sum(v.word == NO_DECISION for v in states)
     if not count:
         return f"all {len(states)} pairs are decided after {runs} runs."
     if number == len(schedule.runs):
@@ -287,7 +278,15 @@ def describe_end(number: int, schedule: LookSchedule, states: Sequence[PairState
     return ""
 
 
-def _list_states(states: Sequence[PairState]) -> str:
+def _list_states(states: Sequence[Verdict]) -> str:
     """List up to six pairs."""
     more = f" and {len(states) - _LISTED} more" if len(states) > _LISTED else ""
-    return f"{', '.join(map(str, states[:_LISTED]))}{more}"
+    return f"{', '.join(map(describe_pair, states[:_LISTED]))}{more}"
+
+
+def describe_pair(verdict: Verdict) -> str:
+    """Describe a pair after a look."""
+    word, is_than = verdict.word, verdict.word in ("better", "worse")
+    relation = f"{word} than" if is_than else "/"
+    ending = f" {word}" if word in ("equal", "identical") else ""
+    return f"{verdict.a} {relation} {verdict.b}{ending} (ratio {verdict.low:.3g} to {verdict.high:.3g})"

@@ -126,24 +126,13 @@ def describe_dependence(table: pd.DataFrame, value: str, run: list[str]) -> str:
 RUN = ["seed", "run"]  # columns that name a run
 
 
-class IndependentRows(NamedTuple):
-    """Rows of all metrics without copies of runs.
-
-    Attributes:
-        rows: Rows of the runs that are not copies.
-        sentence: What is left out, and whether neighbouring runs are alike; empty for independent runs.
-    """
-
-    rows: pd.DataFrame
-    sentence: str
-
-
 def select_independent_runs(
     rows: pd.DataFrame, mains: Mapping[tuple[str, str, str], str]
-) -> IndependentRows:
+) -> tuple[pd.DataFrame, str]:
     """Leave out copies of runs, as a report does.
 
-    Returns the rows of the other runs, with a sentence on what is left out.
+    Returns the rows of the other runs, with a sentence on what is left out and whether neighbouring runs are alike; empty for
+    independent runs.
     """
     keys = zip(rows["scenario"], rows["noise"], rows["model"], strict=True)
     main = pd.Series(list(keys), index=rows.index).map(mains)
@@ -152,4 +141,4 @@ def select_independent_runs(
     regime = errors["noise"].astype(str) + " / " + errors["model"].astype(str)
     table = errors.assign(filter=errors["label"], regime=regime)
     copies, sentence = assess_runs(table, "value", RUN)
-    return IndependentRows(drop_runs(rows, copies, RUN).reset_index(drop=True), sentence)
+    return drop_runs(rows, copies, RUN).reset_index(drop=True), sentence

@@ -28,11 +28,12 @@ def format_digits(value: float, digits: int = 3) -> str:
 def format_with_interval(ratio: float, low: float, high: float) -> str:
     """Format a ratio with its interval: three decimals where two would put a bound on one that is not one.
 
-    An end that lost runs or few runs leave open is infinite.
+    An end that lost runs or few runs leave open is infinite. One that is exactly 1, where a test stops, is written 1.
     """
     digits = 3 if any(end != 1.0 and f"{end:.2f}" == "1.00" for end in (low, high)) else 2
-    upper = "∞" if high == math.inf else f"{high:.{digits}f}"
-    return f"{ratio:.{digits}f} [{low:.{digits}f}, {upper}]"
+    ends = {1.0: "1", math.inf: "∞"}
+    texts = (ends.get(end, f"{end:.{digits}f}") for end in (low, high))
+    return f"{ratio:.{digits}f} [{', '.join(texts)}]"
 
 
 def percent(log_ratio: float) -> str:

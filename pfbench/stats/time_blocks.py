@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pfbench.core.parameter_checks import require
 from pfbench.stats.comparison import (
     NO_DECISION,
     SAME_RUNS,
@@ -69,10 +70,13 @@ def bound_losses(error: Array, keeps_track: Flags, cap: float) -> Array:
     Raises:
         ValueError: If the cap is not a positive number.
     """
-    if not (cap > 0 and math.isfinite(cap)):
-        raise ValueError(
-            f"cap must be a positive number, got {cap}. State the divergence threshold of the world."
-        )
+    require(
+        cap > 0 and math.isfinite(cap),
+        "cap",
+        "be a positive number",
+        cap,
+        "State the divergence threshold of the world.",
+    )
     counts = keeps_track & np.isfinite(error)
     with np.errstate(divide="ignore"):
         return np.asarray(np.log(np.where(counts, np.minimum(error, cap), cap)))

@@ -220,58 +220,90 @@ def check_scenario(scenario: Any) -> Mapping[str, LawCheck]:
     return _check_alone("the data of a run do not depend on other runs", draw)
 
 
-def check_regime(noise: Any, runs: int = 2000) -> Mapping[str, LawCheck]:
-    """Check that the errors of a run are the same alone and among others, and have the distribution that is stated.
+_SIZES = 1, 2, 3  # numbers of channels that a regime is tried with
+
+
+def check_regime(noise: Any, runs: int = 2000, scenario: Any = None) -> Mapping[str, LawCheck]:
+    """Check that a regime works with any number of channels, and that its errors are independent and as it states.
 
     Args:
-        noise: Noise regime.
+        noise: Noise regime. Each law is checked with 1, 2 and 3 channels of a standard deviation of 1.
         runs: Number of runs; 2 leave out the test of the distribution.
+        scenario: Scenario with whose channels and times the regime is checked, too.
 
     Raises:
         AssertionError: If one does not hold.
     """
-    channels = MeasurementChannels.of_one_kind(torch.ones(2, dtype=torch.float64), "position")
-    time, name = torch.arange(1, 201, dtype=torch.float64), type(noise).__name__
+    time = torch.arange(1, 201, dtype=torch.float64)
+    sds = (torch.ones(size, dtype=torch.float64) for size in _SIZES)
+    worlds = [(MeasurementChannels.of_one_kind(sd, "position"), time) for sd in sds]
+    if scenario is not None:
+        source = RecordingRegime(NominalNoise())
+        episode = scenario.draw(source, torch.arange(2), 1)
+        worlds += [(source.channels, episode.time)] if source.channels else []
+    checks = [check_regime_in(noise, channels, at, runs) for channels, at in worlds]
+    return {
+        name: max(
+            (rows[name] for rows in checks if name in rows), key=lambda check: check.statistic
+        )
+        for name in dict.fromkeys(name for rows in checks for name in rows)
+    }
+
+
+def check_regime_in(
+    noise: Any, channels: MeasurementChannels, time: Tensor, runs: int = 2
+) -> Mapping[str, LawCheck]:
+    """Check a regime with the channels of one world at times [T]; 2 runs leave out the test of the distribution."""
+    name, steps, size = type(noise).__name__, len(time), len(channels.sd)
 
     def draw(numbers: Any) -> Any:
-        errors = noise.draw_errors(PhiloxStream(1, numbers), channels, time)
-        shape = [len(numbers), 200, 2]
-        got = list(getattr(errors, "shape", ())) or type(errors).__name__
-        assert got == shape, (
-            f"{name}.draw_errors must return errors [R, T, Dy] = {shape}, got {got}. Draw them by draws.normal(name, T, Dy)"
-        )
-        return errors
+        shape, problem = [len(numbers), steps, size], None
+        try:
+            errors = noise.draw_errors(PhiloxStream(1, numbers), channels, time)
+            got = list(getattr(errors, "shape", ())) or type(errors).__name__
+        except (RuntimeError, IndexError) as error:  # of tensors that do not fit
+            problem, got = error, f"the error {error}"
+        if got == shape:
+            return errors
+        raise AssertionError(
+            f"{name}.draw_errors must return errors [R, T, Dy] = {shape} for {size} of any number of channels, got {got}. "
+            "Draw them by draws.normal(name, len(time), len(channels.sd)) and scale them by channels.sd"
+        ) from problem
 
     results = _check_alone("the errors of a run do not depend on other runs", draw)
     factors = noise.process_factors(time)
     got = list(factors.shape) if float(factors.min()) >= 0.0 else "a negative one"
-    assert got == [200], (
-        f"{name}.process_factors must return a factor of at least 0 for each time, [200], got {got}. "
+    assert got == [steps], (
+        f"{name}.process_factors must return a factor of at least 0 for each time, [{steps}], got {got}. "
         "Leave the method out for nominal process noise"
     )
     try:
         stated_errors = noise.error_distribution(channels, time)
     except ValueError:
         return results
+    errors = draw(torch.arange(runs)) / channels.sd
+    return {**results, **_check_family(name, stated_errors, errors, runs)}
+
+
+def _check_family(
+    name: str, stated_errors: Any, errors: Tensor, runs: int
+) -> Mapping[str, LawCheck]:
+    """Check the distribution that a regime states by its errors in standard deviations, [R, T, Dy]; only its shape for 2 runs."""
     assert isinstance(stated_errors, tuple) and len(stated_errors) == 3, (  # noqa: PT018
         f"{name}.error_distribution must return a family, shift and scale, got {type(stated_errors).__name__}. "
         "Return for example (make_normal, shift, scale) with pfbench.noise.make_normal"
     )
     family, shift, scale = stated_errors
-    errors = draw(torch.arange(runs))
     density, narrow = family(shift, scale).log_prob(errors), make_normal(shift, 0.7 * scale)
-    assert list(density.shape) == [runs, 200], (
+    assert list(density.shape) == list(errors.shape[:2]), (
         f"{name}.error_distribution must make a distribution of all components of a measurement, with log_prob [R, T] = "
-        f"[{runs}, 200], got {list(density.shape)}. Return for example lambda shift, scale: Independent(Laplace(shift, scale), 1)"
+        f"{list(errors.shape[:2])}, got {list(density.shape)}. Return for example lambda shift, scale: Independent(Laplace(shift, scale), 1)"
     )
-    ratio = (narrow.log_prob(errors) - density).exp()
-    statement = "error_distribution is that of the errors"
-    means = {
-        "the ratio of a narrow normal density to it - 1": ratio.nan_to_num(1.0).mean(1).numpy()
-        - 1.0
-    }
-    check = check_means(statement, means, 4.5) if runs > 2 else LawCheck(statement, 0.0, 4.5)
-    return {**results, "distribution": check}
+    if runs == 2:
+        return {}
+    ratio = (narrow.log_prob(errors) - density).exp().nan_to_num(1.0).mean(1).numpy()
+    means = {"the ratio of a narrow normal density to it - 1": ratio - 1.0}
+    return {"distribution": check_means("error_distribution is that of the errors", means, 4.5)}
 
 
 def _check_alone(statement: str, draw: Callable[[Any], Any]) -> Mapping[str, LawCheck]:

@@ -15,7 +15,7 @@ from scipy import stats
 
 from pfbench import job
 from pfbench.cli.compose import read_sweep
-from pfbench.report.board.pack import StudyFacts
+from pfbench.report import StudyFacts
 from pfbench.report.options import ReportOptions
 from pfbench.results.looks import find_looks
 

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from checkout import ROOT
+from refusals import check_refused
 
 from pfbench.report import RUNS_FILE, format_runs, read_stored_study
 
@@ -118,8 +119,15 @@ def test_tier_b_of_each_world_is_tuned_on_it() -> None:
     assert "not tuned here" not in text
     foreign = tuned_worlds.tuned_table({"passive_3": tuned_worlds.read_tuning("flight_500s", "flight_500s (model ins_gnss_inflated, seed 1001, 20 runs; noise: nominal, outliers, student)")["data"]})  # fmt: skip
     assert "| `passive_3` | not tuned here: flight_500s (" in foreign
-    with pytest.raises(ValueError, match=r"must have a file of the tuning on moon, got none"):
-        tuned_worlds.read_tuning("moon", "moon")
+    check_refused(
+        [
+            (
+                r"must have a file of the tuning on moon, got none",
+                lambda: tuned_worlds.read_tuning("moon", "moon"),
+            )
+        ],
+        remedy=False,
+    )
 
 
 # newer cells of a published study
@@ -201,14 +209,35 @@ def test_other_data_are_refused(folders: tuple[Path, Path]) -> None:
 
     is_control = runs["filter"] == "ekf"
     write(runs.assign(rmse=np.where(is_control, 1.01, 1.0) * runs["rmse"]))
-    with pytest.raises(ValueError, match=r"errors of ekf must be those of the published study"):
-        merge_study.merge_study("robust_canyon", newer, published)
+    check_refused(
+        [
+            (
+                r"errors of ekf must be those of the published study",
+                lambda: merge_study.merge_study("robust_canyon", newer, published),
+            )
+        ],
+        remedy=False,
+    )
     write(runs[~is_control])
-    with pytest.raises(ValueError, match=r"got 0 other runs and \d+ conditions without one"):
-        merge_study.merge_study("robust_canyon", newer, published)
+    check_refused(
+        [
+            (
+                r"got 0 other runs and \d+ conditions without one",
+                lambda: merge_study.merge_study("robust_canyon", newer, published),
+            )
+        ],
+        remedy=False,
+    )
     write(runs[runs["run"] < 40])
-    with pytest.raises(ValueError, match=r"the same runs, got \d+ other runs"):
-        merge_study.merge_study("robust_canyon", newer, published)
+    check_refused(
+        [
+            (
+                r"the same runs, got \d+ other runs",
+                lambda: merge_study.merge_study("robust_canyon", newer, published),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_a_filter_with_several_numbers_of_particles_has_them_in_its_name() -> None:
@@ -229,8 +258,15 @@ def test_a_filter_with_several_numbers_of_particles_has_them_in_its_name() -> No
     }  # fmt: skip
     assert new == {"sir": "sir[particles=1000]", "ekf": "ekf"}
     mixed = table([("a", "sir", 1000), ("b", "sir", 5000)])
-    with pytest.raises(ValueError, match=r"sir must have one number of particles in each report"):
-        merge_study.name_by_number([first, mixed])
+    check_refused(
+        [
+            (
+                r"sir must have one number of particles in each report",
+                lambda: merge_study.name_by_number([first, mixed]),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_notes_of_one_filter_add_up_and_none_counts_twice() -> None:
@@ -251,8 +287,15 @@ def test_notes_of_one_filter_add_up_and_none_counts_twice() -> None:
     cells = pd.DataFrame({"scenario": ["a", "b"], "regime": "nominal", "filter": "sir"})
     assert merge_study.select_added_notes([note], cells, cells) == []
     assert merge_study.select_added_notes([note], cells[:0], cells) == [note]
-    with pytest.raises(ValueError, match=r"sir must be new in all conditions .*, got 1 of 2"):
-        merge_study.select_added_notes([note], cells[:1], cells)
+    check_refused(
+        [
+            (
+                r"sir must be new in all conditions .*, got 1 of 2",
+                lambda: merge_study.select_added_notes([note], cells[:1], cells),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_curves_of_a_finer_page_are_read_at_the_instants_of_the_published_one() -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from checkout import ROOT
 from config_cases import GROUPS
 
 from pfbench.claims.claim_lines import read_proofs
@@ -28,13 +27,10 @@ def list_factors(paper: str) -> set[str]:
     return {row["factor"] for row in read_reading_table(paper).values()} - {"none"}
 
 
-def test_there_are_88_claims_and_those_of_the_first_ledger_are_among_them() -> None:
+def test_there_are_88_claims() -> None:
     assert len(CLAIMS) == 88
     counts = Counter(claim.paper for claim in CLAIMS)
     assert counts == {"000": 10, "001": 12, "002": 40, "003": 11, "004": 15}
-    old = set(yaml.safe_load((ROOT / "pfbench" / "claims" / "ledger_1.yaml").read_text()))
-    assert len(old) == 71
-    assert old < {claim.id for claim in CLAIMS}
 
 
 def test_each_claim_names_what_exists() -> None:

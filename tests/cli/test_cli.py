@@ -11,6 +11,7 @@ from unittest import mock
 import pytest
 import torch
 from command_line import pfbench
+from refusals import check_refused
 
 import pfbench as package
 from pfbench import job
@@ -185,7 +186,7 @@ MISTAKES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "unknown engine": (
         ("engine=steam",),
-        ("engine must be auto, eager, kernels or compiled, got steam",),
+        ("engine must be auto, eager, kernels, tape or compiled, got steam",),
     ),
     "unknown device": (("device=gpu",), ("device must be cpu, cuda", "got gpu")),
     "told maybe": (("oracle_noise=maybe",), ("oracle_noise must be true", "or false, got maybe")),
@@ -287,11 +288,14 @@ def test_a_device_that_does_not_exist_is_reported(tmp_path: Path, device: str) -
 def test_the_traceback_is_printed_on_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(ValueError, match="runs must be"):
-        pfbench("run", *WALK, "runs=0", "--traceback", home=tmp_path)
+    check_refused(
+        [("runs must be", lambda: pfbench("run", *WALK, "runs=0", "--traceback", home=tmp_path))],
+        remedy=False,
+    )
     monkeypatch.setenv("PFBENCH_TRACEBACK", "1")
-    with pytest.raises(ValueError, match="runs must be"):
-        pfbench("run", *WALK, "runs=0", home=tmp_path)
+    check_refused(
+        [("runs must be", lambda: pfbench("run", *WALK, "runs=0", home=tmp_path))], remedy=False
+    )
 
 
 def test_an_interrupted_sweep_reports_how_to_resume(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from config_cases import GROUPS, RECORDED, composed, world
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 from recorded_data import DATA
+from refusals import check_refused
 from torch import Tensor
 
 from pfbench import job
@@ -167,8 +168,15 @@ REFUSED = {
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_does_not_fit_is_refused_with_the_models_that_do(name: str) -> None:
     words, message = REFUSED[name]
-    with pytest.raises(ValueError, match=rf"^model must fit the scenario: .*{message}"):
-        job.build_plan(job.compose([*words, "data.root=null", "filter=ekf"]))
+    check_refused(
+        [
+            (
+                rf"^model must fit the scenario: .*{message}",
+                lambda: job.build_plan(job.compose([*words, "data.root=null", "filter=ekf"])),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_a_wrong_value_of_a_model_that_fits_keeps_its_own_message() -> None:
@@ -179,8 +187,15 @@ def test_a_wrong_value_of_a_model_that_fits_keeps_its_own_message() -> None:
 
 def test_a_datasheet_is_refused_as_a_job_is(tmp_path: Path) -> None:
     words = ["scenario=terrain", "model=pendulum", f"results_dir={tmp_path}", "runs=2"]
-    with pytest.raises(ValueError, match=r"measures 'height of the terrain below \[m\]' there"):
-        job.build_datasheet(job.compose(words))
+    check_refused(
+        [
+            (
+                r"measures 'height of the terrain below \[m\]' there",
+                lambda: job.build_datasheet(job.compose(words)),
+            )
+        ],
+        remedy=False,
+    )
 
 
 # scenarios and models of users
@@ -257,8 +272,15 @@ def test_an_input_that_nothing_states_is_named_when_it_lacks() -> None:
         message = f"^record.u must have the input heating, which Heated reads, got {got}. Choose"
         with pytest.raises(ValueError, match=message):
             run_filter(UKF, model, record, PhiloxStream(1, torch.arange(2)))
-    with pytest.raises(ValueError, match=r"^record\.u must have the input heating"):
-        ModelSimulation(model, 4).draw(NominalNoise(), torch.arange(2), 1)
+    check_refused(
+        [
+            (
+                r"^record\.u must have the input heating",
+                lambda: ModelSimulation(model, 4).draw(NominalNoise(), torch.arange(2), 1),
+            )
+        ],
+        remedy=False,
+    )
     record = Draft(Inputs(torch.zeros(1, 4).double())).draw(None, torch.arange(2), 1).record
     run_filter(UKF, model, record, PhiloxStream(1, torch.arange(2)))
 
@@ -273,8 +295,15 @@ def test_inputs_of_another_kind_are_refused_in_python_too() -> None:
 
 
 def test_a_truth_of_another_size_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"^truth of state must have 1 components, .* got 2"):
-        room().assemble({"state": torch.zeros(2, 4, 2)})
+    check_refused(
+        [
+            (
+                r"^truth of state must have 1 components, .* got 2",
+                lambda: room().assemble({"state": torch.zeros(2, 4, 2)}),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_names_are_as_many_as_components() -> None:

@@ -19,6 +19,7 @@ from command_line import pfbench as command
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from notebook_cells import MODEL, PROPOSAL, WORLD, Notebook
+from refusals import check_refused
 
 import pfbench
 from pfbench.cli.compose import plan_study
@@ -26,6 +27,7 @@ from pfbench.door import laws, own_source
 from pfbench.job import IGNORED_IN_KEY, compose, job_key
 from pfbench.job.trust import FOLDERS
 from pfbench.results import main_component_group, store
+from pfbench.scenario import ModelSimulation
 
 SMALL = {"runs": 4, "particles": 40}
 WALK = pfbench.get("scenario", "linear_walk", steps=6)
@@ -160,6 +162,33 @@ def test_a_model_of_a_notebook_is_simulated_with_its_arguments(notebook: Noteboo
     assert stored("room")["ukf"].data["error"].shape[:2] == (4, 100)
     assert world.errors()["ukf"].between(0, 5).all()
     assert pfbench.check(notebook["Room"]).passed
+    one = pfbench.own(ModelSimulation(notebook["Room"](), 7))  # named by its model
+    assert (one.name, pfbench.own(ModelSimulation, model=notebook["Room"], steps=7)) == (
+        "room",
+        one,
+    )
+
+
+TURNS = """
+class Compass(Room):
+    def initial(self, runs):
+        return normal_batch(runs, torch.full_like(self.sd, 3.0), torch.full_like(self.sd, 18.0))
+    def propagate(self, x, u, w):
+        return x + 0.3 + 0.01 * w
+    def observation(self, x, u):
+        return independent_normal(wrap_angle(x), 0.1 * self.sd)
+class Circle(Compass):
+    def residual(self, y, y_hat):
+        return wrap_angle(y - y_hat)
+"""
+
+
+def test_a_measured_angle_without_a_residual_is_found(notebook: Notebook) -> None:
+    notebook.run("from pfbench.core import wrap_angle")
+    notebook.run(MODEL + TURNS)
+    assert pfbench.check(notebook["Circle"]).passed
+    (row,) = pfbench.check(notebook["Compass"]).rows
+    assert row.message.startswith("channel 1 of Compass jumps by 2 pi. Define residual(self, y")
 
 
 def test_parts_of_a_script_share_its_classes_and_depend_on_what_they_reach(
@@ -219,6 +248,46 @@ def test_a_regime_that_states_another_distribution_is_found(notebook: Notebook) 
     assert not pfbench.run(WALK, "ekf", noise=notebook["Slips"](), study="n", **SMALL).failed()
 
 
+REGIMES = {"Three": "len(time), 3", "Few": "len(time), min(2, size)", "Long": "200, size"}  # array
+
+
+def test_a_regime_is_tried_in_its_world_and_checked_with_any_number_of_channels(
+    notebook: Notebook,
+) -> None:
+    notebook.run("from pfbench.noise import NoiseRegime")
+    for name, shape in REGIMES.items():
+        notebook.run(
+            f"class {name}(NoiseRegime):\n    def draw_errors(self, draws, channels, time):\n        size = len(channels.sd)\n"
+            f"        return draws.normal('mine', {shape})"
+        )
+    three, few, long = (notebook[name]() for name in REGIMES)
+    lorenz = pfbench.get("scenario", "lorenz63", steps=5)
+    assert not pfbench.run(lorenz, "ekf", noise=three, study="n", progress=False, **SMALL).failed()
+    sentence = (
+        "draw_errors must return errors [R, T, Dy] = {} for {} of any number of channels, got"
+    )
+    for call, shape in (
+        (lambda: pfbench.check(three), [2, 200, 1]),
+        (lambda: pfbench.check(few), [2, 200, 3]),
+        (lambda: pfbench.check(long, scenario=lorenz), [2, 5, 3]),
+    ):
+        assert sentence.format(shape, shape[-1]) in call().rows[0].message
+    assert pfbench.check(long).passed
+    check_refused(
+        [
+            (
+                re.escape(sentence.format([2, 5, 3], 3)),
+                lambda: pfbench.run(lorenz, "ekf", noise=few, study="m", **SMALL),
+            ),
+            (
+                "scenario must be given for a noise only",
+                lambda: pfbench.check(lorenz, scenario=lorenz),
+            ),
+        ],
+        remedy=False,
+    )
+
+
 def test_a_file_that_an_own_stage_reads_must_be_stated(
     notebook: Notebook, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -265,7 +334,7 @@ BAD_CELLS = {
         "Bare()", "Bare must be a subclass of pfbench.noise.NoiseRegime to be a noise regime, got a subclass of object"
     ),
     f"SD = 1.0\n{WORLD}\nclass Flat(Slips):\n    def draw_errors(self, draws, channels, time):\n        return time": (
-        "Flat()", "Flat.draw_errors must return errors [R, T, Dy] = [2, 200, 2], got [200]"
+        "Flat()", "Flat.draw_errors must return errors [R, T, Dy] = [2, 6, 1] for 1 of any number of channels, got [6]"
     ),
     f"SD = 1.0\n{WORLD}\nclass Loud(Slips):\n    def draw_errors(self, draws, channels, time):\n        return time.nothing": (
         "Loud()", "draw_errors of your class must succeed, got AttributeError: 'Tensor' object has no attribute 'nothing'. Correct the line: return time.nothing"
@@ -314,10 +383,10 @@ def test_an_object_of_an_earlier_definition_is_refused(notebook: Notebook) -> No
     notebook.run(PROPOSAL)
     old = notebook["Defensive"]()
     notebook.run(PROPOSAL)
-    with pytest.raises(
-        ValueError, match=r"got one that was defined before\. Make the object again"
-    ):
-        pfbench.own(old)
+    check_refused(
+        [(r"got one that was defined before\. Make the object again", lambda: pfbench.own(old))],
+        remedy=False,
+    )
 
 
 # bad input: the sentences of the command line
@@ -362,7 +431,7 @@ def test_unknown_keys_have_the_sentence_of_the_command_line(home: Path) -> None:
 
 
 def test_a_failed_job_is_listed_with_the_words_that_repeat_it(
-    home: Path, capsys: pytest.CaptureFixture[str]
+    home: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     bad = pfbench.get("filter", "sir", particles=0)
     study = pfbench.run(WALK, ["ekf", bad], study="f", **SMALL)
@@ -379,6 +448,13 @@ def test_a_failed_job_is_listed_with_the_words_that_repeat_it(
     assert "must be a whole number of at least 2, got 0" in said.err + said.out
     with pytest.raises(RuntimeError, match="must be a whole number of at least 2, got 0"):
         pfbench.run(WALK, [bad], study="g", progress=False, **SMALL)
+    assert capsys.readouterr() == ("", "")
+    caplog.clear()
+    pfbench.run(WALK, ["ekf", bad], study="f", progress=False, **SMALL)
+    (record,) = (
+        r for r in caplog.records if r.levelname == "WARNING"
+    )  # without lines of progress one warning says it
+    assert "1 of 2 jobs failed: filter.particles must be a whole number" in record.getMessage()
 
 
 # a study
@@ -422,10 +498,13 @@ def test_errors_are_those_of_the_files(study: pfbench.Study) -> None:
             rmse = np.sqrt((error**2).sum(-1).mean(-1))
             np.testing.assert_allclose(errors.loc[condition.noise][job.label], rmse, rtol=1e-6)
     assert set(study.table("rmse")["metric"]) == {"rmse"}
-    with pytest.raises(ValueError, match="metric must be one of"):
-        study.table("rsme")
-    with pytest.raises(ValueError, match="group must be one of"):
-        study.errors("wing")
+    check_refused(
+        [
+            ("metric must be one of", lambda: study.table("rsme")),
+            ("group must be one of", lambda: study.errors("wing")),
+        ],
+        remedy=False,
+    )
 
 
 def test_a_comparison_is_the_one_of_the_page_and_of_the_errors(study: pfbench.Study) -> None:
@@ -450,17 +529,29 @@ def test_a_comparison_is_the_one_of_the_page_and_of_the_errors(study: pfbench.St
     assert len(comparison.table()) == 2
     with pytest.raises(ValueError, match="must have one condition, got 2"):
         _ = comparison.word
-    with pytest.raises(ValueError, match="filter must be a filter of the study, got 'sirr'"):
-        study.compare("sirr", "ekf")
+    check_refused(
+        [
+            (
+                "filter must be a filter of the study, got 'sirr'",
+                lambda: study.compare("sirr", "ekf"),
+            )
+        ],
+        remedy=False,
+    )
 
 
-def test_summary_page_and_html(study: pfbench.Study) -> None:
+def test_summary_page_and_html(study: pfbench.Study, capsys: pytest.CaptureFixture[str]) -> None:
     summary = study.summary()
     page = study.report(figure_formats=("svg",)).with_name("report.md").read_text()
     assert summary.sentence in page
     for row in summary.rows:
         assert row[1] in page
     assert repr(summary) in repr(study)
+    one = pfbench.run(WALK, ["ekf", "sir"], study="one", results_dir=study.results, **SMALL)
+    for row in one.summary().rows:  # one number in the table, in errors() and on the console
+        error = one.errors()[row[1].lower()].median()
+        assert float(row[2].split()[0]) == pytest.approx(error, rel=5e-3)
+        assert f"median RMS error {error:.4g} m" in capsys.readouterr().out or row[1] != "EKF"
     html = study._repr_html_()
     assert html.count("<tr>") == 4
     assert summary.rows[0][1] in html
@@ -475,10 +566,13 @@ def test_figures_show_each_filter_once(study: pfbench.Study, kind: str) -> None:
     labels = {text.get_text().strip() for text in (*ax.texts, *ax.get_yticklabels())}
     labels |= {text.get_text() for text in (ax.get_legend().get_texts() if ax.get_legend() else ())}
     assert {"EKF", "SIR", "RPF"} <= labels
-    with pytest.raises(ValueError, match="must select one condition of the study, got 2"):
-        study.plot(kind)
-    with pytest.raises(ValueError, match="kind must be one of cost, time, calibration, run"):
-        study.plot("pie")
+    check_refused(
+        [
+            ("must select one condition of the study, got 2", lambda: study.plot(kind)),
+            ("kind must be one of cost, time, calibration, run", lambda: study.plot("pie")),
+        ],
+        remedy=False,
+    )
 
 
 def test_more_runs_are_those_of_one_longer_study(home: Path) -> None:

@@ -38,11 +38,14 @@ def test_the_readme_runs_as_a_script_and_prints_its_leaderboard(tmp_path: Path) 
 def test_the_examples_of_the_page_run_as_a_script(tmp_path: Path) -> None:
     printed = run_page(ROOT / "docs" / "python.md", tmp_path)
     assert "FAILS" not in printed
-    assert printed.count(", 0 failed in") == 7  # studies of the page
+    assert printed.count(", 0 failed in") == 10  # studies of the page
     assert {path.name for path in (tmp_path / "results").iterdir()} == {
         "first",
         "settings",
         "mine",
+        "resamplers",
+        "inflated",
+        "buoy",
         "public",
         "beside",
         "room",

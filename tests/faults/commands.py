@@ -192,7 +192,11 @@ def plant_results(home: Home, rng: random.Random) -> None:
 
 
 def plant_caches(home: Home, rng: random.Random) -> None:
-    """Damaged caches, and links out of the folder."""
+    """Damaged caches, links out of the folder, pipes and names of two lines."""
+    for name in ("manifest.json", "figures/paper_1.png"):
+        home.write(f"reports/{STUDY}/{name}", "").unlink()
+        os.mkfifo(home.place / "reports" / STUDY / name)
+    home.write("conf/noise/two\nlines.yaml", "_target_: mylab.Noise\n")
     home.write("worlds/0123456789abcdef.npz", "PK\x03\x04")
     home.write(f"results/{STUDY}/0123456789abcdef.failed.json", "{}")
     secret = home.path / "outside" / "secret.csv"
@@ -256,7 +260,7 @@ def judge(ending: Ending, found: list[str]) -> tuple[str, str]:
     if ending.state != "done" or "Traceback (most" in str(ending.value[1]):
         return "crash", f"{ending}"
     code, text = ending.value
-    if "\x1b" in text or (code not in (0, 3) and not CLEAR.search(text)):
+    if "\x1b" in text or "\nlines" in text or (code not in (0, 3) and not CLEAR.search(text)):
         return "unclear", f"{code} {text[-300:]!r}"
     return FINE, ""
 

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
+from refusals import check_refused
 
 from pfbench.files import limits
 from pfbench.files.table_file import read_table_file
@@ -183,8 +184,9 @@ def test_a_bomb_is_refused_before_it_is_read(tmp_path: Path, name: str) -> None:
     write(path)
     tracemalloc.start()
     start = time.process_time()
-    with pytest.raises(ValueError, match=rf"{file}.* must (have|inflate to|be).*got .*\. [A-Z]"):
-        read(path)
+    check_refused(
+        [(rf"{file}.* must (have|inflate to|be).*got .*\. [A-Z]", lambda: read(path))], remedy=False
+    )
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 4 * limits.INFLATED_FREE
@@ -197,11 +199,15 @@ def test_files_within_the_limits_are_read(tmp_path: Path) -> None:
     path.write_bytes(gzip.compress(content[: 2**20]) + gzip.compress(content[2**20 :]))
     assert limits.inflate(path, path.read_bytes()) == content
     path.write_bytes(gzip.compress(content)[:-9])
-    with pytest.raises(ValueError, match=r"a\.gz must be a gzip file"):
-        limits.inflate(path, path.read_bytes())
+    check_refused(
+        [(r"a\.gz must be a gzip file", lambda: limits.inflate(path, path.read_bytes()))],
+        remedy=False,
+    )
     path.write_bytes(b"no gzip")
-    with pytest.raises(ValueError, match=r"a\.gz must be a gzip file"):
-        limits.inflate(path, path.read_bytes())
+    check_refused(
+        [(r"a\.gz must be a gzip file", lambda: limits.inflate(path, path.read_bytes()))],
+        remedy=False,
+    )
     stream = io.BytesIO()
     np.savez_compressed(stream, zeros=np.zeros(2**20))  # a ratio of a thousand, and 8 MB
     path.write_bytes(stream.getvalue())

@@ -154,7 +154,7 @@ def test_a_filter_is_recorded_or_the_page_says_why_not(
 def record_only(function: Any, example: list[Tensor]) -> Any:
     """Record a step as `compile_function` does, and run the recorded operations."""
     graph = make_fx(function)(*example)
-    return lambda given: graph(*given), None
+    return lambda given: graph(*given)
 
 
 def test_the_page_counts_the_filters_that_compile() -> None:
@@ -203,7 +203,7 @@ def test_a_compiled_step_with_other_numbers_is_not_used(
                 out[1] = 0.5 * out[1]
             return out
 
-        return run_step, None
+        return run_step
 
     monkeypatch.setattr(compiled_filter, "compile_function", compile_wrongly)
     model, step = tracker().to(dtype), CompiledParticleFilter(method_of("sir"))

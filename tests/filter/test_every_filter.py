@@ -76,7 +76,7 @@ SELDOM_RESAMPLED = (
 MOVED = ("mcmc_tail", "mcmc_bridge", "mcmc_rpf_printed", "mcmc_rpf_literal")
 EXACT = (
     *("sir", "sir_printed", "sir_literal", "apf", "sqmc", "rbpf"), *("ckf_pf", "ekf_pf", "ukf_pf"), *MOVED,
-    *("dmc_density", "dmc_noise", "dmc_optimal"), "guided_start", "interval_pf", *EXACT_EACH,
+    *("dmc_density", "dmc_noise", "dmc_optimal"), "guided_start", *EXACT_EACH,
 )  # fmt: skip
 
 

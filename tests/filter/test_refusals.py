@@ -58,9 +58,6 @@ REFUSED: dict[str, list[Refusal]] = {
         (r"alpha must be positive, got 0\.0", lambda: f.UnscentedPoints(0.0)),
         (r"kappa must be above -2, got -2\.0\. More than -d", lambda: f.UnscentedPoints(1.0, 2.0, -2.0)(2)),
         ("linearisation.largest_angle must be positive, got 0", lambda: f.SigmaPointLinearisation(f.CubaturePoints(), largest_angle=0.0)),
-        (r"points\.order must be .* at least 2, got 1", lambda: f.GaussHermitePoints(1)),
-        (r"at most 20000 points, got 3\^15 .*filter=sparse_grid", lambda: f.GaussHermitePoints(3)(15)),
-        (r"points\.level must be 2 or 3, got 4", lambda: f.SparseGridPoints(4)),
     ],
     "ensemble": [
         (r"filter\.particles must be .*, got 1", lambda: f.EnsembleKalmanFilter(1)),

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from config_cases import truncated
 
@@ -27,11 +28,11 @@ def settings(tmp_path: Path, *words: str) -> Any:
     return compose([*JOB, f"results_dir={tmp_path}/results", "episode_cache_dir=null", *words])
 
 
-@pytest.mark.parametrize(("engine", "batch"), [("auto", 4), ("compiled", 2)])
-def test_a_job_takes_the_batches_of_its_engine(
-    engine: str, batch: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("engine", ["auto", "compiled"])
+def test_a_job_takes_its_batches_in_every_engine(
+    engine: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those of a compiled step are smaller where the state has many components. By default no small step is compiled."""
+    """By default no step is compiled."""
     passes: list[tuple[int, int | None]] = []
 
     def spy(method: Any, model: Any, record: Any, draws: Any, *more: Any) -> Any:
@@ -40,16 +41,47 @@ def test_a_job_takes_the_batches_of_its_engine(
 
     monkeypatch.setattr(filter_pass, "run_filter", spy)
     compiled: list[Any] = []
-    monkeypatch.setattr(compiled_filter, "compile_step", compiled.append)  # no step of any kind
+    monkeypatch.setattr(
+        compiled_filter, "compile_step", lambda *parts: compiled.append(parts)
+    )  # no step of any kind
     words = ["scenario=flight_300s", "runs=4", "particles=8000", f"engine={engine}"]
     plan = build_plan(resolve_config(settings(tmp_path, *words)))
     episode = truncated(plan.draw_episode(plan.runs), 3)
     result = filter_pass.pass_filter(plan, episode, plan.runs, "")
-    assert passes == [(2, None), (3, batch)]
+    assert passes == [(2, None), (3, 4)]
     assert bool(compiled) == (engine == "compiled")
     assert result.cost["likelihoods_per_step"] == 8000.0
-    # 15 components: the overhead of calls alone, in one batch
-    assert filter_pass._predict_saving(plan.method, plan.model, 4, 1000) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(("threads", "batch"), [(1, 4), (2, 2)])
+def test_a_job_with_a_tape_gives_the_results_of_one_with_kernels(
+    threads: int, batch: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the batches of kernels, which threads share. By default a bootstrap filter has a tape, in double precision."""
+    batches: list[int | None] = []
+
+    def spy(method: Any, model: Any, record: Any, draws: Any, *more: Any) -> Any:
+        batches.append(more[2] if more else None)
+        return run_filter(method, model, record, draws, *more)
+
+    monkeypatch.setattr(filter_pass, "run_filter", spy)
+    found: dict[str, dict[str, Any]] = {}
+    for engine in ("kernels", "tape", "auto"):
+        words = ["runs=4", "particles=300", f"engine={engine}", f"threads={threads}"]
+        plan = build_plan(resolve_config(settings(tmp_path, *words)))
+        episode = truncated(plan.draw_episode(plan.runs), 8)
+        result = filter_pass.pass_filter(plan, episode, plan.runs, "")
+        assert result.cost["engine"] == ("tape" if engine == "auto" else engine)
+        assert result.cost["likelihoods_per_step"] == 300.0
+        assert batches[-1] == (4 if engine == "kernels" else batch)
+        found[engine] = result.arrays(episode, None)
+    for engine in ("tape", "auto"):
+        assert found[engine].keys() == found["kernels"].keys()
+        for name, values in found[engine].items():  # in single precision, as they are stored
+            np.testing.assert_allclose(values, found["kernels"][name], rtol=1e-5, atol=1e-6)
+    single = build_plan(resolve_config(settings(tmp_path, "engine=auto", "dtype=float32")))
+    episode = truncated(single.draw_episode(single.runs), 3)
+    assert filter_pass.pass_filter(single, episode, single.runs, "").cost["engine"] == "kernels"
 
 
 def test_what_a_process_loads_once_is_not_in_the_time_of_a_step(

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from command_line import environment, pfbench
+from refusals import check_refused
 
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
@@ -129,14 +130,23 @@ def test_as_many_runs_as_fit_in_parts_of_equal_size(limit: float, size: int) -> 
 
 def test_what_earlier_parts_leave_counts() -> None:
     assert memory.runs_within_limit(estimate(result=0.1), 100, 19.0) == 10
-    with pytest.raises(ValueError, match=r"for the results of 100 runs, got .*first_run=50"):
-        memory.runs_within_limit(estimate(result=0.5), 100, 30.0)
+    check_refused(
+        [
+            (
+                r"for the results of 100 runs, got .*first_run=50",
+                lambda: memory.runs_within_limit(estimate(result=0.5), 100, 30.0),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_one_run_that_does_not_fit_is_told() -> None:
     told = r"memory must be at least 3 GiB for a single run, got 2 GiB. Use fewer particles or dtype=float32"
-    with pytest.raises(ValueError, match=told):
-        memory.runs_within_limit(estimate(run=3.0 * GIB), 100, 2.0 * GIB)
+    check_refused(
+        [(told, lambda: memory.runs_within_limit(estimate(run=3.0 * GIB), 100, 2.0 * GIB))],
+        remedy=False,
+    )
 
 
 def test_small_jobs_are_not_tried() -> None:
@@ -163,8 +173,7 @@ def test_a_world_that_cannot_fit_is_refused_before_it_is_drawn(
     monkeypatch.setattr(plan.JobPlan, "draw_episode", lambda *_: pytest.fail("it was drawn"))
     config = job.compose([*words.split(), "filter=ekf", "runs=2", "memory_limit_gib=0.5"])
     told = r"memory must be at least \S+ GiB for a single run, got 0.5 GiB. Use fewer steps or a shorter flight, or set memory_limit_gib="
-    with pytest.raises(ValueError, match=told):
-        budget.EpisodeSource(job.build_plan(config))
+    check_refused([(told, lambda: budget.EpisodeSource(job.build_plan(config)))], remedy=False)
 
 
 def test_a_world_and_its_filter_hold_objects_of_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -470,30 +470,6 @@ def test_a_loop_by_hand_moves_by_the_coefficients_that_are_not_zero(
 
 
 @compiler
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("particles", [1, 5, 63, 64, 200])
-def test_one_operator_moves_parents_as_its_parts_do_one_after_the_other(
-    dtype: torch.dtype, particles: int
-) -> None:
-    """Bit by bit: also with noise that no component takes, another number of particles, and one that is lost."""
-    slots = 77
-    x = DRAWS.normal("x", slots, D).to(dtype).permute(2, 0, 1).contiguous()
-    x[2, 1, 5] = torch.nan
-    phi, gain = DRAWS.normal("phi", D, D).to(dtype), DRAWS.normal("gain", D, 4).to(dtype)
-    phi[:, 3], gain[1], gain[:, :, 2] = 0.0, 0.0, 0.0
-    ancestors = (DRAWS.uniform("a", particles, 1)[..., 0] * slots).long()
-    key = torch.tensor(4), 99, torch.tensor(3), torch.tensor([7, 0, 12])
-    draw = dispatch.philox_normals if dtype == torch.float32 else dispatch.philox_normals_float64
-    for a, b in ((phi, gain), (phi[:1], gain[:1]), (phi[:1], gain), (phi, gain[:1])):
-        noise = draw(*key, 4, -(-particles // 4))[..., :particles].permute(1, 2, 0)
-        parents = dispatch.gather_particles(x, ancestors).permute(1, 2, 0)
-        expected = dispatch.propagate_affine(a, parents, b, noise)
-        moved = dispatch.gather_propagate(a, x, ancestors, b, *key)
-        assert moved.dtype == dtype
-        torch.testing.assert_close(moved, expected, rtol=0.0, atol=0.0, equal_nan=True)
-
-
-@compiler
 def test_a_gradient_goes_round_the_loops_by_hand() -> None:
     x, w = (
         DRAWS.normal("x", N, D).requires_grad_(),
@@ -544,32 +520,30 @@ def test_a_compiled_job_gives_the_numbers_of_an_eager_one(tmp_path: Path, dtype:
 
 
 @compiler
-def test_auto_takes_the_operators_and_compiles_the_step_where_it_repays(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_auto_takes_a_tape_where_it_applies(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    model, small, large = linear_walk(1.0, 0.3, 1.0), ParticleFilter(100), ParticleFilter(10**6)
+    model, plain = linear_walk(1.0, 0.3, 1.0), ParticleFilter(100)
     gaussian = gaussian_filter.GaussianFilter(
         linearisation_rules.SigmaPointLinearisation(CubaturePoints())
     )
     filter_pass._say_once.cache_clear()
     choose = filter_pass.choose_engine
-    for _ in range(2):
-        assert choose("auto", small, model, 1, 10) == "kernels"
-        assert choose("auto", large, model, 10, 400) == "compiled"
-    assert [record.getMessage() for record in caplog.records] == [
-        "engine=auto: C++ operators",
-        "engine=auto: the step is compiled, which saves about 25 s",
-    ]
-    assert choose("auto", gaussian, model, 10**4, 10**4) == "kernels"
+    for engine in ("auto", "tape", "auto"):
+        assert choose(engine, plain, model, 10, 400) == "tape"
+        assert choose(engine, gaussian, model, 10, 400) == "kernels"
+    assert choose("auto", plain, linear_walk(1.0, 0.3, 1.0).float(), 10, 400) == "kernels"
+    said = [record.getMessage() for record in caplog.records]
+    assert said[0] == "engine=auto: all steps in C++, with a tape of the model"
+    assert said[1] == "engine=auto: C++ operators, step by step (it is no filter of these stages)"
+    assert len(said) == 5  # each line once
     for engine in ("eager", "kernels", "compiled"):
-        assert choose(engine, small, model, 1, 10) == engine
+        assert choose(engine, plain, model, 1, 10) == engine
 
 
 def test_auto_runs_in_torch_operations_without_a_library(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(filter_pass, "is_library_loaded", lambda: False)
     model = linear_walk(1.0, 0.3, 1.0)
-    for engine in ("auto", "kernels", "compiled"):
+    for engine in ("auto", "kernels", "tape", "compiled"):
         assert filter_pass.choose_engine(engine, ParticleFilter(100), model, 10, 10) == "eager"
 
 

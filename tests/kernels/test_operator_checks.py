@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import random
 import shutil
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,19 +21,15 @@ from pfbench.filter.particle import stages
 from pfbench.filter.proposed import swarm_weighting
 from pfbench.job import scoring
 from pfbench.kernels import (
-    cpp_library,
-    cpp_library as private_folder,
     dispatch,
     manifest,
     operator_sources,
-    step_compiler,
 )
 from pfbench.kernels.manifest import check_arguments
-from pfbench.kernels.step_compiler import compile_function
 
 COMPILER = shutil.which("c++") or shutil.which("g++")
 compiler = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler")
-NONE = torch.zeros(0, dtype=torch.int64)
+
 X, W = torch.rand(2, 3, 4), torch.rand(3, 4)
 ONE = torch.ones(3, 1)
 
@@ -91,22 +85,6 @@ def test_wrong_values_are_refused() -> None:
             call()
 
 
-def gather_and_propagate(*args: Any) -> Tensor:
-    """The parts of `gather_propagate`, by torch functions: a recorded step alone has it."""
-    check_arguments("gather_propagate", args)
-    phi, x, ancestors, gain, *key = args
-    draw = (
-        random_stream.draw_normals
-        if x.dtype == torch.float32
-        else random_stream.draw_normals_float64
-    )
-    wanted = ancestors.shape[1]
-    noise = draw(*key, gain.shape[-1], -(-wanted // 4))[..., :wanted].permute(1, 2, 0)
-    return linear_algebra._affine(
-        phi, belief._gather_components(x, ancestors).permute(1, 2, 0), gain, noise.to(x.dtype)
-    )
-
-
 class GivenUniform(random_stream.PhiloxStream):
     """A stream whose uniform numbers are given, as `seed`."""
 
@@ -152,7 +130,6 @@ def eager_function(name: str) -> Callable[..., Any]:
         "log_normal": density._quadratic,
         "log_observed_normal": density._density,
         "propagate_affine": linear_algebra._affine,
-        "gather_propagate": gather_and_propagate,
         "count_unique": belief.count_distinct_ancestors,
         "sum_and_squares": belief._totals,
         "sum_log_weights": belief._add_terms,
@@ -305,121 +282,6 @@ def test_a_wrong_call_has_one_message_in_eager_mode_and_in_cpp(name: str) -> Non
         assert refusal(getattr(dispatch, name), call) == message
         with dispatch.use_kernels():
             assert refusal(function, call) == message
-
-
-@compiler
-def test_a_step_is_called_by_its_number_only() -> None:
-    """No address goes through Python, and a library without a step is not taken."""
-    for number in (-1, 0, 4096, 2**62, id(X)):
-        with pytest.raises(RuntimeError, match="must be the number of a registered step"):
-            step_compiler.run_steps(number, [], [], [torch.rand(2, 1)], [], NONE, NONE)
-    loaded = str(Path(torch.__file__).parent / "lib/libc10.so").encode()  # may be another user's
-    names = [b"", b"no such file", b"libc10.so", loaded, b"\xff" * 5000]
-    for name in names:
-        with pytest.raises(
-            RuntimeError if name != loaded else (RuntimeError, PermissionError),
-            match=r"library must be a step of torch's compiler|Compiled code is not loaded",
-        ):
-            step_compiler.register_step(torch.tensor(list(name), dtype=torch.uint8), 1, [])
-    with pytest.raises(RuntimeError, match="must be a path as bytes"):
-        step_compiler.register_step(torch.zeros(4), 1, [])
-
-
-@compiler
-def test_a_step_is_loaded_only_from_where_others_cannot_write(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Refused before it is loaded, which alone would run its code; a link counts as what it leads to."""
-    cpp_library.load_library()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
-    folder = tmp_path / "steps"
-    library, link = folder / "step.so", tmp_path / "link.so"
-    folder.mkdir(mode=0o700)
-    library.write_bytes(b"")
-    link.symlink_to(library)
-
-    def register(path: Path) -> None:
-        step_compiler.register_step(step_compiler.encode_path(path), 1, [])
-
-    for folder_mode, library_mode in ((0o777, 0o600), (0o700, 0o666), (0o720, 0o600)):
-        folder.chmod(folder_mode)
-        library.chmod(library_mode)
-        for path in (library, link):
-            with pytest.raises(PermissionError, match="Compiled code is not loaded from it"):
-                register(path)
-    folder.chmod(0o700)
-    library.chmod(0o600)
-    kept = private_folder.code_folder() / "torch" / "step.so"
-    kept.parent.mkdir()
-    kept.write_bytes(b"")
-    kept.chmod(0o664)  # of a user whose files a group may write, in a folder that it cannot enter
-    for path in (library, link, kept, Path(step_compiler.__file__)):
-        with pytest.raises(RuntimeError, match="library must be a step of torch's compiler"):
-            register(path)
-    monkeypatch.setattr(os, "getuid", lambda: 12345)
-    with pytest.raises(PermissionError, match="of this user"):
-        register(library)
-
-
-@compiler
-def test_a_compiled_step_takes_the_arguments_that_it_was_compiled_for() -> None:
-    example = [torch.rand(3, 2), torch.rand(4, dtype=torch.float64)]
-    _, entry = compile_function(lambda a, b: [a + 1.0, b * 2.0], example)
-    assert entry is not None
-    number, constants = entry
-    good = [torch.rand(1, 3, 2), torch.rand(1, 4).double()]
-    first, second = step_compiler.run_once(entry, example)
-    assert torch.equal(first, example[0] + 1.0)
-    assert torch.equal(second, example[1] * 2.0)
-    wrong = {
-        "arguments": [good[0]],
-        "argument 0": [torch.rand(1, 2, 3), good[1]],
-        "argument 1": [good[0], torch.rand(1, 4)],
-        "one row": [good[0], torch.rand(2, 4).double()],
-        "strides": [torch.rand(1, 2, 3).permute(0, 2, 1), good[1]],
-    }
-    for words, inputs in wrong.items():
-        with pytest.raises(RuntimeError, match=words):
-            step_compiler.run_steps(number, constants, [], inputs, [], NONE, NONE)
-    with pytest.raises(RuntimeError, match="inputs must have at least one"):
-        step_compiler.run_steps(number, constants, example, [], [], NONE, NONE)
-    with pytest.raises(RuntimeError, match="state must have at most 2 tensors"):
-        step_compiler.run_steps(
-            number, constants, [*example, example[0]], [good[0]], [], NONE, NONE
-        )
-    for numbers, words in (([2], "joined must be numbers of results"), ([-1], "joined must be")):
-        with pytest.raises(RuntimeError, match=words):
-            step_compiler.run_steps(number, constants, [], good, [], torch.tensor(numbers), NONE)
-    with pytest.raises(RuntimeError, match=r"kept must be int64 \[n\]"):
-        step_compiler.run_steps(number, constants, [], good, [], NONE, torch.zeros(2))
-
-
-@compiler
-def test_steps_end_before_the_first_result_that_is_not_finite() -> None:
-    """Joined results of the steps before it, the others of the kept steps and of the last one."""
-    example = [torch.zeros(2), torch.zeros(3, 1, 4), torch.zeros(())]
-    _, entry = compile_function(
-        lambda a, x, t: [a + t, x - t, (a + t).log().sum().reshape(1), (x + t).sum(-1)], example
-    )
-    assert entry is not None
-    number, constants = entry
-
-    def run(steps: list[float], kept: list[int]) -> list[torch.Tensor]:
-        joined = torch.tensor([2, 3])
-        state, inputs = [torch.ones(2), torch.zeros(3, 1, 4)], [torch.tensor(steps)]
-        return step_compiler.run_steps(
-            number, constants, state, inputs, [], joined, torch.tensor(kept, dtype=torch.int64)
-        )
-
-    sums, first, *others = run([1.0, 2.0, -9.0, 3.0], [0])  # 2, 4, and the logarithm of -5
-    torch.testing.assert_close(sums, 2.0 * torch.tensor([[2.0], [4.0]]).log())
-    assert first.shape == (2, 3, 1)
-    assert [tuple(a.shape) for a in others] == [(2,), (1, 4, 3)] * 2
-    assert [float(a.flatten()[0]) for a in others] == [2.0, -1.0, 4.0, -3.0]
-    assert len(run([1.0, 2.0, 3.0], [2])) == 4  # the last one, once
-    assert len(run([1.0, 2.0, 3.0], [0, 1, 2])) == 8
-    nothing = run([-9.0, 1.0], [0, 1])
-    assert [tuple(a.shape) for a in nothing] == [(0, 1), (0, 3, 1)]
 
 
 def test_the_python_check_names_the_argument() -> None:

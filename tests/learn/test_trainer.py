@@ -17,6 +17,7 @@ import pytest
 import torch
 from command_line import pfbench
 from network_cases import NETWORKS, shaken
+from refusals import check_refused
 from synthetic_results import list_results
 from torch import Tensor, nn
 from torch.distributions import Distribution, Independent, Normal
@@ -348,11 +349,21 @@ def test_another_training_does_not_go_on_from_there(
     with pytest.raises(Stop):
         run(plan, stop)
     options = {name: value for name, value in change.items() if name in ("memory", "guide_filter")}
-    with pytest.raises(ValueError, match=said):
-        run(
-            replace(plan, **{name: value for name, value in change.items() if name not in options}),
-            **options,
-        )
+    check_refused(
+        [
+            (
+                said,
+                lambda: run(
+                    replace(
+                        plan,
+                        **{name: value for name, value in change.items() if name not in options},
+                    ),
+                    **options,
+                ),
+            )
+        ],
+        remedy=False,
+    )
     run(replace(plan, epochs=3, patience_epochs=5))  # more of the same is the same training
     assert len(checkpoint.read_checkpoint(tmp_path / "one.pt")["losses"]) == 3
 
@@ -466,8 +477,9 @@ def test_every_network_can_be_trained(tmp_path: Path) -> None:
     ],
 )
 def test_training_refuses_values_of_no_use(key: str, value: Any) -> None:
-    with pytest.raises(ValueError, match=f"train.{key} must be .*, got {value}"):
-        Training(**{key: value})
+    check_refused(
+        [(f"train.{key} must be .*, got {value}", lambda: Training(**{key: value}))], remedy=False
+    )
 
 
 def test_training_refuses_what_it_cannot_do(tmp_path: Path) -> None:

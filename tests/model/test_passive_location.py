@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from refusals import check_refused
 from torch import Tensor
 from torch.autograd import forward_ad
 
@@ -256,8 +257,15 @@ def test_it_starts_about_its_origin_where_no_record_says_otherwise() -> None:
     assert law.stddev[0].tolist() == [1e4, 2e4, 5.0, 6.0]
     truth = {"position": torch.ones(1, 2, 2), "velocity": 2 * torch.ones(1, 2, 2)}
     assert model.assemble(truth)[0, 0].tolist() == [1.0, 1.0, 2.0, 2.0]
-    with pytest.raises(ValueError, match=r"record\.u must be PlatformInputs .*, got no inputs"):
-        model.prepare(Record(torch.zeros(1, 1, 5)))
+    check_refused(
+        [
+            (
+                r"record\.u must be PlatformInputs .*, got no inputs",
+                lambda: model.prepare(Record(torch.zeros(1, 1, 5))),
+            )
+        ],
+        remedy=False,
+    )
 
 
 @pytest.mark.parametrize(
@@ -277,5 +285,14 @@ def test_it_starts_about_its_origin_where_no_record_says_otherwise() -> None:
     ],
 )
 def test_bad_numbers_are_refused(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        PassiveLocation(**{"interval": 1.0, "acceleration_sd": 0.1, "measurement_sd": SD} | change)
+    check_refused(
+        [
+            (
+                message,
+                lambda: PassiveLocation(
+                    **{"interval": 1.0, "acceleration_sd": 0.1, "measurement_sd": SD} | change
+                ),
+            )
+        ],
+        remedy=False,
+    )

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from checkout import ROOT
+from refusals import check_refused
 from torch import Tensor
 from typing_extensions import override
 
@@ -182,15 +183,23 @@ def test_without_slope_the_point_mass_filter_keeps_the_initial_distribution() ->
     ],
 )
 def test_a_terrain_of_bad_values_is_refused(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        replace(TERRAIN, **change)
+    check_refused([(message, lambda: replace(TERRAIN, **change))], remedy=False)
 
 
 @pytest.mark.parametrize("name", ["initial_sd", "drift", "measurement_sd", "interval_s"])
 def test_sizes_that_are_not_positive_are_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=f"scenario.{name} must be finite positive"):
-        replace(SCENE, **{name: 0.0})
+    check_refused(
+        [(f"scenario.{name} must be finite positive", lambda: replace(SCENE, **{name: 0.0}))],
+        remedy=False,
+    )
     values = {"interval": 1.0, "drift": 1.0, "measurement_sd": 1.0, "initial_sd": 1.0}
     key = name.removesuffix("_s")
-    with pytest.raises(ValueError, match=f"model.{key} must be finite positive"):
-        TerrainAided(TERRAIN, **(values | {key: -1.0}))
+    check_refused(
+        [
+            (
+                f"model.{key} must be finite positive",
+                lambda: TerrainAided(TERRAIN, **(values | {key: -1.0})),
+            )
+        ],
+        remedy=False,
+    )

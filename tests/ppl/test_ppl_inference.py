@@ -29,7 +29,7 @@ from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.linear_gaussian import local_level
 from pfbench.model.textbook import StochasticVolatility
-from pfbench.ppl.ibis_smc2 import smc2
+from pfbench.ppl.ibis_smc2 import Smc2Result, smc2
 from pfbench.ppl.inference_job import draw_equally
 from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood
 from pfbench.ppl.nuts_svi import normal_guide, nuts, svi
@@ -319,10 +319,14 @@ def on_grid(model: Any, record: Record) -> torch.Tensor:
     return (torch.stack(totals).log().sum() + tops.sum())[None]
 
 
+def _equal(result: Smc2Result) -> ParameterPosterior:
+    return draw_equally(result.values, result.weights, "SMC2")
+
+
 WIDE = {"rho": Beta(18.0, 2.0), "mu": Normal(8.0, 1.5), "sigma": LogNormal(-0.7, 0.5)}
 FITS: dict[str, Callable[[], ParameterPosterior]] = {
-    "few": lambda: draw_equally(smc2(VOLATILITY, ParticleFilter(60), INDEX, 100, seed=1)),
-    "smc2": lambda: draw_equally(smc2(VOLATILITY, ParticleFilter(100), INDEX, 400, seed=1)),
+    "few": lambda: _equal(smc2(VOLATILITY, ParticleFilter(60), INDEX, 100, seed=1)),
+    "smc2": lambda: _equal(smc2(VOLATILITY, ParticleFilter(100), INDEX, 400, seed=1)),
     "pmmh": lambda: pmmh(VOLATILITY, ParticleFilter(100), INDEX, 100, 60, 64, 1, PmmhSettings(start=WIDE)),
     "nuts": lambda: nuts(program(VOLATILITY, on_grid), INDEX, draws=300, warmup=120, chains=1, seed=1),
     "svi": lambda: svi(

@@ -13,7 +13,7 @@ from checkout import ROOT
 from scipy import stats
 
 from pfbench.report import RUNS_FILE, read_stored_study
-from pfbench.report.board.entries import StudyNames, metric_entries
+from pfbench.report.board.entries import StudyFacts, metric_entries
 from pfbench.report.board.study_views import (
     build_views,
     planned_entries,
@@ -183,11 +183,12 @@ def views_of(data: pd.DataFrame, limit: float | None = None, **options: Any) -> 
     """Views of a page with the baselines SIR and UKF."""
     labels = sorted(data["filter"].unique())
     worlds = {w: PartName(w, w, "", "m", limit, w) for w in data["scenario"].unique()}
-    names = StudyNames(find_looks(labels), worlds, {}, [k for k in ("sir", "ukf") if k in labels])
+    baselines = [k for k in ("sir", "ukf") if k in labels]
+    facts = StudyFacts(find_looks(labels), worlds, {}, ReportOptions(**options), {})
     runs = arrange_runs(data, labels)
-    court = Court(runs, fix_pairs(labels, [], names.baselines[0]), MARGIN, 0.05)
+    court = Court(runs, fix_pairs(labels, [], baselines[0]), MARGIN, 0.05)
     groups = data.groupby(["scenario", "regime"])[["unit", "group"]].first()
-    return build_views(court, groups, names, ReportOptions(**options))
+    return build_views(court, groups, facts, baselines)
 
 
 def test_filters_are_compared_where_all_of_them_were_run() -> None:
@@ -342,10 +343,10 @@ def test_sentences_of_published_studies_have_at_most_55_words(study: str) -> Non
 
 def test_the_interval_of_a_new_world_needs_ten_worlds() -> None:
     data = table({"mcmc_rpf": -0.3, "sir": 0.0}, worlds=11, runs=10)
-    looks, options = find_looks(["mcmc_rpf", "sir"]), ReportOptions()
+    looks = find_looks(["mcmc_rpf", "sir"])
     worlds = {f"w{k}": PartName(f"w{k}", f"w{k}", "", "m", None, f"w{k}") for k in range(11)}
     court = Court(arrange_runs(data, looks), plan_look_pairs(looks))
-    (entry,) = planned_entries(court, looks, worlds, options)
+    (entry,) = planned_entries(court, StudyFacts(looks, worlds, {}, ReportOptions(), {}))
     new = entry["new_world"]
     assert (new["worlds"], new["word"]) == (11, "better")
     assert new["low"] < entry["estimate"] < new["high"]
@@ -353,9 +354,9 @@ def test_the_interval_of_a_new_world_needs_ten_worlds() -> None:
 
 def test_too_few_runs_say_why_a_planned_pair_has_no_interval() -> None:
     data = table(runs=4, worlds=1)
-    looks, options = find_looks(sorted(data["filter"].unique())), ReportOptions()
+    looks = find_looks(sorted(data["filter"].unique()))
     court = Court(arrange_runs(data, looks), plan_look_pairs(looks))
-    (entry, *_) = planned_entries(court, looks, {}, options)
+    (entry, *_) = planned_entries(court, StudyFacts(looks, {}, {}, ReportOptions(), {}))
     assert (entry["low"], entry["high"], entry["word"]) == (None, None, "not decided")
     assert "are not decided (4 runs, 10 are required; ratio" in entry["sentence"]
     pack = {"planned": [entry], "filters": [{"key": k, "name": k} for k in looks]}

@@ -12,7 +12,7 @@ from pfbench.report import provenance
 from pfbench.report.board import build_pack
 from pfbench.report.board.curves import read_settings, select_telling_runs
 from pfbench.report.board.entries import describe_uncommitted
-from pfbench.report.board.pack import MethodNotes, select_baselines
+from pfbench.report.board.pack import join_notes, note_job, select_baselines
 from pfbench.report.methods_text import write_methods
 from pfbench.report.options import ReportOptions
 from pfbench.results.conditions import Condition, JobFile, load_conditions
@@ -104,11 +104,8 @@ def test_notes_state_exactness_failures_and_choices(results: Path) -> None:
 def test_weights_are_bounded_if_every_job_states_it(results: Path) -> None:
     job = load_conditions("demo", results)[0].jobs[0].load()
     for stated, common in (((True, True), True), ((True, False), False), ((False, None), None)):
-        notes = MethodNotes()
-        for value in stated:
-            meta = {**job.meta, "has_bounded_weights": value}
-            notes.add("sir", JobResult(meta, job.data))
-        (note,) = notes.to_entries({})["filter_notes"]
+        metas = [{**job.meta, "has_bounded_weights": value} for value in stated]
+        (note,) = join_notes([note_job("sir", JobResult(meta, job.data)) for meta in metas])
         assert note["has_bounded_weights"] is common
 
 

@@ -50,6 +50,7 @@ def test_datasheet(tmp_path: Path) -> None:
     assert (made / "tables" / "residuals.csv").is_file()
     assert faults_of_folder(made) == {}
     assert "onerror" in (made / "index.html").read_text()
+    assert "6 runs, seed" in (made / "report.md").read_text()  # the other form says the same
 
 
 def test_claims(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,10 @@ from page_packs import build_pack
 
 from pfbench.report import RUNS_FILE, format_runs, read_stored_study
 from pfbench.report.journal.paper_folder import format_methods
-from pfbench.report.methods_text import MethodsFacts, collect_methods_facts, write_methods
+from pfbench.report.methods_text import FACTS, collect_methods_facts, read_facts, write_methods
 from pfbench.report.study_report import rebuild_page, write_report
 from pfbench.results.conditions import Condition, load_conditions
 
-FACTS = [field.name for field in fields(MethodsFacts)]
 # another value of each fact, and words that the paragraph then has
 CHANGED: dict[str, tuple[Any, str]] = {
     "filters": (1, "compares 1 filter with pfbench"),
@@ -118,8 +116,7 @@ def test_all_readers_write_the_same_paragraph(home: Path, tmp_path: Path) -> Non
         assert (said := pfbench("paper", *words, home=place)).code == 0, said.err
         written = (place / "reports" / "demo" / "paper" / "methods.tex").read_text()
         assert written == format_methods(texts)
-    restored = MethodsFacts.from_entries(stored["methods"])
-    assert restored == collect_methods_facts(load_conditions("demo", home / "results"))
+    assert stored["methods"] == collect_methods_facts(load_conditions("demo", home / "results"))
 
 
 def test_pairs_and_names_are_those_that_the_page_decides_again(pack: dict[str, Any]) -> None:
@@ -171,7 +168,7 @@ def test_the_methods_name_filters_with_other_numbers_of_particles(
 
 
 def test_facts_are_those_of_the_results(conditions: list[Condition]) -> None:
-    facts = collect_methods_facts(conditions, metric="CRPS")
+    facts = read_facts(collect_methods_facts(conditions, metric="CRPS"))
     assert (facts.filters, facts.worlds, facts.metric) == (4, 1, "CRPS")
     assert (facts.scenarios, facts.regimes) == (["flight"], ["surge"])
     assert (facts.runs, facts.steps, facts.seeds) == ([4], [5], [5])
@@ -191,11 +188,11 @@ def test_facts_follow_the_metadata_of_the_jobs(conditions: list[Condition]) -> N
     jobs[0].meta["config"]["budget"] = "time"
     jobs[1].meta["config"]["scenario"] = {"root": "folder", "paper": {"divergence_threshold": 9.0}}
     jobs[2].meta["particles"], jobs[3].meta["seed"] = 50, 6
-    facts = collect_methods_facts(conditions)
+    facts = read_facts(collect_methods_facts(conditions))
     assert facts.rounds == 7
     assert facts.budgets == ["particles", "time"]
     assert (facts.is_recorded, facts.has_threshold) == (True, True)
     assert facts.particles[jobs[2].label] == [50]
     assert facts.seeds == [5, 6]
     partial = conditions[0]._replace(jobs=jobs[:2])
-    assert not collect_methods_facts([*conditions, partial]).is_complete
+    assert not collect_methods_facts([*conditions, partial])["is_complete"]

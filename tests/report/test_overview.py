@@ -36,7 +36,6 @@ from pfbench.report.overview.tables import (
     PRINTED,
     Overview,
     TabKey,
-    Winner,
     World,
     WorldFacts,
     add_levels,
@@ -46,10 +45,12 @@ from pfbench.report.overview.tables import (
     count_recorded_drives,
     count_wins,
     decide_cells,
+    find_outdone,
     find_winners,
     has_overview,
     is_worse,
     list_levels,
+    list_plain_losses,
     list_rivals,
     list_world_notes,
     name_without_level,
@@ -174,8 +175,8 @@ def judge(rows: pd.DataFrame, fixed: list[tuple[str, str]] | None = None) -> lis
     rows = rows.assign(family=rows["scenario"], regime="nominal")
     labels = {str(v): str(v) for v in rows["filter"].unique()}
     court = Court(arrange_runs(rows, tuple(labels)), fixed or combinations(labels, 2))
-    facts = WorldFacts("ekf", None)
-    return [build_world(part, facts, (court, labels)) for _, part in rows.groupby("scenario", sort=False)]  # fmt: skip
+    facts, names = WorldFacts("ekf", None), dict.fromkeys(rows["scenario"])
+    return [build_world(PartName(v, v, v), facts, court, "nominal", labels) for v in names]
 
 
 def test_a_lost_run_is_worse_than_any_kept_one() -> None:
@@ -216,7 +217,7 @@ def test_a_winner_is_better_than_every_baseline() -> None:
     clear = make_rows(rng, "clear", {"m": -0.8, "ekf": 0.0, "sir": 0.2})
     tied = make_rows(rng, "tied", {"m": -0.8, "ekf": 0.0, "sir": -0.8})
     found = find_winners(judge(pd.concat([clear, tied])), ["m"], ["ekf", "sir"])
-    assert [winner.wins for winner in found] == [True, False]
+    assert [wins for _, wins in found.values()] == [True, False]
 
 
 def test_a_filter_loses_track_where_fewer_than_80_percent_of_runs_are_shown_to_keep_it() -> None:
@@ -242,7 +243,7 @@ def test_the_reference_is_that_of_the_tuning_and_not_of_the_runs(
 ) -> None:
     facts = read_world_facts("passive_1", "passive_location")
     assert facts is not None
-    assert overview.names[facts.reference] in {world.reference for world in overview.worlds}
+    assert facts.reference in {world.reference for world in overview.worlds}
     better = table.copy()
     better.loc[better["filter"] == "ukf", "rmse"] *= 0.1
     changed = build_overview(better, looks, parts)
@@ -252,7 +253,7 @@ def test_the_reference_is_that_of_the_tuning_and_not_of_the_runs(
     assert list(left) == ["passive_1"]
     assert f"must have runs of its reference {facts.reference}" in left["passive_1"]
     unknown = build_overview(table.assign(model="other"), looks, parts)
-    assert unknown.worlds == ()
+    assert unknown.worlds == []
     assert "Run pfbench tune scenario=azimuth model=other" in unknown.left_out["azimuth"]
 
 
@@ -262,7 +263,7 @@ def test_sentences_are_short_and_state_numbers_of_the_tables(overview: Overview)
     assert not re.search(r"robust|points|planned|trade-off|consistent", headline)
     cells_of = [c for c in overview.cells if c.filter in overview.methods]
     words = ["lost" if c.loses_track else c.verdict.word for c in cells_of]
-    single = sum(winner.wins for winner in overview.kalman_winners)
+    single = sum(cell.beats_kalman for cell in overview.cells)
     assert f"better in {words.count('better')} of {len(words)} cells" in headline
     assert (f"(in {single} than all single ones)" in headline) == (single > 0)
     against_best = re.sub(r"\(.*?\)", "", headline.split("Kalman filter:", 1)[1])
@@ -278,24 +279,24 @@ def test_sentences_are_short_and_state_numbers_of_the_tables(overview: Overview)
         of_method = [c for c in overview.cells if c.filter == method]
         parts = [story[key] for key in ("wins", "equal", "open", "loses")]
         for world in overview.worlds:
-            assert sum(world.name in text for text in parts) == sum(
+            assert sum(world.part_name.name in text for text in parts) == sum(
                 cell.world == world.key for cell in of_method
             )
 
 
 def test_wins_over_some_kalman_filters_alone_have_a_dagger(overview: Overview) -> None:
     """A dagger is what separates the two counts of the headline."""
-    winners = [w._replace(wins=k == 0) for k, w in enumerate(overview.kalman_winners)]
+    winner = overview.of_methods[0]
     cells = [
-        c._replace(verdict=c.verdict._replace(word="better"), loses_track=False)
+        c._replace(verdict=c.verdict._replace(word="better"), loses_track=False, beats_kalman=c is winner)
         for c in overview.cells
-    ]
-    page = overview._replace(cells=cells, kalman_winners=winners)
+    ]  # fmt: skip
+    page = overview._replace(cells=cells)
     wins = [tell_story(page, method, "")["wins"] for method in page.methods]
     count = sum(cell.filter in page.methods for cell in cells)
     assert sum(text.count("†") for text in wins) == count - 1
-    world = {w.key: w.name for w in page.worlds}[winners[0].world]
-    of_winner = wins[page.methods.index(winners[0].filter)]
+    world = {w.key: w.part_name.name for w in page.worlds}[winner.world]
+    of_winner = wins[page.methods.index(winner.filter)]
     assert re.search(rf"{re.escape(world)} \((\d+\.\d+|\d+ % keep track)\)", of_winner)
 
 
@@ -324,14 +325,14 @@ def test_a_win_against_kalman_filters_is_one_against_each_of_them(
     one = strong["scenario"] == overview.worlds[0].key
     strong.loc[one & (strong["filter"] == "student_tuned"), "rmse"] *= 0.001
     first = build_overview(strong, looks, parts)
-    counts = count_better_worlds({100: first, EQUAL_TIME: first._replace(kalman_winners=[])})
+    counts = count_better_worlds({100: first, EQUAL_TIME: first._replace(cells=[])})
     single = [
         v for v, look in looks.items()
         if look.family == "kalman" and not look.proposed and v != "ekf_bank"
     ]  # fmt: skip
     assert {"ekf", "ukf"} < set(single)
     assert "student_tuned" in single
-    won = [(w.world, w.filter) for w in first.kalman_winners if w.wins]
+    won = [(cell.world, cell.filter) for cell in first.cells if cell.beats_kalman]
     assert overview.worlds[0].key not in [world for world, _ in won]  # one filter of many is better
     assert sum(better for better, _ in counts.values()) == len(won) > 0
     assert {count for _, count in counts.values()} == {len(overview.worlds)}
@@ -344,9 +345,9 @@ def test_a_win_against_kalman_filters_is_one_against_each_of_them(
     better.loc[better["filter"] == "ukf", "rmse"] *= 0.001
     changed = build_overview(better, looks, parts)
     references = {world.key: world.reference for world in changed.worlds}
-    ukf = changed.names["ukf"]
-    outdone = {world.key: world.outdone.b for world in changed.worlds if world.outdone}
-    assert outdone == {key: "ukf" for key, name in references.items() if name != ukf}
+    found = {w.key: find_outdone(w, changed.single) for w in changed.worlds}
+    outdone = {key: verdict.b for key, verdict in found.items() if verdict}
+    assert outdone == {key: "ukf" for key, name in references.items() if name != "ukf"}
     assert "In these runs another one is better: UKF in" in describe_setting(changed)
     assert not any(won for won, _ in count_better_worlds({0: changed}).values())
 
@@ -356,7 +357,7 @@ def test_losses_against_an_untuned_filter_are_worse_than_it(
 ) -> None:
     """The cells that are worse than a tuned reference, and in most runs than the plain UKF too."""
     worse = {(c.world, c.filter) for c in overview.cells if is_worse(c) and c.filter in overview.methods}  # fmt: skip
-    found = {(w.key, m) for w in overview.worlds for m in w.plain_losses or ()}
+    found = {(c.world, c.filter) for c in list_plain_losses(overview) or ()}
     assert found < worse
     for world, m in found:
         d = losses(table, world, m) - losses(table, world, "ukf")
@@ -407,13 +408,13 @@ def test_recordings_are_counted_by_the_files_of_their_scenarios(
     assert count_recorded_drives(own.stem) == 2
     frame = pd.DataFrame({"scenario": "recorded_quad_flights", "filter": "ekf", "run": range(9), "rmse": 1.0, "keeps_track": True, "seed": 1})  # fmt: skip
     (world,) = judge(frame, [("ekf", "m")])
-    (same,) = list_world_notes(world, False)
+    (same,) = list_world_notes(world)
     assert (
         same
         == "the best Kalman filter was tuned on the same 20 recordings, with other random numbers"
     )
-    drive = world._replace(name="recorded_canyon")
-    single, part = list_world_notes(drive, True)
+    drive = world._replace(key="recorded_canyon", facts=WorldFacts("ekf", None, has_part=True))
+    single, part = list_world_notes(drive)
     assert single.startswith("one recording: ")
     assert part == "the best Kalman filter was tuned on a part of it"
 
@@ -539,8 +540,9 @@ def test_undecided_cells_have_no_colour_and_lost_tracks_are_grey(overview: Overv
     words = {(c.world, c.filter): c for c in overview.cells}
     first = next(key for key, c in words.items() if c.verdict.word == "not decided")
     words[first] = words[first]._replace(verdict=words[first].verdict._replace(word="equal"))
+    page = overview._replace(cells=list(words.values()))
     drawn = {
-        key: figures.describe_cell(words, world, key[1], overview)
+        key: figures.describe_cell(page, world, key[1])
         for key in words
         for world in overview.worlds
         if world.key == key[0]
@@ -561,9 +563,8 @@ def test_the_cost_of_a_method_is_the_median_of_its_worlds_with_the_range(
     overview: Overview,
 ) -> None:
     method = overview.methods[0]
-    labels = {name: label for label, name in overview.names.items()}
     costs = dict(zip((world.key for world in overview.worlds), (2.0, 9.0, 3.0), strict=True))
-    times = {(world.key, labels[world.reference]): 4.0 for world in overview.worlds}
+    times = {(world.key, world.reference): 4.0 for world in overview.worlds}
     times |= {(key, method): 4.0 * cost for key, cost in costs.items()}
     story = tell_story(overview._replace(times=times), method, "")
     assert story["time"] == "3 (2 to 9)"
@@ -617,9 +618,9 @@ def test_each_number_of_particles_has_its_tables(
     assert half["azimuth", "fm_mssrckf"] == plain["azimuth", "fm_mssrckf"]
     doses = {key: levels[key] for key in (100, 1000)}
     points = figures.dose_points(doses, overview.worlds[0], "mcmc_rpf", "particles")
-    assert [point.x for point in points] == [100.0, 1000.0]
+    assert [x for x, _ in points] == [100.0, 1000.0]
     times = figures.dose_points(doses, overview.worlds[0], "mcmc_rpf", "time")
-    assert times[1].x == pytest.approx(9 * times[0].x)
+    assert times[1][0] == pytest.approx(9 * times[0][0])
 
 
 def test_labels_without_their_number_of_particles() -> None:
@@ -683,7 +684,7 @@ def test_filters_at_equal_time_and_as_printed_have_tables_of_their_own(
 def test_filters_that_take_longer_than_the_equal_time_are_named(tabs: dict[TabKey, Overview]) -> None:  # fmt: skip
     """A filter cannot have less than its fewest particles."""
     tab = tabs[EQUAL_TIME]
-    worlds = {world.key: world.name for world in tab.worlds}
+    worlds = {world.key: world.part_name.name for world in tab.worlds}
     even = dict.fromkeys(tab.times, 2.0)
     assert describe_times(tab._replace(times=even)) == ""
     key = next(key for key in even if key[1] == "mcmc_rpf")
@@ -730,10 +731,15 @@ def test_a_world_with_one_number_of_particles_stands_in_its_table(
 
 def test_the_first_sentence_says_what_holds_at_equal_time(tabs: dict[TabKey, Overview]) -> None:
     first, timed = tabs[1000], tabs[EQUAL_TIME]
-    winner = Winner("azimuth", "mcmc_rpf", 0.01, True)
-    with_star, without = first._replace(winners=[winner]), first._replace(winners=[])
-    timed_star, timed_none = timed._replace(winners=[winner]), timed._replace(winners=[])
-    said = [word_headline(a, b) for a in (with_star, without) for b in (timed_star, timed_none)]
+
+    def with_winner(page: Overview, *winner: str) -> Overview:
+        cells = [c._replace(wins=(c.world, c.filter) == winner) for c in page.cells]
+        return page._replace(cells=cells)
+
+    stars = [
+        [with_winner(page, "azimuth", "mcmc_rpf"), with_winner(page)] for page in (first, timed)
+    ]
+    said = [word_headline(a, b) for a in stars[0] for b in stars[1]]
     name = first.names["mcmc_rpf"]
     assert (
         f"with as many particles: {name} (azimuth). Also at equal time: {name} (azimuth)."
@@ -761,7 +767,7 @@ def test_the_page_shows_all_tables(tabs: dict[TabKey, Overview]) -> None:
     page = files["index.html"]
     assert "<li>SIR in azimuth; elsewhere, since x must be 1</li>" in page
     assert "Not on this page: SIR in azimuth; elsewhere, since x must be 1" in files["report.md"]
-    has_star = any(winner.wins for tab in tabs.values() for winner in tab.winners)
+    has_star = any(cell.wins for tab in tabs.values() for cell in tab.cells)
     assert ("☆" in page) == has_star
     assert "How many particles are enough?" in page
     assert "paired runs each, 1000 particles" in page

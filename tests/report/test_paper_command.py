@@ -8,6 +8,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 import synthetic_results as synthetic
+from refusals import check_refused
 
 from pfbench.cli.paper import write_study_paper
 from pfbench.report.study_report import write_report
@@ -56,10 +57,17 @@ def test_without_results_it_uses_the_stored_data_of_the_report(
     assert {path.name: path.read_bytes() for path in paper.iterdir()} == expected
     data = tmp_path / "demo" / "runs.parquet"
     assert f"note: without results, the paper is made of {data}" in capsys.readouterr().out
-    with pytest.raises(
-        ValueError, match=r"options of the report need results, got report\.alpha=0\.1"
-    ):
-        write_study_paper([*words, f"results_dir={tmp_path}/none", "report.alpha=0.1"])
+    check_refused(
+        [
+            (
+                r"options of the report need results, got report\.alpha=0\.1",
+                lambda: write_study_paper(
+                    [*words, f"results_dir={tmp_path}/none", "report.alpha=0.1"]
+                ),
+            )
+        ],
+        remedy=False,
+    )
 
 
 @pytest.mark.parametrize(
@@ -72,6 +80,15 @@ def test_without_results_it_uses_the_stored_data_of_the_report(
     ],
 )
 def test_errors_name_key_value_and_remedy(home: Path, words: list[str], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        write_study_paper([*words, f"results_dir={home}/results", f"reports_dir={home}/none"])
+    check_refused(
+        [
+            (
+                message,
+                lambda: write_study_paper(
+                    [*words, f"results_dir={home}/results", f"reports_dir={home}/none"]
+                ),
+            )
+        ],
+        remedy=False,
+    )
     assert not (home / "none").exists()

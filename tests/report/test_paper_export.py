@@ -15,6 +15,7 @@ import yaml
 from checkout import ROOT
 from matplotlib.figure import Figure
 from page_packs import build_pack
+from refusals import check_refused
 from synthetic_results import study
 
 from pfbench.files.recorded_folder import RecordedFolder
@@ -68,7 +69,7 @@ def write(
     folder: Path, pack: dict[str, Any], conditions: list[Condition], journal: str, width: str = ""
 ) -> list[str]:
     page = find_page_format(journal, width)
-    pack["methods"] = collect_methods_facts(conditions).to_entries() | {"particles": {}}
+    pack["methods"] = collect_methods_facts(conditions) | {"particles": {}}
     pack["bibtex"] = provenance.format_bibliography(pack, conditions)
     with RecordedFolder(folder) as target:
         return paper_folder.write_paper(pack, page, target)
@@ -143,7 +144,7 @@ def test_the_figures_of_the_paper_are_in_the_export(
     conditions: list[Condition], tmp_path: Path
 ) -> None:
     pack = build_pack(3, 1, 1, runs=3, instants=4, carried=0)
-    pack["methods"] = collect_methods_facts(conditions).to_entries() | {"particles": {}}
+    pack["methods"] = collect_methods_facts(conditions) | {"particles": {}}
     pack["bibtex"] = provenance.format_bibliography(pack, conditions)
     drawings = {
         "paper_1_a.pdf": ("Figure 1: 80 % of runs.", b"%PDF"), "paper_2.svg": ("Figure 2.", b"<svg/>"),
@@ -179,8 +180,7 @@ def test_millimetres_are_converted() -> None:
     ],
 )
 def test_advice_of_page_formats(journal: str, width: str, advice: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(advice)):
-        find_page_format(journal, width)
+    check_refused([(re.escape(advice), lambda: find_page_format(journal, width))], remedy=False)
 
 
 def test_tables_split_by_regime_and_move_intervals_to_a_supplement() -> None:
@@ -198,12 +198,26 @@ def test_a_table_that_does_not_fit_is_refused_with_advice(
     conditions: list[Condition], tmp_path: Path
 ) -> None:
     wide = build_pack(3, 1, 1, runs=3, instants=4, carried=0, names={0: "long name " * 9})
-    with pytest.raises(ValueError, match=r"table_main must fit 252 pt, got \d+ pt. Use a wider"):
-        write(tmp_path / "paper", wide, conditions, "", "252pt")
+    check_refused(
+        [
+            (
+                r"table_main must fit 252 pt, got \d+ pt. Use a wider",
+                lambda: write(tmp_path / "paper", wide, conditions, "", "252pt"),
+            )
+        ],
+        remedy=False,
+    )
     assert not list(tmp_path.rglob("*.tex"))
     high = build_pack(70, 1, 1, runs=3, instants=4, carried=0)
-    with pytest.raises(ValueError, match=r"at most 63 rows, got 72. Run a study of fewer filters"):
-        write(tmp_path / "paper", high, conditions, "ieee")
+    check_refused(
+        [
+            (
+                r"at most 63 rows, got 72. Run a study of fewer filters",
+                lambda: write(tmp_path / "paper", high, conditions, "ieee"),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_worlds_that_do_not_fit_are_split_and_none_is_left_out() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from checkout import ROOT
+from refusals import check_refused
 
 import pfbench
 from pfbench.cli.compare import compare_study
@@ -58,18 +59,25 @@ def test_other_worlds_are_not_compared(home: Path, monkeypatch: pytest.MonkeyPat
     own = stored[stored["filter"] == "ukf"]
     assert find_witness(own, stored) == "ukf"
     moved = own.assign(rmse=own["rmse"] * np.where(own["run"] == 3, 1.01, 1.0))
-    with pytest.raises(
-        ValueError,
-        match=r"ukf must have the errors of the published study, got others in 1 of 12 runs",
-    ):
-        find_witness(moved, stored)
-    with pytest.raises(ValueError, match=r"its runs must have seed=7"):
-        find_witness(own.assign(seed=8), stored)
-    with pytest.raises(ValueError, match=r"must run again as a witness. Add filter=\w+"):
-        find_witness(own.assign(filter="apf"), stored)
+    check_refused(
+        [
+            (
+                r"ukf must have the errors of the published study, got others in 1 of 12 runs",
+                lambda: find_witness(moved, stored),
+            ),
+            (r"its runs must have seed=7", lambda: find_witness(own.assign(seed=8), stored)),
+            (
+                r"must run again as a witness. Add filter=\w+",
+                lambda: find_witness(own.assign(filter="apf"), stored),
+            ),
+        ],
+        remedy=False,
+    )
     both = pd.concat([own, own.assign(seed=8)])
-    with pytest.raises(ValueError, match=r"its runs must have seed=7, got \[7, 8\]"):
-        find_witness(both, stored)
+    check_refused(
+        [(r"its runs must have seed=7, got \[7, 8\]", lambda: find_witness(both, stored))],
+        remedy=False,
+    )
     compared = compare_tables(own.assign(scenario="elsewhere"), study)
     assert compared.verdicts == {}
     assert "Choose one of its scenarios" in str(compared)
@@ -117,10 +125,10 @@ def test_a_study_of_one_world_has_a_table_alone(
     monkeypatch.chdir(home)
     compared = pfbench.study("mine").against("public")
     assert not compared.cells
-    with pytest.raises(
-        ValueError, match=r"must have a published study of several methods.*Use table"
-    ):
-        compared.plot()
+    check_refused(
+        [(r"must have a published study of several methods.*Use table", lambda: compared.plot())],
+        remedy=False,
+    )
 
 
 def test_a_filter_that_ignores_the_measurements_is_no_witness(home: Path) -> None:
@@ -128,12 +136,19 @@ def test_a_filter_that_ignores_the_measurements_is_no_witness(home: Path) -> Non
     stored = read_stored_study(home / "reports" / "public").table
     ukf, sir = stored[stored["filter"] == "ukf"], stored[stored["filter"] == "sir"]
     blind = ukf.assign(filter="dead_reckoning")
-    with pytest.raises(ValueError, match=r"must run again as a witness"):
-        find_witness(blind, pd.concat([stored, blind]))
-    with pytest.raises(
-        ValueError, match=r"ukf must have the errors .* got others in 12 of 12 runs"
-    ):
-        find_witness(pd.concat([sir, ukf.assign(rmse=2 * ukf["rmse"])]), stored)
+    check_refused(
+        [
+            (
+                r"must run again as a witness",
+                lambda: find_witness(blind, pd.concat([stored, blind])),
+            ),
+            (
+                r"ukf must have the errors .* got others in 12 of 12 runs",
+                lambda: find_witness(pd.concat([sir, ukf.assign(rmse=2 * ukf["rmse"])]), stored),
+            ),
+        ],
+        remedy=False,
+    )
 
 
 @pytest.mark.parametrize(
@@ -148,5 +163,4 @@ def test_what_is_missing_is_said(
     words: list[str], message: str, home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(home)
-    with pytest.raises(ValueError, match=message):
-        compare_study(words)
+    check_refused([(message, lambda: compare_study(words))], remedy=False)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import synthetic_results as synthetic
+from refusals import check_refused
 from scipy import stats
 
 from pfbench.results import conditions, frame, metrics, status, store
@@ -91,13 +92,22 @@ def test_coverage_tells_narrow_from_honest_and_leaves_lost_runs_out(loaded):
 def test_scores_of_wrong_shape_are_refused(study, tmp_path):
     path = next((study / "demo").glob("*.npz"))
     meta, arrays = store.read_result(path)
-    with pytest.raises(
-        ValueError, match=r"pit must have shape \['R', 'S', 'D'\].* got \(60, 3, 9\)"
-    ):
-        store.write_result(tmp_path / path.name, meta, {**arrays, "pit": arrays["pit"][:, :3]})
-    with pytest.raises(ValueError, match=r"crps must have shape \['R', 'S', 'D'\] = \(60, 0, 9\)"):
-        store.write_result(
-            tmp_path / path.name,
-            meta,
-            {name: a for name, a in arrays.items() if name != "score_steps"},
-        )
+    check_refused(
+        [
+            (
+                r"pit must have shape \['R', 'S', 'D'\].* got \(60, 3, 9\)",
+                lambda: store.write_result(
+                    tmp_path / path.name, meta, {**arrays, "pit": arrays["pit"][:, :3]}
+                ),
+            ),
+            (
+                r"crps must have shape \['R', 'S', 'D'\] = \(60, 0, 9\)",
+                lambda: store.write_result(
+                    tmp_path / path.name,
+                    meta,
+                    {name: a for name, a in arrays.items() if name != "score_steps"},
+                ),
+            ),
+        ],
+        remedy=False,
+    )

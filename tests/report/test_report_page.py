@@ -10,10 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 import synthetic_results as synthetic
+from refusals import check_refused
 
 from pfbench.report import study_report, writers
 from pfbench.report.board.curves import make_curves
+from pfbench.report.board.entries import round_values
 from pfbench.report.board.study_views import DECISION_COLUMNS
+from pfbench.report.study_page import page_writer
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
 from pfbench.stats.sentences import format_with_interval
@@ -141,8 +144,15 @@ def test_mixed_versions_are_refused_and_named_when_allowed(tmp_path):
         steps=20,
         versions={**synthetic.VERSIONS, "commit": "fff9999"},
     )
-    with pytest.raises(ValueError, match=r"versions\.commit"):
-        study_report.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
+    check_refused(
+        [
+            (
+                r"versions\.commit",
+                lambda: study_report.write_report("demo", tmp_path, tmp_path / "reports", QUICK),
+            )
+        ],
+        remedy=False,
+    )
     assert not (tmp_path / "reports").exists()
     mixed = study_report.ReportOptions(figure_formats=("svg",), allow_mixed_versions=True)
     path = study_report.write_report("demo", tmp_path, tmp_path / "reports", mixed)
@@ -160,13 +170,17 @@ def test_the_page_says_what_its_jobs_took_and_how_many_were_asked_for(results, t
 
 
 def test_a_threshold_of_no_group_is_refused_before_anything_is_written(results, tmp_path):
-    with pytest.raises(
-        ValueError,
-        match=r"report\.convergence_threshold must name groups of the results, got height",
-    ):
-        study_report.write_report(
-            "demo", results, tmp_path, replace(QUICK, convergence_threshold={"height": 1.0})
-        )
+    check_refused(
+        [
+            (
+                r"report\.convergence_threshold must name groups of the results, got height",
+                lambda: study_report.write_report(
+                    "demo", results, tmp_path, replace(QUICK, convergence_threshold={"height": 1.0})
+                ),
+            )
+        ],
+        remedy=False,
+    )
     assert not list(tmp_path.iterdir())
 
 
@@ -237,10 +251,16 @@ def test_conditions_whose_data_differ_say_so(tmp_path):
 
 
 def test_options_are_checked():
-    with pytest.raises(ValueError, match="alpha must be between 0 and 1, got 5"):
-        study_report.ReportOptions(alpha=5)
-    with pytest.raises(ValueError, match=r"formats must be a subset of svg, png, got .'gif'"):
-        study_report.ReportOptions(figure_formats=("gif",))
+    check_refused(
+        [
+            ("alpha must be between 0 and 1, got 5", lambda: study_report.ReportOptions(alpha=5)),
+            (
+                r"formats must be a subset of svg, png, got .'gif'",
+                lambda: study_report.ReportOptions(figure_formats=("gif",)),
+            ),
+        ],
+        remedy=False,
+    )
 
 
 @pytest.mark.parametrize(
@@ -259,11 +279,17 @@ def test_numbers_have_three_digits(value, text):
     ("numbers", "text"),
     [
         ((0.951, 0.899, 0.9964), "0.951 [0.899, 0.996]"), ((1.05, 1.0031, 1.1), "1.050 [1.003, 1.100]"),
-        ((0.5, 0.4, 0.6), "0.50 [0.40, 0.60]"), ((1.0, 1.0, 1.0), "1.00 [1.00, 1.00]"), ((2.0, 1.0, float("inf")), "2.00 [1.00, ∞]"),
+        ((0.5, 0.4, 0.6), "0.50 [0.40, 0.60]"), ((1.0, 1.0, 1.0), "1.00 [1, 1]"), ((2.0, 1.0, float("inf")), "2.00 [1, ∞]"),
     ],
 )  # fmt: skip
 def test_an_interval_without_one_does_not_seem_to_end_there(numbers, text):
     assert format_with_interval(*numbers) == text
+
+
+@pytest.mark.parametrize(("high", "text"), [(1.0, "[0.500, 1]"), (1.0034, "[0.500, 1.003]"), (0.99996, "[0.500, 1.000]"), (1.2, "[0.500, 1.20]")])  # fmt: skip
+def test_an_end_on_a_page_is_1_only_where_it_is(high, text):
+    row = round_values({"low": 0.5, "high": high})
+    assert page_writer.format_interval(row["low"], row["high"]) == text
 
 
 def test_markdown_columns_line_up():
@@ -282,4 +308,4 @@ def test_templates_are_packaged():
         "setuptools"
     ]["package-data"]
     shipped = {path.name for pattern in patterns["pfbench.report"] for path in here.glob(pattern)}
-    assert {"datasheet.html.jinja", "datasheet.md.jinja", "style.css"} <= shipped
+    assert {"methods.bib", "style.css"} <= shipped

@@ -29,15 +29,21 @@ def job_result(threshold: float | None = 50.0) -> tuple[dict[str, np.ndarray], d
 
 
 def test_healthy_runs_keep_the_track() -> None:
-    assert describe_runs(*job_result()) == "position RMSE 5.196 m; track kept in 10 of 10 runs"
-    assert describe_runs(*job_result(None)) == "position RMSE 5.196 m; 10 of 10 runs valid"
+    assert (
+        describe_runs(*job_result())
+        == "position: median RMS error 5.196 m; track kept in 10 of 10 runs"
+    )
+    assert (
+        describe_runs(*job_result(None))
+        == "position: median RMS error 5.196 m; 10 of 10 runs valid"
+    )
 
 
 def test_a_job_that_diverged_says_so_with_the_limit() -> None:
     arrays, meta = job_result()
     arrays["error"][:] = 480.0
     line = describe_runs(arrays, meta)
-    assert line.startswith("position RMSE 831.4 m; 10 of 10 runs diverged (")
+    assert line.startswith("position: no finite median RMS error; 10 of 10 runs diverged (")
     assert "error above 50 m" in line
 
 
@@ -81,4 +87,4 @@ def test_several_kinds_are_listed_and_a_job_without_valid_runs_has_no_finite_err
     arrays["lost"][:3], arrays["error"][5] = True, 1e4
     assert "; 3 lost, 1 diverged of 10 runs" in describe_runs(arrays, meta)
     arrays["lost"][:] = True
-    assert describe_runs(arrays, meta) == "no finite position error; 10 of 10 runs lost"
+    assert describe_runs(arrays, meta) == "position: no finite median RMS error; 10 of 10 runs lost"

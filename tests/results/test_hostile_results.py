@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import synthetic_results as synthetic
+from refusals import check_refused
 
 from pfbench.files.atomic_write import hash_content
 from pfbench.job.run_selection import find_run
@@ -97,8 +98,9 @@ def test_metadata_of_another_kind_are_refused(tmp_path: Path, message: str) -> N
 def test_arrays_of_another_kind_are_refused(tmp_path: Path, message: str) -> None:
     data = arrays()
     ARRAYS[message](data)
-    with pytest.raises(ValueError, match=message):
-        store.read_result(forge(tmp_path, meta(), data))
+    check_refused(
+        [(message, lambda: store.read_result(forge(tmp_path, meta(), data)))], remedy=False
+    )
 
 
 def write_pickle(path: Path) -> None:
@@ -138,8 +140,7 @@ FILES: dict[str, tuple[Callable[[Path], object], str]] = {
 def test_files_that_are_no_result_are_refused(tmp_path: Path, name: str) -> None:
     write, message = FILES[name]
     write(tmp_path / f"{KEY}.npz")
-    with pytest.raises(ValueError, match=message):
-        store.read_result(tmp_path / f"{KEY}.npz")
+    check_refused([(message, lambda: store.read_result(tmp_path / f"{KEY}.npz"))], remedy=False)
     assert [path.name for path in tmp_path.iterdir()] == [f"{KEY}.npz"]
 
 

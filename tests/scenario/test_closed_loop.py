@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from refusals import check_refused
 from torch import Tensor
 
 from pfbench import job
@@ -372,17 +373,31 @@ def test_a_told_filter_of_a_corrected_world_knows_each_step() -> None:
 
 def test_models_and_filters_that_cannot_close_the_loop_are_refused() -> None:
     episode = pair(LARGE)[1]
-    with pytest.raises(
-        ValueError, match=r"scenario\.closed_loop must be false.*Choose model=ins_gnss"
-    ):
-        run_filter(UKF, linear_walk(1.0, 0.5, 1.0), episode.record, PhiloxStream(1, RUNS))
+    check_refused(
+        [
+            (
+                r"scenario\.closed_loop must be false.*Choose model=ins_gnss",
+                lambda: run_filter(
+                    UKF, linear_walk(1.0, 0.5, 1.0), episode.record, PhiloxStream(1, RUNS)
+                ),
+            )
+        ],
+        remedy=False,
+    )
     way, model = underway(episode), azimuth()
     way.at_step(0)
     zero = torch.zeros(3, 2, 9, dtype=torch.float64)
     past = ParticleBelief(zero, zero[..., 0], zero[:, 0, 0], window={"parents": zero.unsqueeze(2)})
     info = StepInfo(zero[:, 0], zero[:, 0] + 1, lambda: zero, {})
-    with pytest.raises(ValueError, match=r"must not store.*scenario\.closed_loop=false"):
-        apply_feedback(model, way, past, info)
+    check_refused(
+        [
+            (
+                r"must not store.*scenario\.closed_loop=false",
+                lambda: apply_feedback(model, way, past, info),
+            )
+        ],
+        remedy=False,
+    )
 
 
 class Odometer:
@@ -399,10 +414,15 @@ def test_instruments_without_fixes_are_refused() -> None:
         flight(LARGE, False, receiver=Odometer()).draw(NominalNoise(), RUNS, 1).record.feedback
         is None
     )
-    with pytest.raises(
-        ValueError, match=r"scenario\.closed_loop must be false.*got true with Odometer"
-    ):
-        flight(LARGE, True, receiver=Odometer())
+    check_refused(
+        [
+            (
+                r"scenario\.closed_loop must be false.*got true with Odometer",
+                lambda: flight(LARGE, True, receiver=Odometer()),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_records_carry_the_loop_to_another_device_and_drop_it_at_a_step() -> None:

@@ -8,7 +8,8 @@ import pytest
 from decision_cases import make_study
 
 from pfbench.report.board.view import View, build_rows, describe_filters
-from pfbench.report.overview.tables import WorldFacts, build_world, compare_methods, decide_cells
+from pfbench.report.overview.tables import WorldFacts, build_world, decide_cells
+from pfbench.results.looks import PartName
 from pfbench.stats.comparison import compare, decide
 from pfbench.stats.court import Court
 from pfbench.stats.pair_states import LookSchedule, decide_at_looks
@@ -32,16 +33,18 @@ def test_all_callers_agree(effect: float, lost: float) -> None:
     losses = compute_losses(runs, "rmse")
     (pair,) = decide(compare_filters(runs, losses, [("A", "B")]))
     (direct,) = decide([compare(("A", losses[0, 0]), ("B", losses[1, 0]))])
-    facts, labels = WorldFacts("B", None), {"A": "A", "B": "B"}
-    world = build_world(table, facts, (Court(runs, [("A", "B")]), labels))
+    facts, part = WorldFacts("B", None), PartName(table["scenario"].iloc[0], "", "")
+    world = build_world(
+        part, facts, Court(runs, [("A", "B")]), table["regime"].iloc[0], {"A": "A", "B": "B"}
+    )
     (cell,) = decide_cells([world], ["A"])
-    (method,) = compare_methods([world], ["A", "B"])
+    method = world.find("A", "B")
     (state,) = decide_at_looks(runs, [("A", "B")], LookSchedule(40))
     (single,) = decide_at_looks(runs, [("A", "B")], LookSchedule(20))
     word, ratio = page_verdict(table)
-    assert {direct.word, pair.word, cell.verdict.word, method.verdict.word, word} == {pair.word}
-    for value in (direct.ratio, cell.verdict.ratio, method.verdict.ratio, ratio):
+    assert {direct.word, pair.word, cell.verdict.word, method.word, word} == {pair.word}
+    for value in (direct.ratio, cell.verdict.ratio, method.ratio, ratio):
         assert value == pytest.approx(pair.ratio)
     opposite = {"better": "worse", "worse": "better"}
-    for looks in (state.verdict.word, single.verdict.word):  # their levels are smaller
+    for looks in (state.word, single.word):  # their levels are smaller
         assert looks != opposite.get(pair.word)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pfbench.core.chart import Chart
 from pfbench.core.linear_algebra import distribution_covariance, factor
-from pfbench.core.parameter_checks import require_range
+from pfbench.core.parameter_checks import require, require_range
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief, StepInfo
@@ -298,11 +298,13 @@ def check_adaptations(
 ) -> None:
     """Check that adaptations do not judge one innovation twice."""
     require_range("filter.iterations", iterations, "whole [1, inf) Use 1 for a single update.")
-    if iterations > 1 and (noise_adaptations or gain_adaptations):
-        raise ValueError(
-            "filter.iterations must be 1 with noise_adaptations or gain_adaptations, got "
-            f"{iterations}. Set filter.iterations=1."
-        )
+    require(
+        not iterations > 1 or (not noise_adaptations and (not gain_adaptations)),
+        "filter.iterations",
+        "be 1 with noise_adaptations or gain_adaptations",
+        iterations,
+        "Set filter.iterations=1.",
+    )
     judges = [type(a).__name__ for a in noise_adaptations if not states_evidence(a)]
     if len(judges) > 1:
         raise ValueError(

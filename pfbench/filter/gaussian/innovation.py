@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from pfbench.core.linear_algebra import factor, shared_distribution_covariance, squared_length
+from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.linearisation_rules import (
@@ -298,11 +299,13 @@ def axes_by_group(innovation: Innovation, groups: Sequence[int] | None) -> tuple
         size = diagonal_axes(innovation.nominal)
         group_mask = (size.unsqueeze(-1) - size.unsqueeze(-2)).abs() <= 1e-6 * size.unsqueeze(-1)
     else:
-        if len(groups) != k:
-            raise ValueError(
-                f"groups must have {k} group numbers, got {list(groups)}. "
-                "Set one number for each measured component."
-            )
+        require(
+            len(groups) == k,
+            "groups",
+            f"have {k} group numbers",
+            list(groups),
+            "Set one number for each measured component.",
+        )
         group_index = torch.tensor(list(groups), device=observed_mask.device)
         group_mask = (group_index[:, None] == group_index).expand(*observed_mask.shape, k)
     return group_mask, group_mask & observed_mask.unsqueeze(-1) & observed_mask.unsqueeze(-2)

@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from pfbench.core.chart import SIDES, Chart
 from pfbench.core.linear_algebra import jacobian
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import GaussianBelief, ParticleBelief, StepInfo, normalise_log_weights
@@ -42,10 +43,13 @@ class InvariantFilter:
     chart: str = "left"
 
     def __post_init__(self) -> None:
-        if self.chart not in SIDES:
-            raise ValueError(
-                f"filter.chart must be left or right, got {self.chart}. Use left for position fixes."
-            )
+        require(
+            self.chart in SIDES,
+            "filter.chart",
+            "be left or right",
+            self.chart,
+            "Use left for position fixes.",
+        )
         if not isinstance(self.filter, (GaussianFilter, ParticleFilter)):
             raise ValueError(
                 "filter.filter must be GaussianFilter or ParticleFilter, got "

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import (
     GainAdaptation,
@@ -400,11 +400,13 @@ class BoundedRatioGain(GainAdaptation):
     has_evidence = True
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.min_ratio <= self.max_ratio:
-            raise ValueError(
-                "BoundedRatioGain.min_ratio must be from 0 to max_ratio, "
-                f"got min_ratio={self.min_ratio}, max_ratio={self.max_ratio}. Choose 0 <= min_ratio <= max_ratio."
-            )
+        require(
+            0.0 <= self.min_ratio <= self.max_ratio,
+            "BoundedRatioGain.min_ratio",
+            "be from 0 to max_ratio",
+            f"min_ratio={self.min_ratio}, max_ratio={self.max_ratio}",
+            "Choose 0 <= min_ratio <= max_ratio.",
+        )
 
     @override
     def __call__(self, innovation: Innovation, factor: Tensor) -> Tensor:

@@ -152,11 +152,13 @@ class SharedGuideProposal(Proposal):
         z = self.points(draws).normal("guide", slots, d)
         if not self.match_moments:
             return z
-        if slots <= d:
-            raise ValueError(
-                f"proposal.match_moments must be false with {d} states and {slots} particles, got true. "
-                f"Use more than {d} particles."
-            )
+        require(
+            not slots <= d,
+            "proposal.match_moments",
+            f"be false with {d} states and {slots} particles",
+            "true",
+            f"Use more than {d} particles.",
+        )
         equal_weights = active.to(z.dtype) / active.sum(1, keepdim=True)
         z = z - (equal_weights.unsqueeze(-1) * z).sum(1, keepdim=True)
         return whiten(z, torch.linalg.cholesky_ex((equal_weights.unsqueeze(-1) * z).mT @ z)[0])
@@ -199,12 +201,13 @@ def _adapted_noise_ratio(
     ]
     if not is_capturing() and torch.equal(*noises) and torch.equal(*masks):
         return torch.zeros_like(x[..., 0])
-    if not is_normal(model.observation(x, record.u)):
-        raise ValueError(
-            "proposal.weight_model must be nominal if the guide adapts R and the measurement "
-            f"distribution is not normal, got adapted with {type(model).__name__}. "
-            "Choose weight_model=nominal, or a guide that does not adapt R."
-        )
+    require(
+        is_normal(model.observation(x, record.u)),
+        "proposal.weight_model",
+        "be nominal if the guide adapts R and the measurement distribution is not normal",
+        f"adapted with {type(model).__name__}",
+        "Choose weight_model=nominal, or a guide that does not adapt R.",
+    )
     r, values = innovation_at(model, x, record), []
     for noise, mask in zip(noises, masks, strict=True):
         root, ok = factor(noise)

@@ -11,7 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_values
@@ -66,11 +66,13 @@ class GuidedInitialProposal(InitialProposal):
             passes="whole [0, inf) Use 3.",
             prior_fraction="(0, 1) Use 0.2.",
         )
-        if not isinstance(self.guide_filter, GaussianFilter) or not self.guide_filter.plain:
-            raise ValueError(
-                "initial_proposal.guide_filter must be a Gaussian filter without adaptations, got "
-                f"{type(self.guide_filter).__name__}. Choose ekf, ukf or ckf."
-            )
+        require(
+            isinstance(self.guide_filter, GaussianFilter) and self.guide_filter.plain,
+            "initial_proposal.guide_filter",
+            "be a Gaussian filter without adaptations",
+            type(self.guide_filter).__name__,
+            "Choose ekf, ukf or ckf.",
+        )
 
     @override
     def __call__(

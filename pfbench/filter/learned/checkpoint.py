@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.atomic_write import DIGEST, has_valid_digest, hash_content, write_atomically
 from pfbench.files.limits import TABLE_BYTES, check_is_file, check_zip
 
@@ -41,11 +42,13 @@ def write_checkpoint(path: str | Path, content: Mapping[str, Any]) -> None:
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
     """Read a checkpoint: tensors, numbers, texts, lists and dicts, never code."""
-    if not Path(path).is_file():
-        raise ValueError(
-            f"checkpoint must be an existing file, got {path}. Use the path that `pfbench train` "
-            "prints, or checkpoint=untrained."
-        )
+    require(
+        Path(path).is_file(),
+        "checkpoint",
+        "be an existing file",
+        path,
+        "Use the path that `pfbench train` prints, or checkpoint=untrained.",
+    )
     check_is_file(Path(path), TABLE_BYTES)
     check_zip(Path(path))
     try:
@@ -60,11 +63,13 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         raise ValueError(
             f"checkpoint must have the format {CHECKPOINT_FORMAT!r}, got {stored!r} in {path}. Train again."
         )
-    if not has_valid_digest(content):
-        raise ValueError(
-            f"checkpoint must be undamaged, got {path} with a digest that is not that of its content. "
-            "Train again."
-        )
+    require(
+        has_valid_digest(content),
+        "checkpoint",
+        "be undamaged",
+        f"{path} with a digest that is not that of its content",
+        "Train again.",
+    )
     return content
 
 
@@ -142,11 +147,13 @@ def load_parameters(path: str, weights: Weights, modules: Mapping[str, nn.Module
     expected = flatten_parameters(modules)
     for name in sorted(expected.keys() | weights.keys()):
         stored, shape = (tuple(a[name].shape) if name in a else None for a in (weights, expected))
-        if stored != shape:
-            raise ValueError(
-                f"checkpoint must have weight {name} of shape {shape}, got {stored} in {path}. "
-                "Set the network of the training (proposal.network, hidden), or train again."
-            )
+        require(
+            stored == shape,
+            "checkpoint",
+            f"have weight {name} of shape {shape}",
+            f"{stored} in {path}",
+            "Set the network of the training (proposal.network, hidden), or train again.",
+        )
     for name, module in modules.items():
         module.load_state_dict(
             {

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributions import Distribution, Normal
 
-from pfbench.core.parameter_checks import require_range
+from pfbench.core.parameter_checks import require, require_range
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.learned.differentiable_resampling import sample_from
@@ -124,11 +124,13 @@ class LearnedRandomWalk(nn.Module, McmcKernel):
             Proposed belief, log acceptance ratio [R, N] and step h delta [R, N, L W].
         """
         noise = belief.window["noise"]
-        if not isinstance(unwrap_independent(model.noise), Normal):
-            raise ValueError(
-                "kernel LearnedRandomWalk must have a model whose noise is normal, got "
-                f"{type(model).__name__}, whose noise is not normal. Choose another kernel."
-            )
+        require(
+            isinstance(unwrap_independent(model.noise), Normal),
+            "kernel LearnedRandomWalk",
+            "have a model whose noise is normal",
+            f"{type(model).__name__}, whose noise is not normal",
+            "Choose another kernel.",
+        )
         if noise.shape[2] < self.lag:
             return (
                 belief,

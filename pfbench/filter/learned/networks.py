@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require
 from pfbench.filter.learned.checkpoint import UNTRAINED, load_parameters, read_checkpoint
 from pfbench.model.base import StateSpaceModel
 
@@ -183,43 +184,6 @@ class SplineFlowHead(nn.Module):
         )
 
 
-class ZukoFlowHead(nn.Module):
-    """Conditional flow of the library zuko (extra `zuko`), then shift and scale.
-
-    Args:
-        features: Number of features.
-        noise: Dimension of the noise.
-        flow: Makes the flow, with a standard normal base: `zuko.flows.NSF`, `MAF` or `NICE` have
-            closed-form inverses. Others use bisection, and their ratio has six correct digits.
-        hidden: Sizes of the hidden layers, also in the flow.
-    """
-
-    def __init__(
-        self,
-        features: int,
-        noise: int,
-        flow: Callable[..., nn.Module],
-        hidden: Sequence[int] = (32, 32),
-    ) -> None:
-        super().__init__()
-        self.net = SkipMlp(features, 2 * noise, hidden)
-        self.flow = flow(noise, context=features, hidden_features=list(hidden))
-
-    @override
-    def forward(self, features: Tensor) -> Distribution:
-        mean, log_scale = self.net(features).chunk(2, -1)
-        # zuko maps data to base, and its samples share one stream for all runs: use only the map
-        steps = [
-            self.flow(features).transform.inv,
-            transforms.AffineTransform(mean, bounded_log_scale(log_scale), event_dim=1),
-        ]
-        return TransformedDistribution(
-            independent_heads(torch.zeros_like(mean), torch.ones_like(mean)),
-            steps,
-            validate_args=False,
-        )
-
-
 # --------------------------------------------------------------------------------------------------
 # Networks of a learned filter part, built untrained or from a checkpoint.
 
@@ -262,11 +226,13 @@ def build_networks(
     Returns the modules by name.
     """
     path = learnable.checkpoint
-    if path is None and not fresh:
-        raise ValueError(
-            "checkpoint must be a file or `untrained` for a filter with a network, got null. "
-            "Train it with `pfbench train` and the same options, then set checkpoint=FILE."
-        )
+    require(
+        path is not None or fresh,
+        "checkpoint",
+        "be a file or `untrained` for a filter with a network",
+        "null",
+        "Train it with `pfbench train` and the same options, then set checkpoint=FILE.",
+    )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(learnable.seed)
         modules = {name: module.to(model.anchor) for name, module in make().items()}
@@ -312,8 +278,10 @@ def _check_sizes(
     for (name, label), size, stored in zip(
         SIZES.items(), sizes, content["sizes"][key], strict=True
     ):
-        if size != stored:
-            raise ValueError(
-                f"checkpoint must have {name}={size} ({label}), got {stored} in {path}. "
-                "Set the model and filter options of the training, or train again."
-            )
+        require(
+            size == stored,
+            "checkpoint",
+            f"have {name}={size} ({label})",
+            f"{stored} in {path}",
+            "Set the model and filter options of the training, or train again.",
+        )

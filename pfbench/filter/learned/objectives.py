@@ -143,11 +143,13 @@ class InferenceCompilation(Objective):
     @override
     def __call__(self, step: TrainingStep) -> Tensor:
         proposal = step.method.proposal
-        if not isinstance(proposal, LearnedProposal):
-            raise ValueError(
-                "filter.proposal must be LearnedProposal for train.objective=InferenceCompilation, "
-                f"got {type(proposal).__name__}. Choose filter=neural_sir."
-            )
+        require(
+            isinstance(proposal, LearnedProposal),
+            "filter.proposal",
+            "be LearnedProposal for train.objective=InferenceCompilation",
+            type(proposal).__name__,
+            "Choose filter=neural_sir.",
+        )
         if isinstance(step.model, StaticModel):
             return torch.zeros_like(step.after.log_w[:, 0])
         assert step.parent is not None
@@ -173,11 +175,13 @@ class ExpectedSquaredJump(Objective):
             move.kernel for move in step.method.moves if isinstance(move, MetropolisHastings)
         ]
         learned = [kernel for kernel in kernels if isinstance(kernel, LearnedRandomWalk)]
-        if not learned:
-            raise ValueError(
-                "filter.moves must have a LearnedRandomWalk for train.objective=ExpectedSquaredJump, "
-                "got none. Choose filter=neural_mh."
-            )
+        require(
+            learned,
+            "filter.moves",
+            "have a LearnedRandomWalk for train.objective=ExpectedSquaredJump",
+            "none",
+            "Choose filter=neural_mh.",
+        )
         _, log_alpha, increment = learned[0].propose_step(step.model, step.after, step.draws)
         acceptance = torch.exp(torch.nan_to_num(log_alpha, -torch.inf, 0.0).clamp(max=0.0))
         weighted = acceptance * step.after.log_w.exp()

@@ -11,7 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record, map_inputs
 from pfbench.filter.belief import GaussianBelief, ParticleBelief, StepInfo
@@ -219,11 +219,13 @@ class GaussianSplitFilter:
             largest_sd="(0, inf) Use 0.35 for angles.",
         )
         inner = self.filter.filter if isinstance(self.filter, InvariantFilter) else self.filter
-        if not isinstance(inner, GaussianFilter) or not inner.plain:
-            raise ValueError(
-                "filter.filter must be a Gaussian filter without adaptations, or an invariant filter "
-                f"with one, got {type(inner).__name__}. Choose ekf, ukf or invariant_ekf."
-            )
+        require(
+            isinstance(inner, GaussianFilter) and inner.plain,
+            "filter.filter",
+            "be a Gaussian filter without adaptations, or an invariant filter with one",
+            type(inner).__name__,
+            "Choose ekf, ukf or invariant_ekf.",
+        )
 
     def init(
         self,
@@ -309,11 +311,13 @@ class GaussianSplitFilter:
         """Return the indices of the sampled states."""
         sampled = partition_state(model, self.sampled_states).sampled_states
         units = sorted({model.units[i] for i in sampled})
-        if len(units) != 1:
-            raise ValueError(
-                f"filter.sampled_states must have one unit, that of largest_sd, got {units} of "
-                f"{list(self.sampled_states)}. Select states of one unit."
-            )
+        require(
+            len(units) == 1,
+            "filter.sampled_states",
+            "have one unit, that of largest_sd",
+            f"{units} of {list(self.sampled_states)}",
+            "Select states of one unit.",
+        )
         return sampled
 
     def _split(

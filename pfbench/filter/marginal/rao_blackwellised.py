@@ -24,7 +24,7 @@ from torch.distributions import Distribution, MultivariateNormal
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, StepInfo, normalise_log_weights
@@ -258,19 +258,22 @@ def partition_state(model: StateSpaceModel, sampled: Sequence[str] | None) -> St
     d = len(model.names)
     if sampled is None:
         linear = list(range(d)) if model.linear else sorted(model.linear_given)
-        if not linear:
-            raise ValueError(
-                "filter.sampled_states must be names for a model with no component that is linear "
-                f"given the rest, got null with {type(model).__name__}. Choose groups of "
-                f"{sorted(model.groups)} (filter=sir samples all). The rest is linearised."
-            )
+        require(
+            linear,
+            "filter.sampled_states",
+            "be names for a model with no component that is linear given the rest",
+            f"null with {type(model).__name__}",
+            f"Choose groups of {sorted(model.groups)} (filter=sir samples all). The rest is linearised.",
+        )
         return StatePartition([i for i in range(d) if i not in linear], linear, model.linear)
     unknown = [name for name in sampled if name not in model.groups and name not in model.names]
-    if unknown:
-        raise ValueError(
-            f"filter.sampled_states must be groups {sorted(model.groups)} or states "
-            f"{list(model.names)} of {type(model).__name__}, got {unknown}. Correct the names."
-        )
+    require(
+        not unknown,
+        "filter.sampled_states",
+        f"be groups {sorted(model.groups)} or states {list(model.names)} of {type(model).__name__}",
+        unknown,
+        "Correct the names.",
+    )
     selected: set[int] = set()
     for name in sampled:
         selected |= set(model.groups[name]) if name in model.groups else {model.names.index(name)}

@@ -10,7 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import distribution_covariance, factor
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights, weighted_mean_cov
@@ -305,11 +305,13 @@ class NoiseFlowKernel(McmcKernel):
         if self.noise_refresh == 0.0 or w.shape[2] == 0:
             return w
         noise: Any = model.noise
-        if not isinstance(unwrap_independent(noise), torch.distributions.Normal):
-            raise ValueError(
-                "kernel.noise_refresh must be 0 for noise that is not normal, got "
-                f"{self.noise_refresh} with {type(model).__name__}. Set noise_refresh=0."
-            )
+        require(
+            isinstance(unwrap_independent(noise), torch.distributions.Normal),
+            "kernel.noise_refresh",
+            "be 0 for noise that is not normal",
+            f"{self.noise_refresh} with {type(model).__name__}",
+            "Set noise_refresh=0.",
+        )
         n, steps, width = w.shape[1:]
         e = draws.normal("refresh", n, steps * width).unflatten(2, (steps, width))
         return (

@@ -10,6 +10,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import distribution_covariance, factor
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import RandomStream, relabel
 from pfbench.core.record import Record
 from pfbench.filter.linearisation import (
@@ -100,12 +101,13 @@ def driving_noise(model: StateSpaceModel, path: PathSegment) -> Tensor:
     noises = []
     for j, record in enumerate(path.records):
         gain, x = model.noise_gain(record.u), path.states[:, :, j]
-        if gain is None or gain.shape[-2] != gain.shape[-1]:
-            raise ValueError(
-                "filter.moves must not combine this kernel with NoiseFlowKernel for a model whose "
-                f"states do not determine its noise, got {type(model).__name__}. "
-                "Remove one of the kernels."
-            )
+        require(
+            gain is not None and gain.shape[-2] == gain.shape[-1],
+            "filter.moves",
+            "not combine this kernel with NoiseFlowKernel for a model whose states do not determine its noise",
+            type(model).__name__,
+            "Remove one of the kernels.",
+        )
         prediction = model.propagate(x, record.u, mean_noise(model, x))
         r = model.chart.subtract(path.states[:, :, j + 1], prediction)
         noises.append(model.noise.mean + torch.linalg.solve_ex(gain, r.mT)[0].mT)

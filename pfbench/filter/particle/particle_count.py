@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.filter.belief import ParticleBelief, ess
 from pfbench.filter.particle.stages import (
     ParticleCount,
@@ -33,12 +33,13 @@ class CountLimits:
     initial: int
 
     def __post_init__(self) -> None:
-        if not 2 <= self.minimum <= self.initial <= self.maximum:
-            raise ValueError(
-                "particle_count.limits must satisfy 2 <= minimum <= initial <= maximum, got "
-                f"minimum={self.minimum}, initial={self.initial}, maximum={self.maximum}. "
-                "Put them in order."
-            )
+        require(
+            2 <= self.minimum <= self.initial <= self.maximum,
+            "particle_count.limits",
+            "satisfy 2 <= minimum <= initial <= maximum",
+            f"minimum={self.minimum}, initial={self.initial}, maximum={self.maximum}",
+            "Put them in order.",
+        )
 
     def initial_count(self, slots: int) -> int:
         """Return the initial number.
@@ -46,11 +47,13 @@ class CountLimits:
         Raises:
             ValueError: If there are fewer slots than `maximum`.
         """
-        if self.maximum > slots:
-            raise ValueError(
-                f"particle_count.limits.maximum must be at most filter.particles={slots}, got "
-                f"{self.maximum}. Raise filter.particles or lower maximum and initial."
-            )
+        require(
+            not self.maximum > slots,
+            "particle_count.limits.maximum",
+            f"be at most filter.particles={slots}",
+            self.maximum,
+            "Raise filter.particles or lower maximum and initial.",
+        )
         return self.initial
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import distribution_covariance
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream, relabel
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state
@@ -101,17 +101,20 @@ class ParticleFilter(Filter):
         _ = self.is_exact  # warns of each stage that does not state it
         if self.initial_proposal is not None:
             _check_initial_proposal(self.moves, self.particle_count)
-        if self.moves and isinstance(self.weight_update, MemoryWeightUpdate):
-            raise ValueError(
-                "filter.moves must be empty with a weight update that replaces the model's "
-                f"likelihood, got {len(self.moves)} with {type(self.weight_update).__name__}. "
-                "Remove the moves: they use the likelihood of the model."
-            )
-        if self.moves and self.stores_path:
-            raise ValueError(
-                "filter.moves must be empty with a proposal that stores the path of particles, got "
-                f"{len(self.moves)} with {type(self.proposal).__name__}. Remove the moves."
-            )
+        require(
+            not self.moves or not isinstance(self.weight_update, MemoryWeightUpdate),
+            "filter.moves",
+            "be empty with a weight update that replaces the model's likelihood",
+            f"{len(self.moves)} with {type(self.weight_update).__name__}",
+            "Remove the moves: they use the likelihood of the model.",
+        )
+        require(
+            not self.moves or not self.stores_path,
+            "filter.moves",
+            "be empty with a proposal that stores the path of particles",
+            f"{len(self.moves)} with {type(self.proposal).__name__}",
+            "Remove the moves.",
+        )
         if (self.history is not None or self.stores_path) and not isinstance(
             self.resampler, EssResampler
         ):
@@ -325,11 +328,13 @@ class ParticleFilter(Filter):
 
 def _check_initial_proposal(moves: tuple[Move, ...], count: ParticleCount) -> None:
     """Raise an error for stages that need equal weights of the initial distribution."""
-    if moves or not isinstance(count, FixedCount):
-        raise ValueError(
-            "filter.initial_proposal must be used without moves and with a fixed number of "
-            f"particles, got {len(moves)} moves and {type(count).__name__}. Remove one of them."
-        )
+    require(
+        not moves and isinstance(count, FixedCount),
+        "filter.initial_proposal",
+        "be used without moves and with a fixed number of particles",
+        f"{len(moves)} moves and {type(count).__name__}",
+        "Remove one of them.",
+    )
 
 
 def _hold_resampling(log_a: Tensor, belief: ParticleBelief) -> tuple[Tensor, ParticleBelief]:

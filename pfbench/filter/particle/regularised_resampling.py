@@ -11,7 +11,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
 from pfbench.filter.particle.stages import EssResampler, Resampler
@@ -75,11 +75,13 @@ class GaussianSmoothing(SmoothingKernel):
     @override
     def bandwidth(self, d: int, n: Tensor) -> Tensor:
         d = d if self.dimension is None else self.dimension
-        if not d + self.offset > 0:
-            raise ValueError(
-                f"kernel.offset must exceed -{d} with {d} dimensions, got {self.offset}: the bandwidth "
-                "does not exist. Use 2, as derived."
-            )
+        require(
+            d + self.offset > 0,
+            "kernel.offset",
+            f"exceed -{d} with {d} dimensions",
+            f"{self.offset}: the bandwidth does not exist",
+            "Use 2, as derived.",
+        )
         return (4.0 / (d + self.offset)) ** (1.0 / (d + 4)) * n ** (-1.0 / (d + 4))
 
     @override
@@ -239,11 +241,13 @@ class ThompsonTaylorResampler(Resampler):
         draws: RandomStream,
     ) -> tuple[ParticleBelief, Tensor]:
         slots, m = belief.x.shape[1], self.neighbours
-        if m > slots:
-            raise ValueError(
-                f"resampler.neighbours must be at most {slots} (the particles), got {m}. "
-                "Choose fewer."
-            )
+        require(
+            not m > slots,
+            "resampler.neighbours",
+            f"be at most {slots} (the particles)",
+            m,
+            "Choose fewer.",
+        )
         mean, covariance = weighted_mean_cov(model.chart, belief)
         copies, resampled_mask = self.resampler(model, belief, log_a, n, draws)
         d = model.chart.subtract(copies.x, mean.unsqueeze(1))

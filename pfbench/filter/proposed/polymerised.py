@@ -21,7 +21,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights, select_by_run
 from pfbench.filter.particle.gaussian_particle_filter import refuse_history
@@ -70,11 +70,13 @@ class WhitenedCells(CellPartition):
     reach: float = 6.0
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.cell_size <= self.reach:
-            raise ValueError(
-                "resampler.partition.cell_size must be in (0, reach], got "
-                f"cell_size={self.cell_size}, reach={self.reach}. Set both in standard deviations."
-            )
+        require(
+            0.0 < self.cell_size <= self.reach,
+            "resampler.partition.cell_size",
+            "be in (0, reach]",
+            f"cell_size={self.cell_size}, reach={self.reach}",
+            "Set both in standard deviations.",
+        )
 
     @property
     @override

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
@@ -210,11 +210,13 @@ class SwarmProposal(Proposal):
 
     def __post_init__(self) -> None:
         require_ranges("proposal", self, iterations="[1, inf]")
-        if self.limits.scale_by_prior and self.coordinates.whiten:
-            raise ValueError(
-                "proposal.limits.scale_by_prior must be false in whitened coordinates, got true. "
-                "Set limits.scale_by_prior or coordinates.whiten to false."
-            )
+        require(
+            not self.limits.scale_by_prior or not self.coordinates.whiten,
+            "proposal.limits.scale_by_prior",
+            "be false in whitened coordinates",
+            "true",
+            "Set limits.scale_by_prior or coordinates.whiten to false.",
+        )
 
     @property
     @override

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import DerivedStream, RandomStream
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
 from pfbench.filter.particle.stages import PointSet
@@ -120,16 +120,20 @@ class InertiaVelocity(VelocityUpdate):
     escape_schedule: str = "cosine"
 
     def __post_init__(self) -> None:
-        if self.printed_iterations is not None and self.printed_iterations < 1:
-            raise ValueError(
-                "proposal.velocity.printed_iterations must be at least 1, got "
-                f"{self.printed_iterations}. Use null for the meaning of eq. 35."
-            )
-        if self.escape_schedule not in ("cosine", "linear"):
-            raise ValueError(
-                "proposal.velocity.escape_schedule must be cosine or linear, got "
-                f"{self.escape_schedule!r}. Use cosine for eq. 35."
-            )
+        require(
+            self.printed_iterations is None or not self.printed_iterations < 1,
+            "proposal.velocity.printed_iterations",
+            "be at least 1",
+            self.printed_iterations,
+            "Use null for the meaning of eq. 35.",
+        )
+        require(
+            self.escape_schedule in ("cosine", "linear"),
+            "proposal.velocity.escape_schedule",
+            "be cosine or linear",
+            f"{self.escape_schedule!r}",
+            "Use cosine for eq. 35.",
+        )
         require_ranges(
             "proposal.velocity",
             self,

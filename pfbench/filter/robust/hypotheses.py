@@ -14,6 +14,7 @@ from typing_extensions import override
 
 from pfbench.core.chart import Chart
 from pfbench.core.linear_algebra import squared_length
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record, map_inputs
 from pfbench.filter.belief import GaussianBelief, StepInfo
@@ -52,31 +53,39 @@ class NoiseHypotheses:
     def __post_init__(self) -> None:
         for name in ("process_factors", "measurement_factors"):
             factors = getattr(self, name)
-            if len(factors) < 2 or not all(0.0 < f < float("inf") for f in factors):
-                raise ValueError(
-                    f"hypotheses.{name} must be at least two positive numbers, got {list(factors)}. "
-                    "Use 1 for the model's noise."
-                )
-        m = len(self.process_factors)
-        if len(self.measurement_factors) != m:
-            raise ValueError(
-                "hypotheses.measurement_factors must be as many as process_factors, got "
-                f"{len(self.measurement_factors)} and {m}. Give both for each hypothesis."
+            require(
+                not len(factors) < 2 and all(0.0 < f < float("inf") for f in factors),
+                f"hypotheses.{name}",
+                "be at least two positive numbers",
+                list(factors),
+                "Use 1 for the model's noise.",
             )
+        m = len(self.process_factors)
+        require(
+            len(self.measurement_factors) == m,
+            "hypotheses.measurement_factors",
+            "be as many as process_factors",
+            f"{len(self.measurement_factors)} and {m}",
+            "Give both for each hypothesis.",
+        )
         matrix: Any = self.transition  # of a configuration: anything
         rows = [list(r) if _is_row(r) else r for r in matrix] if _is_row(matrix) else [matrix]
         is_square = len(rows) == m and all(_is_row(row) and len(row) == m for row in rows)
-        if not is_square or not all(_is_distribution(row) for row in rows):
-            raise ValueError(
-                f"hypotheses.transition must be {m} rows of {m} probabilities with sum 1, got "
-                f"{rows}. Correct the rows."
-            )
+        require(
+            is_square and all(_is_distribution(row) for row in rows),
+            "hypotheses.transition",
+            f"be {m} rows of {m} probabilities with sum 1",
+            rows,
+            "Correct the rows.",
+        )
         flow = np.array(rows) - np.eye(m)
-        if np.linalg.matrix_rank(flow, tol=_ROUNDING) < m - 1:
-            raise ValueError(
-                "hypotheses.transition must have one stationary distribution, got "
-                f"{rows}. Let each hypothesis be reached from the others."
-            )
+        require(
+            not np.linalg.matrix_rank(flow, tol=_ROUNDING) < m - 1,
+            "hypotheses.transition",
+            "have one stationary distribution",
+            rows,
+            "Let each hypothesis be reached from the others.",
+        )
 
     def start_probabilities(self) -> list[float]:
         """Return the stationary distribution, [M]."""

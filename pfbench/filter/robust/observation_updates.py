@@ -21,7 +21,7 @@ from torch.distributions import (
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import distribution_covariance
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.gaussian.kalman_update import (
     MeasurementUpdate,
@@ -295,12 +295,13 @@ def _combine_components(distribution: Any) -> NormalMixtureParameters | None:
     if not parts or any(type(item) is not Normal for _, item in parts):
         return None
     count = len(parts) ** k
-    if count > MOST_PARTS:
-        raise ValueError(
-            f"filter.measurement_update must have at most {MOST_PARTS} parts of the observation "
-            f"distribution, got {len(parts)}^{k} for {k} components. Use a particle filter, for "
-            "example filter=sir."
-        )
+    require(
+        not count > MOST_PARTS,
+        "filter.measurement_update",
+        f"have at most {MOST_PARTS} parts of the observation distribution",
+        f"{len(parts)}^{k} for {k} components",
+        "Use a particle filter, for example filter=sir.",
+    )
     shape = base.batch_shape
     log_w = torch.stack([a.expand(shape) for a, _ in parts], -1)
     mean = torch.stack([item.mean.expand(shape) for _, item in parts], -1)

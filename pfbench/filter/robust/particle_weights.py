@@ -16,6 +16,7 @@ from torch.distributions import Independent, MultivariateNormal, Normal
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import factor, shared_distribution_covariance
+from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record
 from pfbench.filter.belief import normalise_log_weights
 from pfbench.filter.gaussian.innovation import Innovation, diagonal_axes
@@ -52,16 +53,20 @@ class RobustWeightUpdate(MemoryWeightUpdate):
 
     def __post_init__(self) -> None:
         name = type(self.update).__name__
-        if not isinstance(self.update, (ResidualLoss, InnovationWeight)):
-            raise ValueError(
-                f"weight_update.update must be a robust update, got {name}. Choose InnovationGate, "
-                "HuberUpdate, StudentUpdate, CorrentropyUpdate or WeightedLikelihoodUpdate."
-            )
-        if getattr(self.update, "weight_prior", False):
-            raise ValueError(
-                f"weight_update.update.weight_prior must be false for particles, got {name} with "
-                "true. Set it to false."
-            )
+        require(
+            isinstance(self.update, (ResidualLoss, InnovationWeight)),
+            "weight_update.update",
+            "be a robust update",
+            name,
+            "Choose InnovationGate, HuberUpdate, StudentUpdate, CorrentropyUpdate or WeightedLikelihoodUpdate.",
+        )
+        require(
+            not getattr(self.update, "weight_prior", False),
+            "weight_update.update.weight_prior",
+            "be false for particles",
+            f"{name} with true",
+            "Set it to false.",
+        )
 
     @property
     def has_evidence(self) -> bool:
@@ -110,12 +115,13 @@ def _check_normal(model: StateSpaceModel, predicted_y: Any) -> None:
     is_normal = isinstance(predicted_y, MultivariateNormal) or (
         isinstance(predicted_y, Independent) and isinstance(inner, Normal)
     )
-    if not is_normal:
-        raise ValueError(
-            f"{type(model).__name__}.observation must be normal for a robust weight update, got "
-            f"{type(inner).__name__}. Use filter.weight_update of filter=sir: the model has a "
-            "distribution of its own."
-        )
+    require(
+        is_normal,
+        f"{type(model).__name__}.observation",
+        "be normal for a robust weight update",
+        type(inner).__name__,
+        "Use filter.weight_update of filter=sir: the model has a distribution of its own.",
+    )
 
 
 def _predicted_innovation(

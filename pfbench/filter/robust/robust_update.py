@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.special import gammainc, gammaincc, gammaln
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import (
     Innovation,
@@ -66,18 +66,22 @@ class ComponentGrouping:
     def numbers(self, components: int) -> Sequence[int] | None:
         """Return the group number of each component, None for groups of equal variance."""
         if self.groups is not None:
-            if len(self.groups) != components:
-                raise ValueError(
-                    f"groups must be one number for each of the {components} components of the measurement, got "
-                    f"{list(self.groups)}. Give as many numbers."
-                )
+            require(
+                len(self.groups) == components,
+                "groups",
+                f"be one number for each of the {components} components of the measurement",
+                list(self.groups),
+                "Give as many numbers.",
+            )
             return self.groups
         if self.kind == "satellite":
-            if components % 2:
-                raise ValueError(
-                    "grouping must be component for a measurement without a range rate for each "
-                    f"range, got satellite with {components} components. Choose component."
-                )
+            require(
+                not components % 2,
+                "grouping",
+                "be component for a measurement without a range rate for each range",
+                f"satellite with {components} components",
+                "Choose component.",
+            )
             return [i % (components // 2) for i in range(components)]
         return {"all": [0] * components, "component": range(components)}.get(self.kind)
 

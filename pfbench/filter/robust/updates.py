@@ -220,16 +220,20 @@ class WeightedLikelihoodUpdate(InnovationWeight):
         name = type(self).__name__
         is_known = self.distance in ("mahalanobis", "plain")
         require(is_known, f"{name}.distance", "be mahalanobis or plain", self.distance)
-        if self.distance == "plain" and self.threshold is None:
-            raise ValueError(
-                f"{name}.threshold must be a number in the unit of the measurement with "
-                "distance=plain, got None. Set it, or use distance=mahalanobis."
-            )
-        if self.distance == "plain" and self.groups is None and self.grouping == "all":
-            raise ValueError(
-                f"{name}.grouping must be sensor or component with distance=plain, which adds "
-                "squares of one unit, got all. Set groups=[0, ...] if all units are equal."
-            )
+        require(
+            self.distance != "plain" or self.threshold is not None,
+            f"{name}.threshold",
+            "be a number in the unit of the measurement with distance=plain",
+            "None",
+            "Set it, or use distance=mahalanobis.",
+        )
+        require(
+            self.distance != "plain" or self.groups is not None or self.grouping != "all",
+            f"{name}.grouping",
+            "be sensor or component with distance=plain, which adds squares of one unit",
+            "all",
+            "Set groups=[0, ...] if all units are equal.",
+        )
 
     @override
     def noise_adapt(

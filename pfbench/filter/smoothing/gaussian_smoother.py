@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pfbench.core.linear_algebra import factor
-from pfbench.core.parameter_checks import require_range
+from pfbench.core.parameter_checks import require, require_range
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record, iterate_steps
 from pfbench.filter.belief import GaussianBelief, StepInfo
@@ -58,11 +58,13 @@ def smooth(
         H. Rauch, F. Tung and C. Striebel (1965). S. Sarkka (2008), Unscented
         Rauch-Tung-Striebel smoother.
     """
-    if not method.plain:
-        raise ValueError(
-            "smooth: method must use the model's noise and gain, got a filter that adapts them. "
-            "Choose a filter without adaptations."
-        )
+    require(
+        method.plain,
+        "smooth: method",
+        "use the model's noise and gain",
+        "a filter that adapts them",
+        "Choose a filter without adaptations.",
+    )
     check_no_feedback(record)
     filtered_moments: list[tuple[Tensor, Tensor]] = []
 
@@ -112,11 +114,13 @@ def _backward_gain(
 
 def check_no_feedback(record: Record) -> None:
     """Raise an error if the record has feedback."""
-    if record.feedback is not None:
-        raise ValueError(
-            "smoothing: record must not depend on the filter, got one with feedback. "
-            "Set scenario.closed_loop=false."
-        )
+    require(
+        record.feedback is None,
+        "smoothing: record",
+        "not depend on the filter",
+        "one with feedback",
+        "Set scenario.closed_loop=false.",
+    )
 
 
 # --------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from torch.distributions import Independent, MultivariateNormal, Normal
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import distribution_covariance, factor, jacobian
-from pfbench.core.parameter_checks import require_range, require_ranges
+from pfbench.core.parameter_checks import require, require_range, require_ranges
 from pfbench.core.random_stream import RandomStream, relabel
 from pfbench.core.record import Record, iterate_steps
 from pfbench.filter.loop import prepare_record
@@ -143,11 +143,13 @@ class NoiseSpace:
 def _check_normal(model: str, name: str, distribution: Any) -> None:
     """Raise an error if a distribution is not normal."""
     base = distribution.base_dist if isinstance(distribution, Independent) else distribution
-    if not isinstance(base, Normal | MultivariateNormal):
-        raise ValueError(
-            f"{model}.{name} must be normal for smoothing in noise space, got "
-            f"{type(base).__name__}. Use sample_trajectories."
-        )
+    require(
+        isinstance(base, Normal | MultivariateNormal),
+        f"{model}.{name}",
+        "be normal for smoothing in noise space",
+        type(base).__name__,
+        "Use sample_trajectories.",
+    )
 
 
 # --------------------------------------------------------------------------------------------------

@@ -1,7 +1,6 @@
 // Written by `python -m pfbench.kernels.operator_sources` from operators.toml.
-// The operators as torch calls them: checks of the arguments, calls by compiled steps, registration.
+// The operators as torch calls them: checks of the arguments, registration.
 #include "argument_check.h"
-#include "direct_call.h"
 #include "operators.h"
 
 namespace {
@@ -94,20 +93,6 @@ Tensor propagate_affine(const Tensor& phi, const Tensor& x, const Tensor& gain, 
     check.real("gain", gain, "rEW");
     check.real("w", w, "RNW");
     return operators::propagate_affine(phi, x, gain, w);
-}
-
-Tensor gather_propagate(const Tensor& phi, const Tensor& x, const Tensor& ancestors, const Tensor& gain, const Tensor& seed, int64_t purpose, const Tensor& step, const Tensor& runs) {
-    ArgumentCheck check("gather_propagate");
-    check.real("phi", phi, "rDD");
-    check.real("x", x, "DRN");
-    check.int64("ancestors", ancestors, "RM");
-    check.real("gain", gain, "rDW");
-    check.int64("seed", seed, "");
-    check.integer("purpose", purpose);
-    check.int64("step", step, "");
-    check.int64("runs", runs, "R");
-    check.range("ancestors", ancestors, 1, 'N', 1);
-    return operators::gather_propagate(phi, x, ancestors, gain, seed, purpose, step, runs);
 }
 
 Tensor count_unique(const Tensor& ancestors, const Tensor& log_w) {
@@ -223,7 +208,6 @@ const pfbench::Registration registration(
     pfbench::entry<&log_normal>("log_normal"),
     pfbench::entry<&log_observed_normal>("log_observed_normal"),
     pfbench::entry<&propagate_affine>("propagate_affine"),
-    pfbench::entry<&gather_propagate>("gather_propagate"),
     pfbench::entry<&count_unique>("count_unique"),
     pfbench::entry<&sum_and_squares>("sum_and_squares"),
     pfbench::entry<&sum_log_weights>("sum_log_weights"),
@@ -239,28 +223,3 @@ const pfbench::Registration registration(
     pfbench::entry<&marginal_scores>("marginal_scores"),
     pfbench::entry<&energy_score>("energy_score"));
 }  // namespace
-
-DIRECT_CALL aoti_torch_cpu_philox_normals(AtenTensorHandle seed, int64_t purpose, AtenTensorHandle step, AtenTensorHandle runs, int64_t components, int64_t quarters, AtenTensorHandle* result_0) { return call_directly<&philox_normals>({result_0}, seed, purpose, step, runs, components, quarters); }
-DIRECT_CALL aoti_torch_cpu_philox_normals_float64(AtenTensorHandle seed, int64_t purpose, AtenTensorHandle step, AtenTensorHandle runs, int64_t components, int64_t quarters, AtenTensorHandle* result_0) { return call_directly<&philox_normals_float64>({result_0}, seed, purpose, step, runs, components, quarters); }
-DIRECT_CALL aoti_torch_cpu_philox_uniforms(AtenTensorHandle seed, int64_t purpose, AtenTensorHandle step, AtenTensorHandle runs, int64_t components, int64_t quarters, AtenTensorHandle* result_0) { return call_directly<&philox_uniforms>({result_0}, seed, purpose, step, runs, components, quarters); }
-DIRECT_CALL aoti_torch_cpu_resample_systematic(AtenTensorHandle a, AtenTensorHandle n, AtenTensorHandle u, AtenTensorHandle* result_0) { return call_directly<&resample_systematic>({result_0}, a, n, u); }
-DIRECT_CALL aoti_torch_cpu_gather_particles(AtenTensorHandle x, AtenTensorHandle ancestors, AtenTensorHandle* result_0) { return call_directly<&gather_particles>({result_0}, x, ancestors); }
-DIRECT_CALL aoti_torch_cpu_resample_particles(AtenTensorHandle x, AtenTensorHandle log_w, AtenTensorHandle w, AtenTensorHandle n, AtenTensorHandle u, AtenTensorHandle threshold, AtenTensorHandle* result_0, AtenTensorHandle* result_1, AtenTensorHandle* result_2, AtenTensorHandle* result_3) { return call_directly<&resample_particles>({result_0, result_1, result_2, result_3}, x, log_w, w, n, u, threshold); }
-DIRECT_CALL aoti_torch_cpu_log_normal(AtenTensorHandle y, AtenTensorHandle mean, AtenTensorHandle scale, AtenTensorHandle constant, AtenTensorHandle* result_0) { return call_directly<&log_normal>({result_0}, y, mean, scale, constant); }
-DIRECT_CALL aoti_torch_cpu_log_observed_normal(AtenTensorHandle y, AtenTensorHandle mean, AtenTensorHandle sd, AtenTensorHandle* result_0) { return call_directly<&log_observed_normal>({result_0}, y, mean, sd); }
-DIRECT_CALL aoti_torch_cpu_propagate_affine(AtenTensorHandle phi, AtenTensorHandle x, AtenTensorHandle gain, AtenTensorHandle w, AtenTensorHandle* result_0) { return call_directly<&propagate_affine>({result_0}, phi, x, gain, w); }
-DIRECT_CALL aoti_torch_cpu_gather_propagate(AtenTensorHandle phi, AtenTensorHandle x, AtenTensorHandle ancestors, AtenTensorHandle gain, AtenTensorHandle seed, int64_t purpose, AtenTensorHandle step, AtenTensorHandle runs, AtenTensorHandle* result_0) { return call_directly<&gather_propagate>({result_0}, phi, x, ancestors, gain, seed, purpose, step, runs); }
-DIRECT_CALL aoti_torch_cpu_count_unique(AtenTensorHandle ancestors, AtenTensorHandle log_w, AtenTensorHandle* result_0) { return call_directly<&count_unique>({result_0}, ancestors, log_w); }
-DIRECT_CALL aoti_torch_cpu_sum_and_squares(AtenTensorHandle terms, AtenTensorHandle* result_0, AtenTensorHandle* result_1) { return call_directly<&sum_and_squares>({result_0, result_1}, terms); }
-DIRECT_CALL aoti_torch_cpu_sum_log_weights(AtenTensorHandle log_likelihood, AtenTensorHandle log_w, AtenTensorHandle log_ratio, AtenTensorHandle* result_0) { return call_directly<&sum_log_weights>({result_0}, log_likelihood, log_w, log_ratio); }
-DIRECT_CALL aoti_torch_cpu_normalise_weights(AtenTensorHandle log_w, AtenTensorHandle* result_0, AtenTensorHandle* result_1, AtenTensorHandle* result_2, AtenTensorHandle* result_3) { return call_directly<&normalise_weights>({result_0, result_1, result_2, result_3}, log_w); }
-DIRECT_CALL aoti_torch_cpu_log_mixture(AtenTensorHandle a, AtenTensorHandle centres, AtenTensorHandle log_w, AtenTensorHandle* result_0) { return call_directly<&log_mixture>({result_0}, a, centres, log_w); }
-DIRECT_CALL aoti_torch_cpu_weighted_moments(AtenTensorHandle x, AtenTensorHandle w, AtenTensorHandle* result_0, AtenTensorHandle* result_1) { return call_directly<&weighted_moments>({result_0, result_1}, x, w); }
-DIRECT_CALL aoti_torch_cpu_weigh_particles(AtenTensorHandle x, AtenTensorHandle log_w, AtenTensorHandle* result_0, AtenTensorHandle* result_1, AtenTensorHandle* result_2, AtenTensorHandle* result_3, AtenTensorHandle* result_4, AtenTensorHandle* result_5) { return call_directly<&weigh_particles>({result_0, result_1, result_2, result_3, result_4, result_5}, x, log_w); }
-DIRECT_CALL aoti_torch_cpu_cholesky_factor(AtenTensorHandle covariance, AtenTensorHandle* result_0, AtenTensorHandle* result_1) { return call_directly<&cholesky_factor>({result_0, result_1}, covariance); }
-DIRECT_CALL aoti_torch_cpu_kalman_update(AtenTensorHandle m, AtenTensorHandle r, AtenTensorHandle omega, AtenTensorHandle* result_0, AtenTensorHandle* result_1, AtenTensorHandle* result_2, AtenTensorHandle* result_3, AtenTensorHandle* result_4) { return call_directly<&kalman_update>({result_0, result_1, result_2, result_3, result_4}, m, r, omega); }
-DIRECT_CALL aoti_torch_cpu_fit_affine(AtenTensorHandle r, AtenTensorHandle xi, AtenTensorHandle w, AtenTensorHandle* result_0, AtenTensorHandle* result_1) { return call_directly<&fit_affine>({result_0, result_1}, r, xi, w); }
-DIRECT_CALL aoti_torch_cpu_group_covariance(AtenTensorHandle x, AtenTensorHandle mean, AtenTensorHandle w, AtenTensorHandle groups, AtenTensorHandle* result_0) { return call_directly<&group_covariance>({result_0}, x, mean, w, groups); }
-DIRECT_CALL aoti_torch_cpu_squared_mahalanobis(AtenTensorHandle e, AtenTensorHandle covariance, AtenTensorHandle* result_0) { return call_directly<&squared_mahalanobis>({result_0}, e, covariance); }
-DIRECT_CALL aoti_torch_cpu_marginal_scores(AtenTensorHandle error, AtenTensorHandle deviation, AtenTensorHandle w, AtenTensorHandle* result_0, AtenTensorHandle* result_1) { return call_directly<&marginal_scores>({result_0, result_1}, error, deviation, w); }
-DIRECT_CALL aoti_torch_cpu_energy_score(AtenTensorHandle points, AtenTensorHandle* result_0) { return call_directly<&energy_score>({result_0}, points); }

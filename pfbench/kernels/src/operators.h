@@ -13,7 +13,6 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> resample_particles(const Tensor& x, c
 Tensor log_normal(const Tensor& y, const Tensor& mean, const Tensor& scale, const Tensor& constant);
 Tensor log_observed_normal(const Tensor& y, const Tensor& mean, const Tensor& sd);
 Tensor propagate_affine(const Tensor& phi, const Tensor& x, const Tensor& gain, const Tensor& w);
-Tensor gather_propagate(const Tensor& phi, const Tensor& x, const Tensor& ancestors, const Tensor& gain, const Tensor& seed, int64_t purpose, const Tensor& step, const Tensor& runs);
 Tensor count_unique(const Tensor& ancestors, const Tensor& log_w);
 std::tuple<Tensor, Tensor> sum_and_squares(const Tensor& terms);
 Tensor sum_log_weights(const Tensor& log_likelihood, const Tensor& log_w, const Tensor& log_ratio);

@@ -155,30 +155,6 @@ void affine(T* out, const T* phi, const T* x, const T* gain, const T* w, int64_t
     }
 }
 
-// The parents of a run, their noise and the result of `affine` follow each other: both inputs stay in the second-level cache. Noise
-// that no component takes is not drawn.
-template <class T>
-void moved(T* out, void (*draw)(T*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t), const T* phi,
-           const T* x, const int64_t* ancestor, const T* gain, const int64_t* run, int64_t one_phi, int64_t one_gain, int64_t runs,
-           int64_t particles, int64_t wanted, int64_t states, int64_t noises, int64_t step, int64_t seed, int64_t purpose) {
-    const int64_t quarters = (wanted + 3) / 4;
-    thread_local std::vector<T> room;  // a fresh one would be cleared at each call
-    if (const size_t size = states * wanted + noises * 4 * quarters; room.size() < size) room.resize(size);
-    T *const parent = room.data(), *const noise = parent + states * wanted;
-    std::vector<int32_t> from(states == 1 ? 0 : wanted);
-    Affine<T> move(states, states, noises);
-    for (int64_t r = 0; r < runs; ++r) {
-        const T *a = phi + (one_phi ? 0 : r * states * states), *b = gain + (one_gain ? 0 : r * states * noises);
-        parents<T>({parent, wanted}, {x + r * particles, runs * particles}, ancestor + r * wanted, states, wanted, from);
-        for (int64_t k = 0; k < noises; ++k) {
-            bool taken = false;
-            for (int64_t d = 0; d < states; ++d) taken |= b[d * noises + k] != 0;
-            if (taken) draw(noise + k * 4 * quarters, run + r, 1, k, 1, quarters, step, seed, purpose);
-        }
-        move.apply({out + r * wanted, runs * wanted}, a, {parent, wanted}, b, {noise, 4 * quarters}, wanted);
-    }
-}
-
 // How many of the values 0 to 2 N - 1 occur at slots that hold a particle. Where values do not fall from slot to slot, as after
 // systematic resampling, each new one begins where it differs from the one before.
 template <class T>
@@ -321,6 +297,24 @@ void moments(T* mean, T* variance, const T* x, const T* weight, int64_t componen
         }
 }
 
+// Ancestors of a run and their log weights: resampled if the effective sample size of its weights is below a limit times `wanted`.
+template <class T>
+bool choose(int64_t* ancestor, T* log_w, const T* w, const T* log_w_before, double wanted, double uniform, T limit, int64_t slots) {
+    T whole, square;
+    totals(&whole, &square, w, 1, slots);
+    const bool resampled = limit >= 1 || 1 / square < limit * static_cast<T>(wanted);
+    if (resampled) {
+        systematic(ancestor, w, &wanted, &uniform, 1, slots);
+        const int64_t many = static_cast<int64_t>(std::ceil(wanted));  // slots below n
+        std::fill(log_w, log_w + many, -std::log(static_cast<T>(wanted)));
+        std::fill(log_w + many, log_w + slots, -std::numeric_limits<T>::infinity());
+    } else {
+        std::iota(ancestor, ancestor + slots, 0);
+        std::copy_n(log_w_before, slots, log_w);
+    }
+    return resampled;
+}
+
 template <class T>
 Tensor drawn(void (*draw)(T*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t), const Tensor& seed,
              int64_t purpose, const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {
@@ -331,6 +325,19 @@ Tensor drawn(void (*draw)(T*, const int64_t*, int64_t, int64_t, int64_t, int64_t
     return out;
 }
 }  // namespace
+
+// for tape.cpp, of one run
+extern "C" bool choose_double(int64_t* ancestor, double* log_w, const double* w, const double* before, double uniform, double limit, int64_t slots) {
+    return choose(ancestor, log_w, w, before, static_cast<double>(slots), uniform, limit, slots);
+}
+extern "C" int64_t distinct_double(const int64_t* ancestor, const double* log_w, int64_t slots) {
+    int64_t count;
+    distinct(&count, ancestor, log_w, 1, slots);
+    return count;
+}
+extern "C" void moments_double(double* mean, double* variance, const double* x, const double* w, int64_t slots) {
+    moments(mean, variance, x, w, 1, 1, slots);
+}
 
 Tensor operators::philox_normals(const Tensor& seed, int64_t purpose, const Tensor& step, const Tensor& runs, int64_t components, int64_t quarters) {
     return drawn(normals_float, seed, purpose, step, runs, components, quarters);
@@ -366,21 +373,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> operators::resample_particles(const T
         const Tensor out = fresh<T>({components, runs, slots}), log_out = fresh<T>({runs, slots});
         const Packed<T> weight(w), before(log_w);
         const T limit = few<T>(threshold, 1)[0];
-        for (int64_t r = 0; r < runs; ++r) {
-            const T* from = weight.data + r * slots;
-            T *const to = numbers<T>(log_out) + r * slots, whole, square;
-            totals(&whole, &square, from, 1, slots);
-            int64_t* const ancestor = numbers<int64_t>(ancestors) + r * slots;
-            if ((numbers<bool>(mask)[r] = limit >= 1 || 1 / square < limit * static_cast<T>(wanted[r]))) {
-                systematic(ancestor, from, &wanted[r], &uniform[r], 1, slots);
-                const int64_t many = static_cast<int64_t>(std::ceil(wanted[r]));  // slots below n
-                std::fill(to, to + many, -std::log(static_cast<T>(wanted[r])));
-                std::fill(to + many, to + slots, -std::numeric_limits<T>::infinity());
-            } else {
-                std::iota(ancestor, ancestor + slots, 0);
-                std::copy_n(before.data + r * slots, slots, to);
-            }
-        }
+        for (int64_t r = 0; r < runs; ++r)
+            numbers<bool>(mask)[r] = choose(numbers<int64_t>(ancestors) + r * slots, numbers<T>(log_out) + r * slots, weight.data + r * slots,
+                                            before.data + r * slots, wanted[r], uniform[r], limit, slots);
         copied(numbers<T>(out), Packed<T>(x).data, numbers<int64_t>(ancestors), components, runs, slots, slots);
         return std::make_tuple(out, log_out, ancestors, mask);
     });
@@ -451,25 +446,6 @@ Tensor operators::propagate_affine(const Tensor& phi, const Tensor& x, const Ten
         if (quiet<T>(w)) work(nullptr, nullptr, 0);
         else work(Packed<T>(gain).data, Packed<T>(w, COMPONENTS_FIRST).data, gain.size(2));
         return out;
-    });
-}
-
-Tensor operators::gather_propagate(const Tensor& phi, const Tensor& x, const Tensor& ancestors, const Tensor& gain, const Tensor& seed,
-                                   int64_t purpose, const Tensor& step, const Tensor& runs) {
-    const int64_t states = x.size(0), rows = x.size(1), wanted = ancestors.size(1);
-    require(gain.size(2) * rows < MAX_SIZE && wanted < MAX_SIZE, "gather_propagate: more than 2^30 numbers of a kind");
-    const Packed<int64_t> from(ancestors), run(runs);
-    const auto work = [&](auto like, auto draw) {
-        using T = decltype(like);
-        const Tensor out = fresh<T>({states, rows, wanted});
-        moved(numbers<T>(out), draw, Packed<T>(phi).data, Packed<T>(x).data, from.data, Packed<T>(gain).data, run.data,
-              phi.size(0) == 1, gain.size(0) == 1, rows, x.size(2), wanted, states, gain.size(2), *numbers<int64_t>(step),
-              *numbers<int64_t>(seed), purpose);
-        return out;
-    };
-    return by_type(x, [&](auto like) {
-        if constexpr (sizeof(like) == 8) return work(like, normals_double);
-        else return work(like, normals_float);
     });
 }
 

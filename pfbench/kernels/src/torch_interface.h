@@ -24,7 +24,6 @@ struct StableListOpaque;
 using StableListHandle = StableListOpaque*;
 
 int32_t aoti_torch_device_type_cpu();
-int32_t aoti_torch_dtype_uint8();
 int32_t aoti_torch_dtype_int64();
 int32_t aoti_torch_dtype_float32();
 int32_t aoti_torch_dtype_float64();
@@ -40,8 +39,6 @@ AOTITorchError aoti_torch_get_dtype(AtenTensorHandle tensor, int32_t* dtype);
 AOTITorchError aoti_torch_get_device_type(AtenTensorHandle tensor, int32_t* type);
 AOTITorchError aoti_torch_empty_strided(int64_t ndim, const int64_t* sizes, const int64_t* strides, int32_t dtype, int32_t device_type,
                                         int32_t device_index, AtenTensorHandle* made);
-AOTITorchError aoti_torch__reinterpret_tensor(AtenTensorHandle self, int64_t ndim, const int64_t* sizes, const int64_t* strides,
-                                              int64_t storage_offset, AtenTensorHandle* made);
 AOTITorchError aoti_torch_library_init_impl(const char* space, const char* key, const char* file, uint32_t line,
                                             TorchLibraryHandle* made);
 AOTITorchError torch_library_impl(TorchLibraryHandle self, const char* name, void (*function)(StableIValue*, uint64_t, uint64_t),

@@ -2,64 +2,15 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
-#include <cstring>
 #include <limits>
 #include <tuple>
 #include <vector>
 
+#include "elementary.h"
 #include "operators.h"
 
 namespace {
-// 1 / 0!, 1 / 1!, ..., 1 / (COUNT - 1)!
-template <class T, int COUNT>
-struct InverseFactorials {
-    T of[COUNT];
-    constexpr InverseFactorials() : of() {
-        double factorial = 1;  // exact up to 18!
-        for (int n = 0; n < COUNT; factorial *= ++n) of[n] = static_cast<T>(1 / factorial);
-    }
-    constexpr T operator[](int n) const { return of[n]; }
-};
-
-template <class T>
-struct Exponential;
-template <>
-struct Exponential<double> {
-    typedef int64_t Integer;
-    static constexpr double LEAST = -800, HIGH = 0x1.62e42fefap-1, LOW = 0x1.cf79abc9e3b3ap-40;
-    static constexpr int TERMS = 13, FRACTION = 52, BIAS = 1023;
-    static constexpr InverseFactorials<double, TERMS + 1> INVERSE_FACTORIAL{};
-};
-template <>
-struct Exponential<float> {
-    typedef int32_t Integer;
-    static constexpr float LEAST = -120, HIGH = 0x1.62ep-1f, LOW = 0x1.0bfbe8p-15f;
-    static constexpr int TERMS = 7, FRACTION = 23, BIAS = 127;
-    static constexpr InverseFactorials<float, TERMS + 1> INVERSE_FACTORIAL{};
-};
-
-// 2^k of a k in the range of normal numbers.
-template <class T>
-inline T power_of_two(int32_t k) {
-    typedef typename Exponential<T>::Integer Integer;
-    const Integer bits = static_cast<Integer>(k + Exponential<T>::BIAS) << Exponential<T>::FRACTION;
-    T value;
-    std::memcpy(&value, &bits, sizeof value);
-    return value;
-}
-
-// e^x of x <= 0, to two units of the last place: x = k log 2 + r, and Taylor's series of e^r for |r| <= log(2) / 2.
-template <class T>
-inline T exponential(T x) {
-    typedef Exponential<T> E;
-    x = x > E::LEAST ? x : E::LEAST;  // e^x is 0 there
-    const T k = std::rint(x * T(1.4426950408889634));
-    const T r = (x - k * E::HIGH) - k * E::LOW;
-    T series = E::INVERSE_FACTORIAL[E::TERMS];
-    for (int n = E::TERMS - 1; n >= 0; --n) series = series * r + E::INVERSE_FACTORIAL[n];
-    const int32_t whole = static_cast<int32_t>(k), half = whole / 2;  // 2^k may be subnormal, its two factors are not
-    return series * power_of_two<T>(half) * power_of_two<T>(whole - half);
-}
+using elementary::exponential;
 
 // Sums of numbers and of their squares.
 template <class T>
@@ -182,6 +133,11 @@ void add_row(T* out, const T* terms, const T* first, const T* second, int64_t sl
     }
 }
 }  // namespace
+
+// for tape.cpp
+extern "C" void normalise_double(double* log_w, double* log_total, double* w, double* ess, const double* from, int64_t slots) {
+    normalise(log_w, log_total, w, ess, from, slots);
+}
 
 Tensor operators::sum_log_weights(const Tensor& log_likelihood, const Tensor& log_w, const Tensor& log_ratio) {
     const int64_t runs = log_likelihood.size(0), slots = log_likelihood.size(1);

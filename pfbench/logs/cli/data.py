@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.atomic_write import hash_file
 
 HELP = """\
@@ -58,16 +59,22 @@ def check_data_set(name: str, files: Mapping[str, Mapping[str, Any]], root: Path
 
 def list_data(words: Sequence[str]) -> None:
     """Print the data sets, and check a folder."""
-    if len(words) > 1 or any("=" in word for word in words):
-        raise ValueError(
-            f"pfbench data must receive one folder, got {' '.join(words)}. Use: pfbench data FOLDER"
-        )
+    require(
+        len(words) < 2 and "=" not in "".join(words),
+        "pfbench data",
+        "receive one folder",
+        " ".join(words),
+        "Use: pfbench data FOLDER",
+    )
     folder = words[0] if words else os.environ.get("PFBENCH_DATA", "")
     root = Path(folder).expanduser()
-    if folder and not root.is_dir():
-        raise ValueError(
-            f"FOLDER must be a folder, got {folder}. Name the one that holds the data sets: pfbench data FOLDER"
-        )
+    require(
+        not folder or root.is_dir(),
+        "FOLDER",
+        "be a folder",
+        folder,
+        "Name the one that holds the data sets: pfbench data FOLDER",
+    )
     sets = read_data_sets()
     states = {name: check_data_set(name, facts["files"], root) for name, facts in sets.items()} if folder else {}  # fmt: skip
     for name, facts in sets.items():
@@ -87,8 +94,10 @@ def _refuse_damage(states: Sequence[SetState], folder: str) -> None:
     """Raise ValueError for data sets with files that are missing or differ."""
     faults = [f"{state.name}/{file} is missing" for state in states for file in state.missing]
     faults += [f"{state.name}/{file} differs" for state in states for file in state.changed]
-    if faults:
-        raise ValueError(
-            f"data sets must have all their files unchanged, got {folder} where {'; '.join(faults)}. "
-            "Copy these files again, or remove the folder of the data set."
-        )
+    require(
+        not faults,
+        "data sets",
+        "have all their files unchanged",
+        f"{folder} where {'; '.join(faults)}",
+        "Copy these files again, or remove the folder of the data set.",
+    )

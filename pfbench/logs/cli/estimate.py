@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from pfbench.cli.current_folder import add_search_path
+
 HELP = """\
 pfbench estimate FOLDER [filter=NAME,...] [key=value ...]
 
@@ -17,6 +19,7 @@ reports/estimate_NAME/ with a page, a table of each track, and track.gpx and tra
 
   filter=NAME,...                    filters, the answer is that of the first one (ekf,ukf)
   scenario.KEY=VALUE ...             keys of scenario=user_log_aligned
+  scenario=NAME                      a variant of it, such as one with noise numbers of pfbench infer
   particles=N seed=N ...             other keys of pfbench run
   reports_dir=FOLDER                 folder of reports (reports)"""
 
@@ -33,12 +36,12 @@ def estimate_log(words: Sequence[str]) -> None:
     options = {
         key: value for key, _, value in (word.partition("=") for word in words) if key in _OWN
     }
-    settings = [word for word in words if "=" in word and word.partition("=")[0] not in _OWN]
+    others = [word for word in words if "=" in word and word.partition("=")[0] not in _OWN]
     from pfbench.job import estimate_track
     from pfbench.logs.judge.track_page import describe_track, write_track_page
 
     names = [name for name in options.get("filter", "ekf,ukf").strip("[]").split(",") if name]
-    estimate = estimate_track(folders[0], names, settings)
+    estimate = estimate_track(folders[0], names, add_search_path(others))
     page = write_track_page(estimate, options.get("reports_dir", "reports"))
     print("\n".join(describe_track(estimate)))
     print(f"report: {page.resolve()}")

@@ -7,6 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pfbench.core.parameter_checks import require
+from pfbench.logs.cli.judge import convert_numbers
+
 HELP = """\
 pfbench inspect FOLDER [key=value ...]
 
@@ -70,21 +73,26 @@ def _split_folder(words: Sequence[str]) -> tuple[Path, dict[str, str]]:
         key, equals, value = word.removeprefix("scenario.").partition("=")  # as remedies name them
         if not equals:
             continue
-        if key not in _KEYS or not value or key in values:
-            raise ValueError(
-                f"words must be FOLDER and key=value with the keys {', '.join(_KEYS)}, each once, got {word}. "
-                "See pfbench inspect --help."
-            )
+        require(
+            key in _KEYS and value and key not in values,
+            "words",
+            f"be FOLDER and key=value with the keys {', '.join(_KEYS)}, each once",
+            word,
+            "See pfbench inspect --help.",
+        )
         values[key] = value
     if len(folders) != 1:
         raise ValueError(
             f"inspect needs one folder, got {' '.join(folders) or 'none'}. Use: pfbench inspect my_log"
         )
     folder = Path(folders[0])
-    if not folder.is_dir():
-        raise ValueError(
-            f"{folders[0]} must be a folder with imu, gnss and, if there is one, reference, got none. Check the path."
-        )
+    require(
+        folder.is_dir(),
+        folder,
+        "be a folder with imu, gnss and, if there is one, reference",
+        "none",
+        "Check the path.",
+    )
     return folder.resolve(), values
 
 
@@ -93,23 +101,15 @@ def _convert_options(values: Mapping[str, str]) -> dict[str, Any]:
     options: dict[str, Any] = {}
     for key, name in (("path", "path"), ("sensor", "imu")):
         if key in values:
-            options[name] = int(_number(key, values[key]))
+            options[name] = int(convert_numbers(key, values[key], 0.0))
     if "origin" in values:
-        parts = values["origin"].strip("[]()").split(",")
-        options["origin"] = [_number("origin", text) for text in parts]
+        options["origin"] = list(convert_numbers("origin", values["origin"], ()))
     codes = values.get("fix_codes", "")
     if codes.startswith("["):
-        options["fix_codes"] = [int(_number("fix_codes", c)) for c in codes.strip("[]").split(",")]
+        options["fix_codes"] = [int(code) for code in convert_numbers("fix_codes", codes, ())]
     elif codes:
         options["fix_codes"] = codes
     return options
-
-
-def _number(key: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise ValueError(f"{key} must be a number, got {text}. Change {key}=...") from None
 
 
 def _describe_words(names: Mapping[str, str], options: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from pfbench.cli.messages import suggest_similar
+from pfbench.core.parameter_checks import require
 
 if TYPE_CHECKING:
     from pfbench.logs.judge.judge_options import SourceOptions
@@ -22,7 +23,7 @@ Compare trajectories of any programs with a reference and with each other, and w
   pfbench judge reference=truth/{sequence}.csv 'mine=mine/{sequence}_{run}.csv' 'theirs=theirs/{sequence}.nav'
 
 Formats, found by content: CSV and .parquet with the columns t, pn, pe, pd (or lat_deg, lon_deg, h_m), optional
-vn, ve, vd, roll, pitch, yaw, sd_pn, ..., cov_nn, ...; TUM; NMEA; KF-GINS; .npz of pfbench.
+vn, ve, vd, roll, pitch, yaw, sd_pn, ..., cov_nn, ...; TUM; NMEA; KF-GINS; RTKLIB .pos; .npz of pfbench.
 
   study=NAME             name of the report (judge)        reports_dir=FOLDER   folder of reports (reports)
   from=S to=S every=S    scored time and distance of epochs
@@ -37,7 +38,7 @@ vn, ve, vd, roll, pitch, yaw, sd_pn, ..., cov_nn, ...; TUM; NMEA; KF-GINS; .npz 
   alpha=0.05 margin=0.05 level of the tests, margin of equality
   NAME.frame=enu|ned     axes of a TUM file                NAME.shift=S   time added to a clock
   NAME.columns=t:time,pn:north,...   names of columns      NAME.sd=FILE   deviations of KF-GINS
-  NAME.scale=t:0.001,yaw:0.0174533   factors of columns    NAME.format=table|tum|kf_gins|nmea|result"""
+  NAME.scale=t:0.001,yaw:0.0174533   factors of columns    NAME.format=table|tum|kf_gins|nmea|rtklib|result"""
 
 _RENAMED = {"from": "start", "to": "end"}  # words of the command line that Python reserves
 _OTHER_PAGES = ("claims", "datasheets")  # folders of reports
@@ -57,14 +58,24 @@ def judge_trajectories(words: Sequence[str]) -> None:
     from pfbench.logs.judge.pair_sentences import describe_judgement
 
     reference, study = programs.pop("reference"), str(values.get("study", "judge"))
-    if not re.fullmatch(r"[\w+.-]*\w[\w+.-]*", study) or len(study) > _LONGEST_NAME:
-        raise ValueError(
-            f"study must be letters, digits, _, -, + or ., at most {_LONGEST_NAME}, got {study[:150]}. Change study=NAME."
-        )
-    if study in _OTHER_PAGES:
-        raise ValueError(
-            f"study must not be {' or '.join(_OTHER_PAGES)}, got {study}. These folders hold other pages. Change study=NAME."
-        )
+    must, remedy = (
+        f"be letters, digits, _, -, + or ., at most {_LONGEST_NAME}",
+        "Change study=NAME.",
+    )
+    require(
+        re.fullmatch(r"[\w+.-]*\w[\w+.-]*", study) and len(study) <= _LONGEST_NAME,
+        "study",
+        must,
+        study[:150],
+        remedy,
+    )
+    require(
+        study not in _OTHER_PAGES,
+        "study",
+        f"not be {' or '.join(_OTHER_PAGES)}",
+        study,
+        f"These folders hold other pages. {remedy}",
+    )
     judgement = judge_programs(reference, programs, options, sources)
     page = write_judgement(judgement, values.get("reports_dir", "reports"), study, options)
     print(describe_material(judgement))
@@ -77,11 +88,14 @@ def _split(words: Sequence[str]) -> dict[str, str]:
     """Return the values by key; a key occurs once."""
     values: dict[str, str] = {}
     for word in words:
-        key, equals, value = word.partition("=")
-        if not equals or not value or key in values:
-            raise ValueError(
-                f"words must be key=value, each key once, got {word}. See pfbench judge --help."
-            )
+        key, _, value = word.partition("=")
+        require(
+            value and key not in values,
+            "words",
+            "be key=value, each key once",
+            word,
+            "See pfbench judge --help.",
+        )
         values[key] = value
     return values
 
@@ -102,9 +116,9 @@ def _sort_words(
         name, dot, option = key.partition(".")
         if key in option_keys:
             field = _RENAMED.get(key, key)
-            options[field] = _convert(key, value, types[field])
+            options[field] = convert_numbers(key, value, types[field])
         elif dot:
-            sources.setdefault(name, {})[option] = _convert_source(key, option, value)
+            sources.setdefault(name, {})[option] = convert_source(key, option, value)
         elif key not in ("study", "reports_dir"):
             programs[key] = value
     _check_programs(programs, sources, [*option_keys, "study", "reports_dir"])
@@ -127,24 +141,31 @@ def _check_programs(
         )
     for name, pattern in programs.items():
         is_path = "." in pattern or "/" in pattern or os.path.isfile(pattern)
-        if is_path and not _NAME.fullmatch(name):
-            raise ValueError(
-                f"names of programs must be letters, digits, _, + and -, with a letter first, got {name!r}. "
-                f"Rename the program: {re.sub(r'[^A-Za-z0-9_+-]+', '_', name).strip('_') or 'mine'}={pattern}"
-            )
-        if not is_path:
-            raise ValueError(
-                f"{name} must be a program with a file, got {name}={pattern}."
-                f"{suggest_similar(name, option_keys)} See pfbench judge --help."
-            )
+        require(
+            not is_path or _NAME.fullmatch(name),
+            "names of programs",
+            "be letters, digits, _, + and -, with a letter first",
+            f"{name!r}",
+            f"Rename the program: {re.sub('[^A-Za-z0-9_+-]+', '_', name).strip('_') or 'mine'}={pattern}",
+        )
+        require(
+            is_path,
+            name,
+            "be a program with a file",
+            f"{name}={pattern}.{suggest_similar(name, option_keys)}".removesuffix("."),
+            "See pfbench judge --help.",
+        )
     for name in sources:
-        if name not in programs:
-            raise ValueError(
-                f"{name} must be a program with a file, got options without one. Add {name}=FILE."
-            )
+        require(
+            name in programs,
+            name,
+            "be a program with a file",
+            "options without one",
+            f"Add {name}=FILE.",
+        )
 
 
-def _convert(key: str, value: str, default: Any) -> Any:
+def convert_numbers(key: str, value: str, default: Any) -> Any:
     """Convert the text of an option to the type of its default."""
     if isinstance(default, str):
         return value
@@ -152,29 +173,34 @@ def _convert(key: str, value: str, default: Any) -> Any:
         numbers = tuple(float(text) for text in value.strip("[]()").split(","))
     except ValueError:
         numbers = ()
-    if (
-        not numbers
-        or (isinstance(default, float) and len(numbers) > 1)
-        or any(n != n for n in numbers)
-    ):
-        raise ValueError(f"{key} must be a number, got {value}. Change {key}=...")
+    require(
+        numbers
+        and (len(numbers) == 1 or not isinstance(default, float))
+        and not any(n != n for n in numbers),
+        key,
+        "be a number",
+        value,
+        f"Change {key}=...",
+    )
     return numbers[0] if isinstance(default, float) else numbers
 
 
-def _convert_source(key: str, option: str, value: str) -> Any:
+def convert_source(key: str, option: str, value: str) -> Any:
     """Convert the text of an option of a program."""
     if option == "shift":
-        return _convert(key, value, 0.0)
+        return convert_numbers(key, value, 0.0)
     if option == "columns":
         return _split_pairs(key, value, "NAME:NAME_IN_FILE", "t:time,pn:north")
     if option == "scale":
         factors = _split_pairs(key, value, "NAME:FACTOR", "t:0.001")
-        return {name: _convert(key, text, 0.0) for name, text in factors.items()}
-    if option not in ("frame", "format", "sd"):
-        raise ValueError(
-            f"{key} must be an option of a program, got {option}. Choose from frame, format, shift, columns, "
-            "scale, sd."
-        )
+        return {name: convert_numbers(key, text, 0.0) for name, text in factors.items()}
+    require(
+        option in ("frame", "format", "sd", "time", "repeats"),
+        key,
+        "be an option of a program",
+        option,
+        "Choose from frame, format, shift, columns, scale, sd, time.",
+    )
     return value
 
 

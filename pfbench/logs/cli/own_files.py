@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from pfbench.core.parameter_checks import require
+from pfbench.logs.cli.judge import convert_source
+
 HELP = """\
 pfbench import FOLDER imu=FILE gnss=FILE [reference=FILE] [NAME.key=value ...]
 
@@ -34,15 +37,21 @@ _KEYS = ("format", "frame", "time", "repeats", "columns", "scale")
 def import_log(words: Sequence[str]) -> None:
     """Import a log, and inspect it."""
     folder, files, options, others = _split_words(words)
-    if folder.exists():
-        raise ValueError(
-            f"{folder} must be a new folder, got one that exists. Choose another name, or remove it."
-        )
+    require(
+        not folder.exists(),
+        folder,
+        "be a new folder",
+        "one that exists",
+        "Choose another name, or remove it.",
+    )
     from pfbench.logs.cli.inspect import inspect_folder
-    from pfbench.logs.judge.own_log import ImportOptions, import_table, write_log
+    from pfbench.logs.judge.judge_options import SourceOptions, name_program
+    from pfbench.logs.judge.own_log import import_table, write_log
 
-    readers = {role: ImportOptions(**options.get(role, {})) for role in files}
-    tables = {role: import_table(role, Path(files[role]), readers[role]) for role in files}
+    tables = {}
+    for role, file in files.items():
+        with name_program(role):
+            tables[role] = import_table(role, Path(file), SourceOptions(**options.get(role, {})))
     write_log(folder, tables)
     for role, table in tables.items():
         notes = "".join(f"; {note}" for note in table.notes)
@@ -64,16 +73,17 @@ def _split_words(
             folders.append(word)
         elif key in _TABLES:
             files[key] = value
-        elif role in _TABLES and name in _KEYS:
-            field = "layout" if name == "format" else name
-            options.setdefault(role, {})[field] = _split_columns(key, value) if name in ("columns", "scale") else value  # fmt: skip
         elif key in ("reports_dir", "fix_codes", "origin"):
             others.append(word)
         else:
-            raise ValueError(
-                f"words must be FOLDER, imu=, gnss=, reference= and NAME.key=value, got {word}. "
-                "See pfbench import --help."
+            require(
+                role in _TABLES and name in _KEYS,
+                "words",
+                "be FOLDER, imu=, gnss=, reference= and NAME.key=value",
+                word,
+                "See pfbench import --help.",
             )
+            options.setdefault(role, {})[name] = convert_source(key, name, value)
     missing = [role for role in _TABLES[:2] if role not in files]
     if len(folders) != 1 or missing:
         raise ValueError(
@@ -81,11 +91,3 @@ def _split_words(
             f"{', '.join(missing) or 'folder'}. Use: pfbench import my_log imu=a.csv gnss=b.csv reference=c.csv"
         )
     return Path(folders[0]), files, options, others
-
-
-def _split_columns(key: str, value: str) -> dict[str, str]:
-    """Return the names in the file by name of pfbench."""
-    pairs = [pair.partition(":") for pair in value.strip("{}").split(",")]
-    if not all(colon and name.strip() and text.strip() for name, colon, text in pairs):
-        raise ValueError(f"{key} must be NAME:NAME_IN_FILE,..., got {value}. Use t:time,fx:ax.")
-    return {name.strip(): text.strip() for name, _, text in pairs}

@@ -12,17 +12,15 @@ from pfbench.files.table_file import Array
 _BODY, _LEVEL = ("x", "y", "z"), ("n", "e", "d")
 
 
-def _list_orders() -> tuple[Array, ...]:
-    """List the signed permutations, those near the identity first."""
-    matrices = [
+# the signed permutations, those near the identity first
+BODY_ORDERS: tuple[Array, ...] = tuple(sorted(
+    (
         np.array([[sign[i] * (j == order[i]) for j in range(3)] for i in range(3)], float)
         for order in itertools.permutations(range(3))
         for sign in itertools.product((1, -1), repeat=3)
-    ]
-    return tuple(sorted(matrices, key=lambda m: (-np.trace(m), np.abs(m - np.eye(3)).sum())))
-
-
-BODY_ORDERS = _list_orders()
+    ),
+    key=lambda m: (-np.trace(m), np.abs(m - np.eye(3)).sum()),
+))  # fmt: skip
 LEVEL_ORDERS = tuple(m for m in BODY_ORDERS if abs(m[2, 2]) == 1.0)
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pfbench.files.table_file import Array
 from pfbench.logs.doctor.finding import TELL, WARN, Finding, Picture, thin_curve
-from pfbench.logs.doctor.raw_log import RawImu, RawLog
+from pfbench.logs.doctor.raw_log import RawLog
 from pfbench.logs.doctor.thresholds import SPIKE_DEVIATIONS, limit_of
 
 _COLUMNS = ("fx", "fy", "fz", "wx", "wy", "wz")
@@ -78,9 +78,8 @@ def _find_spikes(values: Array) -> tuple[NDArray[np.intp], float]:
     return np.flatnonzero(is_spike) + 1, float(ratio.max())
 
 
-def find_stuck(imu: RawImu) -> tuple[int, int]:
-    """Return the first and the last row of the longest stretch of equal samples."""
-    samples = np.hstack([imu.force, imu.rate])
+def find_stuck(samples: Array) -> tuple[int, int]:
+    """Return the first and the last row of the longest stretch of equal samples. Shapes: samples [n, k]."""
     is_equal = (np.diff(samples, axis=0) == 0.0).all(1)
     edges = np.flatnonzero(np.diff(np.r_[False, is_equal, False].astype(int)))
     starts, ends = edges[::2], edges[1::2]
@@ -113,10 +112,11 @@ def check_samples(log: RawLog, facts: dict[str, Any]) -> tuple[RawLog, list[Find
 
 def _check_stuck(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
     """Check for samples that do not change."""
-    imu = log.imu
-    first, last = find_stuck(imu)
+    imu, samples = log.imu, np.hstack([log.imu.force, log.imu.rate])
+    first, last = find_stuck(samples)
     duration = float(imu.time[last] - imu.time[first])
     facts["stuck"] = duration
+    yield from _check_dead(log, samples, duration)
     if duration > limit_of("stuck samples"):
         around = slice(max(0, 2 * first - last), 2 * last - first)
         yield Finding(
@@ -128,6 +128,24 @@ def _check_stuck(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
             {"corrections": {"drop": ["stuck"], "gaps": "longest"}},
             picture=Picture("t [s]", "fx [m/s^2]", (thin_curve("fx", imu.time[around], imu.force[around, 0]),),
                             (float(imu.time[first]), float(imu.time[last]))),
+        )  # fmt: skip
+
+
+def _check_dead(log: RawLog, samples: Array, stuck: float) -> Iterator[Finding]:
+    """Check for a column that does not change while the others do."""
+    time, rows = log.imu.time, [find_stuck(column[:, None]) for column in samples.T]
+    durations = [float(time[last] - time[first]) for first, last in rows]
+    k = int(np.argmax(durations))
+    # three constant columns are a motion without errors of sensors
+    if durations[k] > max(limit_of("dead axis"), 2.0 * stuck, sorted(durations)[3]):
+        start = float(time[rows[k][0]])
+        yield Finding(
+            "dead axis", WARN, durations[k], limit_of("dead axis"), "s",
+            f"{log.names[0]}: column {_COLUMNS[k]} is {samples[rows[k][0], k]:g} for {durations[k]:.1f} s from t = {start:.3f} on, "
+            "while other columns change",
+            "Record again, or leave this part out: no correction gives back an axis",
+            explanations=("a broken axis", "a column of another message", "a saturated axis"),
+            picture=Picture("t [s]", _COLUMNS[k], (thin_curve(_COLUMNS[k], time, samples[:, k]),), (start,)),
         )  # fmt: skip
 
 

@@ -9,13 +9,7 @@ import numpy as np
 
 from pfbench.files.table_file import Array
 from pfbench.logs.doctor.finding import REFUSE, TELL, WARN, Finding, Picture, thin_curve
-from pfbench.logs.doctor.raw_log import (
-    RawFixes,
-    RawImu,
-    RawLog,
-    RawReference,
-    take_rows,
-)
+from pfbench.logs.doctor.raw_log import RawLog, take_rows
 from pfbench.logs.doctor.thresholds import limit_of
 from pfbench.logs.worlds.imu_gaps import LONGEST_BRIDGE
 
@@ -57,13 +51,13 @@ def check_clocks(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
 
 def sort_tables(log: RawLog) -> RawLog:
     """Sort each table by time, and keep the first row of each time."""
-    order = [
+    imu, fixes, reference = (
         np.unique(table.time, return_index=True)[1] for table in (log.imu, log.fixes, log.reference)
-    ]
+    )
     return log._replace(
-        imu=RawImu(*take_rows(log.imu, order[0])),
-        fixes=RawFixes(*take_rows(log.fixes, order[1])),
-        reference=RawReference(*take_rows(log.reference, order[2])),
+        imu=take_rows(log.imu, imu),
+        fixes=take_rows(log.fixes, fixes),
+        reference=take_rows(log.reference, reference),
     )
 
 

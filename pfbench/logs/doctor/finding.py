@@ -88,9 +88,7 @@ class LogDiagnosis:
 
 def describe_change(offset: float) -> str:
     """Return what removes the delay of a clock, s."""
-    if offset < 0.0:
-        return f"Add {-offset:.3f} to t"
-    return f"Subtract {offset:.3f} from t"
+    return f"Add {-offset:.3f} to t" if offset < 0.0 else f"Subtract {offset:.3f} from t"
 
 
 def thin_curve(label: str, x: NDArray[Any], y: NDArray[Any]) -> tuple[str, Array, Array]:
@@ -105,17 +103,11 @@ def thin_curve(label: str, x: NDArray[Any], y: NDArray[Any]) -> tuple[str, Array
     values = np.where(np.isfinite(y), y, 0.0)
     least, largest = np.minimum.reduceat(values, edges), np.maximum.reduceat(values, edges)
     block = np.repeat(np.arange(len(edges)), np.diff(np.append(edges, len(y))))
+    extremes = [rows[values == bound[block]] for bound in (least, largest)]
     keep = np.unique(
-        np.concatenate(
-            [_first_of_blocks(rows[values == bound[block]], block) for bound in (least, largest)]
-        )
+        np.concatenate([at[np.unique(block[at], return_index=True)[1]] for at in extremes])
     )
     return label, np.asarray(x, float)[keep], values[keep]
-
-
-def _first_of_blocks(rows: NDArray[np.intp], block: NDArray[np.intp]) -> NDArray[np.intp]:
-    _, first = np.unique(block[rows], return_index=True)
-    return rows[first]
 
 
 def merge_settings(parts: Iterable[Mapping[str, Any]]) -> dict[str, Any]:

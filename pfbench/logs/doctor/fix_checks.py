@@ -19,7 +19,7 @@ from pfbench.logs.doctor.finding import (
     describe_change,
     thin_curve,
 )
-from pfbench.logs.doctor.raw_log import RawLog, dcm_of, interpolate_columns
+from pfbench.logs.doctor.raw_log import RawLog, correlate_neighbours, dcm_of, interpolate_columns
 from pfbench.logs.doctor.thresholds import (
     LEAST_OUTLIER,
     REFUSED_OFFSET,
@@ -65,7 +65,6 @@ class JointFit(NamedTuple):
         offset_error: Its standard error, s.
         shift: Constant shift, m, [3].
         deviation: Standard deviation of the fixes, m, [3].
-        rest: What the fit leaves, m, [n, 3].
     """
 
     lever: Array
@@ -74,7 +73,6 @@ class JointFit(NamedTuple):
     offset_error: float
     shift: Array
     deviation: Array
-    rest: Array
 
 
 def check_fixes(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
@@ -436,7 +434,8 @@ def _check_joint(log: RawLog, errors: FixErrors, outliers: _Mask, facts: dict[st
     )
     if used.sum() < 20:
         return
-    fit = _fit_jointly(log, error[used], at[used])
+    effects = _make_design(log, at)
+    fit = _fit_jointly(error[used], effects[used])
     offset, error_of_offset = errors.offset + fit.offset, fit.offset_error
     middle = np.median(error[used], 0)
     facts.update(
@@ -455,17 +454,24 @@ def _check_joint(log: RawLog, errors: FixErrors, outliers: _Mask, facts: dict[st
         yield _describe_lever(log, fit, error, at)
     if np.abs(middle).max() > limit_of("fix shift"):
         yield _describe_shift(log, error, middle)
-    yield from _check_slow(log, at[used], fit.rest, facts)
+    lasting = errors.inside & ~outliers  # the fit leaves out fixes that are far off for a while
+    rest = error - effects @ np.r_[fit.lever, fit.offset, fit.shift]
+    yield from _check_slow(log, at[lasting], rest[lasting], facts)
 
 
-def _fit_jointly(log: RawLog, error: Array, at: Array) -> JointFit:
-    """Fit lever arm, offset and shift to differences [m, 3] at times [m]."""
+def _make_design(log: RawLog, at: Array) -> Array:
+    """Make the effects of lever arm, offset and shift on the fixes at times [m], [m, 3, 7]."""
     reference = log.reference
     dcm = dcm_of(reference.angles).reshape(-1, 9)
     a = np.zeros((len(at), 3, 7))
     a[:, :, :3] = interpolate_columns(at, reference.time, dcm).reshape(-1, 3, 3)
     a[:, :, 3] = -interpolate_columns(at, reference.time, reference.velocity)
     a[:, :, 4:] = np.eye(3)
+    return a
+
+
+def _fit_jointly(error: Array, a: Array) -> JointFit:
+    """Fit lever arm, offset and shift by their effects [m, 3, 7] to differences [m, 3]."""
     deviation = 1.4826 * np.median(np.abs(error - np.median(error, 0)), 0) + 0.01
     regular = np.diag([1e-4] * 4 + [1e-6] * 3)
     for _ in range(4):
@@ -476,9 +482,7 @@ def _fit_jointly(log: RawLog, error: Array, at: Array) -> JointFit:
         ).astype(float)
         rest = error - a @ solution
         deviation = rest.std(0) + 0.005
-    moving = rest - rest.mean(0)
-    pairs = (moving[1:] * moving[:-1]).sum(0) / np.maximum(np.square(moving).sum(0), 1e-300)
-    memory = float(np.clip(pairs, 0.0, 0.98).mean())  # errors of receivers last longer than a fix
+    memory = correlate_neighbours(rest)  # errors of receivers last longer than a fix
     variance = np.diag(np.linalg.inv(information)) * (1.0 + memory) / (1.0 - memory)
     sd = np.sqrt(variance)
     return JointFit(
@@ -488,7 +492,6 @@ def _fit_jointly(log: RawLog, error: Array, at: Array) -> JointFit:
         float(sd[3]),
         solution[4:],
         np.asarray(deviation),
-        rest,
     )
 
 

@@ -13,9 +13,8 @@ from pfbench.logs.doctor.finding import REFUSE, Finding, Picture, thin_curve
 from pfbench.logs.doctor.force_windows import ForceWindows, fit_force
 from pfbench.logs.doctor.raw_log import RawLog
 from pfbench.logs.doctor.thresholds import LEAST_ACCELERATION, limit_of
-from pfbench.logs.units import find_units
+from pfbench.logs.units import STANDARD_GRAVITY, find_units
 
-_GRAVITY = 9.80665
 _UNIT_ERROR = 0.25  # relative
 _LEFT = 0.25  # part of the squared force that a true unit may leave
 _MISSING = (
@@ -69,7 +68,7 @@ def _select_unit(
     windows: ForceWindows, units: Iterable[float], gravity: float
 ) -> tuple[float, float]:
     """Return factor and gravity with which the force explains the motion best; a factor of 0 if none does."""
-    pairs = (*((factor, gravity) for factor in units), (1.0, 0.0), (_GRAVITY, 0.0))
+    pairs = (*((factor, gravity) for factor in units), (1.0, 0.0), (STANDARD_GRAVITY, 0.0))
     costs = {pair: min(_find_cost(windows, *pair, axes) for axes in BODY_ORDERS) for pair in pairs}
     best = min(costs, key=lambda pair: costs[pair])
     needed = float(np.square(windows.change - [0.0, 0.0, best[1]]).sum(1).mean())

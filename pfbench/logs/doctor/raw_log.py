@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from pfbench.files.table_file import Array
 
 Rows = NDArray[np.intp]
+Table = TypeVar("Table", "RawImu", "RawFixes", "RawReference")
 
 
 class RawImu(NamedTuple):
@@ -72,18 +73,17 @@ class RawLog(NamedTuple):
         return self.describe_row[table](int(parts[table].rows[i]))
 
 
-def take_rows(columns: Iterable[Any], rows: Any) -> Iterator[Any]:
-    """Yield the columns of a table at some rows, in the given order.
+def take_rows(table: Table, rows: Any) -> Table:
+    """Return a table with some of its rows, in the given order.
 
     Args:
-        columns: Arrays with an entry per row.
+        table: IMU samples, fixes or reference.
         rows: Indices or a mask.
 
-    Yields:
-        Arrays.
+    Returns:
+        The rows.
     """
-    for column in columns:
-        yield column[rows]
+    return type(table)(*(column[rows] for column in table))
 
 
 _NO_ROWS = np.empty((0, 3))
@@ -93,6 +93,14 @@ NO_REFERENCE = RawReference(np.empty(0), _NO_ROWS, _NO_ROWS, _NO_ROWS, np.empty(
 def dcm_of(angles: Array) -> Array:
     """Return rotations from the body to the level frame, [k, 3, 3], of roll, pitch, yaw, rad, [k, 3]."""
     return Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix()
+
+
+def correlate_neighbours(residual: Array) -> float:
+    """Return the mean correlation of neighbouring residuals, 0 to 0.98. Shapes: residual [n, k]."""
+    deviation = residual - residual.mean(0)
+    square = np.square(deviation).sum(0)
+    pairs = (deviation[1:] * deviation[:-1]).sum(0) / np.maximum(square, 1e-300)
+    return float(np.clip(pairs, 0.0, 0.98).mean())
 
 
 def interpolate_columns(at: Array, time: Array, values: Array) -> Array:

@@ -40,9 +40,7 @@ def drop_wrong_rows(reference: RawReference) -> RawReference:
         jump = np.minimum(size[1:], size[:-1])
         rest = np.linalg.norm(change[1:] + change[:-1], axis=1)
         wrong[1:-1] |= (jump > least) & (rest < _RETURN * jump)
-    return RawReference(
-        *take_rows(reference, ~wrong if wrong.mean() < _MOST_WRONG else slice(None))
-    )
+    return take_rows(reference, ~wrong if wrong.mean() < _MOST_WRONG else slice(None))
 
 
 def check_reference(

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.signal import detrend
 from scipy.spatial.transform import Rotation
 
 from pfbench.files.table_file import Array
@@ -26,7 +27,14 @@ from pfbench.logs.doctor.force_windows import (
     fit_force,
     integrate_force,
 )
-from pfbench.logs.doctor.raw_log import RawLog, dcm_of, interpolate_columns
+from pfbench.logs.doctor.raw_log import (
+    RawLog,
+    RawReference,
+    correlate_neighbours,
+    dcm_of,
+    interpolate_columns,
+    take_rows,
+)
 from pfbench.logs.doctor.thresholds import (
     CLEAR_AXES,
     LEAST_ACCELERATION,
@@ -46,6 +54,10 @@ _DOWN = np.array([0.0, 0.0, 1.0])
 _FEWEST = 20  # windows for scales
 _LEAST_RATE, _SCALE_ERROR = 0.05, 0.02  # rad/s and 1: motion and accuracy that show a scale
 _SCALE_ERRORS = 6.0
+_DELAYS, _DELAY_S = (
+    np.linspace(-0.2, 0.2, 5),
+    600.0,
+)  # s of the force, and of the log that is compared
 
 
 class Cause(NamedTuple):
@@ -119,6 +131,7 @@ def check_force_and_rate(aligned: Alignment, facts: dict[str, Any]) -> tuple[Raw
         finding, log = _describe_axes(state, is_rate, max(ratio, aligned.rate_ratio))
         return log, [finding]
     return aligned.log, [
+        *_check_force_delay(aligned, facts),
         *_check_force_errors(state, facts),
         *_check_rate_errors(aligned, facts),
     ]
@@ -149,8 +162,10 @@ def _find_rotation(aligned: Alignment, windows: ForceWindows, facts: dict[str, A
     trace = max(float(np.trace(matrix @ m.T)) for m in orders)
     angle = float(np.rad2deg(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0))))
     facts["turn of the sensor [deg]"] = round(angle, 2)
+    # orders with other signs explain a mirrored gyro or heading better than a turn does
+    least = min(float(np.square(measured @ m.T - true).sum()) for m in BODY_ORDERS)
     gains = (
-        min(rates) / max(float(np.square(measured @ matrix.T - true).sum()), 1e-300),
+        least / max(float(np.square(measured @ matrix.T - true).sum()), 1e-300),
         min(forces) / max(fit_force(windows, matrix).cost, 1e-12),
     )
     if angle < limit_of("mounting") or max(gains) < limit_of("axes") or min(gains) < 1.0 / _EQUAL:
@@ -193,7 +208,7 @@ def _try_axes(aligned: Alignment, windows: ForceWindows) -> ForceState:
     for name in CONVENTIONS:
         dcm = dcm_of(convert_angles(name, aligned.log.reference.angles))
         turns = turns_between(dcm, aligned.nodes)[aligned.used]
-        rest = float(((measured - turns + turns.mean(0)) ** 2).sum()) / least
+        rest = float(((measured - detrend(turns, axis=0)) ** 2).sum()) / least
         fitted = integrate_force(aligned.log, dcm, aligned.offset)
         if fitted is not None:
             conventions.append((rest, fit_force(fitted).cost, name))
@@ -351,12 +366,25 @@ def _force_picture(windows: ForceWindows) -> Picture:
 # Biases and scales.
 
 
-def _memory(residual: Array) -> float:
-    """Return the mean correlation of neighbouring residuals, 0 to 0.98. Shapes: residual [n, k]."""
-    deviation = residual - residual.mean(0)
-    square = np.square(deviation).sum(0)
-    pairs = (deviation[1:] * deviation[:-1]).sum(0) / np.maximum(square, 1e-300)
-    return float(np.clip(pairs, 0.0, 0.98).mean())
+def _check_force_delay(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Finding]:
+    """Check that force and rate of the IMU have one clock, in the first minutes of a long log."""
+    log, time = aligned.log, aligned.log.reference.time
+    first = time <= time[0] + _DELAY_S
+    start = log._replace(reference=RawReference(*take_rows(log.reference, first)))
+    delayed = {float(delay): integrate_force(start, aligned.dcm[first], aligned.offset + delay) for delay in _DELAYS}  # fmt: skip
+    costs = {delay: fit_force(windows).cost for delay, windows in delayed.items() if windows}
+    best = min(costs, key=lambda delay: costs[delay], default=0.0)
+    ratio = costs.get(0.0, 0.0) / max(costs.get(best, 0.0), 1e-12)
+    facts["residual of the force over that of a delayed one"] = ratio
+    if ratio > limit_of("force clock"):
+        late, name = "late" if best > 0.0 else "early", log.names[0]
+        yield Finding(
+            "force clock", WARN, ratio, limit_of("force clock"), "times the least residual",
+            f"{name}: fx, fy, fz are about {abs(best):.2f} s {late} against wx, wy, wz, whose turns agree with {log.names[2]}",
+            "Join force and rate of one time in a row: no key moves the force alone",
+            explanations=("a filter of the force", "columns of two messages", f"velocities of {log.names[2]} that are delayed"),
+            picture=_force_picture(cast("ForceWindows", delayed[0.0])),
+        )  # fmt: skip
 
 
 def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Finding]:
@@ -365,7 +393,7 @@ def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Fi
     measured = np.linalg.norm(np.einsum("nijj->ni", windows.products), axis=1)
     needed = np.linalg.norm(windows.change - windows.gravity * _DOWN, axis=1)
     scale = float(np.median(measured / np.maximum(needed, 1e-9)))
-    bias, memory = -fit.bias, _memory(fit.residual)
+    bias, memory = -fit.bias, correlate_neighbours(fit.residual)
     a = windows.rotation[fit.keep].reshape(-1, 3)
     variance = np.diag(np.linalg.inv(a.T @ a + 1e-9 * np.eye(3))) * fit.residual.var()
     error = np.sqrt(variance * (1.0 + memory) / (1.0 - memory))
@@ -419,6 +447,7 @@ def _check_rate_errors(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Fi
             "Set scenario.corrections.bias, or the nominal bias scenario.tuning.gyro_bias_deg_s",
             {"corrections": {"bias": {"imu": _by_column("w", np.deg2rad(bias))}}}, picture=picture,
         )  # fmt: skip
+    yield from _check_bias_drift(name, rates, time, facts)
     scales = list(_find_rate_scales(measured, true, window))
     facts["gyro scale"] = {f"w{axis}": round(scale, 4) for axis, scale, _ in scales}
     wrong = [
@@ -437,6 +466,24 @@ def _check_rate_errors(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Fi
             ("scale factors of the gyroscope", "a reference that smooths its turns"),
             Picture(f"turn of the reference about {axis_name} [rad]", "turn of the imu [rad]",
                     (thin_curve("windows", true[:, "xyz".index(axis_name)], measured[:, "xyz".index(axis_name)]),)),
+        )  # fmt: skip
+
+
+def _check_bias_drift(
+    name: str, rates: Array, time: Array, facts: dict[str, Any]
+) -> Iterator[Finding]:
+    """Check that the bias of the rate in the last third of the log is that in the first."""
+    change = np.subtract(*(np.median(third, 0) for third in np.array_split(rates, 3)[::-2]))
+    axis = int(np.argmax(np.abs(change)))
+    facts["change of the gyro bias [deg/s]"] = change.round(3).tolist()
+    if abs(change[axis]) > limit_of("gyro bias drift"):
+        yield Finding(
+            "gyro bias drift", WARN, float(change[axis]), limit_of("gyro bias drift"), "deg/s",
+            f"{name}: the bias of w{'xyz'[axis]} changes by {change[axis]:+.1f} deg/s from the first third of the log to the last",
+            "Let the sensor warm up, or record in shorter parts: a correction of the bias is one number for the whole log",
+            explanations=("a sensor that warms up", "a reference whose attitude drifts"),
+            picture=Picture("t [s]", f"rate of imu minus reference about {'xyz'[axis]} [deg/s]",
+                            (thin_curve("difference", time, rates[:, axis]),)),
         )  # fmt: skip
 
 
@@ -462,7 +509,7 @@ def _find_rate_scales(measured: Array, true: Array, window: float) -> Iterator[t
     inverse = np.linalg.pinv(a.T @ a)
     motion = np.sqrt(np.square(true - true.mean(0)).mean(0)) / window
     for j, axis in enumerate("xyz"):
-        memory = min(_memory(rest[:, j : j + 1]), 0.95)
+        memory = min(correlate_neighbours(rest[:, j : j + 1]), 0.95)
         error = np.sqrt(inverse[j, j] * rest[:, j].var() * (1.0 + memory) / (1.0 - memory))
         if motion[j] > _LEAST_RATE and error < _SCALE_ERROR:
             yield axis, float(fit[j, j]), float(error)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import detrend
 from scipy.spatial.transform import Rotation
 
 from pfbench.files.table_file import Array
@@ -57,7 +58,7 @@ class TurnSearch:
         return cls(imu.time, integrate(imu.time, imu.rate), nodes, usable)
 
     def pairs(self, turns: Array, offset: float, stretch: _Mask | None = None) -> tuple[Array, Array, _Mask] | None:  # fmt: skip
-        """Return turns of the reference and of the IMU without their means, and their windows; None if few.
+        """Return turns of the reference and of the IMU without their lines over time, and their windows; None if few.
 
         Args:
             turns: Rotation vectors of the reference, rad, [m, 3].
@@ -73,8 +74,8 @@ class TurnSearch:
         if used.sum() < max(FEWEST_TURNS, _LEAST_SHARE * required.sum()):
             return None
         measured = np.diff(interpolate_columns(at, self.time, self.angle), axis=0)[used]
-        true = turns[used]
-        return true - true.mean(0), measured - measured.mean(0), used
+        # a bias, and one that moves evenly, are no turns
+        return detrend(turns[used], axis=0), detrend(measured, axis=0), used
 
     def score(self, turns: Array, offset: float, stretch: _Mask | None = None) -> float:
         """Return the common part of the turns after the best rotation or reflection of the axes, 0 to 1.

@@ -22,6 +22,7 @@ from pfbench.logs.judge.trajectory_table import (
     TrajectoryTable,
 )
 from pfbench.logs.judge.unit_checks import find_angle_factor, settle
+from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, QUANTITIES
 from pfbench.logs.units import UNIT_FACTORS
 from pfbench.stats.error_measures import Array
 
@@ -47,10 +48,7 @@ _AGREES, _HALF, _WORSE = (
 )  # shares of explained variance; ratio of the variances that two columns leave
 _USUAL = 0.97  # share of the increments of an angle that are compared
 _AXES = ((*LOCAL, *VELOCITY_COLUMNS), ("roll", "pitch"), ("yaw",))
-_DIMENSIONS = {
-    **dict.fromkeys((*LOCAL, "h_m"), ("m", "length")), **dict.fromkeys(GEODETIC[:2], ("deg", "place")),
-    **dict.fromkeys(VELOCITY_COLUMNS, ("m/s", "velocity")), **dict.fromkeys(ATTITUDE_COLUMNS, ("rad", "angle")),
-}  # fmt: skip
+_COMPARED = (*LOCAL, GEODETIC[2], *GEODETIC[:2], *VELOCITY_COLUMNS, *ATTITUDE_COLUMNS)
 
 
 def check_run(
@@ -205,7 +203,7 @@ def _pair_columns(table: TrajectoryTable, reference: ReferenceTrack, fewest: int
     columns = {**recorded, **level}
     return [
         _Pair(name, table.values[name][rows], np.interp(table.time[rows], clock, columns[name]))
-        for name in _DIMENSIONS
+        for name in _COMPARED
         if name in table.values and name in columns
     ]
 
@@ -247,11 +245,9 @@ def _check_units(table: TrajectoryTable, reference: ReferenceTrack) -> Iterator[
             note = f"yaw agrees with {reference.file} if it is in degrees: NAME.scale=yaw:0.0174533"
             yield Finding("unit of attitude", TELL, 1.0, 1.0, "1", note)
             return
-        unit, dimension = _DIMENSIONS[pair.name]
-        units = {
-            **UNIT_FACTORS[dimension],
-            **(UNIT_FACTORS["rare angle"] if dimension == "angle" else {}),
-        }
+        quantity = QUANTITIES[LIMIT_COLUMNS[pair.name]]
+        unit, dimension = quantity.unit, quantity.dimension
+        units = quantity.units | (UNIT_FACTORS["rare angle"] if dimension == "angle" else {})
         ratio = _find_ratio(pair, dimension)
         names = [u for u, f in units.items() if abs(ratio * f - 1) < _CLOSE]
         others = [u for u, f in units.items() if abs(ratio / f - 1) < _CLOSE]

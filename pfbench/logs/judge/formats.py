@@ -1,10 +1,11 @@
-"""Files of trajectories: patterns with sequence and run, and the reader of each format."""
+"""Files of trajectories and of own logs: patterns with sequence and run, and the readers of each format."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,13 +13,21 @@ import numpy as np
 
 from pfbench.core.parameter_checks import require
 from pfbench.logs.judge.judge_options import SourceOptions
+from pfbench.logs.judge.named_tables import read_named_table
 from pfbench.logs.judge.nmea import read_nmea_trajectory
 from pfbench.logs.judge.text_formats import (
+    KF_GINS_FIXES,
+    KF_GINS_IMU,
     KF_GINS_SD,
     find_pose_columns,
-    read_csv_trajectory,
+    read_euroc_imu,
+    read_euroc_reference,
     read_head,
+    read_kf_gins_fixes,
+    read_kf_gins_imu,
     read_kf_gins_trajectory,
+    read_kitti,
+    read_rtklib,
     read_tum_trajectory,
     to_numbers,
 )
@@ -26,6 +35,8 @@ from pfbench.logs.judge.trajectory_table import (
     GEODETIC,
     LOCAL,
     POSITION_SD,
+    ROLES,
+    TRAJECTORY,
     TrajectoryTable,
     check_trajectory,
 )
@@ -48,11 +59,13 @@ def read_result_trajectories(file: Path, options: SourceOptions) -> list[Traject
             "Run the job again."
         ) from None
     names = list(result.meta["state"]["names"])
-    if "track" not in result.data or not set(_AXES) <= set(names):
-        raise ValueError(
-            f"{file.name} must have the track of the truth and the states {', '.join(_AXES)}, got "
-            f"{', '.join(names[:9])}. Use a result of a recorded or simulated flight."
-        )
+    require(
+        "track" in result.data and set(_AXES) <= set(names),
+        file.name,
+        f"have the track of the truth and the states {', '.join(_AXES)}",
+        ", ".join(names[:9]),
+        "Use a result of a recorded or simulated flight.",
+    )
     places = [names.index(name) for name in _AXES]
     return [_run_table(file, result, places, run) for run in range(len(result.data["lost"]))]
 
@@ -78,16 +91,28 @@ def _run_table(file: Path, result: JobResult, places: list[int], run: int) -> Tr
 
 
 # --------------------------------------------------------------------------------------------------
-# Files of trajectories: patterns with sequence and run, and the reader of each format.
+# Files of trajectories: patterns with sequence and run, and the readers of each format by what is read.
 
 ONE = "recording"  # name of the sequence of a pattern without {sequence}
 _FIELDS = {"sequence": r"(?P<sequence>[^/]+?)", "run": r"(?P<run>[^/]+?)"}
-_READERS: dict[str, Callable[[Path, SourceOptions], list[TrajectoryTable]]] = {
-    "table": read_csv_trajectory,
-    "tum": read_tum_trajectory,
-    "nmea": read_nmea_trajectory,
-    "result": read_result_trajectories,
-}
+_READERS: dict[str, dict[str, Callable[[Path, SourceOptions], list[TrajectoryTable]]]] = {
+    TRAJECTORY: {
+        "table": partial(read_named_table, ROLES[TRAJECTORY]), "tum": read_tum_trajectory, "kf_gins": read_kf_gins_trajectory,
+        "nmea": read_nmea_trajectory, "rtklib": read_rtklib, "result": read_result_trajectories,
+    },
+    "imu": {
+        "table": partial(read_named_table, ROLES["imu"]), "kf_gins": read_kf_gins_imu, "euroc": read_euroc_imu,
+        "kitti": read_kitti,
+    },
+    "gnss": {
+        "table": partial(read_named_table, ROLES["gnss"]), "tum": read_tum_trajectory, "kf_gins": read_kf_gins_fixes,
+        "nmea": read_nmea_trajectory, "rtklib": read_rtklib, "kitti": read_kitti,
+    },
+    "reference": {
+        "table": partial(read_named_table, ROLES["reference"]), "tum": read_tum_trajectory,
+        "kf_gins": read_kf_gins_trajectory, "euroc": read_euroc_reference, "kitti": read_kitti,
+    },
+}  # fmt: skip
 
 
 class TrajectoryFile(NamedTuple):
@@ -129,55 +154,64 @@ def list_trajectory_files(pattern: str) -> list[TrajectoryFile]:
             files.append(
                 TrajectoryFile(candidate, values.get("sequence", ONE), values.get("run", ""))
             )
-    if not files:
-        raise ValueError(
-            f"{pattern} must match a file, got none. Write {{sequence}} and {{run}} for the parts "
-            "that differ."
-        )
+    require(
+        files,
+        pattern,
+        "match a file",
+        "none",
+        "Write {sequence} and {run} for the parts that differ.",
+    )
     return sorted(files, key=lambda file: (file.sequence, file.run))
 
 
-def read_trajectories(
-    path: Path, options: SourceOptions, sd: Path | None = None
-) -> list[TrajectoryTable]:
-    """Read and check a file; columns are multiplied by their factors, then the clock is shifted."""
-    kind = options.format or find_format(path, bool(options.columns))
-    if sd is not None and kind != "kf_gins":
-        raise ValueError(
-            f"sd must belong to a text file of KF-GINS, got {sd.name} for {path.name}. Remove the option, "
-            "and add columns sd_pn, sd_pe and sd_pd to the file."
+def read_trajectories(path: Path, options: SourceOptions) -> list[TrajectoryTable]:
+    """Read and check the trajectories of a file; the clock is shifted last."""
+    tables = (check_trajectory(table) for table in read_file(path, options))
+    return [replace(table, time=table.time + options.shift) for table in tables]
+
+
+def read_file(path: Path, options: SourceOptions, role: str = TRAJECTORY) -> list[TrajectoryTable]:
+    """Read a file as trajectories or as a table of an own log; columns are multiplied by their factors."""
+    kind = options.format or find_format(path, options, role)
+    readers = _READERS[role]
+    require(
+        kind in readers,
+        role,
+        "be of a format with such data",
+        f"{kind} for {path.name}",
+        f"Formats of {role}: {', '.join(sorted(readers))}.",
+    )
+    for name, belongs, owner, remedy in (
+        ("sd", kind == "kf_gins", "text file of KF-GINS", "Remove the option, and add columns sd_pn, sd_pe and sd_pd to the file."),
+        ("frame", kind == "tum", "TUM file", _FIXED_AXES), ("columns", kind == "table", "table with named columns", _FIXED_AXES),
+    ):  # fmt: skip
+        require(
+            belongs or not getattr(options, name),
+            name,
+            f"belong to a {owner}",
+            f"{Path(options.sd).name} for {path.name}" if name == "sd" else path.name,
+            remedy,
         )
-    for name, is_read in (("frame", kind == "tum"), ("columns", kind == "table")):
-        if getattr(options, name) and not is_read:
-            formats = "TUM file" if name == "frame" else "table with named columns"
-            raise ValueError(
-                f"{name} must belong to a {formats}, got {path.name}. Remove the option: the axes of "
-                "all other formats are North, East, Down or latitude, longitude, height."
-            )
-    if kind == "kf_gins":
-        tables: Sequence[TrajectoryTable] = read_kf_gins_trajectory(path, options, sd)
-    else:
-        tables = _READERS[kind](path, options)
-    return [
-        replace(table, time=table.time + options.shift)
-        for table in (check_trajectory(_scale_columns(t, options.scale)) for t in tables)
-    ]
+    return [_scale_columns(table, options.factors) for table in readers[kind](path, options)]
 
 
 def _scale_columns(table: TrajectoryTable, factors: Mapping[str, float]) -> TrajectoryTable:
     """Multiply columns by the factors of the option scale."""
-    for name in factors:
-        if name != "t" and name not in table.values:
-            raise ValueError(
-                f"NAME.scale must be factors of columns of {table.file}, got {name}. Choose from t, "
-                f"{', '.join(table.values)}."
-            )
+    absent = [name for name in factors if name != "t" and name not in table.values]
+    require(
+        not absent,
+        "NAME.scale",
+        f"be factors of columns of {table.file}",
+        ", ".join(absent),
+        f"Choose from t, {', '.join(table.values)}.",
+    )
     return table.scale_columns(factors)
 
 
 # --------------------------------------------------------------------------------------------------
-# Format of a trajectory file: its content decides, and its suffix only where the content does not.
+# Format of a file: its content decides, and its suffix only where the content does not.
 
+_FIXED_AXES = "Remove the option: the axes of all other formats are North, East, Down or latitude, longitude, height."
 _PARQUET = b"PAR1"
 _SIGNATURES = {_PARQUET: "table", b"PK\x03\x04": "result"}
 _SUFFIXES = {
@@ -193,25 +227,42 @@ _RTKLIB = re.compile(
     rb"^\d{4}/\d\d/\d\d +\d\d:|^% *(program *: *(RTK|rnx2rtkp)|(GPST|UTC|JST) .*(latitude|ecef|baseline))",
     re.MULTILINE,
 )
+_EUROC = re.compile(rb"^(\xef\xbb\xbf)?#? ?timestamp ?\[ns\]", re.IGNORECASE)
 _HEAD = 1 << 16  # bytes
 
 
-def find_format(file: Path, has_names: bool) -> str:
+def find_format(file: Path, options: SourceOptions, role: str = TRAJECTORY) -> str:
     """Find the format of a file."""
+    if file.is_dir():
+        return "kitti"
     with file.open("rb") as content:
         head = content.read(_HEAD)
-    if head[:4] == _PARQUET and file.suffix != ".parquet":
-        raise ValueError(
-            f"{file.name} must have the suffix .parquet, got a Parquet file. Rename it to "
-            f"{file.with_suffix('.parquet').name}."
-        )
+    require(
+        head[:4] != _PARQUET or file.suffix == ".parquet",
+        file.name,
+        "have the suffix .parquet",
+        "a Parquet file",
+        f"Rename it to {file.with_suffix('.parquet').name}.",
+    )
     if head[:4] in _SIGNATURES:
         return _SIGNATURES[head[:4]]
+    if role != TRAJECTORY and options.columns:
+        return "table"
+    if role != TRAJECTORY and _EUROC.search(head):
+        return "euroc"
     if _SENTENCE.search(head):
         return "nmea"
     if _RTKLIB.search(head):
-        raise _rtklib_error(file, head)
-    return _find_text_format(file, has_names)
+        return "rtklib"
+    names, rows = read_head(file)
+    widths = {"imu": (KF_GINS_IMU,), "gnss": KF_GINS_FIXES}.get(role, ())
+    if not names and to_numbers(rows).shape[1] in widths:
+        return "kf_gins"
+    return (
+        "table"
+        if role == "imu"
+        else _find_text_format(file, bool(options.columns or role != TRAJECTORY))
+    )
 
 
 def _find_text_format(file: Path, has_names: bool) -> str:
@@ -219,28 +270,32 @@ def _find_text_format(file: Path, has_names: bool) -> str:
     names, rows = read_head(file)
     by_suffix = _SUFFIXES.get(file.suffix.lower(), "")
     numbers = to_numbers(rows)
-    width = len(rows[0]) if rows else 0
     if names and (has_names or _is_table(names)):
         return "table"
     if find_pose_columns(names, rows):
         return "tum"
     if _is_kf_gins(numbers):
         return "kf_gins"
-    if _is_kitti(numbers):
-        raise ValueError(
-            f"{file.name} must state times, got poses of KITTI, 12 numbers without a time. Write a .csv "
-            "with t from their times.txt, and pn, pe, pd from the position, columns 4, 8 and 12 of a pose."
-        )
-    if by_suffix:
-        return by_suffix
-    if names:
-        return "table"
+    require(
+        not _is_kitti(numbers),
+        file.name,
+        "state times",
+        "poses of KITTI, 12 numbers without a time",
+        "Write a .csv with t from their times.txt, and pn, pe, pd from the position, columns 4, 8 and 12 of a pose.",
+    )
+    if by_suffix or names:
+        return by_suffix or "table"
+    raise _describe_unknown(file, len(rows[0]) if rows else 0)
+
+
+def _describe_unknown(file: Path, width: int) -> ValueError:
+    """Return the error for a text of no known format."""
     remedy = (
         "Insert a line with names, t,pn,pe,pd,..., or set NAME.format=table, tum, kf_gins or nmea."
     )
     if width == KF_GINS_SD:
         remedy = "Use the navigation result of KF-GINS, and its deviations as NAME.sd."
-    raise ValueError(
+    return ValueError(
         f"{file.name} must be a table with names of columns, a TUM file (8 numbers in a line, the last four a "
         f"quaternion), a result of KF-GINS (11 numbers from week and second on) or NMEA, got {width} fields in "
         f"the first row. {remedy}"
@@ -269,20 +324,3 @@ def _is_kitti(numbers: Array) -> bool:
     rotation = numbers.reshape(-1, 3, 4)[:, :, :3]
     product = rotation @ rotation.transpose(0, 2, 1)
     return bool((np.abs(product - np.eye(3)) < 0.01).all())
-
-
-def _rtklib_error(file: Path, head: bytes) -> ValueError:
-    """Return the error for a solution of RTKLIB, with the lines of pandas that convert it."""
-    if re.search(rb"^%.*(ecef|baseline|d\')", head, re.MULTILINE):
-        remedy = "Set out-solformat=llh and out-degform=deg in RTKLIB, and convert its columns"
-    else:
-        remedy = "Convert its columns"
-    has_dates = re.search(rb"^\d{4}/\d\d/\d\d ", head, re.MULTILINE)
-    time = "d[1] + 604800 * (d[0] - d[0][0])"
-    if has_dates:
-        time = "(to_datetime(d[0] + ' ' + d[1]) - to_datetime('1980-01-06')).dt.total_seconds()"
-    return ValueError(
-        f"{file.name} must be a format that judge reads, got a solution of RTKLIB. {remedy}, in pandas: "
-        f"d = read_csv({str(file)!r}, comment='%', sep=r'\\s+', header=None); DataFrame({{'t': {time}, "
-        f"'lat_deg': d[2], 'lon_deg': d[3], 'h_m': d[4]}}).to_csv({str(file.with_suffix('.csv'))!r}, index=False)"
-    )

@@ -8,10 +8,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from pfbench.core.parameter_checks import require, require_range, require_ranges
-from pfbench.logs.judge.trajectory_table import ALL_COLUMNS
+from pfbench.logs.judge.trajectory_table import ROLES
+from pfbench.logs.units import SECONDS
 
 FRAMES = ("", "ned", "enu")
-FORMATS = ("", "table", "tum", "kf_gins", "nmea", "result")
+FORMATS = ("", "table", "tum", "kf_gins", "nmea", "rtklib", "euroc", "kitti", "result")
+REPEATS = ("refuse", "first")
 ALIGNMENTS = ("none", "offset", "yaw")
 _LARGEST_TIME = 1e10  # s, above the GPS and Unix times of this century
 _ORIGIN_LIMITS = (90.0, 360.0, 1e5)  # deg, deg, m
@@ -20,7 +22,7 @@ HOLES = ("refuse", "skip")
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """Options of one program, `NAME.key=value` on the command line.
+    """Options of a file, that of a program or a table of an own log, `NAME.key=value` on the command line.
 
     Attributes:
         frame: Axes of a TUM file, "ned" or "enu".
@@ -28,7 +30,9 @@ class SourceOptions:
         columns: Name in a CSV file by name of pfbench.
         scale: Factor by name of pfbench, for a column in another unit; before `shift`.
         format: One of `FORMATS`; empty to find it from the content.
-        sd: Pattern of the KF-GINS file of standard deviations; empty for none.
+        sd: KF-GINS file of standard deviations, or its pattern; empty for none.
+        time: Unit of the times: s, ms, us, ns, minutes or hours.
+        repeats: "refuse", or "first": keep the first row of each time. For tables of an own log.
     """
 
     frame: str = ""
@@ -37,16 +41,35 @@ class SourceOptions:
     scale: Mapping[str, float] = field(default_factory=dict)
     format: str = ""
     sd: str = ""
+    time: str = "s"
+    repeats: str = "refuse"
 
     def __post_init__(self) -> None:
         require_range("NAME.shift", self.shift, f"[-{_LARGEST_TIME:g}, {_LARGEST_TIME:g}]")
-        require(self.frame in FRAMES, "NAME.frame", "be ned or enu", self.frame)
-        formats = f"be {', '.join(FORMATS[1:])}"
-        require(self.format in FORMATS, "NAME.format", formats, self.format)
+        choices = {"frame": FRAMES, "format": FORMATS, "time": tuple(SECONDS), "repeats": REPEATS}
+        for key, allowed in choices.items():
+            require(
+                getattr(self, key) in allowed,
+                f"NAME.{key}",
+                f"be {', '.join(filter(None, allowed[:-1]))} or {allowed[-1]}",
+                getattr(self, key),
+            )
+        columns = dict.fromkeys(name for names in ROLES.values() for name in names)
         for name, factor in self.scale.items():
-            is_factor = math.isfinite(factor) and factor != 0
-            require(is_factor, "NAME.scale", "be finite and not 0", factor)
-            require(name in ALL_COLUMNS, "NAME.scale", f"be of {', '.join(ALL_COLUMNS)}", name)
+            require(
+                math.isfinite(factor) and factor != 0, "NAME.scale", "be finite and not 0", factor
+            )
+            require(name in columns, "NAME.scale", f"be of {', '.join(columns)}", name)
+
+    @property
+    def factors(self) -> dict[str, float]:
+        """Factors of the columns, with that of the unit of the times."""
+        second = SECONDS[self.time]
+        return (
+            {**self.scale}
+            if second == 1
+            else {**self.scale, "t": self.scale.get("t", 1.0) * second}
+        )
 
 
 @dataclass(frozen=True)

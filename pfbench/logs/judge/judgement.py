@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from pfbench.core.parameter_checks import require
 from pfbench.logs.judge.checks import check_interpolation
 from pfbench.logs.judge.formats import TrajectoryFile, list_trajectory_files
 from pfbench.logs.judge.judge_options import JudgeOptions, SourceOptions
@@ -82,10 +83,13 @@ def plan_pairs(programs: Sequence[str], baseline: str = "") -> tuple[tuple[str, 
     """Return all pairs of programs, or those with the baseline."""
     if not baseline:
         return tuple(combinations(programs, 2))
-    if baseline not in programs:
-        raise ValueError(
-            f"baseline must be a program, got {baseline}. Choose from {', '.join(programs)}."
-        )
+    require(
+        baseline in programs,
+        "baseline",
+        "be a program",
+        baseline,
+        f"Choose from {', '.join(programs)}.",
+    )
     return tuple((name, baseline) for name in programs if name != baseline)
 
 
@@ -127,11 +131,13 @@ def _check_sequences(
     """Check that each file belongs to a reference and that each pair of runs has two names."""
     for program, of_program in files.items():
         for file in of_program:
-            if file.sequence not in references:
-                raise ValueError(
-                    f"{file.path} must have a reference of its sequence {file.sequence}, got "
-                    f"{', '.join(references)}. Use {{sequence}} in all patterns, or in none."
-                )
+            require(
+                file.sequence in references,
+                file.path,
+                f"have a reference of its sequence {file.sequence}",
+                ", ".join(references),
+                "Use {sequence} in all patterns, or in none.",
+            )
         keys = [(file.sequence, file.run) for file in of_program]
         if len(set(keys)) < len(keys):
             double = next(key for key in keys if keys.count(key) > 1)

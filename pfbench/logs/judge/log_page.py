@@ -6,12 +6,13 @@ import json
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import yaml
 from matplotlib.figure import Figure
 
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.logs.doctor.finding import Finding, LogDiagnosis, Picture
 from pfbench.report import writers
 from pfbench.results.plotting import FigureSpec, format_slug, stacked_axes
 
@@ -22,17 +23,8 @@ _ABOUT = {
 }
 
 
-class _Picture(Protocol):
-    """Curves of a finding."""
-
-    xlabel: str
-    ylabel: str
-    curves: Sequence[Any]
-    marks: Sequence[float]
-
-
 def write_log_page(
-    diagnosis: Any,
+    diagnosis: LogDiagnosis,
     source: Mapping[str, Any],
     out: str | Path,
     formats: tuple[str, ...] = ("svg", "png"),
@@ -59,7 +51,10 @@ def write_log_page(
         context = {
             "name": source["name"],
             "findings": findings,
-            "facts": [{"name": key, "value": _format(value)} for key, value in sorted(diagnosis.facts.items())],
+            "facts": [
+                {"name": key, "value": f"{value:.4g}" if isinstance(value, float) else json.dumps(value)}
+                for key, value in sorted(diagnosis.facts.items())
+            ],
             "settings": suggested,
             "mends": bool(diagnosis.settings),
             "remaining": ", ".join(dict.fromkeys(diagnosis.remaining)),
@@ -111,11 +106,7 @@ def _plain(value: Any) -> Any:
     return float(value) if isinstance(value, float) else value
 
 
-def _format(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else json.dumps(value)
-
-
-def _describe(number: int, finding: Any, folder: RecordedFolder, formats: Sequence[str]) -> dict[str, Any]:  # fmt: skip
+def _describe(number: int, finding: Finding, folder: RecordedFolder, formats: Sequence[str]) -> dict[str, Any]:  # fmt: skip
     """Return what a template shows of a finding."""
     settings = finding.settings
     drawing = None
@@ -138,7 +129,7 @@ def _describe(number: int, finding: Any, folder: RecordedFolder, formats: Sequen
     }  # fmt: skip
 
 
-def _draw(picture: _Picture) -> Figure:
+def _draw(picture: Picture) -> Figure:
     """Draw the curves of a finding, and its marks."""
     figure, (axis,) = stacked_axes(1, 2.2)
     for label, x, y in picture.curves:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.limits import read_text
 from pfbench.files.table_file import split_lines
 from pfbench.logs.judge.judge_options import SourceOptions
@@ -55,12 +56,13 @@ def read_nmea_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryT
     kinds = Counter(f"{s.kind} sentences" for s in sentences if s.kind)
     extras: dict[float, _Epoch] = {}
     positions = _read_positions(file, sentences, extras, counts)
-    if not positions:
-        present = ", ".join(f"{n} {name}" for name, n in sorted((kinds + counts).items())) or "none"
-        raise ValueError(
-            f"{file.name} must have GGA or GNS sentences with a fix and a height, got {present}. "
-            "Let the receiver write GGA."
-        )
+    require(
+        positions,
+        file.name,
+        "have GGA or GNS sentences with a fix and a height",
+        ", ".join(f"{n} {name}" for name, n in sorted((kinds + counts).items())) or "none",
+        "Let the receiver write GGA.",
+    )
     merged = [{**epoch, **extras.get(epoch["t"], {})} for _, epoch in positions]
     lines = np.array([line for line, _ in positions])
     return [_make_table(file, merged, lines, counts, notes)]
@@ -80,17 +82,16 @@ def _read_positions(
             counts[f"{sentence.kind} sentences {problem}"] += 1
         elif sentence.kind not in _POSITIONS:
             extras.setdefault(clock.time, {}).update(values)
-        elif before and _is_repetition(sentence.fields, before.fields):
+        elif (
+            before
+            and sentence.fields[1] == before.fields[1]
+            and (sentence.fields[0] != before.fields[0] or sentence.fields == before.fields)
+        ):  # the same time, from another talker or word for word
             counts[f"{sentence.kind} sentences of another talker or twice"] += 1
         else:
             positions[sentence.kind].append((sentence.line, {"t": clock.time, **values}))
             previous[sentence.kind] = sentence
     return next((p for p in positions.values() if p), [])
-
-
-def _is_repetition(fields: list[str], before: list[str]) -> bool:
-    """Return whether a sentence has the time of the one before, and is equal or of another talker."""
-    return fields[1] == before[1] and (fields[0] != before[0] or fields == before)
 
 
 class _Clock:
@@ -121,7 +122,10 @@ def _read_values(file: Path, sentence: _Sentence, clock: _Clock) -> tuple[_Epoch
             return {}, "without a time"
         values = _READERS[sentence.kind](fields)
     except (ValueError, IndexError):
-        raise _field_error(file, sentence) from None
+        raise ValueError(
+            f"{file.name}: line {sentence.line} must have the fields of NMEA 0183, got "
+            f"{sentence.body[:80]!r}. Repair or remove this line."
+        ) from None
     return values, "" if values else "without a fix or a value"
 
 
@@ -167,10 +171,13 @@ def _read_sentences(file: Path, counts: Counter[str]) -> list[_Sentence]:
     sentences = []
     *lines, last = split_lines(read_text(file).decode("ascii", "replace"))
     for number, line in enumerate(map(str.strip, (*lines, last)), 1):
-        if _WITHOUT_SIGN.search(line):
-            raise ValueError(
-                f"{file.name}: line {number} must start with $, got {line[:60]!r}. Remove this line."
-            )
+        require(
+            not _WITHOUT_SIGN.search(line),
+            f"{file.name}: line {number}",
+            "start with $",
+            repr(line[:60]),
+            "Remove this line.",
+        )
         matches = list(_SENTENCE.finditer(line))
         counts["other lines"] += bool(line) and not matches
         for match in matches:
@@ -215,18 +222,15 @@ def _check_checksums(file: Path, sentences: list[_Sentence]) -> list[str]:
     return [*notes, *(["no checksums: damaged lines cannot be told from valid ones"] if none else [])]  # fmt: skip
 
 
-def _field_error(file: Path, sentence: _Sentence) -> ValueError:
-    return ValueError(
-        f"{file.name}: line {sentence.line} must have the fields of NMEA 0183, got "
-        f"{sentence.body[:80]!r}. Repair or remove this line."
-    )
-
-
 def _read_angle(text: str, side: str) -> float:
     """Convert degrees and minutes, as 4807.038, to degrees."""
     degrees, minutes = divmod(float(text), 100)
-    if side not in ("N", "S", "E", "W") or not side or minutes >= 60:
-        raise ValueError(f"angle must be degrees and minutes with N, S, E or W, got {text} {side}")
+    require(
+        side in ("N", "S", "E", "W") and side and (not minutes >= 60),
+        "angle",
+        "be degrees and minutes with N, S, E or W",
+        f"{text} {side}",
+    )
     angle = degrees + minutes / 60
     return -angle if side in ("S", "W") else angle
 
@@ -241,7 +245,7 @@ def _read_fix(fields: list[str]) -> _Epoch:
         "lat_deg": lat,
         "lon_deg": lon,
         "h_m": float(fields[9]),
-        "separation": _optional(fields),
+        "separation": float(fields[11] or "nan"),
     }
 
 
@@ -254,10 +258,6 @@ def _read_gga(fields: list[str]) -> _Epoch:
 def _read_gns(fields: list[str]) -> _Epoch:
     """Return the position of GNS, whose geoid separation lies one field nearer, without units."""
     return _read_fix([*fields[:10], "M", *fields[10:]])
-
-
-def _optional(fields: list[str]) -> float:
-    return float(fields[11]) if fields[11] else math.nan
 
 
 def _read_minimum(fields: list[str]) -> _Epoch:

@@ -145,15 +145,13 @@ def _describe_files(sequences: Sequence[SequenceResults]) -> Iterator[str]:
 
 def _describe_runs(sequence: SequenceResults, options: JudgeOptions) -> Iterator[str]:
     """Yield a note on each run that is lost, has holes, or has another clock."""
-    for k, run in enumerate(sequence.runs):
+    for run, used, holes, _, coverage in sequence.list_runs():
         label = f"{run.program} {run.run}".strip() + f" in {sequence.name}"
-        if sequence.epochs.rows[k] is None:
-            share = 100 * sequence.epochs.coverage[k]
+        if used is None:
             yield (
-                f"Lost: {label} covers {share:.3g} % of the time, {100 * options.coverage:g} % are required. "
+                f"Lost: {label} covers {100 * coverage:.3g} % of the time, {100 * options.coverage:g} % are required. "
                 f"Among runs or sequences it counts as an error of {cap_of(sequence, options):.4g} m."
             )
-        holes = sequence.epochs.holes[k]
         if holes is not None and holes.any():
             yield (
                 f"Holes: {label} lacks {int(holes.sum())} of {len(holes)} epochs that another program "
@@ -309,49 +307,43 @@ def _mean(values: Array, lost: np.ndarray) -> float:
 
 def tabulate_verdicts(pairs: Sequence[PairVerdict]) -> pd.DataFrame:
     """Return one row per pair of programs."""
-    rows = []
-    for pair in pairs:
-        v = pair.verdict
-        rows.append(
-            {
-                "first": v.a,
-                "second": v.b,
-                "verdict on first": v.word,
-                "position error of first": format_size(v.ratio, v.low, v.high) if v.n else "-",
-                "adjusted p": v.p,
-                "sample": "sequence" if pair.unit == "world" else pair.unit,
-                "number": v.n,
-                "independent": pair.effective,
-                "block [s]": pair.block_s,
-                "reason": v.reason or "-",
-            }
-        )
-    return pd.DataFrame(rows)
+    return pd.DataFrame(
+        {
+            "first": v.a,
+            "second": v.b,
+            "verdict on first": v.word,
+            "position error of first": format_size(v.ratio, v.low, v.high) if v.n else "-",
+            "adjusted p": v.p,
+            "sample": "sequence" if pair.unit == "world" else pair.unit,
+            "number": v.n,
+            "independent": pair.effective,
+            "block [s]": pair.block_s,
+            "reason": v.reason or "-",
+        }
+        for pair in pairs
+        for v in (pair.verdict,)
+    )
 
 
 def files_table(sequences: Sequence[SequenceResults]) -> pd.DataFrame:
     """Return one row per trajectory: file, rows, share used, clock and notes."""
-    rows = []
-    for sequence in sequences:
-        epochs = sequence.epochs
-        for k, run in enumerate(sequence.runs):
-            used, holes, table = epochs.rows[k], epochs.holes[k], run.table
-            rows.append(
-                {
-                    "sequence": sequence.name,
-                    "program": run.program,
-                    "run": run.run or "-",
-                    "file": table.file,
-                    "rows": len(table.time),
-                    "scored": 0 if used is None else len(used),
-                    "in holes": 0 if holes is None else int(holes.sum()),
-                    "not common": epochs.unused[k],
-                    "time covered [%]": 100 * epochs.coverage[k],
-                    "clock offset [s]": run.clock_offset,
-                    "notes": "; ".join(table.notes) or "-",
-                }
-            )
-    return pd.DataFrame(rows)
+    return pd.DataFrame(
+        {
+            "sequence": sequence.name,
+            "program": run.program,
+            "run": run.run or "-",
+            "file": run.table.file,
+            "rows": len(run.table.time),
+            "scored": 0 if used is None else len(used),
+            "in holes": 0 if holes is None else int(holes.sum()),
+            "not common": unused,
+            "time covered [%]": 100 * coverage,
+            "clock offset [s]": run.clock_offset,
+            "notes": "; ".join(run.table.notes) or "-",
+        }
+        for sequence in sequences
+        for run, used, holes, unused, coverage in sequence.list_runs()
+    )
 
 
 def error_figures(sequences: Sequence[SequenceResults], largest: int = 8) -> list[FigureSpec]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import median_filter
 
+from pfbench.core.parameter_checks import require
 from pfbench.logs.judge.formats import read_trajectories
 from pfbench.logs.judge.judge_options import JudgeOptions, SourceOptions, name_program
 from pfbench.logs.judge.trajectory_table import (
@@ -63,7 +64,7 @@ class ReferenceTrack:
             return table.select(LOCAL)
         if table.has(GEODETIC) and self.origin:
             return to_north_east_down(table.select(GEODETIC), np.array(self.origin))
-        have = "lat_deg, lon_deg, h_m" if table.has(GEODETIC) else "pn, pe, pd"
+        have = ", ".join(GEODETIC if table.has(GEODETIC) else LOCAL)
         raise ValueError(
             f"{table.file} must have positions in the frame of {self.file}, got {have} and no origin "
             "of the local frame. Set origin=LAT_DEG,LON_DEG,H_M of pn = pe = pd = 0."
@@ -98,10 +99,8 @@ class ReferenceTrack:
         linear = np.stack([np.interp(time, clock, p) for p in position.T], axis=-1)
         if any(name not in self.table.values for name in VELOCITY_COLUMNS):
             return linear
-        velocity = self.table.select(VELOCITY_COLUMNS)
-        k = np.clip(np.searchsorted(clock, time, side="right") - 1, 0, len(clock) - 2)
-        step = (clock[k + 1] - clock[k])[:, None]
-        s = (time - clock[k])[:, None] / step
+        velocity, (k, length, share) = self.table.select(VELOCITY_COLUMNS), self._find_steps(time)
+        step, s = length[:, None], share[:, None]
         slope = (position[k + 1] - position[k]) / step
         start, end = velocity[k] - slope, velocity[k + 1] - slope
         return linear + step * s * (1 - s) * ((1 - s) * start - s * end)
@@ -116,10 +115,8 @@ class ReferenceTrack:
         Shapes: time [K].
         """
         clock, has_velocity = self.table.time, VELOCITY_COLUMNS[-1] in self.table.values
-        k = np.clip(np.searchsorted(clock, time, side="right") - 1, 0, len(clock) - 2)
-        step, power = np.diff(clock), 2 if has_velocity else 1
-        s = (time - clock[k]) / step[k]
-        size = (np.clip(s * (1 - s), 0.0, None) * step[k] ** 2) ** power
+        (k, length, s), step, power = self._find_steps(time), np.diff(clock), 1 + has_velocity
+        size = (np.clip(s * (1 - s), 0.0, None) * length**2) ** power
         if len(clock) < _LEAST_ROWS:
             return np.where(size > 1e-9, np.inf, 0.0)
         bend = np.zeros(len(clock))
@@ -130,7 +127,7 @@ class ReferenceTrack:
             distance = np.linalg.norm(self.position[rows] - left_out, axis=1)
             bend[rows] = distance / (step[rows - 1] * step[rows]) ** power
         bend[0], bend[-1] = bend[1], bend[-2]
-        is_long = step[k] > _GAP_STEPS * np.median(step)
+        is_long = length > _GAP_STEPS * np.median(step)
         return np.where(is_long, 0.0, size * (bend[k] + bend[k + 1]) / 2)
 
     def interpolate_columns(self, names: tuple[str, ...], time: Array) -> Array:
@@ -148,21 +145,29 @@ class ReferenceTrack:
 
     def is_bridged(self, time: Array) -> np.ndarray:
         """Return the times [K] that lie within the reference and in none of its long gaps."""
-        clock = self.table.time
-        k = np.clip(np.searchsorted(clock, time, side="right") - 1, 0, len(clock) - 2)
+        clock, (k, length, _) = self.table.time, self._find_steps(time)
         inside = (time >= clock[0]) & (time <= clock[-1])
         is_exact = (time == clock[k]) | (time == clock[k + 1])
-        return np.asarray(inside & ((clock[k + 1] - clock[k] <= self.largest_gap) | is_exact))
+        return np.asarray(inside & ((length <= self.largest_gap) | is_exact))
+
+    def _find_steps(self, time: Array) -> tuple[np.ndarray, Array, Array]:
+        """Return the row before each time [K], the length of the step after it, s, and the passed share of it."""
+        clock = self.table.time
+        k = np.clip(np.searchsorted(clock, time, side="right") - 1, 0, len(clock) - 2)
+        return k, clock[k + 1] - clock[k], (time - clock[k]) / (clock[k + 1] - clock[k])
 
 
 def read_reference(path: Path, options: JudgeOptions, source: SourceOptions) -> ReferenceTrack:
     """Read the reference of a sequence and check its gaps in the scored time."""
     with name_program("reference"):
         tables = [check_consistent_units(table) for table in read_trajectories(path, source)]
-    if len(tables) != 1:
-        raise ValueError(
-            f"reference must be one trajectory, got {len(tables)} runs in {path.name}. Use a .csv file."
-        )
+    require(
+        len(tables) == 1,
+        "reference",
+        "be one trajectory",
+        f"{len(tables)} runs in {path.name}",
+        "Use a .csv file.",
+    )
     table, step = tables[0], float(np.median(np.diff(tables[0].time)))
     gap = options.largest_gap or max(_LEAST_GAP, _GAP_STEPS * step)
     is_local = table.has(LOCAL)
@@ -179,14 +184,14 @@ def _refuse_holes(reference: ReferenceTrack, options: JudgeOptions) -> None:
     time = reference.table.time
     start, step = time[:-1], np.diff(time)
     holes = (step > reference.largest_gap) & (start < options.end) & (start + step > options.start)
-    if holes.any():
-        k = int(holes.argmax())
-        raise ValueError(
-            f"{reference.file}: line {reference.table.lines[k + 1]}, column t must follow the row "
-            f"before within {reference.largest_gap:g} s, got a hole of {step[k]:.6g} s from "
-            f"{start[k]:.10g} s ({int(holes.sum())} holes). Set holes=skip to leave these epochs "
-            "out, or largest_gap=SECONDS to interpolate them."
-        )
+    k = int(holes.argmax())
+    require(
+        not holes[k],
+        f"{reference.file}: line {reference.table.lines[k + 1]}, column t",
+        f"follow the row before within {reference.largest_gap:g} s",
+        f"a hole of {step[k]:.6g} s from {start[k]:.10g} s ({int(holes.sum())} holes)",
+        "Set holes=skip to leave these epochs out, or largest_gap=SECONDS to interpolate them.",
+    )
 
 
 # --------------------------------------------------------------------------------------------------
@@ -210,16 +215,21 @@ def check_scored_time(reference: ReferenceTrack, options: JudgeOptions) -> None:
         ("from", options.start, options.start < last),
         ("to", options.end, options.end > first),
     ):
-        if not is_valid:
-            raise ValueError(
-                f"{name} must be within {reference.file} ({span}), got {value:.10g} s. Change {name}=..."
-            )
-    seconds = min(last, options.end) - max(first, options.start)
-    if options.block > seconds / 2:
-        raise ValueError(
-            f"block must be at most half of the scored time, {seconds / 2:.10g} s, got {options.block:.10g} s. "
-            "Set block=0 for the rule."
+        require(
+            is_valid,
+            name,
+            f"be within {reference.file} ({span})",
+            f"{value:.10g} s",
+            f"Change {name}=...",
         )
+    half = (min(last, options.end) - max(first, options.start)) / 2
+    require(
+        options.block <= half,
+        "block",
+        f"be at most half of the scored time, {half:.10g} s",
+        f"{options.block:.10g} s",
+        "Set block=0 for the rule.",
+    )
 
 
 def check_shared(
@@ -227,16 +237,21 @@ def check_shared(
 ) -> None:
     """Check that enough epochs are shared, for scores and for the weight of holes."""
     (shared, in_holes), (file, sizes, remedy) = counts, texts
-    if shared < LEAST_EPOCHS:
-        raise ValueError(
-            f"trajectories of {file} must share at least {LEAST_EPOCHS} epochs within {tolerance:g} s, "
-            f"got {shared} of {sizes}. Set {remedy}, or let the programs write the same epochs."
-        )
-    if in_holes and share < LEAST_SHARE:
-        raise ValueError(
-            f"trajectories of {file} must share {100 * LEAST_SHARE:g} % of the epochs outside of holes "
-            f"within {tolerance:g} s, got {100 * share:.3g} % of {sizes}. Set {remedy}."
-        )
+    owner = f"trajectories of {file}"
+    require(
+        shared >= LEAST_EPOCHS,
+        owner,
+        f"share at least {LEAST_EPOCHS} epochs within {tolerance:g} s",
+        f"{shared} of {sizes}",
+        f"Set {remedy}, or let the programs write the same epochs.",
+    )
+    require(
+        not in_holes or share >= LEAST_SHARE,
+        owner,
+        f"share {100 * LEAST_SHARE:g} % of the epochs outside of holes within {tolerance:g} s",
+        f"{100 * share:.3g} % of {sizes}",
+        f"Set {remedy}.",
+    )
 
 
 def space_evenly(time: Array) -> tuple[np.ndarray, Array]:
@@ -268,9 +283,10 @@ def space_evenly(time: Array) -> tuple[np.ndarray, Array]:
 
 def check_coverage(names: list[str], coverage: tuple[float, ...], least: float) -> None:
     """Check that one trajectory at least is not lost."""
-    if max(coverage, default=0.0) < least:
-        shares = ", ".join(f"{100 * c:.3g} % ({n})" for n, c in zip(names, coverage, strict=True))
-        raise ValueError(
-            f"one trajectory must cover {100 * least:g} % of the time that any of them covers, got {shares}. "
-            "Set from and to, or a smaller coverage."
-        )
+    require(
+        max(coverage, default=0.0) >= least,
+        "one trajectory",
+        f"cover {100 * least:g} % of the time that any of them covers",
+        ", ".join(f"{100 * c:.3g} % ({n})" for n, c in zip(names, coverage, strict=True)),
+        "Set from and to, or a smaller coverage.",
+    )

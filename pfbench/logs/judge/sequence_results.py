@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -86,6 +87,15 @@ class SequenceResults(NamedTuple):
     results: dict[str, JobResult]
     run_names: dict[str, tuple[str, ...]]
 
+    def list_runs(
+        self,
+    ) -> Iterator[tuple[JudgedRun, np.ndarray | None, np.ndarray | None, int, float]]:
+        """Return each run with its rows and holes at the common epochs, its unused rows and its coverage."""
+        epochs = self.epochs
+        return zip(
+            self.runs, epochs.rows, epochs.holes, epochs.unused, epochs.coverage, strict=True
+        )
+
 
 def read_runs(
     program: str,
@@ -97,10 +107,9 @@ def read_runs(
     """Read all runs of a program in one sequence and check them against the reference."""
     runs = []
     for file in files:
-        names = {"sequence": file.sequence, "run": file.run}
-        sd = Path(source.sd.format(**names)) if source.sd else None
+        sd = source.sd.format(sequence=file.sequence, run=file.run)
         with name_program(program):
-            tables = read_trajectories(file.path, source, sd)
+            tables = read_trajectories(file.path, replace(source, sd=sd))
             checked = [_check_run(reference.place(t), reference, source, align) for t in tables]
         for table, offset in checked:
             number = f"{table.run:09d}" if len(tables) > 1 else ""
@@ -125,7 +134,8 @@ def score_sequence(
 ) -> SequenceResults:
     """Compute the errors of all runs at the common epochs."""
     epochs = find_common_epochs([run.table for run in runs], reference, options)
-    results, names = {}, {}
+    results, names, holes = {}, {}, {}
+    nothing = np.zeros(len(epochs.time), dtype=bool)
     for program in dict.fromkeys(run.program for run in runs):
         rows = [k for k, run in enumerate(runs) if run.program == program]
         tables = [runs[k].table for k in rows]
@@ -136,15 +146,10 @@ def score_sequence(
         ]
         results[program] = _to_result(program, epochs.time, columns, parts, options)
         names[program] = tuple(runs[k].run for k in rows)
-    fill_holes(results, {p: _holes_of(epochs, runs, p) for p in results})
+        masks = [epochs.holes[k] for k in rows]
+        holes[program] = np.stack([nothing if mask is None else mask for mask in masks])
+    fill_holes(results, holes)
     return SequenceResults(name, reference, tuple(runs), epochs, results, names)
-
-
-def _holes_of(epochs: CommonEpochs, runs: Sequence[JudgedRun], program: str) -> np.ndarray:
-    """Return the holes of the runs of a program, [R, T]; False for a lost run."""
-    nothing = np.zeros(len(epochs.time), dtype=bool)
-    masks = [h for h, run in zip(epochs.holes, runs, strict=True) if run.program == program]
-    return np.stack([nothing if mask is None else mask for mask in masks])
 
 
 class _RunScores(NamedTuple):
@@ -163,15 +168,14 @@ def _score_run(
     """Return the errors of a run, or None if it is lost."""
     if rows is None:
         return None
-    errors, deviations, nees = [], [], []
+    parts = []
     for group, names in columns.items():
         factor = _UNITS[group][1]
         if group == "position":
             error = position_errors(table, reference, rows, options.align)
         else:
             error = factor * column_errors(table, reference, rows, names)
-        sd_names = _SD[group][: len(names)]
-        sd = np.full(error.shape, np.nan)
+        sd, sd_names = np.full(error.shape, np.nan), _SD[group][: len(names)]
         if table.has(sd_names):
             sd = factor * table.select(sd_names)[rows]
         normalised = ((error / sd) ** 2).sum(axis=-1)
@@ -180,11 +184,9 @@ def _score_run(
             sd = np.sqrt(np.diagonal(matrices, axis1=-2, axis2=-1))
             solved = np.linalg.solve(matrices, error[..., None])[..., 0]
             normalised = (error * solved).sum(axis=-1)
-        errors.append(error)
-        deviations.append(sd)
-        nees.append(normalised)
+        parts.append((error, sd, normalised[:, None]))
     return _RunScores(
-        np.concatenate(errors, -1), np.concatenate(deviations, -1), np.stack(nees, -1)
+        *(np.concatenate(columns_of_group, -1) for columns_of_group in zip(*parts, strict=True))
     )
 
 

@@ -1,48 +1,48 @@
-"""Readers of text with columns of a fixed order: TUM and KF-GINS."""
+"""Readers of text with columns of a fixed order: TUM, KF-GINS, RTKLIB, EuRoC and KITTI."""
 
 from __future__ import annotations
 
-import difflib
 import re
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.spatial.transform import Rotation
 
 from pfbench.core.parameter_checks import require
 from pfbench.files.limits import check_columns, read_text
-from pfbench.files.table_file import describe_cut, is_number_text, read_table_file, split_lines
+from pfbench.files.table_file import describe_cut, is_number_text, split_lines
 from pfbench.logs.judge.judge_options import SourceOptions
 from pfbench.logs.judge.trajectory_table import (
-    ALL_COLUMNS,
     ATTITUDE_COLUMNS,
     ATTITUDE_SD,
-    COVARIANCE_COLUMNS,
     GEODETIC,
+    IMU_COLUMNS,
     LOCAL,
     POSITION_SD,
-    SD_GROUPS,
     VELOCITY_COLUMNS,
     VELOCITY_SD,
     TrajectoryTable,
     euler_angles,
-    rotation_from_quaternion,
 )
-from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, QUANTITIES
-from pfbench.logs.units import ALIASES, WEEK
+from pfbench.logs.units import WEEK
 from pfbench.stats.error_measures import Array
 
 _TUM_COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _KF_GINS_COLUMNS = ("week", "t", *GEODETIC, *VELOCITY_COLUMNS, "roll", "pitch", "yaw")
+_EUROC_COLUMNS = ("t", "p_x", "p_y", "p_z", "q_w", "q_x", "q_y", "q_z", "v_x", "v_y", "v_z")
 KF_GINS_SD = 22  # columns of the file of standard deviations: time, 9 of navigation, 12 of sensors
+KF_GINS_IMU, KF_GINS_FIXES = 7, (7, 10, 13)  # columns; fixes with deviations, and with velocities
+_EUROC_WITH_BIASES, _KITTI_PACKET = 17, 30  # columns
 _TO_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # from East, North, Up
 _TO_FRD = np.diag([1.0, -1.0, -1.0])  # a body with forward, left, up
 _COMMENTS, _BOM = ("#", "%"), "\ufeff"
 _HEAD_BYTES = 2**20  # with all comments before the first row
 _UNIT = re.compile(r"[\[(][^\[(\])]*[\])]")  # as in time [s]
 _QUATERNION = re.compile(r"(?:.*\W)?(?:q|quat|quaternion|orientation|rot|rotation)\w*?_?([wxyz])")
+_GPS_DATE = re.compile(r"(\d{4})/(\d\d)/(\d\d)")
 
 
 def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
@@ -52,27 +52,27 @@ def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
     frame=ned they are North, East, Down and forward, right, down. A line of names can state another
     order of the quaternion and further columns, and an index can precede the time.
     """
-    if not options.frame:
-        raise ValueError(
-            f"NAME.frame must be ned or enu for {file.name}, got none: a TUM file does not state its "
-            "axes. Set NAME.frame=enu if z points up."
-        )
+    require(
+        options.frame,
+        "NAME.frame",
+        f"be ned or enu for {file.name}",
+        "none: a TUM file does not state its axes",
+        "Set NAME.frame=enu if z points up.",
+    )
     names, rows = read_head(file)
     places = find_pose_columns(names, rows) or list(range(len(_TUM_COLUMNS)))
     width = len(names) or (to_numbers(rows).shape[1] if places[0] else len(places))
-    numbers, lines, notes = _read_numbers(file, _TUM_COLUMNS, places, width)
+    numbers, lines, notes = _read_numbers(file, _TUM_COLUMNS, (width,), places)
     length = np.linalg.norm(numbers[:, 4:], axis=1)
-    bad = np.abs(length - 1) > 0.01
-    if bad.any():
-        row = int(bad.argmax())
-        raise ValueError(
-            f"{file.name}: line {lines[row]}, columns qx ... qw must be a quaternion of length 1, "
-            f"got length {length[row]:.3g}. Check the order of the columns: {' '.join(_TUM_COLUMNS)}."
-        )
+    row = int((np.abs(length - 1) > 0.01).argmax())
+    require(
+        abs(length[row] - 1) <= 0.01, f"{file.name}: line {lines[row]}, columns qx ... qw", "be a quaternion of length 1",
+        f"length {length[row]:.3g}", f"Check the order of the columns: {' '.join(_TUM_COLUMNS)}.",
+    )  # fmt: skip
     if width > len(_TUM_COLUMNS):
         used = ", ".join(str(index + 1) for index in places)
         notes = (*notes, f"columns {used} of {width} are read as {' '.join(_TUM_COLUMNS)}")
-    position, rotation = numbers[:, 1:4], rotation_from_quaternion(numbers[:, 4:])
+    position, rotation = numbers[:, 1:4], Rotation.from_quat(numbers[:, 4:]).as_matrix()
     if options.frame == "enu":
         position, rotation = position @ _TO_NED.T, _TO_NED @ rotation @ _TO_FRD
     values = _by_name(LOCAL, position) | _by_name(ATTITUDE_COLUMNS, euler_angles(rotation))
@@ -94,9 +94,11 @@ def find_pose_columns(names: Sequence[str], rows: Sequence[Sequence[str]]) -> li
     return list(range(width - 8, width)) if width == 8 or has_index else []
 
 
-def read_kf_gins_trajectory(
-    file: Path, options: SourceOptions, sd: Path | None = None
-) -> list[TrajectoryTable]:
+# --------------------------------------------------------------------------------------------------
+# KF-GINS: navigation results with their deviations, increments of the IMU, and fixes.
+
+
+def read_kf_gins_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
     """Read a navigation result or truth of KF-GINS: week, second, position, velocity, attitude.
 
     The units are deg, deg, m, m/s North, East, Down, and deg for roll, pitch and yaw.
@@ -111,19 +113,148 @@ def read_kf_gins_trajectory(
     time = (
         second if (np.diff(second) > 0).all() else second + WEEK * (numbers[:, 0] - numbers[0, 0])
     )
-    if sd is not None:
-        names = ("t", *(f"column {k}" for k in range(2, KF_GINS_SD + 1)))
+    if options.sd:
+        sd, names = Path(options.sd), ("t", *(f"column {k}" for k in range(2, KF_GINS_SD + 1)))
         require(sd.is_file(), "sd", "be a file", f"{sd} for {file.name}", "Check the path.")
         deviations, _, _ = _read_numbers(sd, names)
-        if deviations.shape[0] != len(time) or (np.abs(deviations[:, 0] - second) > 1e-4).any():
-            raise ValueError(
-                f"{sd.name} must have the times of {file.name}, got {len(deviations)} rows from "
-                f"{deviations[0, 0]} s for {len(time)} rows from {second[0]} s. Use files of one run."
-            )
+        require(
+            len(deviations) == len(time) and (np.abs(deviations[:, 0] - second) <= 1e-4).all(),
+            sd.name,
+            f"have the times of {file.name}",
+            f"{len(deviations)} rows from {deviations[0, 0]} s for {len(time)} rows from {second[0]} s",
+            "Use files of one run.",
+        )
         values |= _by_name(POSITION_SD, deviations[:, 1:4])
         values |= _by_name(VELOCITY_SD, deviations[:, 4:7])
         values |= _by_name(ATTITUDE_SD, np.radians(deviations[:, 7:10]))
     return [TrajectoryTable(file.name, time, values, lines, notes, angle_unit="deg")]
+
+
+def read_kf_gins_imu(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
+    """Read increments: second, three angles, rad, and three velocities, m/s, forward, right, down."""
+    numbers, lines, notes = _read_numbers(file, ("t", "angle increments", "velocity increments"), (KF_GINS_IMU,))  # fmt: skip
+    time = numbers[:, 0]
+    step = np.diff(time, prepend=2.0 * time[0] - time[1])[:, None]
+    row = int((step <= 0.0).argmax())
+    require(step[row, 0] > 0.0, f"{file.name}: line {lines[row]}", "have a later time than before", time[row], "Sort the lines.")  # fmt: skip
+    values = _by_name(IMU_COLUMNS, np.hstack([numbers[:, 4:7], numbers[:, 1:4]]) / step)
+    notes = (*notes, "increments divided by their intervals, at their middles")
+    return [TrajectoryTable(file.name, time - 0.5 * step[:, 0], values, lines, notes)]
+
+
+def read_kf_gins_fixes(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
+    """Read fixes: second, latitude, longitude, height, three deviations, and velocities in files of 13 columns."""
+    names = ("t", "latitude", "longitude", "height", "deviations")
+    numbers, lines, notes = _read_numbers(file, names, KF_GINS_FIXES)
+    values = _by_name(GEODETIC, numbers[:, 1:4])
+    if numbers.shape[1] == KF_GINS_FIXES[-1]:
+        values |= _by_name(VELOCITY_COLUMNS, numbers[:, 7:10])
+    return [TrajectoryTable(file.name, numbers[:, 0], values, lines, notes)]
+
+
+# --------------------------------------------------------------------------------------------------
+# RTKLIB, EuRoC and KITTI.
+
+
+def read_rtklib(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
+    """Read a solution of RTKLIB with latitude, longitude and height; t is the second of the GPS week of the first row."""
+    texts = split_lines(read_text(file).decode("utf-8-sig", "replace"))
+    heads = [text for text in texts if text.startswith("%")]
+    require(
+        not heads or any("latitude(deg)" in head for head in heads),
+        file.name,
+        "have latitude, longitude and height",
+        "other positions",
+        "Set the output of RTKLIB to lat/lon/height in degrees (out-solformat = llh, out-degform = deg).",
+    )
+    rows = [(number, text.split()) for number, text in enumerate(texts, 1) if text.strip() and not text.startswith("%")]  # fmt: skip
+    for number, row in rows:
+        require(
+            len(row) >= 6 and all(map(is_number_text, row[2:6])),
+            f"{file.name}: line {number}",
+            "have time, latitude, longitude, height and Q",
+            repr(" ".join(row)[:80]),
+            "Repair or remove this line.",
+        )
+    stamps = pd.to_datetime([f"{r[0]} {r[1]}" for _, r in rows if _GPS_DATE.match(r[0])])
+    seconds = (stamps - pd.Timestamp("1980-01-06")).total_seconds().to_numpy(float)
+    if len(stamps) < len(rows):
+        seconds = np.array([float(row[0]) * WEEK + float(row[1]) for _, row in rows])
+    week = np.floor(seconds[0] / WEEK) if len(rows) else 0.0
+    numbers = np.array([row[2:6] for _, row in rows], float).reshape(-1, 4)
+    notes = (f"t is the second of GPS week {int(week)}", "the column fix has the codes of RTKLIB")
+    lines = np.array([number for number, _ in rows])
+    return [TrajectoryTable(file.name, seconds - week * WEEK, _by_name((*GEODETIC, "fix"), numbers), lines, notes)]  # fmt: skip
+
+
+def read_euroc_imu(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
+    """Read rate and force. The axes stay as recorded, and the inspection names the mounting."""
+    names = ("t", "w_x", "w_y", "w_z", "a_x", "a_y", "a_z")
+    numbers, lines, notes = _read_numbers(file, names)
+    values = _by_name(IMU_COLUMNS, numbers[:, [4, 5, 6, 1, 2, 3]])
+    notes = (*notes, "axes of the sensor are as recorded")
+    return [TrajectoryTable(file.name, 1e-9 * numbers[:, 0], values, lines, notes)]
+
+
+def read_euroc_reference(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
+    """Read position, quaternion (w, x, y, z) and velocity in a frame with z up, and a body as recorded."""
+    widths = (len(_EUROC_COLUMNS), _EUROC_WITH_BIASES)
+    numbers, lines, notes = _read_numbers(file, _EUROC_COLUMNS, widths)
+    rotation = _TO_NED @ Rotation.from_quat(numbers[:, [5, 6, 7, 4]]).as_matrix()
+    values = (
+        _by_name(LOCAL, numbers[:, 1:4] @ _TO_NED.T)
+        | _by_name(VELOCITY_COLUMNS, numbers[:, 8:11] @ _TO_NED.T)
+        | _by_name(ATTITUDE_COLUMNS, euler_angles(rotation))
+    )
+    notes = (*notes, "x, y, z of the frame are taken as East, North, Up")
+    return [TrajectoryTable(file.name, 1e-9 * numbers[:, 0], values, lines, notes)]
+
+
+def _read_kitti(path: Path) -> tuple[Array, Array]:
+    """Read times, s, [n], and packets, [n, 30], of a folder oxts with timestamps.txt and data/."""
+    folder = path / "oxts" if (path / "oxts").is_dir() else path
+    stamps, files = folder / "timestamps.txt", sorted((folder / "data").glob("*.txt"))
+    remedy = "Use the folder of a KITTI drive."
+    require(stamps.is_file() and files, path, "contain oxts/timestamps.txt and oxts/data/*.txt", "none", remedy)  # fmt: skip
+    times = pd.to_datetime(stamps.read_text().split("\n"), errors="coerce").dropna()
+    require(
+        len(times) == len(files),
+        stamps,
+        f"have a time for each of {len(files)} files",
+        len(times),
+        "Complete the folder.",
+    )
+    packets = [to_numbers(read_head(file)[1]) for file in files]
+    require(
+        all(packet.shape == (1, _KITTI_PACKET) for packet in packets),
+        stamps.parent,
+        f"have packets of {_KITTI_PACKET} numbers",
+        "others",
+        remedy,
+    )
+    return (times - times[0]).total_seconds().to_numpy(float), np.vstack(packets)
+
+
+def read_kitti(path: Path, options: SourceOptions) -> list[TrajectoryTable]:
+    """Read the navigation system of a KITTI drive: acceleration with gravity, rate, place, velocity and attitude.
+
+    Axes of the body are forward, left, up; yaw is counted from East, anticlockwise.
+    """
+    time, packets = _read_kitti(path)
+    angles = np.stack([packets[:, 3], -packets[:, 4], np.pi / 2 - packets[:, 5]], -1)
+    down = -np.gradient(packets[:, 2], time)
+    values = (
+        _by_name(IMU_COLUMNS, np.hstack([packets[:, 11:14] @ _TO_FRD, packets[:, 17:20] @ _TO_FRD]))
+        | _by_name(GEODETIC, packets[:, :3])
+        | _by_name(VELOCITY_COLUMNS, np.column_stack([packets[:, 6:8], down]))
+        | _by_name(ATTITUDE_COLUMNS, angles)
+    )
+    notes = ("fixes and reference are those of the navigation system", "the vertical velocity is the change of the height")  # fmt: skip
+    return [TrajectoryTable(path.name, time, values, np.arange(len(time)), notes)]
+
+
+# --------------------------------------------------------------------------------------------------
+# Rows of numbers.
 
 
 def read_head(file: Path, rows: int = 20) -> tuple[list[str], list[list[str]]]:
@@ -173,135 +304,37 @@ def _by_name(names: tuple[str, ...], columns: Array) -> dict[str, Array]:
 
 
 def _read_numbers(
-    file: Path, names: tuple[str, ...], places: Sequence[int] = (), width: int = 0
+    file: Path, names: tuple[str, ...], widths: tuple[int, ...] = (), places: Sequence[int] = ()
 ) -> tuple[Array, np.ndarray, tuple[str, ...]]:
     """Return numbers [T, K] of some columns or of all, their lines [T], and notes.
 
-    Comments start with # or %, and names can precede the first row. A last line without an end may
-    lack digits, so it is dropped with a note.
+    The width of the first row is one of `widths`, or the number of the names. Comments start with # or %, and names
+    can precede the first row. A last line without an end may lack digits, so it is dropped with a note.
     """
     rows, lines = array("d"), array("q")  # a list of numbers needs four times the memory
     notes: list[str] = []
-    width = width or len(names)
+    widths = widths or (len(names),)
     content = read_text(file).decode("utf-8", "replace").removeprefix(_BOM)
     *complete, last = split_lines(content)
     for number, line in enumerate(complete, 1):
         text, fields = line.strip(), split_line(line)
         if not text or text.startswith(_COMMENTS):
             continue
-        if not (rows or notes) and len(fields) == width and _has_no_number(text):
+        if not (rows or notes) and len(fields) in widths and _has_no_number(text):
             notes = [f"line {number} is read as names of columns: {text[:80]}"]
             continue
         try:
-            row = [float(fields[k]) for k in places or range(width)]
+            row = [float(fields[k]) for k in places or range(len(fields))]
         except (ValueError, IndexError):
             row = []
-        if not row or len(fields) != width:
+        if not row or len(fields) not in widths:
             raise ValueError(
-                f"{file.name}: line {number} must have {width} numbers ({' '.join(names[:11])}), "
+                f"{file.name}: line {number} must have {' or '.join(map(str, widths))} numbers ({' '.join(names[:11])}), "
                 f"got {line[:80]!r}. Repair or remove this line."
             )
+        widths = (len(fields),)
         rows.extend(row)
         lines.append(number)
     notes += [describe_cut(file, len(complete) + 1)] if last.strip() else []
-    numbers = np.array(rows).reshape(len(lines), len(places) or width)
+    numbers = np.array(rows).reshape(len(lines), len(places) or widths[0])
     return numbers, np.array(lines), tuple(notes)
-
-
-# --------------------------------------------------------------------------------------------------
-# Reader of CSV and Parquet tables with named columns.
-
-_STATED_UNIT = re.compile(r"[\[(]\s*([^\[(\])]+?)\s*[\])]\s*$")  # at the end of a name
-
-
-def read_csv_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
-    """Read a table whose columns have the names of `ALL_COLUMNS`."""
-    content = read_table_file(file)
-    rows = content.rows.rename(columns=str)
-    lines = np.arange(len(rows)) + (1 if file.suffix == ".parquet" else 2)
-    rows = _rename_columns(file, rows, options)
-    if "t" not in rows:
-        raise ValueError(
-            f"{file.name} must have the column t (time, s), got {', '.join(map(str, rows))}."
-            f"{_similar('time', list(map(str, rows)))} Rename it with NAME.columns=t:NAME_IN_FILE."
-        )
-    incomplete = [name for group in SD_GROUPS for name in _incomplete(group, rows)]
-    names = [name for name in ALL_COLUMNS if name in rows and name not in incomplete]
-    values = {name: _numbers(file, rows[name], name, lines) for name in names}
-    unused = [str(name) for name in rows if name not in names]
-    notes = (f"columns not used: {', '.join(unused)}",) if unused else ()
-    if COVARIANCE_COLUMNS[0] in values and POSITION_SD[0] in values:
-        notes = (*notes, "the covariance is used in place of sd_pn, sd_pe and sd_pd")
-    time = values.pop("t")
-    origin = _stated_origin(content.stated)
-    table_notes = (*content.notes, *notes)
-    return [TrajectoryTable(file.name, time, values, lines, table_notes, origin=origin)]
-
-
-def _rename_columns(file: Path, rows: pd.DataFrame, options: SourceOptions) -> pd.DataFrame:
-    """Return the rows with the names of pfbench."""
-    for name, in_file in options.columns.items():
-        if in_file not in rows or name not in ALL_COLUMNS:
-            absent = in_file not in rows
-            wrong, choices = (in_file, map(str, rows)) if absent else (name, ALL_COLUMNS)
-            raise ValueError(
-                f"{file.name}: columns must exist, got {wrong}. Choose from {', '.join(choices)}. Write a name "
-                "with commas in quotes."
-            )
-    _check_stated_units(file, options)
-    used = options.columns.items()
-    hidden = [name for name in options.columns if name in rows]
-    rows = rows.drop(columns=[name for name in hidden if name not in options.columns.values()])
-    return rows.rename(columns={in_file: name for name, in_file in used})
-
-
-def _check_stated_units(file: Path, options: SourceOptions) -> None:
-    """Raise ValueError if names state other units, as time [ms], that no factor converts."""
-    factors: dict[str, float] = {}
-    for name, in_file in options.columns.items():
-        match = _STATED_UNIT.search(in_file)
-        stated = match[1] if match else ""
-        units = QUANTITIES[LIMIT_COLUMNS[name]].units if name in LIMIT_COLUMNS else {}
-        factor = units.get(ALIASES.get(stated, stated), 1.0)
-        if factor != 1 and name not in options.scale:
-            factors[name] = factor
-    if factors:
-        names = ", ".join(f"{name} from {options.columns[name]}" for name in factors)
-        word = ",".join(
-            f"{name}:{factor:.8g}" for name, factor in {**options.scale, **factors}.items()
-        )
-        raise ValueError(
-            f"{file.name}: columns must be in s, m, m/s and rad, latitude and longitude in deg, got {names}. "
-            f"Set NAME.scale={word}."
-        )
-
-
-def _stated_origin(stated: Mapping[str, str]) -> tuple[float, ...]:
-    """Return the origin that a Parquet file states in deg, deg, m, or an empty tuple."""
-    try:
-        return tuple(float(stated[f"origin_{name}"]) for name in GEODETIC)
-    except (KeyError, ValueError):
-        return ()
-
-
-def _incomplete(group: tuple[str, ...], rows: pd.DataFrame) -> list[str]:
-    """Return the columns of a group that lacks others."""
-    present = [name for name in group if name in rows]
-    return present if len(present) < len(group) else []
-
-
-def _numbers(file: Path, column: pd.Series, name: str, lines: np.ndarray) -> np.ndarray:
-    numbers = pd.to_numeric(column, errors="coerce").to_numpy(dtype=np.float64)
-    bad = np.isnan(numbers) & column.notna().to_numpy()
-    if bad.any():
-        row = int(bad.argmax())
-        raise ValueError(
-            f"{file.name}: line {lines[row]}, column {name} must be a number, got "
-            f"{str(column.iloc[row])[:40]!r}. Repair or remove this line."
-        )
-    return numbers
-
-
-def _similar(name: str, names: list[str]) -> str:
-    close = difflib.get_close_matches(name, names, 1, 0.5)
-    return f" Similar: {close[0]}." if close else ""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, QUANTITIES
+from pfbench.core.parameter_checks import require
+from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, QUANTITIES, Quantity
 from pfbench.logs.worlds.time_order import find_order_remedy
 from pfbench.stats.error_measures import Array
 
@@ -15,6 +16,7 @@ LOCAL = ("pn", "pe", "pd")
 GEODETIC = ("lat_deg", "lon_deg", "h_m")
 VELOCITY_COLUMNS = ("vn", "ve", "vd")
 ATTITUDE_COLUMNS = ("roll", "pitch", "yaw")
+IMU_COLUMNS = ("fx", "fy", "fz", "wx", "wy", "wz")
 POSITION_SD = ("sd_pn", "sd_pe", "sd_pd")
 VELOCITY_SD = ("sd_vn", "sd_ve", "sd_vd")
 ATTITUDE_SD = ("sd_roll", "sd_pitch", "sd_yaw")
@@ -38,8 +40,16 @@ COLUMN_GROUPS = (
 )
 SD_GROUPS = (POSITION_SD, VELOCITY_SD, ATTITUDE_SD)
 ALL_COLUMNS = ("t", *(name for group in COLUMN_GROUPS for name in group))
+TRAJECTORY = "trajectory"
+ROLES = {  # columns of a trajectory, and of the tables of an own log
+    TRAJECTORY: ALL_COLUMNS,
+    "imu": ("t", *IMU_COLUMNS),
+    "gnss": ("t", *GEODETIC, *LOCAL, *VELOCITY_COLUMNS, "fix"),
+    "reference": ("t", *GEODETIC, *LOCAL, *VELOCITY_COLUMNS, *ATTITUDE_COLUMNS),
+}
 _MOSTLY = 0.1  # share of the rows that are not removed for a column
-_SD_COLUMNS = {name for group in SD_GROUPS for name in group}
+_SD_COLUMNS = {"cov_nn", "cov_ee", "cov_dd", *(name for group in SD_GROUPS for name in group)}
+_UNCERTAINTY = Quantity("", float(np.nextafter(0.0, 1.0)), 1e12)
 
 
 @dataclass(frozen=True)
@@ -98,23 +108,24 @@ def check_trajectory(table: TrajectoryTable) -> TrajectoryTable:
 
     Returns the table.
     """
-    if len(table.time) < 2:
-        raise ValueError(
-            f"{table.file} must have at least 2 rows, got {len(table.time)}. Write the file again."
-        )
+    count = len(table.time)
+    require(count > 1, table.file, "have at least 2 rows", count, "Write the file again.")
     for group in COLUMN_GROUPS:
         present = [name for name in group if name in table.values]
-        if present and len(present) < len(group) and present != ["vn", "ve"]:
-            missing = ", ".join(name for name in group if name not in table.values)
-            raise ValueError(
-                f"{table.file}: columns {', '.join(group)} must be complete, got {', '.join(present)} "
-                f"without {missing}. Add the missing columns or rename all of the group."
-            )
-    if not (table.has(LOCAL) or table.has(GEODETIC)):
-        raise ValueError(
-            f"{table.file} must have the position columns pn, pe, pd or lat_deg, lon_deg, h_m, got "
-            f"{', '.join(table.values) or 'none'}. Rename columns with NAME.columns=pn:north,..."
+        require(
+            len(present) in (0, len(group)) or present == ["vn", "ve"],
+            f"{table.file}: columns {', '.join(group)}",
+            "be complete",
+            f"{', '.join(present)} without {', '.join(name for name in group if name not in present)}",
+            "Add the missing columns or rename all of the group.",
         )
+    require(
+        table.has(LOCAL) or table.has(GEODETIC),
+        table.file,
+        "have the position columns pn, pe, pd or lat_deg, lon_deg, h_m",
+        ", ".join(table.values) or "none",
+        "Rename columns with NAME.columns=pn:north,...",
+    )
     for name, value in (("t", table.time), *table.values.items()):
         _check_finite(table, name, value)
     _check_order(table)
@@ -130,18 +141,18 @@ def _place(table: TrajectoryTable, row: int, name: str) -> str:
 
 def _check_finite(table: TrajectoryTable, name: str, value: Array) -> None:
     bad = ~np.isfinite(value)
-    if bad.any():
-        row = int(bad.argmax())
-        remedy = "Remove these rows or repair the column."
-        if bad.mean() > _MOSTLY:
-            needed = name in ("t", *LOCAL, *GEODETIC)
-            remedy = (
-                "Repair the column." if needed else "Remove or rename the columns of its group."
-            )
-        raise ValueError(
-            f"{_place(table, row, name)} must be a finite number, got {value[row]} (in "
-            f"{int(bad.sum())} of {len(value)} rows). {remedy}"
-        )
+    row, count = int(bad.argmax()), int(bad.sum())
+    remedy = "Remove these rows or repair the column."
+    if count > _MOSTLY * len(value):
+        needed = name in ("t", *LOCAL, *GEODETIC)
+        remedy = "Repair the column." if needed else "Remove or rename the columns of its group."
+    require(
+        not count,
+        _place(table, row, name),
+        "be a finite number",
+        f"{value[row]} (in {count} of {len(value)} rows)",
+        remedy,
+    )
 
 
 def _check_order(table: TrajectoryTable) -> None:
@@ -157,53 +168,49 @@ def _check_order(table: TrajectoryTable) -> None:
 
 
 def _check_range(table: TrajectoryTable, name: str, value: Array) -> None:
-    for least, largest, unit, hint in _ranges(name):
-        bad = (value < least) | (value > largest)
-        if bad.any():
-            row = int(bad.argmax())
-            limits = (
-                f"from {least:g} to {largest:g} {unit}" if unit else f"above 0, at most {largest:g}"
-            )
-            raise ValueError(
-                f"{_place(table, row, name)} must be {limits}, got "
-                f"{value[row]:.10g}. {_unit_remedy(name, value, hint)}"
-            )
-
-
-def _unit_remedy(name: str, value: Array, hint: str) -> str:
-    """Return the options for factors of units that bring all values into their range."""
-    units = QUANTITIES[LIMIT_COLUMNS[name]].units if name in LIMIT_COLUMNS else {}
+    quantity = _quantity_of(name)
+    least, largest = quantity.least, quantity.largest
+    bad = (value < least) | (value > largest)
+    row = int(bad.argmax())
     options = [
         f"if in {unit}, set NAME.scale={name}:{factor:.8g}"
-        for unit, factor in units.items()
-        for least, largest, _, _ in _ranges(name)
+        for unit, factor in quantity.units.items()
         if least <= (factor * value).min() and (factor * value).max() <= largest
     ]
-    return (
-        f"I{'; '.join(options)[1:]}."
-        if options
-        else hint or "Check the unit and the order of the columns."
+    remedy = (
+        f"I{'; '.join(options)[1:]}." if options else "Check the unit and the order of the columns."
     )
+    must = f"be from {least:g} to {largest:g} {quantity.unit}"
+    if quantity is _UNCERTAINTY:
+        must, remedy = (
+            f"be above 0, at most {largest:g}",
+            "Remove the uncertainty columns or repair them.",
+        )
+    require(not bad[row], _place(table, row, name), must, f"{value[row]:.10g}", remedy)
 
 
-def _ranges(name: str) -> Iterator[tuple[float, float, str, str]]:
-    if name in _SD_COLUMNS or name in ("cov_nn", "cov_ee", "cov_dd"):
-        yield np.nextafter(0.0, 1.0), 1e12, "", "Remove the uncertainty columns or repair them."
-    elif name in LIMIT_COLUMNS:
-        quantity = QUANTITIES[LIMIT_COLUMNS[name]]
-        yield quantity.least, quantity.largest, quantity.unit, ""
+def _quantity_of(name: str) -> Quantity:
+    """Return the range of a column; without limits for one that has none."""
+    if name in _SD_COLUMNS:
+        return _UNCERTAINTY
+    return (
+        QUANTITIES[LIMIT_COLUMNS[name]] if name in LIMIT_COLUMNS else Quantity("", -np.inf, np.inf)
+    )
 
 
 def _check_covariance(table: TrajectoryTable) -> None:
     if not table.has(COVARIANCE_COLUMNS):
         return
     least = np.linalg.eigvalsh(covariance_matrices(table.select(COVARIANCE_COLUMNS)))[:, 0]
-    if (least <= 0).any():
-        row = int((least <= 0).argmax())
-        raise ValueError(
-            f"{_place(table, row, 'cov_nn ... cov_dd')} must be a positive definite matrix, got the "
-            f"least eigenvalue {least[row]:.3g} m^2. Repair the columns or remove them."
-        )
+    row = int(least.argmin())
+    got, remedy = f"the least eigenvalue {least[row]:.3g} m^2", "Repair the columns or remove them."
+    require(
+        least[row] > 0,
+        _place(table, row, "cov_nn ... cov_dd"),
+        "be a positive definite matrix",
+        got,
+        remedy,
+    )
 
 
 def covariance_matrices(entries: Array) -> Array:
@@ -243,17 +250,6 @@ def _earth_fixed(geodetic: Array) -> Array:
     normal = SEMI_MAJOR / np.sqrt(1 - ECCENTRICITY_2 * np.sin(lat) ** 2)
     x, y = (normal + h) * np.cos(lat) * np.cos(lon), (normal + h) * np.cos(lat) * np.sin(lon)
     return np.stack([x, y, (normal * (1 - ECCENTRICITY_2) + h) * np.sin(lat)], axis=-1)
-
-
-def rotation_from_quaternion(q: Array) -> Array:
-    """Return the rotation matrices [T, 3, 3] of unit quaternions (x, y, z, w), [T, 4]."""
-    x, y, z, w = (q / np.linalg.norm(q, axis=-1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 def euler_angles(rotation: Array) -> Array:

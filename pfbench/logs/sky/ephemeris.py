@@ -294,8 +294,7 @@ def _records(
             end -= 1
         try:
             prn = lines[begin][version - 2 : indent].strip()
-            if not (prn.isascii() and prn.isdigit()):
-                raise ValueError(f"it must begin with a satellite, got {prn!r}")
+            require(prn.isascii() and prn.isdigit(), "it", "begin with a satellite", f"{prn!r}")
             if end - begin != _RECORD_LINES:
                 raise ValueError(f"it must have {_RECORD_LINES} lines, got {end - begin}")
             record = _parse_record(lines[begin:end], system, version)
@@ -358,6 +357,5 @@ def parse_date(fields: Sequence[str]) -> float:
     if year < 100:
         year += 1900 if year >= 80 else 2000
     second = float(fields[5])
-    if not 0.0 <= second < 60.0:
-        raise ValueError(f"the second must be at least 0 and less than 60, got {second:g}")
+    require(0.0 <= second < 60.0, "the second", "be at least 0 and less than 60", f"{second:g}")
     return (datetime(year, month, day, hour, minute) - EPOCH).total_seconds() + second

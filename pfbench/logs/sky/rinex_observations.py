@@ -50,18 +50,19 @@ def read_observations(file: Path, signals: Mapping[str, Sequence[str]]) -> Obser
     check_version(file.name, lines[0] if lines else "")
     header = _read_header(file.name, lines)
     codes_in_use = {
-        s: _choose(header.types[s], codes) for s, codes in signals.items() if s in header.types
+        s: next((code for code in codes if f"C{code}" in header.types[s]), "")
+        for s, codes in signals.items()
+        if s in header.types
     }
     codes_in_use = {system: code for system, code in codes_in_use.items() if code}
     readable = ", ".join(f"C{code} of {s}" for s, codes in signals.items() for code in codes)
     have = "; ".join(f"{s} {' '.join(types)}" for s, types in header.types.items())
-    remedy = "Record these signals, or name others on 1575.42 MHz in scenario.rinex.signals."
     require(
         codes_in_use,
         f"{file.name}: the types of observations",
         f"include {readable}",
         have or "none",
-        remedy,
+        "Record these signals, or name others on 1575.42 MHz in scenario.rinex.signals.",
     )
     columns = {
         s: [_find(header.types[s], kind + code) for kind in "CDS"]
@@ -110,13 +111,19 @@ def check_version(name: str, first: str) -> None:
         "one in Hatanaka's compression",
         f"Unpack it with crx2rnx: crx2rnx {name}",
     )
-    is_rinex = "RINEX VERSION" in first
-    require(is_rinex, name, must, f"first line {first[:60]!r}", "Choose another file.")
+    require(
+        "RINEX VERSION" in first, name, must, f"first line {first[:60]!r}", "Choose another file."
+    )
     version, kind = first[:9].strip(), first[20:21]
     got = f"a file of RINEX {version}, type {kind!r}"
     require(kind == "O", name, must, got, "Choose the observation file, type O, of this receiver.")
-    remedy = "Let the receiver's program write RINEX 3, or convert it, for example by gfzrnx -vo 3."
-    require(version[:1] == "3", name, must, got, remedy)
+    require(
+        version[:1] == "3",
+        name,
+        must,
+        got,
+        "Let the receiver's program write RINEX 3, or convert it, for example by gfzrnx -vo 3.",
+    )
 
 
 def _read_header(name: str, lines: Sequence[str]) -> _Header:
@@ -137,20 +144,14 @@ def _read_header(name: str, lines: Sequence[str]) -> _Header:
             scale, remedy = line[48:51].strip(), "Write the file with GPS time."
             require(scale in _SCALES, f"{name}: the times", "be GPS time", scale, remedy)
         elif label == "SYS / SCALE FACTOR":
-            is_one = line[2:6].strip() in ("", "0", "1")
             require(
-                is_one,
+                line[2:6].strip() in ("", "0", "1"),
                 f"{name}: SYS / SCALE FACTOR",
                 "be 1",
                 line[2:6].strip(),
                 "Write the file without scale factors.",
             )
     raise ValueError(f"{name} must have a line END OF HEADER, got none. Write the file again.")
-
-
-def _choose(types: Sequence[str], codes: Sequence[str]) -> str:
-    """Return the first code whose range the types include, or an empty text."""
-    return next((code for code in codes if f"C{code}" in types), "")
 
 
 def _find(types: Sequence[str], kind: str) -> int | None:

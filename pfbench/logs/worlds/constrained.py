@@ -41,10 +41,13 @@ class ConstrainedDrive(RecordedDrive):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        is_read = (self.odometer is None) == (self.constraints.odometer_sd is None)
-        must = "be null without, and a source of speeds with, constraints.odometer_sd"
-        remedy = "Set both, or none: scenario.odometer._target_=pfbench.scenario.RecordedOdometer"
-        require(is_read, "scenario.odometer", must, self.odometer, remedy)
+        require(
+            (self.odometer is None) == (self.constraints.odometer_sd is None),
+            "scenario.odometer",
+            "be null without, and a source of speeds with, constraints.odometer_sd",
+            self.odometer,
+            "Set both, or none: scenario.odometer._target_=pfbench.scenario.RecordedOdometer",
+        )
 
     @property
     @override
@@ -60,7 +63,7 @@ class ConstrainedDrive(RecordedDrive):
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
         folder = find_dataset(self.root, self.folder)
-        log = self._read_log(folder)
+        log = self.read_checked(folder)
         leg = self.resample(log)
         episode = self.over(leg, noise, runs, seed)
         extra, notes = self._observe_standing(log, leg)

@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.table_file import Array
 from pfbench.logs.doctor.axis_orders import CONVENTIONS, convert_angles, parse_axes
 from pfbench.logs.doctor.bad_samples import find_bad_samples, find_stuck
 from pfbench.logs.doctor.fix_checks import find_frozen, find_jumps
-from pfbench.logs.doctor.raw_log import RawImu
 from pfbench.logs.worlds.imu_gaps import CUT, cut_longest
 from pfbench.logs.worlds.log_tables import (
     GnssLog,
@@ -83,19 +83,17 @@ class LogCorrections:
     lever_arm: Vector = None
 
     def __post_init__(self) -> None:
-        for key in ("times", "scale", "bias", "shift_s", "mounting", "level_axes"):
-            _check_mapping(key, getattr(self, key) or {}, "by name")
         for key, allowed in (
             ("times", _TABLES), ("scale", _TABLES), ("bias", _TABLES), ("shift_s", _TABLES),
             ("mounting", tuple(_SENSORS)), ("level_axes", tuple(_LEVEL)),
         ):  # fmt: skip
+            _check_mapping(key, getattr(self, key) or {}, "by name")
             _check_names(key, getattr(self, key) or {}, allowed)
-        _check_names("drop", self.drop or (), _DROPS)
-        for value in (self.times or {}).values():
-            _check_names("times", (value,), _TIMES)
-        _check_names("gaps", (self.gaps,), CUT)
-        if self.attitude is not None:
-            _check_names("attitude", (self.attitude,), tuple(CONVENTIONS))
+        for key, names, allowed in (
+            ("drop", self.drop or (), _DROPS), ("times", [*(self.times or {}).values()], _TIMES), ("gaps", (self.gaps,), CUT),
+            ("attitude", () if self.attitude is None else (self.attitude,), tuple(CONVENTIONS)),
+        ):  # fmt: skip
+            _check_names(key, names, allowed)
         for sensor, axes in (self.mounting or {}).items():
             _mounting_matrix(sensor, axes)
         for frame, axes in (self.level_axes or {}).items():
@@ -138,8 +136,9 @@ class LogCorrections:
     def _correct_columns(self, tables: Tables, notes: list[str]) -> None:
         """Apply factors, axes, convention and biases to the columns."""
         for name, factors in (self.scale or {}).items():
-            for column, factor in factors.items():
-                tables[name] = _apply(tables[name], (column,), lambda v, a=factor: a * v)
+            tables[name] = _apply(
+                tables[name], tuple(factors), lambda v, a=factors: v * [*a.values()]
+            )
             notes.append(f"{tables[name].name}: columns multiplied by {dict(factors)}")
         for sensor, axes in (self.mounting or {}).items():
             matrix = _mounting_matrix(sensor, axes)
@@ -166,8 +165,9 @@ class LogCorrections:
                 f"{tables['reference'].name}: attitude converted, since {CONVENTIONS[name][0]}"
             )
         for name, values in (self.bias or {}).items():
-            for column, value in values.items():
-                tables[name] = _apply(tables[name], (column,), lambda v, b=value: v - b)
+            tables[name] = _apply(
+                tables[name], tuple(values), lambda v, b=values: v - [*b.values()]
+            )
             notes.append(f"{tables[name].name}: {dict(values)} subtracted")
 
     def correct_fixes(self, fixes: GnssLog, reference: ReferenceLog | None, name: str) -> tuple[GnssLog, tuple[str, ...]]:  # fmt: skip
@@ -230,7 +230,7 @@ def _apply(table: LogTable, columns: Sequence[str], change: Any) -> LogTable:
             f"scenario.corrections must name columns of {table.name}, got {missing[0]}. "
             f"It has {', '.join(map(str, table.rows.columns))}."
         )
-    values = change(np.stack([convert_column(table, column) for column in columns], -1))
+    values = change(np.array([convert_column(table, column) for column in columns]).T)
     rows = table.rows.assign(**dict(zip(columns, np.asarray(values).T, strict=True)))
     return table._replace(rows=rows)
 
@@ -304,8 +304,7 @@ def _drop_samples(table: LogTable, drop: Sequence[str], notes: list[str]) -> Log
         )
     rows = table.rows.assign(**samples)
     if "stuck" in drop:
-        force, rate = (np.stack([samples[c] for c in group], -1) for group in (_FORCE, _RATE))
-        first, last = find_stuck(RawImu(time, force, rate, np.arange(len(time))))
+        first, last = find_stuck(np.stack([samples[c] for c in (*_FORCE, *_RATE)], -1))
         rows = pd.concat([rows.iloc[: first + 1], rows.iloc[last + 1 :]]).reset_index(drop=True)
         notes.append(f"{table.name}: {last - first} rows with equal samples left out")
     return table._replace(rows=rows)
@@ -319,36 +318,47 @@ def _check_names(
     key: str, names: Sequence[str] | Mapping[str, Any], allowed: Sequence[str]
 ) -> None:
     for name in [names] if isinstance(names, str) else names:
-        if name not in allowed:
-            raise ValueError(
-                f"scenario.corrections.{key} must be of {', '.join(allowed)}, got {name!r}. Choose one of these."
-            )
+        require(
+            name in allowed,
+            f"scenario.corrections.{key}",
+            f"be of {', '.join(allowed)}",
+            f"{name!r}",
+            "Choose one of these.",
+        )
 
 
 def _check_vector(key: str, value: Vector) -> None:
-    if value is not None and not (len(value) == 3 and np.isfinite(np.array(value, float)).all()):
-        raise ValueError(
-            f"scenario.corrections.{key} must be 3 finite numbers in m, got {list(value)}. Set null for none."
-        )
+    require(
+        value is None or (len(value) == 3 and np.isfinite(np.array(value, float)).all()),
+        f"scenario.corrections.{key}",
+        "be 3 finite numbers in m",
+        value,
+        "Set null for none.",
+    )
 
 
 def _check_mapping(key: str, values: Any, kind: str) -> None:
-    if not isinstance(values, Mapping):
-        raise ValueError(
-            f"scenario.corrections.{key} must be values {kind}, got {values}. Set {{NAME: {values}}}."
-        )
+    require(
+        isinstance(values, Mapping),
+        f"scenario.corrections.{key}",
+        f"be values {kind}",
+        values,
+        f"Set {{NAME: {values}}}.",
+    )
 
 
 def _check_columns(key: str, values: Mapping[str, float]) -> None:
     _check_mapping(key, values, "by column")
     for column, value in values.items():
-        if not (isinstance(value, int | float) and np.isfinite(value)) or (
-            key.startswith("scale") and value == 0
-        ):
-            raise ValueError(
-                f"scenario.corrections.{key}.{column} must be a finite number, and a factor not 0, got {value}. "
-                "Set a number."
-            )
+        require(
+            isinstance(value, int | float)
+            and np.isfinite(value)
+            and (value != 0 or not key.startswith("scale")),
+            f"scenario.corrections.{key}.{column}",
+            "be a finite number, and a factor not 0",
+            value,
+            "Set a number.",
+        )
 
 
 def _numbers(values: Sequence[Any]) -> Array | None:
@@ -387,15 +397,19 @@ def _level_matrix(frame: str, axes: Sequence[str | float]) -> Array:
 def _nodes_of(table: str, shift: float | Sequence[Sequence[float]]) -> tuple[Array, Array]:
     """Return times and delays of the nodes of a clock, [k]."""
     pairs = [[0.0, shift]] if isinstance(shift, int | float) else [list(pair) for pair in shift]
-    if not pairs or any(len(pair) != 2 for pair in pairs):
-        raise ValueError(
-            f"scenario.corrections.shift_s.{table} must be a number in s, or nodes [[t, delay], ...], got {shift}. "
-            "Set the delay of the clock."
-        )
+    require(
+        pairs and all(len(pair) == 2 for pair in pairs),
+        f"scenario.corrections.shift_s.{table}",
+        "be a number in s, or nodes [[t, delay], ...]",
+        shift,
+        "Set the delay of the clock.",
+    )
     nodes, delays = np.array(pairs, float).T
-    if not np.isfinite(delays).all() or (np.diff(nodes) <= 0.0).any():
-        raise ValueError(
-            f"scenario.corrections.shift_s.{table} must have increasing times and finite delays, got {pairs}. "
-            "Sort the nodes."
-        )
+    require(
+        np.isfinite(delays).all() and (np.diff(nodes) > 0.0).all(),
+        f"scenario.corrections.shift_s.{table}",
+        "have increasing times and finite delays",
+        pairs,
+        "Sort the nodes.",
+    )
     return nodes, delays

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels
 from pfbench.files.reader_notes import announce_notes
@@ -53,44 +55,81 @@ from pfbench.scenario.base import Scenario, check_added_sd, check_duration
 
 
 @dataclass(frozen=True)
-class RecordedDrive(Scenario):
-    """One recorded log. Runs differ in receiver errors and initial errors.
-
-    Times of an episode are those of the log.
+class RecordedScenario(Scenario):
+    """Recorded IMU, fixes and reference on filter steps.
 
     Attributes:
         root: Folder of all data sets (configuration key data.root).
         folder: Folder of the log in `root`.
         tuning: Parameters that the filter assumes. The initial errors of the runs have the assumed
             distribution.
-        receiver: Selection of fixes, and standard deviations of added errors.
+        receiver: Selection of measurements, and standard deviations of added errors.
         filter_step_s: Longest filter interval, s.
-        start_s: Start, s of the log. None for the start of the data common to all tables.
-        end_s: End, s of the log. None for the end of the data common to all tables.
         files: Names of the tables.
         origin: lat_deg, lon_deg, h_m of the local frame. None if the files contain it.
         limits: Limits of the platform for the checks of the log. None for the default limits.
-        holdout: Selection of withheld fixes, which are the truth instead of the reference. None
-            withholds no fixes.
         fix_codes: Meaning of the column `fix` of the fixes, see `read_log`.
 
     Raises:
-        ValueError: If a step, an interval or the threshold is not positive. `draw` raises it for a
-            missing root or folder, an invalid log, or a run without withheld fixes.
+        ValueError: If the step is not positive. `draw` raises it for a missing root or folder, and an invalid log.
     """
 
     root: str | None
     folder: str
-    tuning: StrapdownTuning
-    receiver: FixReceiver = field(default_factory=FixReceiver)
+    tuning: Any
+    receiver: Any = field(default_factory=FixReceiver)
     filter_step_s: float = 0.25
-    start_s: float | None = None
-    end_s: float | None = None
     files: LogFiles = field(default_factory=LogFiles)
     origin: Sequence[float] | None = None
     limits: PlausibleLimits | None = None
-    holdout: FixHoldout | None = None
     fix_codes: FixCodes = None
+
+    def __post_init__(self) -> None:
+        check_duration("scenario.filter_step_s", self.filter_step_s)
+        check_fix_codes(self.fix_codes)
+
+    def input_files(self) -> list[Path]:
+        """List the files that `draw` reads."""
+        return list_tables(self.root, self.folder, astuple(self.files))
+
+    def read_checked(self, folder: Path, **select: Any) -> NavigationLog:
+        """Read and check the log in a folder.
+
+        Args:
+            folder: Folder of the tables.
+            select: Other attributes of a source, such as the number of a flight.
+
+        Returns:
+            The log.
+        """
+        keys = ("files", "origin", "limits", "fix_codes")
+        return read_log(folder, **{key: getattr(self, key) for key in keys}, **select)
+
+
+@dataclass(frozen=True)
+class RecordedDrive(RecordedScenario):
+    """One recorded log. Runs differ in receiver errors and initial errors.
+
+    Times of an episode are those of the log. The other attributes are those of `RecordedScenario`.
+
+    Attributes:
+        tuning: Parameters that the filter assumes.
+        receiver: Selection of fixes, and standard deviations of added errors.
+        start_s: Start, s of the log. None for the start of the data common to all tables.
+        end_s: End, s of the log. None for the end of the data common to all tables.
+        holdout: Selection of withheld fixes, which are the truth instead of the reference. None
+            withholds no fixes.
+
+    Raises:
+        ValueError: If a step or an interval is not positive. `draw` raises it for a
+            missing root or folder, an invalid log, or a run without withheld fixes.
+    """
+
+    tuning: StrapdownTuning
+    receiver: FixReceiver = field(default_factory=FixReceiver)
+    start_s: float | None = None
+    end_s: float | None = None
+    holdout: FixHoldout | None = None
     input_type = PreintegratedImu
 
     @property
@@ -98,21 +137,13 @@ class RecordedDrive(Scenario):
         """Measured channels: those of the fixes."""
         return self.receiver.channel_names
 
-    def __post_init__(self) -> None:
-        check_duration("scenario.filter_step_s", self.filter_step_s)
-        check_fix_codes(self.fix_codes)
-
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
         return self.over(self.read(), noise, runs, seed)
 
-    def input_files(self) -> list[Path]:
-        """List the files that `draw` reads."""
-        return list_tables(self.root, self.folder, astuple(self.files))
-
     def read(self) -> ResampledLog:
         """Read the log and resample it to filter steps."""
-        return self.resample(self._read_log(find_dataset(self.root, self.folder)))
+        return self.resample(self.read_checked(find_dataset(self.root, self.folder)))
 
     def resample(self, log: NavigationLog) -> ResampledLog:
         """Resample a log to filter steps."""
@@ -126,16 +157,6 @@ class RecordedDrive(Scenario):
         )
         announce_notes(find_dataset(self.root, self.folder), leg.notes)
         return leg
-
-    def _read_log(self, folder: Path) -> NavigationLog:
-        """Read the log in a folder."""
-        return read_log(
-            folder,
-            self.files,
-            origin=self.origin,
-            limits=self.limits,
-            fix_codes=self.fix_codes,
-        )
 
     def over(self, leg: ResampledLog, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
         """Draw the errors of some runs over a resampled log.
@@ -157,44 +178,33 @@ class RecordedDrive(Scenario):
 
 
 @dataclass(frozen=True)
-class RecordedFlights(Scenario):
+class RecordedFlights(RecordedScenario):
     """Several flights of one data set as one batch.
 
     Run r is flight r modulo the number of flights, each time with new errors. Short flights are
     extended to the longest one, without motion, measurements and truth. Times are relative to the
-    start of each flight.
+    start of each flight. The other attributes are those of `RecordedScenario`.
 
     Attributes:
-        root: Folder of all data sets (configuration key data.root).
-        folder: Folder of the log in `root`.
-        tuning: Parameters that the filter assumes. The initial errors of the runs have the assumed
-            distribution.
+        tuning: Parameters that the filter assumes.
         receiver: Selection of fixes, and standard deviations of added errors.
         filter_step_s: Longest filter interval, s.
+        files: Names of the tables.
         flights: Numbers of the flights in the column `path`.
         imu_index: Number of the sensor in the column `imu`. `tuning` contains its nominal biases.
-        files: Names of the tables.
-        origin: lat_deg, lon_deg, h_m of the local frame. None if the files contain it.
-        limits: Limits of the platform for the checks of the log. None for the default limits.
-        fix_codes: Meaning of the column `fix` of the fixes, see `read_log`.
 
     Raises:
-        ValueError: If the step or the threshold is not positive, or no flight is selected. `draw`
+        ValueError: If the step is not positive, or no flight is selected. `draw`
             raises it for a missing root or folder, an invalid log, or flights with different fix
             times.
     """
 
-    root: str | None
-    folder: str
     tuning: StrapdownTuning
     receiver: FixReceiver = field(default_factory=lambda: FixReceiver(position_sd=(1.0, 1.0, 1.0)))
     filter_step_s: float = 0.2
+    files: LogFiles = field(default_factory=lambda: LogFiles(gnss="reference"))
     flights: Sequence[int] = tuple(range(1, 21))
     imu_index: int = 1
-    files: LogFiles = field(default_factory=lambda: LogFiles(gnss="reference"))
-    origin: Sequence[float] | None = None
-    limits: PlausibleLimits | None = None
-    fix_codes: FixCodes = None
     input_type = PreintegratedImu
 
     @property
@@ -203,14 +213,8 @@ class RecordedFlights(Scenario):
         return self.receiver.channel_names
 
     def __post_init__(self) -> None:
-        check_duration("scenario.filter_step_s", self.filter_step_s)
-        check_fix_codes(self.fix_codes)
-        if not self.flights:
-            raise ValueError("scenario.flights must not be empty, got []. Select a flight.")
-
-    def input_files(self) -> list[Path]:
-        """List the files that `draw` reads."""
-        return list_tables(self.root, self.folder, astuple(self.files))
+        super().__post_init__()
+        require(self.flights, "scenario.flights", "not be empty", "[]", "Select a flight.")
 
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
@@ -220,18 +224,7 @@ class RecordedFlights(Scenario):
         )
         # only flights of the requested runs are read
         used = torch.unique(runs % len(self.flights)).tolist()
-        logs = [
-            read_log(
-                folder,
-                self.files,
-                path=self.flights[i],
-                imu=self.imu_index,
-                origin=self.origin,
-                limits=self.limits,
-                fix_codes=self.fix_codes,
-            )
-            for i in used
-        ]
+        logs = [self.read_checked(folder, path=self.flights[i], imu=self.imu_index) for i in used]
         legs = [
             resample_log(log, self.receiver.fix_interval_s, self.filter_step_s, velocity)
             for log in logs
@@ -242,11 +235,14 @@ class RecordedFlights(Scenario):
             same = np.allclose(
                 leg.since_start, longest.since_start[:n], rtol=0.0, atol=TIME_TOLERANCE
             )
-            if not same or not np.array_equal(leg.fix_steps, longest.fix_steps[:n]):
-                raise ValueError(
-                    "scenario.flights must have equal fix times, "
-                    f"got different times in flight {self.flights[i]} of {folder}. Remove this flight."
-                )
+            same = same and np.array_equal(leg.fix_steps, longest.fix_steps[:n])
+            require(
+                same,
+                "scenario.flights",
+                "have equal fix times",
+                f"different times in flight {self.flights[i]} of {folder}",
+                "Remove this flight.",
+            )
         log_index = torch.searchsorted(torch.tensor(used), runs % len(self.flights))
         return assemble(
             legs,
@@ -287,11 +283,13 @@ class BaroMagSensors:
     magnetic_sd: float = 0.0
 
     def __post_init__(self) -> None:
-        if len(self.hard_iron) != 3:
-            raise ValueError(
-                "scenario.instruments.hard_iron must have 3 numbers, "
-                f"got {list(self.hard_iron)}. Set forward, right and down in gauss."
-            )
+        require(
+            len(self.hard_iron) == 3,
+            "scenario.instruments.hard_iron",
+            "have 3 numbers",
+            list(self.hard_iron),
+            "Set forward, right and down in gauss.",
+        )
         for name, sd in (("height_sd", self.height_sd), ("magnetic_sd", self.magnetic_sd)):
             check_added_sd(f"scenario.instruments.{name}", sd)
 
@@ -429,14 +427,8 @@ class FixHoldout:
     shift_between_runs: bool = True
 
     def __post_init__(self) -> None:
-        for name, count in (
-            ("used_fixes", self.used_fixes),
-            ("withheld_fixes", self.withheld_fixes),
-        ):
-            if count < 1:
-                raise ValueError(
-                    f"scenario.holdout.{name} must be at least 1, got {count}. Increase it."
-                )
+        rule = "[1, inf] Increase it."
+        require_ranges("scenario.holdout", self, used_fixes=rule, withheld_fixes=rule)
 
     def select(self, fix_mask: Tensor, time: Tensor, runs: Tensor) -> Tensor:
         """Select the steps that end on a withheld fix.
@@ -501,12 +493,13 @@ class FixHoldout:
         withheld_mask = self.select(
             torch.from_numpy(leg.fix_steps) & ~torch.isnan(recorded[:, 0]), episode.time, runs
         )
-        if not bool(withheld_mask.any(1).all()):
-            raise ValueError(
-                "scenario.holdout must withhold a fix in each run between "
-                f"t = {leg.time[0]:.3f} and {leg.time[-1]:.3f}, got {self}. "
-                "Start earlier or withhold more fixes."
-            )
+        require(
+            withheld_mask.any(1).all(),
+            "scenario.holdout",
+            f"withhold a fix in each run between t = {leg.time[0]:.3f} and {leg.time[-1]:.3f}",
+            self,
+            "Start earlier or withhold more fixes.",
+        )
         count, withheld_mask = int(withheld_mask[0].sum()), withheld_mask.unsqueeze(-1)
         position, velocity = (
             torch.where(withheld_mask, values, torch.nan) for values in recorded.split(3, -1)

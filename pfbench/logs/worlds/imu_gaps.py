@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pfbench.files.table_file import Array
@@ -55,6 +57,28 @@ def _bridge(samples: Array, i: int, share: Array) -> Array:
     return np.asarray(line + noise[np.arange(len(share)) % len(noise)])
 
 
+class LongestPart(NamedTuple):
+    """First and last row of the part between gaps that covers the longest time, and the number of parts."""
+
+    first: int
+    last: int
+    parts: int
+
+
+def find_longest(time: Array) -> LongestPart:
+    """Find the longest part between gaps that are too long to bridge. Shapes: time [n]."""
+    is_gap = np.diff(time) > longest_bridge(time)
+    borders = np.concatenate([[0], np.flatnonzero(is_gap) + 1, [len(time)]])
+    first, last = borders[:-1], borders[1:] - 1
+    i = int(np.argmax(time[last] - time[first]))
+    return LongestPart(int(first[i]), int(last[i]), len(first))
+
+
+def longest_bridge(time: Array) -> float:
+    """Return the longest interval that is bridged, s."""
+    return max(LONGEST_BRIDGE, GAP_SAMPLES * float(np.median(np.diff(time))))
+
+
 def cut_longest(table: LogTable, time: Array) -> tuple[LogTable, tuple[str, ...]]:
     """Keep the rows between two gaps that cover the longest time.
 
@@ -65,16 +89,11 @@ def cut_longest(table: LogTable, time: Array) -> tuple[LogTable, tuple[str, ...]
     Returns:
         The rows, and a note.
     """
-    step = np.diff(time)
-    longest = max(LONGEST_BRIDGE, GAP_SAMPLES * float(np.median(step)))
-    borders = np.concatenate([[0], np.flatnonzero(step > longest) + 1, [len(time)]])
-    if len(borders) == 2:
+    a, b, count = find_longest(time)
+    if count == 1:
         return table, ()
-    first, last = borders[:-1], borders[1:] - 1
-    i = int(np.argmax(time[last] - time[first]))
-    a, b = int(first[i]), int(last[i])
     note = (
-        f"{table.name}: the longest of {len(first)} parts between gaps of more than {longest:.3g} s is used, "
+        f"{table.name}: the longest of {count} parts between gaps of more than {longest_bridge(time):.3g} s is used, "
         f"t = {time[a]:.3f} to {time[b]:.3f}, as scenario.corrections.gaps states"
     )
     return table._replace(rows=table.rows.iloc[a : b + 1].reset_index(drop=True)), (note,)

@@ -1,4 +1,4 @@
-"""Agreement of IMU, fixes and reference of a log.
+"""Agreement of IMU, fixes, wheels, satellites and reference of a log.
 
 A difference that no sensor can explain is an error. A smaller one, which can be a measurement error,
 stays in the data, and a note names its largest row. The file is long since all pairs of tables share
@@ -8,7 +8,7 @@ one rule for notes and errors.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +16,13 @@ import torch
 from numpy.typing import NDArray
 
 from pfbench.core import chart
+from pfbench.core.parameter_checks import require
 from pfbench.logs.doctor.raw_log import RawReference
 from pfbench.logs.doctor.reference_checks import check_reference, drop_wrong_rows
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
+from pfbench.logs.units import DEGREE
 from pfbench.logs.worlds.dead_reckoning import integrate_windows
+from pfbench.logs.worlds.log_frames import GEODETIC_COLUMNS
 from pfbench.logs.worlds.log_tables import (
     Array,
     GnssLog,
@@ -30,12 +33,15 @@ from pfbench.logs.worlds.log_tables import (
     swap_frd_rfu,
 )
 from pfbench.logs.worlds.time_grid import interpolate
-from pfbench.nav import attitude
+from pfbench.nav import attitude, earth
 
 _FIX_LIMITS = (2e3, 5e3, 1e4, 2e4, 5e4, 1e5)  # m; offered limits of the error of a fix
 _WINDOW = 1.0  # s; IMU and reference are compared over windows of about this length
 _STEADY = 2.0  # m/s; least speed at which the track turns as the car
 _FEWEST = 5  # fixes with a median
+_GEOCENTRIC = ("x", "y", "z")
+_BRAKING, _SLOW = 10.0, 1.0  # m/s^2, hard braking on a road; m/s, noise of the wheels about zero
+_LONGEST = 5.0  # s between compared epochs of satellites
 _STRAIGHT = 1.5  # s; longest interval over which the velocity is taken as linear
 
 
@@ -47,12 +53,14 @@ class Agreement(NamedTuple):
         unit: Unit.
         noted: Difference beyond which a note names the row.
         largest: Difference beyond which the log is rejected.
+        remedy: What to do then.
     """
 
     quantity: str
     unit: str
     noted: float
     largest: float
+    remedy: str = "Correct this row, or check units, axes and clocks."
 
 
 MOTION = Agreement("position change and integrated velocity of the reference", "m", 2.0, 200.0)
@@ -63,6 +71,38 @@ FIX_OFFSET = Agreement("median of the fixes and of the reference along an axis",
 FIX_VELOCITY = Agreement("velocity of a fix and of the reference", "m/s", 5.0, math.inf)
 WHEELS = Agreement("wheel speed and speed of the reference", "m/s", 3.0, 50.0)
 YAW_RATE = Agreement("yaw rate and turn of the track", "rad/s", 1.0, 10.0)
+_ROW = "Correct or remove this row."
+PLACE = Agreement(
+    "x, y, z and lat_deg, lon_deg, h_m as the same position",
+    "m",
+    1.0,
+    1.0,
+    "Correct the wrong columns, or remove x, y, z.",
+)
+LEAST_RADIUS, LARGEST_RADIUS = 2.2e7, 4.6e7  # m; perigee of E14 23.3e6, geostationary 42.2e6
+_HALF = 0.5 * (LARGEST_RADIUS - LEAST_RADIUS)
+ORBIT_RADIUS = Agreement(
+    f"distance of sx, sy, sz from the centre of the Earth and {LEAST_RADIUS + _HALF:g} m",
+    "m",
+    _HALF,
+    _HALF,
+    _ROW,
+)
+ORBIT_STEP = Agreement(
+    "position of a satellite and those of the neighbouring epochs", "m", 20.0, 20.0, _ROW
+)
+ORBIT_VELOCITY = Agreement(
+    "velocity of a satellite and change of its position", "m/s", 20.0, 20.0, _ROW
+)
+RANGE = Agreement(
+    "pseudorange and distance, without the common clock,",
+    "m",
+    200.0,
+    math.inf,
+    f"{_ROW[:-1]}, or set scenario.limits.fix_error_m.",
+)
+RATE = Agreement("range rate and motion, without the common clock,", "m/s", 20.0, 200.0, _ROW)
+DIRECTION = Agreement("az, el and the direction of the satellite", "degrees", 1.0, math.inf)
 COMMON_TIME = 2.0  # s at an end of a table that other tables do not cover, without a note
 
 
@@ -76,10 +116,14 @@ def compare_reference(table: LogTable, reference: ReferenceLog) -> tuple[str, ..
     velocity, position = swap_frd_rfu(reference.velocity), swap_frd_rfu(reference.position)
     raw = RawReference(reference.time, angles, velocity, position, np.arange(len(angles)))
     _, findings = check_reference(table.name, drop_wrong_rows(raw), {})
-    if findings:
-        raise ValueError(
-            f"the columns must agree: {findings[0].evidence}. Correct units, signs and order of the columns."
-        )
+    evidence = next((finding.evidence for finding in findings), "")
+    require(
+        not evidence,
+        "the columns",
+        "agree",
+        evidence,
+        "Correct units, signs and order of the columns.",
+    )
     return notes
 
 
@@ -91,7 +135,7 @@ def compare_velocities(table: LogTable, reference: ReferenceLog) -> tuple[str, .
     # the error of the straight line grows with the square of the interval
     slack = np.maximum(1.0, dt / _STRAIGHT) ** 2
     difference = np.linalg.norm(displacement - expected, axis=1) / slack
-    return _judge(MOTION, difference, table, np.arange(1, len(reference.time)))
+    return _judge_rows(MOTION, difference, table, np.arange(1, len(reference.time)))
 
 
 def compare_inertial(table: LogTable, imu: ImuLog, reference: ReferenceLog, gravity: float) -> tuple[str, ...]:  # fmt: skip
@@ -129,8 +173,8 @@ def _compare_windows(
     # errors of an unaided IMU grow with the window, which a gap of the reference extends
     scale = np.maximum(1.0, dt / _WINDOW)
     return (
-        *_judge(VELOCITY, np.linalg.norm(change - level, axis=1) / scale, table, nodes[1:]),
-        *_judge(ATTITUDE, angle.numpy() / scale, table, nodes[1:]),
+        *_judge_rows(VELOCITY, np.linalg.norm(change - level, axis=1) / scale, table, nodes[1:]),
+        *_judge_rows(ATTITUDE, angle.numpy() / scale, table, nodes[1:]),
     )
 
 
@@ -156,12 +200,13 @@ def compare_fixes(
     """Compare fixes with the reference, and outside of it with the previous fix; return notes."""
     is_wrong = _find_wrong(fixes, reference, limits.speed_m_s)
     wrong = is_wrong(limits.fix_error_m)
-    if wrong.any():
-        raise ValueError(
-            f"{table.name}: fixes must be at most {limits.fix_error_m:g} m from the reference and from neighbouring "
-            f"fixes at {limits.speed_m_s:g} m/s, got {_describe_first(table, fixes, reference, wrong)} "
-            f"({int(wrong.sum())} such rows). {_fix_remedy(fixes, wrong, is_wrong)}"
-        )
+    require(
+        not wrong.any(),
+        f"{table.name}: fixes",
+        f"be at most {limits.fix_error_m:g} m from the reference and from neighbouring fixes at {limits.speed_m_s:g} m/s",
+        f"{_describe_first(table, fixes, reference, wrong)} ({int(wrong.sum())} such rows)",
+        _fix_remedy(fixes, wrong, is_wrong),
+    )
     true, rows = interpolate(reference, fixes.time), np.arange(len(fixes.time))
     position_error, velocity_error = (
         np.nan_to_num(np.linalg.norm(measured - expected, axis=1))
@@ -169,8 +214,8 @@ def compare_fixes(
     )
     return (
         *_note_offset(table, fixes.position - true[:, 7:]),
-        *_judge(FIX, position_error, table, rows),
-        *_judge(FIX_VELOCITY, velocity_error, table, rows),
+        *_judge_rows(FIX, position_error, table, rows),
+        *_judge_rows(FIX_VELOCITY, velocity_error, table, rows),
     )
 
 
@@ -250,8 +295,8 @@ def compare_wheels(
     steady = np.minimum(true_speed[1:], true_speed[:-1]) > _STEADY
     off = np.where(steady, np.abs(turn - 0.5 * (yaw_rate[1:] + yaw_rate[:-1])), 0.0)
     return (
-        *_judge(WHEELS, np.abs(np.abs(speed) - true_speed), table, rows),
-        *_judge(YAW_RATE, off, table, rows[1:]),
+        *_judge_rows(WHEELS, np.abs(np.abs(speed) - true_speed), table, rows),
+        *_judge_rows(YAW_RATE, off, table, rows[1:]),
     )
 
 
@@ -294,23 +339,39 @@ def describe_missing_times(name: str, time: Array, steps: Array) -> tuple[str, .
     return tuple(notes)
 
 
-def _judge(agreement: Agreement, difference: Array, table: LogTable, rows: NDArray[np.intp]) -> tuple[str, ...]:  # fmt: skip
-    """Reject, note or accept differences [n] at rows [n] of a table."""
-    if not len(difference):
-        return ()
-    i = int(np.argmax(difference))
-    value = f"{difference[i]:.3g} {agreement.unit} at {table.row(int(rows[i]))}"
-    if not difference[i] <= agreement.largest:
-        raise ValueError(
-            f"{table.name}: {agreement.quantity} must agree to {agreement.largest:g} "
-            f"{agreement.unit}, got {value}. Correct this row, or check units, axes and clocks."
-        )
-    count = int((difference > agreement.noted).sum())
-    if not count:
+def check_geocentric(table: LogTable) -> None:
+    """Check that Earth-fixed and geodetic positions are the same, if a table has both."""
+    if not table.has(_GEOCENTRIC):
+        return
+    geodetic = parse_numbers(table, GEODETIC_COLUMNS) * [DEGREE, DEGREE, 1.0]
+    expected = earth.ecef(torch.from_numpy(geodetic)).numpy()
+    difference = np.linalg.norm(parse_numbers(table, _GEOCENTRIC) - expected, axis=1)
+    _judge_rows(PLACE, difference, table, np.arange(len(difference)))
+
+
+def check_wheel_direction(table: LogTable, time: Array, speed: Array) -> tuple[str, ...]:
+    """Check that the wheels stop before they reverse.
+
+    The reference velocity of a road vehicle does not show whether it moves backwards.
+
+    Returns a note if most of the drive is backwards. Shapes: time [T], speed [T].
+    """
+    change, largest = np.abs(np.diff(speed)), 2.0 * _SLOW + _BRAKING * np.diff(time)
+    wrong = (speed[1:] * speed[:-1] < 0.0) & (change > largest)
+    i = int(wrong.argmax())
+    column, remedy = f"{table.name}: column v_fwd", "Correct the sign or remove this row."
+    require(
+        not wrong[i],
+        column,
+        "change its sign near zero",
+        f"{speed[i + 1]:g} m/s after {speed[i]:g} m/s in {table.row(i + 1)} ({wrong.sum()} such rows)",
+        remedy,
+    )
+    moving, backwards = int((np.abs(speed) > _SLOW).sum()), int((speed < -_SLOW).sum())
+    if 2 * backwards <= moving:
         return ()
     return (
-        f"{table.name}: {agreement.quantity} differ by more than {agreement.noted:g} "
-        f"{agreement.unit} in {count} of {len(difference)} rows, at most {value}",
+        f"{table.name}: the wheels turn backwards in {backwards} of {moving} moving rows. Check the sign of v_fwd",
     )
 
 
@@ -319,15 +380,6 @@ def _judge(agreement: Agreement, difference: Array, table: LogTable, rows: NDArr
 #
 # A range can be off by a reflection, so it stays in the data up to the limit of a fix. A satellite
 # moves smoothly, so its positions must agree.
-
-LEAST_RADIUS, LARGEST_RADIUS = 2.2e7, 4.6e7  # m; perigee of E14 23.3e6, geostationary 42.2e6
-_LONGEST = 5.0  # s between compared epochs
-POSITION_NOISE = 20.0  # m; position against those of the neighbouring epochs
-VELOCITY_NOISE = 20.0  # m/s; velocity against the change of position
-RANGE_NOTE = 200.0  # m; range residual beyond which a note names the satellite
-RATE_NOTE, LARGEST_RATE = 20.0, 200.0  # m/s; residual of a range rate
-
-DIRECTION_NOTE = np.radians(1.0)
 
 
 def check_orbits(
@@ -341,26 +393,18 @@ def check_orbits(
         rows = np.flatnonzero(np.isfinite(position[:, s, 0]))
         p, t = position[rows, s], time[rows]
         radius = np.linalg.norm(p, axis=1)
-        wrong = np.flatnonzero((radius < LEAST_RADIUS) | (radius > LARGEST_RADIUS))
-        if wrong.size:
-            raise ValueError(
-                f"{name}: sx, sy, sz must be {LEAST_RADIUS:g} to {LARGEST_RADIUS:g} m from the "
-                f"centre of the Earth, got {radius[wrong[0]]:g} for {satellite} at "
-                f"t = {t[wrong[0]]:.3f}. Correct or remove this row."
-            )
+        off = np.abs(radius - 0.5 * (LEAST_RADIUS + LARGEST_RADIUS))
+        _judge(ORBIT_RADIUS, off, name, _sighting((satellite,), t))
         dt = np.diff(t)
         speed = np.diff(p, axis=0) / dt[:, None]
         # accelerations are below 1 m/s^2
         bend = np.linalg.norm(np.diff(speed, axis=0), axis=1) * np.minimum(dt[1:], dt[:-1])
         near = (dt[1:] <= _LONGEST) & (dt[:-1] <= _LONGEST)
-        _reject(name, satellite, t[1:-1][near], bend[near], POSITION_NOISE, "position jump", "m")
+        _judge(ORBIT_STEP, bend[near], name, _sighting((satellite,), t[1:-1][near]))
         if velocity is not None and len(t) > 1:
             mean = 0.5 * (velocity[rows, s][1:] + velocity[rows, s][:-1])
-            off = np.linalg.norm(mean - speed, axis=1)
-            near = dt <= _LONGEST
-            _reject(
-                name, satellite, t[1:][near], off[near], VELOCITY_NOISE, "velocity error", "m/s"
-            )
+            off, near = np.linalg.norm(mean - speed, axis=1), dt <= _LONGEST
+            _judge(ORBIT_VELOCITY, off[near], name, _sighting((satellite,), t[1:][near]))
 
 
 def compare_ranges(
@@ -370,14 +414,8 @@ def compare_ranges(
 
     Returns notes. Shapes: time [K], residual [K, S].
     """
-    return _judge_residuals(
-        f"{name}: pseudorange residual",
-        names,
-        time,
-        residual,
-        (RANGE_NOTE, limits.fix_error_m),
-        "m",
-    )
+    agreement = RANGE._replace(largest=limits.fix_error_m)
+    return _judge(agreement, _without_clocks(names, residual), name, _sighting(names, time))
 
 
 def compare_rates(
@@ -387,68 +425,65 @@ def compare_rates(
 
     Returns notes. Shapes: time [K], residual [K, S].
     """
-    return _judge_residuals(
-        f"{name}: range rate residual", names, time, residual, (RATE_NOTE, LARGEST_RATE), "m/s"
-    )
+    return _judge(RATE, _without_clocks(names, residual), name, _sighting(names, time))
 
 
 def compare_directions(
     name: str, names: tuple[str, ...], time: Array, azimuth: Array, elevation: Array
 ) -> tuple[str, ...]:
-    """Check recorded directions against those from the reference.
+    """Compare recorded directions with those from the reference.
 
-    Returns a note if a direction is off by more than a degree. Shapes: time [K], azimuth [K, S],
-    elevation [K, S].
+    Returns notes. Shapes: time [K], differences of azimuth and elevation [K, S].
     """
     # near the zenith the azimuth is free, and angles wrap
     off = np.nan_to_num(np.maximum(np.abs(np.sin(0.5 * azimuth)) * 2.0, np.abs(elevation)))
-    k, s = (int(i) for i in np.unravel_index(np.argmax(off), off.shape))
-    count = int((off > DIRECTION_NOTE).sum())
-    if not count:
-        return ()
-    return (
-        f"{name}: az and el differ from the direction of the satellite by more than 1 degree in "
-        f"{count} rows, at most {np.degrees(off[k, s]):.1f} for {names[s]} at t = {time[k]:.3f}",
-    )
+    return _judge(DIRECTION, np.degrees(off).ravel(), name, _sighting(names, time))
 
 
-def _judge_residuals(
-    label: str,
-    names: tuple[str, ...],
-    time: Array,
-    residual: Array,
-    thresholds: tuple[float, float],
-    unit: str,
-) -> tuple[str, ...]:
-    """Reject or note residuals without the median of each epoch and system."""
+def _sighting(names: Sequence[str], time: Array) -> Callable[[int], str]:
+    """Return a function that describes an entry of a flat array of epochs and satellites, [K * S]."""
+    return lambda i: f"{names[i % len(names)]} at t = {time[i // len(names)]:.3f}"
+
+
+def _without_clocks(names: Sequence[str], residual: Array) -> Array:
+    """Return the sizes of residuals [K, S] without the median of each epoch and system, [K * S]; 0 where there is none."""
     off = np.zeros_like(residual)
     for system in sorted({satellite[0] for satellite in names}):
         columns = [i for i, satellite in enumerate(names) if satellite[0] == system]
         group = residual[:, columns]
-        counts = np.isfinite(group).sum(1, keepdims=True)
-        clock = np.zeros(len(group))
-        some = counts[:, 0] > 0
-        clock[some] = np.nanmedian(group[some], axis=1)
         # the common clock of one satellite alone is not confirmed
-        off[:, columns] = np.nan_to_num(np.abs(group - clock[:, None]))
-    k, s = (int(i) for i in np.unravel_index(np.argmax(off), off.shape))
-    value = f"{off[k, s]:.0f} {unit} for {names[s]} at t = {time[k]:.3f}"
-    noted, largest = thresholds
-    if off[k, s] > largest:
-        raise ValueError(
-            f"{label} must be at most {largest:g} {unit}, got {value}. Correct or remove this row, "
-            "or set scenario.limits.fix_error_m."
-        )
-    count = int((off > noted).sum())
-    return (f"{label} above {noted:g} {unit} in {count} rows, at most {value}",) if count else ()
+        some = np.flatnonzero(np.isfinite(group).any(1))
+        clock = np.nanmedian(group[some], axis=1)[:, None]
+        off[some[:, None], columns] = np.nan_to_num(np.abs(group[some] - clock))
+    return off.ravel()
 
 
-def _reject(
-    name: str, satellite: str, time: Array, values: Array, largest: float, label: str, unit: str
-) -> None:
-    if len(values) and values.max() > largest:
-        i = int(np.argmax(values))
-        raise ValueError(
-            f"{name}: {label} of a satellite must be at most {largest:g} {unit}, got "
-            f"{values[i]:.0f} for {satellite} near t = {time[i]:.3f}. Correct or remove this row."
-        )
+# --------------------------------------------------------------------------------------------------
+# The rule for notes and errors.
+
+
+def _judge_rows(agreement: Agreement, difference: Array, table: LogTable, rows: NDArray[np.intp]) -> tuple[str, ...]:  # fmt: skip
+    """Reject, note or accept differences [n] at rows [n] of a table."""
+    return _judge(agreement, difference, table.name, lambda i: table.row(int(rows[i])))
+
+
+def _judge(agreement: Agreement, difference: Array, name: str, describe: Callable[[int], str]) -> tuple[str, ...]:  # fmt: skip
+    """Reject, note or accept differences [n] of a table, whose places a function describes."""
+    if not len(difference):
+        return ()
+    i, quantity, unit = int(np.argmax(difference)), agreement.quantity, agreement.unit
+    value = f"{difference[i]:.3g} {unit} at {describe(i)}"
+    require(
+        difference[i] <= agreement.largest,
+        f"{name}: {quantity}",
+        f"agree to {agreement.largest:g} {unit}",
+        value,
+        agreement.remedy,
+    )
+    count = int((difference > agreement.noted).sum())
+    if not count:
+        return ()
+    return (
+        f"{name}: {quantity} differ by more than {agreement.noted:g} {unit} in {count} of {len(difference)} rows, "
+        f"at most {value}",
+    )

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
 
-from pfbench.logs.units import DEGREE
-from pfbench.logs.worlds.log_checks import STANDARD_GRAVITY
+from pfbench.core.parameter_checks import require
+from pfbench.logs.units import DEGREE, STANDARD_GRAVITY
 from pfbench.logs.worlds.log_tables import Array, LogTable, parse_numbers, swap_frd_rfu
 from pfbench.nav import attitude, earth
 
@@ -27,11 +27,13 @@ def find_origin(
     ]
     if origin is not None or stated:
         centre = stated[0] if origin is None else list(map(float, origin))
-        if len(centre) != 3 or not abs(centre[0]) <= 90.0:
-            raise ValueError(
-                f"scenario.origin must be lat_deg (-90 to 90), lon_deg, h_m, got {centre}. "
-                "Set the point pn = pe = pd = 0."
-            )
+        require(
+            len(centre) == 3 and abs(centre[0]) <= 90.0,
+            "scenario.origin",
+            "be lat_deg (-90 to 90), lon_deg, h_m",
+            centre,
+            "Set the point pn = pe = pd = 0.",
+        )
         return tuple(centre)
     for table in (gnss, truth):
         if not table.has(LOCAL_COLUMNS) and not table.has(GEODETIC_COLUMNS):
@@ -48,11 +50,15 @@ def find_origin(
     )
 
 
-def read_positions(table: LogTable, origin: tuple[float, ...] | None) -> Array:
-    """Read positions in East, North, Up from the origin, m, [n, 3]."""
+def read_positions(
+    table: LogTable,
+    origin: tuple[float, ...] | None,
+    read: Callable[[LogTable, Sequence[str]], Array] = parse_numbers,
+) -> Array:
+    """Read positions in East, North, Up from the origin, m, [n, 3], by a reader of columns."""
     if table.has(LOCAL_COLUMNS) or not table.has(GEODETIC_COLUMNS):
-        return swap_frd_rfu(parse_numbers(table, LOCAL_COLUMNS))
-    pos = parse_numbers(table, GEODETIC_COLUMNS)
+        return swap_frd_rfu(read(table, LOCAL_COLUMNS))
+    pos = read(table, GEODETIC_COLUMNS)
     scale = np.array([DEGREE, DEGREE, 1.0])
     return earth.local_enu(
         torch.from_numpy(pos * scale), torch.from_numpy(np.array(origin) * scale)

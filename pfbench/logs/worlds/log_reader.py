@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pfbench.core.parameter_checks import require
@@ -38,10 +37,9 @@ from pfbench.logs.doctor.raw_log import (
     take_rows,
 )
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
-from pfbench.logs.units import DEGREE
 from pfbench.logs.worlds.corrections import LogCorrections, LogTables
 from pfbench.logs.worlds.fix_codes import FixCodes, select_usable
-from pfbench.logs.worlds.imu_gaps import GAP_SAMPLES, LONGEST_BRIDGE, bridge_gaps
+from pfbench.logs.worlds.imu_gaps import GAP_SAMPLES, bridge_gaps, find_longest
 from pfbench.logs.worlds.log_agreement import (
     compare_fixes,
     compare_inertial,
@@ -49,10 +47,7 @@ from pfbench.logs.worlds.log_agreement import (
     compare_velocities,
     drop_fixes,
 )
-from pfbench.logs.worlds.log_checks import check_overlap
 from pfbench.logs.worlds.log_frames import (
-    GEODETIC_COLUMNS,
-    LOCAL_COLUMNS,
     find_origin,
     gravity_at,
     quaternion_of_angles,
@@ -70,12 +65,13 @@ from pfbench.logs.worlds.log_tables import (
     check_increasing,
     check_seconds,
     convert_column,
+    convert_columns,
     parse_numbers,
     read_table,
     read_times,
     swap_frd_rfu,
 )
-from pfbench.nav import earth
+from pfbench.logs.worlds.time_order import check_overlap
 
 _OF_FIXES = ("lever arm", "fix shift")  # a reference that also gives the fixes has none
 _FORCE, _RATE, _ANGLES = ("fx", "fy", "fz"), ("wx", "wy", "wz"), ("roll", "pitch", "yaw")
@@ -142,8 +138,10 @@ class LogSource:
         """Convert corrected tables without checks of their contents."""
         inertial, gnss, truth = tables
         centre = find_origin(self.origin, gnss, truth or gnss)
-        imu = RawImu(_columns(inertial, ("t",))[:, 0], _columns(inertial, _FORCE), _columns(inertial, _RATE), np.arange(len(inertial.rows)))  # fmt: skip
-        time, position, codes = _columns(gnss, ("t",))[:, 0], _positions(gnss, centre), None
+        samples = convert_columns(inertial, ("t", *_FORCE, *_RATE))
+        imu = RawImu(samples[:, 0], samples[:, 1:4], samples[:, 4:], np.arange(len(samples)))
+        time, codes = convert_columns(gnss, ("t",))[:, 0], None
+        position = swap_frd_rfu(read_positions(gnss, centre, convert_columns))
         if "fix" in gnss.rows and self.fix_codes is None:
             codes = convert_column(gnss, "fix")
         elif "fix" in gnss.rows:
@@ -151,7 +149,8 @@ class LogSource:
         reference = NO_REFERENCE
         if truth and self.has_attitude:
             columns = _VELOCITY if "vn" in truth.rows else _DERIVED
-            values = np.hstack([_columns(truth, ("t", *_ANGLES, *columns)), _positions(truth, centre)])  # fmt: skip
+            track = swap_frd_rfu(read_positions(truth, centre, convert_columns))
+            values = np.hstack([convert_columns(truth, ("t", *_ANGLES, *columns)), track])
             rows = np.flatnonzero(np.isfinite(values).all(1))
             t, angles, velocity, track = np.split(values[rows], [1, 4, 7], axis=1)
             reference = RawReference(t[:, 0], angles, velocity, track, rows)
@@ -161,7 +160,7 @@ class LogSource:
             position = swap_frd_rfu(self.mending.correct_fixes(fixes, motion, gnss.name)[0].position)  # fmt: skip
         usable = np.flatnonzero(np.isfinite(position).all(1))
         return RawLog(
-            RawImu(*take_rows(imu, np.isfinite(imu.time))), RawFixes(time[usable], position[usable], usable), reference,
+            take_rows(imu, np.isfinite(imu.time)), RawFixes(time[usable], position[usable], usable), reference,
             gravity_at(centre)[0], (inertial.name, gnss.name, (truth or gnss).name),
             (inertial.row, gnss.row, (truth or gnss).row), codes,
         )  # fmt: skip
@@ -185,7 +184,7 @@ class LogSource:
         centre = find_origin(self.origin, gnss, truth or gnss)
         usable, usable_notes = select_usable(gnss, self.fix_codes)
         fixes = read_fixes(gnss, centre, usable)
-        motion = _motion(truth, centre) if truth and self.has_attitude else None
+        motion = read_motion_log(truth, centre) if truth and self.has_attitude else None
         fixes, mended_fixes = self.mending.correct_fixes(fixes, motion, gnss.name)
         spans = [(inertial.name, sensors.time), (gnss.name, fixes.time)]
         spans += [(truth.name, motion.time)] if truth and motion else []
@@ -218,7 +217,7 @@ class LogSource:
         if findings is None or left_out:
             raw = self.take(tables)
             keep = np.isfinite(fixes.position[raw.fixes.rows, 0])
-            findings, _, _ = run_checks(raw._replace(fixes=RawFixes(*take_rows(raw.fixes, keep))))
+            findings, _, _ = run_checks(raw._replace(fixes=take_rows(raw.fixes, keep)))
         diagnosed = judge_findings(findings, has_own_fixes=truth is None or gnss.name != truth.name)
         if truth and motion:
             rows += compare_inertial(truth, sensors, motion, gravity)
@@ -244,33 +243,16 @@ def read_log(folder: str | Path, files: LogFiles | None = None, **options: Any) 
     return LogSource(Path(folder), files or LogFiles(), **options).read()
 
 
-def _columns(table: LogTable, columns: Sequence[str]) -> Array:
-    """Convert columns to numbers, [n, k], NaN where there is none."""
-    missing = [column for column in columns if column not in table.rows]
-    if missing:
-        raise ValueError(
-            f"{table.name} must have a column {', '.join(missing)}, got "
-            f"{', '.join(map(str, table.rows.columns))}. Rename the columns, or map them with pfbench import."
-        )
-    return np.stack([convert_column(table, column) for column in columns], -1)
-
-
-def _positions(table: LogTable, centre: tuple[float, ...] | None) -> Array:
-    """Convert positions to North, East, Down, m, [n, 3]."""
-    if table.has(LOCAL_COLUMNS) or not table.has(GEODETIC_COLUMNS):
-        return _columns(table, LOCAL_COLUMNS)
-    scale = np.array([DEGREE, DEGREE, 1.0])
-    at = torch.from_numpy(_columns(table, GEODETIC_COLUMNS) * scale)
-    return swap_frd_rfu(earth.local_enu(at, torch.from_numpy(np.array(centre) * scale)).numpy())
-
-
 def judge_findings(findings: Sequence[Finding], *, has_own_fixes: bool) -> tuple[str, ...]:
     """Return findings as notes; raise the first that refuses the log. The reader notes the gaps that it bridges."""
-    refused = [finding for finding in findings if finding.level == REFUSE]
-    if refused:
-        raise ValueError(
-            f"the log must agree in itself, got: {refused[0].text} See all findings with pfbench inspect."
-        )
+    refused = next((finding.text for finding in findings if finding.level == REFUSE), "")
+    require(
+        not refused,
+        "the log",
+        "agree in itself",
+        refused.removesuffix("."),
+        "See all findings with pfbench inspect.",
+    )
     return tuple(
         f"{finding.check}: {finding.text}"
         for finding in findings
@@ -281,14 +263,10 @@ def judge_findings(findings: Sequence[Finding], *, has_own_fixes: bool) -> tuple
 def read_samples(table: LogTable) -> tuple[ImuLog, tuple[str, ...]]:
     """Read and check the IMU samples."""
     time, notes = _imu_time(table)
-    force, rate = (
-        parse_numbers(table, ("fx", "fy", "fz")),
-        parse_numbers(table, ("wx", "wy", "wz")),
-    )
-    check_changes(table, ("fx", "fy", "fz", "wx", "wy", "wz"), time, np.hstack([force, rate]))
-    imu, (start, longest, count) = bridge_gaps(
-        ImuLog(time, swap_frd_rfu(force), swap_frd_rfu(rate))
-    )
+    samples = parse_numbers(table, (*_FORCE, *_RATE))
+    check_changes(table, (*_FORCE, *_RATE), time, samples)
+    force, rate = (swap_frd_rfu(columns) for columns in np.hsplit(samples, 2))
+    imu, (start, longest, count) = bridge_gaps(ImuLog(time, force, rate))
     if count:
         notes += (
             f"{table.name}: {count} intervals are longer than {GAP_SAMPLES:g} samples, the longest with {longest:.3f} s "
@@ -315,26 +293,18 @@ def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
         )
     check_increasing(table, time)
     check_seconds(table, time, longest=0.5)
-    step = np.diff(time)
-    i = int(step.argmax())
-    if step[i] > max(LONGEST_BRIDGE, GAP_SAMPLES * typical):
-        raise ValueError(
-            f"{table.name} must not have gaps, got a gap of {step[i]:.3f} s after {table.row(i)} "
-            f"(t = {time[i]}), with samples every {typical:.4f} s. "
-            f"{_longest_part(table, time, step > max(LONGEST_BRIDGE, GAP_SAMPLES * typical))}"
-        )
-    return time, notes
-
-
-def _longest_part(table: LogTable, time: Array, is_gap: NDArray[np.bool_]) -> str:
-    """Name the rows between two gaps that cover the longest time."""
-    borders = np.concatenate([[0], np.flatnonzero(is_gap) + 1, [len(time)]])
-    first, last = borders[:-1], borders[1:] - 1
-    i = int(np.argmax(time[last] - time[first]))
-    return (
-        f"Keep the longest part without a gap, {table.row(int(first[i]))} to {table.row(int(last[i]))} "
-        f"(t = {time[first[i]]:.3f} to {time[last[i]]:.3f})."
+    longest, i = find_longest(time), int(np.diff(time).argmax())
+    require(
+        longest.parts == 1,
+        table.name,
+        "not have gaps",
+        f"a gap of {time[i + 1] - time[i]:.3f} s after {table.row(i)} (t = {time[i]}), with samples every {typical:.4f} s",
+        (
+            f"Keep the longest part without a gap, {table.row(longest.first)} to {table.row(longest.last)} "
+            f"(t = {time[longest.first]:.3f} to {time[longest.last]:.3f})."
+        ),
     )
+    return time, notes
 
 
 def read_fixes(
@@ -351,19 +321,17 @@ def read_fixes(
     return GnssLog(time, position, velocity)
 
 
-def _motion(table: LogTable, origin: tuple[float, ...] | None) -> ReferenceLog:
-    time = read_times(table, longest=100.0)
+def read_motion_log(
+    table: LogTable, origin: tuple[float, ...] | None, longest: float = 100.0
+) -> ReferenceLog:
+    """Read a reference with attitude in East, North, Up from the origin; longest is of the median interval, s."""
+    time = read_times(table, longest)
     derived = "vn" not in table.rows and "vn_d" in table.rows
-    q = quaternion_of_angles(*parse_numbers(table, ("roll", "pitch", "yaw")).T)
+    q = quaternion_of_angles(*parse_numbers(table, _ANGLES).T)
     columns = _DERIVED if derived else _VELOCITY
     velocity = swap_frd_rfu(parse_numbers(table, columns))
     check_changes(table, columns, time, swap_frd_rfu(velocity))
-    return ReferenceLog(
-        time,
-        q,
-        velocity,
-        read_positions(table, origin),
-    )
+    return ReferenceLog(time, q, velocity, read_positions(table, origin))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -381,8 +349,13 @@ def check_level(force: Array, name: str) -> None:
     remedy = f"Gravity lies on f{names[axis]}: set +scenario.corrections.mounting.imu with {down} as its third axis, which is down."
     if down == "-z":
         remedy = "Axes forward, left, up need +scenario.corrections.mounting.imu=[x,-y,-z]; see pfbench inspect."
-    must = "be about -9.8 on fz for most of the time, in axes forward, right, down"
-    require(middle[2] < -0.5 * typical, f"{name}: the specific force", must, f"a median of {middle[2]:.3g}", remedy)  # fmt: skip
+    require(
+        middle[2] < -0.5 * typical,
+        f"{name}: the specific force",
+        "be about -9.8 on fz for most of the time, in axes forward, right, down",
+        f"a median of {middle[2]:.3g}",
+        remedy,
+    )
 
 
 def check_corrections(corrections: LogCorrections, has_positions: bool) -> None:

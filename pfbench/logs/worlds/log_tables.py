@@ -46,13 +46,12 @@ def find_dataset(root: str | None, folder: str) -> Path:
             f"data.root is not set. Recorded data are not part of the package. {remedy}"
         )
     path = find_input(root, folder, is_data_set=True)
-    if not path.is_dir():
-        raise ValueError(f"data.root must contain the folder {folder}, got {root}. {remedy}")
+    require(path.is_dir(), "data.root", f"contain the folder {folder}", root, remedy)
     return path
 
 
 _USUAL_INTERVAL = 10.0  # s
-_DATA_REMEDY = "Remove rows without data."
+_DATA_REMEDY, _ROW_REMEDY = "Remove rows without data.", "Correct or remove this row."
 _COLUMN_REMEDY = "Fill this column. Of fixes, vn, ve, vd and fix can be left out."
 # largest satellite number of each system in its interface document; QZSS and SBAS count from 193 and 120, too
 _LARGEST_NUMBERS = {"G": 63, "R": 32, "E": 36, "C": 63, "J": 202, "I": 14, "S": 158}
@@ -77,18 +76,29 @@ def list_tables(root: str | None, folder: str, names: Iterable[str | None]) -> l
 
 def find_table(folder: Path, name: str | None) -> Path:
     """Return the file of a table."""
-    remedy = "Without a reference use scenario=user_log_aligned."
-    require(name is not None, "scenario.files", "name each table", "none", remedy)
+    require(
+        name is not None,
+        "scenario.files",
+        "name each table",
+        "none",
+        "Without a reference use scenario=user_log_aligned.",
+    )
     files = list_tables(str(folder), "", (name,))
-    if not files:
-        raise ValueError(
-            f"{folder} must contain {name}.parquet or {name}.csv. Store a log as a folder with imu, gnss and "
-            "reference. Without a reference use scenario=user_log_aligned, or pfbench estimate."
-        )
-    if len(files) > 1:
-        raise ValueError(
-            f"{folder} must not contain both {name}.parquet and {name}.csv. Delete one of them."
-        )
+    require(
+        files,
+        folder,
+        f"contain {name}.parquet or {name}.csv",
+        "none",
+        "Store a log as a folder with imu, gnss and reference. Without a reference use scenario=user_log_aligned, or "
+        "pfbench estimate.",
+    )
+    require(
+        len(files) == 1,
+        folder,
+        "contain each table once",
+        f"both {name}.parquet and {name}.csv",
+        "Delete one of them.",
+    )
     return files[0]
 
 
@@ -112,51 +122,48 @@ def read_table(
     for column, value in select.items():
         if column in table.rows:
             table = _selected(table, column, value)
-    if len(table.rows) < 2:
-        raise ValueError(
-            f"{file.name} must have at least 2 rows, got {len(table.rows)}. Use a longer table."
-        )
+    count = len(table.rows)
+    require(count > 1, file.name, "have at least 2 rows", count, "Use a longer table.")
     return table
 
 
 def _selected(table: LogTable, column: str, value: int | None) -> LogTable:
     numbers = parse_numbers(table, (column,))[:, 0]
     values = [int(number) for number in np.unique(numbers)]
-    if np.any(numbers != np.rint(numbers)):
-        raise ValueError(
-            f"{table.name}: column {column} must have whole numbers, got "
-            f"{numbers[numbers != np.rint(numbers)][0]:g}. Correct or remove this row."
-        )
-    if value is None and len(values) > 1:
-        raise ValueError(
-            f"{table.name}: column {column} must have one value, got {values}. "
-            f"Select one of them with {column}=..."
-        )
-    if value is not None and value not in values:
-        raise ValueError(
-            f"{table.name} must have rows with {column}={value}, got {values}. Select one of these."
-        )
+    whole_mask, key = numbers == np.rint(numbers), f"{table.name}: column {column}"
+    require(
+        whole_mask.all(),
+        key,
+        "have whole numbers",
+        f"{numbers[whole_mask.argmin()]:g}",
+        "Correct or remove this row.",
+    )
+    require(
+        value is not None or len(values) == 1,
+        key,
+        "have one value",
+        values,
+        f"Select one of them with {column}=...",
+    )
     selected = values[0] if value is None else value
+    require(
+        selected in values,
+        table.name,
+        f"have rows with {column}={value}",
+        values,
+        "Select one of these.",
+    )
     rows = table.rows[numbers == selected].reset_index(drop=True)
     return table._replace(rows=rows, name=f"{table.name} ({column} {selected})")
 
 
 def parse_numbers(table: LogTable, columns: Sequence[str]) -> Array:
-    """Convert columns to numbers.
+    """Convert columns to numbers, and check that they are finite and in the range of their quantity.
 
     Returns numbers, [n, k].
     """
-    missing = [column for column in columns if column not in table.rows]
-    if missing:
-        available = ", ".join(map(str, table.rows.columns))
-        pronoun = "it" if len(missing) == 1 else "them"
-        raise ValueError(
-            f"{table.name} must have a column {', '.join(missing)}, got {available}. "
-            f"Rename or add {pronoun} (units: s, m, m/s, m/s^2, rad, rad/s)."
-        )
-    out = np.empty((len(table.rows), len(columns)))
-    for i, column in enumerate(columns):
-        values = convert_column(table, column)
+    out = convert_columns(table, columns)
+    for column, values in zip(columns, out.T, strict=True):
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
             raise ValueError(
@@ -165,8 +172,20 @@ def parse_numbers(table: LogTable, columns: Sequence[str]) -> Array:
                 f"{_DATA_REMEDY if bad.size < len(values) else _COLUMN_REMEDY}"
             )
         check_range(table, column, values)
-        out[:, i] = values
     return out
+
+
+def convert_columns(table: LogTable, columns: Sequence[str]) -> Array:
+    """Convert columns to numbers, [n, k], NaN where there is none."""
+    missing = ", ".join(column for column in columns if column not in table.rows)
+    require(
+        not missing,
+        table.name,
+        f"have a column {missing}",
+        ", ".join(map(str, table.rows.columns)),
+        "Rename or add it (units: s, m, m/s, m/s^2, rad, rad/s), or map your columns with pfbench import.",
+    )
+    return np.stack([convert_column(table, column) for column in columns], -1)
 
 
 def convert_column(table: LogTable, column: str) -> Array:
@@ -190,18 +209,40 @@ def parse_satellites(table: LogTable, numbers: Array) -> list[str]:
     """
     systems = table.rows["sys"] if "sys" in table.rows else ["G"] * len(table.rows)
     for i, (system, number) in enumerate(zip(systems, numbers, strict=True)):
-        if system not in _LARGEST_NUMBERS:
-            raise ValueError(
-                f"{table.name}: column sys must be one of {', '.join(_LARGEST_NUMBERS)}, got "
-                f"{system!r} in {table.row(i)}. Correct or remove this row."
-            )
-        if not (1 <= number <= _LARGEST_NUMBERS[system] and number == int(number)):
-            raise ValueError(
-                f"{table.name}: column svid must be a whole number from 1 to "
-                f"{_LARGEST_NUMBERS[system]} for the system {system}, got {number:g} in "
-                f"{table.row(i)}. Correct or remove this row."
-            )
+        where, must = f"in {table.row(i)}", f"be one of {', '.join(_LARGEST_NUMBERS)}"
+        require(
+            system in _LARGEST_NUMBERS,
+            f"{table.name}: column sys",
+            must,
+            f"{system!r} {where}",
+            _ROW_REMEDY,
+        )
+        require(
+            1 <= number <= _LARGEST_NUMBERS[system] and number == int(number),
+            f"{table.name}: column svid",
+            f"be a whole number from 1 to {_LARGEST_NUMBERS[system]} for the system {system}",
+            f"{number:g} {where}",
+            _ROW_REMEDY,
+        )
     return [f"{system}{int(number):02d}" for system, number in zip(systems, numbers, strict=True)]
+
+
+def index_satellites(
+    table: LogTable, row: NDArray[np.intp], names: Sequence[str] | NDArray[np.str_]
+) -> tuple[list[str], tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """Return the satellites, and row and column of each entry in a table of epochs and satellites.
+
+    Shapes: row of the epoch [n], names [n].
+    """
+    satellites, slot = np.unique(names, return_inverse=True)
+    require(
+        len(set(zip(row, slot, strict=True))) == len(slot),
+        table.name,
+        "have one row for each satellite and epoch",
+        "two",
+        "Remove one.",
+    )
+    return satellites.tolist(), (row, slot)
 
 
 def read_times(table: LogTable, longest: float) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.files.reader_notes import announce_notes
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
-from pfbench.logs.worlds.fix_codes import FixCodes, check_fix_codes
+from pfbench.logs.worlds.drive import RecordedScenario
 from pfbench.logs.worlds.log_agreement import (
     check_orbits,
     compare_directions,
@@ -26,7 +27,6 @@ from pfbench.logs.worlds.log_agreement import (
     compare_rates,
     describe_missing_times,
 )
-from pfbench.logs.worlds.log_reader import read_log
 from pfbench.logs.worlds.log_tables import (
     Array,
     LogFiles,
@@ -35,6 +35,7 @@ from pfbench.logs.worlds.log_tables import (
     check_range,
     convert_column,
     find_dataset,
+    index_satellites,
     list_tables,
     parse_numbers,
     parse_satellites,
@@ -54,7 +55,7 @@ from pfbench.model.strapdown_tuning import TightTuning
 from pfbench.nav import earth
 from pfbench.nav.orbits import LIGHT
 from pfbench.noise.base import NoiseRegime, NominalNoise, check_unit_process, draw_added_errors
-from pfbench.scenario.base import Scenario, check_added_sd, check_duration
+from pfbench.scenario.base import check_added_sd, check_duration
 
 _SAME_EPOCH = 0.02  # s; the receiver clock is accurate to some milliseconds
 _MILLISECOND = LIGHT * 1e-3  # m
@@ -127,16 +128,11 @@ def collect_sky(
             f"{table.name} does not contain a row above {receiver.mask_deg} degrees within {_SAME_EPOCH} s of the "
             "end of a step. Use the same clock for t in all tables, or lower scenario.receiver.mask_deg."
         )
-    row_names = np.array(parse_satellites(table, value["svid"]))
-    names, slot = np.unique(row_names[selected_mask], return_inverse=True)
-    index = (row[selected_mask], slot)
-    if len(set(zip(*index, strict=True))) < len(slot):
-        raise ValueError(
-            f"{table.name} must have one row for each satellite and epoch, got two. Remove one."
-        )
+    names = np.array(parse_satellites(table, value["svid"]))[selected_mask]
+    satellites, index = index_satellites(table, row[selected_mask], names)
 
     def fill(column: Array) -> Array:
-        out = np.full((len(time), len(names), *column.shape[1:]), np.nan)
+        out = np.full((len(time), len(satellites), *column.shape[1:]), np.nan)
         out[index] = column[selected_mask]
         return out
 
@@ -152,7 +148,7 @@ def collect_sky(
     angles = np.radians(value["az"]), np.radians(value["el"])
     columns = [fill(column) for column in (*corrected, *reported, *angles)]
     notes = (*table.notes, *describe_missing_times(table.name, np.unique(value["t"]), time))
-    return RawGnssLog._make([tuple(names.tolist()), *columns, notes])
+    return RawGnssLog._make([tuple(satellites), *columns, notes])
 
 
 def _read_columns(
@@ -342,11 +338,13 @@ class RawGnssReceiver:
         check_duration("scenario.receiver.fix_interval_s", self.fix_interval_s)
         check_added_sd("scenario.receiver.range_sd", self.range_sd)
         check_added_sd("scenario.receiver.rate_sd", self.rate_sd)
-        if not -90.0 <= self.mask_deg <= 90.0:
-            raise ValueError(
-                "scenario.receiver.mask_deg must be between -90 and 90, "
-                f"got {self.mask_deg}. Set an elevation in degrees."
-            )
+        require(
+            -90.0 <= self.mask_deg <= 90.0,
+            "scenario.receiver.mask_deg",
+            "be between -90 and 90",
+            self.mask_deg,
+            "Set an elevation in degrees.",
+        )
 
     def channels(self, satellites: int) -> MeasurementChannels:
         """Return the channels of all ranges, then of all range rates."""
@@ -358,51 +356,35 @@ class RawGnssReceiver:
 
 
 @dataclass(frozen=True)
-class RecordedWalk(Scenario):
+class RecordedWalk(RecordedScenario):
     """One recorded log with raw measurements. Runs differ in initial and added errors.
 
     The nominal receiver clock has the bias and drift of the first recorded epoch at the reference.
     It is subtracted from the measurements. The initial clock errors are drawn about it.
 
+    In addition to IMU and reference the log contains a table `pseudorange`, with one row per epoch and satellite. The
+    columns are t, sys (G or E), svid, pr, prr, sd_pr, sd_prr, sx..sz, svx..svz, sclk, sclkd, tropo, iono in SI units,
+    and az, el in degrees. Steps end at the times of the table `gnss`. The other attributes are those of `RecordedScenario`.
+
     Attributes:
-        root: Folder of all data sets (configuration key data.root).
-        folder: Folder of the log in `root`. In addition to IMU and reference it contains a table
-            `pseudorange`, with one row per epoch and satellite. The columns are t, sys (G or E),
-            svid, pr, prr, sd_pr, sd_prr, sx..sz, svx..svz, sclk, sclkd, tropo, iono in SI units,
-            and az, el in degrees.
-        tuning: Parameters that the filter assumes. The initial errors of the runs have the assumed
-            distribution.
+        tuning: Parameters that the filter assumes.
         receiver: Selection of measurements, and standard deviations of added errors.
-        filter_step_s: Longest filter interval, s.
+        files: Names of the tables.
         start_s: Start, s of the log. None for the start of the log.
         end_s: End, s of the log. None for the end of the log.
-        files: Names of the tables. Steps end at the times of `gnss`.
-        origin: lat_deg, lon_deg, h_m of the local frame. None if the files contain it.
-        limits: Limits of the platform for the checks of the log. None for the default limits.
-        fix_codes: Meaning of the column `fix` of the fixes, see `read_log`.
 
     Raises:
-        ValueError: If the step or the threshold is not positive. `draw` raises it for a missing root
+        ValueError: If the step is not positive. `draw` raises it for a missing root
             or folder, an invalid log, a start without GPS satellites, or a regime that changes the
             process noise.
     """
 
-    root: str | None
-    folder: str
     tuning: TightTuning
     receiver: RawGnssReceiver = field(default_factory=RawGnssReceiver)
-    filter_step_s: float = 0.25
+    files: LogFiles = field(default_factory=lambda: LogFiles(gnss="reference"))
     start_s: float | None = None
     end_s: float | None = None
-    files: LogFiles = field(default_factory=lambda: LogFiles(gnss="reference"))
-    origin: Sequence[float] | None = None
-    limits: PlausibleLimits | None = None
-    fix_codes: FixCodes = None
     channel_names, input_type = StrapdownTight.channel_names, StrapdownTight.input_type
-
-    def __post_init__(self) -> None:
-        check_duration("scenario.filter_step_s", self.filter_step_s)
-        check_fix_codes(self.fix_codes)
 
     @override
     def draw(self, noise: NoiseRegime, runs: Tensor, seed: int) -> Episode:
@@ -450,25 +432,15 @@ class RecordedWalk(Scenario):
             motion.datasheet | datasheet,
         )
 
+    @override
     def input_files(self) -> list[Path]:
-        """List the files that `draw` reads."""
-        return list_tables(self.root, self.folder, (*astuple(self.files), SKY))
+        return [*super().input_files(), *list_tables(self.root, self.folder, (SKY,))]
 
     def _draw_start(self, motion: Tensor | None, draws: PhiloxStream) -> Tensor:
         """Draw starts [R, 19], about which the true state has the assumed distribution."""
         # the true clock is the nominal one
         clock = self.tuning.clock_sd * draws.at_step(0).normal("world.clock", 1, 3)[:, 0]
         return torch.cat([clock.new_zeros(len(clock), 0) if motion is None else motion, -clock], -1)
-
-    def _read_log(self, folder: Path) -> NavigationLog:
-        """Read the log, whose fixes are the times at which steps end."""
-        return read_log(
-            folder,
-            self.files,
-            origin=self.origin,
-            limits=self.limits,
-            fix_codes=self.fix_codes,
-        )
 
     def _read_sky(self, folder: Path, log: NavigationLog, time: Array) -> RawGnssLog:
         """Read the raw measurements at some times, s, [K]."""
@@ -477,7 +449,7 @@ class RecordedWalk(Scenario):
     def _read(self) -> tuple[ResampledLog, RawGnssLog]:
         """Read the log on filter steps and the raw measurements relative to the start."""
         folder = find_dataset(self.root, self.folder)
-        log = self._read_log(folder)
+        log = self.read_checked(folder)
         leg = resample_log(
             log,
             self.receiver.fix_interval_s,

@@ -77,8 +77,12 @@ class RinexSource:
             parse_gps_time("scenario.rinex.gps_time", self.gps_time)
         codes = [f"{system}: {code}" for system, names in self.signals.items() for code in names]
         wrong = [c for c in codes if c[0] not in SIGNALS or c[3:4] != "1"]
-        must = "be codes of G and E on 1575.42 MHz, such as {G: [1C], E: [1C, 1X]}"
-        require(codes and not wrong, "scenario.rinex.signals", must, ", ".join(wrong) or "none")
+        require(
+            codes and not wrong,
+            "scenario.rinex.signals",
+            "be codes of G and E on 1575.42 MHz, such as {G: [1C], E: [1C, 1X]}",
+            ", ".join(wrong) or "none",
+        )
 
     def list_files(self, root: str | None, name: str) -> list[Path]:
         """List the files of a data set that are read; those that are not in its folder are left out.
@@ -128,9 +132,13 @@ class RinexSource:
             The table `pseudorange`, without standard deviations.
         """
         inside = (epochs.rows["t"] >= track.time[0]) & (epochs.rows["t"] <= track.time[-1])
-        span = f"{epochs.time[0]:.3f} to {epochs.time[-1]:.3f} s, and the track {track.time[0]:.3f} to {track.time[-1]:.3f} s"
-        remedy = "Set scenario.rinex.gps_time to the GPS time of t = 0."
-        require(inside.any(), f"{epochs.name}: t", "be that of the tables", span, remedy)
+        require(
+            inside.any(),
+            f"{epochs.name}: t",
+            "be that of the tables",
+            f"{epochs.time[0]:.3f} to {epochs.time[-1]:.3f} s, and the track {track.time[0]:.3f} to {track.time[-1]:.3f} s",
+            "Set scenario.rinex.gps_time to the GPS time of t = 0.",
+        )
         rows = epochs.rows[inside].reset_index(drop=True)
         file, first = self._find(folder, "navigation"), float(rows["time"].iloc[0])
         constellation = BroadcastConstellation(str(file.parent), file.name, first)
@@ -177,9 +185,14 @@ class RinexSource:
                     head.startswith("\x1f\x8b") and _looks_like_rinex(file)
                 ):
                     check_version(file.name, head)
-        got = ", ".join(file.name for file in files) or "none"
         label = {"O": "RINEX 3 observation", "N": "RINEX navigation"}[kind]
-        require(len(files) == 1, f"the folder {folder}", f"contain one {label} file", got, f"Name it by scenario.rinex.{key}.")  # fmt: skip
+        require(
+            len(files) == 1,
+            f"the folder {folder}",
+            f"contain one {label} file",
+            ", ".join(file.name for file in files) or "none",
+            f"Name it by scenario.rinex.{key}.",
+        )
         return find_input(folder, files[0].name)
 
 

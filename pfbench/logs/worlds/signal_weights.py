@@ -43,9 +43,13 @@ class SignalWeights:
         )
         pairs = (("elevation_sd", "cn0_sd"), ("rate_elevation_sd", "rate_cn0_sd"))
         for pair in pairs:
-            is_some = max(getattr(self, name) for name in pair) > 0.0
-            keys = f"scenario.receiver.weights: {' or '.join(pair)}"
-            require(is_some, keys, "be positive", "0 for both", "Set one of them.")
+            require(
+                max(getattr(self, name) for name in pair) > 0.0,
+                f"scenario.receiver.weights: {' or '.join(pair)}",
+                "be positive",
+                "0 for both",
+                "Set one of them.",
+            )
 
     def sd(self, elevation: Array, cn0: Array) -> tuple[Array, Array]:
         """Compute the standard deviations of ranges and range rates.

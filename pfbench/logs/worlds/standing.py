@@ -49,8 +49,13 @@ def detect_standing(log: NavigationLog, time: Array) -> tuple[NDArray[np.bool_],
     speed = np.interp(time, log.reference.time, _norm(log.reference.velocity))
     moving = speed > _MOVING
     false = float(standing[moving].mean()) if moving.any() else 0.0
-    must = f"find standing in at most {_LARGEST_FALSE:.0%} of the steps above {_MOVING} m/s"
-    require(false <= _LARGEST_FALSE, "thresholds of standing", must, f"{false:.1%}", remedy)
+    require(
+        false <= _LARGEST_FALSE,
+        "thresholds of standing",
+        f"find standing in at most {_LARGEST_FALSE:.0%} of the steps above {_MOVING} m/s",
+        f"{false:.1%}",
+        remedy,
+    )
     note = (
         f"standing is detected at {int(standing.sum())} of {len(time)} steps, {false:.2%} of the moving ones; "
         f"thresholds {limits[0]:.3g} rad/s, {limits[1]:.3g} and {limits[2]:.3g} m/s^2 from t = {at[0]:.1f} to {at[-1]:.1f} s"

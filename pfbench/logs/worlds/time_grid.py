@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pfbench.core import chart
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record, fix_channels
 from pfbench.logs.worlds.log_tables import Array, ImuLog, NavigationLog, ReferenceLog
@@ -94,12 +95,13 @@ def resample_log(
     low = max(log.imu.time[0], log.reference.time[0], -np.inf if start is None else start)
     high = min(log.imu.time[-1], log.reference.time[-1], np.inf if end is None else end)
     selection = select_fixes(log.fixes.time, interval, low, high)
-    if len(selection) < 2:
-        raise ValueError(
-            "IMU, reference, start and end must have at least 2 fixes in their common time, got "
-            f"{len(selection)} fixes between t = {low:.3f} and {high:.3f}. "
-            "Use a longer log, an earlier start or a later end."
-        )
+    require(
+        len(selection) >= 2,
+        "IMU, reference, start and end",
+        "have at least 2 fixes in their common time",
+        f"{len(selection)} fixes between t = {low:.3f} and {high:.3f}",
+        "Use a longer log, an earlier start or a later end.",
+    )
     if velocity and np.isnan(log.fixes.velocity).all():
         raise ValueError(
             "scenario.receiver.velocity_sd must be null for fixes without vn, ve, vd. "
@@ -262,11 +264,13 @@ class FixReceiver:
     def __post_init__(self) -> None:
         check_duration("scenario.receiver.fix_interval_s", self.fix_interval_s)
         for name, sd in (("position_sd", self.position_sd), ("velocity_sd", self.velocity_sd)):
-            if sd is not None and (len(sd) != 3 or min(sd) < 0.0):
-                raise ValueError(
-                    f"scenario.receiver.{name} must be 3 numbers of at least 0, got {list(sd)}. "
-                    "Set East, North and Up, with 0 for no added errors."
-                )
+            require(
+                sd is None or (len(sd) == 3 and min(sd) >= 0.0),
+                f"scenario.receiver.{name}",
+                "be 3 numbers of at least 0",
+                sd,
+                "Set East, North and Up, with 0 for no added errors.",
+            )
 
     @property
     def channel_names(self) -> tuple[str, ...]:

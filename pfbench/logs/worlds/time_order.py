@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.table_file import Array
 from pfbench.logs.units import UNIT_FACTORS, WEEK
 
@@ -104,6 +105,20 @@ def _longest_part(time: Array) -> tuple[int, int]:
     borders = np.concatenate([[0], np.flatnonzero(np.diff(time) <= 0.0) + 1, [len(time)]])
     i = int(np.argmax(np.diff(borders)))
     return int(borders[i]), int(borders[i + 1]) - 1
+
+
+def check_overlap(imu_name: str, imu_time: Array, name: str, time: Array) -> None:
+    """Check that two tables have a common time.
+
+    Shapes: imu_time [n], time [m].
+    """
+    require(
+        min(imu_time[-1], time[-1]) > max(imu_time[0], time[0]),
+        f"{imu_name} and {name}",
+        "overlap in time",
+        " and ".join(f"t = {t[0]:.3f} to {t[-1]:.3f}" for t in (imu_time, time)),
+        find_overlap_remedy(time, imu_time, name),
+    )
 
 
 def find_overlap_remedy(time: Array, reference: Array, name: str) -> str:

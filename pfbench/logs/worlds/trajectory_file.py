@@ -10,20 +10,19 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.atomic_write import hash_file
 from pfbench.files.reader_notes import announce_notes
 from pfbench.logs.worlds.log_agreement import compare_reference
+from pfbench.logs.worlds.log_reader import read_motion_log
 from pfbench.logs.worlds.log_tables import (
     LogTable,
     ReferenceLog,
-    check_changes,
     find_dataset,
     find_table,
     list_tables,
     parse_numbers,
     read_table,
-    read_times,
-    swap_frd_rfu,
 )
 from pfbench.nav import attitude, earth
 from pfbench.nav.trajectory import MotionSpline, RecordedMotion, TrajectoryData
@@ -64,11 +63,13 @@ class RecordedTrajectory:
     checksum: str = field(init=False, default="")
 
     def __post_init__(self) -> None:
-        if self.start_s is not None and self.end_s is not None and not self.start_s < self.end_s:
-            raise ValueError(
-                f"scenario.trajectory.end_s must be later than start_s = {self.start_s}, "
-                f"got {self.end_s}. Change start_s or end_s."
-            )
+        require(
+            self.start_s is None or self.end_s is None or self.start_s < self.end_s,
+            "scenario.trajectory.end_s",
+            f"be later than start_s = {self.start_s}",
+            self.end_s,
+            "Change start_s or end_s.",
+        )
         table = find_table(find_dataset(self.root, self.folder), self.file)
         object.__setattr__(self, "checksum", hash_file(table))
 
@@ -106,31 +107,27 @@ def read_motion(folder: str | Path, name: str, origin: Sequence[float]) -> Recor
     of the grid rotates the track slightly, which does not affect the motion. The height is -pd above
     the height of the origin, not above its tangent plane [ours].
     """
-    if len(origin) != 3 or not abs(origin[0]) <= 89.0:
-        raise ValueError(
-            "scenario.trajectory.origin must be lat_deg (-89 to 89), lon_deg, h_m, "
-            f"got {list(origin)}. Set the point pn = pe = pd = 0."
-        )
+    require(
+        len(origin) == 3 and abs(origin[0]) <= 89.0,
+        "scenario.trajectory.origin",
+        "be lat_deg (-89 to 89), lon_deg, h_m",
+        list(origin),
+        "Set the point pn = pe = pd = 0.",
+    )
     table = read_table(Path(folder), name, {})
     announce_notes(folder, table.notes)
-    time = torch.from_numpy(read_times(table, longest=1.0))
-    enu, vel = (
-        torch.from_numpy(swap_frd_rfu(parse_numbers(table, columns)))
-        for columns in (("pn", "pe", "pd"), ("vn", "ve", "vd"))
-    )
+    motion = read_motion_log(table, tuple(origin), longest=1.0)
     roll, pitch, yaw = parse_numbers(table, ("roll", "pitch", "yaw")).T
-    check_changes(table, ("vn", "ve", "vd"), time.numpy(), swap_frd_rfu(vel.numpy()))
     dcm = attitude.dcm_from_euler(torch.from_numpy(np.stack([pitch, roll, -yaw], axis=-1)))
-    motion = ReferenceLog(
-        time.numpy(), attitude.quaternion_from_dcm(dcm).numpy(), vel.numpy(), enu.numpy()
-    )
     check_single_velocities(table, motion)
-    contradictions = compare_reference(table, motion)
-    if contradictions:  # a truth is free of measurement errors
-        raise ValueError(
-            f"a trajectory must have positions and velocities that agree, got {contradictions[0]}. "
-            "Correct or remove this row."
-        )
+    require(  # a truth is free of measurement errors
+        not (contradictions := compare_reference(table, motion)),
+        "a trajectory",
+        "have positions and velocities that agree",
+        "; ".join(contradictions),
+        "Correct or remove this row.",
+    )
+    time, vel, enu = map(torch.from_numpy, (motion.time, motion.velocity, motion.position))
     centre = torch.tensor(
         [math.radians(origin[0]), math.radians(origin[1]), origin[2]], dtype=torch.float64
     )

@@ -20,18 +20,20 @@ from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.files.reader_notes import announce_notes
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
 from pfbench.logs.worlds.log_agreement import (
+    check_geocentric,
     check_orbits,
+    check_wheel_direction,
     compare_ranges,
     compare_velocities,
     compare_wheels,
 )
-from pfbench.logs.worlds.log_checks import check_geocentric, check_wheel_direction
 from pfbench.logs.worlds.log_tables import (
     Array,
     LogTable,
     ReferenceLog,
     check_changes,
     find_dataset,
+    index_satellites,
     list_tables,
     parse_numbers,
     parse_satellites,
@@ -231,20 +233,15 @@ def read_drive(folder: Path, limits: PlausibleLimits | None = None) -> UrbanLog:
             f"{folder}: {pseudoranges.name} must have only times t of {wheels.name}. "
             "Use the same epochs in both."
         )
-    names = parse_satellites(pseudoranges, svid)
-    satellites, slot = np.unique(names, return_inverse=True)
-    if len(set(zip(row, slot, strict=True))) < len(slot):
-        raise ValueError(
-            f"{pseudoranges.name} must have one row for each satellite and epoch, got two. Remove one."
-        )
+    satellites, index = index_satellites(pseudoranges, row, parse_satellites(pseudoranges, svid))
     columns = np.full((6, len(time), len(satellites)), np.nan)
-    columns[:, row, slot] = value, np.sqrt(variance), cn0, *positions
+    columns[(slice(None), *index)] = value, np.sqrt(variance), cn0, *positions
     position = np.column_stack([np.radians(reference[:, 1:3]), reference[:, 3]])
     speed, yaw_rate = parse_numbers(wheels, ("v_fwd", "yaw_rate_ned")).T
     sky_columns = columns[0], columns[1], columns[2], np.moveaxis(columns[3:], 0, -1)
     check_changes(wheels, ("v_fwd", "yaw_rate_ned"), time, np.column_stack([speed, yaw_rate]))
     drive = UrbanLog(
-        time, speed, yaw_rate, position, reference[:, 4:], tuple(satellites.tolist()), *sky_columns
+        time, speed, yaw_rate, position, reference[:, 4:], tuple(satellites), *sky_columns
     )
     notes = _check_drive(drive, (pseudoranges, wheels, truth))
     announce_notes(folder, notes)

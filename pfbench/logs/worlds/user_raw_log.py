@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ from pfbench.logs.units import DEGREE
 from pfbench.logs.worlds.corrections import LogCorrections
 from pfbench.logs.worlds.drive import FixHoldout
 from pfbench.logs.worlds.log_frames import find_origin
-from pfbench.logs.worlds.log_reader import read_log, read_track
+from pfbench.logs.worlds.log_reader import read_track
 from pfbench.logs.worlds.log_tables import (
     Array,
     GnssLog,
@@ -54,20 +55,14 @@ HEADER = "header"  # the position in the header of the observations
 _OPTIONAL = ("prr", "cn0")  # what receivers may leave out
 
 
-def make_receiver() -> RawGnssReceiver:
-    """Return the usual choice: measurements as recorded, with weights, since RINEX states no standard deviations."""
-    return RawGnssReceiver(weights=SignalWeights())
-
-
 def check_weights(receiver: RawGnssReceiver) -> None:
     """Check that the receiver has weights."""
-    remedy = "Set scenario.receiver.weights._target_=pfbench.scenario.SignalWeights."
     require(
         receiver.weights,
         "scenario.receiver.weights",
         "be set, RINEX states no standard deviations",
         "null",
-        remedy,
+        "Set scenario.receiver.weights._target_=pfbench.scenario.SignalWeights.",
     )
 
 
@@ -106,7 +101,10 @@ class UserRawLog(Scenario):
     rinex: RinexSource = field(default_factory=RinexSource)
     reference: str | None = "reference"
     standing: str | Sequence[float] | None = None
-    receiver: RawGnssReceiver = field(default_factory=make_receiver)
+    # measurements as recorded, with weights, since RINEX states no standard deviations
+    receiver: RawGnssReceiver = field(
+        default_factory=lambda: RawGnssReceiver(weights=SignalWeights())
+    )
     start_s: float | None = None
     end_s: float | None = None
     origin: Sequence[float] | None = None
@@ -148,8 +146,13 @@ class UserRawLog(Scenario):
         position = torch.from_numpy(points.position[1:])
         has_point = torch.isfinite(position[:, 0])
         withheld = self.holdout.select(has_point, episode.time, runs)[..., None]
-        must = "withhold an epoch with a solution in each run"
-        require(withheld.any(1).all(), "scenario.holdout", must, self.holdout, "Withhold more epochs, or use a longer log.")  # fmt: skip
+        require(
+            withheld.any(1).all(),
+            "scenario.holdout",
+            "withhold an epoch with a solution in each run",
+            self.holdout,
+            "Withhold more epochs, or use a longer log.",
+        )
         truth = {"position": torch.where(withheld, position, torch.nan)}
         sd = torch.from_numpy(np.sqrt(np.nanmean(points.position_sd[1:] ** 2, axis=0)))
         record = episode.record._replace(y=torch.where(withheld, torch.nan, episode.record.y))
@@ -187,17 +190,21 @@ class UserRawLog(Scenario):
             if len(times) > 1
             else times
         )
-        span = f"{len(grid)} between t = {times[0]:.3f} and {times[-1]:.3f}"
-        must = "have at least 2 epochs between start_s and end_s"
         require(
-            len(grid) > 1, f"{epochs.name}", must, span, "Choose an earlier start or a later end."
+            len(grid) > 1,
+            f"{epochs.name}",
+            "have at least 2 epochs between start_s and end_s",
+            f"{len(grid)} between t = {times[0]:.3f} and {times[-1]:.3f}",
+            "Choose an earlier start or a later end.",
         )
         gnss_log = collect_sky(table, grid, self.receiver, optional=_OPTIONAL)
         motion = interpolate(track, grid)
         points = solve_points(gnss_log, self.tuning, motion[:, 7:]) if self._is_alone else None
-        is_known = not np.isnan(motion[0, 4:]).any()
         require(
-            is_known, "scenario.start_s", "not be in a gap of the reference", f"t = {grid[0]:.3f}"
+            not np.isnan(motion[0, 4:]).any(),
+            "scenario.start_s",
+            "not be in a gap of the reference",
+            f"t = {grid[0]:.3f}",
         )
         notes = check_sky(gnss_log, grid, motion, self.limits or PlausibleLimits())
         announce_notes(folder, notes)
@@ -230,9 +237,13 @@ class UserRawLog(Scenario):
             start = np.stack([np.interp(times, track.time, p) for p in track.position.T], -1)
             points = solve_points(sky, self.tuning, start)
             is_solved = np.isfinite(points.position[:, 0])
-            must = "have 2 epochs whose satellites show a position"
-            remedy = "Use a longer log, lower scenario.receiver.mask_deg, or give a reference."
-            require(is_solved.sum() > 1, epochs.name, must, is_solved.sum(), remedy)
+            require(
+                is_solved.sum() > 1,
+                epochs.name,
+                "have 2 epochs whose satellites show a position",
+                is_solved.sum(),
+                "Use a longer log, lower scenario.receiver.mask_deg, or give a reference.",
+            )
             time, position = times[is_solved], points.position[is_solved]
             if not k and not self.origin:
                 centre = _move(centre, position[0])
@@ -254,8 +265,13 @@ class UserRawLog(Scenario):
 
     def _read_header(self, epochs: RawEpochs) -> tuple[float, ...]:
         """Return the place in the header of the observations, lat_deg, lon_deg, h_m."""
-        remedy = "Set scenario.standing=[lat_deg,lon_deg,h_m]."
-        require(epochs.position, f"{epochs.name}: APPROX POSITION XYZ", "be a position", "none", remedy)  # fmt: skip
+        require(
+            epochs.position,
+            f"{epochs.name}: APPROX POSITION XYZ",
+            "be a position",
+            "none",
+            "Set scenario.standing=[lat_deg,lon_deg,h_m].",
+        )
         geodetic = earth.geodetic(torch.tensor(epochs.position, dtype=torch.float64)).tolist()
         return geodetic[0] / DEGREE, geodetic[1] / DEGREE, geodetic[2]
 
@@ -264,21 +280,31 @@ class UserRawLog(Scenario):
         if self._is_alone:
             return self._solve_track(folder, epochs)
         if self.standing is None:
-            remedy = "Without one set scenario.reference=null, and for an antenna that stands scenario.standing=header."
-            require(list_tables(self.root, self.folder, (self.reference,)), f"{folder}", f"contain {self.reference}.csv or .parquet", "none", remedy)  # fmt: skip
+            require(
+                list_tables(self.root, self.folder, (self.reference,)),
+                f"{folder}",
+                f"contain {self.reference}.csv or .parquet",
+                "none",
+                "Without one set scenario.reference=null, and for a fixed antenna scenario.standing=header.",
+            )
             table = read_table(folder, self.reference, {}, self.limits)
             centre = find_origin(self.origin, table, table)
-            remedy = "Set scenario.origin=[lat_deg,lon_deg,h_m]."
             require(
-                centre, f"{table.name}", "contain or have an origin", "pn, pe, pd alone", remedy
+                centre,
+                f"{table.name}",
+                "contain or have an origin",
+                "pn, pe, pd alone",
+                "Set scenario.origin=[lat_deg,lon_deg,h_m].",
             )
             return read_track(table, centre), centre or ()
         if self.standing == HEADER:
             centre = self._read_header(epochs)
         else:
-            is_place = not isinstance(self.standing, str) and len(self.standing) == 3
             require(
-                is_place, "scenario.standing", "be header, or lat_deg, lon_deg, h_m", self.standing
+                not isinstance(self.standing, str) and len(self.standing) == 3,
+                "scenario.standing",
+                "be header, or lat_deg, lon_deg, h_m",
+                self.standing,
             )
             centre = tuple(float(a) for a in self.standing)
         ends = epochs.time[[0, -1]]
@@ -312,10 +338,13 @@ class UserInsLog(RecordedWalk):
         super().__post_init__()
         check_weights(self.receiver)
         of_fixes = (self.corrections.lever_arm, self.corrections.offset_m)
-        is_free = all(value is None for value in of_fixes)
-        must = "not be of fixes, which this log has not"
-        remedy = "Leave lever_arm and offset_m out, and give the reference of the antenna."
-        require(is_free, "scenario.corrections", must, "lever_arm or offset_m", remedy)
+        require(
+            all(value is None for value in of_fixes),
+            "scenario.corrections",
+            "not be of fixes, which this log has not",
+            "lever_arm or offset_m",
+            "Leave lever_arm and offset_m out, and give the reference of the antenna.",
+        )
 
     def input_files(self) -> list[Path]:
         """List the files that `draw` reads."""
@@ -323,16 +352,16 @@ class UserInsLog(RecordedWalk):
         return [*tables, *self.rinex.list_files(self.root, self.folder)]
 
     @override
-    def _read_log(self, folder: Path) -> NavigationLog:
-        log = read_log(
-            folder,
-            replace(self.files, gnss=self.files.reference or ""),
-            origin=self.origin,
-            limits=self.limits,
-            corrections=self.corrections,
+    def read_checked(self, folder: Path, **select: Any) -> NavigationLog:
+        source = replace(self, files=replace(self.files, gnss=self.files.reference or ""))
+        log = RecordedWalk.read_checked(source, folder, corrections=self.corrections, **select)
+        require(
+            log.centre,
+            "the log",
+            "contain its origin",
+            "pn, pe, pd alone",
+            "Set scenario.origin=[lat_deg,lon_deg,h_m].",
         )
-        remedy = "Set scenario.origin=[lat_deg,lon_deg,h_m]."
-        require(log.centre, "the log", "contain its origin", "pn, pe, pd alone", remedy)
         time = self.rinex.read_epochs(folder).time
         time = time[(time >= log.reference.time[0]) & (time <= log.reference.time[-1])]
         motion = interpolate(log.reference, time) if len(time) else np.empty((0, 10))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest
@@ -11,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from pfbench.report.board.entries import ViewKey
+from pfbench.report.board.entries import CellKey, ViewKey, round_values
 from pfbench.report.journal.study_pack import ALL
-from pfbench.results.conditions import main_component_group, parse_label
+from pfbench.results.conditions import drop_settings, main_component_group, parse_label
 from pfbench.results.frame import select_indices
 from pfbench.results.looks import MethodLook
 from pfbench.results.store import JobResult
@@ -24,7 +23,6 @@ from pfbench.stats.error_measures import Array
 
 CURVE_INSTANTS, FEW_CURVE_INSTANTS = 60, 24
 _MANY = 300  # filters times conditions, from which curves have few instants
-CellKey = tuple[str, str]
 
 
 def make_curves(results: Mapping[str, JobResult], conditions: int = 1) -> dict[str, Any]:
@@ -40,9 +38,9 @@ def make_curves(results: Mapping[str, JobResult], conditions: int = 1) -> dict[s
             warnings.simplefilter("ignore")  # instants without a run
             low, median, high = np.nanquantile(norm[:, steps], [0.1, 0.5, 0.9], axis=0)
         filters[label] = {
-            "median": _numbers(median), "q10": _numbers(low), "q90": _numbers(high),
+            "median": round_values(median.tolist()), "q10": round_values(low.tolist()), "q90": round_values(high.tolist()),
         }  # fmt: skip
-    time = _numbers(first.data["time"][steps])
+    time = round_values(first.data["time"][steps].tolist())
     return {"t": time, "filters": filters, "unit": group.unit, "group": group.group}
 
 
@@ -82,7 +80,7 @@ def list_calibration(table: pd.DataFrame) -> dict[CellKey, Any]:
         scopes[str(scenario), str(regime)] = rows.droplevel([0, 1])
     return {
         key: {
-            str(label): {name: _number(value) for name, value in row.items()}
+            str(label): {name: round_values(value) for name, value in row.items()}
             for label, row in rows.to_dict("index").items()
         }
         for key, rows in scopes.items()
@@ -97,18 +95,9 @@ def list_runs(table: pd.DataFrame) -> dict[CellKey, Any]:
         runs[str(world), str(regime)] = {
             "unit": rows["unit"].iloc[0], "name": "RMS error",
             "numbers": [int(number) for number in values.index],
-            "values": {str(label): _numbers(values[label].to_numpy()) for label in values},
+            "values": {str(label): round_values(values[label].to_numpy().tolist()) for label in values},
         }  # fmt: skip
     return runs
-
-
-def _numbers(values: np.ndarray) -> list[float | None]:
-    return [_number(value) for value in values.tolist()]
-
-
-def _number(value: float) -> float | None:
-    """Round a number to four digits; None if it is not finite."""
-    return float(f"{value:.4g}") if math.isfinite(value) else None
 
 
 # --------------------------------------------------------------------------------------------------
@@ -291,13 +280,8 @@ def list_sweeps(
 
 def read_settings(label: str) -> list[LabelSetting]:
     """Read the settings of a label."""
-    method, values = parse_label(label)
-    settings = []
-    for name, value in values.items():
-        others = ",".join(f"{key}={text}" for key, text in values.items() if key != name)
-        line = f"{method}[{others}]" if others else method
-        settings.append(LabelSetting(label, line, name, value))
-    return settings
+    settings = parse_label(label)[1].items()
+    return [LabelSetting(label, drop_settings(label, name), name, v) for name, v in settings]
 
 
 def _list_lines(

@@ -5,18 +5,21 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from pfbench.report import provenance
+from pfbench.report.options import ReportOptions
 from pfbench.results import metrics, status, store
-from pfbench.results.conditions import ComponentGroup, Condition, main_component_group
+from pfbench.results.conditions import ComponentGroup, Condition, main_component_group, parse_label
 from pfbench.results.frame import drop_before
-from pfbench.results.looks import MethodLook, PartName
+from pfbench.results.looks import MethodLook, PartName, add_tuning, find_looks
 from pfbench.results.metrics import MetricInput, page_metrics
-from pfbench.results.step_times import STEP_TIME
+from pfbench.results.paper_block import list_named_parts
+from pfbench.results.step_times import STEP_TIME, StepTimes
 from pfbench.results.store import SAME_LIKELIHOODS, SAME_N
 
 # --------------------------------------------------------------------------------------------------
@@ -41,20 +44,85 @@ class ViewKey(NamedTuple):
     baseline: str
 
 
-class StudyNames(NamedTuple):
-    """Names of the parts of a study.
+_OPTIONS = ("alpha", "equivalence_margin", "metric", "baseline")  # that decide
+CellKey = tuple[str, str]  # world and regime
+
+
+class StudyFacts(NamedTuple):
+    """Inputs of decisions other than the runs.
 
     Attributes:
         looks: Looks by label.
         worlds: Names of the scenarios by key.
         regimes: Names of the noise regimes by key.
-        baselines: Labels of the baselines.
+        options: Options of the report.
+        times: Times in rounds by label, of each scenario and regime.
+        failures: Jobs that failed.
+        warning: Sentence on runs that are not independent; empty if none is shown.
+        differing: Sentence on conditions whose jobs differ in their data; empty without any.
+        records: Recorded conditions with the losses of their blocks of time.
     """
 
     looks: Mapping[str, MethodLook]
     worlds: Mapping[str, PartName]
     regimes: Mapping[str, PartName]
-    baselines: Sequence[str]
+    options: ReportOptions
+    times: Mapping[CellKey, Mapping[str, StepTimes]]
+    failures: Sequence[Any] = ()
+    warning: str = ""
+    differing: str = ""
+    records: Sequence[Mapping[str, Any]] = ()
+
+    def to_entries(self) -> dict[str, Any]:
+        """Return plain values, from which `from_pack` restores the facts."""
+        return {
+            "options": {name: getattr(self.options, name) for name in _OPTIONS},
+            "looks": [asdict(look) for look in self.looks.values()],
+            "regimes": [asdict(name) for name in self.regimes.values()],
+            "times": [
+                [*key, {label: times._replace(seconds=times.seconds.tolist())._asdict()
+                        for label, times in by_label.items()}]
+                for key, by_label in self.times.items() if by_label
+            ],
+            "warning": self.warning,
+            "differing": self.differing,
+            "records": list(self.records),
+        }  # fmt: skip
+
+    @classmethod
+    def from_pack(cls, pack: Mapping[str, Any]) -> StudyFacts:
+        """Restore the facts of a stored page. Installed methods have their present looks, and the stored data of their tuning.
+
+        Args:
+            pack: Data of a page.
+        """
+        facts = pack["facts"]
+        stored = [MethodLook(**{**v, "baselines": tuple(v["baselines"])}) for v in facts["looks"]]
+        labels = [look.key for look in stored]
+        methods = {parse_label(label)[0] for label in labels}
+        is_installed = methods <= set(list_named_parts("filter"))
+        looks = {look.key: look for look in stored}
+        present = find_looks(labels) if is_installed else looks
+        return cls(
+            {
+                key: add_tuning(look, looks[key].tuning, looks[key].tuned_on)
+                for key, look in present.items()
+            },
+            {entry["key"]: PartName(**entry) for entry in pack["worlds"]},
+            {entry["key"]: PartName(**entry) for entry in facts["regimes"]},
+            ReportOptions(**facts["options"]),
+            {
+                (world, regime): {
+                    label: StepTimes(np.array(times["seconds"]), times["group"])
+                    for label, times in by_label.items()
+                }
+                for world, regime, by_label in facts["times"]
+            },
+            pack["failures"],
+            facts["warning"],
+            facts["differing"],
+            tuple(facts.get("records", ())),
+        )
 
 
 def list_metrics(values: Mapping[str, Any] | pd.DataFrame, main: str = "rmse") -> list[str]:
@@ -70,13 +138,14 @@ def format_interval_level(alpha: float) -> str:
 
 
 def round_values(values: Any) -> Any:
-    """Round numbers to four digits; a number that is not finite becomes None."""
+    """Round numbers to four digits, but none to 1 that is not 1; a number that is not finite becomes None."""
     if isinstance(values, dict):
         return {key: round_values(value) for key, value in values.items()}
     if isinstance(values, list):
         return [round_values(value) for value in values]
     if isinstance(values, float):
-        return float(f"{values:.4g}") if math.isfinite(values) else None
+        digits = 4 if abs(values - 1.0) > 1e-3 else 9
+        return float(f"{values:.{digits}g}") if math.isfinite(values) else None
     return None if values == "" else values
 
 

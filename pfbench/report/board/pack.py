@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
-import numpy as np
 import pandas as pd
 
+from pfbench.core.parameter_checks import require
 from pfbench.report import provenance
 from pfbench.report.board.curves import (
-    CellKey,
     count_carried_runs,
     list_calibration,
     list_runs,
@@ -22,7 +20,8 @@ from pfbench.report.board.curves import (
     make_tracks,
 )
 from pfbench.report.board.entries import (
-    StudyNames,
+    CellKey,
+    StudyFacts,
     budget_entries,
     cell_entries,
     describe_uncommitted,
@@ -55,15 +54,12 @@ from pfbench.results.conditions import Condition, differing_settings, parse_labe
 from pfbench.results.frame import drop_before, to_long_rows
 from pfbench.results.looks import (
     MethodLook,
-    PartName,
-    add_tuning,
-    find_looks,
     plan_look_pairs,
     study_looks,
     study_part_names,
 )
 from pfbench.results.metrics import page_metrics
-from pfbench.results.paper_block import REFERENCES, list_named_parts
+from pfbench.results.paper_block import REFERENCES
 from pfbench.results.status import count_statuses
 from pfbench.results.step_times import STEP_TIME, WARM_UP, StepTimes
 from pfbench.results.store import JobResult, list_failures
@@ -117,8 +113,9 @@ def build_pack(
             alpha=options.alpha,
             margin=options.equivalence_margin,
             metric=page_metrics()[options.metric].page_name,
-        ).to_entries(),
-        **data.notes.to_entries(facts.looks),
+        ),
+        "filter_notes": join_notes(data.notes),
+        "choices": list_modelling_choices(data.notes, facts.looks),
         "provenance": [list(row) for row in provenance.list_shared_settings(conditions)],
         "facts": facts.to_entries(),
     }
@@ -147,7 +144,7 @@ class StudyData(NamedTuple):
         metrics: All metrics in long rows, see `frame.load_frame`; empty unless requested.
         curves: Quantiles of the error over time by condition.
         tracks: Single runs by condition.
-        notes: Notes on the filters.
+        notes: Notes on the jobs, see `note_job`.
         times: Times in rounds by label, of each condition; without filters that were not measured.
         warning: Sentences on a truth that is measured, and on runs that are not independent; empty for none.
         records: Recorded conditions with the losses of their blocks of time.
@@ -157,7 +154,7 @@ class StudyData(NamedTuple):
     metrics: pd.DataFrame
     curves: dict[CellKey, dict[str, Any]]
     tracks: dict[CellKey, dict[str, Any]]
-    notes: MethodNotes
+    notes: Sequence[dict[str, Any]]
     times: dict[CellKey, dict[str, StepTimes]]
     warning: str = ""
     records: Sequence[RecordedCondition] = ()
@@ -167,7 +164,7 @@ def read_study(
     conditions: Sequence[Condition], options: ReportOptions, *, has_metrics: bool = False
 ) -> StudyData:
     """Read the results of a study, one condition at a time."""
-    rows, metrics, records, notes = [], [], [], MethodNotes()
+    rows, metrics, records, notes = [], [], [], list[dict[str, Any]]()
     data = StudyData(pd.DataFrame(), pd.DataFrame(), {}, {}, notes, {})
     start, converged = options.start_time_s, options.convergence_threshold
     most = count_carried_runs(max(len(c.jobs) for c in conditions), len(conditions))
@@ -181,7 +178,7 @@ def read_study(
         ]  # fmt: skip
         rows += parts
         for job in condition.jobs:
-            notes.add(job.label, results[job.label])
+            notes.append(note_job(job.label, results[job.label]))
             if has_metrics:
                 metrics.append(to_long_rows(condition, job, results[job.label], start, converged))
         key = condition.scenario, regime
@@ -199,7 +196,7 @@ def read_study(
         data._replace(
             table=join_rows(rows, options.metric),
             metrics=long_rows,
-            warning=notes.describe_truth(),
+            warning=describe_truth(notes),
             records=[record for record in records if record],
         )
     )
@@ -223,84 +220,6 @@ def _leave_out_copies(data: StudyData) -> StudyData:
 _BASELINES = (*REFERENCES, "ukf", "ckf")  # offered first if they are in the study
 _MOST_BASELINES, _FEW_BASELINES = 3, 2
 _MANY = 300  # filters times conditions, from which a page offers few baselines
-_OPTIONS = ("alpha", "equivalence_margin", "metric", "baseline")  # that decide
-
-
-class StudyFacts(NamedTuple):
-    """Inputs of decisions other than the runs.
-
-    Attributes:
-        looks: Looks by label.
-        worlds: Names of the scenarios by key.
-        regimes: Names of the noise regimes by key.
-        options: Options of the report.
-        times: Times in rounds by label, of each scenario and regime.
-        failures: Jobs that failed.
-        warning: Sentence on runs that are not independent; empty if none is shown.
-        differing: Sentence on conditions whose jobs differ in their data; empty without any.
-        records: Recorded conditions with the losses of their blocks of time.
-    """
-
-    looks: Mapping[str, MethodLook]
-    worlds: Mapping[str, PartName]
-    regimes: Mapping[str, PartName]
-    options: ReportOptions
-    times: Mapping[CellKey, Mapping[str, StepTimes]]
-    failures: Sequence[Any] = ()
-    warning: str = ""
-    differing: str = ""
-    records: Sequence[RecordedCondition] = ()
-
-    def to_entries(self) -> dict[str, Any]:
-        """Return plain values, from which `from_pack` restores the facts."""
-        return {
-            "options": {name: getattr(self.options, name) for name in _OPTIONS},
-            "looks": [asdict(look) for look in self.looks.values()],
-            "regimes": [asdict(name) for name in self.regimes.values()],
-            "times": [
-                [*key, {label: times._replace(seconds=times.seconds.tolist())._asdict()
-                        for label, times in by_label.items()}]
-                for key, by_label in self.times.items() if by_label
-            ],
-            "warning": self.warning,
-            "differing": self.differing,
-            "records": list(self.records),
-        }  # fmt: skip
-
-    @classmethod
-    def from_pack(cls, pack: Mapping[str, Any]) -> StudyFacts:
-        """Restore the facts of a stored page. Installed methods have their present looks, and the stored data of their tuning.
-
-        Args:
-            pack: Data of a page.
-        """
-        facts = pack["facts"]
-        stored = [MethodLook(**{**v, "baselines": tuple(v["baselines"])}) for v in facts["looks"]]
-        labels = [look.key for look in stored]
-        methods = {parse_label(label)[0] for label in labels}
-        is_installed = methods <= set(list_named_parts("filter"))
-        looks = {look.key: look for look in stored}
-        present = find_looks(labels) if is_installed else looks
-        return cls(
-            {
-                key: add_tuning(look, looks[key].tuning, looks[key].tuned_on)
-                for key, look in present.items()
-            },
-            {entry["key"]: PartName(**entry) for entry in pack["worlds"]},
-            {entry["key"]: PartName(**entry) for entry in facts["regimes"]},
-            ReportOptions(**facts["options"]),
-            {
-                (world, regime): {
-                    label: StepTimes(np.array(times["seconds"]), times["group"])
-                    for label, times in by_label.items()
-                }
-                for world, regime, by_label in facts["times"]
-            },
-            pack["failures"],
-            facts["warning"],
-            facts["differing"],
-            tuple(facts.get("records", ())),
-        )
 
 
 def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
@@ -315,9 +234,8 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
     conditions = len(court.runs.conditions)
     most = _MOST_BASELINES if len(looks) * conditions <= _MANY else _FEW_BASELINES
     baselines = select_baselines(looks, options.baseline)[:most]
-    names = StudyNames(looks, worlds, facts.regimes, baselines)
     groups = table.groupby(["scenario", "regime"])[["unit", "group"]].first()
-    views = build_views(court, groups, names, options, facts.times)
+    views = build_views(court, groups, facts, baselines)
     recorded = decide_records(facts.records, court, baselines)
     for key, view in views.items():
         view["sentence"] = shorten_view(
@@ -333,10 +251,10 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
         "metrics": metric_entries(table, options.metric),
         "baselines": baselines,
         "views": views,
-        "planned": planned_entries(court, looks, worlds, options),
+        "planned": planned_entries(court, facts),
         "decisions": list_decisions(court, options.metric),
         "recorded": recorded,
-        "world_orders": order_worlds(court, views, looks, options),
+        "world_orders": order_worlds(court, views, facts),
         "warnings": [
             text for text in (_count_failures(len(facts.failures)), facts.warning) if text
         ],
@@ -376,11 +294,13 @@ def _count_failures(number: int) -> str:
 
 def select_baselines(looks: Mapping[str, MethodLook], baseline: str = "") -> list[str]:
     """Select the baselines that a reader may choose, the one of the opening view first."""
-    if baseline and baseline not in looks:
-        raise ValueError(
-            f"report.baseline must be a filter of the study, got {baseline}. "
-            f"Choose from {', '.join(looks)}."
-        )
+    require(
+        not baseline or baseline in looks,
+        "report.baseline",
+        "be a filter of the study",
+        baseline,
+        f"Choose from {', '.join(looks)}.",
+    )
     names = [*_BASELINES, *(name for look in looks.values() for name in look.baselines)]
     available = [label for label in (baseline, *names) if label in looks]
     available += [label for name in names for label in looks if parse_label(label)[0] == name]
@@ -394,61 +314,51 @@ def select_baselines(looks: Mapping[str, MethodLook], baseline: str = "") -> lis
 _COUNTS = ("runs", "lost", "diverged", "collapsed", "severely_overconfident")
 
 
-class MethodNotes:
-    """Notes on all filters of a study, collected job by job."""
-
-    def __init__(self) -> None:
-        self._counts: dict[str, Counter[str]] = {}
-        self._particles: dict[str, dict[str, None]] = {}
-        self._exact: dict[str, bool] = {}
-        self._bounded: dict[str, set[bool | None]] = {}
-        self._choices: dict[str, dict[str, None]] = {}
-        self._truths: dict[str, None] = {}
-
-    def add(self, label: str, result: JobResult) -> None:
-        """Add a job."""
-        meta = result.meta
-        status = count_statuses(result.data, meta)._asdict()
-        counts = self._counts.setdefault(label, Counter())
-        counts.update({name: int(status[name] or 0) for name in _COUNTS})
-        counts["limited_runs"] += int(meta["runs"]) if status["diverged"] is not None else 0
-        counts["cold_jobs"] += WARM_UP not in meta["seconds"] and STEP_TIME not in meta
-        particles = meta.get("particles")
-        self._particles.setdefault(label, {})[str(particles)] = None
-        self._exact[label] = self._exact.get(label, True) and bool(meta.get("is_exact"))
-        self._bounded.setdefault(label, set()).add(meta.get("has_bounded_weights"))
-        if "measured_truth" in meta:
-            self._truths[str(meta["measured_truth"])] = None
-        for text in meta.get("modelling_choices", ()):
-            self._choices.setdefault(str(text), {})[label] = None
-
-    def describe_truth(self) -> str:
-        """State what the errors are distances to, if that is measured; empty if it is not."""
-        names = " and ".join(self._truths)
-        return f"Errors are distances to {names}, which have errors of their own." if names else ""
-
-    def to_entries(self, looks: Mapping[str, MethodLook]) -> dict[str, Any]:
-        """Return the entries of the page."""
-        notes = []
-        for label, counts in self._counts.items():
-            particles = [n for n in self._particles[label] if n != "None"]
-            has_limit = counts["limited_runs"] > 0
-            notes.append({
-                "filter": label, "particles": " or ".join(particles), "is_exact": self._exact[label],
-                "has_bounded_weights": _common(self._bounded[label]), "is_timed": not counts["cold_jobs"],
-                **{name: counts[name] for name in _COUNTS},
-                "diverged": counts["diverged"] if has_limit else None,
-            })  # fmt: skip
-        choices = [
-            {"text": text, "filters": _name_filters(labels, looks)}
-            for text, labels in sorted(self._choices.items())
-        ]
-        return {"filter_notes": notes, "choices": choices}
+def note_job(label: str, result: JobResult) -> dict[str, Any]:
+    """Note what a job states: its failures, particles, exactness, truth and modelling choices."""
+    meta, status = result.meta, count_statuses(result.data, result.meta)._asdict()
+    return {
+        "filter": label, **{name: int(status[name] or 0) for name in _COUNTS}, "has_limit": status["diverged"] is not None,
+        "is_timed": WARM_UP in meta["seconds"] or STEP_TIME in meta, "particles": meta.get("particles"),
+        "is_exact": bool(meta.get("is_exact")), "has_bounded_weights": meta.get("has_bounded_weights"),
+        "truth": meta.get("measured_truth"), "choices": [str(text) for text in meta.get("modelling_choices", ())],
+    }  # fmt: skip
 
 
-def _common(statements: set[bool | None]) -> bool | None:
-    """Return whether weights are bounded in all jobs, None if a job does not state it."""
-    return None if None in statements else all(statements)
+def describe_truth(notes: Sequence[Mapping[str, Any]]) -> str:
+    """State what the errors are distances to, if that is measured; empty if it is not."""
+    names = " and ".join(dict.fromkeys(str(note["truth"]) for note in notes if note["truth"] is not None))  # fmt: skip
+    return f"Errors are distances to {names}, which have errors of their own." if names else ""
+
+
+def join_notes(notes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Join the notes on the jobs of each filter."""
+    by_filter: dict[str, list[Mapping[str, Any]]] = {}
+    for note in notes:
+        by_filter.setdefault(note["filter"], []).append(note)
+    entries = []
+    for label, jobs in by_filter.items():
+        counts = {name: sum(job[name] for job in jobs) for name in _COUNTS}
+        bounded = {job["has_bounded_weights"] for job in jobs}
+        particles = dict.fromkeys(str(job["particles"]) for job in jobs if job["particles"] is not None)  # fmt: skip
+        entries.append({
+            "filter": label, "particles": " or ".join(particles), "is_exact": all(job["is_exact"] for job in jobs),
+            "has_bounded_weights": None if None in bounded else all(bounded),
+            "is_timed": all(job["is_timed"] for job in jobs), **counts,
+            "diverged": counts["diverged"] if any(job["has_limit"] and job["runs"] for job in jobs) else None,
+        })  # fmt: skip
+    return entries
+
+
+def list_modelling_choices(
+    notes: Sequence[Mapping[str, Any]], looks: Mapping[str, MethodLook]
+) -> list[dict[str, str]]:
+    """List the modelling choices, with the names of the filters that make them."""
+    labels: dict[str, dict[str, None]] = {}
+    for note in notes:
+        for text in note["choices"]:
+            labels.setdefault(text, {})[note["filter"]] = None
+    return [{"text": text, "filters": _name_filters(labels[text], looks)} for text in sorted(labels)]  # fmt: skip
 
 
 def _name_filters(labels: Mapping[str, None], looks: Mapping[str, MethodLook]) -> str:

@@ -45,7 +45,7 @@ _ADDED = (
     "rate_sd",
 )  # of errors added to recorded measurements
 _NO_CAP = 1e300
-RecordedCondition = dict[str, Any]
+RecordedCondition = Mapping[str, Any]
 
 
 def collect_record(

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from pfbench.report.board.curves import CellKey
 from pfbench.report.board.entries import (
-    StudyNames,
+    StudyFacts,
     ViewKey,
     format_interval_level,
     list_metrics,
@@ -25,7 +25,6 @@ from pfbench.report.board.view import (
     describe_view,
 )
 from pfbench.report.journal.study_pack import ALL
-from pfbench.report.options import ReportOptions
 from pfbench.results.conditions import parse_label
 from pfbench.results.looks import (
     MethodLook,
@@ -51,77 +50,51 @@ from pfbench.stats.study_runs import (
 )
 
 
-class Selection(NamedTuple):
-    """Conditions of a scope, and what is said of them whatever the metric.
-
-    Attributes:
-        world: Scenario, or "all".
-        regime: Noise regime, or "all".
-        mask: Conditions in which the filters are compared, [C].
-        runs: Runs of these conditions.
-        groups: Unit and main group of these conditions.
-        filters: Description of each filter.
-        where: Words on the scope.
-        small_print: Note below the view.
-    """
-
-    world: str
-    regime: str
-    mask: Flags
-    runs: StudyRuns
-    groups: pd.DataFrame
-    filters: Mapping[str, BoardRow]
-    where: str
-    small_print: str
-
-
 def build_views(
-    court: Court,
-    groups: pd.DataFrame,
-    names: StudyNames,
-    options: ReportOptions,
-    times: Mapping[CellKey, Mapping[str, StepTimes]] | None = None,
+    court: Court, groups: pd.DataFrame, facts: StudyFacts, baselines: Sequence[str]
 ) -> dict[ViewKey, dict[str, Any]]:
     """Build all views that have runs. The first one opens the page.
 
     Args:
         court: Court that decides the pairs of the study.
         groups: Unit and main group by scenario and regime.
-        names: Names of the filters, worlds and regimes.
-        options: Options of the report.
-        times: Times of the filters in rounds by scenario and regime.
+        facts: Names, options and times of the study.
+        baselines: Labels of the baselines.
     """
-    selections = _list_selections(court.runs, groups, names, options)
+    scopes = [_make_view(court, scope, groups, facts) for scope in _list_scopes(court.runs.conditions)]  # fmt: skip
     views: dict[ViewKey, dict[str, Any]] = {}
-    for metric in list_metrics(court.runs.values, options.metric):
-        for selection in selections:
-            view = _make_view(court, selection, metric, names, times or {})
-            name = _name_metric(metric, selection.groups["group"])
-            small_print = f"{selection.small_print} {_describe_timing(view)}"
-            for baseline in names.baselines:
+    for metric in list_metrics(court.runs.values, facts.options.metric):
+        for scope in scopes:
+            has_unit = len(scope.groups) == 1 and page_metrics()[metric].is_of_group
+            view = replace(
+                scope, metric=metric, unit=scope.groups["unit"].iloc[0] if has_unit else ""
+            )
+            name = _name_metric(metric, scope.groups["group"])
+            for baseline in baselines:
                 rows = build_rows(view, baseline)
-                views[ViewKey(metric, selection.world, selection.regime, baseline)] = {
-                    "sentence": describe_view(rows, names.looks, baseline, selection.where, name),
-                    "small_print": small_print,
+                views[ViewKey(metric, *view.scope, baseline)] = {
+                    "sentence": describe_view(rows, facts.looks, baseline, view.where, name),
+                    "small_print": view.small_print,
                     "rows": [_round_row(row, view.has_limit) for row in rows],
                 }
     return views
 
 
 def _make_view(
-    court: Court,
-    selection: Selection,
-    metric: str,
-    names: StudyNames,
-    times: Mapping[CellKey, Mapping[str, StepTimes]],
+    court: Court, scope: tuple[str, str, Flags], groups: pd.DataFrame, facts: StudyFacts
 ) -> View:
-    """Collect the data of a view."""
-    groups = selection.groups
-    is_single = len(groups) == 1 and page_metrics()[metric].is_of_group
-    worlds = [names.worlds.get(name) for name in selection.runs.conditions["scenario"].unique()]
+    """Collect the data of a scope, and what is said of it whatever the metric."""
+    world, regime, in_scope = scope
+    mask = select_common(court.runs, in_scope)
+    runs = court.runs.select(mask)
+    keys = list(runs.conditions[["scenario", "regime"]].itertuples(index=False, name=None))
+    times = [facts.times.get(key, {}) for key in keys]
+    notes = _describe_common(mask, in_scope, len(runs.filters)) + _small_print(runs, facts)
+    worlds = [facts.worlds.get(name) for name in runs.conditions["scenario"].unique()]
     return View(
-        court, selection.mask, metric, groups["unit"].iloc[0] if is_single else "", selection.filters,
-        [times.get(key, {}) for key in groups.index], all(world is None or world.limit is not None for world in worlds),
+        court, mask, "", "", describe_filters(runs, facts.options.alpha), times,
+        all(name is None or name.limit is not None for name in worlds), (world, regime), groups.loc[keys],
+        _describe_scope(runs.conditions, facts), f"{notes} {_describe_timing(runs, times, court.alpha)}",
     )  # fmt: skip
 
 
@@ -164,27 +137,7 @@ def _describe_common(mask: Flags, in_scope: Flags, filters: int) -> str:
     return f"{count} {verb} compared: not all {filters} filters were run in the others. "
 
 
-def _list_selections(
-    runs: StudyRuns, groups: pd.DataFrame, names: StudyNames, options: ReportOptions
-) -> list[Selection]:
-    """List the scopes, their runs and what is said of them whatever the metric."""
-    selections = []
-    for world, regime, in_scope in _list_scopes(runs.conditions):
-        mask = select_common(runs, in_scope)
-        selected = runs.select(mask)
-        keys = list(selected.conditions[["scenario", "regime"]].itertuples(index=False, name=None))
-        described = describe_filters(selected, options.alpha)
-        where = _describe_scope(selected.conditions, names)
-        notes = _describe_common(mask, in_scope, len(runs.filters)) + _small_print(
-            selected, options, names
-        )
-        selections.append(
-            Selection(world, regime, mask, selected, groups.loc[keys], described, where, notes)
-        )
-    return selections
-
-
-def _describe_scope(conditions: pd.DataFrame, names: StudyNames) -> str:
+def _describe_scope(conditions: pd.DataFrame, names: StudyFacts) -> str:
     """Describe worlds and regimes in words."""
     where = f"in {_count_worlds(conditions)}"
     scenarios, regimes = conditions["scenario"].unique(), conditions["regime"].unique()
@@ -202,20 +155,21 @@ def _count_worlds(conditions: pd.DataFrame) -> str:
     return text if scenarios == worlds else f"{text} of {format_count(worlds, 'world')}"
 
 
-def _describe_timing(view: View) -> str:
+def _describe_timing(
+    runs: StudyRuns, times: Sequence[Mapping[str, StepTimes]], alpha: float
+) -> str:
     """Describe how the times per step of a view were measured."""
-    measured = [set(view.runs.filters) <= set(times) for times in view.times]
-    if not all(measured):
+    if not all(set(runs.filters) <= set(by_label) for by_label in times):
         return "ms/step: one timing per job of all its runs, which other programs can change."
-    rounds = sorted({t.seconds.size for times in view.times for t in times.values()})
+    rounds = sorted({t.seconds.size for by_label in times for t in by_label.values()})
     number = str(rounds[0]) if len(rounds) == 1 else f"{rounds[0]} to {rounds[-1]}"
     return (
         f"ms/step: of all runs of a job; median and quartiles of {number} rounds in which the filters took turns. "
-        f"Ratio of the times paired by round, {format_interval_level(view.court.alpha)} interval."
+        f"Ratio of the times paired by round, {format_interval_level(alpha)} interval."
     )
 
 
-def _small_print(runs: StudyRuns, options: ReportOptions, names: StudyNames) -> str:
+def _small_print(runs: StudyRuns, names: StudyFacts) -> str:
     """Describe the sample of a view, its tests, settings in names, and what was tuned."""
     filters = int(runs.present.any(axis=(1, 2)).sum())
     seeds = np.unique(runs.values["seed"][runs.present])
@@ -231,7 +185,7 @@ def _small_print(runs: StudyRuns, options: ReportOptions, names: StudyNames) -> 
     ))  # fmt: skip
     return (
         f"{sample}. Ratios are those of Hodges and Lehmann over paired runs, with simultaneous "
-        f"{format_interval_level(options.alpha)} intervals; without one where more than a fifth of the pairs has a lost run. "
+        f"{format_interval_level(names.options.alpha)} intervals; without one where more than a fifth of the pairs has a lost run. "
         f"Better and worse: Wilcoxon's test, the trimmed mean and the sign test agree. "
         f"A lost run is worse than every kept one. {' '.join(filter(None, texts))}"
     ).rstrip()
@@ -248,13 +202,9 @@ def _count_runs(runs: StudyRuns) -> str:
 # Pairs that a study compares in advance: each method with its own baselines.
 
 
-def planned_entries(
-    court: Court,
-    looks: Mapping[str, MethodLook],
-    worlds: Mapping[str, PartName],
-    options: ReportOptions,
-) -> list[dict[str, Any]]:
+def planned_entries(court: Court, facts: StudyFacts) -> list[dict[str, Any]]:
     """List the entries of the pairs that were compared in advance, in ratios, with each scenario and a new world."""
+    looks, options = facts.looks, facts.options
     mask = select_everywhere(court.runs)
     runs = court.runs.select(mask)
     pairs = [pair for pair in plan_look_pairs(looks) if share_conditions(runs, *pair)]
@@ -265,7 +215,7 @@ def planned_entries(
         {
             "a": v.a, "b": v.b, "kind": _find_kind(looks[v.a], looks[v.b]), "word": v.word, "reason": v.reason or None,
             "sentence": describe_planned(v, looks, runs.conditions), **show_ratio(v), "p": round_values(v.p),
-            "loses": v.lost.word, "cells": _list_cells(court, options.metric, (v.a, v.b), worlds),
+            "loses": v.lost.word, "cells": _list_cells(court, options.metric, (v.a, v.b), facts.worlds),
             "new_world": {**show_ratio(w), "word": w.word, "worlds": w.n} if w.n >= MIN_RUNS else None,
         }
         for v, w in zip(planned, new, strict=True)
@@ -371,10 +321,7 @@ MOST_WORLDS = 3  # more worlds have a page of their own, or an average
 
 
 def order_worlds(
-    court: Court,
-    views: Mapping[ViewKey, Mapping[str, Any]],
-    looks: Mapping[str, MethodLook],
-    options: ReportOptions,
+    court: Court, views: Mapping[ViewKey, Mapping[str, Any]], facts: StudyFacts
 ) -> list[dict[str, Any]]:
     """Describe the order of each world: its sentence, its first filter, and the filters that do as well.
 
@@ -387,13 +334,15 @@ def order_worlds(
         return []
     baseline, orders = next(iter(views)).baseline, []
     for world in worlds:
-        view = views[ViewKey(options.metric, world, ALL, baseline)]
+        view = views[ViewKey(facts.options.metric, world, ALL, baseline)]
         labels = [row["filter"] for row in view["rows"] if row["rank"] is not None]
         mask = select_common(court.runs, (conditions["scenario"] == world).to_numpy())
-        verdicts = [court.find(options.metric, mask, label, labels[0]) for label in labels[1:]]
+        verdicts = [
+            court.find(facts.options.metric, mask, label, labels[0]) for label in labels[1:]
+        ]
         ties = [v.a for v in verdicts if v.word != "worse"]
         is_said = not ties and labels[0] == baseline  # by the sentence of the view
-        text = "" if is_said else _describe_ties(labels[0], ties, len(verdicts), looks)
+        text = "" if is_said else _describe_ties(labels[0], ties, len(verdicts), facts.looks)
         orders.append({"world": world, "sentence": f"{view['sentence']} {text}".rstrip()})
     return orders
 

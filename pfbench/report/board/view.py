@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import scipy  # scipy.stats is imported at its first use
 
 from pfbench.results.looks import MethodLook
@@ -40,6 +41,10 @@ class View:
         filters: Description of each filter, see `describe_filters`.
         times: Times of the filters in rounds, by label in each condition.
         has_limit: Whether all scenarios state a divergence threshold.
+        scope: Scenario and noise regime, or "all".
+        groups: Unit and main group of each condition.
+        where: Words on the scope.
+        small_print: Note below the view.
     """
 
     court: Court
@@ -49,6 +54,10 @@ class View:
     filters: Mapping[str, BoardRow]
     times: Sequence[Mapping[str, StepTimes]]
     has_limit: bool
+    scope: tuple[str, str] = ("", "")
+    groups: pd.DataFrame = field(default_factory=pd.DataFrame)
+    where: str = ""
+    small_print: str = ""
 
     @cached_property
     def runs(self) -> StudyRuns:
@@ -93,16 +102,17 @@ def find_against(view: View, baseline: str, complete: Flags) -> dict[str, Verdic
 
 
 def summarise_levels(view: View) -> Array:
-    """Summarise the losses of each filter: mean over conditions of the medians over runs, and an interval.
+    """Summarise the losses of each filter: mean over conditions of the logs of median errors, and an interval.
 
     Returns level and, for a single condition, the ends of the interval of its median, [3, F]. A level is infinite
     where half of the runs are lost.
     """
     losses = compute_losses(view.runs, view.metric)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # filters without runs
-        medians = np.nanmedian(losses, axis=2)
+    ordered, count = np.sort(losses, axis=2), (~np.isnan(losses)).sum(axis=2, keepdims=True)
+    middle = [np.maximum(count - 1, 0) // 2, count // 2]  # of errors, as a reader takes the median
+    pair = (np.take_along_axis(ordered, places, axis=2)[..., 0] for places in middle)
     with np.errstate(invalid="ignore"):
+        medians = np.logaddexp(*pair) - math.log(2.0)
         level = medians @ weigh_conditions(view.runs.conditions)
     ends = np.full((2, len(level)), np.nan)
     if losses.shape[1] == 1:

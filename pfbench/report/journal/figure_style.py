@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from pfbench.core.parameter_checks import require
 from pfbench.results.plotting import set_plain_ticks
 
 # --------------------------------------------------------------------------------------------------
@@ -260,17 +261,22 @@ def find_page_format(journal: str = "", width: str = "") -> PageFormat:
             f"journal or width must be set, got {got}. Use journal={'|'.join(JOURNALS)} or width=120mm."
         )
     if journal:
-        if journal not in JOURNALS:
-            raise ValueError(
-                f"journal must be one of {', '.join(JOURNALS)}, got {journal}. "
-                "Use width=120mm for other pages."
-            )
+        require(
+            journal in JOURNALS,
+            "journal",
+            f"be one of {', '.join(JOURNALS)}",
+            journal,
+            "Use width=120mm for other pages.",
+        )
         return JOURNALS[journal]
     match = re.fullmatch(r"(\d+(?:\.\d+)?)(mm|pt)", width)
     points = float(match[1]) * (_POINTS_PER_MM if match[2] == "mm" else 1.0) if match else 0.0
-    if not _NARROWEST <= points <= _WIDEST:
-        raise ValueError(
-            f"width must be 60mm to 400mm, in mm or pt, got {width}. Use width=120mm or width=345pt."
-        )
+    require(
+        _NARROWEST <= points <= _WIDEST,
+        "width",
+        "be 60mm to 400mm, in mm or pt",
+        width,
+        "Use width=120mm or width=345pt.",
+    )
     head = f"\\documentclass{{article}}\n{_own_geometry(points, 10, 640)}\n{_TIMES}"
     return PageFormat(width, points, points, 640.0, False, 8.0, 7.0, head, "unsrt")

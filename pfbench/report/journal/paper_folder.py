@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from matplotlib.figure import Figure
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.escapes import escape_latex
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report.journal.figure_style import (
@@ -221,11 +222,13 @@ def _find_width(table: LatexTable, page: PageFormat) -> tuple[float, bool] | Non
 def _format_fitting(table: LatexTable, page: PageFormat) -> str:
     """Format a table for one column, or for the width of the text."""
     most = int(page.height / LINE) - _CAPTION_LINES
-    if table.rows > most:
-        raise ValueError(
-            f"table_{table.name} must have at most {most} rows, got {table.rows}. "
-            "Run a study of fewer filters: filter=a,b,c."
-        )
+    require(
+        table.rows <= most,
+        f"table_{table.name}",
+        f"have at most {most} rows",
+        table.rows,
+        "Run a study of fewer filters: filter=a,b,c.",
+    )
     width = _find_width(table, page)
     if width is None:
         raise ValueError(

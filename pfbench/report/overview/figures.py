@@ -17,9 +17,9 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from pfbench.report.overview.tables import Overview, WorldResult, WorldRow, count_wins
+from pfbench.report.overview.tables import Overview, World, count_wins
 from pfbench.results.plotting import RC, line_styles, set_plain_ticks
-from pfbench.stats.comparison import EQUAL_WORDS
+from pfbench.stats.comparison import EQUAL_WORDS, Verdict
 
 BLUE, ORANGE, GREY, INK = "#2166ac", "#c4561a", "#d4d4d4", "#1b1b1b"
 _SCALE = math.log(3.0)  # log ratio of the strongest colour
@@ -91,23 +91,22 @@ def draw_heat_map(overview: Overview, size: Format) -> Figure:
 
     Colour marks what is decided, a grey ground a filter that loses track, = equality within 5 %.
     """
-    columns = list(overview.methods) if size.name else [*overview.methods, *overview.conventional]
+    columns = list(overview.methods) if size.name else overview.columns
     names = [fold_name(overview.names[label]) for label in columns]
-    table = {(cell.world, cell.filter): cell for cell in overview.cells}
     groups = group_worlds(overview)
     foot = size.row * (1 if size.width > 600 else 2)
     with matplotlib.rc_context({**RC, "font.size": size.font, "axes.grid": False}):
         figure, panels = _lay_out(size, [(title, len(rows)) for title, rows in groups], foot)
         for axes, (_, worlds) in zip(panels, groups, strict=True):
-            cells = [
-                [describe_cell(table, w, label, overview) for label in columns] for w in worlds
-            ]
+            cells = [[describe_cell(overview, w, label) for label in columns] for w in worlds]
             values = np.array([[cell.value for cell in row] for row in cells])
             _draw_grid(axes, values, _SCALE, palette(), np.isnan(values))
             _fill_cells(axes, cells, size)
-            axes.set_yticks(np.arange(len(worlds)) + 0.5, [_short(w.name, size) for w in worlds])
+            axes.set_yticks(
+                np.arange(len(worlds)) + 0.5, [_short(w.part_name.name, size) for w in worlds]
+            )
             if not size.name:
-                _name_references(axes, worlds, len(columns), size)
+                _name_references(axes, overview, worlds, size)
         if panels:
             _name_columns(panels[0], names, len(overview.methods), size)
         _draw_key(figure, size, foot)
@@ -138,7 +137,7 @@ def draw_matrices(overview: Overview, size: Format) -> Figure:
 
 
 def draw_doses(
-    overviews: Mapping[int, Overview], worlds: Sequence[WorldRow], axis: str, size: Format
+    overviews: Mapping[int, Overview], worlds: Sequence[World], axis: str, size: Format
 ) -> Figure:
     """Draw the error of methods and conventional filters against the number of particles, or the time of a step.
 
@@ -153,9 +152,9 @@ def draw_doses(
         for empty in panels[len(worlds) :]:
             empty.remove()
         for axes, world in zip(panels, worlds, strict=False):
-            for label in (*_first(overviews).methods, *_first(overviews).conventional):
+            for label in _first(overviews).columns:
                 _draw_dose(axes, dose_points(overviews, world, label, axis), label, overviews)
-            axes.set(xscale="log", yscale="log", title=world.name)
+            axes.set(xscale="log", yscale="log", title=world.part_name.name)
             axes.set_xlabel(
                 "number of particles" if axis == "particles" else "time of a step of a run [ms]"
             )
@@ -174,46 +173,34 @@ def draw_doses(
     return figure
 
 
-class DosePoint(NamedTuple):
-    """Ratio of errors at a number of particles, with its interval, and its position on the axis."""
-
-    x: float
-    ratio: float
-    low: float
-    high: float
-
-
 def dose_points(
-    overviews: Mapping[int, Overview], world: WorldRow, label: str, axis: str
-) -> list[DosePoint]:
-    """List the ratios of a filter in a world by number of particles."""
+    overviews: Mapping[int, Overview], world: World, label: str, axis: str
+) -> list[tuple[float, Verdict]]:
+    """List the verdicts with a ratio on a filter in a world, with their positions on the axis."""
     points = []
     for level, overview in overviews.items():
-        x = (
-            float(level)
-            if axis == "particles"
-            else overview.times.get((world.key, label), math.nan)
-        )
-        points += [
-            DosePoint(x, cell.verdict.ratio, cell.verdict.low, cell.verdict.high)
-            for cell in overview.cells
-            if (cell.world, cell.filter) == (world.key, label) and cell.verdict.ratio > 0
-        ]
+        time = overview.times.get((world.key, label), math.nan)
+        cell = overview.find(world, label)
+        if cell and cell.verdict.ratio > 0:
+            points.append((float(level) if axis == "particles" else time, cell.verdict))
     return points
 
 
 def _draw_dose(
-    axes: Axes, points: Sequence[DosePoint], label: str, overviews: Mapping[int, Overview]
+    axes: Axes,
+    points: Sequence[tuple[float, Verdict]],
+    label: str,
+    overviews: Mapping[int, Overview],
 ) -> None:
     """Draw the line of one filter, a proposed one solid."""
     if not points:
         return
     first = _first(overviews)
     style = line_styles([label])[label]
-    order = [*first.methods, *first.conventional].index(label)
-    x = np.array([point.x for point in points]) * (1 + 0.03 * (order - len(first.methods) / 2))
-    y = np.array([point.ratio for point in points])
-    ends = np.clip([[p.low, p.high] for p in points], y.min() / 10, y.max() * 10)
+    offset = first.columns.index(label) - len(first.methods) / 2
+    x = np.array([x for x, _ in points]) * (1 + 0.03 * offset)
+    y = np.array([verdict.ratio for _, verdict in points])
+    ends = np.clip([[v.low, v.high] for _, v in points], y.min() / 10, y.max() * 10)
     axes.plot(x, y, **style.line(first.names[label]), **style.mark(), ms=4)
     axes.vlines(x, ends[:, 0], ends[:, 1], color=style.colour, alpha=0.35, lw=1)
 
@@ -223,9 +210,9 @@ def _first(overviews: Mapping[int, Overview]) -> Overview:
     return next(iter(overviews.values()))
 
 
-def group_worlds(overview: Overview) -> list[tuple[str, list[WorldRow]]]:
+def group_worlds(overview: Overview) -> list[tuple[str, list[World]]]:
     """Return the worlds by title: those that Kalman filters fit, those that they do not fit, and others."""
-    groups = [(GROUPS[k], [w for w in overview.worlds if w.kalman_fits is k]) for k in GROUPS]
+    groups = [(GROUPS[k], [w for w in overview.worlds if w.facts.kalman_fits is k]) for k in GROUPS]
     return [(title, worlds) for title, worlds in groups if worlds]
 
 
@@ -288,22 +275,19 @@ class CellLook(NamedTuple):
     is_strong: bool = False
 
 
-def describe_cell(
-    table: Mapping[tuple[str, str], WorldResult], world: WorldRow, label: str, overview: Overview
-) -> CellLook:
+def describe_cell(overview: Overview, world: World, label: str) -> CellLook:
     """Return how a cell is drawn."""
-    cell = table.get((world.key, label))
+    cell = overview.find(world, label)
     if cell is None:
-        return CellLook("1" if world.reference == overview.names[label] else "–")
+        return CellLook("1" if world.reference == label else "–")
     if cell.loses_track:
         return CellLook(f"{100 * cell.track_share:.0f} %", is_grey=True)
     word, ratio = cell.verdict.word, cell.verdict.ratio
     if word in EQUAL_WORDS:
         return CellLook("=")
-    star = any(w.wins for w in overview.winners if (w.world, w.filter) == (world.key, label))
     has_ratio = ratio > 0  # else too many runs are lost, and the share that keeps track is drawn
     size = format_ratio(ratio) if has_ratio else f"{100 * cell.track_share:.0f} %"
-    text = f"{size}{'☆' if star else ''}"
+    text = f"{size}{'☆' if cell.wins else ''}"
     if word == "not decided":
         return CellLook(text)
     value = math.log(ratio) if has_ratio else _SCALE * (1 if word == "worse" else -1)
@@ -371,17 +355,23 @@ def _name_columns(axes: Axes, names: Sequence[str], methods: int, size: Format) 
         )  # fmt: skip
 
 
-def _name_references(axes: Axes, worlds: Sequence[WorldRow], columns: int, size: Format) -> None:
+def _name_references(axes: Axes, overview: Overview, worlds: Sequence[World], size: Format) -> None:
     """Write the reference of each world and its error at the right of the row."""
+    x, font = len(overview.columns) + 0.2, 0.9 * size.font
     for i, world in enumerate(worlds):
-        text = f"1 = {world.reference}, {format_reference_error(world.level, world.unit)}"
-        axes.text(
-            columns + 0.2, i + 0.5, text, va="center", fontsize=0.9 * size.font, color="#555555"
-        )
+        text = f"1 = {format_reference(overview, world)}"
+        axes.text(x, i + 0.5, text, va="center", fontsize=font, color="#555555")
 
 
-def format_reference_error(value: float, unit: str) -> str:
-    """Format an error with its unit."""
+def format_reference(overview: Overview, world: World) -> str:
+    """Format the reference of a world with its error."""
+    return f"{overview.names[world.reference]}, {format_reference_error(world.level, world.part_name.unit)}"
+
+
+def format_reference_error(value: float | None, unit: str) -> str:
+    """Format an error with its unit; a dash without one."""
+    if value is None:
+        return "–"
     if unit == "m" and value >= 1000:
         return f"{value / 1000:.1f} km"
     return f"{value:.0f} {unit}".strip() if value >= 10 else f"{value:.2g} {unit}".strip()

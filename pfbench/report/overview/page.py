@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import itertools
 from collections import Counter
 from collections.abc import Mapping
@@ -19,19 +18,21 @@ from pfbench.report.overview.tables import (
     SIR,
     Overview,
     TabKey,
-    WorldResult,
-    WorldRow,
+    World,
+    find_outdone,
     is_worse,
+    list_plain_losses,
     list_rivals,
+    list_world_notes,
     tell_story,
 )
 from pfbench.report.papers.figures import list_paper_pages
 from pfbench.report.study_page.page_writer import describe_page_knobs
-from pfbench.report.writers import format_csv, template_environment
+from pfbench.report.writers import format_csv, format_data_address, template_environment
 from pfbench.results.conditions import parse_label
 from pfbench.results.looks import find_looks
 from pfbench.results.paper_block import read_paper_block
-from pfbench.stats.comparison import EQUAL_WORDS, TRIM_SHARE, Verdict
+from pfbench.stats.comparison import EQUAL_WORDS, TRIM_SHARE
 from pfbench.stats.sentences import format_with_interval
 
 BOARD_PAGE = "worlds.html"  # the page of each world, which is the first page of other studies
@@ -70,7 +71,7 @@ def render_overview(
         "headline": word_headline(overview, overviews.get(EQUAL_TIME)),
         "setting": describe_setting(overview, level),
         "has_printed": PRINTED in overviews,
-        "has_stars": any(winner.wins for item in overviews.values() for winner in item.winners),
+        "has_stars": any(cell.wins for item in overviews.values() for cell in item.cells),
         "failures": describe_failures(pack, overview),
         "notes": list_notes(overview),
         "times_note": describe_times(overviews[EQUAL_TIME]) if EQUAL_TIME in overviews else "",
@@ -79,11 +80,15 @@ def render_overview(
         "foreign_knobs": describe_page_knobs(pack) if "worlds" in pack else "",
         "ratios": list_ratios(overview),
         "format_error": figures.format_reference_error,
-        "filters": [overview.names[label] for label in (*overview.methods, *overview.conventional)],
+        "format_reference": figures.format_reference,
+        "filters": [overview.names[label] for label in overview.columns],
         "stories": [tell_story(overview, m, _summary(m)) for m in overview.methods],
         "rivals": list_rivals(overview),
         "count": spell_number(len(overview.methods)),
-        "pictures": {name: Markup(_data_address(text)) for name, text in pictures.items()},
+        "pictures": {
+            name: Markup(format_data_address("svg", text.encode()))
+            for name, text in pictures.items()
+        },
         "decided": sum(pair.verdict.word in ("better", "worse") for pair in overview.pairs),
         "papers": list_paper_pages(overview.methods),
         "board": BOARD_PAGE,
@@ -102,10 +107,7 @@ def render_overview(
 
 def choose_level(overviews: Mapping[TabKey, Overview]) -> TabKey:
     """Return the number of particles that opens the page: that with the most results of the methods, else the middle one."""
-    cells = {
-        key: sum(cell.filter in overview.methods for cell in overview.cells)
-        for key, overview in _select_levels(overviews).items()
-    }
+    cells = {key: len(overview.of_methods) for key, overview in _select_levels(overviews).items()}
     levels = [key for key, count in cells.items() if count == max(cells.values())]
     return levels[len(levels) // 2]
 
@@ -151,10 +153,10 @@ def draw_pictures(overviews: Mapping[TabKey, Overview]) -> dict[str, str]:
     return {name: figures.to_svg(figure) for name, figure in pictures.items()}
 
 
-def order_dose_worlds(overview: Overview) -> list[WorldRow]:
+def order_dose_worlds(overview: Overview) -> list[World]:
     """Order worlds by the methods that are better than the reference; those that it does not fit first."""
     wins = Counter(cell.world for cell in overview.cells if cell.verdict.word == "better")
-    return sorted(overview.worlds, key=lambda w: (w.kalman_fits is not False, -wins[w.key]))
+    return sorted(overview.worlds, key=lambda w: (w.facts.kalman_fits is not False, -wins[w.key]))
 
 
 def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> str:
@@ -175,9 +177,9 @@ def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> 
         first += f" {'Also at' if winners else 'At'} equal time: {timed}."
     elif winners and at_equal_time:
         first += " At equal time none is."
-    cells = [cell for cell in overview.cells if cell.filter in overview.methods]
+    cells = overview.of_methods
     words = ["lost" if cell.loses_track else cell.verdict.word for cell in cells]
-    single = sum(winner.wins for winner in overview.kalman_winners)
+    single = sum(cell.beats_kalman for cell in cells)
     better_than_each = f" (in {single} than all single ones)" if single else ""
     counts = [
         f"better in {words.count('better')} of {len(cells)} cells{better_than_each}",
@@ -191,8 +193,8 @@ def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> 
 
 def _name_winners(overview: Overview, most: int = 2) -> str:
     """Name the methods that are better than every conventional filter of a world; empty without one."""
-    worlds = {world.key: world.name for world in overview.worlds}
-    winners = [winner for winner in overview.winners if winner.wins]
+    worlds = {world.key: world.part_name.name for world in overview.worlds}
+    winners = [cell for cell in overview.cells if cell.wins]
     wins = [f"{overview.names[w.filter]} ({worlds[w.world]})" for w in winners[:most]]
     more = f" and {len(winners) - most} more" if len(winners) > most else ""
     return f"{', '.join(wins)}{more}"
@@ -229,10 +231,12 @@ def _name_absent(overview: Overview) -> str:
 
 def _describe_reference(overview: Overview) -> str:
     """Say how the best Kalman filter was chosen, and where it is not the best in these runs."""
+    outdone = [(world, find_outdone(world, overview.single)) for world in overview.worlds]
     better = [
-        f"{overview.names[world.outdone.b]} in {world.name} ({_size_outdone(world.outdone)})"
-        for world in overview.worlds
-        if world.outdone
+        f"{overview.names[v.b]} in {world.part_name.name} ("
+        f"{f'the chosen one has {v.ratio:.2f} times its error' if v.ratio > 0 else v.reason})"
+        for world, v in outdone
+        if v
     ]
     text = "The best Kalman filter of a world was chosen on another seed, tuned ones among the candidates"
     blocks = [read_paper_block("filter", parse_label(method)[0]) for method in overview.methods]
@@ -245,34 +249,28 @@ def _describe_reference(overview: Overview) -> str:
     return text
 
 
-def _size_outdone(verdict: Verdict) -> str:
-    """Say how much worse the chosen filter is."""
-    if verdict.ratio > 0:
-        return f"the chosen one has {verdict.ratio:.2f} times its error"
-    return verdict.reason
-
-
 def _count_plain_losses(overview: Overview) -> str:
     """Say how many of the worse cells remain against a Kalman filter that is not tuned either; empty without it."""
-    worse = sum(is_worse(cell) and cell.filter in overview.methods for cell in overview.cells)
-    lost = [world.plain_losses for world in overview.worlds]
-    count = sum(len(some) for some in lost if some is not None)
-    if not worse or None in lost:
+    worse, plain = sum(map(is_worse, overview.of_methods)), list_plain_losses(overview)
+    if not worse or plain is None:
         return ""
-    return f". Of the {worse} worse cells, {count} are worse also than the UKF, which is not tuned either"
+    return f". Of the {worse} worse cells, {len(plain)} are worse also than the UKF, which is not tuned either"
 
 
 def list_notes(overview: Overview) -> list[tuple[str, str]]:
     """List the worlds with what must be known before their numbers are quoted."""
-    return [(world.name, "; ".join(world.notes)) for world in overview.worlds if world.notes]
+    notes = [
+        (world.part_name.name, "; ".join(list_world_notes(world))) for world in overview.worlds
+    ]
+    return [(name, text) for name, text in notes if text]
 
 
 def describe_times(overview: Overview, most: float = 1.5) -> str:
     """Say which filters take longer than SIR in a table of equal time: with few particles times are hard to meet."""
     times, slow = overview.times, []
-    for label in (*overview.methods, *overview.conventional):
+    for label in overview.columns:
         ratios = {
-            world.name: times[world.key, label] / times[world.key, SIR]
+            world.part_name.name: times[world.key, label] / times[world.key, SIR]
             for world in overview.worlds
             if {(world.key, label), (world.key, SIR)} <= times.keys()
         }
@@ -289,7 +287,7 @@ def spell_number(number: int) -> str:
 
 def describe_failures(pack: Mapping[str, Any], overview: Overview) -> list[str]:
     """Describe the jobs that failed, those of a filter with one reason in a sentence."""
-    worlds = {world.key: world.name for world in overview.worlds}
+    worlds = {world.key: world.part_name.name for world in overview.worlds}
     places: dict[tuple[str, str], dict[str, None]] = {}
     for failure in pack.get("failures", ()):
         world, label = (str(failure["choices"][key]) for key in ("scenario", "filter"))
@@ -302,14 +300,13 @@ def describe_failures(pack: Mapping[str, Any], overview: Overview) -> list[str]:
     ]
 
 
-def list_ratios(overview: Overview) -> list[tuple[WorldRow, list[str]]]:
+def list_ratios(overview: Overview) -> list[tuple[World, list[str]]]:
     """List the ratios of a world with their simultaneous intervals, in the order of the columns of the heat map."""
-    cells = {(cell.world, cell.filter): cell for cell in overview.cells}
     rows = []
     for world in overview.worlds:
         texts = []
-        for label in (*overview.methods, *overview.conventional):
-            cell = cells.get((world.key, label))
+        for label in overview.columns:
+            cell = overview.find(world, label)
             has_ratio = cell is not None and cell.verdict.ratio > 0
             text = format_with_interval(*cell.verdict[3:6]) if cell and has_ratio else "–"
             is_lost = cell is not None and (cell.loses_track or not has_ratio)
@@ -329,18 +326,13 @@ def tabulate_heat_map(overviews: Mapping[TabKey, Overview]) -> tuple[list[str], 
         Names of columns and rows. Shown to be better is bold, not decided in brackets.
     """
     overview = overviews[choose_level(overviews)]
-    columns = [*overview.methods, *overview.conventional]
-    table = {(cell.world, cell.filter): cell for cell in overview.cells}
     rows = [
-        [
-            world.name,
-            f"{world.reference}, {figures.format_reference_error(world.level, world.unit)}",
-        ]
-        + [_format_cell(table, world, label, overview) for label in columns]
+        [world.part_name.name, figures.format_reference(overview, world)]
+        + [_format_cell(overview, world, label) for label in overview.columns]
         for world in overview.worlds
     ]
-    head = ["world", "best Kalman filter = 1", *(overview.names[label] for label in columns)]
-    return head, rows
+    names = [overview.names[label] for label in overview.columns]
+    return ["world", "best Kalman filter = 1", *names], rows
 
 
 def count_better_worlds(overviews: Mapping[TabKey, Overview]) -> dict[str, tuple[int, int]]:
@@ -353,19 +345,14 @@ def count_better_worlds(overviews: Mapping[TabKey, Overview]) -> dict[str, tuple
         Number of these worlds, and of all worlds in which the method ran, by the key of the method.
     """
     overview = overviews[choose_level(overviews)]
-    wins = {
-        method: [winner.wins for winner in overview.kalman_winners if winner.filter == method]
-        for method in overview.methods
-    }
+    cells = overview.of_methods
+    wins = {m: [cell.beats_kalman for cell in cells if cell.filter == m] for m in overview.methods}
     return {method: (sum(won), len(won)) for method, won in wins.items()}
 
 
-def _format_cell(
-    table: Mapping[tuple[str, str], WorldResult], world: WorldRow, label: str, overview: Overview
-) -> str:
+def _format_cell(overview: Overview, world: World, label: str) -> str:
     """Format a cell of the heat map as text."""
-    look = figures.describe_cell(table, world, label, overview)
-    cell = table.get((world.key, label))
+    look, cell = figures.describe_cell(overview, world, label), overview.find(world, label)
     if cell is None or look.is_grey or look.text == "=":
         return look.text
     if cell.verdict.word == "better":
@@ -375,18 +362,15 @@ def _format_cell(
 
 def list_verdicts(overview: Overview) -> pd.DataFrame:
     """List the filters against the reference of each world."""
-    references = {world.key: world.reference for world in overview.worlds}
-    limits = {world.key: world.limit for world in overview.worlds}
-    winners = {(w.world, w.filter): w for w in overview.winners}
+    worlds = {world.key: world for world in overview.worlds}
     rows: list[dict[str, Any]] = []
     for cell in overview.cells:
-        winner = winners.get((cell.world, cell.filter))
+        world = worlds[cell.world]
         verdict = {k: v for k, v in cell.verdict.to_row().items() if k not in ("a", "b")}
         rows.append({
-            "world": cell.world, "filter": cell.filter, "reference": references[cell.world], "limit": limits[cell.world], **verdict,
+            "world": cell.world, "filter": cell.filter, "reference": overview.names[world.reference], "limit": world.part_name.limit, **verdict,
             "track_share": cell.track_share, "loses_track": cell.loses_track,
-            "p_every_baseline": winner.p if winner else "", "is_winner": winner.wins if winner else "",
-            "ms_per_step": overview.times.get((cell.world, cell.filter), ""),
+            "p_every_baseline": cell.p_every, "is_winner": cell.wins, "ms_per_step": overview.times.get((cell.world, cell.filter), ""),
         })  # fmt: skip
     return pd.DataFrame(rows)
 
@@ -399,8 +383,3 @@ def list_comparisons(overview: Overview) -> pd.DataFrame:
 def _summary(label: str) -> str:
     """Return the line of a method that its file states."""
     return str(read_paper_block("filter", parse_label(label)[0]).get("summary", ""))
-
-
-def _data_address(svg: str) -> str:
-    """Return a picture as an address, for a page of one file."""
-    return "data:image/svg+xml;base64," + base64.b64encode(svg.encode()).decode()

@@ -16,8 +16,9 @@ import numpy as np
 import pandas as pd
 import yaml
 
+from pfbench.core.parameter_checks import require
 from pfbench.files import limits
-from pfbench.results.conditions import parse_label
+from pfbench.results.conditions import drop_settings, parse_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.results.paper_block import conf_dir, read_paper_block
 from pfbench.results.store import SAME_TIME
@@ -39,24 +40,50 @@ _WORDS = ("better", "worse", *EQUAL_WORDS, "not decided")
 _FAMILIES = ("particle", "guided", "swarm", "gaussian", "learned", "kalman", "")
 
 
+class WorldFacts(NamedTuple):
+    """Facts of a world that the file of its tuning states, from another seed than that of a study.
+
+    Attributes:
+        reference: Best conventional filter.
+        kalman_fits: Whether Kalman filters fit the world; None if it is not known.
+        has_part: Whether the tuning had settings of the scenario of its own, such as a part of a recording.
+    """
+
+    reference: str
+    kalman_fits: bool | None
+    has_part: bool = False
+
+
 class World(NamedTuple):
     """A world of the page, and where the court of the study has it.
 
     Attributes:
-        name: Name of the scenario.
-        reference: Conventional filter with which all others are compared, fixed before the study.
-        kalman_fits: Whether Kalman filters fit the world, by a rule on another seed; None if unknown.
+        key: Name of the scenario.
         court: Court of the study.
         mask: Condition of the world, [C].
         labels: Labels of the study, by the names of the filters in their table.
+        reference: Name of the conventional filter with which all others are compared, fixed before the study.
+        facts: Facts of the world, by a rule on another seed.
+        part_name: Name of the world for a reader, with its unit and its limit.
     """
 
-    name: str
-    reference: str
-    kalman_fits: bool | None
+    key: str
     court: Court
     mask: Flags
     labels: Mapping[str, str]
+    reference: str = ""
+    facts: WorldFacts = WorldFacts("", None)
+    part_name: PartName = PartName("", "", "")
+
+    @property
+    def runs(self) -> int:
+        """Number of runs of the reference."""
+        return self.losses(self.reference).shape[1]
+
+    @property
+    def level(self) -> float:
+        """Error of the reference, median over runs; infinite if it loses half of them."""
+        return float(np.exp(np.median(self.losses(self.reference))))
 
     def find(self, a: str, b: str) -> Verdict:
         """Return the verdict of the study on two filters of the table."""
@@ -74,77 +101,31 @@ class World(NamedTuple):
         return float(np.isfinite(self.losses(name)).mean())
 
 
-class WorldResult(NamedTuple):
-    """A filter in a world.
+class WorldCell(NamedTuple):
+    """A row of the frame of a page: a pair of filters in a world.
 
     Attributes:
-        world: Name of the world.
-        filter: Label of the filter.
-        verdict: Verdict on the filter against the reference of the world.
-        track_share: Share of runs that keep track.
+        world: Name of the scenario.
+        verdict: Verdict on the first filter: against the reference of the world, or against another method.
+        track_share: Share of runs in which the first filter keeps track.
         loses_track: Whether it is shown that this share is below 0.8.
+        p_every: Largest p-value against all baselines of the world, with Holm's correction; None if it is not asked.
+        wins: Whether it is better than all of them; None if it is not asked.
+        beats_kalman: Whether it is better than every single Kalman filter of the world.
     """
-
-    world: str
-    filter: str
-    verdict: Verdict
-    track_share: float
-    loses_track: bool
-
-
-class WorldPair(NamedTuple):
-    """A pair of methods in a world."""
 
     world: str
     verdict: Verdict
+    track_share: float = math.nan
+    loses_track: bool = False
+    p_every: float | None = None
+    wins: bool | None = None
+    beats_kalman: bool = False
 
-
-class Winner(NamedTuple):
-    """Test of a method against all baselines of a world.
-
-    Attributes:
-        world: Name of the world.
-        filter: Label of the method.
-        p: Largest p-value of all baselines and tests, with Holm's correction.
-        wins: Whether it is better than all of them.
-    """
-
-    world: str
-    filter: str
-    p: float
-    wins: bool
-
-
-class WorldRow(NamedTuple):
-    """A world of the page.
-
-    Attributes:
-        key: Name of the scenario, with its model if the study has several.
-        name: Name for a reader.
-        reference: Name of the conventional filter that is best on the seed of the tuning.
-        level: Error of the reference, median over runs; infinite if it loses half of them.
-        unit: Unit of the error.
-        runs: Number of runs.
-        kalman_fits: Whether Kalman filters fit the world; None without a tuning.
-        words: What the world is, in a line.
-        limit: Error above which a run has lost the track; NaN without one.
-        outdone: Verdict on the reference against the best other single Kalman filter, if that is better in these runs.
-        notes: What must be known before a number of the world is quoted.
-        plain_losses: Methods that are worse than the reference and than the UKF, which is not tuned; None without a UKF.
-    """
-
-    key: str
-    name: str
-    reference: str
-    level: float
-    unit: str
-    runs: int
-    kalman_fits: bool | None
-    words: str = ""
-    limit: float = math.nan
-    outdone: Verdict | None = None
-    notes: tuple[str, ...] = ()
-    plain_losses: tuple[str, ...] | None = None
+    @property
+    def filter(self) -> str:
+        """Name of the first filter."""
+        return self.verdict.a
 
 
 class Overview(NamedTuple):
@@ -154,41 +135,40 @@ class Overview(NamedTuple):
         worlds: Worlds, those that Kalman filters fit first.
         methods: Proposed methods, in the order of the page.
         conventional: Conventional filters that stand next to them.
+        single: Single Kalman filters.
         names: Names of all filters.
         cells: Methods and conventional filters against the reference of each world.
         pairs: All pairs of methods in each world.
-        winners: Methods that are better than every conventional filter of a world.
         times: Median time of a step [ms] by world and filter.
         left_out: Worlds that are not on the page, with the reason.
-        kalman_winners: Methods that are better than each single Kalman filter of a world.
         numbers: Number of particles of the filters that have another one than the title of their table states.
     """
 
-    worlds: tuple[WorldRow, ...]
-    methods: tuple[str, ...]
-    conventional: tuple[str, ...]
+    worlds: Sequence[World]
+    methods: Sequence[str]
+    conventional: Sequence[str]
+    single: Sequence[str]
     names: Mapping[str, str]
-    cells: Sequence[WorldResult]
-    pairs: Sequence[WorldPair]
-    winners: Sequence[Winner]
+    cells: Sequence[WorldCell]
+    pairs: Sequence[WorldCell]
     times: Mapping[tuple[str, str], float]
     left_out: Mapping[str, str]
-    kalman_winners: Sequence[Winner]
     numbers: Mapping[str, float] = MappingProxyType({})
 
+    @property
+    def columns(self) -> list[str]:
+        """Methods and the conventional filters next to them."""
+        return [*self.methods, *self.conventional]
 
-class WorldFacts(NamedTuple):
-    """Facts of a world that the file of its tuning states, from another seed than that of a study.
+    @property
+    def of_methods(self) -> list[WorldCell]:
+        """Methods against the reference of each world."""
+        return [cell for cell in self.cells if cell.filter in self.methods]
 
-    Attributes:
-        reference: Best conventional filter.
-        kalman_fits: Whether Kalman filters fit the world; None if it is not known.
-        has_part: Whether the tuning had settings of the scenario of its own, such as a part of a recording.
-    """
-
-    reference: str
-    kalman_fits: bool | None
-    has_part: bool = False
+    def find(self, world: World, label: str) -> WorldCell | None:
+        """Return a filter against the reference of a world; None where it did not run."""
+        keys = (world.key, label)
+        return next((cell for cell in self.cells if (cell.world, cell.filter) == keys), None)
 
 
 def read_world_facts(scenario: str, model: str) -> WorldFacts | None:
@@ -262,113 +242,49 @@ def plan_world_pairs(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> di
     ]  # fmt: skip
     pairs = {}
     for name, rows in table.groupby("scenario", observed=True, sort=False):
-        facts = _find_facts(central_rows(rows), str(name))
+        facts = _find_facts(central_rows(rows).iloc[0], str(name))
         bases = {PLAIN, facts.reference if facts else PLAIN}
         references = [label for label in looks if parse_label(label)[0] in bases]
         pairs[str(name)] = [*methods, *((a, b) for b in references for a in looks if a != b)]
     return pairs
 
 
-def build_overview(
-    table: pd.DataFrame,
-    looks: Mapping[str, MethodLook],
-    parts: Mapping[str, PartName],
-    judged: tuple[Court, Mapping[str, str]],
-    is_shown: Callable[[MethodLook], bool] = is_method,
-) -> Overview:
-    """Collect all that the first page shows.
-
-    Args:
-        table: Runs of the filters of the page.
-        looks: Looks of the filters, by their names in the table.
-        parts: Names of the scenarios by key.
-        judged: Court of the study, and the labels that it has for the names of the table.
-        is_shown: Whether a filter is one of the methods of the page.
-
-    Returns:
-        Tables of one study. A world without a stated reference, or without runs of it, is left out with the reason.
-    """
-    methods = order_methods([label for label in looks if is_shown(looks[label])], looks)
-    by_name = {parse_label(label)[0]: label for label in looks}
-    conventional = tuple(
-        by_name[name] for name in CONVENTIONAL if name in by_name and name not in methods
-    )
-    worlds, rows, left_out, has_part = [], [], {}, {}
-    for key, group in table.groupby("scenario", observed=True, sort=False):
-        try:
-            facts = _read_facts(central_rows(group), parts[str(key)])
-            world = build_world(central_rows(group), facts, judged)
-        except ValueError as error:
-            left_out[parts[str(key)].name] = str(error)
-            continue
-        worlds.append(world)
-        has_part[world.name] = facts.has_part
-        rows.append(_describe_world(world, parts[str(key)], looks))
-    order = sorted(range(len(worlds)), key=lambda k: worlds[k].kalman_fits is False)
-    worlds, rows = [worlds[k] for k in order], [rows[k] for k in order]
-    baselines = [label for label, look in looks.items() if not look.proposed]
-    single = [
-        v
-        for v in baselines
-        if looks[v].family == "kalman" and parse_label(v)[0] not in CONVENTIONAL
-    ]
-    cells = decide_cells(worlds, [*methods, *conventional])
-    rows = [
-        row._replace(
-            outdone=find_outdone(world, single),
-            notes=list_world_notes(world, has_part[world.name]),
-            plain_losses=_find_plain_losses(world, [c.filter for c in cells if c.world == world.name and c.filter in methods and is_worse(c)]),
-        )
-        for row, world in zip(rows, worlds, strict=True)
-    ]  # fmt: skip
-    return Overview(
-        tuple(rows), methods, conventional, {label: look.name for label, look in looks.items()},
-        cells, compare_methods(worlds, methods), find_winners(worlds, methods, baselines),
-        _list_times(table, [row.key for row in rows]), left_out, find_winners(worlds, methods, single),
-    )  # fmt: skip
-
-
-def is_worse(cell: WorldResult) -> bool:
+def is_worse(cell: WorldCell) -> bool:
     """Return whether a filter is worse than the reference of its world, and does not lose track."""
     return cell.verdict.word == "worse" and not cell.loses_track
 
 
-def decide_cells(worlds: Sequence[World], filters: Sequence[str]) -> list[WorldResult]:
+def decide_cells(worlds: Sequence[World], filters: Sequence[str]) -> list[WorldCell]:
     """Select the verdicts on filters against the reference of each world, without it and without absent filters."""
     cells = []
     for world in worlds:
         lost = world.court.find_lost(world.mask)
         cells += [
-            WorldResult(world.name, name, world.find(name, world.reference), world.share_track(name), world.labels[name] in lost)
+            WorldCell(world.key, world.find(name, world.reference), world.share_track(name), world.labels[name] in lost)
             for name in filters if name in world.labels and name != world.reference
         ]  # fmt: skip
     return cells
 
 
-def compare_methods(worlds: Sequence[World], methods: Sequence[str]) -> list[WorldPair]:
-    """Select the verdicts on all pairs of methods in all worlds."""
-    return [
-        WorldPair(world.name, world.find(a, b))
-        for world in worlds for a, b in combinations(methods, 2) if {a, b} <= set(world.labels)
-    ]  # fmt: skip
-
-
 def find_winners(
     worlds: Sequence[World], methods: Sequence[str], baselines: Sequence[str]
-) -> list[Winner]:
-    """Find methods that are better than every baseline of a world, with Holm's correction over worlds and methods."""
+) -> dict[tuple[str, str], tuple[float, bool]]:
+    """Find methods that are better than every baseline of a world, with Holm's correction over worlds and methods.
+
+    Returns the largest p-value of all baselines and tests, and whether a method is better than all, by world and method.
+    """
     keys = [(w, m) for w in worlds for m in methods if m in w.labels]
     largest = [
         find_largest_p([(both[0], both[1]) for b in baselines if b in w.labels for both in [w.losses(m, b)]])
         for w, m in keys
     ]  # fmt: skip
-    return [
-        Winner(w.name, m, float(p), bool(p < w.court.alpha))
+    return {
+        (w.key, m): (float(p), bool(p < w.court.alpha))
         for (w, m), p in zip(keys, holm(largest), strict=True)
-    ]
+    }
 
 
-def count_wins(pairs: Sequence[WorldPair], worlds: Sequence[str]) -> Counter[Pair]:
+def count_wins(pairs: Sequence[WorldCell], worlds: Sequence[str]) -> Counter[Pair]:
     """Count the worlds in which the first method of a pair is better than the second."""
     verdicts = [pair.verdict for pair in pairs if pair.world in worlds]
     wins = [(v.a, v.b) for v in verdicts if v.word == "better"]
@@ -383,25 +299,25 @@ def find_outdone(world: World, single: Sequence[str]) -> Verdict | None:
     return max(worse, key=lambda v: v.ratio if v.ratio > 0 else math.inf, default=None)
 
 
-def _find_plain_losses(world: World, worse: Sequence[str]) -> tuple[str, ...] | None:
-    """Find those of the worse methods that are worse than the plain UKF too; None without a UKF."""
-    if PLAIN not in world.labels:
+def list_plain_losses(overview: Overview) -> list[WorldCell] | None:
+    """List the cells of methods that are worse than the reference and than the plain UKF; None without a UKF in a world."""
+    worlds = {world.key: world for world in overview.worlds}
+    if any(PLAIN not in world.labels for world in overview.worlds):
         return None
-    is_same = world.reference == PLAIN
-    return tuple(name for name in worse if is_same or world.find(name, PLAIN).word == "worse")
+    return [
+        cell
+        for cell in filter(is_worse, overview.of_methods)
+        for world in [worlds[cell.world]]
+        if world.reference == PLAIN or world.find(cell.filter, PLAIN).word == "worse"
+    ]
 
 
-def list_world_notes(world: World, has_part: bool) -> tuple[str, ...]:
-    """List what must be known before a number of a world is quoted.
-
-    Args:
-        world: World of the page.
-        has_part: Whether its tuning had a part of its recording.
-    """
-    texts, drives = [], count_recorded_drives(parse_label(world.name)[0])
+def list_world_notes(world: World) -> list[str]:
+    """List what must be known before a number of a world is quoted."""
+    texts, drives = [], count_recorded_drives(parse_label(world.key)[0])
     if drives == 1:
         texts.append("one recording: words are about other starts and random numbers on it")
-    if drives and has_part:
+    if drives and world.facts.has_part:
         texts.append("the best Kalman filter was tuned on a part of it")
     elif drives:
         same = "it" if drives == 1 else f"the same {drives} recordings"
@@ -411,7 +327,7 @@ def list_world_notes(world: World, has_part: bool) -> tuple[str, ...]:
         texts.append("the best Kalman filter is not shown to be better than dead reckoning")
     if (share := world.share_track(world.reference)) < TRACK_SHARE:
         texts.append(f"the best Kalman filter keeps track in {100 * share:.0f} % of runs")
-    return tuple(texts)
+    return texts
 
 
 def count_recorded_drives(scenario: str) -> int:
@@ -451,39 +367,34 @@ def build_overviews(
         parts: Names of the scenarios by key.
         court: Court of these runs.
     """
-    levels: list[TabKey] = [*list_levels(looks)]
-    timed = [label for label in looks if _has_equal_time(label)]
+    levels, timed = list_levels(looks), [label for label in looks if _has_equal_time(label)]
+    rest = [label for label in looks if label not in timed]
     printed = [label for label, look in looks.items() if is_printed(look)]
-    overviews = {}
-    for key in levels or [0]:
-        labels = [label for label in looks if label not in timed and _level(label) in (None, key)]
-        alone = labels if levels else [label for label in looks if label not in timed]
-        tab = _build_tab(table, looks, parts, alone, court)
-        overviews[key] = _count_particles(tab, table, labels, int(key)) if key else tab
+    tabs: dict[TabKey, _Tab] = {
+        key: _Tab([label for label in rest if _level(label) in (None, key)], key) for key in levels
+    }
+    tabs = tabs or {0: _Tab(rest)}
     if sum(is_method(looks[label]) for label in timed) >= FEWEST_METHODS:
         names = {name_without_level(label) for label in timed}
         fixed = [label for label in looks if _level(label) is None and label not in names]
-        overviews[EQUAL_TIME] = _build_tab(table, looks, parts, [*timed, *fixed], court)
+        tabs[EQUAL_TIME] = _Tab([*timed, *fixed])
     if len(printed) >= FEWEST_METHODS:
         number = table.loc[table["filter"].isin(printed), "particles"].dropna().median()
-        same = [label for label in looks if label not in timed and _level(label) in (None, number)]
-        others = [label for label in same if not is_method(looks[label])]
-        tab = _build_tab(table, looks, parts, others, court, is_printed)
-        overviews[PRINTED] = _count_particles(tab, table, others)
-    return overviews
+        others = [v for v in rest if _level(v) in (None, number) and not is_method(looks[v])]
+        tabs[PRINTED] = _Tab(others, 0, is_printed)
+    central = {
+        str(key): central_rows(rows).iloc[0]
+        for key, rows in table.groupby("scenario", observed=True, sort=False)
+    }
+    return {key: _build_tab(tab, central, looks, parts, court) for key, tab in tabs.items()}
 
 
-def _count_particles(
-    tab: Overview, table: pd.DataFrame, labels: Sequence[str], level: int = 0
-) -> Overview:
-    """Count the particles of the filters of a tab that have another number than `level`."""
-    rows = table[table["filter"].isin(labels)]
-    if "particles" not in rows:
-        return tab
-    names = rows["filter"].astype(str).map(name_without_level)
-    counts = rows.groupby(names)["particles"].median().dropna()
-    others = {str(k): n for k, n in counts.items() if k in tab.names and n != level}
-    return tab._replace(numbers=others)
+class _Tab(NamedTuple):
+    """Filters of a table, its number of particles if it is counted, and whether a filter is one of its methods."""
+
+    labels: Sequence[str]
+    level: int | None = None
+    is_shown: Callable[[MethodLook], bool] = is_method
 
 
 def add_levels(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> pd.DataFrame:
@@ -504,30 +415,88 @@ def add_levels(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> pd.DataF
 
 
 def _build_tab(
-    table: pd.DataFrame,
+    tab: _Tab,
+    central: Mapping[str, pd.Series[Any]],
     looks: Mapping[str, MethodLook],
     parts: Mapping[str, PartName],
-    labels: Sequence[str],
     court: Court,
-    is_shown: Callable[[MethodLook], bool] = is_method,
 ) -> Overview:
-    """Collect the tables of some filters under names without their numbers of particles."""
-    names = {label: name_without_level(label) for label in labels}
-    rows = table[table["filter"].isin(labels)]
-    swept = [
-        label for label in labels if is_shown is is_printed or name_without_level(label) != label
+    """Collect the tables of some filters, under names without their numbers of particles.
+
+    A world without a stated reference, or without runs of it, is left out with the reason.
+    """
+    present, scenarios = (
+        np.asarray(court.runs.present.any(axis=2)),
+        court.runs.conditions["scenario"],
+    )
+    where = {v: set(scenarios[present[court.runs.filters.index(v)]]) for v in tab.labels}
+    swept = [v for v in tab.labels if tab.is_shown is is_printed or name_without_level(v) != v]
+    swept = [v for v in swept if tab.is_shown(looks[v])] or list(tab.labels)
+    keys = [key for key in central if any(key in where[v] for v in swept)]
+    labels = {name_without_level(v): v for v in tab.labels if where[v] & set(keys)}
+    plain = find_looks(list(labels))
+    kinds = {k: plain[k] if plain[k].family else replace(looks[v], key=k) for k, v in labels.items()}  # fmt: skip
+    worlds, left_out = [], {}
+    for key in keys:
+        try:
+            facts = _read_facts(central[key], key)
+            worlds.append(build_world(parts[key], facts, court, str(central[key]["regime"]), labels))  # fmt: skip
+        except ValueError as error:
+            left_out[parts[key].name] = str(error)
+    worlds.sort(key=lambda world: world.facts.kalman_fits is False)
+    overview = _decide_tab(worlds, kinds, tab.is_shown)
+    return overview._replace(left_out=left_out, numbers=_count_particles(tab, labels, court))
+
+
+def _decide_tab(
+    worlds: Sequence[World], looks: Mapping[str, MethodLook], is_shown: Callable[[MethodLook], bool]
+) -> Overview:
+    """Select all rows of a table from the court of its worlds."""
+    methods = [label for label, look in looks.items() if is_shown(look)]
+    methods.sort(key=lambda label: _FAMILIES.index(looks[label].family))  # one Gaussian last
+    by_name = {parse_label(label)[0]: label for label in looks}
+    conventional = [
+        by_name[name] for name in CONVENTIONAL if name in by_name and name not in methods
     ]
-    methods = [label for label in swept if is_shown(looks[label])]
-    if methods:
-        worlds = rows.loc[rows["filter"].isin(methods), "scenario"].unique()
-        rows = rows[rows["scenario"].isin(worlds)]
-    rows = rows.assign(filter=rows["filter"].map(names))
-    present = [name for name in dict.fromkeys(names.values()) if name in set(rows["filter"])]
-    plain = find_looks(present)
-    kinds = {names[label]: looks[label] for label in labels}
-    present_looks = {k: plain[k] if plain[k].family else replace(kinds[k], key=k) for k in present}
-    judged = court, {name: label for label, name in names.items()}
-    return build_overview(rows, present_looks, parts, judged, is_shown)
+    baselines = [label for label, look in looks.items() if not look.proposed]
+    single = [
+        v
+        for v in baselines
+        if looks[v].family == "kalman" and parse_label(v)[0] not in CONVENTIONAL
+    ]
+    every, kalman = (find_winners(worlds, methods, some) for some in (baselines, single))
+    cells = [
+        c._replace(p_every=every[key][0], wins=every[key][1], beats_kalman=kalman[key][1])
+        if (key := (c.world, c.filter)) in every
+        else c
+        for c in decide_cells(worlds, [*methods, *conventional])
+    ]
+    pairs = [
+        WorldCell(w.key, w.find(a, b))
+        for w in worlds for a, b in combinations(methods, 2) if {a, b} <= set(w.labels)
+    ]  # fmt: skip
+    times = {(w.key, name): _find_time(w, label) for w in worlds for name, label in w.labels.items()}  # fmt: skip
+    names = {label: look.name for label, look in looks.items()}
+    return Overview(worlds, methods, conventional, single, names, cells, pairs, times, {})
+
+
+def _find_time(world: World, label: str) -> float:
+    """Return the median time of a step of a filter in all regimes of a world [ms]."""
+    runs = world.court.runs
+    of_world = (runs.conditions["scenario"] == world.key).to_numpy()
+    return float(np.nanmedian(runs.values["ms"][runs.filters.index(label), of_world]))
+
+
+def _count_particles(tab: _Tab, labels: Mapping[str, str], court: Court) -> dict[str, float]:
+    """Count the particles of the filters of a table that have another number than its title."""
+    if tab.level is None or "particles" not in court.runs.values:
+        return {}
+    counts = {
+        name: court.runs.values["particles"][court.runs.filters.index(label)]
+        for name, label in labels.items()
+    }
+    medians = {k: float(np.nanmedian(n)) for k, n in counts.items() if not np.isnan(n).all()}
+    return {k: n for k, n in medians.items() if n != tab.level}
 
 
 def list_levels(looks: Mapping[str, MethodLook]) -> list[int]:
@@ -540,11 +509,7 @@ def list_levels(looks: Mapping[str, MethodLook]) -> list[int]:
 
 def name_without_level(label: str) -> str:
     """Return a label without its number of particles and the budget that determines it."""
-    name, settings = parse_label(label)
-    others = [
-        f"{key}={value}" for key, value in settings.items() if key not in ("particles", "budget")
-    ]
-    return f"{name}[{','.join(others)}]" if others else name
+    return drop_settings(label, "particles", "budget")
 
 
 def _level(label: str) -> int | None:
@@ -558,78 +523,59 @@ def _has_equal_time(label: str) -> bool:
     return parse_label(label)[1].get("budget") == SAME_TIME
 
 
-def order_methods(labels: Sequence[str], looks: Mapping[str, MethodLook]) -> tuple[str, ...]:
-    """Order methods: those of particles first, those of one Gaussian last."""
-    return tuple(sorted(labels, key=lambda label: _FAMILIES.index(looks[label].family)))
-
-
 def central_rows(rows: pd.DataFrame) -> pd.DataFrame:
     """Select the central noise regime of a world."""
     regimes: Collection[str] = rows["regime"].unique()
     return rows[rows["regime"] == (CENTRAL if CENTRAL in regimes else next(iter(regimes)))]
 
 
-def _read_facts(rows: pd.DataFrame, name: PartName) -> WorldFacts:
+def _find_facts(row: pd.Series[Any], scenario: str) -> WorldFacts | None:
+    """Find the facts that the tuning of a world states, by a row of its runs; None without one."""
+    return read_world_facts(scenario, str(row.get("model", "")))
+
+
+def _read_facts(row: pd.Series[Any], scenario: str) -> WorldFacts:
     """Read the facts that the tuning of a world states."""
-    facts = _find_facts(rows, name.key)
+    facts = _find_facts(row, scenario)
     if facts is None:
         raise ValueError(
-            f"{name.key} must have a tuning that states its best conventional filter, got none. "
-            f"Run pfbench tune scenario={name.key} model={_find_model(rows)}."
+            f"{scenario} must have a tuning that states its best conventional filter, got none. "
+            f"Run pfbench tune scenario={scenario} model={row.get('model', '')}."
         )
     return facts
 
 
-def _find_facts(rows: pd.DataFrame, scenario: str) -> WorldFacts | None:
-    """Find the facts that the tuning of a world states; None without one."""
-    return read_world_facts(scenario, _find_model(rows))
-
-
-def _find_model(rows: pd.DataFrame) -> str:
-    """Return the model of a world, empty if the table has none."""
-    return str(rows["model"].iloc[0]) if "model" in rows else ""
-
-
 def build_world(
-    rows: pd.DataFrame, facts: WorldFacts, judged: tuple[Court, Mapping[str, str]]
+    part_name: PartName, facts: WorldFacts, court: Court, regime: str, labels: Mapping[str, str]
 ) -> World:
     """Build a world with the reference that its tuning states.
 
     Args:
-        rows: Runs of one condition.
+        part_name: Name of the world.
         facts: Facts of the world.
-        judged: Court of the study, and the labels that it has for the names of the table.
+        court: Court of the study.
+        regime: Noise regime of the page.
+        labels: Labels of the court, by the names of the filters.
 
     Raises:
         ValueError: If runs of the reference are missing.
     """
-    (court, labels), present = judged, set(rows["filter"])
-    name, regime = str(rows["scenario"].iloc[0]), rows["regime"].iloc[0]
-    by_name = {parse_label(label)[0]: label for label in labels if label in present}
-    if facts.reference not in by_name:
-        raise ValueError(
-            f"{name} must have runs of its reference {facts.reference}, got none. Run filter={facts.reference} in this study."
-        )
-    conditions = court.runs.conditions
-    mask = ((conditions["scenario"] == name) & (conditions["regime"] == regime)).to_numpy()
-    present_labels = {key: label for key, label in labels.items() if key in present}
-    return World(name, by_name[facts.reference], facts.kalman_fits, court, mask, present_labels)
-
-
-def _describe_world(world: World, name: PartName, looks: Mapping[str, MethodLook]) -> WorldRow:
-    """Return the row of a world."""
-    losses = world.losses(world.reference)[0]
-    return WorldRow(
-        world.name, name.name, looks[world.reference].name, float(np.exp(np.median(losses))), name.unit,
-        len(losses), world.kalman_fits, name.words, math.nan if name.limit is None else name.limit,
-    )  # fmt: skip
-
-
-def _list_times(table: pd.DataFrame, worlds: Sequence[str]) -> dict[tuple[str, str], float]:
-    """List the times of a step by world and filter."""
-    selected = table[table["scenario"].isin(list(worlds))]
-    groups = selected.groupby(["scenario", "filter"], observed=True)
-    return {(str(key[0]), str(key[1])): float(rows["ms"].median()) for key, rows in groups}
+    conditions, present = court.runs.conditions, np.asarray(court.runs.present.any(axis=2))
+    mask = ((conditions["scenario"] == part_name.key) & (conditions["regime"] == regime)).to_numpy()
+    present_labels = {
+        k: v for k, v in labels.items() if present[court.runs.filters.index(v), mask].any()
+    }
+    by_name = {parse_label(name)[0]: name for name in present_labels}
+    require(
+        facts.reference in by_name,
+        part_name.key,
+        f"have runs of its reference {facts.reference}",
+        "none",
+        f"Run filter={facts.reference} in this study.",
+    )
+    return World(
+        part_name.key, court, mask, present_labels, by_name[facts.reference], facts, part_name
+    )
 
 
 def tell_story(overview: Overview, method: str, summary: str) -> dict[str, str]:
@@ -638,9 +584,9 @@ def tell_story(overview: Overview, method: str, summary: str) -> dict[str, str]:
     A win that is not shown against every single Kalman filter has a dagger.
     """
     cells = [cell for cell in overview.cells if cell.filter == method]
-    names = {world.key: world.name for world in overview.worlds}
-    over_all = {w.world for w in overview.kalman_winners if w.wins and w.filter == method}
-    by_word: dict[str, list[WorldResult]] = {word: [] for word in (*_WORDS, "lost")}
+    names = {world.key: world.part_name.name for world in overview.worlds}
+    over_all = {cell.world for cell in cells if cell.beats_kalman}
+    by_word: dict[str, list[WorldCell]] = {word: [] for word in (*_WORDS, "lost")}
     for cell in sorted(cells, key=_distance, reverse=True):
         by_word["lost" if cell.loses_track else cell.verdict.word].append(cell)
 
@@ -668,12 +614,12 @@ def tell_story(overview: Overview, method: str, summary: str) -> dict[str, str]:
     }
 
 
-def _distance(cell: WorldResult) -> float:
+def _distance(cell: WorldCell) -> float:
     """Return the distance of a ratio from 1; infinite where lost runs leave none."""
     return abs(math.log(cell.verdict.ratio)) if cell.verdict.ratio > 0 else math.inf
 
 
-def _size(cell: WorldResult) -> str:
+def _size(cell: WorldCell) -> str:
     """Format the ratio of a cell; the share of runs that keep track where lost runs leave none."""
     if cell.verdict.ratio > 0:
         return f"{cell.verdict.ratio:.2f}"
@@ -682,7 +628,7 @@ def _size(cell: WorldResult) -> str:
 
 def list_rivals(overview: Overview) -> list[tuple[str, str, str, str]]:
     """List each pair of methods with the worlds in which the first is better, and those in which the second is."""
-    names = {world.key: world.name for world in overview.worlds}
+    names = {world.key: world.part_name.name for world in overview.worlds}
     rows: dict[tuple[str, str], dict[str, list[str]]] = {}
     for pair in overview.pairs:
         worlds = rows.setdefault((pair.verdict.a, pair.verdict.b), {"better": [], "worse": []})
@@ -699,9 +645,8 @@ def format_times(overview: Overview, method: str) -> str:
 
     The median relative to SIR with as many particles follows, if SIR is in the study.
     """
-    labels = {name: label for label, name in overview.names.items()}
     ratios = [
-        overview.times[world.key, method] / overview.times[world.key, labels[world.reference]]
+        overview.times[world.key, method] / overview.times[world.key, world.reference]
         for world in overview.worlds
         if (world.key, method) in overview.times
     ]

@@ -188,7 +188,7 @@ function drawBoard() {
         `<tr data-filter="${esc(row.filter)}"><td class="number">${row.rank === null ? "–" : row.rank}</td>` +
         `<th scope="row"${look.proposed ? ' class="proposed"' : ""}><button type="button" class="name" data-row="${esc(row.filter)}" aria-expanded="${open}" title="${esc(look.long || look.name)}">${icon(look)}${esc(look.name)}</button></th>` +
         `<td class="desk">${several ? strip(row.filter) : esc(valueText(row))}</td>` +
-        `<td class="number"><b>${short(row.ratio)}</b> <span class="interval faint">${interval(row.ratio_low, row.ratio_high)}</span></td>` +
+        `<td class="number"><b>${end(row.ratio)}</b> <span class="interval faint">${interval(row.ratio_low, row.ratio_high)}</span></td>` +
         `<td class="desk scale">${drawBar(row)}</td><td class="verdict ${row.verdict.replaceAll(" ", "_")}">${signs[row.verdict] || ""} ${esc(row.words)}</td>` +
         `<td class="number">${percent(row.track)}</td><td class="desk">${percent(row.coverage)}${row.calibration ? ", " : ""}<span class="not_decided">${esc(row.calibration || "")}</span></td>` +
         `<td class="number desk"${row.cost > 0 ? ` title="ratio ${short(row.cost)} ${interval(row.cost_low, row.cost_high)}"` : ""}>${short(row.ms)}${row.ms_low > 0 ? ` <span class="interval faint">${quartiles(row)}</span>` : ""}</td></tr>${open ? details(row, columns.length) : ""}`

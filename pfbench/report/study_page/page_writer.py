@@ -16,9 +16,11 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from pfbench.report.board.recorded_units import describe_records, list_questions
+from pfbench.report.journal.study_pack import name_of
 from pfbench.report.methods_text import write_methods
 from pfbench.report.papers.figures import list_page_figures
 from pfbench.report.writers import template_environment
+from pfbench.results.conditions import drop_settings
 from pfbench.results.looks import describe_foreign_knobs, find_stored_world
 
 # --------------------------------------------------------------------------------------------------
@@ -170,7 +172,13 @@ def format_share(value: float | None) -> str:
 
 def format_interval(low: float | None, high: float | None) -> str:
     """Format an interval in brackets, or nothing where it is missing."""
-    return "" if low is None or high is None else f"[{format_short(low)}, {format_short(high)}]"
+    return "" if low is None or high is None else f"[{_format_end(low)}, {_format_end(high)}]"
+
+
+def _format_end(value: float | None) -> str:
+    """Format a ratio or an end of its interval: 1 is exactly 1, and a value near it has four digits."""
+    text = format_short(value)
+    return text if text != "1.00" else "1" if value == 1.0 else format_short(value, 4)
 
 
 def format_sentence(text: str) -> Markup:
@@ -191,9 +199,9 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
     metric, world, regime, baseline = key
     names = {f["key"]: f for f in pack["filters"]}
     parts = (
-        _name(pack["metrics"], metric),
-        _scope(pack["worlds"], world, "scenario"),
-        _scope(pack["regimes"], regime, "noise regime"),
+        name_of(pack, "metrics", metric),
+        _scope(pack, "worlds", world, "scenario"),
+        _scope(pack, "regimes", regime, "noise regime"),
         f"ratio to {names[baseline]['name']}",
     )
     orders = pack.get("world_orders", ())
@@ -223,8 +231,8 @@ def _table_of_world(
     """Return caption and rows of the table of one world."""
     rows = pack["views"][opening._replace(world=world)]["rows"]
     parts = (
-        _name(pack["metrics"], opening.metric),
-        _name(pack["worlds"], world),
+        name_of(pack, "metrics", opening.metric),
+        name_of(pack, "worlds", world),
         f"ratio to {names[opening.baseline]['name']}",
     )
     present = [row for row in rows if row["rank"] is not None]
@@ -285,7 +293,7 @@ def _row(row: Mapping[str, Any], look: Mapping[str, Any]) -> dict[str, Any]:
         "name": look["name"],
         "proposed": look["proposed"],
         "value": value,
-        "ratio": format_short(row["ratio"]),
+        "ratio": _format_end(row["ratio"]),
         "interval": format_interval(row["ratio_low"], row["ratio_high"]),
         "verdict": row["verdict"].replace(" ", "_"),
         "words": f"{SIGNS[row['verdict']]} {row['words']}".strip(),
@@ -303,7 +311,7 @@ def describe_pairs(pack: Mapping[str, Any]) -> list[dict[str, str]]:
     return [
         {
             "pair": f"{names[pair['a']]} against {names[pair['b']]}",
-            "effect": format_short(pair["estimate"]),
+            "effect": _format_end(pair["estimate"]),
             "interval": format_interval(pair["low"], pair["high"]) or pair["reason"] or "",
             "word": pair["word"],
             "sentence": _remove_marks(pair["sentence"]),
@@ -312,22 +320,17 @@ def describe_pairs(pack: Mapping[str, Any]) -> list[dict[str, str]]:
     ]
 
 
-def _name(items: Sequence[Mapping[str, Any]], key: str) -> str:
-    """Return the name of a key."""
-    return next((str(item["name"]) for item in items if item["key"] == key), key)
-
-
-def _scope(items: Sequence[Mapping[str, Any]], key: str, noun: str) -> str:
+def _scope(pack: Mapping[str, Any], kind: str, key: str, noun: str) -> str:
     """Return the name of a key, or how many there are."""
     if key != "all":
-        return _name(items, key)
+        return name_of(pack, kind, key)
+    items = pack[kind]
     return str(items[0]["name"]) if len(items) == 1 else f"all {len(items)} {noun}s"
 
 
 # --------------------------------------------------------------------------------------------------
 # Choice of filters at equal time, from a study with several numbers of particles of the same filters.
 
-_PARTICLES = re.compile(r"(?<=[\[,])particles=\d+,?")
 _LEAST = 2  # filters with several numbers of particles
 
 
@@ -361,7 +364,7 @@ def select_equal_time(pack: Mapping[str, Any]) -> tuple[float, list[str]]:
     times = {row["filter"]: float(row["ms"]) for row in rows if row["ms"] is not None}
     variants: dict[str, list[tuple[int, str]]] = {}
     for key in times:
-        name = _PARTICLES.sub("", key).replace(",]", "]").removesuffix("[]")
+        name = drop_settings(key, "particles")
         number = notes.get(key, "")
         variants.setdefault(name, []).append((int(number) if number.isdigit() else 0, key))
     swept = [sorted(group) for group in variants.values() if len({n for n, _ in group}) > 1]

@@ -18,6 +18,7 @@ from config_cases import GROUPS, composed
 from filter_cases import UNPRINTED, method_of
 from model_cases import tracker
 from omegaconf import OmegaConf
+from refusals import check_refused
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
@@ -162,8 +163,7 @@ def test_a_literal_form_changes_nothing_that_is_printed(name: str) -> None:
     ],
 )
 def test_entries_that_are_no_forms_are_told(entry: dict[str, Any], key: str) -> None:
-    with pytest.raises(ValueError, match=key):
-        check_paper_blocks({"filter": {"paper": entry}})
+    check_refused([(key, lambda: check_paper_blocks({"filter": {"paper": entry}}))], remedy=False)
 
 
 # what each literal form computes
@@ -175,10 +175,17 @@ def test_a_form_whose_equations_are_lost_refuses_and_names_the_one_that_complete
 ) -> None:
     """002: "transforms equation (16) into:" and "Equations (23), (24), and (27) are modified as follows:" end there."""
     method, model = method_of(name), tracker()
-    with pytest.raises(
-        ValueError, match=rf"filter={name} must have equations.*lost.* Choose filter="
-    ):
-        run_filter(method, model, Record(torch.zeros(1, 2, 2)), PhiloxStream(1, torch.arange(1)))
+    check_refused(
+        [
+            (
+                rf"filter={name} must have equations.*lost.* Choose filter=",
+                lambda: run_filter(
+                    method, model, Record(torch.zeros(1, 2, 2)), PhiloxStream(1, torch.arange(1))
+                ),
+            )
+        ],
+        remedy=False,
+    )
     assert method.name == name
     assert BLOCKS[method.instead]["form"] == "printed"
 

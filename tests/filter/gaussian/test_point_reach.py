@@ -21,7 +21,6 @@ from pfbench.filter.gaussian.gaussian_filter import check_point_reach
 from pfbench.filter.gaussian.linearisation_rules import (
     CubaturePoints,
     SigmaPointLinearisation,
-    SparseGridPoints,
     UnscentedPoints,
 )
 
@@ -61,7 +60,7 @@ def test_the_limit_is_two_radians(points: Any) -> None:
     check_point_reach(rule, CHART, covariance(150.0))  # an explicit choice
 
 
-RULES = [CubaturePoints(), UnscentedPoints(0.9, kappa=-5.0), SparseGridPoints()]
+RULES = [CubaturePoints(), UnscentedPoints(0.9, kappa=-5.0)]
 
 
 @pytest.mark.parametrize("points", RULES)

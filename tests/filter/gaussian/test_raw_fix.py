@@ -9,6 +9,7 @@ import pytest
 import torch
 from config_cases import composed, world
 from filter_cases import method_of
+from refusals import check_refused
 from torch import Tensor
 
 from pfbench import job
@@ -136,8 +137,9 @@ def test_a_raw_fix_refuses_measurements_that_give_none(model: Any, y: Any, words
     record = Record(torch.tensor(y, dtype=torch.float64).expand(2, 4, -1))
     draws = PhiloxStream(1, torch.arange(2))
     text = rf"^filter=raw_fix must have measurements that {words}.*\. Choose filter=dead_reckoning"
-    with pytest.raises(ValueError, match=text):
-        run_filter(RawFix(), model, record, draws, no_step)
+    check_refused(
+        [(text, lambda: run_filter(RawFix(), model, record, draws, no_step))], remedy=False
+    )
 
 
 def test_a_later_step_that_determines_the_state_is_enough() -> None:
@@ -148,8 +150,7 @@ def test_a_later_step_that_determines_the_state_is_enough() -> None:
     y = torch.tensor([[0.8, 0.7, 0.9, nan, nan], [nan, nan, nan, 1.0, 4.0]], dtype=torch.float64)
     mean = run(model, y).mean[0]
     torch.testing.assert_close(mean[1], torch.tensor([3.0, 1.0], dtype=torch.float64))
-    with pytest.raises(ValueError, match="see 50 % of their initial variance"):
-        run(model, y[:1])
+    check_refused([("see 50 % of their initial variance", lambda: run(model, y[:1]))], remedy=False)
 
 
 # dead reckoning

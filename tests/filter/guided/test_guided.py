@@ -11,6 +11,7 @@ import pytest
 import torch
 from filter_cases import EACH, method_of
 from particle_cases import CASES, WALK, WALK_Y, Drifting, Spiky
+from refusals import check_refused
 from torch import Tensor
 from torch.distributions import Independent, MultivariateNormal, Normal, StudentT
 
@@ -274,8 +275,10 @@ def test_a_guide_without_a_root_proposes_from_the_prior() -> None:
     ],
 )
 def test_guided_noise_refuses_what_it_would_ignore(guide: GaussianFilter) -> None:
-    with pytest.raises(ValueError, match="Remove adaptations, gains and iterations"):
-        GuidedNoiseProposal(guide)
+    check_refused(
+        [("Remove adaptations, gains and iterations", lambda: GuidedNoiseProposal(guide))],
+        remedy=False,
+    )
 
 
 # one guide for the cloud
@@ -453,8 +456,17 @@ def test_an_adapted_noise_needs_a_normal_law() -> None:
 
     linear, y = tracker()
     model = Heavy(linear.f, linear.g, linear.h, linear.r, linear.m0, [2.0, 1.0])
-    with pytest.raises(ValueError, match="Choose weight_model=nominal"):
-        filter_record(ParticleFilter(20, proposal=SharedGuideProposal(COFM)), model, y, runs=2)
+    check_refused(
+        [
+            (
+                "Choose weight_model=nominal",
+                lambda: filter_record(
+                    ParticleFilter(20, proposal=SharedGuideProposal(COFM)), model, y, runs=2
+                ),
+            )
+        ],
+        remedy=False,
+    )
     for stage in (
         SharedGuideProposal(COFM, "nominal"),
         SharedGuideProposal(replace(COFM, noise_adaptations=(FadingMemory(1.1),))),
@@ -719,8 +731,17 @@ def test_a_guide_for_each_particle_is_told_to_be_dear() -> None:
 @pytest.mark.filterwarnings("ignore:ParticleGuideProposal")
 def test_a_singular_transition_is_refused_and_noise_takes_it() -> None:
     model, y, exact = CASES["singular"]()
-    with pytest.raises(ValueError, match="Choose GuidedNoise"):
-        filter_record(ParticleFilter(20, proposal=ParticleGuideProposal(EKF)), model, y, runs=2)
+    check_refused(
+        [
+            (
+                "Choose GuidedNoise",
+                lambda: filter_record(
+                    ParticleFilter(20, proposal=ParticleGuideProposal(EKF)), model, y, runs=2
+                ),
+            )
+        ],
+        remedy=False,
+    )
     estimate = filter_record(
         ParticleFilter(3000, proposal=GuidedNoiseProposal(EKF)), model, y, runs=20
     )
@@ -793,13 +814,20 @@ def test_on_a_linear_model_the_number_comes_to_rest_at_its_least() -> None:
 
 
 def test_matching_needs_more_particles_than_states() -> None:
-    with pytest.raises(ValueError, match="Use more than 2 particles"):
-        filter_record(
-            ParticleFilter(2, proposal=SharedGuideProposal(EKF, match_moments=True)),
-            WALK,
-            WALK_Y,
-            runs=1,
-        )
+    check_refused(
+        [
+            (
+                "Use more than 2 particles",
+                lambda: filter_record(
+                    ParticleFilter(2, proposal=SharedGuideProposal(EKF, match_moments=True)),
+                    WALK,
+                    WALK_Y,
+                    runs=1,
+                ),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_moments_of_empty_slots_are_nothing() -> None:

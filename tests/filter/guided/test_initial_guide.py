@@ -7,6 +7,7 @@ import pytest
 import torch
 from config_cases import composed
 from filter_cases import method_of
+from refusals import check_refused
 
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
@@ -93,10 +94,23 @@ def test_compiled_and_separate_runs_start_at_the_same_particles() -> None:
 
 def test_what_has_no_initial_proposal_says_why() -> None:
     guide = GuidedInitialProposal(GUIDE)
-    with pytest.raises(ValueError, match="initial_proposal needs the record"):
-        ParticleFilter(10, initial_proposal=guide).init(SHARP, 1, PhiloxStream(0, torch.arange(1)))
-    with pytest.raises(ValueError, match="without moves"):
-        ParticleFilter(10, moves=(MetropolisHastings(NoiseFlowKernel(3)),), initial_proposal=guide)
+    check_refused(
+        [
+            (
+                "initial_proposal needs the record",
+                lambda: ParticleFilter(10, initial_proposal=guide).init(
+                    SHARP, 1, PhiloxStream(0, torch.arange(1))
+                ),
+            ),
+            (
+                "without moves",
+                lambda: ParticleFilter(
+                    10, moves=(MetropolisHastings(NoiseFlowKernel(3)),), initial_proposal=guide
+                ),
+            ),
+        ],
+        remedy=False,
+    )
     for name, value in (("steps", 0), ("steps", 2.5), ("passes", -1), ("prior_fraction", 1.0)):
         with pytest.raises(ValueError, match=rf"initial_proposal\.{name} must .*got {value}\. Use"):
             GuidedInitialProposal(GUIDE, **{name: value})

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from filter_cases import method_of
+from refusals import check_refused
 from scipy.spatial.transform import Rotation
 
 from pfbench.core.random_stream import PhiloxStream
@@ -146,7 +147,18 @@ def test_the_configured_filter_is_the_left_invariant_one() -> None:
 )
 def test_a_model_without_a_group_is_refused_at_the_start(message: str) -> None:
     model = linear_walk(1.0, 0.3, 1.0)
-    with pytest.raises(ValueError, match=message):
-        run_filter(LEFT, model, Record(torch.zeros(1, 2, 1)), PhiloxStream(1, torch.arange(1)))
-    with pytest.raises(ValueError, match=r"which has none\. Choose filter=ekf, or a scenario"):
-        ChartModel(model, "left")
+    check_refused(
+        [
+            (
+                message,
+                lambda: run_filter(
+                    LEFT, model, Record(torch.zeros(1, 2, 1)), PhiloxStream(1, torch.arange(1))
+                ),
+            ),
+            (
+                r"which has none\. Choose filter=ekf, or a scenario",
+                lambda: ChartModel(model, "left"),
+            ),
+        ],
+        remedy=False,
+    )

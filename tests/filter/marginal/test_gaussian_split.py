@@ -12,6 +12,7 @@ import oracles
 import pytest
 import torch
 from filter_cases import method_of
+from refusals import check_refused
 from scipy.integrate import trapezoid
 from torch import Tensor
 from torch.distributions import Distribution
@@ -246,7 +247,16 @@ def test_what_cannot_be_split_says_why() -> None:
         ):
             GaussianSplitFilter(inner, 8)  # type: ignore[arg-type]
     draws, model = PhiloxStream(1, torch.arange(1)), StrapdownTotal(heading_cases.tuning(45.0))
-    with pytest.raises(ValueError, match=r"must have one unit.*got \['m/s', 'rad'\].*Select"):
-        GaussianSplitFilter(EKF, 8, ["attitude", "velocity"]).init(model, 1, draws)
-    with pytest.raises(ValueError, match=r"must be groups .*got \['heading'\]"):
-        GaussianSplitFilter(EKF, 8, ["heading"]).init(model, 1, draws)
+    check_refused(
+        [
+            (
+                r"must have one unit.*got \['m/s', 'rad'\].*Select",
+                lambda: GaussianSplitFilter(EKF, 8, ["attitude", "velocity"]).init(model, 1, draws),
+            ),
+            (
+                r"must be groups .*got \['heading'\]",
+                lambda: GaussianSplitFilter(EKF, 8, ["heading"]).init(model, 1, draws),
+            ),
+        ],
+        remedy=False,
+    )

@@ -13,6 +13,7 @@ import torch
 from filter_laws import check_own
 from hydra import compose, initialize_config_dir
 from model_cases import measurements
+from refusals import check_refused
 from scipy import stats
 from torch import Tensor
 
@@ -484,8 +485,15 @@ def test_the_grid_lies_in_the_plane_of_position_or_the_first_two_components() ->
     assert list(PolymerisedResampler()._plane(Lorenz63())) == [0, 1]
     assert list(PolymerisedResampler()._plane(UnivariateGrowth())) == [0]
     assert list(PolymerisedResampler(axes=[3])._plane(odd)) == [3]
-    with pytest.raises(ValueError, match=r"axes must be at most .*, got \[4\]"):
-        PolymerisedResampler(axes=[4])._plane(odd)
+    check_refused(
+        [
+            (
+                r"axes must be at most .*, got \[4\]",
+                lambda: PolymerisedResampler(axes=[4])._plane(odd),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_it_aggregates_in_the_chart_about_the_mean() -> None:
@@ -811,5 +819,6 @@ CLOUD, ONE = one_cloud(1)
     ids=["neighbours", "past"],
 )  # fmt: skip
 def test_clouds_that_do_not_fit_are_refused(resampler: Any, window: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        refreshed(resampler, CLOUD._replace(window=window), ONE)
+    check_refused(
+        [(message, lambda: refreshed(resampler, CLOUD._replace(window=window), ONE))], remedy=False
+    )

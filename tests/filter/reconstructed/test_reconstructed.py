@@ -12,6 +12,7 @@ import pytest
 import torch
 from filter_laws import check_own
 from particle_cases import CASES, WALK, WALK_Y, belief, singular_case
+from refusals import check_refused
 from scipy.linalg import solve_discrete_lyapunov
 from torch import Tensor
 
@@ -349,8 +350,10 @@ def test_corrected_versions_are_unbiased(name: str, case: str) -> None:
     model, y, exact = CASES[case]()
     method = ParticleFilter(60, EssResampler(Systematic(), 0.7), proposal=EXACT[name])
     if (name, case) == ("density", "benes"):
-        with pytest.raises(ValueError, match="with additive noise"):
-            check_evidence(method, model, y, exact, runs=2)
+        check_refused(
+            [("with additive noise", lambda: check_evidence(method, model, y, exact, runs=2))],
+            remedy=False,
+        )
         return
     if (name, case) == (
         "density",
@@ -767,7 +770,17 @@ def test_what_cannot_be_is_told() -> None:
                 WALK_Y,
                 runs=1,
             )
-    with pytest.raises(ValueError, match="must return its noise"):
-        filter_record(
-            ParticleFilter(5, proposal=ReconstructedNoiseProposal(Silent())), WALK, WALK_Y, runs=1
-        )
+    check_refused(
+        [
+            (
+                "must return its noise",
+                lambda: filter_record(
+                    ParticleFilter(5, proposal=ReconstructedNoiseProposal(Silent())),
+                    WALK,
+                    WALK_Y,
+                    runs=1,
+                ),
+            )
+        ],
+        remedy=False,
+    )

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from move_cases import moving
+from refusals import check_refused
 from scipy import stats
 from smoothing_cases import SINGULAR, dense, record_of
 from torch import Tensor
@@ -193,18 +194,32 @@ def test_paths_do_not_depend_on_how_many_are_weighed_at_a_time(
 def test_what_cannot_be_smoothed_says_why() -> None:
     model = linear_walk(1.0, 0.5, 0.8)
     record, draws = record_of(model, 1, 4), PhiloxStream(0, torch.arange(1))
-    with pytest.raises(ValueError, match="must have a transition density"):
-        sample_trajectories(ParticleFilter(20), SINGULAR, record, draws, 2)
-    with pytest.raises(ValueError, match="must be a particle filter"):
-        sample_trajectories(GaussianFilter(TaylorLinearisation()), model, record, draws, 2)
-    with pytest.raises(ValueError, match="at least 1"):
-        sample_trajectories(ParticleFilter(20), model, record, draws, 0)
+    check_refused(
+        [
+            (
+                "must have a transition density",
+                lambda: sample_trajectories(ParticleFilter(20), SINGULAR, record, draws, 2),
+            ),
+            (
+                "must be a particle filter",
+                lambda: sample_trajectories(
+                    GaussianFilter(TaylorLinearisation()), model, record, draws, 2
+                ),
+            ),
+            (
+                "at least 1",
+                lambda: sample_trajectories(ParticleFilter(20), model, record, draws, 0),
+            ),
+        ],
+        remedy=False,
+    )
     regularised = ParticleFilter(20, RegularisedResampler(EssResampler(Systematic())))
     for method in (regularised, moving(MetropolisHastings(NoiseFlowKernel(3)))):
         with pytest.raises(ValueError, match="must get the parents of particles"):
             sample_trajectories(method, model, record, draws, 2, MetropolisBackwardSampler())
-    with pytest.raises(ValueError, match="mcmc_steps must be at least 1"):
-        MetropolisBackwardSampler(0)
+    check_refused(
+        [("mcmc_steps must be at least 1", lambda: MetropolisBackwardSampler(0))], remedy=False
+    )
 
 
 def test_a_lost_run_has_no_paths_and_no_smoothed_law_and_spoils_no_other() -> None:

@@ -16,6 +16,7 @@ import yaml
 from checkout import ROOT
 from command_line import pfbench
 from log_faults import FAULTS
+from refusals import check_refused
 from synthetic_log import drive, tables, write
 
 import pfbench as package
@@ -97,6 +98,19 @@ def test_the_settings_of_a_refused_log_let_it_read(tmp_path: Path, fault: str) -
     assert re.search(
         r"subtracted|are \[|replaced|left out|longest of|converted|codes of nmea", said
     )
+
+
+OVER_TIME = (
+    "fixes off 15 m for 10 s", "reference jumps 8 m", "gyro bias drifts 3 deg/s", "force late 0.2 s", "fy of zero",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", OVER_TIME)
+def test_what_changes_over_time_has_a_name_and_no_other_remedy(tmp_path: Path, fault: str) -> None:
+    diagnosis = inspect_log(spoilt(tmp_path, fault))
+    found = {finding.check for finding in diagnosis.findings}
+    assert FAULTS[fault].named in found <= {FAULTS[fault].named, *FAULTS[fault].also}
+    assert diagnosis.settings == {}
 
 
 def test_no_remedy_is_printed_that_leaves_the_log_worse_than_a_clean_one(tmp_path: Path) -> None:
@@ -200,8 +214,15 @@ def test_wrong_corrections_are_refused_in_words(case: str) -> None:
 
 def test_a_column_that_is_not_there_cannot_be_corrected(tmp_path: Path) -> None:
     folder = spoilt(tmp_path)
-    with pytest.raises(ValueError, match=r"must name columns of imu\.csv, got ax"):
-        read_log(folder, corrections=LogCorrections(scale={"imu": {"ax": 2.0}}))
+    check_refused(
+        [
+            (
+                r"must name columns of imu\.csv, got ax",
+                lambda: read_log(folder, corrections=LogCorrections(scale={"imu": {"ax": 2.0}})),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_a_lever_arm_moves_the_fixes_to_the_imu(tmp_path: Path) -> None:
@@ -243,8 +264,9 @@ def test_a_short_gap_is_bridged_with_the_noise_of_the_log(tmp_path: Path) -> Non
 
 def test_a_long_gap_is_refused_or_cut_by_the_key(tmp_path: Path) -> None:
     folder = write(tmp_path / "own", without(noisy(), 20.0, 0.25))
-    with pytest.raises(ValueError, match=r"must not have gaps, got a gap of 0\.250 s"):
-        read_log(folder)
+    check_refused(
+        [(r"must not have gaps, got a gap of 0\.250 s", lambda: read_log(folder))], remedy=False
+    )
     log = read_log(folder, corrections=LogCorrections(gaps="longest"))
     assert log.imu.time[0] == pytest.approx(20.25)
     assert any("the longest of 2 parts" in note for note in log.notes)

@@ -9,10 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from command_line import pfbench
+from refusals import check_refused
 from scipy.spatial.transform import Rotation
 from synthetic_log import drive
 
-from pfbench.logs.judge.own_log import ImportOptions, import_table
+from pfbench.logs.judge.judge_options import SourceOptions
+from pfbench.logs.judge.own_log import import_table
 
 SECONDS, RATE = 40, 50
 ORIGIN = (48.0, 11.0, 500.0)
@@ -50,29 +52,29 @@ def save(path: Path, rows: np.ndarray, digits: str = "%.10f", head: str = "") ->
     return path
 
 
-def write_named(folder: Path) -> tuple[str, Path, ImportOptions]:
+def write_named(folder: Path) -> tuple[str, Path, SourceOptions]:
     own = {"time": "t", "ax": "fx", "ay": "fy", "az": "fz", "gx": "wx", "gy": "wy", "gz": "wz"}
     rows = table(IMU).set_axis(list(own), axis=1)
     rows["time"] *= 1e3
     rows.to_csv(folder / "a.csv", index=False)
     columns = {new: old for old, new in own.items()}
-    return "imu", folder / "a.csv", ImportOptions(time="ms", columns=columns)
+    return "imu", folder / "a.csv", SourceOptions(time="ms", columns=columns)
 
 
-def write_increments(folder: Path) -> tuple[str, Path, ImportOptions]:
+def write_increments(folder: Path) -> tuple[str, Path, SourceOptions]:
     """Increments of KF-GINS end at their time: those of the mean of two samples."""
     m = table(IMU).to_numpy()
     middle = 0.5 * (m[1:] + m[:-1])
     rows = np.column_stack([m[1:, 0], middle[:, 4:7] / RATE, middle[:, 1:4] / RATE])
-    return "imu", save(folder / "imu.txt", rows, "%.12f"), ImportOptions()
+    return "imu", save(folder / "imu.txt", rows, "%.12f"), SourceOptions()
 
 
-def write_euroc_imu(folder: Path) -> tuple[str, Path, ImportOptions]:
+def write_euroc_imu(folder: Path) -> tuple[str, Path, SourceOptions]:
     m = table(IMU).to_numpy()
     rows = np.column_stack([np.rint(m[:, 0] * 1e9), m[:, 4:7], m[:, 1:4]])
     head = "#timestamp [ns],w_x,w_y,w_z,a_x,a_y,a_z"
     np.savetxt(folder / "data.csv", rows, fmt=["%d", *["%.12f"] * 6], delimiter=",", header=head, comments="")  # fmt: skip
-    return "imu", folder / "data.csv", ImportOptions()
+    return "imu", folder / "data.csv", SourceOptions()
 
 
 def enu_quaternion() -> np.ndarray:
@@ -83,28 +85,28 @@ def enu_quaternion() -> np.ndarray:
     return Rotation.from_matrix(to_enu @ ned @ np.diag([1.0, -1.0, -1.0])).as_quat()
 
 
-def write_tum(folder: Path) -> tuple[str, Path, ImportOptions]:
+def write_tum(folder: Path) -> tuple[str, Path, SourceOptions]:
     """Under a suffix that says nothing."""
     m = motion()
     rows = np.column_stack([m["t"], m["pe"], m["pn"], -m["pd"], enu_quaternion()])
-    return "reference", save(folder / "truth.log", rows), ImportOptions(frame="enu")
+    return "reference", save(folder / "truth.log", rows), SourceOptions(frame="enu")
 
 
-def write_kf_gins(folder: Path) -> tuple[str, Path, ImportOptions]:
+def write_kf_gins(folder: Path) -> tuple[str, Path, SourceOptions]:
     m = motion()
     rows = np.column_stack(
         [np.full(len(m["t"]), 2000), m["t"], geodetic(RATE), m["vn"], m["ve"], m["vd"],
          *(np.degrees(m[a]) for a in ("roll", "pitch", "yaw"))]
     )  # fmt: skip
-    return "reference", save(folder / "truth.nav", rows), ImportOptions()
+    return "reference", save(folder / "truth.nav", rows), SourceOptions()
 
 
-def write_fixes(folder: Path) -> tuple[str, Path, ImportOptions]:
+def write_fixes(folder: Path) -> tuple[str, Path, SourceOptions]:
     rows = np.column_stack([motion(1)["t"], geodetic(1), np.ones((SECONDS + 1, 3))])
-    return "gnss", save(folder / "gnss.txt", rows), ImportOptions()
+    return "gnss", save(folder / "gnss.txt", rows), SourceOptions()
 
 
-def write_rtklib(folder: Path) -> tuple[str, Path, ImportOptions]:
+def write_rtklib(folder: Path) -> tuple[str, Path, SourceOptions]:
     start = pd.Timestamp("2024-01-07 00:00:00")  # first second of a GPS week
     lines = [
         "% program : RTKPOST",
@@ -114,7 +116,7 @@ def write_rtklib(folder: Path) -> tuple[str, Path, ImportOptions]:
         stamp = (start + pd.Timedelta(seconds=float(t))).strftime("%Y/%m/%d %H:%M:%S.000")
         lines.append(f"{stamp} {p[0]:.10f} {p[1]:.10f} {p[2]:.4f} 1 12")
     (folder / "rover.pos").write_text("\n".join(lines) + "\n")
-    return "gnss", folder / "rover.pos", ImportOptions()
+    return "gnss", folder / "rover.pos", SourceOptions()
 
 
 def write_kitti(folder: Path) -> Path:
@@ -137,7 +139,7 @@ def write_kitti(folder: Path) -> Path:
     return folder / "drive"
 
 
-WRITERS: dict[str, tuple[Callable[[Path], tuple[str, Path, ImportOptions]], float]] = {
+WRITERS: dict[str, tuple[Callable[[Path], tuple[str, Path, SourceOptions]], float]] = {
     "names": (write_named, 1e-9),
     "increments": (
         write_increments,
@@ -171,7 +173,7 @@ def test_a_file_of_each_kind_is_the_drive(tmp_path: Path, name: str) -> None:
 def test_a_folder_of_kitti_gives_all_three_tables(tmp_path: Path) -> None:
     folder, m = write_kitti(tmp_path), motion(10)
     for role in ("imu", "gnss", "reference"):
-        rows = import_table(role, folder, ImportOptions()).rows
+        rows = import_table(role, folder, SourceOptions()).rows
         for column in set(rows) & set(m):
             atol = 0.1 if column == "vd" else 1e-6
             np.testing.assert_allclose(rows[column], m[column], atol=atol)
@@ -205,8 +207,11 @@ def test_the_command_writes_the_log_and_inspects_it(
 
 BAD = {
     "file": (["imu=none.csv"], "imu must be a file, got none at none.csv"),
-    "column": (["imu.columns=t:clock"], "got t (clock)"),
-    "unit": (["imu.time=min"], "NAME.time must be one of s, ms, us, ns, minutes, hours, got min"),
+    "column": (
+        ["imu.columns=t:clock"],
+        "a.csv: columns must exist, got clock. Choose from time, ax",
+    ),
+    "unit": (["imu.time=min"], "imu.time must be s, ms, us, ns, minutes or hours, got min"),
     "kind": (["gnss.format=euroc"], "gnss must be of a format with such data, got euroc"),
     "word": (["imu.sd=1"], "words must be FOLDER, imu=, gnss=, reference="),
 }
@@ -226,13 +231,22 @@ def test_what_cannot_be_imported_is_told_and_nothing_is_written(tmp_path: Path, 
 def test_repeated_times_are_refused_or_the_first_is_kept(tmp_path: Path) -> None:
     rows = table(IMU).iloc[[0, 1, 1, 2, 3]]
     rows.to_csv(tmp_path / "a.csv", index=False)
-    with pytest.raises(ValueError, match=r"imu must have one row for each time, got 1 rows"):
-        import_table("imu", tmp_path / "a.csv", ImportOptions())
-    kept = import_table("imu", tmp_path / "a.csv", ImportOptions(repeats="first"))
+    check_refused(
+        [
+            (
+                r"imu must have one row for each time, got 1 rows",
+                lambda: import_table("imu", tmp_path / "a.csv", SourceOptions()),
+            )
+        ],
+        remedy=False,
+    )
+    kept = import_table("imu", tmp_path / "a.csv", SourceOptions(repeats="first"))
     assert len(kept.rows) == 4
     assert "1 rows that repeat a time left out" in kept.notes
-    options = ImportOptions(repeats="first", scale={"fz": "-2"})
+    options = SourceOptions(repeats="first", scale={"fz": -2.0})
     assert np.allclose(import_table("imu", tmp_path / "a.csv", options).rows["fz"], -2.0 * kept.rows["fz"])  # fmt: skip
     table(IMU).iloc[[0, 0, 0, 0, 1]].to_csv(tmp_path / "b.csv", index=False)
-    with pytest.raises(ValueError, match="have lost digits"):
-        import_table("imu", tmp_path / "b.csv", options)
+    check_refused(
+        [("have lost digits", lambda: import_table("imu", tmp_path / "b.csv", options))],
+        remedy=False,
+    )

@@ -10,12 +10,13 @@ import pandas as pd
 import pytest
 import synthetic_log
 import torch
+from refusals import check_refused
 
 from pfbench.core import PhiloxStream, chart
 from pfbench.filter import GaussianFilter, TaylorLinearisation, run_filter
-from pfbench.logs.worlds.aligned_log import find_start
 from pfbench.logs.worlds.log_frames import quaternion_of_angles
 from pfbench.logs.worlds.log_tables import GnssLog, ImuLog, NavigationLog, swap_frd_rfu
+from pfbench.logs.worlds.user_log import find_start
 from pfbench.model import Constraints, StrapdownBlocks, StrapdownTotal, StrapdownTuning
 from pfbench.noise import NominalNoise
 from pfbench.scenario import (
@@ -93,11 +94,15 @@ def test_a_stated_heading_needs_no_motion() -> None:
     error = start_error(found.state, true, round(found.time * RATE))
     assert abs(error[2]) < 4.0 * found.sd[2]
     stands = replace(log, fixes=log.fixes._replace(position=np.zeros_like(log.fixes.position)))
-    with pytest.raises(
-        ValueError,
-        match=r"must show level and heading .* at best 90 deg of heading .* scenario\.alignment\.heading_deg",
-    ):
-        StartAlignment().find(stands, TUNING, None)
+    check_refused(
+        [
+            (
+                r"must show level and heading .* at best 90 deg of heading .* scenario\.alignment\.heading_deg",
+                lambda: StartAlignment().find(stands, TUNING, None),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_a_late_start_is_not_before_its_key() -> None:
@@ -155,7 +160,7 @@ def test_all_runs_start_at_the_estimate_with_its_spread(tmp_path: Path) -> None:
     log = scenario(tmp_path)
     record = log.draw(NominalNoise(), torch.arange(3), 1).record
     assert torch.equal(record.start, record.start[:1].expand(3, -1))
-    estimate = log.alignment.find(log._read_log(tmp_path / "log"), TUNING, None)
+    estimate = log.alignment.find(log.read_checked(tmp_path / "log"), TUNING, None)
     expected = torch.cat([torch.from_numpy(estimate.sd), TUNING.initial_sd[9:]])
     assert torch.equal(record.spread, torch.diag(expected).expand(3, -1, -1))
     blocks = Constraints(
@@ -189,8 +194,8 @@ def test_the_filter_finds_the_attitude_without_a_reference(tmp_path: Path) -> No
     true = np.stack(
         [np.interp(leg.time, reference.t, reference[c]) for c in ("pe", "pn", "pd")], -1
     ) * [1, 1, -1]
-    origin = find_start(log._read_log(tmp_path / "log"), leg)
-    start = log.alignment.find(log._read_log(tmp_path / "log"), TUNING, None)
+    origin = find_start(log.read_checked(tmp_path / "log"), leg)
+    start = log.alignment.find(log.read_checked(tmp_path / "log"), TUNING, None)
     assert not np.allclose(start.state[7:], origin)
     late = leg.time > 20.0
     estimated = result.mean[0, late, 7:10].numpy() + start.state[7:]
@@ -206,7 +211,7 @@ def test_positions_of_a_reference_are_a_truth_without_attitude(tmp_path: Path) -
     assert set(episode.truth) == {"position", "velocity"}
     assert episode.measured_truth is None
     reference = tables["reference"]
-    start = log.alignment.find(log._read_log(tmp_path / "log"), TUNING, None).state[7:]
+    start = log.alignment.find(log.read_checked(tmp_path / "log"), TUNING, None).state[7:]
     east = np.interp(episode.time.numpy(), reference.t, reference.pe) - start[0]
     np.testing.assert_allclose(episode.truth["position"][0, :, 0].numpy(), east, atol=0.02)
 
@@ -228,8 +233,7 @@ def test_without_withheld_fixes_nothing_is_scored_and_said(tmp_path: Path) -> No
     ],
 )  # fmt: skip
 def test_what_needs_a_reference_is_refused(tmp_path: Path, changes: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        scenario(tmp_path, **changes)
+    check_refused([(message, lambda: scenario(tmp_path, **changes))], remedy=False)
 
 
 def test_axes_forward_left_up_are_refused_with_the_key_that_mends_them(tmp_path: Path) -> None:
@@ -238,10 +242,15 @@ def test_axes_forward_left_up_are_refused_with_the_key_that_mends_them(tmp_path:
     imu = pd.read_csv(file)
     imu[["fy", "fz", "wy", "wz"]] *= -1.0
     imu.to_csv(file, index=False)
-    with pytest.raises(
-        ValueError, match=r"-9\.8 on fz .* got a median of 9\.8.*mounting\.imu=\[x,-y,-z\]"
-    ):
-        scenario(tmp_path).draw(NominalNoise(), torch.arange(1), 1)
+    check_refused(
+        [
+            (
+                r"-9\.8 on fz .* got a median of 9\.8.*mounting\.imu=\[x,-y,-z\]",
+                lambda: scenario(tmp_path).draw(NominalNoise(), torch.arange(1), 1),
+            )
+        ],
+        remedy=False,
+    )
     mended = scenario(tmp_path, corrections=LogCorrections(mounting={"imu": ["x", "-y", "-z"]}))
     assert any(
         "forward, right, down" in note

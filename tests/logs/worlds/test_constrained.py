@@ -12,6 +12,7 @@ import pytest
 import torch
 from config_cases import composed
 from recorded_data import DATA, believed, recorded
+from refusals import check_refused
 from synthetic_log import GRAVITY, write
 
 from pfbench import job
@@ -98,16 +99,26 @@ def test_thresholds_that_no_data_confirm_are_refused(tmp_path: Path) -> None:
     log = read_log(write(tmp_path / "glide", glide))
     straight = log.imu.rate * [1.0, 1.0, 0.0]
     quiet = replace(log, imu=log.imu._replace(rate=straight, force=0.1 * log.imu.force))
-    with pytest.raises(
-        ValueError, match=r"find standing in at most 5% of the steps above 0\.3 m/s, got [1-9]"
-    ):
-        detect_standing(quiet, np.arange(0.2, 59.0, 0.2))
+    check_refused(
+        [
+            (
+                r"find standing in at most 5% of the steps above 0\.3 m/s, got [1-9]",
+                lambda: detect_standing(quiet, np.arange(0.2, 59.0, 0.2)),
+            )
+        ],
+        remedy=False,
+    )
     moving = {name: table[table.t > 16.0] for name, table in stop_and_go(seconds=34.0).items()}
     short = read_log(write(tmp_path / "moving", moving))
-    with pytest.raises(
-        ValueError, match=r"the log must stand for 8 s, .* got no such part\. Set constraints\."
-    ):
-        detect_standing(short, np.arange(17.0, 33.0, 0.2))
+    check_refused(
+        [
+            (
+                r"the log must stand for 8 s, .* got no such part\. Set constraints\.",
+                lambda: detect_standing(short, np.arange(17.0, 33.0, 0.2)),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_components_are_zero_or_the_recorded_rate_and_missing_where_nothing_is_known(
@@ -166,12 +177,21 @@ def test_a_recorded_odometer_is_read_at_the_steps_but_not_in_its_gaps(root: Path
     assert np.array_equal(np.isfinite(speed), known)
     assert np.allclose(speed[known], 2.0 + 0.5 * time[known])
     assert [path.name for path in scene.input_files()][-1] == "wheels.csv"
-    with pytest.raises(ValueError, match=r"must contain tyres\.parquet or tyres\.csv"):
-        replace(scene, odometer=RecordedOdometer("tyres")).draw(NominalNoise(), RUNS, 1)
-    with pytest.raises(
-        ValueError, match=r"scenario\.odometer must be null without, and .* got None"
-    ):
-        constrained(root, odometer_sd=0.3)
+    check_refused(
+        [
+            (
+                r"must contain tyres\.parquet or tyres\.csv",
+                lambda: replace(scene, odometer=RecordedOdometer("tyres")).draw(
+                    NominalNoise(), RUNS, 1
+                ),
+            ),
+            (
+                r"scenario\.odometer must be null without, and .* got None",
+                lambda: constrained(root, odometer_sd=0.3),
+            ),
+        ],
+        remedy=False,
+    )
 
 
 def test_a_model_without_the_constraints_is_refused_with_the_one_that_has_them() -> None:
@@ -179,11 +199,15 @@ def test_a_model_without_the_constraints_is_refused_with_the_one_that_has_them()
         "scenario=user_log", "scenario.folder=drive", "scenario.constraints.lever_arm=[1,0,0]"
     )
     values = (job.instantiate(tree.model), job.instantiate(tree.scenario))
-    with pytest.raises(
-        ValueError,
-        match=r"reads 'position East \[m\]' as channel 1, .*'position of the antenna East .* Models that fit: strapdown_blocks\.",
-    ):
-        check_fit(*values, tree, ())
+    check_refused(
+        [
+            (
+                r"reads 'position East \[m\]' as channel 1, .*'position of the antenna East .* Models that fit: strapdown_blocks\.",
+                lambda: check_fit(*values, tree, ()),
+            )
+        ],
+        remedy=False,
+    )
 
 
 # --------------------------------------------------------------------------------------------------

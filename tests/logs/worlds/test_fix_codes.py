@@ -14,6 +14,7 @@ import pytest
 from checkout import ROOT
 from command_line import pfbench
 from recorded_data import believed
+from refusals import check_refused
 from synthetic_log import tables, write
 
 from pfbench.files import reader_notes
@@ -86,8 +87,15 @@ def test_other_codes_are_refused_and_each_named_key_reads_them(
 
 
 def test_a_code_that_the_program_does_not_have_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"must be a code of ublox, got 9 in 33 of 101 rows"):
-        read_log(write_codes(tmp_path, [3, 3, 9]), fix_codes="ublox")
+    check_refused(
+        [
+            (
+                r"must be a code of ublox, got 9 in 33 of 101 rows",
+                lambda: read_log(write_codes(tmp_path, [3, 3, 9]), fix_codes="ublox"),
+            )
+        ],
+        remedy=False,
+    )
 
 
 @pytest.mark.parametrize(("codes", "choice"), [([0.0], None), ([0, 6], "nmea"), ([4.0], [5])])
@@ -103,10 +111,15 @@ def test_a_table_without_a_usable_fix_is_refused(
 
 @pytest.mark.parametrize("codes", ["novatel", [], [-1], [1.5], ["4"], [True]])
 def test_other_values_of_the_key_are_refused(codes: Any) -> None:
-    with pytest.raises(
-        ValueError, match=r"scenario\.fix_codes must be nmea, rtklib, mavlink, ublox, null"
-    ):
-        check_fix_codes(codes)
+    check_refused(
+        [
+            (
+                r"scenario\.fix_codes must be nmea, rtklib, mavlink, ublox, null",
+                lambda: check_fix_codes(codes),
+            )
+        ],
+        remedy=False,
+    )
 
 
 KEYS = ("scenario=user_log", "scenario.folder=log", "runs=1", "scenario.fix_codes=rtklib")
@@ -126,10 +139,15 @@ def test_the_console_says_it_once_before_the_first_job_of_a_sweep(tmp_path: Path
 def test_no_usable_fix_in_the_chosen_time_is_an_error(tmp_path: Path) -> None:
     write_codes(tmp_path / "log", [1.0] * 21 + [0.0] * 80)  # usable until t = 4 s
     drive = RecordedDrive(str(tmp_path), "log", believed([1.5, 1.5, 3.0], None), start_s=5.0)
-    with pytest.raises(
-        ValueError, match=r"must include a usable one, got none of 15.*\(t = 0\.000 to 4\.000\)"
-    ):
-        drive.read()
+    check_refused(
+        [
+            (
+                r"must include a usable one, got none of 15.*\(t = 0\.000 to 4\.000\)",
+                lambda: drive.read(),
+            )
+        ],
+        remedy=False,
+    )
     assert np.isfinite(replace(drive, start_s=0.0).read().fixes).any()
 
 

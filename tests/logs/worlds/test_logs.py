@@ -13,10 +13,11 @@ import pytest
 from checkout import ROOT
 from command_line import block
 from pymap3d import ned2geodetic
+from refusals import check_refused
 from scipy.spatial.transform import Rotation
 from synthetic_log import GRAVITY, ORIGIN, drive, tables, write
 
-from pfbench.logs.worlds.log_checks import STANDARD_GRAVITY
+from pfbench.logs.units import STANDARD_GRAVITY
 from pfbench.logs.worlds.log_reader import read_log
 from pfbench.logs.worlds.log_tables import LogFiles, swap_frd_rfu
 
@@ -121,13 +122,16 @@ def test_flights_and_sensors_of_one_table_are_told_apart(tmp_path: Path) -> None
     first, other = read_log(folder, path=1, imu=2), read_log(folder, path=2, imu=1)
     assert len(first.imu.time) == len(other.imu.time) == len(log["imu"])
     assert np.allclose(first.reference.position[:, 2] - other.reference.position[:, 2], 50.0)
-    with pytest.raises(
-        ValueError,
-        match=r"column path must have one value, got \[1, 2\]. Select one of them with path=",
-    ):
-        read_log(folder, imu=1)
-    with pytest.raises(ValueError, match=r"must have rows with imu=2, got \[1\]"):
-        read_log(folder, path=2, imu=2)
+    check_refused(
+        [
+            (
+                r"column path must have one value, got \[1, 2\]. Select one of them with path=",
+                lambda: read_log(folder, imu=1),
+            ),
+            (r"must have rows with imu=2, got \[1\]", lambda: read_log(folder, path=2, imu=2)),
+        ],
+        remedy=False,
+    )
 
 
 def test_fixes_may_come_from_the_reference(tmp_path: Path) -> None:
@@ -281,24 +285,38 @@ def test_what_is_wrong_is_said_with_its_place_and_remedy(tmp_path: Path, name: s
     spoil, message = BAD[name]
     log = tables()
     spoil(log)
-    with pytest.raises(ValueError, match=message):
-        read_log(write(tmp_path, log))
+    check_refused([(message, lambda: read_log(write(tmp_path, log)))], remedy=False)
 
 
 def test_rows_of_parquet_are_counted_from_0(tmp_path: Path) -> None:
     log = tables()
     log["imu"].loc[7, "wz"] = np.nan
-    with pytest.raises(ValueError, match=r"imu\.parquet: column wz .*got nan in row 7 \(from 0\)"):
-        read_log(write(tmp_path, log, ".parquet"))
+    check_refused(
+        [
+            (
+                r"imu\.parquet: column wz .*got nan in row 7 \(from 0\)",
+                lambda: read_log(write(tmp_path, log, ".parquet")),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_a_missing_or_doubled_table_is_named(tmp_path: Path) -> None:
     write(tmp_path, tables())
-    with pytest.raises(ValueError, match=r"must contain gps\.parquet or gps\.csv.*as a folder"):
-        read_log(tmp_path, LogFiles(gnss="gps"))
+    check_refused(
+        [
+            (
+                r"must contain gps\.parquet or gps\.csv.*as a folder",
+                lambda: read_log(tmp_path, LogFiles(gnss="gps")),
+            )
+        ],
+        remedy=False,
+    )
     write(tmp_path, tables(), ".parquet")
-    with pytest.raises(ValueError, match=r"both imu\.parquet and imu\.csv. Delete one"):
-        read_log(tmp_path)
+    check_refused(
+        [(r"both imu\.parquet and imu\.csv. Delete one", lambda: read_log(tmp_path))], remedy=False
+    )
 
 
 def test_parquet_without_pyarrow_says_what_to_install(
@@ -306,17 +324,28 @@ def test_parquet_without_pyarrow_says_what_to_install(
 ) -> None:
     write(tmp_path, tables(), ".parquet")
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(
-        ValueError,
-        match=r"needs pyarrow. Run pip install 'pfbench\[data\]', or store the log as CSV",
-    ):
-        read_log(tmp_path)
+    check_refused(
+        [
+            (
+                r"needs pyarrow. Run pip install 'pfbench\[data\]', or store the log as CSV",
+                lambda: read_log(tmp_path),
+            )
+        ],
+        remedy=False,
+    )
 
 
 @pytest.mark.parametrize("origin", [(40.0, 5.0), (140.0, 5.0, 0.0)])
 def test_an_impossible_origin_is_refused(tmp_path: Path, origin: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match=r"origin must be lat_deg .*, lon_deg, h_m, got \["):
-        read_log(write(tmp_path, tables()), origin=origin)
+    check_refused(
+        [
+            (
+                r"origin must be lat_deg .*, lon_deg, h_m, got \[",
+                lambda: read_log(write(tmp_path, tables()), origin=origin),
+            )
+        ],
+        remedy=False,
+    )
 
 
 PAGE = ROOT / "docs" / "use_your_data.md"

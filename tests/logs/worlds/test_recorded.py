@@ -12,6 +12,7 @@ import torch
 from checkout import ROOT
 from hydra import compose, initialize_config_dir
 from recorded_data import DATA, believed, recorded
+from refusals import check_refused
 from synthetic_log import drive, tables, write
 
 from pfbench.core.random_stream import PhiloxStream
@@ -230,10 +231,15 @@ def test_start_and_end_bound_the_drive(root: Path) -> None:
     assert episode.time[[0, -1]].tolist() == pytest.approx(
         [4.85, 11.6]
     )  # fixes at 4.6, 5.6 ... 11.6
-    with pytest.raises(
-        ValueError, match=r"got 1 fixes between t = 19\.500 and 20\.000.*earlier start"
-    ):
-        one_drive(root, start_s=19.5).draw(NominalNoise(), numbers(0), 1)
+    check_refused(
+        [
+            (
+                r"got 1 fixes between t = 19\.500 and 20\.000.*earlier start",
+                lambda: one_drive(root, start_s=19.5).draw(NominalNoise(), numbers(0), 1),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def test_runs_of_flights_are_the_flights_and_then_again(root: Path) -> None:
@@ -269,23 +275,34 @@ def test_a_flight_alone_is_the_flight_in_its_batch(root: Path) -> None:
 
 
 def test_missing_data_say_which_key_to_set(root: Path) -> None:
-    with pytest.raises(
-        ValueError,
-        match=r"data\.root is not set.*PFBENCH_DATA or data\.root .*car_rtk_mems/",
-    ):
-        find_dataset(None, "car_rtk_mems")
-    with pytest.raises(
-        ValueError, match=r"data\.root must contain the folder elsewhere.*PFBENCH_DATA"
-    ):
-        find_dataset(str(root), "elsewhere")
+    check_refused(
+        [
+            (
+                r"data\.root is not set.*PFBENCH_DATA or data\.root .*car_rtk_mems/",
+                lambda: find_dataset(None, "car_rtk_mems"),
+            ),
+            (
+                r"data\.root must contain the folder elsewhere.*PFBENCH_DATA",
+                lambda: find_dataset(str(root), "elsewhere"),
+            ),
+        ],
+        remedy=False,
+    )
 
 
 def test_flights_with_other_fixes_are_refused(root: Path, tmp_path: Path) -> None:
     whole = {name: pd.read_csv(root / "flights" / f"{name}.csv") for name in ("imu", "reference")}
     whole["reference"].loc[whole["reference"].path == 3, "t"] *= 1.01
     write(tmp_path / "flights", whole)
-    with pytest.raises(ValueError, match="got different times in flight 3"):
-        flights(tmp_path).draw(NominalNoise(), torch.arange(3), 1)
+    check_refused(
+        [
+            (
+                "got different times in flight 3",
+                lambda: flights(tmp_path).draw(NominalNoise(), torch.arange(3), 1),
+            )
+        ],
+        remedy=False,
+    )
 
 
 @pytest.mark.parametrize(
@@ -311,18 +328,24 @@ def test_flights_with_other_fixes_are_refused(root: Path, tmp_path: Path) -> Non
     ],
 )
 def test_impossible_settings_name_their_key(root: Path, make: object, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        make(root)
+    check_refused([(message, lambda: make(root))], remedy=False)
 
 
 def test_velocities_that_were_not_recorded_are_not_invented(root: Path, tmp_path: Path) -> None:
     log = tables()
     log["gnss"] = log["gnss"].drop(columns=["vn", "ve", "vd"])
     write(tmp_path / "drive", log)
-    with pytest.raises(ValueError, match="must be null for fixes without vn, ve, vd"):
-        one_drive(tmp_path, receiver=FixReceiver(velocity_sd=[0.1] * 3)).draw(
-            NominalNoise(), numbers(0), 1
-        )
+    check_refused(
+        [
+            (
+                "must be null for fixes without vn, ve, vd",
+                lambda: one_drive(tmp_path, receiver=FixReceiver(velocity_sd=[0.1] * 3)).draw(
+                    NominalNoise(), numbers(0), 1
+                ),
+            )
+        ],
+        remedy=False,
+    )
 
 
 def run(

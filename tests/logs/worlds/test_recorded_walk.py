@@ -16,6 +16,7 @@ import torch
 from checkout import ROOT
 from hydra import compose, initialize_config_dir
 from recorded_data import believed, recorded
+from refusals import check_refused
 from synthetic_log import ORIGIN, drive, tables, write
 from torch import Tensor
 
@@ -310,8 +311,7 @@ def test_the_truth_is_a_draw_of_the_initial_law_about_the_start(root: Path) -> N
     ],
 )
 def test_impossible_settings_name_their_key(root: Path, make: object, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        make(root)
+    check_refused([(message, lambda: make(root))], remedy=False)
 
 
 @pytest.mark.parametrize(
@@ -328,8 +328,9 @@ def test_impossible_settings_name_their_key(root: Path, make: object, message: s
 )
 def test_faulty_tables_are_refused(tmp_path: Path, spoil: object, message: str) -> None:
     write(tmp_path / "walk", {**tables(), "pseudorange": spoil(sky())})
-    with pytest.raises(ValueError, match=message):
-        walk(tmp_path).draw(NominalNoise(), numbers(0), 1)
+    check_refused(
+        [(message, lambda: walk(tmp_path).draw(NominalNoise(), numbers(0), 1))], remedy=False
+    )
 
 
 # the recorded walk

@@ -162,7 +162,7 @@ def fast() -> Log:
 
 def obey(log: Log, said: str, unit: str = "") -> None:
     """Does to a log what a message about units tells, where two fit for the true unit."""
-    name, _, rest = said.removeprefix("the log must agree in itself, got: ").partition(".csv")
+    name, _, rest = said.removeprefix("the log must agree in itself, got ").partition(".csv")
     columns = re.findall(r"\b(f[xyz]|w[xyz]|v[ned]|p[ned])\b", rest)
     group = next((g for g in GROUPS if columns and columns[0] in g), [])
     said = said.partition(f"in {unit},")[2] or said if unit else said
