@@ -63,7 +63,7 @@ def tensors_in(tree: Any) -> list[Tensor]:
 
 @dataclass(eq=False)
 class WholeStepFilter(Filter, MultiStepFilter, RecordStartedFilter):
-    """Particle filter of which some steps are taken together, by another engine.
+    """Particle filter some of whose steps another engine takes together.
 
     Attributes:
         method: The filter.

@@ -192,7 +192,7 @@ class _Recorder(TorchFunctionMode):
         return result
 
     def _compute(self, function: Any, name: str, result: Tensor, args: Any, options: Any) -> Any:
-        """Return the atoms of the results of a function, of which `result` is the first."""
+        """Return the atoms of the results of a function. The first of them is `result`."""
         if name in _MOVES:
             return function(self.read(args[0]), *args[1:], **options)
         if name in _JOINS:

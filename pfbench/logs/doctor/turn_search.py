@@ -74,7 +74,7 @@ class TurnSearch:
         if used.sum() < max(FEWEST_TURNS, _LEAST_SHARE * required.sum()):
             return None
         measured = np.diff(interpolate_columns(at, self.time, self.angle), axis=0)[used]
-        # a bias, and one that moves evenly, are no turns
+        # a bias does not turn, nor does one that moves evenly
         return detrend(turns[used], axis=0), detrend(measured, axis=0), used
 
     def score(self, turns: Array, offset: float, stretch: _Mask | None = None) -> float:
