@@ -91,7 +91,7 @@ class _Graph:
         """Return the number of a node, the same one for the same node."""
         if (number := self._known.get(node)) is None:
             if len(self.nodes) > _MOST_NODES:
-                raise NoTapeError(f"it has more than {_MOST_INSTRUCTIONS} instructions")
+                raise NoTapeError(f"it needs more than {_MOST_INSTRUCTIONS} instructions")
             number = self._known[node] = len(self.nodes)
             self.nodes.append(node)
             self.of_particles.append(of_particles)
@@ -106,7 +106,7 @@ class _Graph:
         lane = max(atom % _LANES for atom in atoms)
         run = 1 + (lane - 3) // FEW if lane >= 3 else lane
         if any(atom % _LANES not in (0, run, lane) for atom in atoms):
-            raise NoTapeError("it mixes particles or runs")
+            raise NoTapeError("it mixes particles or runs, which a tape cannot")
         operands = [atom // _LANES for atom in atoms]
         if name == "mul" and (unit := self.number(1.0) // _LANES) in operands:
             return operands[operands[0] == unit] * _LANES + lane
@@ -184,7 +184,7 @@ class _Recorder(TorchFunctionMode):
         if not any(id(a) in self._atoms for a in tensors_in((args, options))):
             return result
         if not (tensors := tensors_in(result)):
-            raise NoTapeError(f"it asks for values by {name}")
+            raise NoTapeError(f"it asks for values by {name}, which a tape cannot give")
         name = _ALIASES.get(name, name)
         atoms = tensors_in(self._compute(function, name, tensors[0], args, options))
         for tensor, numbers in zip(tensors, atoms, strict=True):
@@ -214,7 +214,7 @@ class _Recorder(TorchFunctionMode):
         is_choice = name == "where" and all(_plain(a) in (0.0, 1.0) for a in args[1:])
         is_logical = result.dtype == torch.bool and name in ("add", "sub")
         if name not in self._table or is_logical or not (is_choice or result.dtype in _TYPES):
-            raise NoTapeError(f"it uses torch.{name} with a result of {result.dtype}")
+            raise NoTapeError(f"it needs torch.{name} with a result of {result.dtype}")
         keywords = {key: self.read(a) for key, a in options.items() if a is not None}
         return self._combine(self._table[name], [self.read(a) for a in args], keywords)
 
@@ -233,7 +233,7 @@ class _Recorder(TorchFunctionMode):
     def _reduce(self, name: str, a: Tensor, *args: Any, **options: Any) -> Tensor:
         """Return the atoms of a sum or a product over axes."""
         if set(options) - {"dim", "keepdim"} or len(args) > 1:
-            raise NoTapeError(f"it uses torch.{name} with other options")
+            raise NoTapeError(f"it needs torch.{name} with other options")
         axes = options.get("dim", args[0] if args else tuple(range(a.dim())))
         axes = axes if isinstance(axes, tuple | list) else (axes,)
         rows = self.read(a).movedim(tuple(axes), tuple(range(-len(axes), 0))).flatten(-len(axes))
@@ -282,12 +282,14 @@ def record_tape(model: StateSpaceModel, x: Tensor, w: Tensor, record: Record) ->
         value = model.log_likelihood(record.y, states, record.u).expand(x.shape[:2])
     if not torch.equal(state, torch.get_rng_state()):
         torch.set_rng_state(state)
-        raise NoTapeError("it draws random numbers")
+        raise NoTapeError("it draws random numbers, which a tape cannot")
     atoms = torch.cat([recorder.read(states), recorder.read(value).unsqueeze(-1)], -1)
     lane, nodes = atoms % _LANES, atoms // _LANES
     is_own = (lane == 0) | (lane == lanes) | (lane == 1 + (lanes - 3) // FEW)
     if not bool(is_own.all() and (nodes == nodes[:1, :1]).all()):
-        raise NoTapeError("its numbers depend on the place of a particle or run")
+        raise NoTapeError(
+            "its numbers depend on the place of a particle or run, which a tape cannot follow"
+        )
     return _arrange(graph, nodes[0, 0].tolist(), w.shape[2], sources, inputs), states, value
 
 
@@ -296,7 +298,7 @@ def _follow_inputs(recorder: _Recorder, tensors: Sequence[Tensor]) -> int:
     inputs = 0
     for leaf in tensors:
         if leaf.dtype not in _TYPES[:2]:
-            raise NoTapeError(f"it has inputs of {leaf.dtype}")
+            raise NoTapeError(f"it needs inputs of {leaf.dtype}")
         places = range(inputs, inputs + leaf[0].numel())
         nodes = _stack((recorder.graph.add("input", k) for k in places), (-1,))
         lane = torch.arange(1, 1 + len(leaf)).unsqueeze(1) * (len(leaf) > 1)
@@ -336,7 +338,7 @@ def _arrange(graph: _Graph, roots: list[int], noises: int, sources: int, inputs:
             register_of[a] for a in set(operands) if last[a] == k and register_of[a] >= sources
         ]
     if sum(row[1] >= 0 for row in code) > _MOST_INSTRUCTIONS:
-        raise NoTapeError(f"it has more than {_MOST_INSTRUCTIONS} instructions")
+        raise NoTapeError(f"it needs more than {_MOST_INSTRUCTIONS} instructions")
     return Tape(
         _stack(chain(*code), (-1, 5)),
         _stack((register_of[k] for k in roots), (-1,)),

@@ -148,7 +148,7 @@ class TapedParticleFilter(WholeStepFilter):
             return
         try:
             if type(draws) is not PhiloxStream or draws.dtype != torch.float64 or belief.memory:
-                raise NoTapeError("its random numbers or its particles are of another kind")
+                raise NoTapeError("its random numbers or its particles are not those of a tape")
             changes = any(model.at_step(k) is not model for k in range(t + 1, record.y.shape[1]))
             reason = "its model changes from step to step" if changes else ""
             if reason := reason or find_obstacle(self.method, model):
@@ -221,4 +221,4 @@ def _check_tape(
     computed = (block.last.log_w + block.log_evidence)[weighed]
     agrees = partial(torch.allclose, rtol=1e-9, atol=1e-12)
     if not (agrees(block.last.x[finite], states[finite]) and agrees(computed, updated[weighed])):
-        raise NoTapeError("the tape computes other numbers than torch")
+        raise NoTapeError("the tape does not compute the numbers of torch")

@@ -284,9 +284,9 @@ REFUSED: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
     "order": ("the place of a particle", lambda x: x + torch.arange(x.shape[1])),
     "flip": ("the place of a particle", lambda x: x.flip(1)),
     "runs": ("the place of a particle", lambda x: x.flip(0)),
-    "sort": (r"uses torch.sort", lambda x: x.sort(-1)[0]),
+    "sort": (r"needs torch.sort", lambda x: x.sort(-1)[0]),
     "in place": ("setitem", fill_in_place),
-    "single": (r"uses torch.float .* torch.float32", lambda x: x.float().double()),
+    "single": (r"needs torch.float .* torch.float32", lambda x: x.float().double()),
     "long": ("more than 400 instructions", lambda x: sum((x * k for k in range(2, 450)), x)),
 }
 
@@ -307,12 +307,12 @@ class Clamped(UnivariateGrowth):
 
 
 OTHERS: dict[str, tuple[Any, StateSpaceModel, torch.dtype]] = {
-    "uses torch.clamp_": (make_filter(), Clamped(), torch.float64),
+    "needs torch.clamp_": (make_filter(), Clamped(), torch.float64),
     "Stratified in place of Systematic": (
         ParticleFilter(60, EssResampler(Stratified())), UnivariateGrowth(), torch.float64,
     ),
     "states have angles": (make_filter(), Pendulum(), torch.float64),
-    "of another kind": (make_filter(), UnivariateGrowth().float(), torch.float32),
+    "not those of a tape": (make_filter(), UnivariateGrowth().float(), torch.float32),
 }  # fmt: skip
 
 
@@ -348,7 +348,7 @@ def test_a_tape_of_other_numbers_is_not_used(
     model = UnivariateGrowth()
     assert_close(run(taped, model, simulate(model)), run(make_filter(), model, simulate(model)))
     assert not taped.is_active
-    assert "the tape computes other numbers than torch" in caplog.text
+    assert "the tape does not compute the numbers of torch" in caplog.text
 
 
 # --------------------------------------------------------------------------------------------------
