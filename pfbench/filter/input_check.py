@@ -67,7 +67,7 @@ def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) ->
         not isinstance(numbers, Tensor) or numbers.shape == (runs,),
         "draws",
         f"be of {runs} runs, as record.y is",
-        list(getattr(numbers, "shape", ())),
+        len(numbers) if isinstance(numbers, Tensor) else 0,
         f"Use PhiloxStream(seed, torch.arange({runs})).",
     )
     require(
