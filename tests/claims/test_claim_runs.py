@@ -155,8 +155,7 @@ def test_losses_of_track_that_nobody_has_decide_nothing() -> None:
             StoredValues(cell, 2001, 0, 30, "k", "c", 1.0, "", (0,) * 30, {name: [1.0, lost] * 15 for name in measures})
             for cell, measures in list_claim_cells(plan).items()
         ]  # fmt: skip
-        decisions = decide_claims([plan], ClaimRuns(records))
-        return {decided.word for decided in decisions.values()}
+        return {decided.word for decided in decide_claims([plan], ClaimRuns(records)).values()}
 
     assert decide_by(1.0) == {"untestable"}
     assert "untestable" not in decide_by(2.0)
@@ -280,9 +279,8 @@ def test_runs_are_those_of_fresh_seeds_without_repetition() -> None:
 def test_a_planted_effect_in_stored_values_gives_the_word_of_its_claim(
     ratio: float, word: str
 ) -> None:
-    runs = ClaimRuns(list(draw_values("004-C10", ratio)))
     plans = [PLANS["004-C10"]]
-    line = conclude(plans[0], decide_claims(plans, runs))
+    line = conclude(plans[0], decide_claims(plans, ClaimRuns(list(draw_values("004-C10", ratio)))))
     assert (line.word, line.repaired) == (word, word)
     assert conclude(plans[0], decide_claims(plans, ClaimRuns([]))).reason == "not run"
 
@@ -293,15 +291,13 @@ def test_a_proof_decides_the_readings_that_it_covers() -> None:
     decision = decide_claims([plan], ClaimRuns([]))["002-32", "published", "direction"]
     assert decision.word == OPEN
     assert decision.outcomes == {"central": "false", "heading_45": "not run", "heading_80": "not run"}  # fmt: skip
-    worse = decide_claims([plan], ClaimRuns(list(draw_values("002-32", 1.2))))
+    worse, better = (decide_claims([plan], ClaimRuns(list(draw_values("002-32", ratio)))) for ratio in (1.2, 0.8))  # fmt: skip
     assert worse["002-32", "published", "direction"].word == REFUTED
-    better = decide_claims([plan], ClaimRuns(list(draw_values("002-32", 0.8))))
     assert better["002-32", "published", "direction"].factors == ("heading",)
 
 
 def test_a_fitted_reading_does_not_count() -> None:
-    runs = ClaimRuns(list(draw_values("004-C5", 0.6)))
-    decision = decide_claims([PLANS["004-C5"]], runs)["004-C5", "published", "direction"]
+    decision = decide_claims([PLANS["004-C5"]], ClaimRuns(list(draw_values("004-C5", 0.6))))["004-C5", "published", "direction"]  # fmt: skip
     assert decision.outcomes["receiver_fitted"] == "not counted"
     assert decision.word == CONFIRMED
 
@@ -309,9 +305,15 @@ def test_a_fitted_reading_does_not_count() -> None:
 def test_no_word_changes_with_the_order_of_the_files() -> None:
     records = [*draw_values("003-C10", 0.7), *draw_values("003-C4", 1.0)]
     plans = [PLANS["003-C10"], PLANS["003-C4"]]
-    first = decide_claims(plans, ClaimRuns(records))
-    again = decide_claims(plans[::-1], ClaimRuns(records[::-1]))
+    first, again = (decide_claims(plans[::k], ClaimRuns(records[::k])) for k in (1, -1))
     assert {k: d.word for k, d in first.items()} == {k: d.word for k, d in again.items()}
+
+
+def test_a_run_of_two_overlapping_jobs_counts_once() -> None:
+    long = StoredValues(("a",), 2001, 0, 3, "k", "c", 1.0, "", (0, 1, 0), {"x": [1.0, 2.0, 3.0]})
+    short = replace(long, runs=2, lost=(0, 1), values={"x": [1.0, 2.0]})
+    series = ClaimRuns([long, short]).join(("a",), "x")
+    assert [list(column) for column in series or ()][1:] == [[1.0, 2.0, 3.0], [0, 1, 0]]
 
 
 # plans
