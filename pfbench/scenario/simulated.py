@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
+import pfbench
 from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record, take_groups
@@ -146,7 +147,8 @@ def load_or_build(folder: str | Path | None, recipe: object, build: Callable[[],
     """
     if folder is None:
         return build()
-    head = f"episodes 2 generator {GENERATOR_VERSION}"
+    # one folder for all environments of a user: another version may simulate otherwise
+    head = f"episodes 2 generator {GENERATOR_VERSION} pfbench {pfbench.__version__}"
     key = hashlib.sha256(f"{head} {recipe!r}".encode()).hexdigest()[:16]
     path = Path(folder) / f"{key}.npz"
     if path.exists():
@@ -175,5 +177,4 @@ def _read(path: Path) -> Arrays:
         raise ValueError("its digest must be that of its content")
     if str(data.get(_KEY)) != path.stem:
         raise ValueError(f"its key must be {path.stem}, got {data.get(_KEY)}")
-    items = (item for item in data.items() if item[0] not in (DIGEST, _KEY))
-    return {name: torch.from_numpy(value) for name, value in items}
+    return {name: torch.from_numpy(value) for name, value in data.items() if name not in (DIGEST, _KEY)}  # fmt: skip

@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from pfbench import job
 from pfbench.kernels import cpp_library, cpp_library as private_folder, library_build
+from pfbench.scenario.simulated import load_or_build
 
 LOAD = """
 from pathlib import Path
@@ -30,8 +32,7 @@ def test_a_folder_that_others_can_write_is_refused(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     folder = private_folder.code_folder()
-    assert folder == tmp_path / "pfbench"
-    assert folder.stat().st_mode & 0o777 == 0o700
+    assert (folder, folder.stat().st_mode & 0o777) == (tmp_path / "pfbench", 0o700)
     for mode in (0o770, 0o707, 0o777, 0o720):
         folder.chmod(mode)
         with pytest.raises(PermissionError, match="others cannot write"):
@@ -51,6 +52,18 @@ def test_a_folder_of_another_user_is_refused(
     monkeypatch.setattr(os, "getuid", lambda: 12345)
     with pytest.raises(PermissionError, match="of this user"):
         private_folder.code_folder()
+
+
+def test_no_episode_comes_from_the_current_folder_or_from_another_version(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who gives a folder away could give false episodes with it."""
+    monkeypatch.setattr(os, "environ", {"XDG_CACHE_HOME": str(tmp_path)})
+    assert job.compose(["scenario=growth"]).values["episode_cache_dir"] == f"{tmp_path}/pfbench/worlds"  # fmt: skip
+    for version in ("1.0", "1.1", "1.1"):
+        monkeypatch.setattr("pfbench.__version__", version)
+        load_or_build(tmp_path, "flight", dict)
+    assert len(list(tmp_path.glob("*.npz"))) == 2
 
 
 @pytest.mark.slow

@@ -46,21 +46,20 @@ Stored = tuple[dict[str, object], pd.DataFrame]
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Stored:
     """Pack and runs of a study."""
-    folder = study(tmp_path_factory.mktemp("results") / "demo")
-    conditions, options = load_conditions("demo", folder.parent), ReportOptions()
+    conditions = load_conditions("demo", study(tmp_path_factory.mktemp("results") / "demo").parent)
+    options = ReportOptions()
     data = read_study(conditions, options)
     return build_pack("demo", conditions, options, data), data.table
 
 
 def decide(stored: Stored, table: pd.DataFrame) -> pd.DataFrame:
-    facts = StudyFacts.from_pack(stored[0])
-    return pd.DataFrame(decide_parts(table, facts)["decisions"]).set_index(["a", "b"])
+    parts = decide_parts(table, StudyFacts.from_pack(stored[0]))
+    return pd.DataFrame(parts["decisions"]).set_index(["a", "b"])
 
 
 def test_the_order_of_rows_changes_no_verdict(stored: Stored) -> None:
-    table = stored[1]
-    mixed = decide(stored, table.sample(frac=1, random_state=1))
-    pd.testing.assert_frame_equal(mixed, decide(stored, table), check_exact=False, rtol=1e-9)
+    mixed, first = (decide(stored, table) for table in (stored[1].sample(frac=1, random_state=1), stored[1]))  # fmt: skip
+    pd.testing.assert_frame_equal(mixed, first, check_exact=False, rtol=1e-9)
 
 
 def test_the_numbers_of_the_runs_change_no_verdict(stored: Stored) -> None:
@@ -69,8 +68,8 @@ def test_the_numbers_of_the_runs_change_no_verdict(stored: Stored) -> None:
     renamed = table.assign(run=number[table["run"].to_numpy()])
     first = decide(stored, table)
     pd.testing.assert_frame_equal(decide(stored, renamed), first, check_exact=False, rtol=1e-9)
-    of_one = np.where(table["filter"] == "ukf", number[table["run"].to_numpy()], table["run"])
-    apart = decide(stored, table.assign(run=of_one))  # they are paired by it
+    one = table["run"].where(table["filter"] != "ukf", renamed["run"])
+    apart = decide(stored, table.assign(run=one))  # they are paired by it
     widths = [math.log(t.loc[("cofm_amssrcpf", "ukf"), "high"] / t.loc[("cofm_amssrcpf", "ukf"), "low"]) for t in (first, apart)]  # fmt: skip
     assert widths[1] > 1.2 * widths[0]
 
@@ -81,8 +80,7 @@ def test_order_of_files_and_workers_change_no_verdict(tmp_path: Path) -> None:
     for turn in (0, 7):
         folder = study(tmp_path / f"results{turn}" / "demo", turn)
         made = study_report.write_report("demo", folder.parent, tmp_path / f"reports{turn}")
-        names = ("decisions.csv", "consistency.csv", "metrics.csv", "verdicts.csv")
-        said.append([(made.parent / name).read_text() for name in names])
+        said.append([(made.parent / f"{name}.csv").read_text() for name in ("decisions", "consistency", "metrics", "verdicts")])  # fmt: skip
         assert ("worker 3" in made.read_text()) is bool(turn)
     assert said[0] == said[1]
     assert len(said[0][0].splitlines()) == 4  # all pairs of three filters
