@@ -287,6 +287,10 @@ _KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "config": ("a dictionary", lambda value: isinstance(value, dict)),
     "choices": ("a dictionary of names", _are_texts),
     "versions": ("a dictionary of texts", _are_texts),
+    "inputs": (
+        "a dictionary of dictionaries of texts",
+        lambda value: isinstance(value, dict) and all(map(_are_texts, value.values())),
+    ),
     "seconds": (
         "a dictionary of numbers",
         lambda value: isinstance(value, dict) and all(map(_is_number, value.values())),

@@ -72,6 +72,8 @@ METADATA: dict[str, Change] = {
     "versions must": lambda m: m.update(versions="x"),
     "seconds must": lambda m: m.update(seconds={"filter": "x"}),
     "config must": lambda m: m.update(config="x"),
+    "inputs must be a dictionary of dictionaries": lambda m: m.update(inputs="x"),
+    "inputs must": lambda m: m.update(inputs={"scenario": "x"}),
 }  # fmt: skip
 ARRAYS: dict[str, Change] = {
     "error must be real numbers": lambda d: d.update(error=d["error"].astype(str)),
