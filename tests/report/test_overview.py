@@ -28,6 +28,7 @@ from pfbench.report.overview.page import (
     describe_times,
     list_notes,
     list_verdicts,
+    order_dose_worlds,
     render_overview,
     word_headline,
 )
@@ -589,6 +590,8 @@ def test_the_page_has_its_figures_tables_and_stories(overview: Overview) -> None
         assert overview.names[method] in text
     assert "The seven against each other" in page
     assert word_headline(overview) in page.replace("&#39;", "'")
+    left = overview._replace(cells=[cell for cell in overview.cells if cell.world != "azimuth"])
+    assert [w.key for w in order_dose_worlds(left)] == [w.key for w in order_dose_worlds(overview) if w.key != "azimuth"]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -616,10 +619,8 @@ def test_each_number_of_particles_has_its_tables(
     half = {(c.world, c.filter): c.verdict.ratio for c in levels[1000].cells}
     assert half["azimuth", "mcmc_rpf"] == pytest.approx(plain["azimuth", "mcmc_rpf"] / 2, rel=0.1)
     assert half["azimuth", "fm_mssrckf"] == plain["azimuth", "fm_mssrckf"]
-    doses = {key: levels[key] for key in (100, 1000)}
-    points = figures.dose_points(doses, overview.worlds[0], "mcmc_rpf", "particles")
+    points, times = (figures.dose_points({k: levels[k] for k in (100, 1000)}, overview.worlds[0], "mcmc_rpf", axis) for axis in ("particles", "time"))  # fmt: skip
     assert [x for x, _ in points] == [100.0, 1000.0]
-    times = figures.dose_points(doses, overview.worlds[0], "mcmc_rpf", "time")
     assert times[1][0] == pytest.approx(9 * times[0][0])
 
 

@@ -154,9 +154,12 @@ def draw_pictures(overviews: Mapping[TabKey, Overview]) -> dict[str, str]:
 
 
 def order_dose_worlds(overview: Overview) -> list[World]:
-    """Order worlds by the methods that are better than the reference; those that it does not fit first."""
+    """Order the worlds that have a ratio by the methods that are better than the reference; those that it does not fit first."""
     wins = Counter(cell.world for cell in overview.cells if cell.verdict.word == "better")
-    return sorted(overview.worlds, key=lambda w: (w.facts.kalman_fits is not False, -wins[w.key]))
+    return sorted(
+        (w for w in overview.worlds if any(c.verdict.ratio > 0 for c in overview.cells if c.world == w.key)),
+        key=lambda w: (w.facts.kalman_fits is not False, -wins[w.key]),
+    )  # fmt: skip
 
 
 def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> str:
