@@ -653,7 +653,7 @@ def tabs(table: pd.DataFrame, parts: dict[str, PartName]) -> dict[TabKey, Overvi
     ]
     printed = swept[swept["filter"].isin(particle[1:4]) & (swept["scenario"] != "azimuth")]
     kinds.append(printed.assign(filter=printed["filter"] + "_printed", particles=100))
-    both = pd.concat([table[~table["filter"].isin(particle)].assign(particles=pd.NA), *kinds])
+    both = pd.concat([table[~table["filter"].isin(particle)].assign(particles=np.nan), *kinds])
     return build_tabs(both, find_looks(sorted(both["filter"].unique())), parts)
 
 
@@ -723,7 +723,7 @@ def test_a_world_with_one_number_of_particles_stands_in_its_table(
             for n in (100, 1000)
         ),
     ]
-    both = pd.concat([table[~table["filter"].isin(particle)].assign(particles=pd.NA), *kinds])
+    both = pd.concat([table[~table["filter"].isin(particle)].assign(particles=np.nan), *kinds])
     found = build_tabs(both, find_looks(sorted(both["filter"].unique())), parts)
     assert [len(found[n].worlds) for n in (100, 1000)] == [3, 2]
     ratios = {(c.world, c.filter): c.verdict.ratio for c in found[100].cells}
