@@ -28,7 +28,6 @@ COLUMN = 3.5  #: inches, width of a column of print
 CURVE_RANGE = 1e4  # of an axis, above the typical value of the best filter
 INSTANTS = 180  # points of a curve at most: a column of print is 250 points wide
 SMALL = 6.5  # points, smallest font size
-LETTER = 0.62 * SMALL  # points, mean width of a letter of that size
 _WIDE_LABEL = 24  # letters; a legend with longer labels has a single column
 #: settings of matplotlib for all figures
 RC: Any = {

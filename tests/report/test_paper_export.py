@@ -233,12 +233,13 @@ def test_worlds_that_do_not_fit_are_split_and_none_is_left_out() -> None:
         assert row[1:] == [cell for other in others for cell in other[1:]]
 
 
+@pytest.mark.parametrize("kind", ["over_time", "cost"])
 @pytest.mark.parametrize("journal", JOURNALS)
-def test_a_legend_is_within_its_figure(journal: str) -> None:
+def test_a_legend_is_within_its_figure(journal: str, kind: str) -> None:
     names = {i: f"A method with a long name {i}" for i in range(9)}
     pack = build_pack(9, 1, 1, runs=5, instants=10, carried=0, names=names)
     figure = draw_paper_figure(
-        select_figures(pack)["over_time"], pack, FigureSetting(find_page_format(journal))
+        select_figures(pack)[kind], pack, FigureSetting(find_page_format(journal))
     )
     figure.draw_without_rendering()
     box = figure.legends[0].get_window_extent()

@@ -14,7 +14,6 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
 
-from pfbench.report.journal import ratio_figures
 from pfbench.report.scenario_figures import plot_training, write_training_figure
 from pfbench.results import plotting
 from pfbench.results.plotting import render_palette_png
@@ -99,17 +98,6 @@ def test_powers_are_those_of_the_values() -> None:
     assert plotting.format_ticks([1.0, 1e4, 1e8]) == ["10⁰", "10⁴", "10⁸"]
     assert plotting.format_ticks([-2e6, 0.0, 5e-5]) == ["-2·10⁶", "0", "5·10⁻⁵"]
     assert plotting.format_ticks([-1000.0, 0.0, 0.5]) == ["-1000", "0", "0.5"]
-
-
-# the front of accuracy and time
-
-
-def test_a_name_of_two_lines_takes_room_for_two():
-    one, two = (
-        ratio_figures._text_size(name) for name in ("sir[particles=100]", "sir\n[particles=100]")
-    )
-    assert two[1] == 2 * one[1]
-    assert two[0] < one[0]
 
 
 # the figure of a training shows what the file of losses says

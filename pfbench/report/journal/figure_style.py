@@ -23,6 +23,9 @@ ROW = 0.135  # inches, height of a row with a name
 MARGIN = 0.42  # inches, axis below the rows
 DAGGER = "†"
 
+_LEGEND_ROW = 0.15  # inches
+_WIDE = 4.0  # inches, width from which a legend has four columns
+
 LookData = Mapping[str, Any]
 Escape = Callable[[str], str]
 
@@ -119,6 +122,30 @@ def draw_interval(
     style = {**mark_style(look), "marker": ">" if value > limits[1] else "<"}
     axis.plot([edge], [y], zorder=3, clip_on=False, **{**style, "linestyle": "none"})
     return False
+
+
+def add_legend_below(
+    axis: Axes, entries: Sequence[tuple[str, Mapping[str, Any]]], setting: FigureSetting
+) -> None:
+    """Add a legend below the figure of some axes, and make the figure higher by it; none without names.
+
+    It has as many columns as fit. An entry has a name and the arguments of `Axes.plot`.
+    """
+    if not entries:
+        return
+    figure: Any = axis.figure
+    handles = [axis.plot([], [], **style)[0] for _, style in entries]
+    names = [setting.escape(name) for name, _ in entries]
+    width, height = figure.get_size_inches()
+    for columns in range(min(len(names), 4 if width > _WIDE else 3), 0, -1):
+        legend = figure.legend(
+            handles, names, loc="outside lower center", ncols=columns, handlelength=2.4
+        )
+        figure.set_size_inches(width, height + _LEGEND_ROW * -(-len(names) // columns))
+        figure.draw_without_rendering()
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            break
+        legend.remove()
 
 
 # --------------------------------------------------------------------------------------------------

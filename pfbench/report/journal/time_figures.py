@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from pfbench.report.journal.figure_style import (
     MARGIN,
     FigureSetting,
+    add_legend_below,
     label_rows,
     line_style,
     mark_style,
@@ -27,8 +28,6 @@ from pfbench.results.plotting import CURVE_RANGE, use_log_if_wide
 _CURVES = 9  # filters at most
 _PANELS = 6  # worlds at most
 _MARKS = 6  # marks of a curve
-_LEGEND_ROW = 0.15  # inches
-_WIDE = 4.0  # inches, width from which a legend has four columns
 
 
 def select_curves(pack: Pack) -> list[str]:
@@ -71,7 +70,8 @@ def plot_over_time(pack: Pack, setting: FigureSetting) -> Figure:
     for axis in axes[::across]:
         if axis.figure is not None:
             axis.set_ylabel(setting.escape(_quantity(pack, worlds, regime)))
-    _add_legend(figure, axes[0], [looks[key] for key in curve_keys], setting)
+    lines = [(str(looks[key]["name"]), line_style(looks[key])) for key in curve_keys]
+    add_legend_below(axes[0], lines, setting)
     return figure
 
 
@@ -143,21 +143,3 @@ def _quantity(pack: Pack, worlds: list[str], regime: str) -> str:
     group = f"{groups.pop()} error" if len(groups) == 1 else "error"
     unit = units.pop() if len(units) == 1 else ""
     return f"median {group} [{unit}]" if unit else f"median {group}"
-
-
-def _add_legend(figure: Figure, axis: Axes, looks: list[Pack], setting: FigureSetting) -> None:
-    """Add a legend below a figure and make the figure higher by it."""
-    if not looks:
-        return
-    handles = [axis.plot([], [], **line_style(look))[0] for look in looks]
-    names = [setting.escape(str(look["name"])) for look in looks]
-    width, height = figure.get_size_inches()
-    for columns in range(min(len(names), 4 if width > _WIDE else 3), 0, -1):
-        legend = figure.legend(
-            handles, names, loc="outside lower center", ncols=columns, handlelength=2.4
-        )
-        figure.set_size_inches(width, height + _LEGEND_ROW * -(-len(names) // columns))
-        figure.draw_without_rendering()
-        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
-            break
-        legend.remove()
