@@ -221,12 +221,6 @@ def _own_block(label: str, blocks: Mapping[str, Mapping[str, Any]]) -> Mapping[s
     return {} if is_inherited else block
 
 
-def installed_colours() -> list[str]:
-    """List the colours of the installed methods on white ground."""
-    blocks = [read_paper_block("filter", key) for key in list_named_parts("filter")]
-    return sorted({str(block["colour"][0]) for block in blocks if "colour" in block})
-
-
 def _installed_names() -> Collection[str]:
     """Return the names of the installed methods."""
     blocks = [read_paper_block("filter", key) for key in list_named_parts("filter")]

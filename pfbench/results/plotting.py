@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
 from itertools import cycle
 from typing import Any, NamedTuple
 
@@ -18,7 +17,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from typing_extensions import override
 
-from pfbench.results.looks import MethodLook, find_looks, installed_colours
+from pfbench.results.looks import MethodLook, find_looks
 from pfbench.results.paper_block import MARKERS
 
 # --------------------------------------------------------------------------------------------------
@@ -56,10 +55,6 @@ RC: Any = {
 }
 # Okabe and Ito 2008, without yellow, which has too little contrast on white; for lines of no method.
 PLAIN_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#56B4E9", "#E69F00")
-# Tints and shades of one blue in equal steps of lightness, which stay distinct in grey print.
-SHADES = (
-    "#dfedf5", "#aad0e5", "#74b2d5", "#3e94c5", "#0474b3", "#005788", "#003c5d", "#002235",
-)  # fmt: skip
 _COORDINATES = re.compile(rb' (?:d|x|y|transform)="[^"]*"')
 _DIGITS = re.compile(rb"-?\d+\.\d+")
 _LINES = re.compile(rb"M [\d. e-]+(?:\nL [\d. e-]+)+")  # of a path, whose letters may be left out
@@ -351,26 +346,7 @@ def render_palette_png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")
     image = Image.open(buffer).convert("RGB")
-    image = image.quantize(palette=_palette(), dither=Image.Dither.NONE)
+    image = image.quantize(256, dither=Image.Dither.NONE)
     buffer = io.BytesIO()
     image.save(buffer, "PNG", optimize=True)
     return buffer.getvalue()
-
-
-@cache
-def _palette() -> Image.Image:
-    """Build the palette: colours of methods in steps to white, the shades of maps, and greys."""
-    plain = [colour for colour in PLAIN_COLOURS if colour != "#000000"]
-    colours = list(dict.fromkeys([*installed_colours(), *plain, "#B35900"]))
-    pure = np.array([[int(colour[i : i + 2], 16) for i in (1, 3, 5)] for colour in colours])
-    fractions = np.linspace(0, 1, 5, endpoint=False)[:, None]
-    tints = (pure[:, None] + (255 - pure[:, None]) * fractions).reshape(-1, 3)
-    tints = tints[np.ptp(tints, axis=1) > 16]  # paler ones would be nearest to greys
-    shades = np.array([[int(shade[i : i + 2], 16) for i in (1, 3, 5)] for shade in SHADES])
-    # Greys are so dense that no tint is the nearest colour of a grey.
-    greys = np.repeat(np.minimum(np.arange(0, 257, 8), 255)[:, None], 3, axis=1)
-    steps = np.round(np.concatenate([tints, shades, greys])).astype(np.uint8)
-    padding = np.repeat(steps[-1:], 256 - len(steps), axis=0)
-    palette = Image.new("P", (1, 1))
-    palette.putpalette(np.concatenate([steps, padding]).tobytes())
-    return palette
