@@ -61,7 +61,7 @@ def write_study_paper(words: Sequence[str]) -> None:
 
 def _read_results(config: JobConfig) -> tuple[dict[str, Any], pd.DataFrame, Drawings]:
     """Read and decide the results of a study: data of its page, values of all runs, and PDFs of its paper's figures."""
-    from pfbench.report.board import build_pack, read_study
+    from pfbench.report.board.pack import build_pack, read_study
     from pfbench.report.papers.figures import paper_figures
     from pfbench.report.stored_study import round_runs
     from pfbench.report.study_report import list_job_settings

@@ -134,7 +134,7 @@ class GrowingSweep:
 
     def read(self, number: int) -> LookResults:
         """Read the results until a look: one row per filter, condition and run, without copies of runs."""
-        from pfbench.report.board import build_run_table
+        from pfbench.report.board.entries import build_run_table
         from pfbench.results.conditions import load_conditions
         from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
 

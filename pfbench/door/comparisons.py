@@ -12,9 +12,8 @@ import pandas as pd
 
 from pfbench.core.parameter_checks import require
 from pfbench.door.parts import format_html_table
-from pfbench.report.board import build_pack, build_run_table
-from pfbench.report.board.entries import name_regimes
-from pfbench.report.board.pack import open_court
+from pfbench.report.board.entries import build_run_table, name_regimes
+from pfbench.report.board.pack import build_pack, open_court
 from pfbench.report.board.recorded_units import count_drives, describe_drives
 from pfbench.report.methods_text import is_recorded
 from pfbench.report.options import ReportOptions

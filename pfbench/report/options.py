@@ -23,8 +23,13 @@ def _are_texts(value: Any) -> bool:
 
 # kinds of options that a command line or a file sets: requirement and test
 _KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
-    **dict.fromkeys(("alpha", "start_time_s", "equivalence_margin"), ("a number", _is_number)),
-    "figure_formats": ("a list of names such as [svg,png]", _are_texts),
+    "alpha": ("a number between 0 and 1", lambda value: _is_number(value) and 0 < value < 1),
+    "start_time_s": ("a number", _is_number),
+    "equivalence_margin": ("a positive number", lambda value: _is_number(value) and value > 0),
+    "figure_formats": (
+        f"a list of names of {', '.join(_FORMATS)}",
+        lambda value: _are_texts(value) and bool(value) and set(value) <= set(_FORMATS),
+    ),
     "paper_figures": ("a list of names, or null", lambda value: value is None or _are_texts(value)),
     "allow_mixed_versions": ("true or false", lambda value: type(value) is bool),
     "convergence_threshold": (
@@ -78,22 +83,3 @@ class ReportOptions:
                 "Leave it out for the default.",
             )
         check_page_metric(self.metric)
-        require(
-            0 < self.alpha < 1,
-            "report.alpha",
-            "be between 0 and 1",
-            self.alpha,
-            "Use 0.05.",
-        )
-        require(
-            self.equivalence_margin > 0,
-            "report.equivalence_margin",
-            "be positive",
-            self.equivalence_margin,
-            "Use 0.05 for 5 %.",
-        )
-        if not self.figure_formats or set(self.figure_formats) - set(_FORMATS):
-            options = ", ".join(_FORMATS)
-            raise ValueError(
-                f"report.figure_formats must be a subset of {options}, got {list(self.figure_formats)}. Use svg."
-            )

@@ -19,8 +19,7 @@ from matplotlib.figure import Figure
 
 from pfbench.core.parameter_checks import require
 from pfbench.files.recorded_folder import describe_missing_runs, find_published_file, list_published
-from pfbench.report.board import build_run_table
-from pfbench.report.board.entries import StudyFacts
+from pfbench.report.board.entries import StudyFacts, build_run_table
 from pfbench.report.overview.figures import HEAT_FORMATS, draw_heat_map
 from pfbench.report.overview.page import choose_level
 from pfbench.report.overview.tables import (

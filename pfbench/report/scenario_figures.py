@@ -96,8 +96,7 @@ def plot_sky(sheet: store.JobResult) -> Figure:
     axis.set_thetagrids(range(0, 360, 45), labels=["N", "NE", "E", "SE", "S", "SW", "W", "NW"])
     azimuth = sheet.data["azimuth"].astype(float)
     zenith = 90 - np.degrees(sheet.data["elevation"].astype(float))
-    angle = _free_direction(azimuth, zenith)
-    axis.set_rgrids([30, 60], labels=["60°", "30°"], angle=angle, color="0.4", fontsize=6.5)
+    axis.set_rgrids([30, 60], labels=["60°", "30°"], angle=22.5, color="0.4", fontsize=6.5)
     names = list_satellites(sheet)
     looks = line_styles(names)
     for k, name in enumerate(names):
@@ -118,8 +117,7 @@ def _plot_satellite(axis: Any, theta: np.ndarray, r: np.ndarray, name: str, colo
         arrow |= {"shrinkA": 0, "shrinkB": 0}
         axis.annotate("", (theta[-1], r[-1]), (theta[before], r[before]), arrowprops=arrow)
     font: Any = {"fontsize": 7, "color": colour, "ha": "center", "va": "center"}
-    offset = _label_offset(theta, r)
-    axis.annotate(name, (theta[0], r[0]), offset, textcoords="offset points", **font)
+    axis.annotate(name, (theta[0], r[0]), (0, 8), textcoords="offset points", **font)
 
 
 def plot_measurements(sheet: store.JobResult) -> Figure:
@@ -195,37 +193,6 @@ def plot_error_spread(sheet: store.JobResult) -> Figure:
     panels[-1].set_xlabel("time [s]")
     add_legend(figure, panels[0])
     return figure
-
-
-def _free_direction(azimuth: np.ndarray, zenith: np.ndarray) -> float:
-    """Return the direction (deg) in which ring labels are farthest from all satellites."""
-    finite_mask = ~np.isnan(azimuth)
-    positions = zenith[finite_mask] * np.exp(1j * azimuth[finite_mask])
-    directions = np.arange(22.5, 360, 45)
-
-    def room(direction: float) -> float:
-        return min(
-            float(np.abs(positions - ring * np.exp(1j * np.radians(direction))).min(initial=90))
-            for ring in (30, 60)
-        )
-
-    return float(max(directions, key=room))
-
-
-def _label_offset(theta: np.ndarray, r: np.ndarray) -> tuple[float, float]:
-    """Return the label offset in points, against the motion, or outwards if there is none."""
-    east, north = r * np.sin(theta), r * np.cos(theta)
-    step = np.array(
-        [east[0] - east[min(len(east) - 1, 20)], north[0] - north[min(len(east) - 1, 20)]]
-    )
-    if np.hypot(*step) < 0.05:
-        step = np.array([east[0], north[0]])
-    length = float(np.hypot(*step))
-    return (
-        (10.0 * float(step[0]) / length, 10.0 * float(step[1]) / length)
-        if length > 0
-        else (0.0, 9.0)
-    )
 
 
 # --------------------------------------------------------------------------------------------------

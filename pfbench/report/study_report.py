@@ -12,9 +12,8 @@ import pandas as pd
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import provenance, provenance as cost, writers
-from pfbench.report.board import build_pack, read_study
 from pfbench.report.board.entries import StudyFacts, ViewKey
-from pfbench.report.board.pack import open_court
+from pfbench.report.board.pack import build_pack, open_court, read_study
 from pfbench.report.board.study_views import DECISION_COLUMNS
 from pfbench.report.journal.ratio_figures import HEADLINE, render_headline
 from pfbench.report.options import ReportOptions
@@ -30,7 +29,7 @@ from pfbench.report.overview.tables import (
 from pfbench.report.papers import figures
 from pfbench.report.provenance import renew_bibliography
 from pfbench.report.stored_study import RUNS_FILE, format_runs, read_stored_study, round_runs
-from pfbench.report.study_page import render_page
+from pfbench.report.study_page.page_writer import render_page
 from pfbench.report.writers import format_csv
 from pfbench.results.conditions import (
     Condition,

@@ -25,15 +25,15 @@ DEMO = ("study=demo", "report.figure_formats=[svg]")
 REPLAY = ("replay", "study=demo", "run=0", "filter=ekf")
 # command lines of all commands, and a part of the sentence
 MISTAKES: dict[tuple[str, ...], str] = {
-    ("report", *DEMO, "report.alpha=[]"): "report.alpha must be a number, got ()",
-    ("report", *DEMO, "report.alpha=nan"): "report.alpha must be a number, got nan",
+    ("report", *DEMO, "report.alpha=[]"): "report.alpha must be a number between 0 and 1, got ()",
+    ("report", *DEMO, "report.alpha=nan"): "report.alpha must be a number between 0 and 1, got nan",
     ("report", *DEMO, "report.metric=5"): "report.metric must be a name, got 5",
     ("report", *DEMO, "report.figure_formats=null"): "report.figure_formats must be a list of names",
     ("report", *DEMO, "report.figure_formats=[[svg]]"): "report.figure_formats must be a list of names",
     ("report", *DEMO, "report.start_time_s=x"): "report.start_time_s must be a number, got 'x'",
     ("report", *DEMO, "report.baseline=[]"): "report.baseline must be the label of a filter, got ()",
     ("report", *DEMO, "report.convergence_threshold=5"): "report.convergence_threshold must be numbers by group",
-    ("report", *DEMO, "report.equivalence_margin=null"): "report.equivalence_margin must be a number, got None",
+    ("report", *DEMO, "report.equivalence_margin=null"): "report.equivalence_margin must be a positive number, got None",
     ("report", *DEMO, "report.allow_mixed_versions=maybe"): "report.allow_mixed_versions must be true or false",
     ("report", "study=demo", "~report"): "report must have keys of alpha,",
     ("report", *DEMO, "+report.nope=1"): "report must have keys of alpha,",
@@ -41,7 +41,7 @@ MISTAKES: dict[tuple[str, ...], str] = {
     ("report", *DEMO, "reports_dir=/dev/full"): "must be accessible, got 'Not a directory'. Set a folder",
     ("report", "study=[a]"): "study must be a name of letters",
     ("report", "study={a"): "each word must be key=value",
-    ("paper", "study=demo", "journal=ieee", "report.alpha=x"): "report.alpha must be a number, got 'x'",
+    ("paper", "study=demo", "journal=ieee", "report.alpha=x"): "report.alpha must be a number between 0 and 1, got 'x'",
     (*REPLAY[:2], "run=²", "filter=ekf"): "run must be a whole number of at least 0, got ²",
     (*REPLAY, "results_dir=[]"): "results_dir must be a folder, got []",
     (*REPLAY, "noise="): "words must be key=value, each key once, got noise=",

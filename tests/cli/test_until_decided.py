@@ -11,7 +11,7 @@ import pytest
 from command_line import Said, pfbench
 
 import pfbench as package
-from pfbench.report.board import build_run_table
+from pfbench.report.board.entries import build_run_table
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
 from pfbench.stats.pair_states import LookSchedule, decide_at_looks, describe_pair

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pfbench.report.study_page import render_page
+from pfbench.report.study_page.page_writer import render_page
 
 FAMILIES = ("kalman", "particle", "gaussian", "guided", "swarm")
 COLOURS = {

@@ -9,10 +9,9 @@ import pytest
 import synthetic_results as synthetic
 
 from pfbench.report import provenance
-from pfbench.report.board import build_pack
-from pfbench.report.board.curves import read_settings, select_telling_runs
+from pfbench.report.board.curves import select_telling_runs
 from pfbench.report.board.entries import describe_uncommitted
-from pfbench.report.board.pack import join_notes, note_job, select_baselines
+from pfbench.report.board.pack import build_pack, join_notes, note_job, select_baselines
 from pfbench.report.methods_text import write_methods
 from pfbench.report.options import ReportOptions
 from pfbench.results.conditions import Condition, JobFile, load_conditions
@@ -59,15 +58,6 @@ def test_tracks_are_those_of_the_results(results: Path) -> None:
             np.testing.assert_allclose(entry["error"][job.label][str(run)], norm, rtol=1e-6)
             if "plane" in entry:
                 np.testing.assert_allclose(entry["plane"][job.label][str(run)], error[:, :2])
-
-
-def test_settings_of_a_label() -> None:
-    items = read_settings("sir[particles=100,noise.sd=[1.0, 2.0]]")
-    assert [(item.line, item.name, item.value) for item in items] == [
-        ("sir[noise.sd=[1.0, 2.0]]", "particles", "100"),
-        ("sir[particles=100]", "noise.sd", "[1.0, 2.0]"),
-    ]
-    assert read_settings("ekf") == []
 
 
 def test_a_study_of_a_setting_has_a_sweep(tmp_path: Path) -> None:

@@ -12,9 +12,8 @@ import pytest
 import synthetic_results as synthetic
 
 from pfbench.report import study_report
-from pfbench.report.board import build_pack, read_study
 from pfbench.report.board.entries import StudyFacts
-from pfbench.report.board.pack import decide_parts
+from pfbench.report.board.pack import build_pack, decide_parts, read_study
 from pfbench.report.options import ReportOptions
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions

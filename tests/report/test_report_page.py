@@ -83,7 +83,7 @@ def test_the_page_says_what_ran_what_failed_and_what_was_lost(report):
     ):
         assert said in html, said
         assert said in text, said
-    for said in ("0123abc", "@misc{pfbench,", "year    = {2026}", "N = 200 in each particle filter",
+    for said in ("0123abc", "@misc{pfbench,", "year    = {2026}", "200 particles in each particle filter",
                  "<code>pcrb</code>"):  # fmt: skip
         assert said in html, said
     lost = pd.read_csv(report / "verdicts.csv").query("world == 'all' and metric == 'rmse'")
@@ -253,9 +253,12 @@ def test_conditions_whose_data_differ_say_so(tmp_path):
 def test_options_are_checked():
     check_refused(
         [
-            ("alpha must be between 0 and 1, got 5", lambda: study_report.ReportOptions(alpha=5)),
             (
-                r"formats must be a subset of svg, png, got .'gif'",
+                "alpha must be a number between 0 and 1, got 5",
+                lambda: study_report.ReportOptions(alpha=5),
+            ),
+            (
+                r"formats must be a list of names of svg, png, got .'gif'",
                 lambda: study_report.ReportOptions(figure_formats=("gif",)),
             ),
         ],

@@ -7,8 +7,12 @@ import numpy as np
 import page_packs
 import pytest
 
-from pfbench.report.study_page import render_page
-from pfbench.report.study_page.page_writer import compress_pack, encode_pack, format_short
+from pfbench.report.study_page.page_writer import (
+    compress_pack,
+    encode_pack,
+    format_short,
+    render_page,
+)
 
 WORDS = ("better", "equal", "identical", "not decided", "worse", "loses track", "missing")
 

@@ -16,9 +16,8 @@ import synthetic_results as synthetic
 from checkout import ROOT
 
 from pfbench.cli.compose import count_planned_jobs, read_sweep
-from pfbench.report.board import build_pack, read_study
 from pfbench.report.board.entries import StudyFacts
-from pfbench.report.board.pack import decide_parts
+from pfbench.report.board.pack import build_pack, decide_parts, read_study
 from pfbench.report.journal.ratio_figures import render_headline
 from pfbench.report.options import ReportOptions
 from pfbench.report.study_page.page_writer import render_markdown

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import zip_longest
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -229,24 +229,6 @@ def _mask_lost(result: JobResult) -> Array:
 # --------------------------------------------------------------------------------------------------
 # Dose and response: errors of filters over a setting that a study varies.
 
-_MIN_VALUES = 2  # of a setting
-
-
-class LabelSetting(NamedTuple):
-    """A setting in the label of a filter, such as "particles" of "sir[particles=100]".
-
-    Attributes:
-        label: Label of the filter.
-        line: Method with its other settings.
-        name: Name of the setting.
-        value: Value as text.
-    """
-
-    label: str
-    line: str
-    name: str
-    value: str
-
 
 def list_sweeps(
     views: Mapping[ViewKey, Mapping[str, Any]], looks: Mapping[str, MethodLook], metric: str
@@ -255,63 +237,51 @@ def list_sweeps(
 
     Filters without the setting are constant lines.
     """
-    settings = [item for label in looks for item in read_settings(label)]
+    settings = pd.DataFrame(
+        [
+            (label, drop_settings(label, name), name, value)
+            for label in looks for name, value in parse_label(label)[1].items()
+        ],
+        columns=["filter", "line", "name", "value"],
+    )  # fmt: skip
+    cells = {
+        key[1:3]: {row["filter"]: row for row in view["rows"] if row["value"] is not None}
+        for key, view in views.items() if key.metric == metric and ALL not in key[1:3]
+    }  # fmt: skip
     sweeps = []
-    cells = {key[1:3]: view for key, view in views.items() if key.metric == metric}
-    for name in dict.fromkeys(item.name for item in settings):
-        members = [item for item in settings if item.name == name]
-        values = list(dict.fromkeys(item.value for item in members))
-        if len(values) < _MIN_VALUES:
-            continue
-        numbers = [number for value in values if (number := _to_number(value)) is not None]
-        is_number = len(numbers) == len(values)
-        x = {value: numbers[k] if is_number else float(k) for k, value in enumerate(values)}
-        for (world, regime), view in cells.items():
-            rows = {row["filter"]: row for row in view["rows"] if row["value"] is not None}
-            lines = _list_lines(members, rows, x, looks)
-            if ALL not in (world, regime) and lines:
+    for name, members in settings.groupby("name", sort=False):
+        values = list(members["value"].unique())
+        numbers = pd.to_numeric(pd.Series(values), errors="coerce")
+        is_number = bool(numbers.notna().all())
+        places = dict(zip(values, numbers if is_number else range(len(values)), strict=True))
+        members = members.assign(x=members["value"].map(places))
+        for (world, regime), rows in cells.items():
+            if lines := _list_lines(members, rows, looks):
+                unit = next((str(row["unit"]) for row in rows.values() if row["unit"]), "")
                 sweeps.append({
-                    "name": name, "world": world, "regime": regime, "unit": "",
-                    "ticks": None if is_number else values, "value_unit": _find_unit(rows),
-                    "lines": lines, "caption": f"Error of a run against {name}.",
+                    "name": name, "world": world, "regime": regime, "unit": "", "ticks": None if is_number else values,
+                    "value_unit": unit, "lines": lines, "caption": f"Error of a run against {name}.",
                 })  # fmt: skip
     return sweeps
 
 
-def read_settings(label: str) -> list[LabelSetting]:
-    """Read the settings of a label."""
-    settings = parse_label(label)[1].items()
-    return [LabelSetting(label, drop_settings(label, name), name, v) for name, v in settings]
-
-
 def _list_lines(
-    members: list[LabelSetting],
-    rows: Mapping[str, Mapping[str, Any]],
-    x: Mapping[str, float],
-    looks: Mapping[str, MethodLook],
+    members: pd.DataFrame, rows: Mapping[str, Mapping[str, Any]], looks: Mapping[str, MethodLook]
 ) -> list[dict[str, Any]]:
     """List the points of each method in one condition; none if no method has several values."""
-    lines: dict[str, list[LabelSetting]] = {}
-    for item in members:
-        if item.label in rows:
-            lines.setdefault(item.line, []).append(item)
-    if max(map(len, lines.values()), default=0) < _MIN_VALUES:
+    present = members[members["filter"].isin(list(rows))]
+    if not present["line"].duplicated().any():
         return []
-    entries: list[dict[str, Any]] = [
-        {
-            "filter": items[0].label,
-            "name": _name_line(line, looks[items[0].label]),
-            "points": [_point(x[item.value], rows[item.label]) for item in sorted(items, key=lambda item: x[item.value])],
-        }
-        for line, items in lines.items()
-    ]  # fmt: skip
-    swept = {item.label for item in members}
-    ends = min(x.values()), max(x.values())
-    for label, row in rows.items():
-        if label not in swept:
-            points = [_point(end, row) for end in ends]
-            entries.append({"filter": label, "name": looks[label].name, "points": points})
-    return entries
+    lines: list[dict[str, Any]] = []
+    for line, items in present.groupby("line", sort=False):
+        look = looks[items["filter"].iloc[0]]
+        ordered = items.sort_values("x", kind="stable")
+        points = [_point(x, rows[v]) for x, v in zip(ordered["x"], ordered["filter"], strict=True)]
+        lines.append({"filter": look.key, "name": _name_line(str(line), look), "points": points})
+    for label in [label for label in rows if label not in set(members["filter"])]:
+        ends = [_point(x, rows[label]) for x in (members["x"].min(), members["x"].max())]
+        lines.append({"filter": label, "name": looks[label].name, "points": ends})
+    return lines
 
 
 def _name_line(line: str, look: MethodLook) -> str:
@@ -322,16 +292,5 @@ def _name_line(line: str, look: MethodLook) -> str:
 
 
 def _point(x: float, row: Mapping[str, Any]) -> dict[str, Any]:
-    return {"x": x, **{name: row[name] for name in ("value", "low", "high")}}
-
-
-def _find_unit(rows: Mapping[str, Mapping[str, Any]]) -> str:
-    return next((str(row["unit"]) for row in rows.values() if row["unit"]), "")
-
-
-def _to_number(text: str) -> float | None:
-    """Return the number of a text, or None."""
-    try:
-        return float(text)
-    except ValueError:
-        return None
+    """Return the error of a row at a value of a setting."""
+    return {"x": float(x), **{name: row[name] for name in ("value", "low", "high")}}

@@ -10,7 +10,7 @@ import pytest
 
 from pfbench.logs.judge.judge_options import JudgeOptions
 from pfbench.logs.judge.judgement import judge_programs
-from pfbench.report.board import build_run_table
+from pfbench.report.board.entries import build_run_table
 from pfbench.results.conditions import load_conditions
 from pfbench.results.store import write_result
 from pfbench.stats.court import Court
