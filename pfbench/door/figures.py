@@ -1,4 +1,4 @@
-"""Figures and arrays of a study for Python, in the looks of the report."""
+"""Figures and arrays of a study for Python: those of its page and its paper."""
 
 from __future__ import annotations
 
@@ -11,34 +11,29 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pfbench.core.parameter_checks import require
-from pfbench.results.conditions import Condition, main_component_group
-from pfbench.results.frame import list_main_groups
-from pfbench.results.looks import study_looks
-from pfbench.results.plotting import (
-    COLUMN,
-    RC,
-    LineStyle,
-    compute_run_quantiles,
-    format_axis_label,
-    line_styles,
-    use_log_if_wide,
-)
-from pfbench.results.step_times import STEP_TIME, WARM_UP
+from pfbench.report.board.curves import compute_error_norms
+from pfbench.report.board.pack import build_pack
+from pfbench.report.journal.figure_style import FigureSetting, find_page_format, line_style
+from pfbench.report.journal.ratio_figures import draw_error_against_cost
+from pfbench.report.journal.study_pack import Pack, filters_by_key
+from pfbench.report.journal.time_figures import draw_coverage, draw_curves
+from pfbench.report.options import ReportOptions
+from pfbench.results.conditions import Condition
+from pfbench.results.plotting import COLUMN, RC, format_axis_label
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from pfbench.door.study import Study
 
 _NAMES = ("scenario", "noise", "model")
+_SETTING = FigureSetting(find_page_format(width="140mm"))
 
 
 def draw_study(study: Study, kind: str, ax: Axes | None, choice: Mapping[str, Any]) -> Axes:
     """Draw a figure of one condition of a study."""
-    drawings: dict[str, Callable[[Axes, _Scene], None]] = {
+    drawings: dict[str, Callable[[Axes, Pack, Condition, Mapping[str, Any]], None]] = {
         "cost": _draw_cost,
         "time": _draw_time,
-        "calibration": _draw_calibration,
+        "calibration": lambda axis, pack, *_: draw_coverage(axis, pack, _SETTING),
         "run": _draw_run,
     }
     require(
@@ -48,11 +43,13 @@ def draw_study(study: Study, kind: str, ax: Axes | None, choice: Mapping[str, An
         f"{kind!r}",
         "Choose one of them.",
     )
-    scene = _Scene(study, select_condition(study.conditions(), choice), choice)
+    condition = select_condition(study.conditions(), choice)
+    pack = build_pack(study.name, [condition], ReportOptions())
     with matplotlib.rc_context(RC):
         if ax is None:
             ax = Figure(figsize=(1.6 * COLUMN, 1.1 * COLUMN), layout="constrained").subplots()
-        drawings[kind](ax, scene)
+        ax.set_title(condition.name)
+        drawings[kind](ax, pack, condition, choice)
     return ax
 
 
@@ -69,109 +66,51 @@ def select_condition(conditions: Sequence[Condition], choice: Mapping[str, Any])
     return matches[0]
 
 
-class _Scene:
-    """Condition of a study that is drawn.
-
-    Attributes:
-        study: Study.
-        condition: Condition.
-        choice: Choices of the user.
-    """
-
-    def __init__(self, study: Study, condition: Condition, choice: Mapping[str, Any]) -> None:
-        self.study, self.condition, self.choice = study, condition, choice
-        self.group = main_component_group(condition.jobs[0].meta["state"])
-        labels = [job.label for job in condition.jobs]
-        self.styles: dict[str, LineStyle] = line_styles(labels, study_looks([condition]))
-        self.looks = study_looks([condition])
-
-    def rows(self, metric: str, component: str = "norm") -> pd.DataFrame:
-        """Return the rows of a metric of the main group, of this condition."""
-        frame = self.study.table(metric)
-        for name in _NAMES:
-            frame = frame[frame[name] == getattr(self.condition, name)]
-        group = next(iter(list_main_groups([self.condition]).values()))
-        return frame[(frame["group"] == group) & (frame["component"] == component)]
-
-    def name(self, label: str) -> str:
-        """Return the name of a filter for a reader."""
-        return self.looks[label].name
-
-
-def _draw_cost(ax: Axes, scene: _Scene) -> None:
-    """Draw the error of each filter, geometric mean over runs that keep track with 95 % interval, against its cost."""
-    rows = scene.rows("rmse")
-    by_label = {job.label: job.meta for job in scene.condition.jobs}
+def _draw_cost(ax: Axes, pack: Pack, condition: Condition, choice: Mapping[str, Any]) -> None:
+    """Draw the median error of each filter against its time per step."""
     require(
-        all({WARM_UP, STEP_TIME} & {*meta, *meta["seconds"]} for meta in by_label.values()),
+        all(note["is_timed"] for note in pack["filter_notes"]),
         "a cost",
         "be a time after warm-up steps",
         "jobs of an earlier version without",
-        f"Measure it: pfbench cost study={scene.study.name}",
+        f"Measure it: pfbench cost study={pack['study']}",
     )
-    costs = {
-        label: 1e3 * float(meta.get(STEP_TIME, {}).get("median", meta["seconds"]["per_step"]))
-        for label, meta in by_label.items()
-    }
-    for label, of_label in rows.groupby("label", observed=True, sort=False):
-        values = of_label.loc[of_label["keeps_track"], "value"].to_numpy(dtype=float)
-        logs = np.log(values[values > 0])
-        if not logs.size:
-            continue
-        style, half = scene.styles[str(label)], 0.0
-        if logs.size > 1:
-            half = 1.96 * float(logs.std(ddof=1)) / np.sqrt(logs.size)
-        mean = float(np.exp(logs.mean()))
-        ends = [[mean - mean * np.exp(-half)], [mean * np.exp(half) - mean]]
-        ax.errorbar(costs[str(label)], mean, ends, color=style.colour, capsize=2, **style.mark())
-        ax.annotate(f"  {scene.name(str(label))}", (costs[str(label)], mean), fontsize=6.5)
-    ax.set(xscale="log", xlabel="time per step [ms]", title=scene.condition.name)
-    ax.set_ylabel(format_axis_label(f"RMSE {scene.group.group}", scene.group.unit))
-    use_log_if_wide(ax, ax.yaxis, [rows["value"].to_numpy(dtype=float)])
-
-
-def _draw_time(ax: Axes, scene: _Scene) -> None:
-    """Draw the median error of each filter over time."""
-    curves = []
-    for job in scene.condition.jobs:
-        data, style = job.load().data, scene.styles[job.label]
-        norm = np.linalg.norm(data["error"][..., scene.group.places], axis=-1) * scene.group.scale
-        curves.append(compute_run_quantiles(norm[~data["lost"].astype(bool)], [0.5])[0])
-        ax.plot(data["time"], curves[-1], **style.line(scene.name(job.label)))
-    ax.set(xlabel="time [s]", title=f"{scene.condition.name}, median over runs")
-    ax.set_ylabel(format_axis_label(scene.group.group, scene.group.unit))
-    use_log_if_wide(ax, ax.yaxis, curves)
+    for name, style in draw_error_against_cost(ax, pack, _SETTING, "value"):
+        ax.plot([], [], label=name, **style)
     ax.legend(ncols=2)
 
 
-def _draw_calibration(ax: Axes, scene: _Scene) -> None:
-    """Draw the share of true values in the 90 % intervals of each filter."""
-    rows = scene.rows("coverage_90", "mean")
-    means = rows.groupby("label", observed=True, sort=False)["value"].mean()
-    for k, (label, value) in enumerate(means.items()):
-        style = scene.styles[str(label)]
-        ax.plot(100 * value, k, ls="", **style.mark())
-    ax.axvline(90, color="0.45", lw=0.7)
-    ax.set_yticks(range(len(means)), [scene.name(str(label)) for label in means.index])
-    ax.set(xlabel="true values in 90 % intervals [%]", title=scene.condition.name, xlim=(0, 100))
+def _draw_time(ax: Axes, pack: Pack, condition: Condition, choice: Mapping[str, Any]) -> None:
+    """Draw the median error of each filter over time."""
+    looks, (curves,) = filters_by_key(pack), pack["curves"].values()
+    for key in draw_curves(ax, curves, list(looks), looks):
+        ax.plot([], [], label=looks[key]["name"], **line_style(looks[key]))
+    ax.set(xlabel="time [s]", title=f"{condition.name}, median over runs")
+    ax.set_ylabel(format_axis_label(curves["group"], curves["unit"]))
+    ax.legend(ncols=2)
 
 
-def _draw_run(ax: Axes, scene: _Scene) -> None:
+def _draw_run(ax: Axes, pack: Pack, condition: Condition, choice: Mapping[str, Any]) -> None:
     """Draw the error of one run of each filter, or of one filter, over time."""
-    number = int(scene.choice.get("run", 0))
-    selected_label = scene.choice.get("filter")
-    for job in scene.condition.jobs:
-        data, style = job.load().data, scene.styles[job.label]
-        index = number - int(job.meta.get("first_run", 0))
-        if not 0 <= index < len(data["lost"]):
-            raise ValueError(
-                f"run must be a run of {job.label}, got {number}. Set run={job.meta.get('first_run', 0)}."
-            )
-        if selected_label in (None, job.label):
-            norm = np.linalg.norm(data["error"][index][:, scene.group.places], axis=-1)
-            ax.plot(data["time"], norm * scene.group.scale, **style.line(scene.name(job.label)))
-    ax.set(xlabel="time [s]", title=f"{scene.condition.name}, run {number}")
-    ax.set_ylabel(format_axis_label(scene.group.group, scene.group.unit))
+    number, looks = int(choice.get("run", 0)), filters_by_key(pack)
+    labels = [job.label for job in condition.jobs if choice.get("filter") in (None, job.label)]
+    results = {job.label: job.load() for job in condition.jobs if job.label in labels}
+    for label, norm in compute_error_norms(results).items():
+        first = int(results[label].meta.get("first_run", 0))
+        require(
+            first <= number < first + len(norm),
+            "run",
+            f"be a run of {label}",
+            number,
+            f"Set run={first}.",
+        )
+        style = {**line_style(looks[label]), "marker": ""}
+        ax.plot(
+            results[label].data["time"], norm[number - first], label=looks[label]["name"], **style
+        )
+    (curves,) = pack["curves"].values()
+    ax.set(xlabel="time [s]", title=f"{condition.name}, run {number}")
+    ax.set_ylabel(format_axis_label(curves["group"], curves["unit"]))
     ax.legend(ncols=2)
 
 

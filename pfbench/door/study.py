@@ -143,8 +143,8 @@ class Study:
         """Draw a figure in the looks of the report.
 
         Args:
-            kind: cost (error against time per step), time (error over time), calibration (coverage of 90 % intervals),
-                or run (error of one run over time).
+            kind: cost (median error against time per step), time (error over time), calibration (coverage of 50 and 90 %
+                intervals), or run (error of one run over time).
             ax: Axes to draw into. New ones by default.
             **choice: For a study of several conditions `scenario`, `noise` and `model`; for `run` also `run` and `filter`.
 

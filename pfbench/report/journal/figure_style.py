@@ -28,6 +28,7 @@ _WIDE = 4.0  # inches, width from which a legend has four columns
 
 LookData = Mapping[str, Any]
 Escape = Callable[[str], str]
+LegendEntries = Sequence[tuple[str, Mapping[str, Any]]]  # names and arguments of `Axes.plot`
 
 
 class FigureSetting:
@@ -124,12 +125,10 @@ def draw_interval(
     return False
 
 
-def add_legend_below(
-    axis: Axes, entries: Sequence[tuple[str, Mapping[str, Any]]], setting: FigureSetting
-) -> None:
+def add_legend_below(axis: Axes, entries: LegendEntries, setting: FigureSetting) -> None:
     """Add a legend below the figure of some axes, and make the figure higher by it; none without names.
 
-    It has as many columns as fit. An entry has a name and the arguments of `Axes.plot`.
+    It has as many columns as fit.
     """
     if not entries:
         return

@@ -17,6 +17,7 @@ from pfbench.report.journal.figure_style import (
     MARGIN,
     ROW,
     FigureSetting,
+    LegendEntries,
     add_legend_below,
     draw_interval,
     find_page_format,
@@ -35,7 +36,7 @@ from pfbench.report.journal.study_pack import (
     list_pairs,
     name_of,
 )
-from pfbench.results.plotting import set_plain_ticks
+from pfbench.results.plotting import format_axis_label, set_plain_ticks
 
 # --------------------------------------------------------------------------------------------------
 # Figures of ratios: leaderboard, planned pairs, and error against cost.
@@ -150,40 +151,44 @@ def plot_planned(pack: Pack, setting: FigureSetting) -> Figure:
 
 def plot_error_against_cost(pack: Pack, setting: FigureSetting) -> Figure:
     """Plot error against time per step, with the filters that no filter surpasses in both."""
-    looks, rows = filters_by_key(pack), find_rows(pack)
-    rows_with_ratio = {
-        k: row for k, row in rows.items() if is_number(row["ratio"]) and is_number(row["ms"])
-    }
     figure = setting.make_figure(2.4)
     axis = figure.subplots()
-    cost = np.array([float(row["ms"]) for row in rows_with_ratio.values()])
-    limits = ratio_limits([float(row["ratio"]) for row in rows_with_ratio.values()], most=2.6)
-    ratio = np.clip([float(row["ratio"]) for row in rows_with_ratio.values()], *limits)
-    _set_cost_axes(axis, cost, limits)
-    marks = []
-    for i, (key, row) in enumerate(rows_with_ratio.items()):
-        is_inside = limits[0] <= row["ratio"] <= limits[1]
-        style = mark_style(looks[key]) | ({} if is_inside else {"marker": "^"})
-        mark = {**style, "linestyle": "none"}
-        axis.plot([cost[i]], [ratio[i]], clip_on=False, zorder=3, **mark)
-        extra = "" if is_inside else f" {row['ratio']:.3g}"
-        marks.append((f"{looks[key]['name']}{extra}", mark))
-    path = list_front_corners(np.column_stack([cost, ratio]), limits[1])
-    axis.plot(*path.T, color="0.6", lw=0.7, zorder=1.2)
-    baseline = looks[str(pack["baselines"][0])]["name"] if pack["baselines"] else ""
-    axis.set_xlabel("time per step of a batch of runs [ms]")
-    axis.set_ylabel(setting.escape(f"{pack['metrics'][0]['name']} / {baseline}"))
-    add_legend_below(axis, marks, setting)
+    add_legend_below(axis, draw_error_against_cost(axis, pack, setting), setting)
     return figure
 
 
-def _set_cost_axes(axis: Axes, cost: np.ndarray, limits: tuple[float, float]) -> None:
-    """Use logarithmic axes with plain numbers, and a line at 1."""
+def draw_error_against_cost(
+    axis: Axes, pack: Pack, setting: FigureSetting, column: str = "ratio"
+) -> LegendEntries:
+    """Draw the ratio to the baseline, or the median error `value`, against time per step; return the entries of a legend."""
+    looks, is_ratio = filters_by_key(pack), column == "ratio"
+    rows = {k: r for k, r in find_rows(pack).items() if is_number(r[column]) and is_number(r["ms"])}
+    cost, values = (np.array([float(r[n]) for r in rows.values()]) for n in ("ms", column))
+    limits = (
+        ratio_limits(list(values), most=2.6) if is_ratio else (min(values) / 2, max(values) * 2)
+    )
+    errors = np.clip(values, *limits)
     axis.set(xscale="log", yscale="log", ylim=limits)
     axis.set_xlim(cost.min() / 1.6, cost.max() * 1.6)
     set_plain_ticks(axis.xaxis, cost)
     set_plain_ticks(axis.yaxis, np.array(limits))
-    axis.axhline(1.0, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
+    marks = []
+    for key, x, value, y in zip(rows, cost, values, errors, strict=True):
+        style = mark_style(looks[key]) | ({} if value == y else {"marker": "^"})
+        mark = {**style, "linestyle": "none"}
+        axis.plot([x], [y], clip_on=False, zorder=3, **mark)
+        marks.append((f"{looks[key]['name']}{'' if value == y else f' {value:.3g}'}", mark))
+    path = list_front_corners(np.column_stack([cost, errors]), limits[1])
+    axis.plot(*path.T, color="0.6", lw=0.7, zorder=1.2)
+    axis.set_xlabel("time per step of a batch of runs [ms]")
+    metric = pack["metrics"][0]
+    label = f"median {format_axis_label(metric['name'], metric['unit'])}"
+    if is_ratio:
+        axis.axhline(1.0, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
+        baseline = looks[str(pack["baselines"][0])]["name"] if pack["baselines"] else ""
+        label = f"{metric['name']} / {baseline}"
+    axis.set_ylabel(setting.escape(label))
+    return marks
 
 
 def list_front_corners(points: np.ndarray, top: float) -> np.ndarray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -62,7 +64,7 @@ def plot_over_time(pack: Pack, setting: FigureSetting) -> Figure:
     curve_keys: dict[str, None] = {}
     for axis, world in zip(axes, worlds, strict=False):
         curves = pack["curves"][world, regime]
-        curve_keys |= dict.fromkeys(_plot_curves(axis, curves, keys, looks, setting))
+        curve_keys |= dict.fromkeys(draw_curves(axis, curves, keys, looks))
         axis.set_title(setting.escape(name_of(pack, "worlds", world)))
         axis.set_xlabel("time [s]")
     for axis in axes[len(worlds) :]:
@@ -77,48 +79,49 @@ def plot_over_time(pack: Pack, setting: FigureSetting) -> Figure:
 
 def plot_calibration(pack: Pack, setting: FigureSetting) -> Figure:
     """Plot the coverage of 50 and 90 % intervals, and NEES relative to its expectation."""
-    looks, values = filters_by_key(pack), pack["calibration"].get((ALL, ALL), {})
-    keys = [key for key in find_rows(pack) if key in values] or [
-        key for key in looks if key in values
-    ]
-    names = [str(looks[key]["name"]) for key in keys]
+    looks, values = filters_by_key(pack), find_calibration(pack)
+    names = [str(looks[key]["name"]) for key in values]
     figure = setting.make_figure(MARGIN + 0.1 + measure_rows(names, setting.page))
-    coverage_axis, nees_axis = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1.0))
-    label_rows(coverage_axis, names, setting)
-    label_rows(nees_axis, names, setting)
-    nees_axis.tick_params(labelleft=False)
-    for level in (50, 90):
-        coverage_axis.axvline(level, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
-    ratios: list[float] = []
-    for y, key in enumerate(keys):
-        ratios += _plot_calibration_row((coverage_axis, nees_axis), y, values[key], looks[key])
-    coverage_axis.set_xlim(-2, 102)
-    coverage_axis.set_xticks([0, 25, 50, 75, 90])
-    coverage_axis.set_xlabel("coverage [%]".replace("%", setting.escape("%")))
-    use_log_if_wide(nees_axis, nees_axis.xaxis, [np.array([1.0, *ratios])], narrow=True)
-    nees_axis.axvline(1.0, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
-    nees_axis.set_xlabel("NEES / expectation")
+    coverage_axis, axis = figure.subplots(1, 2, sharey=True, width_ratios=(1.6, 1.0))
+    draw_coverage(coverage_axis, pack, setting)
+    label_rows(axis, names, setting)
+    axis.tick_params(labelleft=False)
+    ratios = {key: row["nees_ratio"] for key, row in values.items()}
+    shown = {key: float(v) for key, v in ratios.items() if is_number(v) and v > 0}
+    for key, ratio in shown.items():
+        style = {**mark_style(looks[key]), "linestyle": "none"}
+        axis.plot([ratio], [list(values).index(key)], zorder=3, **style)
+    use_log_if_wide(axis, axis.xaxis, [np.array([1.0, *shown.values()])], narrow=True)
+    axis.axvline(1.0, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
+    axis.set_xlabel("NEES / expectation")
     return figure
 
 
-def _plot_calibration_row(axes: tuple[Axes, Axes], y: int, values: Pack, look: Pack) -> list[float]:
-    """Plot coverage and NEES of a filter; return the ratio of the NEES if there is one."""
-    shares = [values[name] for name in ("c50", "c90")]
-    if all(map(is_number, shares)):
-        axes[0].plot(
-            [100 * share for share in shares], [y, y], lw=0.8, zorder=2, **mark_style(look)
-        )
-    ratio = values["nees_ratio"]
-    if not is_number(ratio) or ratio <= 0:
-        return []
-    axes[1].plot([ratio], [y], zorder=3, **{**mark_style(look), "linestyle": "none"})
-    return [float(ratio)]
+def find_calibration(pack: Pack) -> dict[str, Pack]:
+    """Return coverage and NEES ratio by filter, in the order of the board if it has them."""
+    values = pack["calibration"].get((ALL, ALL), {})
+    ordered = [key for key in find_rows(pack) if key in values] or filters_by_key(pack)
+    return {key: values[key] for key in ordered if key in values}
 
 
-def _plot_curves(
-    axis: Axes, curves: Pack, keys: list[str], looks: Pack, setting: FigureSetting
-) -> list[str]:
-    """Plot the curves of one panel; return the filters that have one."""
+def draw_coverage(axis: Axes, pack: Pack, setting: FigureSetting) -> None:
+    """Draw the coverage of 50 and 90 % intervals, a row per filter."""
+    looks, values = filters_by_key(pack), find_calibration(pack)
+    label_rows(axis, [str(looks[key]["name"]) for key in values], setting)
+    for level in (50, 90):
+        axis.axvline(level, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
+    for y, (key, row) in enumerate(values.items()):
+        shares = [row[name] for name in ("c50", "c90")]
+        if all(map(is_number, shares)):
+            ends = [100 * share for share in shares]
+            axis.plot(ends, [y, y], lw=0.8, zorder=2, **mark_style(looks[key]))
+    axis.set_xlim(-2, 102)
+    axis.set_xticks([0, 25, 50, 75, 90])
+    axis.set_xlabel("coverage [%]".replace("%", setting.escape("%")))
+
+
+def draw_curves(axis: Axes, curves: Pack, keys: Sequence[str], looks: Pack) -> list[str]:
+    """Draw the curves of one panel; return the filters that have one."""
     time, lines = np.asarray(curves["t"], dtype=np.float64), []
     present = [key for key in keys if key in curves["filters"]]
     for i, key in enumerate(present):
