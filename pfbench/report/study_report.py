@@ -13,7 +13,7 @@ import pandas as pd
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import provenance, provenance as cost, writers
 from pfbench.report.board.entries import StudyFacts, ViewKey
-from pfbench.report.board.pack import build_pack, open_court, read_study
+from pfbench.report.board.pack import StudyData, build_pack, open_court, read_study
 from pfbench.report.board.study_views import DECISION_COLUMNS
 from pfbench.report.journal.ratio_figures import HEADLINE, render_headline
 from pfbench.report.options import ReportOptions
@@ -79,24 +79,42 @@ def write_report(
         Path of index.html.
     """
     options = options or ReportOptions()
-    conditions = load_conditions(study, results, allow_mixed_versions=options.allow_mixed_versions)
-    _check_groups(conditions, options.convergence_threshold)
-    data = read_study(conditions, options, has_metrics=True)
-    table = round_runs(data.table)
-    pack = build_pack(study, conditions, options, data._replace(table=table))
-    pack["provenance"] += list_job_settings(conditions, options.planned)
-    pack["definitions"] = [(metric.name, metric.caption) for metric in METRICS]
-    pack["paper_figures"], files = _draw_paper_figures(study, conditions, options)
+    pack, data, files = read_results(study, results, options, options.figure_formats)
     files |= {
         "metrics.csv": format_csv(summarise_metrics(data.metrics)),
         "consistency.csv": format_csv(assess_consistency(data.metrics, options.alpha)),
-        RUNS_FILE: format_runs(table, pack),
+        RUNS_FILE: format_runs(data.table, pack),
     }
-    times = conditions[0].jobs[0].path.parent / STEP_TIMES
+    times = Path(results) / study / STEP_TIMES
     if times.is_file():
         files[STEP_TIMES] = times.read_bytes()
     with RecordedFolder(Path(out) / study) as folder:
-        return _write_all(folder, {**files, **render_study(pack, table, folder.path, files)})
+        return _write_all(folder, {**files, **render_study(pack, data.table, folder.path, files)})
+
+
+def read_results(
+    study: str, results: str | Path, options: ReportOptions, formats: Sequence[str]
+) -> tuple[dict[str, Any], StudyData, Files]:
+    """Read the results of a study, decide them, and draw the figures of its paper.
+
+    Args:
+        study: Name of the study.
+        results: Folder of all results.
+        options: Options of the report.
+        formats: Formats of the figures.
+
+    Returns:
+        Data of the page, tables of the results, and figures by file name.
+    """
+    conditions = load_conditions(study, results, allow_mixed_versions=options.allow_mixed_versions)
+    _check_groups(conditions, options.convergence_threshold)
+    data = read_study(conditions, options, has_metrics=True)
+    data = data._replace(table=round_runs(data.table))
+    pack = build_pack(study, conditions, options, data)
+    pack["provenance"] += list_job_settings(conditions, options.planned)
+    pack["definitions"] = [(metric.name, metric.caption) for metric in METRICS]
+    pack["paper_figures"], files = _draw_paper_figures(study, conditions, options, formats)
+    return pack, data, files
 
 
 def rebuild_page(folder: Path) -> Path:
@@ -239,13 +257,13 @@ def summarise_metrics(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _draw_paper_figures(
-    study: str, conditions: Sequence[Condition], options: ReportOptions
+    study: str, conditions: Sequence[Condition], options: ReportOptions, formats: Sequence[str]
 ) -> tuple[list[dict[str, Any]], Files]:
     """Draw the figures of the paper of a study; return template variables and files."""
     names, start = options.paper_figures, options.start_time_s
     pairs = figures.paper_figures(study, conditions, names, start)
     drawings = [drawing for _, drawing in pairs]
-    entries, files = writers.render_figures(drawings, "paper", options.figure_formats)
+    entries, files = writers.render_figures(drawings, "paper", formats)
     for (name, _), entry in zip(pairs, entries, strict=True):
         path = Path(entry["file"])  # the page shows the file that is stored
         source = writers.format_data_address(path.suffix, files[entry["file"]])

@@ -6,6 +6,7 @@ import base64
 import itertools
 import math
 from collections.abc import Mapping, Sequence
+from decimal import ROUND_HALF_UP, Context, Decimal
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import provenance
 from pfbench.results.plotting import FigureSpec, draw_figure, format_slug
 
+DASH = "–"
 _HERE = Path(__file__).parent
 
 
@@ -207,6 +209,21 @@ def format_csv(table: pd.DataFrame) -> str:
     )
 
 
+def format_short(value: float | None, digits: int = 3) -> str:
+    """Format a number with significant digits, as the script of the page does."""
+    if value is None:
+        return DASH
+    if value == math.inf:
+        return "∞"
+    rounded = Context(prec=digits, rounding=ROUND_HALF_UP).create_decimal(Decimal(value))
+    if rounded == 0:
+        return "0"
+    exponent = rounded.adjusted()
+    if not -4 <= exponent < 6:
+        return f"{rounded:.{digits - 1}e}".replace("e+", "e")
+    return f"{rounded:.{max(0, digits - 1 - exponent)}f}"
+
+
 def format_number(value: Any) -> str:
     """Format a value with three significant digits; counts and texts are unchanged."""
     if (
@@ -214,7 +231,7 @@ def format_number(value: Any) -> str:
         or value is pd.NA
         or (isinstance(value, float | np.floating) and np.isnan(value))
     ):
-        return "–"
+        return DASH
     if isinstance(value, bool | np.bool_):
         return "yes" if value else "no"
     if not isinstance(value, float | np.floating):

@@ -10,7 +10,7 @@ import numpy as np
 import page_packs
 import pytest
 
-from pfbench.report.study_page.page_writer import format_short
+from pfbench.report.writers import format_short
 
 playwright = pytest.importorskip(
     "playwright.sync_api", reason="playwright is not installed: pip install 'pfbench[browser]'"

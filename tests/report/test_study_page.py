@@ -10,9 +10,9 @@ import pytest
 from pfbench.report.study_page.page_writer import (
     compress_pack,
     encode_pack,
-    format_short,
     render_page,
 )
+from pfbench.report.writers import format_short
 
 WORDS = ("better", "equal", "identical", "not decided", "worse", "loses track", "missing")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ from pfbench.report.journal.study_pack import (
     is_number,
     list_cells,
     list_pairs,
+    name_baseline,
     name_of,
     name_with_star,
 )
@@ -27,10 +29,10 @@ from pfbench.report.journal.table_layout import (
     Column,
     LatexCell,
     LatexTable,
-    number_column,
     text_cell,
     text_width,
 )
+from pfbench.report.writers import format_short
 
 # --------------------------------------------------------------------------------------------------
 # Main table of a paper: errors of all filters in all conditions.
@@ -105,7 +107,10 @@ def _make_table(
     has_one_regime = len({column.regime for column in columns}) == 1
     head, rules = _make_head(pack, columns, per_cell, has_one_regime)
     groups = [
-        [[_name_cell(pack, key), *_error_cells(columns, key, has_intervals)] for key in family]
+        [
+            [text_cell(name_with_star(pack, key)), *_error_cells(columns, key, has_intervals)]
+            for key in family
+        ]
         for family in filters_by_family(pack)
     ]
     caption = describe_columns(
@@ -156,15 +161,6 @@ def _name_world(pack: Pack, column: ErrorColumn) -> str:
     return f"{name_of(pack, 'worlds', column.world)}{f' ({column.unit})' if column.unit else ''}"
 
 
-def _name_cell(pack: Pack, key: str) -> LatexCell:
-    """Return the cell with the name of a filter."""
-    name = name_with_star(pack, key)
-    tex = escape_latex(name.removesuffix("*")) + (
-        r"\textsuperscript{*}" if name[-1:] == "*" else ""
-    )
-    return LatexCell(tex, text_width(name, SIZE))
-
-
 def _error_cells(columns: Sequence[ErrorColumn], key: str, has_intervals: bool) -> list[LatexCell]:
     """Return the cells of a filter: number with its mark, and interval."""
     cells = []
@@ -178,12 +174,7 @@ def _error_cells(columns: Sequence[ErrorColumn], key: str, has_intervals: bool) 
             LatexCell(tex + r"\phantom{\textsuperscript{\textdagger}}", _error_width(text, is_best))
         )
         if has_intervals:
-            small = (
-                rf"{{\fontsize{{{INTERVAL_SIZE:g}}}{{{SIZE:g}}}\selectfont {interval}}}"
-                if interval
-                else ""
-            )
-            cells.append(LatexCell(small, text_width(interval, INTERVAL_SIZE)))
+            cells.append(text_cell(interval, size=INTERVAL_SIZE))
     return cells
 
 
@@ -225,16 +216,9 @@ class ErrorColumn(NamedTuple):
         return {key for key, number in numbers.items() if number == least}
 
 
-def format_error_value(value: Any, digits: int = 3) -> str:
-    """Format an error with some significant digits, without an exponent below a million."""
-    if not is_number(value):
-        return "--"
-    if value and not 1e-4 <= abs(value) < 1e6:
-        return f"{value:.{digits - 1}e}"
-    return np.format_float_positional(
-        float(f"{value:.{digits - 1}e}"), trim="-" if value >= 10 ** (digits - 1) else "k",
-        precision=digits, unique=False, fractional=False,
-    ).rstrip(".")  # fmt: skip
+def format_value(value: Any, digits: int = 3) -> str:
+    """Format a number with significant digits; two hyphens without one."""
+    return format_short(value, digits) if is_number(value) else "--"
 
 
 def make_column(pack: Pack, world: str, regime: str) -> ErrorColumn:
@@ -252,10 +236,10 @@ def make_column(pack: Pack, world: str, regime: str) -> ErrorColumn:
         interval = (
             ""
             if low is None or high is None or row["verdict"] == "loses track"
-            else f"[{format_error_value(low, 2)}, {format_error_value(high, 2)}]"
+            else f"[{format_value(low, 2)}, {format_value(high, 2)}]"
         )
         is_lost = row["verdict"] == "loses track" or (value is None and row.get("lost"))
-        text = "lost" if is_lost else format_error_value(value)
+        text = "lost" if is_lost else format_value(value)
         entries[key] = (text, interval, str(row["verdict"]))
     return ErrorColumn(world, regime, _KILO.get(unit, unit) if is_kilo else unit, entries)
 
@@ -282,17 +266,11 @@ def describe_columns(
     )
     return (
         f"{metric}: median over runs{interval}{where}. Bold: smallest. "
-        rf"\textsuperscript{{\textdagger}}: shown to be worse than {_name_baseline(pack)}, jointly for all filters "
+        rf"\textsuperscript{{\textdagger}}: shown to be worse than {escape_latex(name_baseline(pack))}, jointly for all filters "
         r"of the column. lost: shown to keep track in fewer than 80\,\% of runs. \textsuperscript{*}: proposed methods."
         + _describe_absent(pack, cells)
         + _describe_lost(pack, cells)
     )
-
-
-def _name_baseline(pack: Pack) -> str:
-    """Return the name of the baseline in LaTeX."""
-    names = {str(look["key"]): str(look["name"]) for look in pack["filters"]}
-    return escape_latex(names[str(pack["baselines"][0])]) if pack["baselines"] else "the baseline"
 
 
 def _describe_absent(pack: Pack, cells: Sequence[tuple[str, str]]) -> str:
@@ -313,17 +291,18 @@ def _describe_absent(pack: Pack, cells: Sequence[tuple[str, str]]) -> str:
 
 def _describe_lost(pack: Pack, cells: Sequence[tuple[str, str]]) -> str:
     """List the filters that lost runs in these conditions."""
-    counts: dict[str, int] = {}
+    counts: Counter[str] = Counter()
     for world, regime in cells:
-        for key, row in find_rows(pack, world, regime).items():
-            counts[key] = counts.get(key, 0) + int(row.get("lost") or 0)
-    lost = {key: number for key, number in counts.items() if number}
+        counts.update(
+            {k: int(row.get("lost") or 0) for k, row in find_rows(pack, world, regime).items()}
+        )
+    lost = +counts
     if not lost:
         return " No run was lost."
     if len(lost) > 6:
         return rf" Lost runs of {len(lost)} filters: Table~\ref{{tab:cost}}."
-    names = {str(look["key"]): str(look["name"]) for look in pack["filters"]}
-    listed = ", ".join(f"{escape_latex(names[key])} {number}" for key, number in lost.items())
+    looks = filters_by_key(pack)
+    listed = ", ".join(f"{escape_latex(str(looks[k]['name']))} {n}" for k, n in lost.items())
     return f" Lost runs, which are worse than all others: {listed}."
 
 
@@ -376,10 +355,7 @@ def make_cost_table(pack: Pack, particles: Mapping[str, str]) -> LatexTable:
     """Build the table of cost and reliability of each filter over all conditions."""
     rows = find_rows(pack)
     has_rounds = any(is_number(row.get("cost")) for row in rows.values())
-    columns = [
-        Column("l"), Column("r"), number_column(_whole_digits(rows, "ms"), 2), *([Column("l")] * has_rounds),
-        number_column(3, 0), number_column(_whole_digits(rows, "lost"), 0), number_column(3, 0),
-    ]  # fmt: skip
+    columns = [*map(Column, "lrr"), *([Column("l")] * has_rounds), *map(Column, "rrr")]
     ratio = ["ratio"] if has_rounds else []
     head = ["Method", "N", "ms/step", *ratio, "track (%)", "lost", "coverage (%)"]
     groups = [
@@ -399,7 +375,7 @@ def make_cost_table(pack: Pack, particles: Mapping[str, str]) -> LatexTable:
         rf"that keep track, lost runs of {runs}, coverage of 90\,\% intervals. \textsuperscript{{*}}: proposed methods. "
         + (_ROUNDS if has_rounds else "Times: one timing per job.")
     )
-    return LatexTable("cost", caption, columns, [[_head_cell(text) for text in head]], groups)
+    return LatexTable("cost", caption, columns, [[text_cell(text) for text in head]], groups)
 
 
 def _cost_cells(row: Row, particles: str, has_rounds: bool) -> list[LatexCell]:
@@ -408,8 +384,7 @@ def _cost_cells(row: Row, particles: str, has_rounds: bool) -> list[LatexCell]:
         f"{100 * row[name]:.0f}" if is_number(row[name]) else "--" for name in ("track", "coverage")
     )
     cost = f"{row['ms']:.2f}" if is_number(row["ms"]) else "--"
-    values = (cost, track, str(int(row["lost"] or 0)), coverage)
-    cells = [LatexCell("{--}" if text == "--" else text, text_width(text, SIZE)) for text in values]
+    cells = [text_cell(text) for text in (cost, track, str(int(row["lost"] or 0)), coverage)]
     if has_rounds:
         ends = f" [{_ratio(row['cost_low'])}, {_ratio(row['cost_high'])}]"
         cells.insert(1, text_cell(_ratio(row["cost"]) + ends if is_number(row["cost"]) else "--"))
@@ -421,24 +396,13 @@ def _indent(cell: LatexCell) -> LatexCell:
     return cell._replace(tex=rf"\hspace*{{{_INDENT:g}pt}}{cell.tex}", width=cell.width + _INDENT)
 
 
-def _head_cell(text: str) -> LatexCell:
-    """Return a cell of the head, protected from siunitx."""
-    return LatexCell(f"{{{escape_latex(text)}}}", text_width(text, SIZE))
-
-
-def _whole_digits(rows: dict[str, Row], name: str) -> int:
-    """Return the number of digits before the point of the largest value."""
-    values = [float(row[name]) for row in rows.values() if is_number(row[name])]
-    return max(1, len(str(int(max(values, default=0.0)))))
-
-
 def _ratio(value: Any) -> str:
     """Format a ratio with two places, three near 1, or two digits if it is large."""
     if not is_number(value):
         return r"--"
     if f"{value:.2f}" == "1.00" and abs(value - 1) > _EQUAL:
         return f"{value:.3f}"
-    return f"{value:.2f}" if 0.095 <= value < 9.995 else format_error_value(value, 2)
+    return f"{value:.2f}" if 0.095 <= value < 9.995 else format_value(value, 2)
 
 
 def _effect_cell(text: str, word: str) -> LatexCell:

@@ -29,7 +29,15 @@ from pfbench.report.journal.ratio_figures import (
     plot_leaderboard,
     plot_planned,
 )
-from pfbench.report.journal.study_pack import ALL, Pack, find_rows, is_number, list_pairs
+from pfbench.report.journal.study_pack import (
+    ALL,
+    Pack,
+    filters_by_key,
+    find_rows,
+    is_number,
+    list_pairs,
+    name_baseline,
+)
 from pfbench.report.journal.table_layout import (
     LINE,
     LatexTable,
@@ -79,7 +87,7 @@ def write_paper(
     pack: Pack,
     page: PageFormat,
     folder: RecordedFolder,
-    drawings: Mapping[str, tuple[str, bytes]] | None = None,
+    drawings: Mapping[str, tuple[str, str | bytes]] | None = None,
 ) -> list[str]:
     """Write the files of a paper except its data.
 
@@ -134,7 +142,7 @@ def _write_plots(
 
 
 def _write_drawings(
-    drawings: Mapping[str, tuple[str, bytes]], folder: RecordedFolder, remarks: list[str]
+    drawings: Mapping[str, tuple[str, str | bytes]], folder: RecordedFolder, remarks: list[str]
 ) -> dict[str, str]:
     """Write the figures of the paper of a study, and a remark on SVG; return their captions by file name."""
     for name, (_, content) in drawings.items():
@@ -289,16 +297,14 @@ def format_methods(paragraphs: Sequence[str]) -> str:
 
 def format_caption(name: str, pack: Pack) -> str:
     """Format the caption of a figure."""
-    looks = {str(look["key"]): look for look in pack["filters"]}
-    baseline = looks.get(str(pack["baselines"][0])) if pack["baselines"] else None
+    baselines = [filters_by_key(pack)[str(key)] for key in pack["baselines"][:1]]
     regime = str(pack["regimes"][0]["name"]).lower()
     words = {
         "{dots}": "Dots: single worlds. " * bool(list_pairs(pack)),
         "{metric}": escape_latex(str(pack["metrics"][0]["name"])),
         "{level}": f"{100 * (1 - float(pack['alpha'])):g}",
         "{regime}": escape_latex(regime),
-        "{baseline}": "the baseline" if baseline is None else escape_latex(str(baseline["name"]))
-        + cite([str(baseline.get("cite") or "")]),
+        "{baseline}": escape_latex(name_baseline(pack)) + cite([str(look.get("cite") or "") for look in baselines]),
     }  # fmt: skip
     text = CAPTIONS[name]
     for word, value in words.items():

@@ -34,6 +34,7 @@ from pfbench.report.journal.study_pack import (
     find_rows,
     is_number,
     list_pairs,
+    name_baseline,
     name_of,
 )
 from pfbench.results.plotting import format_axis_label, set_plain_ticks
@@ -117,10 +118,10 @@ def _draw_leaderboard(
         )  # fmt: skip
         if row["verdict"] == "worse":
             _write_dagger(axis, y, text, setting)
-    metric, baseline = pack["metrics"][0], looks[str(pack["baselines"][0])]["name"] if pack["baselines"] else ""  # fmt: skip
+    metric = pack["metrics"][0]
     level = f"median {metric['name']} [{'k' * is_far}{metric['unit']}]"
     axis.set_xlabel(
-        setting.escape(f"{metric['name']} relative to {baseline}" if is_ratio else level)
+        setting.escape(f"{metric['name']} relative to {name_baseline(pack)}" if is_ratio else level)
     )
 
 
@@ -185,8 +186,7 @@ def draw_error_against_cost(
     label = f"median {format_axis_label(metric['name'], metric['unit'])}"
     if is_ratio:
         axis.axhline(1.0, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
-        baseline = looks[str(pack["baselines"][0])]["name"] if pack["baselines"] else ""
-        label = f"{metric['name']} / {baseline}"
+        label = f"{metric['name']} / {name_baseline(pack)}"
     axis.set_ylabel(setting.escape(label))
     return marks
 

@@ -26,13 +26,10 @@ def filters_by_family(pack: Pack) -> list[list[str]]:
     return [group for group in groups if group]
 
 
-def find_rows(
-    pack: Pack, world: str = ALL, regime: str = ALL, *, metric: str = "", baseline: str = ""
-) -> dict[str, Row]:
-    """Return the rows of a view by filter."""
-    metric = metric or str(pack["metrics"][0]["key"])
-    baseline = baseline or next(iter(map(str, pack["baselines"])), "")
-    view = pack["views"].get((metric, world, regime, baseline), {"rows": ()})
+def find_rows(pack: Pack, world: str = ALL, regime: str = ALL) -> dict[str, Row]:
+    """Return the rows of a view of the first metric against the first baseline, by filter."""
+    baseline = next(iter(map(str, pack["baselines"])), "")
+    view = pack["views"].get((pack["metrics"][0]["key"], world, regime, baseline), {"rows": ()})
     return {str(row["filter"]): row for row in view["rows"]}
 
 
@@ -46,6 +43,12 @@ def list_cells(pack: Pack) -> list[tuple[str, str]]:
 def name_of(pack: Pack, kind: str, key: str) -> str:
     """Return the name of a world or a regime."""
     return next((str(node["name"]) for node in pack[kind] if node["key"] == key), key)
+
+
+def name_baseline(pack: Pack) -> str:
+    """Return the name of the first baseline, or words for none."""
+    keys = map(str, pack["baselines"])
+    return next((str(filters_by_key(pack)[key]["name"]) for key in keys), "the baseline")
 
 
 def name_with_star(pack: Pack, key: str) -> str:

@@ -42,12 +42,10 @@ class Column(NamedTuple):
     Attributes:
         spec: Column type of LaTeX.
         is_close: Whether a thin space separates it from the column before.
-        width: Least width in points, of a column of numbers with fixed places.
     """
 
     spec: str
     is_close: bool = False
-    width: float = 0.0
 
 
 class LatexTable(NamedTuple):
@@ -78,18 +76,14 @@ class LatexTable(NamedTuple):
 def text_cell(text: str, *, size: float = SIZE, is_bold: bool = False, span: int = 1) -> LatexCell:
     """Return a cell with a text, which is escaped."""
     tex = rf"\textbf{{{escape_latex(text)}}}" if is_bold else escape_latex(text)
+    if size != SIZE and text:
+        tex = rf"{{\fontsize{{{size:g}}}{{{SIZE:g}}}\selectfont {tex}}}"
     return LatexCell(tex, text_width(text, size, is_bold=is_bold), span)
-
-
-def number_column(digits: int, places: int, is_close: bool = False) -> Column:
-    """Return a column of siunitx with numbers aligned at the decimal point."""
-    text = "0" * (digits + places) + ("." if places else "")
-    return Column(f"S[table-format={digits}.{places}]", is_close, text_width(text, SIZE))
 
 
 def measure_table(table: LatexTable, separation: float) -> float:
     r"""Compute the width of a table."""
-    widths = [column.width for column in table.columns]
+    widths = [0.0] * len(table.columns)
     gaps = [_gap(column, separation) if i else 0.0 for i, column in enumerate(table.columns)]
     rows = [*table.head, *(row for group in table.groups for row in group)]
     for spanning in (False, True):

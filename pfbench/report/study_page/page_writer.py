@@ -8,7 +8,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from decimal import ROUND_HALF_UP, Context, Decimal
+from decimal import ROUND_HALF_UP, Decimal
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from pfbench.report.board.recorded_units import describe_records, list_questions
 from pfbench.report.journal.study_pack import name_of
 from pfbench.report.methods_text import write_methods
 from pfbench.report.papers.figures import list_page_figures
-from pfbench.report.writers import template_environment
+from pfbench.report.writers import DASH, format_short, template_environment
 from pfbench.results.conditions import drop_settings
 from pfbench.results.looks import describe_foreign_knobs, find_stored_world
 
@@ -144,29 +144,13 @@ SIGNS = {
     "better": "▲", "equal": "≈", "equal in kept runs": "≈", "identical": "≈", "not decided": "?", "worse": "▼", "loses track": "✕",
     "missing": "–", "baseline": "",
 }  # fmt: skip
-_DASH = "–"
 _NAMED = 4  # filters with severely overconfident runs in the first lines
-
-
-def format_short(value: float | None, digits: int = 3) -> str:
-    """Format a number with significant digits, as the script of the page does."""
-    if value is None:
-        return _DASH
-    if value == math.inf:
-        return "∞"
-    rounded = Context(prec=digits, rounding=ROUND_HALF_UP).create_decimal(Decimal(value))
-    if rounded == 0:
-        return "0"
-    exponent = rounded.adjusted()
-    if not -4 <= exponent < 6:
-        return f"{rounded:.{digits - 1}e}".replace("e+", "e")
-    return f"{rounded:.{max(0, digits - 1 - exponent)}f}"
 
 
 def format_share(value: float | None) -> str:
     """Format a share as percent."""
     if value is None:
-        return _DASH
+        return DASH
     return f"{Decimal(100 * value).quantize(Decimal(1), ROUND_HALF_UP)} %"
 
 
@@ -289,7 +273,7 @@ def _row(row: Mapping[str, Any], look: Mapping[str, Any]) -> dict[str, Any]:
         value = f"{format_short(row['value'])} {unit} {interval}"
     calibration = row["calibration"] or ""
     return {
-        "rank": _DASH if row["rank"] is None else str(row["rank"]),
+        "rank": DASH if row["rank"] is None else str(row["rank"]),
         "name": look["name"],
         "proposed": look["proposed"],
         "value": value,
