@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,115 +38,45 @@ from pfbench.report.writers import format_short
 # --------------------------------------------------------------------------------------------------
 # Main table of a paper: errors of all filters in all conditions.
 
-ONE_TABLE, WITH_INTERVALS = 8, 16  # cells at most of one table, and of tables with intervals
 _DAGGER = r"\rlap{\textsuperscript{\textdagger}}"
 
 
 Fits = Callable[[LatexTable], bool]
 
 
-def _fit_always(_: LatexTable) -> bool:
-    """Accept a table of any width."""
-    return True
-
-
-def make_main_tables(pack: Pack, fits: Fits = _fit_always) -> list[LatexTable]:
-    """Build the main table: one, or one per regime above eight conditions.
-
-    Returns tables of the paper. Above 16 conditions they lack intervals, see `make_supplement`.
-    """
+def make_main_tables(pack: Pack, fits: Fits) -> list[LatexTable]:
+    """Build the main tables of a paper: one per noise regime, each with as many worlds as fit."""
     cells = list_cells(pack)
-    return _split(pack, cells, "main", fits, has_intervals=len(cells) <= WITH_INTERVALS)
-
-
-def make_supplement(pack: Pack, fits: Fits = _fit_always) -> list[LatexTable]:
-    """Build the tables with intervals that the main tables lack, one per regime; empty if they have them."""
-    cells = list_cells(pack)
-    if len(cells) <= WITH_INTERVALS:
-        return []
-    return _split(pack, cells, "supplement", fits, has_intervals=True)
-
-
-def _split(
-    pack: Pack, cells: Sequence[tuple[str, str]], name: str, fits: Fits, *, has_intervals: bool
-) -> list[LatexTable]:
-    """Build one table, or one per regime if there are many cells, each with as many worlds as fit."""
-    groups = [list(cells)]
-    if len(cells) > ONE_TABLE or name != "main":
-        regimes = dict.fromkeys(regime for _, regime in cells)
-        groups = [[cell for cell in cells if cell[1] == regime] for regime in regimes]
-    parts: list[list[tuple[str, str]]] = []
-    for group in groups:
-        for count in range(1, len({world for world, _ in group}) + 1):
-            split = _split_worlds(group, count)
-            if all(fits(_make_table(pack, members, name, has_intervals)) for members in split):
+    parts: list[tuple[list[str], str]] = []
+    for regime in dict.fromkeys(regime for _, regime in cells):
+        worlds = [world for world, of in cells if of == regime]
+        for count in range(1, len(worlds) + 1):
+            ends = [i * len(worlds) // count for i in range(count + 1)]
+            split = [worlds[start:end] for start, end in pairwise(ends)]
+            if all(fits(_make_table(pack, some, regime, "main")) for some in split):
                 break
-        parts += split
-    if len(parts) == 1 and name == "main":
-        return [_make_table(pack, parts[0], name, has_intervals)]
-    return [_make_table(pack, p, f"{name}_{i}", has_intervals) for i, p in enumerate(parts, 1)]
+        parts += [(some, regime) for some in split]
+    names = [f"main_{i}" for i in range(1, len(parts) + 1)] if len(parts) > 1 else ["main"]
+    return [_make_table(pack, *part, name) for part, name in zip(parts, names, strict=True)]
 
 
-def _split_worlds(cells: Sequence[tuple[str, str]], count: int) -> list[list[tuple[str, str]]]:
-    """Split cells into parts with about as many worlds each."""
-    worlds = list(dict.fromkeys(world for world, _ in cells))
-    parts = [
-        worlds[i * len(worlds) // count : (i + 1) * len(worlds) // count] for i in range(count)
-    ]
-    return [[cell for cell in cells if cell[0] in members] for members in parts]
-
-
-def _make_table(
-    pack: Pack, cells: Sequence[tuple[str, str]], name: str, has_intervals: bool
-) -> LatexTable:
-    """Build the table of some conditions."""
-    columns = [make_column(pack, *cell) for cell in cells]
-    per_cell = 2 if has_intervals else 1
-    specs = [Column("l")]
-    for _ in columns:
-        specs += [Column("r"), Column("l", is_close=True)] if has_intervals else [Column("r")]
-    has_one_regime = len({column.regime for column in columns}) == 1
-    head, rules = _make_head(pack, columns, per_cell, has_one_regime)
+def _make_table(pack: Pack, worlds: Sequence[str], regime: str, name: str) -> LatexTable:
+    """Build the table of some worlds in a noise regime."""
+    columns = [make_column(pack, world, regime) for world in worlds]
+    specs = [Column("l"), *[Column("r"), Column("l", is_close=True)] * len(columns)]
     groups = [
-        [
-            [text_cell(name_with_star(pack, key)), *_error_cells(columns, key, has_intervals)]
-            for key in family
-        ]
+        [[text_cell(name_with_star(pack, key)), *_error_cells(columns, key)] for key in family]
         for family in filters_by_family(pack)
     ]
-    caption = describe_columns(
-        pack, [(column.world, column.regime) for column in columns], has_intervals, has_one_regime
-    )
-    return LatexTable(name, caption, specs, head, groups, rules)
+    caption = describe_columns(pack, worlds, regime)
+    return LatexTable(name, caption, specs, _make_head(pack, columns), groups)
 
 
-def _make_head(
-    pack: Pack, columns: Sequence[ErrorColumn], per_cell: int, has_one_regime: bool
-) -> tuple[list[list[LatexCell]], list[tuple[int, int]]]:
-    """Build the rows of the head: worlds with units, then regimes unless there is one."""
-    if has_one_regime:
-        return _make_world_head(pack, columns, per_cell), []
-    worlds = list(dict.fromkeys(column.world for column in columns))
-    first, rules, start = [text_cell("")], [], 2
-    for world in worlds:
-        members = [column for column in columns if column.world == world]
-        span = per_cell * len(members)
-        first.append(text_cell(_name_world(pack, members[0]), span=span))
-        rules.append((start, start + span - 1))
-        start += span
-    second = [
-        text_cell(name_of(pack, "regimes", column.regime), span=per_cell) for column in columns
-    ]
-    return [first, [text_cell("Method"), *second]], rules
-
-
-def _make_world_head(
-    pack: Pack, columns: Sequence[ErrorColumn], per_cell: int
-) -> list[list[LatexCell]]:
-    """Build the head of a table of one regime, with the names of worlds in lines of about equal width."""
+def _make_head(pack: Pack, columns: Sequence[ErrorColumn]) -> list[list[LatexCell]]:
+    """Build the head: the names of worlds with units, in lines of about equal width."""
     lines = [_break_name(_name_world(pack, column)) for column in columns]
-    upper = [text_cell(""), *(text_cell(line[0], span=per_cell) for line in lines)]
-    lower = [text_cell("Method"), *(text_cell(line[1], span=per_cell) for line in lines)]
+    upper = [text_cell(""), *(text_cell(line[0], span=2) for line in lines)]
+    lower = [text_cell("Method"), *(text_cell(line[1], span=2) for line in lines)]
     return [upper, lower] if any(line[0] for line in lines) else [lower]
 
 
@@ -161,7 +92,7 @@ def _name_world(pack: Pack, column: ErrorColumn) -> str:
     return f"{name_of(pack, 'worlds', column.world)}{f' ({column.unit})' if column.unit else ''}"
 
 
-def _error_cells(columns: Sequence[ErrorColumn], key: str, has_intervals: bool) -> list[LatexCell]:
+def _error_cells(columns: Sequence[ErrorColumn], key: str) -> list[LatexCell]:
     """Return the cells of a filter: number with its mark, and interval."""
     cells = []
     for column in columns:
@@ -173,8 +104,7 @@ def _error_cells(columns: Sequence[ErrorColumn], key: str, has_intervals: bool) 
         cells.append(
             LatexCell(tex + r"\phantom{\textsuperscript{\textdagger}}", _error_width(text, is_best))
         )
-        if has_intervals:
-            cells.append(text_cell(interval, size=INTERVAL_SIZE))
+        cells.append(text_cell(interval, size=INTERVAL_SIZE))
     return cells
 
 
@@ -195,13 +125,11 @@ class ErrorColumn(NamedTuple):
 
     Attributes:
         world: Key of the world.
-        regime: Key of the regime.
         unit: Unit that is printed.
         entries: Text, interval and verdict by filter.
     """
 
     world: str
-    regime: str
     unit: str
     entries: dict[str, tuple[str, str, str]]
 
@@ -241,7 +169,7 @@ def make_column(pack: Pack, world: str, regime: str) -> ErrorColumn:
         is_lost = row["verdict"] == "loses track" or (value is None and row.get("lost"))
         text = "lost" if is_lost else format_value(value)
         entries[key] = (text, interval, str(row["verdict"]))
-    return ErrorColumn(world, regime, _KILO.get(unit, unit) if is_kilo else unit, entries)
+    return ErrorColumn(world, _KILO.get(unit, unit) if is_kilo else unit, entries)
 
 
 def is_printed_number(text: str) -> bool:
@@ -249,37 +177,31 @@ def is_printed_number(text: str) -> bool:
     return text not in ("--", "lost")
 
 
-def describe_columns(
-    pack: Pack, cells: Sequence[tuple[str, str]], has_intervals: bool, has_one_regime: bool
-) -> str:
+def describe_columns(pack: Pack, worlds: Sequence[str], regime: str) -> str:
     """Write the caption of a table of errors: metric, interval, marks and lost runs.
 
     Returns LaTeX.
     """
     metric = escape_latex(str(pack["metrics"][0]["name"]))
     level = f"{100 * (1 - float(pack['alpha'])):g}"
-    interval = rf" and its {level}\,\% interval" if has_intervals else ""
-    where = (
-        f", {escape_latex(name_of(pack, 'regimes', cells[0][1]).lower())}"
-        if has_one_regime and len(pack["regimes"]) > 1
-        else ""
-    )
+    tables = [find_rows(pack, world, regime) for world in worlds]
+    named = f", {escape_latex(name_of(pack, 'regimes', regime).lower())}"
+    where = named if len(pack["regimes"]) > 1 else ""
     return (
-        f"{metric}: median over runs{interval}{where}. Bold: smallest. "
+        rf"{metric}: median over runs and its {level}\,\% interval{where}. Bold: smallest. "
         rf"\textsuperscript{{\textdagger}}: shown to be worse than {escape_latex(name_baseline(pack))}, jointly for all filters "
         r"of the column. lost: shown to keep track in fewer than 80\,\% of runs. \textsuperscript{*}: proposed methods."
-        + _describe_absent(pack, cells)
-        + _describe_lost(pack, cells)
+        + _describe_absent(pack, tables)
+        + _describe_lost(pack, tables)
     )
 
 
-def _describe_absent(pack: Pack, cells: Sequence[tuple[str, str]]) -> str:
+def _describe_absent(pack: Pack, tables: Sequence[Mapping[str, Row]]) -> str:
     """Explain the dash of filters without an error in a condition; empty if there is none."""
-    rows = [find_rows(pack, world, regime) for world, regime in cells]
     keys = [str(look["key"]) for look in pack["filters"]]
     has_dash = any(
         key not in row or (row[key]["value"] is None and not row[key].get("lost"))
-        for row in rows
+        for row in tables
         for key in keys
     )
     return (
@@ -289,13 +211,11 @@ def _describe_absent(pack: Pack, cells: Sequence[tuple[str, str]]) -> str:
     )
 
 
-def _describe_lost(pack: Pack, cells: Sequence[tuple[str, str]]) -> str:
+def _describe_lost(pack: Pack, tables: Sequence[Mapping[str, Row]]) -> str:
     """List the filters that lost runs in these conditions."""
     counts: Counter[str] = Counter()
-    for world, regime in cells:
-        counts.update(
-            {k: int(row.get("lost") or 0) for k, row in find_rows(pack, world, regime).items()}
-        )
+    for rows in tables:
+        counts.update({key: int(row.get("lost") or 0) for key, row in rows.items()})
     lost = +counts
     if not lost:
         return " No run was lost."

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from matplotlib.figure import Figure
 
@@ -22,7 +22,6 @@ from pfbench.report.journal.main_table import (
     make_cost_table,
     make_main_tables,
     make_planned_table,
-    make_supplement,
 )
 from pfbench.report.journal.ratio_figures import (
     plot_error_against_cost,
@@ -97,26 +96,24 @@ def write_paper(
         folder: Folder of the paper.
         drawings: Caption and content by file name of the figures of the paper of the study, PDF or SVG.
 
-    Returns remarks for the user: tables in a supplement, and figures without PGF.
+    Returns remarks for the user: what is left out, and figures without PGF.
     """
     pack = shorten_names(pack)
     tables = _format_tables(pack, page)
     plots = select_figures(pack)
-    remarks = _list_remarks(pack, tables, plots)
+    remarks = []
+    if pack["planned"] and "planned" not in plots:
+        remarks.append(
+            "no pair compared in advance has a ratio, so that planned.pdf and table_planned.tex are left out"
+        )
     widths = _write_plots(plots, pack, page, folder, remarks)
     for name, text in tables.items():
         folder.write(f"{name}.tex", text)
     folder.write("methods.tex", format_methods(write_methods(pack)))
     folder.write("pfbench.bib", renew_bibliography(pack))
-    main = sorted(  # wide floats hold up others
-        (name for name in tables if "supplement" not in name),
-        key=lambda name: "{table*}" in tables[name],
-    )
+    main = sorted(tables, key=lambda name: "{table*}" in tables[name])  # wide floats hold up others
     captions = _write_drawings(drawings or {}, folder, remarks)
     folder.write("paper.tex", format_document(pack, page, widths, main, captions))
-    if len(main) < len(tables):
-        supplement = [name for name in tables if "supplement" in name]
-        folder.write("supplement.tex", format_document(pack, page, {}, supplement))
     return remarks
 
 
@@ -170,16 +167,6 @@ def _describe_tuning(pack: Pack) -> str:
     return f" Tuned elsewhere: on {escape_latex(', '.join(data))}." if data else ""
 
 
-def _list_remarks(pack: Pack, tables: Iterable[str], plots: Iterable[str]) -> list[str]:
-    """List the tables of the supplement, and what is left out."""
-    remarks = [f"{name}.tex has the intervals" for name in tables if "supplement" in name]
-    if pack["planned"] and "planned" not in plots:
-        remarks.append(
-            "no pair compared in advance has a ratio, so that planned.pdf and table_planned.tex are left out"
-        )
-    return remarks
-
-
 def draw_paper_figure(plot: Plot, pack: Pack, setting: FigureSetting) -> Figure:
     """Draw a figure in the settings of a page."""
     with setting.applied():
@@ -211,7 +198,7 @@ def _format_tables(pack: Pack, page: PageFormat) -> dict[str, str]:
 
     tables = [
         *make_main_tables(pack, fits), *([planned] if planned else []),
-        make_cost_table(pack, _list_particles(pack)), *make_supplement(pack, fits),
+        make_cost_table(pack, _list_particles(pack)),
     ]  # fmt: skip
     note = _describe_tuning(pack)
     tables = [table._replace(caption=table.caption + note) for table in tables]

@@ -57,7 +57,6 @@ class LatexTable(NamedTuple):
         columns: Columns.
         head: Rows of the head.
         groups: Groups of rows, with a rule between them.
-        rules: Rules below the first row of the head: first and last column of each, from 1.
     """
 
     name: str
@@ -65,7 +64,6 @@ class LatexTable(NamedTuple):
     columns: Sequence[Column]
     head: Sequence[Sequence[LatexCell]]
     groups: Sequence[Sequence[Sequence[LatexCell]]]
-    rules: Sequence[tuple[int, int]] = ()
 
     @property
     def rows(self) -> int:
@@ -114,8 +112,6 @@ def format_table(table: LatexTable, separation: float, *, is_wide: bool) -> str:
     star = "*" if is_wide else ""
     specs = "".join((r"@{\,}" if column.is_close else "") + column.spec for column in table.columns)
     head = [_format_row(row) for row in table.head]
-    if table.rules:
-        head.insert(1, " ".join(rf"\cmidrule(lr){{{a}-{b}}}" for a, b in table.rules))
     body = "\n\\midrule\n".join(
         "\n".join(map(_format_row, group)) for group in table.groups if group
     )
