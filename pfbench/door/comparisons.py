@@ -15,6 +15,7 @@ from pfbench.door.parts import format_html_table
 from pfbench.report.board.entries import build_run_table, name_regimes
 from pfbench.report.board.pack import build_pack, open_court
 from pfbench.report.board.recorded_units import count_drives, describe_drives
+from pfbench.report.board.view import word_verdict
 from pfbench.report.methods_text import is_recorded
 from pfbench.report.options import ReportOptions
 from pfbench.report.study_page.page_writer import describe_opening
@@ -149,18 +150,12 @@ class Comparison:
 
 
 def _format(verdict: Verdict) -> str:
-    """Format a verdict as a sentence."""
-    reason = f" ({verdict.reason})" if verdict.reason else ""
-    loses = f", {verdict.lost.word} runs" if verdict.lost.word else ""
+    """Format a verdict as a sentence, in the words of the pages."""
+    words = word_verdict(verdict)
     if not np.isfinite(verdict.ratio):
-        if not verdict.n:
-            return f"{verdict.a} and {verdict.b} are not compared: {verdict.reason}."
-        return f"{verdict.a} against {verdict.b}: {verdict.word}{loses}{reason}."
+        return f"{verdict.a} against {verdict.b}: {words}."
     size = format_with_interval(verdict.ratio, verdict.low, verdict.high)
-    return (
-        f"the error of {verdict.a} is {size} times that of {verdict.b} ({verdict.n} paired runs): "
-        f"{verdict.word}{loses}{reason}."
-    )
+    return f"the error of {verdict.a} is {size} times that of {verdict.b} ({verdict.n} paired runs): {words}."
 
 
 def compare_in_conditions(conditions: Sequence[Condition], a: str, b: str) -> Comparison:

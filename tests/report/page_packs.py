@@ -243,7 +243,7 @@ class _Numbers:
             has_interval = runs >= 10 or self.are_equal
             found.append({
                 "a": self.keys[a], "b": self.keys[b], "kind": ("paper", "tuned", "")[k % 3], "word": word,
-                "sentence": f"[[Filter {a}]] against [[Filter {b}]]: {words}.",
+                "words": words,
                 "estimate": _short(np.exp(mean)), "low": _short(np.exp(mean - 2 * sd)) if has_interval else None,
                 "high": _short(np.exp(mean + 2 * sd)) if has_interval else None,
                 "p": 0.01, "reason": words.partition(", ")[2] or None,

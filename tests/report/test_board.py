@@ -358,7 +358,7 @@ def test_too_few_runs_say_why_a_planned_pair_has_no_interval() -> None:
     court = Court(arrange_runs(data, looks), plan_look_pairs(looks))
     (entry, *_) = planned_entries(court, StudyFacts(looks, {}, {}, ReportOptions(), {}))
     assert (entry["low"], entry["high"], entry["word"]) == (None, None, "not decided")
-    assert "are not decided (4 runs, 10 are required; ratio" in entry["sentence"]
+    assert entry["words"] == "not decided, 4 runs, 10 are required"
     pack = {"planned": [entry], "filters": [{"key": k, "name": k} for k in looks]}
     assert describe_pairs(pack)[0]["interval"] == "4 runs, 10 are required"
 

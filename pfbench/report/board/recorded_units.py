@@ -343,14 +343,14 @@ def _describe_verdict(entry: Mapping[str, Any] | None, unit: str) -> str:
     count = format_count(entry["n"], {"starts": "run", "blocks": "block", "drives": "drive"}[unit])
     if unit == "blocks":
         count += f", as {format_digits(entry['effective'], 2)} independent"
-    reason = f": {entry['reason']}" if entry["reason"] else ""
-    if entry["word"] == SAME_RUNS or entry["ratio"] is None:
-        return f"{entry['word']} ({count}){reason}"
-    p = "" if entry["p"] is None else f"p = {format_digits(entry['p'], 2)}, "
-    ratio = f"ratio {format_digits(entry['ratio'])}"
-    if entry["low"] is not None and entry["high"] is not None:
-        ratio += f" [{format_digits(entry['low'])}, {format_digits(entry['high'])}]"
-    return f"{entry['word']} ({p}{ratio}, {count}){reason}"
+    parts = []
+    if entry["word"] != SAME_RUNS and entry["ratio"] is not None:
+        bounds = [entry["low"], entry["high"]]
+        ends = "" if None in bounds else f" [{', '.join(map(format_digits, bounds))}]"
+        p = [] if entry["p"] is None else [f"p = {format_digits(entry['p'], 2)}"]
+        parts = [*p, f"ratio {format_digits(entry['ratio'])}{ends}"]
+    text = f"{entry['word']} ({', '.join([*parts, count])})"
+    return ": ".join(filter(None, (text, entry["reason"])))
 
 
 def list_questions(pack: Mapping[str, Any]) -> Iterator[str]:

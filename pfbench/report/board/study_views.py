@@ -23,6 +23,7 @@ from pfbench.report.board.view import (
     build_rows,
     describe_filters,
     describe_view,
+    word_verdict,
 )
 from pfbench.report.journal.study_pack import ALL
 from pfbench.results.conditions import parse_label
@@ -37,10 +38,10 @@ from pfbench.results.looks import (
 )
 from pfbench.results.metrics import page_metrics
 from pfbench.results.step_times import StepTimes
-from pfbench.stats.comparison import EQUAL_WORDS, MIN_RUNS, NO_DECISION, Verdict, decide
+from pfbench.stats.comparison import MIN_RUNS, NO_DECISION, Verdict, decide
 from pfbench.stats.court import Court
 from pfbench.stats.error_measures import Flags
-from pfbench.stats.sentences import format_count, format_with_interval
+from pfbench.stats.sentences import format_count
 from pfbench.stats.study_runs import (
     StudyRuns,
     compare_filters,
@@ -214,7 +215,7 @@ def planned_entries(court: Court, facts: StudyFacts) -> list[dict[str, Any]]:
     return [
         {
             "a": v.a, "b": v.b, "kind": _find_kind(looks[v.a], looks[v.b]), "word": v.word, "reason": v.reason or None,
-            "sentence": describe_planned(v, looks, runs.conditions), **show_ratio(v), "p": round_values(v.p),
+            "words": word_verdict(v, court.margin), **show_ratio(v), "p": round_values(v.p),
             "loses": v.lost.word, "cells": _list_cells(court, options.metric, (v.a, v.b), facts.worlds),
             "new_world": {**show_ratio(w), "word": w.word, "worlds": w.n} if w.n >= MIN_RUNS else None,
         }
@@ -246,27 +247,6 @@ def list_decisions(court: Court, metric: str) -> list[dict[str, Any]]:
 def select_everywhere(runs: StudyRuns) -> Flags:
     """Select the conditions of the view that opens a page, [C]."""
     return select_common(runs, np.ones(len(runs.conditions), dtype=bool))
-
-
-def describe_planned(
-    verdict: Verdict, looks: Mapping[str, MethodLook], conditions: pd.DataFrame
-) -> str:
-    """Describe the verdict on a pair in a sentence."""
-    first, second = (f"[[{looks[label].name}]]" for label in (verdict.a, verdict.b))
-    where = f"in {_count_worlds(conditions)}, {format_count(verdict.n, 'paired run')}"
-    a, b, both, _ = verdict.lost
-    lost = f"{a + both} and {b + both} of {verdict.n} runs lost" if a + b else verdict.reason
-    size = f"ratio {format_with_interval(*verdict[3:6])}" if verdict.ratio > 0 else lost
-    if verdict.word in ("better", "worse"):
-        than = "smaller" if verdict.word == "better" else "larger"
-        return f"{first} has a {than} error than {second} in most runs ({size}; {where})."
-    if verdict.word in EQUAL_WORDS[:2]:
-        suffix = verdict.word.removeprefix("equal")
-        return f"{first} and {second} are equal within the margin{suffix} ({size}; {where})."
-    if verdict.word == "identical":
-        return f"{first} and {second} have the same errors ({where})."
-    reason = f"{verdict.reason}; " if verdict.ratio > 0 and verdict.reason else ""
-    return f"{first} and {second} are not decided ({reason}{size}; {where})."
 
 
 def _find_kind(method: MethodLook, baseline: MethodLook) -> str:

@@ -15,7 +15,13 @@ import scipy  # scipy.stats is imported at its first use
 
 from pfbench.results.looks import MethodLook
 from pfbench.results.step_times import StepTimes, describe_costs
-from pfbench.stats.comparison import EQUAL_WORDS, MIN_RUNS, Verdict, estimate_mean
+from pfbench.stats.comparison import (
+    EQUAL_WORDS,
+    EQUALITY_MARGIN,
+    MIN_RUNS,
+    Verdict,
+    estimate_mean,
+)
 from pfbench.stats.court import Court, find_lost_conditions
 from pfbench.stats.error_measures import Array, Flags
 from pfbench.stats.rank_tests import holm
@@ -149,28 +155,29 @@ def _show_verdict(view: View, label: str, verdicts: Mapping[str, Verdict | None]
     ends = {**dict.fromkeys(("ratio", "ratio_low", "ratio_high", "p"), math.nan), "loses": ""}
     if label not in verdicts:
         return {**ends, "verdict": MISSING, "words": "not run in all conditions"}
-    verdict, lost = verdicts[label], view.filters[label]["lost_conditions"]
+    verdict, track = verdicts[label], _word_lost(view, label)
     if verdict is None:
         ends |= dict.fromkeys(("ratio", "ratio_low", "ratio_high"), 1.0)
-        return {
-            **ends,
-            "verdict": BASE,
-            "words": ", ".join(filter(None, (BASE, _word_lost(view, label)))),
-        }
+        return {**ends, "verdict": BASE, "words": ", ".join(filter(None, (BASE, track)))}
     ends = {
         "ratio": verdict.ratio, "ratio_low": verdict.low, "ratio_high": verdict.high, "p": verdict.p,
         "loses": verdict.lost.word,
     }  # fmt: skip
-    more, reason = f"{verdict.lost.word} runs" if verdict.lost.word else "", verdict.reason
-    if math.isnan(verdict.ratio) and verdict.lost.a + verdict.lost.b:  # its reason has labels
-        more, reason = f"{more or 'lost runs'} ({verdict.lost.a + verdict.lost.both} of {verdict.n}, the baseline {verdict.lost.b + verdict.lost.both})", ""  # fmt: skip
-    if lost and len(view.runs.conditions) == 1:
-        return {**ends, "verdict": LOSES_TRACK, "words": _word_lost(view, label)}
-    words = f" within {100 * math.expm1(view.court.margin):.3g} %" * (
-        verdict.word in EQUAL_WORDS[:2]
-    )
-    texts = (f"{verdict.word}{words}", more, reason, _word_lost(view, label))
-    return {**ends, "verdict": verdict.word, "words": ", ".join(filter(None, texts))}
+    if track and len(view.runs.conditions) == 1:
+        return {**ends, "verdict": LOSES_TRACK, "words": track}
+    a, b, both, loses = verdict.lost
+    words = word_verdict(verdict, view.court.margin)
+    if math.isnan(verdict.ratio) and a + b:  # its reason has labels
+        counts = f"({a + both} of {verdict.n}, the baseline {b + both})"
+        words = f"{word_verdict(verdict._replace(reason=''), view.court.margin)}{'' if loses else ', lost runs'} {counts}"
+    return {**ends, "verdict": verdict.word, "words": ", ".join(filter(None, (words, track)))}
+
+
+def word_verdict(verdict: Verdict, margin: float = EQUALITY_MARGIN) -> str:
+    """Word a verdict: with the margin of an equal pair, whether it loses more runs, and what a reader must know."""
+    within = f" within {100 * math.expm1(margin):.3g} %" * (verdict.word in EQUAL_WORDS[:2])
+    loses = f"{verdict.lost.word} runs" if verdict.lost.word else ""
+    return ", ".join(filter(None, (f"{verdict.word}{within}", loses, verdict.reason)))
 
 
 def _word_lost(view: View, label: str) -> str:

@@ -285,17 +285,14 @@ def format_methods(paragraphs: Sequence[str]) -> str:
 def format_caption(name: str, pack: Pack) -> str:
     """Format the caption of a figure."""
     baselines = [filters_by_key(pack)[str(key)] for key in pack["baselines"][:1]]
-    regime = str(pack["regimes"][0]["name"]).lower()
-    words = {
-        "{dots}": "Dots: single worlds. " * bool(list_pairs(pack)),
-        "{metric}": escape_latex(str(pack["metrics"][0]["name"])),
-        "{level}": f"{100 * (1 - float(pack['alpha'])):g}",
-        "{regime}": escape_latex(regime),
-        "{baseline}": escape_latex(name_baseline(pack)) + cite([str(look.get("cite") or "") for look in baselines]),
-    }  # fmt: skip
-    text = CAPTIONS[name]
-    for word, value in words.items():
-        text = text.replace(word, value)
+    text = CAPTIONS[name].format(
+        dots="Dots: single worlds. " * bool(list_pairs(pack)),
+        metric=escape_latex(str(pack["metrics"][0]["name"])),
+        level=f"{100 * (1 - float(pack['alpha'])):g}",
+        regime=escape_latex(str(pack["regimes"][0]["name"]).lower()),
+        baseline=escape_latex(name_baseline(pack))
+        + cite([str(look.get("cite") or "") for look in baselines]),
+    )
     text += _describe_tuning(pack)
     if name == "over_time":
         text += _describe_selection(pack)

@@ -5,7 +5,6 @@ const findAll = (selector, part = document) => [...part.querySelectorAll(selecto
 const escapes = { "&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;", "'": "&#39;" };
 const esc = (text) => String(text).replace(/[&<>"']/g, (sign) => escapes[sign]);
 const strong = (text) => esc(text).replace(/\[\[(.*?)\]\](?!\])/g, "<b>$1</b>");
-const plain = (text) => String(text).replace(/\[\[|\]\]/g, "");
 
 // Numbers with significant digits, as page_writer.py writes them.
 function short(value, digits = 3) {

@@ -298,7 +298,7 @@ def describe_pairs(pack: Mapping[str, Any]) -> list[dict[str, str]]:
             "effect": _format_end(pair["estimate"]),
             "interval": format_interval(pair["low"], pair["high"]) or pair["reason"] or "",
             "word": pair["word"],
-            "sentence": _remove_marks(pair["sentence"]),
+            "words": pair["words"],
         }
         for pair in pack["planned"]
     ]

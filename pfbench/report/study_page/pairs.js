@@ -75,7 +75,7 @@ function forest(part, pairs) {
           wordsOf(pair),
           ` style="font-size:11.5px;fill:var(--${verdictStyle(pair.word)})"`,
         );
-    content += `<g${spoken(`${group}. ${names}: ${words}, ${pair.word}. ${plain(pair.sentence)}`)}><rect x="${left}" y="${px(y + rise)}" width="${px(width - left - right)}" height="${px(height - rise - 4)}" fill="transparent"/>`;
+    content += `<g${spoken(`${group}. ${names}: ${words}, ${pair.words}.`)}><rect x="${left}" y="${px(y + rise)}" width="${px(width - left - right)}" height="${px(height - rise - 4)}" fill="transparent"/>`;
     if (pair.new_world && shown(pair.new_world.low) && shown(pair.new_world.high)) content += bar(inside(pair.new_world.low), inside(pair.new_world.high), middle, 3, a, 0.45);
     content +=
       (known ? bar(inside(pair.low), inside(pair.high), middle, 6, a, 0.85) : "") + mark(a, inside(pair.estimate), middle, 6) + "</g>";
