@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from pfbench.cli.compose import compose_study
 from pfbench.cli.report import check_has_results, find_page_data, make_report_options
+from pfbench.job.config import JobConfig
 
 HELP = """\
 pfbench paper study=NAME journal=ieee|elsevier|springer [key=value ...]
@@ -32,22 +34,15 @@ def write_study_paper(words: Sequence[str]) -> None:
     config = compose_study([word for word in words if word.partition("=")[0] not in values])
     from pfbench.files.recorded_folder import RecordedFolder
     from pfbench.report.journal.paper_folder import write_paper
-    from pfbench.report.stored_study import RUNS_FILE, format_runs, read_stored_study
-    from pfbench.report.study_report import format_verdicts, read_results
+    from pfbench.report.stored_study import RUNS_FILE, format_runs
+    from pfbench.report.study_report import format_verdicts
 
     study, reports = config.values["study"], Path(config.values["reports_dir"])
     RecordedFolder(reports / study, is_complete=False)  # refuses a link
     stored = find_page_data(config, words)
     if stored is None:
         check_has_results(study, Path(config.values["results_dir"]))
-        pack, data, files = read_results(
-            study, config.values["results_dir"], make_report_options(config), ("pdf",)
-        )
-        table = data.table
-    else:
-        pack, table = read_stored_study(stored.parent)
-        names = [entry["file"] for entry in pack["paper_figures"]]
-        files = {name: (stored.parent / name).read_bytes() for name in names}
+    pack, table, files = _read_study(config, stored)
     drawings = {
         Path(entry["file"]).name: (entry["caption"], files[entry["file"]])
         for entry in pack["paper_figures"]
@@ -61,6 +56,22 @@ def write_study_paper(words: Sequence[str]) -> None:
     for remark in remarks:
         print(f"note: {remark}")
     print(f"paper: {(folder.path / 'paper.tex').resolve()}")
+
+
+def _read_study(
+    config: JobConfig, stored: Path | None
+) -> tuple[dict[str, Any], Any, dict[str, Any]]:
+    """Read a study from its results, or from its stored runs: data of its page, runs, and figures of its paper."""
+    from pfbench.report.stored_study import read_stored_study
+    from pfbench.report.study_report import read_results
+
+    if stored is None:
+        study, results = config.values["study"], config.values["results_dir"]
+        pack, data, files = read_results(study, results, make_report_options(config), ("pdf",))
+        return pack, data.table, files
+    pack, table = read_stored_study(stored.parent)
+    names = [entry["file"] for entry in pack["paper_figures"]]
+    return pack, table, {name: (stored.parent / name).read_bytes() for name in names}
 
 
 def _value(words: Sequence[str], key: str) -> str:

@@ -186,8 +186,8 @@ def cite(keys: Sequence[str]) -> str:
 def _entries() -> dict[str, str]:
     """Read the entries by key."""
     text = Path(__file__).with_name("methods.bib").read_text(encoding="utf-8")
-    found = re.finditer(r"^@\w+\{(\w+),\n.*?^\}\n", text, re.MULTILINE | re.DOTALL)
-    return {entry[1]: entry[0] for entry in found}
+    matches = re.finditer(r"^@\w+\{(\w+),\n.*?^\}\n", text, re.MULTILINE | re.DOTALL)
+    return {entry[1]: entry[0] for entry in matches}
 
 
 # --------------------------------------------------------------------------------------------------

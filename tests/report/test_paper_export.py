@@ -28,7 +28,7 @@ from pfbench.report.journal.figure_style import (
     find_page_format,
 )
 from pfbench.report.journal.main_table import (
-    format_value,
+    format_entry,
     make_main_tables,
     make_planned_table,
 )
@@ -288,7 +288,7 @@ def test_lost_and_missing_entries_are_words() -> None:
 
 def test_errors_have_three_digits() -> None:
     values = [0.0123456, 1.0, 12.34, 99.96, 123.4, 123456.0, 2.5e7, None, float("inf")]
-    printed = [format_value(value) for value in values]
+    printed = [format_entry(value) for value in values]
     assert printed == ["0.0123", "1.00", "12.3", "100", "123", "123000", "2.50e7", "--", "--"]
 
 

@@ -57,7 +57,10 @@ def make_main_tables(pack: Pack, fits: Fits) -> list[LatexTable]:
                 break
         parts += [(some, regime) for some in split]
     names = [f"main_{i}" for i in range(1, len(parts) + 1)] if len(parts) > 1 else ["main"]
-    return [_make_table(pack, *part, name) for part, name in zip(parts, names, strict=True)]
+    return [
+        _make_table(pack, worlds, regime, name)
+        for (worlds, regime), name in zip(parts, names, strict=True)
+    ]
 
 
 def _make_table(pack: Pack, worlds: Sequence[str], regime: str, name: str) -> LatexTable:
@@ -144,7 +147,7 @@ class ErrorColumn(NamedTuple):
         return {key for key, number in numbers.items() if number == least}
 
 
-def format_value(value: Any, digits: int = 3) -> str:
+def format_entry(value: Any, digits: int = 3) -> str:
     """Format a number with significant digits; two hyphens without one."""
     return format_short(value, digits) if is_number(value) else "--"
 
@@ -164,10 +167,10 @@ def make_column(pack: Pack, world: str, regime: str) -> ErrorColumn:
         interval = (
             ""
             if low is None or high is None or row["verdict"] == "loses track"
-            else f"[{format_value(low, 2)}, {format_value(high, 2)}]"
+            else f"[{format_entry(low, 2)}, {format_entry(high, 2)}]"
         )
         is_lost = row["verdict"] == "loses track" or (value is None and row.get("lost"))
-        text = "lost" if is_lost else format_value(value)
+        text = "lost" if is_lost else format_entry(value)
         entries[key] = (text, interval, str(row["verdict"]))
     return ErrorColumn(world, _KILO.get(unit, unit) if is_kilo else unit, entries)
 
@@ -185,8 +188,8 @@ def describe_columns(pack: Pack, worlds: Sequence[str], regime: str) -> str:
     metric = escape_latex(str(pack["metrics"][0]["name"]))
     level = f"{100 * (1 - float(pack['alpha'])):g}"
     tables = [find_rows(pack, world, regime) for world in worlds]
-    named = f", {escape_latex(name_of(pack, 'regimes', regime).lower())}"
-    where = named if len(pack["regimes"]) > 1 else ""
+    noise = f", {escape_latex(name_of(pack, 'regimes', regime).lower())}"
+    where = noise if len(pack["regimes"]) > 1 else ""
     return (
         rf"{metric}: median over runs and its {level}\,\% interval{where}. Bold: smallest. "
         rf"\textsuperscript{{\textdagger}}: shown to be worse than {escape_latex(name_baseline(pack))}, jointly for all filters "
@@ -322,7 +325,7 @@ def _ratio(value: Any) -> str:
         return r"--"
     if f"{value:.2f}" == "1.00" and abs(value - 1) > _EQUAL:
         return f"{value:.3f}"
-    return f"{value:.2f}" if 0.095 <= value < 9.995 else format_value(value, 2)
+    return f"{value:.2f}" if 0.095 <= value < 9.995 else format_entry(value, 2)
 
 
 def _effect_cell(text: str, word: str) -> LatexCell:

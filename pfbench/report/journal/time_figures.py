@@ -87,11 +87,11 @@ def plot_calibration(pack: Pack, setting: FigureSetting) -> Figure:
     label_rows(axis, names, setting)
     axis.tick_params(labelleft=False)
     ratios = {key: row["nees_ratio"] for key, row in values.items()}
-    shown = {key: float(v) for key, v in ratios.items() if is_number(v) and v > 0}
-    for key, ratio in shown.items():
+    positive = {key: float(v) for key, v in ratios.items() if is_number(v) and v > 0}
+    for key, ratio in positive.items():
         style = {**mark_style(looks[key]), "linestyle": "none"}
         axis.plot([ratio], [list(values).index(key)], zorder=3, **style)
-    use_log_if_wide(axis, axis.xaxis, [np.array([1.0, *shown.values()])], narrow=True)
+    use_log_if_wide(axis, axis.xaxis, [np.array([1.0, *positive.values()])], narrow=True)
     axis.axvline(1.0, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
     axis.set_xlabel("NEES / expectation")
     return figure

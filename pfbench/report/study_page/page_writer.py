@@ -51,7 +51,12 @@ _SECTIONS = (
 
 
 def render_page(pack: Mapping[str, Any], name: str = "index.html") -> dict[str, str]:
-    """Render the page of a study and its Markdown by file name. Equal packs give equal texts."""
+    """Render the page of a study and its Markdown by file name. Equal packs give equal texts.
+
+    Args:
+        pack: Data of the page.
+        name: Name of the file of the page.
+    """
     pack = {**dict.fromkeys(_OPTIONAL, ()), **pack}
     pack["budgets"] = offer_budgets(pack)
     names = {look["key"]: look["name"] for look in pack["filters"]}
@@ -86,7 +91,11 @@ def render_page(pack: Mapping[str, Any], name: str = "index.html") -> dict[str, 
 
 
 def render_markdown(pack: Mapping[str, Any]) -> str:
-    """Render the page of a study as Markdown, one screen."""
+    """Render the page of a study as Markdown, one screen.
+
+    Args:
+        pack: Data of the page.
+    """
     pack = {"headline": "", "failures": (), "choices": (), "paper_figures": (), **pack}
     template = template_environment(_HERE, is_html=False).get_template("report.md.jinja")
     return template.render(_describe_page(pack))
