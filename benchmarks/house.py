@@ -102,6 +102,7 @@ def sir(work: Any, dtype: torch.dtype, engine: str = "eager") -> Filter:
 
 def ckf(work: Any, dtype: torch.dtype, engine: str = "eager") -> Filter:
     """The project's cubature filter, as it is configured."""
+    job.register_experiments()
     with initialize_config_module("pfbench.conf", version_base="1.3"):
         method = job.instantiate(compose("config", ["filter=ckf"])["filter"])
     return of(method, 1, work, dtype, engine)

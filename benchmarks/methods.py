@@ -37,7 +37,8 @@ STORE = HERE / "methods.json"
 
 def methods(particles: int) -> dict[str, Any]:
     """Every filter that can be composed, by the name of its yaml; networks cost the same before they are trained."""
-    names = sorted(path.stem for path in (HERE.parent / "conf" / "filter").glob("*.yaml"))
+    names = job.list_groups()["filter"]
+    job.register_experiments()
     with initialize_config_module("pfbench.conf", version_base="1.3"):
         words = (
             f"particles={particles}",
@@ -52,6 +53,7 @@ def methods(particles: int) -> dict[str, Any]:
 
 def flights(runs: int, steps: int) -> tuple[Any, Record]:
     """The first steps of simulated flights and the model of all filters."""
+    job.register_experiments()
     with initialize_config_module("pfbench.conf", version_base="1.3"):
         cfg = compose(
             "config", ["scenario=flight_500s", "model=ins_gnss_inflated", "episode_cache_dir=null"]

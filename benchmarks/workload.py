@@ -132,6 +132,7 @@ def _nominal(steps: int, seed: int) -> InsIntervals:
 
 
 def _configured() -> Any:
+    job.register_experiments()
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         return compose(
             "config",

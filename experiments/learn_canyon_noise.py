@@ -43,7 +43,7 @@ from tqdm import tqdm
 from pfbench.core import PhiloxStream, Record
 from pfbench.files import markdown_bullets, markdown_head, markdown_paragraph, markdown_row
 from pfbench.filter import ParticleFilter, run_filter
-from pfbench.job import instantiate
+from pfbench.job import instantiate, register_experiments
 from pfbench.model import (
     LosNlosRangeError,
     NormalExponentialMixture,
@@ -121,6 +121,7 @@ def drive(stretch: str, interval: float = 1.0) -> UrbanDrive:
         f"scenario.end_s={end}",
         f"scenario.receiver.fix_interval_s={interval}",
     ]
+    register_experiments()
     with initialize_config_module("pfbench.conf", version_base="1.3"):
         cfg = compose("config", ["scenario=recorded_berlin", *places])
     scenario: UrbanDrive = instantiate(cfg.scenario)

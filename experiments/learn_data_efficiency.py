@@ -52,7 +52,7 @@ from pfbench.filter import (
     TaylorLinearisation,
     run_filter,
 )
-from pfbench.job import instantiate
+from pfbench.job import instantiate, register_experiments
 from pfbench.learn import Training, draw_training_data, train
 from pfbench.model import StateSpaceModel, StochasticVolatility
 from pfbench.noise import NominalNoise
@@ -101,6 +101,7 @@ class Case:
 
 def navigation(name: str) -> tuple[StateSpaceModel, Scenario]:
     """A scenario of the configuration with the model of its filters."""
+    register_experiments()
     with initialize_config_module("pfbench.conf", version_base="1.3"):
         cfg = compose("config", [f"scenario={name}"])
     return instantiate(cfg.model), instantiate(cfg.scenario)

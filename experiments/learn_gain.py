@@ -45,7 +45,7 @@ from pfbench.filter import (
     TaylorLinearisation,
     run_filter,
 )
-from pfbench.job import instantiate
+from pfbench.job import instantiate, register_experiments
 from pfbench.learn import Training, draw_training_data, train
 from pfbench.model import StateSpaceModel
 from pfbench.report import COLUMN, RC, line_styles, render_palette_png
@@ -93,6 +93,7 @@ def build(world: str, method: str = "sir", particles: int = PARTICLES) -> Any:
     scenario, noise = world.split(", ")
     words = [f"scenario={scenario}", f"noise={noise}", f"filter={method}", f"particles={particles}"]
     words += ["tuned=flight_500s_with_ins_gnss_inflated"]  # another world, as the page says
+    register_experiments()
     with initialize_config_module("pfbench.conf", version_base="1.3"):
         return compose("config", words)
 

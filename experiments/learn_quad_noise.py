@@ -40,7 +40,7 @@ from pfbench.filter import (
     TaylorLinearisation,
     run_filter,
 )
-from pfbench.job import instantiate
+from pfbench.job import instantiate, register_experiments
 from pfbench.model import StrapdownTotal, StrapdownTuning
 from pfbench.noise import NominalNoise
 from pfbench.ppl import (
@@ -79,6 +79,7 @@ REPEATS = 3  # of each flight, with other errors of fixes and start
 
 
 def make_scenario(flights: tuple[int, ...], step: float) -> RecordedFlights:
+    register_experiments()
     with initialize_config_module("pfbench.conf", version_base="1.3"):
         cfg = compose(
             "config",

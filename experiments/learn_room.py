@@ -42,7 +42,7 @@ from pfbench.filter import (
     TaylorLinearisation,
     normalise_log_weights,
 )
-from pfbench.job import instantiate
+from pfbench.job import instantiate, register_experiments
 from pfbench.model import StateSpaceModel, StaticModel
 from pfbench.report import COLUMN, RC, add_legend, line_styles, render_palette_png
 from pfbench.scenario import RecordingRegime
@@ -78,6 +78,7 @@ def draw_record(words: str, runs: int, steps: int | None) -> tuple[StateSpaceMod
         ValueError: If recorded data are missing.
     """
     scenario, *choices = words.split(",")
+    register_experiments()
     with initialize_config_module("pfbench.conf", version_base="1.3"):
         cfg = compose("config", [f"scenario={scenario}", *choices])
     model, recorder = instantiate(cfg.model), RecordingRegime(instantiate(cfg.noise))

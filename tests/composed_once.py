@@ -23,6 +23,7 @@ from hydra.core.utils import JobRuntime
 from hydra.types import RunMode
 from omegaconf import _utils
 
+from pfbench.job.config import register_experiments
 from pfbench.results.paper_block import conf_dir
 
 READS_MORE = re.compile(r"\$|hydra")
@@ -67,6 +68,7 @@ class TwoSafeParsers(TwoParsers):
 
 def install() -> None:
     """Make Hydra return copies of what it has composed before, and YAML be read by the parser in C."""
+    register_experiments()
     _utils.get_yaml_loader = lambda: TwoParsers
     yaml.safe_load = lambda stream: yaml.load(stream, Loader=TwoSafeParsers)  # type: ignore[arg-type]
     ConfigLoaderImpl._load_configuration_impl = compose_once  # type: ignore[method-assign,assignment]

@@ -2,39 +2,33 @@
 
 from __future__ import annotations
 
-import re
 import tempfile
 from copy import deepcopy
 from functools import cache
 from pathlib import Path
 
 import torch
-from hydra import compose, initialize_config_dir
+import yaml
 from omegaconf import DictConfig
 
 from pfbench import job
 from pfbench.core.record import Episode, Record, map_inputs
+from pfbench.job.config import compose_tree
 from pfbench.logs.sky.raw_log import write_raw_log
 from pfbench.noise.base import NominalNoise
+from pfbench.results.paper_block import list_named_parts, read_part
 
 CONF = job.conf_dir()
 
 SEED, RUNS, STEPS = 1, torch.arange(2), 5
 
-GROUPS = {
-    group: [file.stem for file in sorted((CONF / group).glob("*.yaml"))]
-    for group in ("filter", "model", "noise", "scenario")
-}
+GROUPS = {group: list_named_parts(group) for group in ("filter", "model", "noise", "scenario")}
 
 
 @cache
 def composed(*words: str) -> DictConfig:
     """Compose a configuration, to be read only: equal words are composed once, in 0.25 s."""
-    job.register_experiments()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose(
-            "config", ["checkpoint=untrained", "episode_cache_dir=null", "particles=30", *words]
-        )
+    return compose_tree(["checkpoint=untrained", "episode_cache_dir=null", "particles=30", *words])
 
 
 def truncated(episode: Episode, steps: int = STEPS) -> Episode:
@@ -69,11 +63,16 @@ def world(scenario: str) -> Episode:
     return WORLDS[scenario]
 
 
-def is_recorded(file: Path) -> bool:
+def list_bases(group: str, name: str) -> list[str]:
+    """List the names of its group on which a name is built."""
+    entries = yaml.safe_load(read_part(group, name)).get("defaults", ())
+    return [base for base in entries if isinstance(base, str) and base != "_self_"]
+
+
+def is_recorded(scenario: str) -> bool:
     """Return whether a scenario, or one that it starts from, reads recorded data."""
-    text = file.read_text()
-    starts = [file.with_name(f"{name}.yaml") for name in re.findall(r"^  - (\w+)$", text, re.M)]
-    return "${data.root}" in text or any(f.is_file() and is_recorded(f) for f in starts)
+    is_own = "${data.root}" in read_part("scenario", scenario)
+    return is_own or any(map(is_recorded, list_bases("scenario", scenario)))
 
 
-RECORDED = [file.stem for file in sorted((CONF / "scenario").glob("*.yaml")) if is_recorded(file)]
+RECORDED = [name for name in GROUPS["scenario"] if is_recorded(name)]

@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any
 
 import torch
-from config_cases import CONF
+from config_cases import CONF, GROUPS
 from hydra import compose, initialize_config_dir
 
 from pfbench import job
@@ -16,10 +16,11 @@ from pfbench.core.record import Record
 from pfbench.filter.gaussian.linearisation_rules import SigmaPointLinearisation
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.model.base import StateSpaceModel
+from pfbench.results.paper_block import read_part
 
 SLOTS = 30
 
-TEXTS = {file.stem: file.read_text() for file in sorted((CONF / "filter").glob("*.yaml"))}
+TEXTS = {name: read_part("filter", name) for name in GROUPS["filter"]}
 
 NEEDS_TRAINING = ("neural_", "kalman_net")  # starts of the names of filters with a network
 

@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Iterator
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -22,7 +21,6 @@ from config_cases import (
     world,
 )
 from filter_cases import NEEDS_ATTITUDE, UNPRINTED, method_of
-from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf, open_dict
 from recorded_data import DATA
@@ -34,14 +32,25 @@ from pfbench.core.record import Episode, MeasurementChannels
 from pfbench.filter.exactness import has_covariance
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.job.config import expand_filter_names
+from pfbench.job.config import compose_tree, expand_filter_names, list_groups
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.job.tuned_knobs import select_knobs
 from pfbench.model.base import StateSpaceModel
+from pfbench.results.paper_block import read_part
 from pfbench.results.store import compute_config_key
 
-FILES = [*sorted(CONF.rglob("*.yaml")), *sorted(job.experiments_dir().glob("*.yaml"))]
-EXPERIMENTS = [file.stem for file in sorted(job.experiments_dir().glob("*.yaml"))]
+TEXTS = {
+    f"{group}/{name}": read_part(group, name)
+    for group, names in list_groups().items()
+    for name in names
+}
+ALONE = [
+    CONF / "config.yaml",
+    *(CONF / "reading").glob("*.yaml"),
+    *(CONF / "hydra").rglob("*.yaml"),
+]
+TEXTS |= {f"{file.relative_to(CONF)}": file.read_text() for file in ALONE}
+EXPERIMENTS = list_groups()["experiment"]
 
 
 def targets(node: Any) -> Iterator[str]:
@@ -53,8 +62,8 @@ def targets(node: Any) -> Iterator[str]:
             yield from targets(part)
 
 
-def raw(file: Path) -> dict[str, Any]:
-    read = OmegaConf.to_container(OmegaConf.load(file), resolve=False)
+def raw(text: str) -> dict[str, Any]:
+    read = OmegaConf.to_container(OmegaConf.create(text), resolve=False)
     assert isinstance(read, dict)
     return {str(key): value for key, value in read.items()}
 
@@ -62,14 +71,11 @@ def raw(file: Path) -> dict[str, Any]:
 # what is written
 
 
-def has_description(file: Path) -> bool:
-    """Return whether a file begins with a comment of one sentence, which `pfbench list` prints."""
-    first, *rest = [
-        line for line in file.read_text().splitlines() if not line.startswith("# @package")
-    ]
+def has_description(text: str) -> bool:
+    """Return whether a text begins with a comment of one sentence, which `pfbench list` prints."""
+    first, *rest = [line for line in text.splitlines() if not line.startswith("# @package")]
     is_sentence = first.rstrip()[-1] in ".]?)" or "pfbench run" in first
-    is_listed = file.parent.parent != CONF or file.parent.name not in GROUPS
-    is_listed = is_listed or read_description(file) == first.removeprefix("# ").strip()
+    is_listed = read_description(text) == first.removeprefix("# ").strip()
     return (
         first.startswith("# ")
         and 10 < len(first) <= 130
@@ -79,12 +85,12 @@ def has_description(file: Path) -> bool:
     )
 
 
-def lies_in_the_folder_of_its_class(file: Path) -> bool:
-    content = raw(file)
+def lies_in_the_folder_of_its_class(group: str, text: str) -> bool:
+    content = raw(text)
     if "_target_" not in content:  # it builds on another yaml of its group
         based = [part for part in content["defaults"] if isinstance(part, str) and part != "_self_"]
-        return len(based) == 1 and based[0] in GROUPS[file.parent.name]
-    folder = {"train": "learn"}.get(file.parent.name, file.parent.name)
+        return len(based) == 1 and based[0] in GROUPS[group]
+    folder = {"train": "learn"}.get(group, group)
     stages = targets(content) if folder == "filter" else [content["_target_"]]
     return all(target.startswith(f"pfbench.{folder}.") for target in stages)
 
@@ -95,20 +101,21 @@ def names_a_local_path(text: str) -> bool:
 
 
 def test_yaml_files_follow_the_rules() -> None:
-    assert len(FILES) > 150
-    assert [file.name for file in FILES if not has_description(file)] == []
-    grouped = [file for file in FILES if file.parent.name in GROUPS]
-    assert [file.name for file in grouped if not lies_in_the_folder_of_its_class(file)] == []
-    assert [file.name for file in FILES if names_a_local_path(file.read_text())] == []
+    assert len(TEXTS) > 300
+    assert [name for name, text in TEXTS.items() if not has_description(text)] == []
+    grouped = {name: name.partition("/")[0] for name in TEXTS}
+    assert [
+        n
+        for n, g in grouped.items()
+        if g in GROUPS and not lies_in_the_folder_of_its_class(g, TEXTS[n])
+    ] == []
+    assert [name for name, text in TEXTS.items() if names_a_local_path(text)] == []
 
 
-def test_the_rules_for_yaml_files_find_faults(tmp_path: Path) -> None:
-    folder = tmp_path / "noise"
-    folder.mkdir()
-    file = folder / "a.yaml"
-    file.write_text("_target_: pfbench.filter.Systematic\n")
-    assert not has_description(file)
-    assert not lies_in_the_folder_of_its_class(file)
+def test_the_rules_for_yaml_files_find_faults() -> None:
+    text = "_target_: pfbench.filter.Systematic\n"
+    assert not has_description(text)
+    assert not lies_in_the_folder_of_its_class("noise", text)
     assert all(map(names_a_local_path, ("root: /home/me/data", "root: ~/data", "root: 'C:/data'")))
 
 
@@ -247,8 +254,7 @@ def test_every_regime_gives_errors(scenario: str, noise: str) -> None:
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_the_choices_of_every_experiment_compose(experiment: str) -> None:
     """All values are composed, but of filters and regimes, which test_every_filter composes, only the first and the last."""
-    job.register_experiments()
-    content = raw(job.experiments_dir() / f"{experiment}.yaml")
+    content = raw(TEXTS[f"experiment/{experiment}"])
     # `pfbench report` finds what +experiment=NAME made; NAME_5000 adds jobs to the study NAME
     assert content["study"] in EXPERIMENTS
     assert experiment.startswith(content["study"])
@@ -264,12 +270,7 @@ def test_the_choices_of_every_experiment_compose(experiment: str) -> None:
     cells, names = {*range(number), max(map(len, swept.values())) - 1}, set()
     for k in cells:
         cell = [f"{key}={values[k % len(values)]}" for key, values in swept.items()]
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            cfg = compose(
-                "config",
-                [f"+experiment={experiment}", *cell, "data.root=somewhere"],
-                return_hydra_config=True,
-            )
+        cfg = compose_tree([f"+experiment={experiment}", *cell, "data.root=somewhere"])
         HydraConfig.instance().set_config(cfg)  # an experiment may look up what was chosen
         select_knobs(cfg, cfg.hydra.runtime.choices, ())
         with open_dict(cfg):

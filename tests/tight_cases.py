@@ -6,11 +6,10 @@ from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from torch import Tensor
 
 from pfbench.core.record import Episode, Record
-from pfbench.job import conf_dir
+from pfbench.job.config import compose_tree
 from pfbench.model.tight_coupling import SinsGnssTight, TightStep
 from pfbench.nav import earth
 from pfbench.nav.aiding import AlignmentErrors, ProcessNoiseInflation
@@ -60,8 +59,7 @@ def linear(
 
 
 def composed(*words: str) -> Any:
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose("config", ["episode_cache_dir=null", *words])
+    return compose_tree(["episode_cache_dir=null", *words])
 
 
 def kalman(model: SinsGnssTight, record: Record) -> tuple[Tensor, Tensor, Tensor]:

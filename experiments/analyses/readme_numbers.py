@@ -21,6 +21,7 @@ from typing import Any
 
 import pfbench
 from pfbench.files import markdown_bullets
+from pfbench.job import list_groups
 from pfbench.report import find_overviews, read_stored_study, tabulate_heat_map
 
 TOP = Path(__file__).parents[2]
@@ -405,13 +406,9 @@ def contents() -> str:
     """List what the package has, with its numbers of parts."""
 
     def count(group: str) -> int:
-        return len(list((TOP / "conf" / group).glob("*.yaml")))
+        return len(list_groups()[group])
 
-    sets = [
-        name
-        for name in pfbench.names("filter")
-        if not (TOP / "conf" / "filter" / f"{name}.yaml").is_file()
-    ]
+    sets = [name for name in pfbench.names("filter") if name not in list_groups()["filter"]]
 
     decided = re.findall(
         r"(\d+) (confirmed|refuted|depends|untestable|open|not run)", claims_2().split("\n")[0]

@@ -16,6 +16,7 @@ from pfbench.cli.compose import read_description
 from pfbench.cli.main import COMMANDS, USAGE, open_module
 from pfbench.job import conf_dir
 from pfbench.job.config import list_groups
+from pfbench.results.paper_block import read_part
 
 Pages = dict[str, str]
 _GROUPS = {  # title and first sentence of the page of a group
@@ -133,10 +134,10 @@ def describe_constant(module: str, name: str) -> str:
 
 def _write_keys() -> Pages:
     """Write the table of the keys of a job, and a page for each group."""
-    groups = {name: files for name, files in list_groups().items() if name in _GROUPS}
+    groups = {name: names for name, names in list_groups().items() if name in _GROUPS}
     rows = [
-        f"| [{name}]({name}.md) | {len(files)} | {_GROUPS[name][1]} |"
-        for name, files in sorted(groups.items())
+        f"| [{name}]({name}.md) | {len(names)} | {_GROUPS[name][1]} |"
+        for name, names in sorted(groups.items())
     ]
     lines = [
         "# Keys of the configuration", "",
@@ -144,11 +145,11 @@ def _write_keys() -> Pages:
         "`pfbench.run(..., particles=1000)`, with two underscores for a point. `pfbench run --cfg job` prints all keys of a job.", "",
         "## Keys of a job", "", "| key | default | meaning |", "|---|---|---|",
         *(f"| `{key}` | `{value}` | {_escape(text)} |" for key, value, text in read_keys()), "",
-        "## Groups", "", "| group | files | content |", "|---|---|---|", *rows, "",
+        "## Groups", "", "| group | names | content |", "|---|---|---|", *rows, "",
         "```{toctree}", ":hidden:", "", *sorted(groups), "```", "",
     ]  # fmt: skip
     pages = {
-        f"reference/keys/{name}.md": _format_group(name, files) for name, files in groups.items()
+        f"reference/keys/{name}.md": _format_group(name, names) for name, names in groups.items()
     }
     return {"reference/keys/index.md": "\n".join(lines), **pages}
 
@@ -173,15 +174,14 @@ def read_keys() -> list[tuple[str, str, str]]:
     return keys
 
 
-def _format_group(group: str, files: list[Path]) -> str:
-    """Format the page of a group: each file with its description and its keys."""
+def _format_group(group: str, names: list[str]) -> str:
+    """Format the page of a group: each name with its description and its keys."""
     title, sentence = _GROUPS[group]
     lines = [f"# {title}", "", sentence, ""]
-    for file in files:
-        text = file.read_text(encoding="utf-8").strip()
-        lines += [f"## {file.stem}", "", read_description(file).replace("[", "\\["), ""]
-        if group != "tuned":  # which has the record of all candidates
-            lines += [":::{dropdown} Keys and values", "```yaml", text, "```", ":::", ""]
+    for name in names:
+        text = read_part(group, name).strip()
+        lines += [f"## {name}", "", read_description(text).replace("[", "\\["), ""]
+        lines += [":::{dropdown} Keys and values", "```yaml", text, "```", ":::", ""]
     return "\n".join(lines)
 
 

@@ -9,6 +9,7 @@ from pfbench.cli.messages import format_error
 from pfbench.core.parameter_checks import require
 from pfbench.files.command_start import collect_rarely, start_work
 from pfbench.job.config import compose, list_groups
+from pfbench.results.paper_block import read_part
 
 HELP = """\
 pfbench check
@@ -48,12 +49,12 @@ _ADDED = ("experiment", "infer")  # groups that are not in the list of defaults
 
 def _compose_all() -> Iterator[tuple[str, str]]:
     """Yield the choice of each configuration file, and its error or an empty text."""
-    for group, files in list_groups().items():
-        for path in files:
+    for group, names in list_groups().items():
+        for name in names:
             sign = "+" if group in _ADDED else ""
-            choice = f"{sign}{group}={path.stem}"
+            choice = f"{sign}{group}={name}"
             try:
-                compose([choice, *_matching_scenario(group, path.stem), "data.root=somewhere"])
+                compose([choice, *_matching_scenario(group, name), "data.root=somewhere"])
                 yield choice, ""
             except Exception as error:
                 yield choice, format_error(error, [choice])
@@ -66,7 +67,7 @@ def _matching_scenario(group: str, name: str) -> list[str]:
     parts = name.split("_")
     for model in ("_".join(parts[:n]) for n in range(len(parts), 0, -1)):
         entry = f"/model@_global_.model: {model}\n"
-        for path in list_groups()["scenario"]:
-            if entry in path.read_text():
-                return [f"scenario={path.stem}"]
+        for scenario in list_groups()["scenario"]:
+            if entry in read_part("scenario", scenario):
+                return [f"scenario={scenario}"]
     return []

@@ -8,14 +8,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice, product
-from pathlib import Path
 from typing import Any, NoReturn
 
 from pfbench.cli.messages import format_flag, suggest_similar
 from pfbench.core.parameter_checks import require
 from pfbench.job.config import CHOICES, JobConfig, compose, compose_tree, expand_filter_sets
 from pfbench.job.trust import UntrustedConfigError, check_study, trusted_packages
-from pfbench.results.paper_block import PAPER, conf_dir, experiments_dir
+from pfbench.results.paper_block import PAPER, experiments_dir, list_named_parts
 
 # --------------------------------------------------------------------------------------------------
 # Configurations of commands: sweeps, experiments and descriptions of files.
@@ -98,10 +97,9 @@ def read_sweep(experiment: str) -> list[str]:
     return expand_filter_sets([f"{name}={value}" for name, value in params.items()])
 
 
-def read_description(path: Path) -> str:
-    """Read the first comment of a configuration file, its description."""
-    lines = path.read_text().splitlines()
-    first = next((line for line in lines if not line.startswith("# @package")), "")
+def read_description(text: str) -> str:
+    """Read the first comment of the text of a configuration file, its description."""
+    first = next((line for line in text.splitlines() if not line.startswith("# @package")), "")
     return first.removeprefix("#").strip() if first.startswith("#") else ""
 
 
@@ -240,15 +238,9 @@ def _check_sweep(overrides: list[str]) -> JobConfig | None:
             if key == "study":
                 check_study(value.strip("'\""))
             is_plain = key in values and not isinstance(values[key], Mapping)
-            if not is_plain and not _is_own_file(key, value):
+            if not is_plain and value not in list_named_parts(key):
                 _check_composition([*first[:index], option, *first[index + 1 :]])
     return config
-
-
-def _is_own_file(group: str, name: str) -> bool:
-    """Return whether a choice of a group is a file of pfbench."""
-    folder = experiments_dir() if group == "experiment" else conf_dir() / group
-    return (folder / f"{name}.yaml").is_file()
 
 
 # --------------------------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ def add_search_path(words: Sequence[str]) -> list[str]:
     from pfbench.job.config import list_groups
 
     for match in filter(None, map(_CHOICE.fullmatch, words)):
-        names = set(match[2].split(",")) - {path.stem for path in list_groups().get(match[1], ())}
+        names = set(match[2].split(",")) - {*list_groups().get(match[1], ())}
         has_knobs = match[1] == "filter" and re.search(r"_tuned\b|tuned_baselines", match[2])
         if names & {path.stem for path in list_own_files(match[1])} or (
             has_knobs and list_own_files("tuned")

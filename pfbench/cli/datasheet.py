@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from pfbench.cli.compose import given_keys, read_description
 from pfbench.job.config import compose
-from pfbench.results.paper_block import conf_dir
+from pfbench.results.paper_block import read_part
 
 HELP = """\
 pfbench datasheet scenario=NAME [noise=NAME] [runs=20] [key=value ...]
@@ -29,8 +29,9 @@ def report_scenario(words: Sequence[str]) -> None:
     from pfbench.report.datasheet import write_datasheet
 
     config = compose(words if "runs" in keys else [*words, f"runs={RUNS}"])
-    file = conf_dir() / "scenario" / f"{config.choices['scenario']}.yaml"
-    data = build_datasheet(config, read_description(file) if file.exists() else "")
+    data = build_datasheet(
+        config, read_description(read_part("scenario", config.choices["scenario"]))
+    )
     page = write_datasheet(
         data, config.values["reports_dir"], tuple(config.values["report"]["figure_formats"])
     )

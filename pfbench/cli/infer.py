@@ -93,7 +93,7 @@ def _read_words(words: Sequence[str]) -> tuple[str, list[str]]:
     if not {"model", "scenario"} & keys or "method" not in keys:
         missing = "method" if {"model", "scenario"} & keys else "model"
         raise ValueError(f"{missing} must be set. {_USAGE}")
-    methods = [path.stem for path in list_groups()["infer"]]
+    methods = list_groups()["infer"]
     words_by_key = {word.partition("=")[0]: word.partition("=")[2] for word in words}
     method = words_by_key["method"]
     if method not in methods:
@@ -114,8 +114,7 @@ def _read_words(words: Sequence[str]) -> tuple[str, list[str]]:
 
 def _find_scenario(model: str) -> str:
     """Return the scenario of the name of a model."""
-    names = [path.stem for path in list_groups()["scenario"]]
-    if model not in names:
+    if model not in list_groups()["scenario"]:
         raise ValueError(
             f"scenario must be set for model={model}, since none has its name. Choose one: pfbench list scenario"
         )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from pathlib import Path
 
 from pfbench.cli.compose import given_keys, read_description
 from pfbench.cli.current_folder import list_own_files
 from pfbench.cli.messages import suggest_similar
 from pfbench.job.config import FILTER_SETS, list_groups
+from pfbench.results.paper_block import read_part
 
 HELP = """\
 pfbench list [GROUP] [key=value ...]
@@ -27,35 +27,36 @@ def list_options(words: Sequence[str]) -> None:
     """Print the configuration groups, or the files of one group."""
     groups = list_groups()
     if not words:
-        for group, files in groups.items():
-            print(f"{group:12} {', '.join(sorted(path.stem for path in files))}")
+        for group, names in groups.items():
+            print(f"{group:12} {', '.join(names)}")
         print("\nNext: pfbench list GROUP")
         return
     _check_group(words[0], list(groups))
-    files = list_files(words[0])
+    texts = describe_files(words[0])
     if len(words) > 1:
-        names = _list_fitting(words[0], words[1:])
-        files = [path for path in files if path.stem in names]
-    for path in files:
-        print(f"{path.stem:24} {read_description(path)}")
-    if not files:
+        fitting = _list_fitting(words[0], words[1:])
+        texts = {name: text for name, text in texts.items() if name in fitting}
+    for name, text in texts.items():
+        print(f"{name:24} {text}")
+    if not texts:
         print(f"No shipped {words[0]} fits.")
 
 
-def list_files(group: str) -> list[Path]:
-    """List the files of a group, those of the current folder included."""
-    return sorted([*list_groups()[group], *list_own_files(group)])
+def describe_files(group: str) -> dict[str, str]:
+    """Return the descriptions of a group by name, those of the current folder last."""
+    texts = {name: read_part(group, name) for name in list_groups()[group]}
+    texts |= {path.stem: path.read_text() for path in list_own_files(group)}
+    return {name: read_description(text) for name, text in texts.items()}
 
 
 def describe_choices(group: str | None) -> dict[str, str]:
     """Return the descriptions of the files of a group by name, or the groups with their numbers of files."""
     groups = list_groups()
     if group is None:
-        return {name: f"{len(list_files(name))} names" for name in groups}
+        return {name: f"{len(describe_files(name))} names" for name in groups}
     _check_group(group, list(groups))
     sets = {name: ", ".join(names) for name, names in FILTER_SETS.items()}
-    texts = {path.stem: read_description(path) for path in list_files(group)}
-    return {**texts, **(sets if group == "filter" else {})}
+    return {**describe_files(group), **(sets if group == "filter" else {})}
 
 
 def _check_group(group: str, groups: Sequence[str]) -> None:

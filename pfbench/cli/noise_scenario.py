@@ -16,13 +16,12 @@ _PLAIN = ("gyro_density", "accelerometer_density", "gyro_bias_walk", "accelerome
 
 def check_scenario_name(name: str, folder: str) -> Path:
     """Return the file of a scenario, which must not be one that another command or a person wrote."""
-    from pfbench.results.paper_block import conf_dir
+    from pfbench.results.paper_block import list_named_parts
 
     require(re.fullmatch(r"\w+", name), "name", "consist of letters, digits and underscores", name)
     path = Path(folder) / "scenario" / f"{name}.yaml"
-    is_own = not path.is_file() or path.read_text(encoding="utf-8").startswith(_FIRST)
-    is_own = is_own and not (conf_dir() / "scenario" / f"{name}.yaml").is_file()
-    require(is_own, "name", "be that of a new file, or of one that this command wrote", name, "Add name=NAME.")  # fmt: skip
+    is_new = not path.is_file() or path.read_text(encoding="utf-8").startswith(_FIRST)
+    require(is_new and name not in list_named_parts("scenario"), "name", "be that of a new file, or of one that this command wrote", name, "Add name=NAME.")  # fmt: skip
     return path
 
 

@@ -177,10 +177,10 @@ def _describe_use(folder: Path, words: Sequence[str]) -> str:
 
 def _check_new_name(name: str, folder: Path) -> None:
     """Check that the name of a file of a user's own folder differs from those of pfbench, since a run refuses it."""
-    from pfbench.results.paper_block import conf_dir
+    from pfbench.results.paper_block import read_families
 
     require(
-        folder.resolve() == conf_dir() or not (conf_dir() / "tuned" / f"{name}.yaml").is_file(),
+        name not in read_families("tuned"),
         "name",
         f"differ from pfbench's own tuned={name}",
         f"the same for a file of {folder}",

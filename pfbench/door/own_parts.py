@@ -321,7 +321,7 @@ class _NodeWriter:
         import yaml
 
         name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|\W+", "_", title).strip("_").lower()
-        if name in {path.stem for path in list_groups()[group]}:
+        if name in list_groups()[group]:
             name = f"own_{name}"
         head: dict[str, Any] = {}
         if self.model is not None:

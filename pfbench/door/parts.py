@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
-from pfbench.cli.list import list_files
+from pfbench.cli.list import describe_files
 from pfbench.cli.messages import format_error, format_unknown_choice, is_named, notes_of
 from pfbench.core.parameter_checks import require
 
@@ -132,7 +132,7 @@ def get_part(group: str, name: str, /, **changes: Any) -> Part:
         raise TypeError(
             f"{group} must be a name, got {describe_value(name)}. List the names: pfbench.names({group!r})."
         )
-    names = [path.stem for path in list_files(group)]
+    names = list(describe_files(group))
     if name not in names:
         message = format_unknown_choice(group, name, names)
         raise ValueError(message)

@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache, partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pfbench.core.parameter_checks import require
@@ -24,9 +23,12 @@ from pfbench.job.trust import (
 )
 from pfbench.job.tuned_knobs import TUNED, check_tuned_seed, mark_foreign, select_knobs
 from pfbench.results.paper_block import (
+    FAMILY_FOLDER,
     check_paper_blocks,
     conf_dir,
-    experiments_dir,
+    list_named_parts,
+    read_families,
+    read_part,
     remove_nested_blocks,
 )
 from pfbench.results.store import list_not_finite
@@ -201,15 +203,10 @@ def _take_knobs(tree: Any, choices: Mapping[str, str], trusted: Sequence[str]) -
     return False
 
 
-def list_groups() -> dict[str, list[Path]]:
-    """List the files of each configuration group and of the group `experiment`."""
-    folders = [
-        path
-        for path in sorted(conf_dir().iterdir())
-        if any(path.glob("*.yaml")) and path.name != READING
-    ]
-    groups = {folder.name: sorted(folder.glob("*.yaml")) for folder in folders}
-    return groups | {"experiment": sorted(experiments_dir().glob("*.yaml"))}
+def list_groups() -> dict[str, list[str]]:
+    """List the names of each configuration group and of the group `experiment`."""
+    groups = sorted({path.parent.name for path in conf_dir().glob("*/*.yaml")} - {READING})
+    return {group: list_named_parts(group) for group in [*groups, "experiment"]}
 
 
 @dataclass(eq=False)
@@ -236,23 +233,30 @@ class _LazyGroup(dict[str, Any]):
 
 
 def register_experiments() -> None:
-    """Register experiments/NAME.yaml with Hydra as the group `experiment`, and the readings as groups of their papers."""
+    """Register with Hydra what no file of its own has: experiments, readings of the papers, and names in families."""
     from hydra.core.config_store import ConfigStore
 
     repo = ConfigStore.instance().repo
-    repo["experiment"] = _LazyGroup(
-        lambda: [path.name for path in experiments_dir().glob("*.yaml")], _make_experiment
-    )
     repo[READING] = {
         path.stem: _LazyGroup(partial(_list_readings, path.stem), partial(_make_reading, path.stem))
         for path in (conf_dir() / READING).glob("*.yaml")
     }
+    for group in (
+        "experiment",
+        *(path.parent.name for path in conf_dir().glob(f"*/{FAMILY_FOLDER}")),
+    ):
+        repo[group] = _LazyGroup(partial(_list_stored, group), partial(_make_stored, group))
 
 
-def _make_experiment(name: str) -> Any:
-    """Load an experiment, again if its file changed."""
-    path = experiments_dir() / name
-    return _load_experiment(path, path.stat().st_mtime_ns)
+def _list_stored(group: str) -> list[str]:
+    """List the files that all experiments, or the names in the families of a group, stand for."""
+    names = list_named_parts(group) if group == "experiment" else read_families(group)
+    return [f"{name}.yaml" for name in names]
+
+
+def _make_stored(group: str, name: str) -> Any:
+    """Make the node of an experiment or of a name in a family."""
+    return _load_text(group, name, read_part(group, name.removesuffix(".yaml")))
 
 
 def _list_readings(group: str) -> list[str]:
@@ -271,16 +275,17 @@ def _make_reading(group: str, name: str) -> Any:
 
 
 @cache
-def _load_experiment(path: Path, changed_ns: int) -> Any:
-    """Load an experiment in its state at a time, with the filters of named sets in its sweep."""
+def _load_text(group: str, name: str, text: str) -> Any:
+    """Make the node of a text, with the filters of named sets in the sweep of an experiment."""
     from hydra.core.config_store import ConfigNode
     from omegaconf import OmegaConf
 
-    node: Any = OmegaConf.load(path)
+    node: Any = OmegaConf.create(text)
     params = OmegaConf.select(node, "hydra.sweeper.params")
     if params is not None and "filter" in params:
         params["filter"] = expand_filter_names(str(params["filter"]))
-    return ConfigNode(path.name, node, "experiment", "_global_", "pfbench.experiments")
+    package = "_global_" if group == "experiment" else None
+    return ConfigNode(name, node, group, package, f"pfbench.{group}")
 
 
 def _move_hydra_node(composed: DictConfig) -> None:
@@ -430,9 +435,11 @@ def check_simulated_model(values: Mapping[str, Any], choices: Mapping[str, str])
 
 def is_simulated_from(scenario: Any, name: str) -> bool:
     """Return whether a scenario is a shipped one that is simulated from the model of the same name."""
-    target = scenario.get("_target_") if isinstance(scenario, Mapping) else None
-    is_shipped = (conf_dir() / "scenario" / f"{name}.yaml").is_file()
-    return target == "pfbench.scenario.ModelSimulation" and is_shipped
+    return (
+        isinstance(scenario, Mapping)
+        and scenario.get("_target_") == "pfbench.scenario.ModelSimulation"
+        and name in list_named_parts("scenario")
+    )
 
 
 # --------------------------------------------------------------------------------------------------

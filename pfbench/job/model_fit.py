@@ -49,7 +49,7 @@ def explain_error(
             "model must be given with a scenario of your own, got that of flights. Use pfbench.run(scenario, filters, model=...)."
         )
     fitting = list_fitting_models(tree, trusted, scenario)
-    is_shipped = model in {path.stem for path in list_groups()["model"]}
+    is_shipped = model in list_groups()["model"]
     fits = model in fitting if is_shipped else target in fitting.values()
     if not fitting or fits or not target.startswith("pfbench."):
         return error
@@ -67,7 +67,7 @@ def list_fitting_models(
 
     Returns class of each model by the name of its file.
     """
-    names = [path.stem for path in list_groups()["model"]]
+    names = list_groups()["model"]
     # one composition for all: each costs as much as a hundred files
     nodes = compose_tree([f"+model@shipped.{name}={name}" for name in names])["shipped"]
     plain, models = _plain_values(tree), _plain_values(nodes)
@@ -83,7 +83,7 @@ def list_fitting_scenarios(words: Sequence[str]) -> list[str]:
     Returns names of their files.
     """
     fitting = []
-    for name in (path.stem for path in list_groups()["scenario"]):
+    for name in list_groups()["scenario"]:
         tree = compose_tree([f"scenario={name}", *words])
         is_own = tree.hydra.runtime.choices.get("model") == name
         if (is_own or not is_simulated_from(tree["scenario"], name)) and is_fitting(tree):

@@ -8,6 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 from itertools import combinations
 from pathlib import Path
+from textwrap import dedent
 from typing import Any
 
 import yaml
@@ -209,25 +210,16 @@ def describe_foreign(values: Mapping[str, Any]) -> str:
 # Nodes `paper` as the installed configuration files state them, without composition.
 
 _TUNED_DATA = "${tuned.data}"  # of a filter whose knobs are those of the group `tuned`
-_NAME = re.compile(r"\w+")
 _NODE = re.compile(rf"^{PAPER}:.*\n(?:[ \t]+.*\n?|[ \t]*\n)*", re.MULTILINE)
 
 
 @cache
 def read_paper_block(group: str, name: str) -> Mapping[str, Any]:
     """Read the node `paper` of an installed file; a variant does not inherit that of its parent."""
-    path = conf_dir() / group / f"{name}.yaml"
-    if not _NAME.fullmatch(name) or not path.is_file():
-        return {}
-    node = _NODE.search(path.read_text(encoding="utf-8"))
+    node = _NODE.search(read_part(group, name))
     block = (yaml.safe_load(node.group())[PAPER] or {}) if node else {}
     is_open = block.get("tuning") == _TUNED_DATA
     return {**block, "tuning": OWN_WORLD} if is_open else block
-
-
-def list_named_parts(group: str) -> list[str]:
-    """List the names of the installed files of a group."""
-    return [path.stem for path in sorted(Path(conf_dir() / group).glob("*.yaml"))]
 
 
 def plan_installed_pairs(labels: Collection[str]) -> list[tuple[str, str]]:
@@ -245,7 +237,44 @@ def plan_installed_pairs(labels: Collection[str]) -> list[tuple[str, str]]:
 
 
 # --------------------------------------------------------------------------------------------------
-# Folders of the configuration files, of the installed package or of the checkout.
+# Installed configuration files: their folders, and their texts by group and name. A file in the folder `families` of a group has several names as
+# keys, each with its description, as if each were a file. They are in Hydra's store (`pfbench.job.config`).
+
+FAMILY_FOLDER = "families"
+_ENTRY = re.compile(r"^(\w+):  # (.*)\n((?:  .*\n)*)", re.MULTILINE)
+
+
+@cache
+def read_families(group: str) -> Mapping[str, str]:
+    """Read the texts in the families of a group by name, each as that of a file of its own."""
+    files = [
+        path.read_text("utf-8") for path in (conf_dir() / group / FAMILY_FOLDER).glob("*.yaml")
+    ]
+    return {
+        name: f"# {about}\n{dedent(body)}"
+        for text in files
+        for name, about, body in _ENTRY.findall(text)
+    }
+
+
+def list_named_parts(group: str) -> list[str]:
+    """List the names of a group: those of its installed files and of its families."""
+    return sorted(
+        {*(path.stem for path in _group_dir(group).glob("*.yaml")), *read_families(group)}
+    )
+
+
+def read_part(group: str, name: str) -> str:
+    """Read the text of an installed file, empty if there is none."""
+    path = _group_dir(group) / f"{name}.yaml"
+    if re.fullmatch(r"\w+", name) and path.is_file():
+        return path.read_text(encoding="utf-8")
+    return read_families(group).get(name, "")
+
+
+def _group_dir(group: str) -> Path:
+    """Return the folder of a group."""
+    return experiments_dir() if group == "experiment" else conf_dir() / group
 
 
 def conf_dir() -> Path:

@@ -79,7 +79,7 @@ def test_the_page_states_the_stored_results_of_all_scenarios() -> None:
     assert ceiling.PAGE.read_text() == ceiling.page(stored)
     assert "feedback" in stored["azimuth_closed_loop"]["refused"]
     named = {name.split()[0] for name in stored} | set(" ".join(ceiling.LEFT_OUT).split("`"))
-    assert {file.stem for file in job.list_groups()["scenario"]} <= named
+    assert {*job.list_groups()["scenario"]} <= named
 
 
 def test_no_stored_limit_is_above_the_error_of_the_filter() -> None:

@@ -117,12 +117,12 @@ def test_tier_b_of_each_world_is_tuned_on_it() -> None:
         for study in robustness.STUDIES for world in robustness.read_study(study).facts.worlds
     })  # fmt: skip
     assert "not tuned here" not in text
-    foreign = tuned_worlds.tuned_table({"passive_3": tuned_worlds.read_tuning("flight_500s", "flight_500s (model ins_gnss_inflated, seed 1001, 20 runs; noise: nominal, outliers, student)")["data"]})  # fmt: skip
+    foreign = tuned_worlds.tuned_table({"passive_3": tuned_worlds.read_tuning("flight_500s", "flight_500s (model ins_gnss_inflated, seed 1001, 20 runs; noise: nominal, outliers, student)")[1]["data"]})  # fmt: skip
     assert "| `passive_3` | not tuned here: flight_500s (" in foreign
     check_refused(
         [
             (
-                r"must have a file of the tuning on moon, got none",
+                r"must have an entry of the tuning on moon, got none",
                 lambda: tuned_worlds.read_tuning("moon", "moon"),
             )
         ],

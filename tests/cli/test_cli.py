@@ -17,6 +17,7 @@ import pfbench as package
 from pfbench import job
 from pfbench.cli import check
 from pfbench.job import computation
+from pfbench.results.paper_block import list_named_parts
 
 WALK = ("scenario=linear_walk", "scenario.steps=5", "runs=2", "particles=20")
 no_cuda = pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a CUDA device")
@@ -380,7 +381,7 @@ def test_list_names_every_yaml(tmp_path: Path) -> None:
     assert said.code == 0
     lines = {line.split()[0]: line for line in said.out.splitlines() if line}
     for folder in ("filter", "model", "noise", "scenario", "report"):
-        assert all(file.stem in lines[folder] for file in (job.conf_dir() / folder).glob("*.yaml"))
+        assert all(name in lines[folder] for name in list_named_parts(folder))
     assert all(file.stem in lines["experiment"] for file in job.experiments_dir().glob("*.yaml"))
 
 
@@ -388,7 +389,7 @@ def test_list_of_a_group_says_what_each_one_is(tmp_path: Path) -> None:
     said = pfbench("list", "filter", home=tmp_path)
     assert said.code == 0
     assert "sir                      SIR: bootstrap particle filter" in said.out
-    assert len(said.out.splitlines()) == len(list((job.conf_dir() / "filter").glob("*.yaml")))
+    assert len(said.out.splitlines()) == len(list_named_parts("filter"))
 
 
 def test_a_link_of_a_stranger_s_folder_is_neither_listed_nor_written_through(
@@ -453,13 +454,16 @@ def test_check_finds_nothing_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(check, "compose", tenth)
     said = pfbench("check", home=tmp_path)
     assert said.code == 0, said.err
-    files = [*job.conf_dir().glob("*/*.yaml"), *job.experiments_dir().glob("*.yaml")]
-    added = {"experiments": "+experiment", "infer": "+infer"}  # groups that no job has by default
-    named = [(added.get(file.parent.name, file.parent.name), file.stem) for file in files]
+    added = {"experiment": "+experiment", "infer": "+infer"}  # groups that no job has by default
+    named = [
+        (added.get(group, group), name)
+        for group, names in job.list_groups().items()
+        for name in names
+    ]
     assert sorted(requested) == sorted(["", *(f"{group}={name}" for group, name in named)])
     rows = {line.split("  ")[0]: line.split() for line in said.out.splitlines()}
     assert rows["item"] == ["item", "value", "status"]
-    assert rows["configurations"][1:] == [str(len(files)), "of", str(len(files)), "ok"]
+    assert rows["configurations"][1:] == [str(len(named)), "of", str(len(named)), "ok"]
     assert rows["pfbench"][1:] == [package.__version__, "ok"]
     assert rows["torch"][1:] == [torch.__version__, "ok"]
     assert rows["data root"][2:4] == ["not", "set"]

@@ -11,19 +11,17 @@ from unittest import mock
 
 import pytest
 from command_line import environment
-from hydra import compose, initialize_config_dir
 
 from pfbench import job
 from pfbench.cli.messages import format_error
 from pfbench.cli.run import run_with_retries
 from pfbench.door import worker
 from pfbench.files.foreign_folder import start_python
+from pfbench.job.config import compose_tree
 
 
 def launcher(name: str, *words: str) -> Any:
-    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
-        composed = compose("config", [f"hydra/launcher={name}", *words], return_hydra_config=True)
-    return composed.hydra.launcher
+    return compose_tree([f"hydra/launcher={name}", *words]).hydra.launcher
 
 
 # presets

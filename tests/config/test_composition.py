@@ -33,7 +33,6 @@ def test_a_copied_composition_of_these_tests_is_that_of_hydra(
 ) -> None:
     """A change of a copy does not reach the next one."""
     words = ["scenario=linear_walk", "filter=rpf", "filter.particles=33", *mode]
-    job.register_experiments()
     with initialize_config_dir(str(job.conf_dir()), version_base="1.3", job_name="one"):
         for _ in range(2):
             loader = cast(ConfigLoaderImpl, GlobalHydra.instance().config_loader())

@@ -34,7 +34,6 @@ GROUPS = list_groups()
 def composed_by(loader: type[ConfigLoaderImpl], words: Sequence[str], mode: RunMode) -> DictConfig:
     """Compose by a loader, and by nothing that these tests or pfbench keep if it is Hydra's own."""
     version.setbase("1.3")
-    job.register_experiments()
     made = Hydra("app", loader(create_config_search_path(str(job.conf_dir()))))
     own = shared_loader.collect_choices_by_hydra
     is_shared = loader is shared_loader.SharedLoader
@@ -73,24 +72,24 @@ def is_same(words: Sequence[str], mode: RunMode = RunMode.RUN) -> bool:
 def chosen_together() -> Iterator[list[str]]:
     """Words that choose each file of each group, groups of independent files together: a composition takes 0.1 s."""
     together = [
-        [f"{group}={path.stem}" for path in paths]
-        for group, paths in GROUPS.items()
+        [f"{group}={name}" for name in names]
+        for group, names in GROUPS.items()
         if group not in ("model", "experiment", "infer")
     ]
     for place in range(max(map(len, together))):
         yield [words[place % len(words)] for words in together]
     for group in ("experiment", "infer"):  # that are not in the list of defaults
-        for path in GROUPS[group]:
-            yield [f"+{group}={path.stem}"]
-    for path in GROUPS["model"]:
-        yield [f"model={path.stem}", *_matching_scenario("model", path.stem)]
+        for name in GROUPS[group]:
+            yield [f"+{group}={name}"]
+    for name in GROUPS["model"]:
+        yield [f"model={name}", *_matching_scenario("model", name)]
 
 
 @pytest.mark.parametrize("part", range(3))
 def test_each_configuration_is_composed_as_by_hydra(part: int) -> None:
     words = list(chosen_together())
     named = {word.lstrip("+") for some in words for word in some}
-    assert named >= {f"{group}={path.stem}" for group, paths in GROUPS.items() for path in paths}
+    assert named >= {f"{group}={name}" for group, names in GROUPS.items() for name in names}
     for some in words[part::3]:
         assert is_same(some), some
 
@@ -170,8 +169,8 @@ def test_an_error_of_a_file_is_that_of_hydra(
 
 def test_no_file_of_pfbench_sets_the_mode_of_hydra() -> None:
     """So that words alone can."""
-    for path in GROUPS["experiment"]:
-        words = [f"+experiment={path.stem}"]
+    for name in GROUPS["experiment"]:
+        words = [f"+experiment={name}"]
         composed = composed_by(shared_loader.SharedLoader, words, RunMode.MULTIRUN)
         assert composed.hydra.mode is None
     for words in (["hydra.mode=RUN"], ["a=1", "++hydra.mode=RUN"], ["hydra={mode: RUN}"]):

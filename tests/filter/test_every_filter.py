@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from config_cases import CONF, GROUPS, RECORDED, composed, truncated, world
+from config_cases import GROUPS, RECORDED, composed, list_bases, truncated, world
 from filter_cases import EACH, NAMES, ON_ANY_MODEL, SLOTS, TEXTS, method_of, refusal
 from model_cases import tracker
 from particle_cases import HARD
@@ -32,7 +32,7 @@ from pfbench.filter.particle.weights import LookAheadWeights
 from pfbench.filter.proposed.swarm import SwarmProposal
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
-from pfbench.results.paper_block import read_paper_block
+from pfbench.results.paper_block import read_paper_block, read_part
 from pfbench.testing import (
     check_bounded_weights,
     check_causality,
@@ -135,12 +135,10 @@ WORLDS = (
 
 def model_of(scenario: str) -> str:
     """Return the default model of a scenario, as its file or the one it extends names it."""
-    text = (CONF / "scenario" / f"{scenario}.yaml").read_text()
+    text = read_part("scenario", scenario)
     if named := re.search(r"override /model@_global_\.model: (\w+)", text):
         return named[1]
-    base = re.search(r"^  - (?!_self_)(\w+)$", text, re.MULTILINE)
-    assert base
-    return model_of(base[1])
+    return model_of(*list_bases("scenario", scenario))
 
 
 def test_the_worlds_have_every_default_model() -> None:

@@ -6,12 +6,12 @@ import re
 
 import pytest
 import torch
-import yaml
 from checkout import ROOT
 from scipy import stats
 
 from pfbench import job
 from pfbench.job.raw_estimate import RawEstimate, compute_raw_estimate
+from pfbench.results.paper_block import read_paper_block
 
 
 def test_the_raw_error_of_a_measured_position_is_that_of_a_normal_variable() -> None:
@@ -37,8 +37,7 @@ def test_a_scenario_has_the_threshold_of_the_table_or_none() -> None:
     rows = [line.split(" | ") for line in lines if "raw estimate" not in line]
     assert len(rows) > 40
     for name, _, _, _, _, cell, _, _, *shares in rows:
-        content = yaml.safe_load((ROOT / "conf" / "scenario" / f"{name}.yaml").read_text())
-        stored = content.get("paper", {}).get("divergence_threshold")
+        stored = read_paper_block("scenario", name).get("divergence_threshold")
         assert stored == (None if "none" in cell else float(cell)), name
         ekf, sir, *wrong = (float(share) if share != "–" else 100.0 for share in shares)
         assert ("none" in cell) == (min(ekf, sir) > 10.0 or max(wrong) < 50.0), name

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from refusals import check_refused
 from scipy import stats
 from torch import Tensor
@@ -26,7 +25,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
     UnscentedPoints,
 )
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.job import conf_dir
+from pfbench.job.config import compose_tree
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.ins_gnss import InsGnss, LooseStep
 from pfbench.nav import attitude, earth, error_dynamics
@@ -64,8 +63,7 @@ def flight() -> Episode:
 
 
 def composed(*words: str) -> Any:
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose("config", list(words))
+    return compose_tree(list(words))
 
 
 # the transition

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from scipy import stats
 from torch import Tensor
 
@@ -25,7 +24,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
 )
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.job import conf_dir
+from pfbench.job.config import compose_tree
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.azimuth import (
     ErrorEquations,
@@ -119,8 +118,7 @@ def states(model: SinsGpsAzimuth, n: int, runs: int = 4) -> Tensor:
 
 
 def composed(*words: str) -> Any:
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose("config", ["episode_cache_dir=null", *words])
+    return compose_tree(["episode_cache_dir=null", *words])
 
 
 # the equations

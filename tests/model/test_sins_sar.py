@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from refusals import check_refused
 from scipy import stats
 from torch import Tensor
@@ -27,7 +26,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
 )
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.job import conf_dir
+from pfbench.job.config import compose_tree
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.sins_sar import SarStep, SinsSar
 from pfbench.nav import attitude, earth, error_dynamics
@@ -77,8 +76,7 @@ def flight() -> Episode:
 
 
 def composed(*words: str) -> Any:
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose("config", ["episode_cache_dir=null", *words])
+    return compose_tree(["episode_cache_dir=null", *words])
 
 
 def states(particles: int, scale: float = 1.0, runs: Tensor = RUNS) -> Tensor:

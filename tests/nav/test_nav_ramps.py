@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from nav_reference import errors, true_start
 from torch import Tensor
 
 from pfbench import job
-from pfbench.job import conf_dir
+from pfbench.job.config import compose_tree
 from pfbench.nav import attitude, earth
 from pfbench.nav.manoeuvres import (
     CosineRamp,
@@ -215,8 +214,7 @@ def test_a_cosine_must_begin_and_end_at_samples_and_a_cycloid_need_not() -> None
 
 
 def printed(scenario: str) -> TrajectoryData:
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = compose("config", [f"scenario={scenario}"])
+    cfg = compose_tree([f"scenario={scenario}"])
     made: TrajectoryData = job.instantiate(cfg.scenario).trajectory.generate(10.0)
     return made
 

@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
-from checkout import ROOT
 from matplotlib.figure import Figure
 from page_packs import build_pack
 from refusals import check_refused
@@ -49,6 +47,7 @@ from pfbench.report.journal.table_layout import (
 )
 from pfbench.report.methods_text import collect_methods_facts
 from pfbench.results.conditions import Condition, load_conditions
+from pfbench.results.paper_block import list_named_parts, read_paper_block
 
 HOSTILE = {0: r"A_b%$#&{}~^\x", 1: "Kürzel α [2]", 2: "$x^2$ <b>|"}
 needs_tex = pytest.mark.skipif(
@@ -350,10 +349,7 @@ def test_other_formats_compile(
 
 
 def test_each_reference_of_a_filter_has_an_entry_and_each_entry_a_filter() -> None:
-    blocks = [
-        yaml.safe_load(path.read_text()).get("paper") or {}
-        for path in (ROOT / "conf" / "filter").glob("*.yaml")
-    ]
+    blocks = [read_paper_block("filter", name) for name in list_named_parts("filter")]
     cited = {block["cite"] for block in blocks if block.get("cite")}
     bib = (Path(provenance.__file__).with_name("methods.bib")).read_text()
     assert set(re.findall(r"^@\w+\{(\w+),", bib, re.MULTILINE)) == cited

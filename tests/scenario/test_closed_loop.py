@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from refusals import check_refused
 from torch import Tensor
 
@@ -23,7 +22,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
 )
 from pfbench.filter.loop import FilterResult, apply_feedback, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.job import conf_dir
+from pfbench.job.config import compose_tree
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.azimuth import (
     ExactErrorEquations,
@@ -437,16 +436,14 @@ def test_records_carry_the_loop_to_another_device_and_drop_it_at_a_step() -> Non
 @pytest.mark.slow
 def test_on_the_published_flight_both_loops_are_equally_accurate() -> None:
     """20 runs, 300 s, from 20 degrees: per group of states within 3 per cent of each other."""
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = compose(
-            "config",
-            [
-                "episode_cache_dir=null",
-                "scenario=azimuth_closed_loop",
-                "model.process_noise_factor=5",
-                "scenario.imu_rate_hz=20",
-            ],
-        )
+    cfg = compose_tree(
+        [
+            "episode_cache_dir=null",
+            "scenario=azimuth_closed_loop",
+            "model.process_noise_factor=5",
+            "scenario.imu_rate_hz=20",
+        ]
+    )
     runs, model, scene = torch.arange(20), job.instantiate(cfg.model), job.instantiate(cfg.scenario)
     rms = []
     for closed in (False, True):

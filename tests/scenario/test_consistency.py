@@ -12,13 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from numpy.typing import NDArray
 from scipy import stats
 
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.loop import run_filter
+from pfbench.job.config import compose_tree
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.noise.base import NominalNoise
 
@@ -54,10 +54,9 @@ class Consistency(NamedTuple):
 
 def measured(scenario: str, *words: str, seed: int = 21) -> dict[str, Consistency]:
     """The scene's own model and the extended Kalman filter, which is the Kalman filter where all is linear."""
-    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
-        cfg: Any = compose(
-            "config", [f"scenario={scenario}", "filter=ekf", "episode_cache_dir=null", *words]
-        )
+    cfg: Any = compose_tree(
+        [f"scenario={scenario}", "filter=ekf", "episode_cache_dir=null", *words]
+    )
     model, runs = job.instantiate(cfg.model), torch.arange(RUNS)
     with torch.no_grad():
         episode = job.instantiate(cfg.scenario).draw(NominalNoise(), runs, seed)

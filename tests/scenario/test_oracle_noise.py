@@ -16,7 +16,6 @@ import oracles
 import pytest
 import torch
 from command_line import pfbench
-from hydra import compose, initialize_config_dir
 from pyro.distributions import MultivariateNormal
 from refusals import check_refused
 from scipy import stats
@@ -32,6 +31,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
     TaylorLinearisation,
 )
 from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.job.config import compose_tree
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
 from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
@@ -46,11 +46,11 @@ from pfbench.noise.base import (
 from pfbench.noise.correlated import GaussMarkovNoise, NonLineOfSightNoise
 from pfbench.noise.error_replay import ErrorReplay
 from pfbench.noise.time_windows import BiasStep, MeasurementOutage, VarianceSurge
+from pfbench.results.paper_block import list_named_parts
 from pfbench.scenario.base import RecordingRegime
 from pfbench.scenario.oracle_noise import OracleNoiseModel
 from pfbench.scenario.simulated import ModelSimulation
 
-CONF = job.conf_dir()
 KALMAN = GaussianFilter(TaylorLinearisation())
 TIME = torch.arange(1.0, 61.0, dtype=torch.float64)
 SURGE = VarianceSurge(((20.0, 30.0), (40.0, 50.0)), (9.5, 8.0), (100.0, 7.5))
@@ -566,11 +566,10 @@ def test_a_record_of_another_length_and_a_silent_witness_are_refused() -> None:
 @cache
 def composed(*words: str) -> Any:
     """For reading: the same words are composed once."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose("config", [*words, "episode_cache_dir=null"])
+    return compose_tree([*words, "episode_cache_dir=null"])
 
 
-PRESETS = [file.stem for file in sorted((CONF / "noise").glob("*.yaml"))]
+PRESETS = list_named_parts("noise")
 CANNOT = {"gauss_markov", "replay", "nlos_persistent", "added_outliers", "added_white"}
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from refusals import check_refused
 from scipy import stats
 from torch import Tensor
@@ -25,7 +24,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
     TaylorLinearisation,
 )
 from pfbench.filter.loop import run_filter
-from pfbench.job import conf_dir
+from pfbench.job.config import compose_tree
 from pfbench.job.pcrb import compute_posterior_bound
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.passive_location import (
@@ -99,8 +98,7 @@ def differing(a: Episode, b: Episode) -> set[str]:
 
 @cache
 def composed(scenario: str) -> Any:
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        return compose("config", [f"scenario={scenario}"])
+    return compose_tree([f"scenario={scenario}"])
 
 
 # whose world it is

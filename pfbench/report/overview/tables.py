@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from itertools import combinations
@@ -20,7 +21,7 @@ from pfbench.core.parameter_checks import require
 from pfbench.files import limits
 from pfbench.results.conditions import drop_settings, parse_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
-from pfbench.results.paper_block import conf_dir, read_paper_block
+from pfbench.results.paper_block import list_named_parts, read_paper_block, read_part
 from pfbench.results.store import SAME_TIME
 from pfbench.stats.comparison import EQUAL_WORDS, Verdict, find_largest_p
 from pfbench.stats.court import TRACK_SHARE, Court, Pair
@@ -177,31 +178,36 @@ def read_world_facts(scenario: str, model: str) -> WorldFacts | None:
     They are those of pfbench, and those that `pfbench tune` wrote into `conf` of the current folder.
     """
     candidates: list[tuple[bool, WorldFacts]] = []
-    for folder in dict.fromkeys((conf_dir().resolve(), Path("conf").resolve())):
-        for path in sorted((folder / "tuned").glob("*.yaml")):
-            content = _read_tuning(path, path.stat().st_mtime_ns)
-            world = content.get("world") or {}
-            if (world.get("scenario"), world.get("model")) != (scenario, model):
-                continue
-            if content.get("best"):
-                facts = WorldFacts(
-                    str(content["best"]),
-                    content.get("kalman_fits"),
-                    bool(world.get("settings")),
+    for content in (*_read_shipped_tunings(), *_read_own_tunings()):
+        world = content.get("world") or {}
+        is_of = (world.get("scenario"), world.get("model")) == (scenario, model)
+        if is_of and content.get("best"):
+            candidates.append(
+                (
+                    world.get("regimes") != [CENTRAL],
+                    WorldFacts(
+                        str(content["best"]),
+                        content.get("kalman_fits"),
+                        bool(world.get("settings")),
+                    ),
                 )
-                candidates.append((world.get("regimes") != [CENTRAL], facts))
+            )
     return min(candidates, key=lambda item: item[0])[1] if candidates else None
 
 
 @cache
-def _read_tuning(path: Path, changed: int) -> Mapping[str, Any]:
-    """Read a file of a tuning, again if it changed; nothing from a file that is none."""
-    limits.check_is_file(path, _TUNING_BYTES)
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError):
-        return {}  # a composition that uses it says so
-    return content if isinstance(content, dict) else {}
+def _read_shipped_tunings() -> list[Mapping[str, Any]]:
+    """Read the tunings of pfbench."""
+    return [yaml.safe_load(read_part("tuned", name)) for name in list_named_parts("tuned")]
+
+
+def _read_own_tunings() -> Iterator[Mapping[str, Any]]:
+    """Yield the tunings in `conf` of the current folder. A file that cannot be read is left out."""
+    for path in sorted(Path("conf/tuned").glob("*.yaml")):
+        limits.check_is_file(path, _TUNING_BYTES)
+        with suppress(yaml.YAMLError, UnicodeDecodeError):  # a composition that uses it says so
+            content = yaml.safe_load(path.read_text(encoding="utf-8"))
+            yield from [content] if isinstance(content, dict) else []
 
 
 def has_overview(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> bool:
@@ -338,16 +344,14 @@ def count_recorded_drives(scenario: str) -> int:
 
 def _read_scenario(name: str) -> dict[str, Any]:
     """Read the file of a scenario, in pfbench or in `conf` of the current folder, with those on which it is based."""
-    for folder in (conf_dir(), Path("conf")):
-        path = folder / "scenario" / f"{name}.yaml"
-        if path.is_file():
-            content = yaml.safe_load(path.read_text(encoding="utf-8"))
-            bases = [base for base in content.get("defaults", ()) if isinstance(base, str)]
-            values: dict[str, Any] = {}
-            for base in bases:
-                values |= {} if base == "_self_" else _read_scenario(base)
-            return values | content
-    return {}
+    path = Path("conf", "scenario", f"{name}.yaml")
+    text = read_part("scenario", name) or (path.read_text("utf-8") if path.is_file() else "")
+    content = yaml.safe_load(text) or {}
+    values: dict[str, Any] = {}
+    for base in content.get("defaults", ()):
+        if isinstance(base, str) and base != "_self_":
+            values |= _read_scenario(base)
+    return values | content
 
 
 def build_overviews(

@@ -11,7 +11,6 @@ import oracles
 import pytest
 import torch
 from filter_laws import check_lost_alone, check_own, check_single, check_wrapped
-from hydra import compose, initialize_config_dir
 from model_cases import measurements
 from pyro.distributions import Laplace, MultivariateNormal
 from refusals import check_refused
@@ -38,7 +37,7 @@ from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
 from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.filter.whitening import condition_on, kalman_update_root
-from pfbench.job import conf_dir
+from pfbench.job.config import compose_tree
 from pfbench.model.azimuth import (
     ErrorEquations,
     ExactErrorEquations as ExactForm,
@@ -631,8 +630,7 @@ def test_a_large_azimuth_error(form: ErrorEquations, flight: Episode) -> None:
 
 def test_a_quaternion_may_be_sampled_and_so_may_all_but_it() -> None:
     """The chart's differences are sampled, three of them; close to the extended Kalman filter where errors are minutes of arc."""
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = compose("config", ["scenario=sar_flight", "episode_cache_dir=null"])
+    cfg = compose_tree(["scenario=sar_flight", "episode_cache_dir=null"])
     cfg.scenario.imu_rate_hz = 20.0
     cfg.scenario.trajectory.duration_s = 5.0
     model, episode = (

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from filter_laws import check_lost_alone, check_own
-from hydra import compose, initialize_config_dir
 from move_cases import Always, moving
 from particle_cases import CASES
 from refusals import check_refused
@@ -63,6 +62,7 @@ from pfbench.filter.particle.stages import (
     ProposalSample,
     Systematic,
 )
+from pfbench.job.config import compose_tree
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
 from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
@@ -572,8 +572,7 @@ def test_flow_steps_in_the_coordinates_in_which_its_start_is_normal() -> None:
 def compose_flight(word: str) -> Any:
     """Six seconds of SINS/SAR."""
     words = ["scenario=sar_flight", "episode_cache_dir=null", "scenario.trajectory.duration_s=6"]
-    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
-        return compose("config", [*words, word])
+    return compose_tree([*words, word])
 
 
 @pytest.mark.slow

@@ -11,7 +11,6 @@ import oracles
 import pytest
 import torch
 from filter_laws import check_own
-from hydra import compose, initialize_config_dir
 from model_cases import measurements
 from refusals import check_refused
 from scipy import stats
@@ -44,6 +43,7 @@ from pfbench.filter.proposed.polymerised import (
     divide_cells,
 )
 from pfbench.filter.whitening import whiten
+from pfbench.job.config import compose_tree
 from pfbench.job.pcrb import compute_posterior_bound
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
@@ -724,8 +724,7 @@ def test_over_a_sample_the_generator_loses_what_its_neighbourhoods_lack() -> Non
 @pytest.mark.parametrize("scenario", ["passive_1", "passive_2", "passive_3"])
 def test_no_filter_beats_the_bound_and_the_repair_beats_the_print(scenario: str) -> None:
     """Root mean square relative error over the last 20 looks of 50 runs; below 0.9 of the bound a filter reads off the truth."""
-    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
-        cfg = compose("config", [f"scenario={scenario}"])
+    cfg = compose_tree([f"scenario={scenario}"])
     model, episode = (
         job.instantiate(cfg.model),
         job.instantiate(cfg.scenario).draw(NominalNoise(), torch.arange(50), 1),
@@ -741,10 +740,7 @@ def test_no_filter_beats_the_bound_and_the_repair_beats_the_print(scenario: str)
         *("sir", "qmc_gpf", "qmc_polymerised", "qmc_polymerised_printed"),
         *others[scenario],
     ):
-        with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
-            method = job.instantiate(
-                compose("config", [f"filter={name}", "particles=200"])["filter"]
-            )
+        method = job.instantiate(compose_tree([f"filter={name}", "particles=200"])["filter"])
         mean = run_filter(method, model, episode.record, PhiloxStream(1, torch.arange(50))).mean
         off = (
             100
@@ -781,17 +777,15 @@ def test_the_repaired_method_does_not_notice_where_north_lies() -> None:
     width: dict[str, list[Tensor]] = {"qmc_polymerised": [], "qmc_polymerised_printed": []}
     for name, both in width.items():
         for change in ([], [f"scenario.{c}" for c in turned]):
-            with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
-                cfg = compose(
-                    "config",
-                    [
-                        "scenario=passive_1",
-                        "scenario.steps=30",
-                        f"filter={name}",
-                        "particles=200",
-                        *change,
-                    ],
-                )
+            cfg = compose_tree(
+                [
+                    "scenario=passive_1",
+                    "scenario.steps=30",
+                    f"filter={name}",
+                    "particles=200",
+                    *change,
+                ]
+            )
             runs = torch.arange(200)
             model, episode = (
                 job.instantiate(cfg.model),

@@ -13,7 +13,6 @@ import oracles
 import pytest
 import torch
 from filter_laws import check_own
-from hydra import compose, initialize_config_dir
 from pyro.distributions import Independent, Normal
 from refusals import check_refused
 from scipy import stats
@@ -53,6 +52,7 @@ from pfbench.filter.proposed.swarm_weighting import (
     MixtureWeighting,
     PrintedWeighting,
 )
+from pfbench.job.config import compose_tree
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
@@ -665,10 +665,7 @@ PRESETS = ("pso_pf", "cpso_pf", "cpso_escape", "cpso_escape_printed", "cpso_esca
 
 
 def composed(scenario: str, *words: str) -> Any:
-    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
-        return compose(
-            "config", [f"scenario={scenario}", "episode_cache_dir=null", "particles=100", *words]
-        )
+    return compose_tree([f"scenario={scenario}", "episode_cache_dir=null", "particles=100", *words])
 
 
 def flown(runs: int, steps: int, model: str) -> tuple[Any, Episode]:

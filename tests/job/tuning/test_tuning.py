@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
+import sys
 from collections.abc import Mapping
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
+from checkout import ROOT
 from refusals import check_refused
 
 from pfbench import job
@@ -43,28 +48,34 @@ from pfbench.results.looks import (
     find_looks,
     find_stored_world,
 )
-from pfbench.results.paper_block import list_named_parts, list_tuned_worlds
+from pfbench.results.paper_block import list_named_parts, list_tuned_worlds, read_families
 
-TUNED = sorted(
-    path.stem
-    for path in (job.conf_dir() / "tuned").glob("*.yaml")
-    if path.stem not in (AUTO, NOMINAL)
-)
+sys.path.insert(0, str(ROOT / "experiments" / "analyses"))  # scripts, not a package
+import tuned_table
+
+TUNED = sorted(read_families("tuned"))
 
 
 def read_candidates(node: Mapping[str, Any]) -> tuple[list[Candidate], Candidate]:
     """Read the candidates of a filter from the file of a tuning."""
-    head, *rows = (line.split() for line in node["candidates"].splitlines())
-    places = {name: k for k, name in enumerate(head)}
-    knobs, regimes = head[: places["log_ratio"]], head[places["nees_ratio"] + 1 :]
+    return to_candidates(pd.read_csv(StringIO(node["candidates"]), sep=" ", na_values="-"))
+
+
+def to_candidates(rows: pd.DataFrame) -> tuple[list[Candidate], Candidate]:
+    """Return the candidates, and the filter without knobs, which is the last row."""
+    columns = list(rows)
+    knobs, regimes = (
+        columns[: columns.index("log_ratio")],
+        columns[columns.index("nees_ratio") + 1 :],
+    )
     candidates = [
         Candidate(
-            {knob: float(row[places[knob]]) for knob in knobs if row[places[knob]] != "-"},
-            float(row[places["log_ratio"]]),
-            float(row[places["nees_ratio"]]),
-            {r.removeprefix("error_"): float(row[places[r]]) for r in regimes},
+            {knob: row[knob] for knob in knobs if not math.isnan(row[knob])},
+            row["log_ratio"],
+            row["nees_ratio"],
+            {regime.removeprefix("error_"): row[regime] for regime in regimes},
         )
-        for row in rows
+        for row in rows.astype(float).to_dict("records")
     ]
     return candidates[:-1], candidates[-1]
 
@@ -128,7 +139,7 @@ def test_the_first_study_contains_the_tuned_baselines() -> None:
 
 def read_tuned(name: str) -> dict[str, Any]:
     """Content of the file of a tuning."""
-    return dict(yaml.safe_load((job.conf_dir() / "tuned" / f"{name}.yaml").read_text()))
+    return dict(yaml.safe_load(read_families("tuned")[name]))
 
 
 def stated_knobs(words: list[str]) -> dict[str, Any]:
@@ -147,7 +158,7 @@ def test_stored_knobs_are_the_choice_among_the_stored_candidates(name: str) -> N
     assert "ekf_scaled" in methods  # the control
     has_particles = "scale" in content.get("rpf", {})
     for method in [*methods, *["rpf"] * has_particles]:
-        candidates, untuned = read_candidates(content[method])
+        candidates, untuned = to_candidates(tuned_table.read_candidates(name, method))
         choice = choose_candidate(candidates)
         assert choice.values == {key: content[method][key] for key in choice.values}
         assert [c.values for c in candidates] == list_candidates(method)
@@ -174,7 +185,7 @@ def test_a_file_states_the_best_filter_of_its_world_and_whether_kalman_filters_f
     errors = {}
     for method in TUNED_METHODS:
         if "unsupported" not in content[method]:
-            candidates, _ = read_candidates(content[method])
+            candidates, _ = to_candidates(tuned_table.read_candidates(name, method))
             errors[f"{method}_tuned"] = choose_candidate(candidates)
     scenario = job.compose([f"scenario={content['world']['scenario']}"]).values["scenario"]
     limit = scenario["paper"].get("divergence_threshold") or 0.0
@@ -335,6 +346,19 @@ def test_a_filter_is_added_to_the_file_of_its_world(
         assert path.read_text().startswith(first)
     node = yaml.safe_load(path.read_text())["rpf"]
     candidates, _ = read_candidates(node)
+    monkeypatch.setattr(tuned_table, "TUNED", path.parent)
+    monkeypatch.setattr(tuned_table, "TABLE", tmp_path / "families" / "worlds.yaml")
+    monkeypatch.setattr(tuned_table, "CANDIDATES", tmp_path / "candidates.parquet")
+    written = path.read_text()
+    for scenario in ("linear_walk", "benes"):  # a second time the entry is replaced
+        path.write_text(written.replace('scenario: "linear_walk', f'scenario: "{scenario}'))
+        tuned_table.add_files()
+        assert not path.exists()
+    (entry,) = yaml.safe_load(tuned_table.TABLE.read_text()).values()
+    assert entry["world"]["scenario"] == "benes"
+    assert entry["rpf"] == {key: value for key, value in node.items() if key != "candidates"}
+    assert to_candidates(tuned_table.read_candidates("walk", "rpf"))[0] == candidates
+    path.write_text(written)
     assert node["particles"] == 500
     assert choose_candidate(candidates).values == {key: node[key] for key in ("r_factor", "scale")}
     assert len(candidates) == 4

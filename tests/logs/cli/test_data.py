@@ -6,13 +6,12 @@ import hashlib
 from pathlib import Path
 
 import pytest
-import yaml
 from checkout import ROOT
 from command_line import pfbench as command
 
-from pfbench.job import conf_dir
 from pfbench.logs.cli import data
 from pfbench.logs.cli.data import check_data_set, read_data_sets
+from pfbench.results.paper_block import list_named_parts, read_part
 
 CONTENT = b"t,x\n0,1\n"
 FILES = {"imu.csv": {"bytes": len(CONTENT), "sha256": hashlib.sha256(CONTENT).hexdigest()}}
@@ -61,9 +60,9 @@ def test_the_page_has_source_commit_licence_and_size_of_each() -> None:
 
 def test_all_folders_that_scenarios_name_are_listed() -> None:
     names = set(read_data_sets())
-    for path in [*(conf_dir() / "scenario").glob("*.yaml"), *(conf_dir() / "noise").glob("*.yaml")]:
-        text = path.read_text()
-        node = yaml.safe_load(text)
-        if "${data.root}" in text and not path.stem.startswith("user_"):
-            assert any(name in text for name in names), path.stem
-            assert node
+    for part in [
+        (group, name) for group in ("scenario", "noise") for name in list_named_parts(group)
+    ]:
+        text = read_part(*part)
+        if "${data.root}" in text and not part[1].startswith("user_"):
+            assert any(name in text for name in names), part

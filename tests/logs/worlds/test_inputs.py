@@ -23,6 +23,7 @@ from pfbench.job.replay import recompute_run
 from pfbench.job.run_selection import StoredRun
 from pfbench.report.study_report import write_report
 from pfbench.results.conditions import load_conditions
+from pfbench.results.paper_block import list_named_parts, read_part
 from pfbench.results.store import list_failures, read_result
 
 OF_FILES = (
@@ -87,8 +88,8 @@ def test_a_shipped_job_reads_no_file_that_it_does_not_name(
 
 def test_every_shipped_scenario_with_a_data_folder_is_among_them() -> None:
     listed = {*OF_FILES, "user_log", "user_raw_log", "user_ins_log"}
-    for file in (job.conf_dir() / "scenario").glob("*.yaml"):
-        assert ("${data.root}" in file.read_text()) == (file.stem in listed), file.stem
+    for name in list_named_parts("scenario"):
+        assert ("${data.root}" in read_part("scenario", name)) == (name in listed), name
 
 
 @pytest.mark.parametrize("name", ["imu", "gnss", "reference"])

@@ -9,8 +9,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from checkout import ROOT
-from hydra import compose, initialize_config_dir
 from recorded_data import DATA, believed, recorded
 from refusals import check_refused
 from synthetic_log import drive, tables, write
@@ -26,6 +24,7 @@ from pfbench.filter.gaussian.linearisation_rules import (
 )
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.job import instantiate
+from pfbench.job.config import compose_tree
 from pfbench.logs.worlds.drive import RecordedDrive, RecordedFlights
 from pfbench.logs.worlds.log_reader import read_log
 from pfbench.logs.worlds.log_tables import ImuLog, LogFiles, ReferenceLog, find_dataset
@@ -41,8 +40,6 @@ from pfbench.model.strapdown import StrapdownTotal
 from pfbench.nav.strapdown import PreintegratedImu
 from pfbench.noise.base import NominalNoise
 from pfbench.noise.time_windows import MeasurementOutage
-
-CONF = ROOT / "conf"
 
 BELIEVED = believed([1.0, 1.0, 2.0], None)
 
@@ -351,8 +348,7 @@ def test_velocities_that_were_not_recorded_are_not_invented(root: Path, tmp_path
 def run(
     rule: LinearisationRule, runs: int, *overrides: str
 ) -> tuple[Episode, StrapdownTotal, FilterResult]:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("config", overrides=list(overrides))
+    cfg = compose_tree(list(overrides))
     scenario, model = (instantiate(cfg[part]) for part in ("scenario", "model"))
     episode = scenario.draw(NominalNoise(), torch.arange(runs), 1)
     return (

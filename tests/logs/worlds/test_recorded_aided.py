@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from recorded_data import believed, recorded
 from refusals import check_refused
 from scipy.spatial.transform import Rotation
 from synthetic_log import tables, write
 
 from pfbench import job
-from pfbench.job import conf_dir
+from pfbench.job.config import compose_tree
 from pfbench.logs.worlds.drive import (
     BaroMagSensors,
     FixHoldout,
@@ -141,8 +140,7 @@ def test_the_barometer_is_believed_as_the_fixes_of_the_run_itself_say(run: int) 
     Errors of size s that are forgotten in some seconds and a walk of density w give 2 s^2 + w^2 t. Over 40 s the walk is well
     known, and 2 s^2 is what is left; s is believed to be twice that, since it is no white noise.
     """
-    with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        cfg = compose("config", ["scenario=recorded_fixed_wing_aided", "episode_cache_dir=null"])
+    cfg = compose_tree(["scenario=recorded_fixed_wing_aided", "episode_cache_dir=null"])
     scene = job.instantiate(cfg.scenario)
     y = scene.draw(NominalNoise(), torch.arange(2), 1).record.y[run]
     off = (y[:, 6] - y[:, 2])[torch.isfinite(y[:, 2])].numpy()  # of every second second

@@ -9,8 +9,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from checkout import ROOT
-from hydra import compose, initialize_config_dir
 from recorded_data import DATA, recorded
 from synthetic_log import GRAVITY, ORIGIN, drive, write
 
@@ -19,13 +17,12 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
 from pfbench.job import instantiate
+from pfbench.job.config import compose_tree
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.logs.worlds.trajectory_file import RecordedTrajectory, read_motion
 from pfbench.nav import attitude, earth
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.flights import SimulatedFlight
-
-CONF = ROOT / "conf"
 
 
 @pytest.fixture(scope="module")
@@ -144,10 +141,7 @@ def test_what_cannot_be_flown_is_refused(
 
 
 def composed(*overrides: str) -> tuple[SimulatedFlight, object]:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose(
-            "config", overrides=["scenario=recorded_boreas", "episode_cache_dir=null", *overrides]
-        )
+    cfg = compose_tree(["scenario=recorded_boreas", "episode_cache_dir=null", *overrides])
     return tuple(instantiate(cfg[part]) for part in ("scenario", "model"))
 
 

@@ -11,8 +11,6 @@ import pandas as pd
 import pymap3d
 import pytest
 import torch
-from checkout import ROOT
-from hydra import compose, initialize_config_dir
 from pfbench.experiments.urban_error_fit import (
     RangeResiduals,
     estimate_mixture,
@@ -29,6 +27,7 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.job.config import compose_tree
 from pfbench.logs.worlds.urban import (
     PseudorangeReceiver,
     UrbanDrive,
@@ -46,8 +45,6 @@ from pfbench.model.urban_gnss import (
 )
 from pfbench.noise.base import NominalNoise
 from pfbench.noise.time_windows import MeasurementOutage, VarianceSurge
-
-CONF = ROOT / "conf"
 
 BELIEVED = UrbanTuning(
     distance_density=0.1,
@@ -377,8 +374,7 @@ def test_the_factor_is_found_again() -> None:
 
 
 def conf(*overrides: str) -> tuple[UrbanDrive, UrbanGnss]:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("config", overrides=["scenario=recorded_berlin", *overrides])
+    cfg = compose_tree(["scenario=recorded_berlin", *overrides])
     return tuple(job.instantiate(cfg[part]) for part in ("scenario", "model"))  # type: ignore[return-value]
 
 

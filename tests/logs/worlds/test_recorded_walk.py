@@ -13,8 +13,6 @@ import pandas as pd
 import pytest
 import scipy
 import torch
-from checkout import ROOT
-from hydra import compose, initialize_config_dir
 from recorded_data import believed, recorded
 from refusals import check_refused
 from synthetic_log import ORIGIN, drive, tables, write
@@ -26,6 +24,7 @@ from pfbench.core.record import Episode, MeasurementChannels
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
+from pfbench.job.config import compose_tree
 from pfbench.logs.sky.raw_gnss import RawGnss, RawGnssTuning
 from pfbench.logs.worlds.raw_gnss import RawGnssReceiver, RecordedWalk
 from pfbench.model.strapdown import StrapdownTight, TightMemsInputs
@@ -36,7 +35,6 @@ from pfbench.nav.ranging import ReceiverClock
 from pfbench.noise.base import NoiseRegime, NominalNoise
 from pfbench.noise.time_windows import MeasurementOutage
 
-CONF = ROOT / "conf"
 BIAS, DRIFT, OTHER = -4.6e5, -60.0, 12.0  # of the clock, and of the other system
 
 MOTION = believed([1.0, 1.0, 1.0], None)
@@ -337,8 +335,7 @@ def test_faulty_tables_are_refused(tmp_path: Path, spoil: object, message: str) 
 
 
 def configured(noise: NoiseRegime, runs: int, *overrides: str) -> tuple[Episode, StrapdownTight]:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("config", overrides=["scenario=recorded_walk", *overrides])
+    cfg = compose_tree(["scenario=recorded_walk", *overrides])
     scenario, model = (job.instantiate(cfg[part]) for part in ("scenario", "model"))
     return scenario.draw(noise, torch.arange(runs), 1), model
 

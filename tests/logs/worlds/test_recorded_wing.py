@@ -10,8 +10,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from checkout import ROOT
-from hydra import compose, initialize_config_dir
 from recorded_data import DATA, believed, recorded
 from synthetic_log import tables, write
 
@@ -21,13 +19,13 @@ from pfbench.core.record import Episode, Record
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.job.config import compose_tree
 from pfbench.logs.worlds.drive import FixHoldout, RecordedDrive
 from pfbench.logs.worlds.time_grid import FixReceiver
 from pfbench.model.strapdown import StrapdownTotal
 from pfbench.noise.base import NominalNoise
 from pfbench.noise.time_windows import MeasurementOutage
 
-CONF = ROOT / "conf"
 MISSED = np.array([0.3, -0.2, 0.1])  # m North, East, down: the errors of the synthetic fixes
 
 AS_RECORDED = FixReceiver(position_sd=(0.0, 0.0, 0.0), velocity_sd=(0.0, 0.0, 0.0))
@@ -168,8 +166,7 @@ def test_what_cannot_be_scored_is_refused(root: Path, make: object, message: str
 
 
 def drawn(runs: int, *overrides: str) -> tuple[Episode, StrapdownTotal]:
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = compose("config", overrides=["scenario=recorded_fixed_wing", *overrides])
+    cfg = compose_tree(["scenario=recorded_fixed_wing", *overrides])
     scenario, model = (job.instantiate(cfg[part]) for part in ("scenario", "model"))
     assert isinstance(model, StrapdownTotal)
     return scenario.draw(NominalNoise(), torch.arange(runs), 1), model

@@ -12,18 +12,20 @@ from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig, OmegaConf, open_dict
+from config_cases import GROUPS, RECORDED, list_bases
+from omegaconf import DictConfig, open_dict
 from recorded_data import DATA
 from scipy import stats
 from torch import Tensor
 
 from pfbench import job
 from pfbench.job import datasheet_data
+from pfbench.job.config import compose_tree
 from pfbench.noise.base import NominalNoise
 from pfbench.results import status
+from pfbench.results.paper_block import read_part
 
-SCENES = sorted(file.stem for file in (job.conf_dir() / "scenario").glob("*.yaml"))
+SCENES = GROUPS["scenario"]
 RUNS = torch.arange(20)
 FALSE_ALARM = 1e-3  # of all numbers of all scenes together
 NUMBERS = (
@@ -71,8 +73,7 @@ def shortened(scene: DictConfig) -> DictConfig:
 
 def at_the_truth(scenario: str) -> Tensor:
     """Residuals [R, T, Dy] in the standard deviations that the model states."""
-    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
-        cfg: Any = compose("config", [f"scenario={scenario}", "episode_cache_dir=null"])
+    cfg: Any = compose_tree([f"scenario={scenario}", "episode_cache_dir=null"])
     model, scene = job.instantiate(cfg.model), job.instantiate(shortened(cfg.scenario))
     with torch.no_grad():
         episode = scene.draw(
@@ -110,19 +111,12 @@ def entangled(z: Tensor) -> list[str]:
 
 def test_scenes_without_a_law_are_recorded_ones() -> None:
     for scenario in NO_LAW:
-        folder = job.conf_dir() / "scenario"
-        built_on = OmegaConf.load(folder / f"{scenario}.yaml")["defaults"]
-        files = [
-            scenario,
-            *(part for part in built_on if isinstance(part, str) and part != "_self_"),
-        ]
-        assert any("${data.root}" in (folder / f"{file}.yaml").read_text() for file in files)
+        assert scenario in RECORDED
 
 
 def varied(scenario: str) -> bool:
     """Whether it is another scene with other numbers."""
-    built_on = OmegaConf.load(job.conf_dir() / "scenario" / f"{scenario}.yaml")["defaults"]
-    return any(isinstance(part, str) and part != "_self_" for part in built_on)
+    return bool(list_bases("scenario", scenario))
 
 
 @pytest.mark.parametrize(
@@ -134,7 +128,7 @@ def varied(scenario: str) -> bool:
     ],
 )
 def test_residuals_at_the_truth_have_the_stated_law(scenario: str) -> None:
-    text = (job.conf_dir() / "scenario" / f"{scenario}.yaml").read_text()
+    text = read_part("scenario", scenario)
     if "${data.root}" in text and DATA is None:
         pytest.skip("PFBENCH_DATA does not name the folder of the recorded data sets")
     z = at_the_truth(scenario)[..., : FIXES_ALONE.get(scenario)]

@@ -13,7 +13,6 @@ import pytest
 import torch
 from checkout import ROOT
 from command_line import block, pfbench
-from hydra import compose, initialize_config_dir
 from recorded_data import DATA, recorded
 from refusals import check_refused
 
@@ -23,6 +22,7 @@ from pfbench.core.record import Episode
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
+from pfbench.job.config import compose_tree
 from pfbench.logs.sky import raw_log
 from pfbench.logs.sky.ephemeris import GM_GPS, read_rinex
 from pfbench.logs.sky.rinex_observations import SIGNALS, read_observations
@@ -44,10 +44,7 @@ RANGE, RATE = (
 
 
 def scene(root: Path, name: str, *words: str) -> Any:
-    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
-        cfg = compose(
-            "config", [f"scenario={name}", f"data.root={root}", "scenario.folder=drive", *words]
-        )
+    cfg = compose_tree([f"scenario={name}", f"data.root={root}", "scenario.folder=drive", *words])
     return job.instantiate(cfg.scenario), job.instantiate(cfg.model)
 
 
@@ -280,8 +277,7 @@ def test_the_walk_written_as_rinex_runs_as_its_table_does(tmp_path: Path) -> Non
     words = ("scenario.start_s=15", "scenario.end_s=80", f"scenario.rinex.gps_time={start}")
     origin = "scenario.origin=[40.0967388700055,-105.14708736222939,1577.4480057330802]"
     scenario, model = scene(tmp_path, "user_ins_log", *words, origin)
-    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
-        cfg = compose("config", ["scenario=recorded_walk", f"data.root={DATA}", "scenario.end_s=80", "scenario.receiver.range_sd=0", "scenario.receiver.rate_sd=0"])  # fmt: skip
+    cfg = compose_tree(["scenario=recorded_walk", f"data.root={DATA}", "scenario.end_s=80", "scenario.receiver.range_sd=0", "scenario.receiver.rate_sd=0"])  # fmt: skip
     table_scene, table_model = job.instantiate(cfg.scenario), job.instantiate(cfg.model)
     scenario = replace(scenario, tuning=replace(scenario.tuning, motion=table_scene.tuning.motion))
     model = type(model)(scenario.tuning)
