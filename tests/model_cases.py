@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
-from pfbench.core.chart import Chart, EuclideanBlock, wrap_angle
+from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, wrap_angle
 from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.model.base import StateSpaceModel
@@ -41,6 +41,21 @@ class Unrolled(Pendulum):
     @property
     def chart(self) -> Chart:
         return Chart((EuclideanBlock(2),))
+
+
+class Hidden(LinearGaussian):
+    """A linear model that keeps its noise gain to itself: the noise goes through the rule, as an unknown beside the state."""
+
+    def noise_gain(self, u: Any) -> None:
+        return None
+
+
+class Turning(LinearGaussian):
+    """A linear model whose first state is an angle."""
+
+    @property
+    def chart(self) -> Chart:
+        return Chart((AngleBlock(1), EuclideanBlock(1)))
 
 
 class Fragile(LinearGaussian):

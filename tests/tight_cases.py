@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from pfbench.core.record import Episode, Record
-from pfbench.job.config import compose_tree
 from pfbench.model.tight_coupling import SinsGnssTight, TightStep
 from pfbench.nav import earth
 from pfbench.nav.aiding import AlignmentErrors, ProcessNoiseInflation
@@ -56,10 +55,6 @@ def linear(
     inflation: ProcessNoiseInflation | None = None, receiver: RangingReceiver = RECEIVER
 ) -> SinsGnssTight:
     return SinsGnssTight(IMU, receiver, INITIAL, inflation)
-
-
-def composed(*words: str) -> Any:
-    return compose_tree(["episode_cache_dir=null", *words])
 
 
 def kalman(model: SinsGnssTight, record: Record) -> tuple[Tensor, Tensor, Tensor]:

@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 import torch
+from config_cases import composed
 from recorded_data import recorded
 from refusals import check_refused
-from tight_cases import IMU, INITIAL, PATH, RECEIVER, RUNS, composed, flight, kalman, linear
+from tight_cases import IMU, INITIAL, PATH, RECEIVER, RUNS, flight, kalman, linear
 from torch import Tensor
 
 from pfbench import job

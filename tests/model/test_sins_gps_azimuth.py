@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from config_cases import composed
 from scipy import stats
 from torch import Tensor
 
@@ -24,7 +25,6 @@ from pfbench.filter.gaussian.linearisation_rules import (
 )
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.job.config import compose_tree
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.azimuth import (
     ErrorEquations,
@@ -115,10 +115,6 @@ def worlds() -> Episode:
 
 def states(model: SinsGpsAzimuth, n: int, runs: int = 4) -> Tensor:
     return PhiloxStream(2, torch.arange(runs)).normal("x", n, len(model.names)) * model.p0
-
-
-def composed(*words: str) -> Any:
-    return compose_tree(["episode_cache_dir=null", *words])
 
 
 # the equations

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from config_cases import composed
 from refusals import check_refused
 from scipy import stats
 from torch import Tensor
@@ -26,7 +27,6 @@ from pfbench.filter.gaussian.linearisation_rules import (
 )
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.job.config import compose_tree
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.sins_sar import SarStep, SinsSar
 from pfbench.nav import attitude, earth, error_dynamics
@@ -73,10 +73,6 @@ every_variant = pytest.mark.parametrize("model", VARIANTS.values(), ids=list(VAR
 @pytest.fixture(scope="module")
 def flight() -> Episode:
     return FLIGHT.draw(NominalNoise(), RUNS, 5)
-
-
-def composed(*words: str) -> Any:
-    return compose_tree(["episode_cache_dir=null", *words])
 
 
 def states(particles: int, scale: float = 1.0, runs: Tensor = RUNS) -> Tensor:

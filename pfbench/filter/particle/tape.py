@@ -1,4 +1,4 @@
-"""A model as a tape: the torch operations of its step on one particle, recorded once as elementwise instructions.
+"""A model as a tape: the torch operations of its step on one particle, recorded once as instructions on numbers.
 
 Recording runs `propagate` and `log_likelihood` once, on a few particles, and follows each number of each tensor. A number may depend on
 the numbers of its own particle, on inputs of its run and on constants. What else a model does is refused with a reason: a branch on a
@@ -25,12 +25,10 @@ from pfbench.model.base import StateSpaceModel
 # instructions in the order of `execute` in kernels/src/tape.cpp
 OPERATIONS = (
     "copy", "add", "sub", "mul", "div", "neg", "sqrt", "exp", "log", "sin", "cos", "atan2", "hypot", "pow", "minimum", "maximum",
-    "remainder", "eq", "ne", "lt", "le", "abs", "round", "floor", "tan", "tanh", "log1p", "expm1", "special_ndtr", "where",
+    "remainder", "eq", "ne", "lt", "le", "abs", "round", "floor", "tan", "tanh", "log1p", "expm1", "special_ndtr", "where", "affine",
 )  # fmt: skip
 FEW = 2  # runs and particles of a recording
-_MOST_INSTRUCTIONS = (
-    400  # per particle: longer ones are dense matrices, which operators multiply faster
-)
+_MOST_INSTRUCTIONS = 400  # per particle: longer ones are products of matrices of each particle
 _MOST_NODES = 4 * _MOST_INSTRUCTIONS  # with constants, inputs and what nothing needs in the end
 # Names of torch functions that are one, without underscores. Functions that move the numbers of a tensor, or of several, that change
 # their type alone, that sum them, that fill a tensor, and those whose results depend on shapes.
@@ -48,6 +46,7 @@ _SUMS = {"sum": "add", "prod": "mul", "all": "mul", "any": "maximum"}
 _FILLS = {"zeros_like", "ones_like", "full_like", "new_zeros", "new_ones", "new_full", "new_tensor"}
 _SHAPES = {"size", "dim", "stride", "numel", "len", "get", "is_floating_point", "is_contiguous", "is_complex", "ndimension"}  # fmt: skip
 _TYPES = (torch.float64, torch.bool, torch.int64)
+_FEW_TERMS = 2  # of a sum of products, which elementwise instructions compute as fast
 # A number is followed as an atom: a node of the recorded expressions, times the number of lanes, plus its lane, which is 0 for all runs,
 # 1 + r for a run, and 3 + 2 r + n for a particle.
 _LANES = 16
@@ -61,7 +60,7 @@ class Tape(NamedTuple):
     """Instructions of a step of a model for one particle.
 
     Attributes:
-        code: Operation, result and three operands of each instruction, int64 [I, 5]. From 0 on: registers of particles, first those
+        code: Operation, result and three operands of each instruction, or of each term of a sum of products, int64 [I, 5]. From 0 on: registers of particles, first those
             of states and noise. ~0, ~1, ...: numbers of a run, which are constants, inputs of the step, results.
         outputs: Places of the new state and of its log likelihood, int64 [D + 1].
         constants: Constants, float64 [C].
@@ -112,9 +111,18 @@ class _Graph:
             return operands[operands[0] == unit] * _LANES + lane
         return self.add(name, *operands, of_particles=lane >= 3) * _LANES + lane
 
-    def is_zero(self, a: int, b: int) -> bool:
-        """Return whether a product is that of 0 and a component of the state or the noise, which are finite."""
-        return any(p == 0 and self.nodes[q // _LANES][0] == "state" for p, q in ((a, b), (b, a)))
+    def add_products(self, row: Iterable[tuple[int, int]]) -> int:
+        """Return the atom of a sum of products: one instruction for those of numbers of a run and of particles.
+
+        Products of the state with zeros are left out, as by the operators: states and noise are finite.
+        """
+        ordered = (sorted(pair, key=lambda atom: atom % _LANES) for pair in row)
+        pairs = [(a, b) for a, b in ordered if a != 0 or self.nodes[b // _LANES][0] != "state"]
+        terms = [(a, b) for a, b in pairs if a % _LANES < 3 <= b % _LANES]
+        is_short = len(terms) <= _FEW_TERMS
+        sums = [] if is_short else [self.emit("affine", *chain(*terms))]
+        sums += [self.emit("mul", *pair) for pair in pairs if is_short or pair not in terms]
+        return reduce(partial(self.emit, "add"), sums or [0])
 
 
 def _make_table(graph: _Graph) -> dict[str, Callable[..., int]]:
@@ -199,24 +207,35 @@ class _Recorder(TorchFunctionMode):
             return function([self.read(a) for a in args[0]], *args[1:], **options)
         if name in _SUMS:
             return self._reduce(name, *args, **options).reshape(result.shape)
-        if name in ("matmul", "rmatmul", "mm", "mv"):
-            pair = args[::-1] if name == "rmatmul" else args
-            return self._multiply(*map(self.read, pair)).reshape(result.shape)
+        if name == "linear":  # with a bias or without one
+            bias = [self.read(a) for a in (*args[2:], *options.values()) if a is not None]
+            return self._combine(
+                lambda *atoms: reduce(partial(self.graph.emit, "add"), atoms),
+                [self._multiply(self.read(args[0]), self.read(args[1]).mT), *bias],
+                {},
+            )
+        if name in ("matmul", "rmatmul", "mm", "mv", "bmm"):
+            return self._multiply(
+                *map(self.read, args[::-1] if name == "rmatmul" else args)
+            ).reshape(result.shape)
         if name == "propagate_affine.default":
             phi, x, gain, w = map(self.read, args)
-            terms = self._multiply(phi, x.mT), self._multiply(gain, w.mT)
-            return self._combine(self._table["add"], terms, {}).transpose(0, 1)
+            both = torch.cat([a.expand(len(x), -1, -1) for a in (phi, gain)], -1)
+            return self._multiply(both, torch.cat([x, w], -1).mT).transpose(0, 1)
         if name in _CASTS and result.dtype in (torch.float64, args[0].dtype):
             return self.read(args[0])
         if name == "pow" and (short := {2: "square", 0.5: "sqrt"}.get(_plain(args[1]))):
             name, args = short, args[:1]
         # torch chooses between Python's numbers in single precision
         is_choice = name == "where" and all(_plain(a) in (0.0, 1.0) for a in args[1:])
-        is_logical = result.dtype == torch.bool and name in ("add", "sub")
-        if name not in self._table or is_logical or not (is_choice or result.dtype in _TYPES):
+        fits = name in self._table and (is_choice or result.dtype in _TYPES)
+        if not fits or (result.dtype == torch.bool and name in ("add", "sub")):
             raise NoTapeError(f"it needs torch.{name} with a result of {result.dtype}")
-        keywords = {key: self.read(a) for key, a in options.items() if a is not None}
-        return self._combine(self._table[name], [self.read(a) for a in args], keywords)
+        return self._combine(
+            self._table[name],
+            [self.read(a) for a in args],
+            {key: self.read(a) for key, a in options.items() if a is not None},
+        )
 
     def _combine(
         self, build: Callable[..., int], operands: Sequence[Tensor], options: dict[str, Tensor]
@@ -236,23 +255,20 @@ class _Recorder(TorchFunctionMode):
             raise NoTapeError(f"it needs torch.{name} with other options")
         axes = options.get("dim", args[0] if args else tuple(range(a.dim())))
         axes = axes if isinstance(axes, tuple | list) else (axes,)
-        rows = self.read(a).movedim(tuple(axes), tuple(range(-len(axes), 0))).flatten(-len(axes))
-        add = partial(self.graph.emit, _SUMS[name])
-        return _stack((reduce(add, row) for row in rows.flatten(0, -2).tolist()), (-1,))
+        atoms = self.read(a).movedim(tuple(axes), tuple(range(-len(axes), 0)))
+        rows = atoms.flatten(-len(axes)).flatten(0, -2).tolist()
+        return _stack(map(partial(reduce, partial(self.graph.emit, _SUMS[name])), rows), (-1,))
 
     def _multiply(self, matrix: Tensor, multiplier: Tensor) -> Tensor:
-        """Return the atoms of a product of matrices; products of the state with zeros are left out, as by the operators."""
-        matrix = matrix.unsqueeze(0) if matrix.dim() == 1 else matrix
-        multiplier = multiplier.unsqueeze(0) if multiplier.dim() == 1 else multiplier.mT
-        pair, e = (
-            torch.broadcast_tensors(matrix.unsqueeze(-2), multiplier.unsqueeze(-3)),
-            self.graph.emit,
+        """Return the atoms of a product of matrices."""
+        rows = matrix.unsqueeze(0) if matrix.dim() == 1 else matrix
+        columns = multiplier.unsqueeze(0) if multiplier.dim() == 1 else multiplier.mT
+        pair = torch.broadcast_tensors(rows.unsqueeze(-2), columns.unsqueeze(-3))
+        products = zip(*(m.reshape(-1, m.shape[-1]).tolist() for m in pair), strict=True)
+        return _stack(
+            (self.graph.add_products(zip(*row, strict=True)) for row in products),
+            pair[0].shape[:-1],
         )
-        sums = []
-        for row in zip(*(m.reshape(-1, m.shape[-1]).tolist() for m in pair), strict=True):
-            terms = [e("mul", *two) for two in zip(*row, strict=True) if not self.graph.is_zero(*two)]  # fmt: skip
-            sums.append(reduce(partial(e, "add"), terms or [0]))
-        return _stack(sums, pair[0].shape[:-1])
 
 
 def _stack(atoms: Iterable[int], shape: Any) -> Tensor:
@@ -275,7 +291,7 @@ def record_tape(model: StateSpaceModel, x: Tensor, w: Tensor, record: Record) ->
     leaves = _stack((graph.add("state", k, of_particles=True) for k in range(sources)), (-1,))
     for tensor, nodes in zip((x, w), leaves.split([x.shape[2], w.shape[2]]), strict=True):
         recorder.follow(tensor, nodes * _LANES + lanes)
-    inputs = _follow_inputs(recorder, tensors_in((record.u, record.y)))
+    inputs = _follow_inputs(recorder, list_inputs(record))
     state = torch.get_rng_state()
     with torch.no_grad(), dispatch.capture_graph(), recorder:
         states = model.propagate(x, record.u, w).expand(x.shape)
@@ -291,6 +307,11 @@ def record_tape(model: StateSpaceModel, x: Tensor, w: Tensor, record: Record) ->
             "its numbers depend on the place of a particle or run, which a tape cannot follow"
         )
     return _arrange(graph, nodes[0, 0].tolist(), w.shape[2], sources, inputs), states, value
+
+
+def list_inputs(record: Record) -> list[Tensor]:
+    """Return the inputs of a tape, [R or 1, ...]: those that runs share, those of each run, and the measurement."""
+    return [*sorted(tensors_in(record.u), key=len), record.y]
 
 
 def _follow_inputs(recorder: _Recorder, tensors: Sequence[Tensor]) -> int:
@@ -318,9 +339,11 @@ def _arrange(graph: _Graph, roots: list[int], noises: int, sources: int, inputs:
     entries = [(k, *graph.nodes[k]) for k in order]
     values = [float.fromhex(row[2]) for row in entries if row[1] == "number"]
     numbers = [row[0] for row in entries if row[1] == "number"]
-    register_of = {k: ~index for index, k in enumerate(numbers)}
-    register_of |= {k: ~(len(values) + a[0]) for k, name, *a in entries if name == "input"}
-    register_of |= {k: a[0] for k, name, *a in entries if name == "state"}
+    register_of = {
+        **{k: ~index for index, k in enumerate(numbers)},
+        **{k: ~(len(values) + a[0]) for k, name, *a in entries if name == "input"},
+        **{k: a[0] for k, name, *a in entries if name == "state"},
+    }
     steps = [row for row in entries if row[0] not in register_of]
     last = {a: k for k, _, *operands in steps for a in operands} | dict.fromkeys(roots, -1)
     code: list[list[int]] = []
@@ -332,12 +355,18 @@ def _arrange(graph: _Graph, roots: list[int], noises: int, sources: int, inputs:
             register_of[k] = free.pop() if free else registers - 1
         else:
             register_of[k], count = ~count, count + 1
-        row = [register_of[a] for a in operands]
-        code.append([OPERATIONS.index(name), register_of[k], *row, *row[-1:] * (3 - len(row))])
-        free += [
-            register_of[a] for a in set(operands) if last[a] == k and register_of[a] >= sources
+        row, size = [register_of[a] for a in operands], 2 if name == "affine" else 3
+        code += [
+            [OPERATIONS.index(name), register_of[k], *some, *some[-1:] * (3 - len(some))]
+            for some in (row[first : first + size] for first in range(0, len(row), size))
         ]
-    if sum(row[1] >= 0 for row in code) > _MOST_INSTRUCTIONS:
+        # adjacent sums are computed together, so that none may write what another one reads
+        free += [
+            register_of[a]
+            for a in set(operands)
+            if last[a] == k and register_of[a] >= sources and name != "affine"
+        ]
+    if sum(graph.of_particles[row[0]] for row in steps) > _MOST_INSTRUCTIONS:
         raise NoTapeError(f"it needs more than {_MOST_INSTRUCTIONS} instructions")
     return Tape(
         _stack(chain(*code), (-1, 5)),

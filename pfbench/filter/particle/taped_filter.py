@@ -6,8 +6,7 @@ import logging
 import math
 import zlib
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 from weakref import WeakSet
 
 import torch
@@ -39,9 +38,8 @@ from pfbench.filter.particle.taken_steps import (
     TakenSteps,
     WholeStepFilter,
     keep_count,
-    tensors_in,
 )
-from pfbench.filter.particle.tape import FEW, NoTapeError, Tape, record_tape
+from pfbench.filter.particle.tape import FEW, NoTapeError, Tape, list_inputs, record_tape
 from pfbench.kernels import dispatch
 from pfbench.kernels.step_compiler import to_storage
 from pfbench.model.base import StateSpaceModel
@@ -76,15 +74,6 @@ def find_obstacle(method: Any, model: StateSpaceModel) -> str:
     return "" if is_double else "its numbers are not of double precision on the CPU"
 
 
-class _Pass(NamedTuple):
-    """A pass over a record, the tape of its model, and the evaluations of the measurement distribution per particle and step."""
-
-    model: StateSpaceModel
-    record: Record
-    tape: Tape
-    evaluations: int
-
-
 @dataclass(eq=False)
 class TapedParticleFilter(WholeStepFilter):
     """Bootstrap filter whose steps are taken by one C++ call, with the model as a tape.
@@ -102,7 +91,8 @@ class TapedParticleFilter(WholeStepFilter):
     has_bounded_weights = WholeStepFilter.has_bounded_weights
     is_active: bool = False
     seconds: float = 0.0
-    _passes: dict[tuple[int, int], _Pass] = field(default_factory=dict)
+    # by model and record, which live as long: their tape, and evaluations of the measurement distribution per particle and step
+    _passes: dict[tuple[int, int], tuple[Tape, int, Any]] = field(default_factory=dict)
     _refused: WeakSet[StateSpaceModel] = field(default_factory=WeakSet)
 
     @override
@@ -128,14 +118,13 @@ class TapedParticleFilter(WholeStepFilter):
             if current is None or model.at_step(t) is not model:
                 belief, info = self.method.step(model.at_step(t), belief, record.at_step(t), stream)
                 return StepBlock.of_step(t, belief, info), belief, limit
-        numbers = belief.x.numel() + 3 * belief.log_w.numel()
         most = (1 if selection.all_steps else _MORE_UNKEPT) * MAX_NUMBERS
-        steps = min(max(1, most // numbers), remaining)
+        steps = min(max(1, most // (belief.x.numel() + 3 * belief.log_w.numel())), remaining)
         block_record = record.select_steps(slice(t, t + steps))
+        (tape, evaluations, _), rows = current, selection.select_rows(t, steps)
         threshold = cast(EssResampler, self.method.resampler).ess_threshold
-        rows = selection.select_rows(t, steps)
-        block = _run(current.tape, threshold, belief, block_record, stream, rows)
-        self.count(steps * current.evaluations * belief.log_w.numel())
+        block = _run(tape, threshold, belief, block_record, stream, rows)
+        self.count(steps * evaluations * belief.log_w.numel())
         if steps == remaining:
             self._passes.pop(key)
         return block.make_block(self.method, model, block_record, t, selection), block.last, limit
@@ -169,31 +158,27 @@ class TapedParticleFilter(WholeStepFilter):
         while len(self._passes) >= _PASSES:
             self._passes.pop(next(iter(self._passes)))
         self.is_active = True
-        self._passes[id(model), id(record)] = _Pass(
-            model, record, tape, evaluations_each
-        )  # which live as long
+        self._passes[id(model), id(record)] = tape, evaluations_each, (model, record)
 
 
 def _run(
     tape: Tape, threshold: float, belief: ParticleBelief, record: Record, draws: Any, rows: list[int]
 ) -> TakenSteps:  # fmt: skip
     """Take all steps of a record. `draws` belongs to the first of them, and `rows` are those whose particles are returned."""
-    steps, runs = record.y.shape[1], len(record.y)
+    steps = record.y.shape[1]
     returned = rows if steps - 1 in rows else [*rows, steps - 1]
-    leaves = [
-        a.transpose(0, 1).expand(steps, runs, *a.shape[2:]).reshape(steps, runs, -1).double()
-        for a in tensors_in((record.u, record.y))
+    *leaves, y = [
+        a.transpose(0, 1).expand(steps, -1, *a.shape[2:]).reshape(steps, len(a), -1).double()
+        for a in list_inputs(record)
     ]
-    labels = [zlib.crc32(label) for label in (b"resample", b"noise")]
-    sizes = [tape.noises, tape.registers, tape.numbers, int(draws.step), int(draws.seed), *labels]
+    shared = [y[:, :1, :0], *(a for a in leaves if a.shape[1] == 1)]
+    separate = [*(a for a in leaves if a.shape[1] > 1), y]
+    sizes = [*tape[3:], int(draws.step), int(draws.seed), *map(zlib.crc32, (b"resample", b"noise"))]
     weights = belief.log_w, exponentiate(belief.log_w, belief.weights)
-    others = (
-        torch.tensor(returned),
-        torch.tensor([threshold], dtype=torch.float64),
-        torch.tensor(sizes),
-    )
-    state = to_storage(belief.x), *weights, draws.runs, *others
-    results = dispatch.run_tape([*tape[:3], torch.cat(leaves, -1), *state])
+    cloud = to_storage(belief.x), *weights, draws.runs, torch.tensor(returned)
+    limits = torch.tensor([threshold], dtype=torch.float64), torch.tensor(sizes)
+    inputs = torch.cat(shared, -1), torch.cat(separate, -1)
+    results = dispatch.run_tape([*tape[:3], *inputs, *cloud, *limits])
     mean, variance, total, ess, resampled, ancestors = (a.transpose(0, 1) for a in results[:6])
     log_evidence = belief.log_evidence.unsqueeze(1) + total.cumsum(1)
     clouds = {}
@@ -213,12 +198,15 @@ def _check_tape(
     Shapes: x [R, N, D], record [R, 1, Dy], states [R, N, D], value [R, N].
     """
     log_w = torch.full_like(value, -math.log(FEW))
-    before = ParticleBelief(x, log_w, log_w.new_zeros(len(x)))
+    before = ParticleBelief(x, log_w, value.new_zeros(len(x)))
     block = _run(tape, 0.0, before, record, draws, [0])  # a threshold of 0 keeps all particles
     finite = torch.isfinite(states).all(-1)
     updated = torch.where(finite & ~torch.isnan(value), value + log_w, -torch.inf)
     weighed = torch.isfinite(updated.logsumexp(1))
-    computed = (block.last.log_w + block.log_evidence)[weighed]
-    agrees = partial(torch.allclose, rtol=1e-9, atol=1e-12)
-    if not (agrees(block.last.x[finite], states[finite]) and agrees(computed, updated[weighed])):
+    computed = (
+        block.last.x[finite].flatten(),
+        (block.last.log_w + block.log_evidence)[weighed].flatten(),
+    )
+    expected = states[finite].flatten(), updated[weighed].flatten()
+    if not torch.allclose(torch.cat(computed), torch.cat(expected), rtol=1e-9, atol=1e-12):
         raise NoTapeError("the tape does not compute the numbers of torch")

@@ -23,40 +23,21 @@ extern "C" void systematic_float(int64_t*, const float*, const double*, const do
 extern "C" void systematic_double(int64_t*, const double*, const double*, const double*, int64_t, int64_t);
 
 namespace {
-inline void systematic(int64_t* ancestor, const float* weight, const double* n, const double* u, int64_t runs, int64_t slots) {
-    systematic_float(ancestor, weight, n, u, runs, slots);
-}
-inline void systematic(int64_t* ancestor, const double* weight, const double* n, const double* u, int64_t runs, int64_t slots) {
-    systematic_double(ancestor, weight, n, u, runs, slots);
-}
+inline void systematic(int64_t* ancestor, const float* w, const double* n, const double* u, int64_t runs, int64_t slots) { systematic_float(ancestor, w, n, u, runs, slots); }
+inline void systematic(int64_t* ancestor, const double* w, const double* n, const double* u, int64_t runs, int64_t slots) { systematic_double(ancestor, w, n, u, runs, slots); }
 
-// Rows of components of one run, `plane` numbers apart.
-template <class T>
-struct Rows {
-    T* from;
-    int64_t plane;
-};
-
-// Copies the parents of one run, out [D, M] by planes of x and of out.
-template <class T>
-void parents(Rows<T> out, Rows<const T> x, const int64_t* ancestor, int64_t components, int64_t wanted, std::vector<int32_t>& from) {
-    if (components == 1) {
-        for (int64_t j = 0; j < wanted; ++j) out.from[j] = x.from[ancestor[j]];
-        return;
-    }
-    for (int64_t j = 0; j < wanted; ++j) from[j] = static_cast<int32_t>(ancestor[j]);  // half as long
-    for (int64_t d = 0; d < components; ++d) {
-        const T* row = x.from + d * x.plane;
-        T* to = out.from + d * out.plane;
-        for (int64_t j = 0; j < wanted; ++j) to[j] = row[from[j]];
-    }
-}
-
+// Copies parents: out [D, R, M] of x [D, R, N].
 template <class T>
 void copied(T* out, const T* x, const int64_t* ancestor, int64_t components, int64_t runs, int64_t slots, int64_t wanted) {
-    std::vector<int32_t> from(components == 1 ? 0 : wanted);
-    for (int64_t r = 0; r < runs; ++r)
-        parents<T>({out + r * wanted, runs * wanted}, {x + r * slots, runs * slots}, ancestor + r * wanted, components, wanted, from);
+    std::vector<int32_t> from(wanted);
+    for (int64_t r = 0; r < runs; ++r, ancestor += wanted) {
+        for (int64_t j = 0; j < wanted; ++j) from[j] = static_cast<int32_t>(ancestor[j]);  // half as long
+        for (int64_t d = 0; d < components; ++d) {
+            const T* row = x + (d * runs + r) * slots;
+            T* to = out + (d * runs + r) * wanted;
+            for (int64_t j = 0; j < wanted; ++j) to[j] = row[from[j]];
+        }
+    }
 }
 
 // -1/2 sum ((y - mean) scale)^2 - constant; y, scale and constant are of a run, mean [R, N, K] lies as its strides say.
@@ -82,16 +63,9 @@ void log_normal(T* out, const T* y, const T* mean, const T* scale, const T* cons
     }
 }
 
-// A coefficient that is not zero, and the row that it is for.
-template <class T>
-struct Term {
-    const T* from;
-    T by;
-};
-
 // Rows of sums of terms, the ends of which are in `last`, for particles that fill S registers or more.
 template <class T, int S>
-void summed(T* out, const Term<T>* terms, const std::vector<int64_t>& last, int64_t plane, int64_t particles) {
+void summed(T* const* out, const Product<T>* terms, const std::vector<int64_t>& last, int64_t particles) {
     typedef T Lanes __attribute__((vector_size(REGISTER), aligned(sizeof(T)), may_alias));
     constexpr int64_t WIDE = S * REGISTER / sizeof(T);
     for (int64_t next = 0; next < particles; next += WIDE) {
@@ -102,56 +76,44 @@ void summed(T* out, const Term<T>* terms, const std::vector<int64_t>& last, int6
                 const Lanes* from = reinterpret_cast<const Lanes*>(terms[t].from + at);
                 for (int k = 0; k < S; ++k) sum[k] += terms[t].by * from[k];
             }
-            for (int k = 0; k < S; ++k) reinterpret_cast<Lanes*>(out + d * plane + at)[k] = sum[k];
+            for (int k = 0; k < S; ++k) reinterpret_cast<Lanes*>(out[d] + at)[k] = sum[k];
         }
+    }
+}
+
+template <class T>
+void sums(T* const* out, const Product<T>* terms, const std::vector<int64_t>& last, int64_t particles) {
+    constexpr int64_t WIDE = REGISTER / sizeof(T);
+    if (particles >= 8 * WIDE) return summed<T, 8>(out, terms, last, particles);
+    if (particles >= 4 * WIDE) return summed<T, 4>(out, terms, last, particles);
+    if (particles >= WIDE) return summed<T, 1>(out, terms, last, particles);
+    for (int64_t d = 0, t = 0; d < static_cast<int64_t>(last.size()); ++d) {
+        std::fill_n(out[d], particles, T(0));
+        for (; t < last[d]; ++t)
+            for (int64_t at = 0; at < particles; ++at) out[d][at] += terms[t].by * terms[t].from[at];
     }
 }
 
 // out = phi x + gain w of each particle, by the coefficients that are not zero: in error models of an INS three in four are.
 template <class T>
-class Affine {
-  public:
-    Affine(int64_t rows, int64_t states, int64_t noises)
-        : states_(states), noises_(noises), terms_(rows * (states + noises)), last_(rows) {}
-
-    void apply(Rows<T> out, const T* phi, Rows<const T> x, const T* gain, Rows<const T> w, int64_t particles) {
-        constexpr int64_t WIDE = REGISTER / sizeof(T);
-        const int64_t rows = last_.size();
-        int64_t count = 0;
-        for (int64_t d = 0; d < rows; ++d) {
-            for (int64_t k = 0; k < states_; ++k)
-                if (const T c = phi[d * states_ + k]; c != 0) terms_[count++] = {x.from + k * x.plane, c};
-            for (int64_t k = 0; k < noises_; ++k)
-                if (const T c = gain[d * noises_ + k]; c != 0) terms_[count++] = {w.from + k * w.plane, c};
-            last_[d] = count;
-        }
-        if (particles >= 8 * WIDE) summed<T, 8>(out.from, terms_.data(), last_, out.plane, particles);
-        else if (particles >= 4 * WIDE) summed<T, 4>(out.from, terms_.data(), last_, out.plane, particles);
-        else if (particles >= WIDE) summed<T, 1>(out.from, terms_.data(), last_, out.plane, particles);
-        else
-            for (int64_t d = 0, t = 0; d < rows; ++d) {
-                T* to = out.from + d * out.plane;
-                for (int64_t at = 0; at < particles; ++at) to[at] = 0;
-                for (; t < last_[d]; ++t)
-                    for (int64_t at = 0; at < particles; ++at) to[at] += terms_[t].by * terms_[t].from[at];
-            }
-    }
-
-  private:
-    int64_t states_, noises_;
-    std::vector<Term<T>> terms_;
-    std::vector<int64_t> last_;
-};
-
-template <class T>
 void affine(T* out, const T* phi, const T* x, const T* gain, const T* w, int64_t one_phi, int64_t one_gain, int64_t runs,
             int64_t particles, int64_t rows, int64_t states, int64_t noises) {
-    Affine<T> move(rows, states, noises);
+    std::vector<Product<T>> terms(rows * (states + noises));
+    std::vector<int64_t> last(rows);
+    std::vector<T*> to(rows);
     const int64_t plane = runs * particles;
-    for (int64_t r = 0; r < runs; ++r) {
-        const int64_t first = r * particles;
-        move.apply({out + first, plane}, phi + (one_phi ? 0 : r * rows * states), {x + first, plane},
-                   gain + (one_gain ? 0 : r * rows * noises), {w + first, plane}, particles);
+    for (int64_t r = 0; r < runs; ++r, x += particles, w += particles, out += particles) {
+        int64_t count = 0;
+        const auto add = [&](const T* row, const T* from, int64_t many) {
+            for (int64_t k = 0; k < many; ++k)
+                if (row[k] != 0) terms[count++] = {from + k * plane, row[k]};
+        };
+        for (int64_t d = 0; d < rows; ++d) {
+            add(phi + ((one_phi ? 0 : r * rows) + d) * states, x, states);
+            add(gain + ((one_gain ? 0 : r * rows) + d) * noises, w, noises);
+            last[d] = count, to[d] = out + d * plane;
+        }
+        sums(to.data(), terms.data(), last, particles);
     }
 }
 
@@ -334,6 +296,9 @@ extern "C" int64_t distinct_double(const int64_t* ancestor, const double* log_w,
     int64_t count;
     distinct(&count, ancestor, log_w, 1, slots);
     return count;
+}
+extern "C" void sums_double(double* const* out, const Product<double>* terms, const std::vector<int64_t>* last, int64_t particles) {
+    sums(out, terms, *last, particles);
 }
 extern "C" void moments_double(double* mean, double* variance, const double* x, const double* w, int64_t slots) {
     moments(mean, variance, x, w, 1, 1, slots);

@@ -1,4 +1,4 @@
-// Steps of a bootstrap filter whose model is a tape: elementwise instructions that were recorded once (pfbench/filter/particle/tape.py).
+// Steps of a bootstrap filter whose model is a tape: instructions that were recorded once (pfbench/filter/particle/tape.py).
 //
 // A run's particles are taken in blocks, so that all registers of the tape stay in the first-level cache. Random numbers, resampling,
 // weights and moments are those of the operators, by the same code.
@@ -17,6 +17,7 @@ extern "C" void normals_double(double*, const int64_t*, int64_t, int64_t, int64_
 extern "C" void uniforms(double*, const int64_t*, int64_t, int64_t, int64_t, int64_t, int64_t, int64_t);
 extern "C" bool choose_double(int64_t*, double*, const double*, const double*, double, double, int64_t);
 extern "C" int64_t distinct_double(const int64_t*, const double*, int64_t);
+extern "C" void sums_double(double* const*, const Product<double>*, const std::vector<int64_t>*, int64_t);
 extern "C" void moments_double(double*, double*, const double*, const double*, int64_t);
 extern "C" void normalise_double(double*, double*, double*, double*, const double*, int64_t);
 
@@ -92,10 +93,11 @@ void execute(int64_t operation, double* out, Operand a, Operand b, Operand c, in
             for (int64_t i = 0; i < n; ++i) out[i] = a.at[i * a.across] != 0 ? b.at[i * b.across] : c.at[i * c.across];
     }
 }
-constexpr int64_t OPERATIONS = 30;
+constexpr int64_t AFFINE = 30, OPERATIONS = 31;
 
 // Rows of `code`: operation, result and three operands. Numbers from 0 on are registers of particles: states, noise, results. ~0, ~1, ...
-// are numbers of a run: constants, inputs of the step, results.
+// are numbers of a run: constants, inputs of the step, results. A row of AFFINE is a term of its result, a number of the run times a
+// register. The terms of a result are adjacent, and no adjacent one writes what another reads.
 struct Tape {
     int64_t states, noises, constants, inputs, registers, numbers;
     const int64_t* code;
@@ -114,6 +116,7 @@ struct Tape {
             require(row[1] >= states + noises || (row[1] < 0 && ~row[1] >= constants + inputs), "run_tape: a result must have a place of its own");
             for (int k = 2; k < 5; ++k)
                 require(row[1] >= 0 || row[k] < 0, "run_tape: a number of a run must not depend on particles");
+            require(row[0] != AFFINE || (row[1] >= 0 && row[2] < 0 && row[3] >= 0), "run_tape: a term must be a number times a register");
         }
         for (int64_t d = 0; d <= states; ++d) check_operand(outputs[d]);
     }
@@ -121,14 +124,32 @@ struct Tape {
 
 // A run's memory, used again for each run and step.
 struct Workspace {
-    std::vector<double> parents, noise, scratch, number, log_w, updated;
+    std::vector<double> copies, noise, scratch, number, log_w, updated;
+    const double* parents = nullptr;  // [states] rows `apart` apart: copies of the chosen ones, or the states before
+    int64_t apart = 0;
     std::vector<int64_t> ancestors;
     std::vector<const double*> place;
+    std::vector<Product<double>> terms;  // of sums that are computed together
+    std::vector<int64_t> last;
+    std::vector<double*> sums;
     Workspace(const Tape& tape, int64_t slots)
-        : parents(tape.states * slots), noise(tape.noises * 4 * ((slots + 3) / 4)),
+        : copies(tape.states * slots), noise(tape.noises * 4 * ((slots + 3) / 4)),
           scratch((tape.registers - tape.states - tape.noises) * BLOCK), number(tape.numbers), log_w(slots), updated(slots), ancestors(slots),
           place(tape.registers) {}
 };
+
+// The adjacent sums from `row` on. Returns the row after them. Zeros are left out where they multiply states and noise, which are finite.
+const int64_t* add_terms(const Tape& tape, Workspace& work, const int64_t* row, int64_t n) {
+    const int64_t given = tape.states + tape.noises;
+    work.terms.clear(), work.last.clear(), work.sums.clear();
+    for (int64_t result = -1; row < tape.code + 5 * tape.rows && row[0] == AFFINE; result = row[1], row += 5) {
+        if (row[1] != result) work.sums.push_back(work.scratch.data() + (row[1] - given) * BLOCK), work.last.push_back(0);
+        if (const double by = work.number[~row[2]]; by != 0 || row[3] >= given) work.terms.push_back({work.place[row[3]], by});
+        work.last.back() = work.terms.size();
+    }
+    sums_double(work.sums.data(), work.terms.data(), &work.last, n);
+    return row;
+}
 
 // New states [states] rows `plane` apart, and the log weights `updated` of one run, from its parents and its noise.
 void propagate(const Tape& tape, Workspace& work, double* x, int64_t plane, int64_t slots) {
@@ -136,11 +157,12 @@ void propagate(const Tape& tape, Workspace& work, double* x, int64_t plane, int6
     const auto read = [&](int64_t a) { return a < 0 ? Operand{&work.number[~a], 0} : Operand{work.place[a], 1}; };
     for (int64_t first = 0; first < slots; first += BLOCK) {
         const int64_t n = std::min(BLOCK, slots - first);
-        for (int64_t d = 0; d < tape.states; ++d) work.place[d] = work.parents.data() + d * slots + first;
+        for (int64_t d = 0; d < tape.states; ++d) work.place[d] = work.parents + d * work.apart + first;
         for (int64_t d = 0; d < tape.noises; ++d) work.place[tape.states + d] = work.noise.data() + d * stride + first;
         for (int64_t k = given; k < tape.registers; ++k) work.place[k] = work.scratch.data() + (k - given) * BLOCK;
-        for (const int64_t* row = tape.code; row < tape.code + 5 * tape.rows; row += 5) {
-            if (row[1] < 0 && first > 0) continue;  // computed with the first block
+        for (const int64_t *row = tape.code, *next; row < tape.code + 5 * tape.rows; row = next) {
+            next = row[0] == AFFINE ? add_terms(tape, work, row, n) : row + 5;
+            if (row[0] == AFFINE || (row[1] < 0 && first > 0)) continue;  // numbers of a run are computed with the first block
             double* const out = row[1] < 0 ? &work.number[~row[1]] : work.scratch.data() + (row[1] - given) * BLOCK;
             execute(row[0], out, read(row[2]), read(row[3]), read(row[4]), row[1] < 0 ? 1 : n);
         }
@@ -161,7 +183,7 @@ void deactivate(double* x, int64_t plane, Workspace& work, int64_t states, int64
         for (int64_t d = 0; d < states; ++d) sum += x[d * plane + i];
         if (std::isfinite(sum)) continue;
         work.updated[i] = NONE;
-        for (int64_t d = 0; d < states; ++d) x[d * plane + i] = work.parents[d * slots + i];
+        for (int64_t d = 0; d < states; ++d) x[d * plane + i] = work.parents[d * work.apart + i];
     }
 }
 
@@ -176,21 +198,23 @@ struct Results {
     std::vector<Tensor> list() const { return {mean, variance, total, ess, resampled, distinct, x, log_w, w, prior}; }
 };
 
-// T steps from `first` on. Tensors: code int64 [I, 5], outputs int64 [D + 1], constants float64 [C], inputs float64 [T, R, U],
-// x float64 [D, R, N], log_w and w float64 [R, N], runs int64 [R], kept int64 [K] (ascending, with the last step), threshold float64 [1],
-// sizes int64 [7]: noises, registers, numbers, first, seed, purposes of offset and noise.
+// T steps from `first` on. Tensors: code int64 [I, 5], outputs int64 [D + 1], constants float64 [C], inputs of all runs float64 [T, 1, S] and
+// of each float64 [T, R, U], x float64 [D, R, N], log_w and w float64 [R, N], runs int64 [R], kept int64 [K] (ascending, with the last
+// step), threshold float64 [1], sizes int64 [7]: noises, registers, numbers, first, seed, purposes of offset and noise.
 std::vector<Tensor> run_tape(std::vector<Tensor> given) {
-    require(given.size() == 11, "run_tape: must have 11 tensors");
-    const auto axes = [&](int k, int64_t count) { require(given[k].dim() == count && given[k].numel() < MAX_SIZE, "run_tape: a tensor has another shape"); };
-    for (const auto& [k, count] : {std::pair{0, 2}, {1, 1}, {2, 1}, {3, 3}, {4, 3}, {5, 2}, {6, 2}, {7, 1}, {8, 1}, {9, 1}, {10, 1}}) axes(k, count);
-    const Packed<int64_t> code(given[0]), outputs(given[1]), run(given[7]), kept(given[8]), size(given[10]);
-    const Packed<double> constants(given[2]), input(given[3]), x0(given[4]), log_w0(given[5]), w0(given[6]), threshold(given[9]);
-    const int64_t steps = given[3].size(0), runs = given[4].size(1), slots = given[4].size(2), rows = given[8].size(0);
+    require(given.size() == 12, "run_tape: must have 12 tensors");
+    constexpr int AXES[] = {2, 1, 1, 3, 3, 3, 2, 2, 1, 1, 1, 1};
+    for (int k = 0; k < 12; ++k) require(given[k].dim() == AXES[k] && given[k].numel() < MAX_SIZE, "run_tape: a tensor has another shape");
+    const Packed<int64_t> code(given[0]), outputs(given[1]), run(given[8]), kept(given[9]), size(given[11]);
+    const Packed<double> constants(given[2]), shared(given[3]), own(given[4]), x0(given[5]), log_w0(given[6]), w0(given[7]), threshold(given[10]);
+    const int64_t steps = given[4].size(0), runs = given[5].size(1), slots = given[5].size(2), rows = given[9].size(0);
     const auto is_cloud = [&](int k) { return given[k].size(0) == runs && given[k].size(1) == slots; };
-    require(given[10].size(0) == 7 && given[9].size(0) == 1 && given[0].size(1) == 5 && given[1].size(0) == given[4].size(0) + 1 &&
-                given[3].size(1) == runs && is_cloud(5) && is_cloud(6) && given[7].size(0) == runs && slots > 0,
+    require(given[11].size(0) == 7 && given[10].size(0) == 1 && given[0].size(1) == 5 && given[1].size(0) == given[5].size(0) + 1 &&
+                given[3].size(0) == steps && given[3].size(1) == 1 && given[4].size(1) == runs && is_cloud(6) && is_cloud(7) &&
+                given[8].size(0) == runs && slots > 0,
             "run_tape: its tensors must have common sizes");
-    const Tape tape{given[4].size(0), size.data[0], given[2].size(0), given[3].size(2), size.data[1], size.data[2], code.data, given[0].size(0), outputs.data};
+    const int64_t common = given[3].size(2), each = given[4].size(2);
+    const Tape tape{given[5].size(0), size.data[0], given[2].size(0), common + each, size.data[1], size.data[2], code.data, given[0].size(0), outputs.data};
     tape.check();
     for (int64_t k = 0; k < rows; ++k)
         require(kept.data[k] < steps && kept.data[k] > (k ? kept.data[k - 1] : -1), "run_tape: kept must ascend below the number of steps");
@@ -198,38 +222,42 @@ std::vector<Tensor> run_tape(std::vector<Tensor> given) {
     const int64_t plane = runs * slots, first = size.data[3], seed = size.data[4];
     const Results out(steps, rows, tape.states, runs, slots);
     Workspace work(tape, slots);
-    std::vector<double> spare[2] = {std::vector<double>(rows < steps ? tape.states * plane : 0), std::vector<double>(rows < steps ? tape.states * plane : 0)};
-    std::vector<double> spare_log_w(rows < steps ? plane : 0), spare_w(rows < steps ? plane : 0);
+    std::vector<double> spare[2] = {std::vector<double>(tape.states * slots), std::vector<double>(tape.states * slots)}, spare_log_w(slots), spare_w(slots);
     std::copy_n(constants.data, tape.constants, work.number.data());
-    const double *x = x0.data, *log_w = log_w0.data, *w = w0.data;
-    for (int64_t t = 0, row = 0; t < steps; ++t) {
-        const bool keep = kept.data[row] == t;
-        double* const new_x = keep ? numbers<double>(out.x) + row * tape.states * plane : spare[t % 2].data();
-        double* const new_log_w = keep ? numbers<double>(out.log_w) + row * plane : spare_log_w.data();
-        double* const new_w = keep ? numbers<double>(out.w) + row * plane : spare_w.data();
-        for (int64_t r = 0; r < runs; ++r) {
-            const int64_t at = t * runs + r, from = r * slots;
+    for (int64_t r = 0; r < runs; ++r) {  // all steps of a run, whose particles stay in the cache
+        const int64_t from = r * slots;
+        const double *x = x0.data + from, *log_w = log_w0.data + from, *w = w0.data + from;
+        int64_t apart = plane;
+        for (int64_t t = 0, row = 0; t < steps; ++t) {
+            const bool keep = kept.data[row] == t;
+            const int64_t at = t * runs + r, new_apart = keep ? plane : slots;
+            double* const new_x = keep ? numbers<double>(out.x) + row * tape.states * plane + from : spare[t % 2].data();
+            double* const new_log_w = keep ? numbers<double>(out.log_w) + row * plane + from : spare_log_w.data();
+            double* const new_w = keep ? numbers<double>(out.w) + row * plane + from : spare_w.data();
             double offset[4];
             uniforms(offset, run.data + r, 1, 1, 1, first + t, seed, size.data[5]);
-            numbers<bool>(out.resampled)[at] = choose_double(work.ancestors.data(), work.log_w.data(), w + from, log_w + from, *offset, *threshold.data, slots);
+            const bool resampled = choose_double(work.ancestors.data(), work.log_w.data(), w, log_w, *offset, *threshold.data, slots);
+            numbers<bool>(out.resampled)[at] = resampled;
             numbers<int64_t>(out.distinct)[at] = distinct_double(work.ancestors.data(), work.log_w.data(), slots);
-            for (int64_t d = 0; d < tape.states; ++d)
-                for (int64_t i = 0; i < slots; ++i) work.parents[d * slots + i] = x[d * plane + from + work.ancestors[i]];
+            for (int64_t d = 0; resampled && d < tape.states; ++d)
+                for (int64_t i = 0; i < slots; ++i) work.copies[d * slots + i] = x[d * apart + work.ancestors[i]];
+            work.parents = resampled ? work.copies.data() : x, work.apart = resampled ? slots : apart;
             normals_double(work.noise.data(), run.data + r, 1, 0, tape.noises, (slots + 3) / 4, first + t, seed, size.data[6]);
-            std::copy_n(input.data + at * tape.inputs, tape.inputs, work.number.data() + tape.constants);
-            propagate(tape, work, new_x + from, plane, slots);
+            std::copy_n(own.data + at * each, each, std::copy_n(shared.data + t * common, common, work.number.data() + tape.constants));
+            propagate(tape, work, new_x, new_apart, slots);
             if (keep) std::copy_n(work.log_w.data(), slots, numbers<double>(out.prior) + row * plane + from);
             double *const mean = numbers<double>(out.mean) + at * tape.states, *const variance = numbers<double>(out.variance) + at * tape.states;
             const auto weigh = [&] {
-                normalise_double(new_log_w + from, numbers<double>(out.total) + at, new_w + from, numbers<double>(out.ess) + at, work.updated.data(), slots);
-                for (int64_t d = 0; d < tape.states; ++d) moments_double(mean + d, variance + d, new_x + d * plane + from, new_w + from, slots);
+                normalise_double(new_log_w, numbers<double>(out.total) + at, new_w, numbers<double>(out.ess) + at, work.updated.data(), slots);
+                for (int64_t d = 0; d < tape.states; ++d) moments_double(mean + d, variance + d, new_x + d * new_apart, new_w, slots);
             };
             weigh();
-            if (std::isfinite(std::accumulate(mean, mean + tape.states, 0.0))) continue;
-            deactivate(new_x + from, plane, work, tape.states, slots);
-            weigh();
+            if (!std::isfinite(std::accumulate(mean, mean + tape.states, 0.0))) {
+                deactivate(new_x, new_apart, work, tape.states, slots);
+                weigh();
+            }
+            x = new_x, log_w = new_log_w, w = new_w, apart = new_apart, row += keep;
         }
-        x = new_x, log_w = new_log_w, w = new_w, row += keep;
     }
     return out.list();
 }

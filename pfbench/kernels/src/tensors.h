@@ -17,6 +17,13 @@ inline void require(bool condition, const char* message) {
     if (!condition) throw std::runtime_error(message);
 }
 
+// A product of a sum: numbers of particles, and their coefficient.
+template <class T>
+struct Product {
+    const T* from;
+    T by;
+};
+
 // Of the processor: a compiler takes longer vectors apart badly.
 #if defined(__AVX512F__)
 constexpr int REGISTER = 64;  // bytes

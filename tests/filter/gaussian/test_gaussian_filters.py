@@ -12,7 +12,7 @@ import pytest
 import torch
 from checkout import TESTS
 from filter_laws import check_own, check_wrapped
-from model_cases import Bearing, four_states, measurements
+from model_cases import Bearing, Hidden, four_states, measurements
 from pyro.distributions import GaussianHMM, MultivariateNormal
 from refusals import check_refused
 from torch import Tensor
@@ -203,13 +203,6 @@ def test_draws_by_the_posterior_root_do_not_hang_on_rounding(gradient: bool) -> 
         rtol=0,
         atol=1e-14,
     )
-
-
-class Hidden(LinearGaussian):
-    """A linear model that keeps its noise gain to itself: the noise goes through the rule, as an unknown beside the state."""
-
-    def noise_gain(self, u: Any) -> None:
-        return None
 
 
 @every_rule

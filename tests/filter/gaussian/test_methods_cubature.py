@@ -7,9 +7,10 @@ from typing import Any
 
 import pytest
 import torch
+from config_cases import composed
 from rule_cases import RULES
 from scipy import stats
-from tight_cases import composed, flight, kalman, linear
+from tight_cases import flight, kalman, linear
 from torch import Tensor
 
 from pfbench import job

@@ -11,11 +11,11 @@ import oracles
 import pytest
 import torch
 from filter_laws import check_lost_alone, check_own
-from model_cases import measurements
+from model_cases import Turning, measurements
 from scipy import stats
 from torch import Tensor
 
-from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock
+from pfbench.core.chart import Chart
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
@@ -190,11 +190,6 @@ def test_empty_slots_take_no_part_and_stay_empty() -> None:
 
 
 def test_it_draws_in_the_chart() -> None:
-    class Turning(LinearGaussian):
-        @property
-        def chart(self) -> Chart:
-            return Chart((AngleBlock(1), EuclideanBlock(1)))
-
     model = Turning(np.eye(2), np.eye(2), np.eye(2), [1.0, 1.0], [0.0, 0.0], [1.0, 1.0])
     top = torch.tensor([math.pi, 0.0], dtype=torch.float64)
     x = model.chart.add(top, 0.1 * PhiloxStream(1, torch.arange(1)).normal("x", 500, 2))

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from model_cases import Turning
 from scipy import stats
 from torch import Tensor
 
-from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.filter.belief import (
     ComputedWeights,
@@ -26,7 +26,7 @@ from pfbench.filter.particle import resampling
 from pfbench.filter.particle.regularised_resampling import RegularisedResampler
 from pfbench.filter.particle.resampling import Multinomial, Residual, Stratified
 from pfbench.filter.particle.stages import EssResampler, ResamplingScheme, Systematic
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
+from pfbench.model.linear_gaussian import linear_walk
 from pfbench.testing import check_resampling
 
 SCHEMES: list[ResamplingScheme] = [
@@ -406,11 +406,6 @@ def test_regularisation_of_a_collapsed_cloud_moves_nothing_far() -> None:
 
 
 def test_regularisation_respects_the_chart() -> None:
-    class Turning(LinearGaussian):
-        @property
-        def chart(self) -> Chart:
-            return Chart((AngleBlock(1), EuclideanBlock(1)))
-
     model = Turning(np.eye(2), np.eye(2), np.eye(2), [1.0, 1.0], [0.0, 0.0], [1.0, 1.0])
     z = normal(1, 500, 2)
     x = model.chart.add(torch.tensor([math.pi, 0.0], dtype=torch.float64), 0.1 * z)

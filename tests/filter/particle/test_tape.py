@@ -16,6 +16,7 @@ from model_cases import tracker
 from torch import Tensor
 
 from pfbench import job
+from pfbench.core.linear_algebra import affine_map
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, StepInfo
@@ -24,12 +25,14 @@ from pfbench.filter.particle import taped_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.resampling import Stratified
 from pfbench.filter.particle.stages import EssResampler, Systematic
+from pfbench.filter.particle.taken_steps import tensors_in
 from pfbench.filter.particle.tape import NoTapeError, record_tape
 from pfbench.filter.particle.taped_filter import TapedParticleFilter
 from pfbench.job.scoring import LikelihoodCounter
 from pfbench.kernels import dispatch
 from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import linear_walk
+from pfbench.model.ins_gnss import LooseStep
+from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.model.textbook import (
     Benes,
     Lorenz63,
@@ -44,6 +47,9 @@ pytestmark = compiler
 RUNS = torch.tensor([7, 0, 12])
 PARTICLES = 700  # blocks of 256 and a rest
 CLOSE = 2e-12
+ROTATION = torch.linalg.qr(torch.arange(25.0).reshape(5, 5).double().sin())[0]
+# dense, with a few noises: the distribution of the next state is singular
+MATRICES = 0.95 * ROTATION, ROTATION[:, :3], ROTATION[:2] + 0.1, [0.5, 0.7], [1.0] * 5, [2.0] * 5
 
 
 def make_filter(threshold: float = 0.5, particles: int = PARTICLES) -> ParticleFilter:
@@ -94,6 +100,7 @@ MODELS: dict[str, Callable[[], StateSpaceModel]] = {
     "lorenz": Lorenz63,
     "benes": Benes,
     "tracker": tracker,
+    "linear": lambda: LinearGaussian(*MATRICES),
 }
 
 
@@ -108,12 +115,12 @@ def test_a_tape_computes_what_the_operators_compute(name: str, threshold: float)
     assert bool(resampled.any()) == (threshold > 0.0)
 
 
-@pytest.mark.parametrize("words", ["passive_1", "terrain"])
+@pytest.mark.parametrize("words", ["passive_1", "terrain", "flight_500s", "gps_ins_inflated"])
 def test_a_tape_of_a_scenario_has_its_inputs_and_residual(words: str) -> None:
     record = world(words).record.select_steps(slice(0, 15))
     model = job.instantiate(composed(f"scenario={words}").model)
-    moves = record.u.position
-    assert bool((moves[:, 1:] != moves[:, :-1]).any())  # else a step may have those of another
+    moves = [a[:, 1:] != a[:, :-1] for a in tensors_in(model.prepare(record).u)]
+    assert any(bool(a.any()) for a in moves)  # else a step may have those of another
     compare(model, record)
 
 
@@ -137,6 +144,26 @@ class Breaking(UnivariateGrowth):
         moved = 0.5 * x + 25.0 * x / (1.0 + x * x) + u.shift[:, None, None] + self.q * w
         fails = (moved > 15.0) | (u.breaks[:, None, None] > 0.0)
         return torch.where(fails, torch.nan, torch.where(moved < -9.0, torch.inf, moved))
+
+
+class Turning(LinearGaussian):
+    """Matrices of each run and step, and a gain that runs share."""
+
+    prepare, noise_gain = Breaking.prepare, Breaking.noise_gain
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return affine_map(u.phi, x, u.gain, w)
+
+
+@pytest.mark.parametrize("threshold", [0.5, 1.0])
+def test_matrices_may_be_those_of_a_run_and_a_step(threshold: float) -> None:
+    """With a third of zeros, at other places in each. Threads change no bit."""
+    model, change = Turning(*MATRICES), PhiloxStream(4, RUNS).normal("matrices", 20, 40)
+    change = torch.where(change.abs() < 0.4, 0.0, 0.3 * change).unflatten(2, (5, 8))
+    inputs = LooseStep(change[..., :5], change[:1, :, :, 5:])
+    record = simulate(LinearGaussian(*MATRICES))._replace(u=inputs)
+    result, taped = compare(model, record, threshold), TapedParticleFilter(make_filter(threshold))
+    assert torch.equal(run(taped, model, record, run_batch=1, threads=3).mean, result.mean)
 
 
 def break_record() -> Record:
@@ -376,6 +403,9 @@ FUNCTIONS: dict[str, Callable[..., Tensor]] = {
     "missing": lambda a, b: torch.where(a > 0.0, torch.nan, a).nan_to_num(3.0 * 0.0) + b,
     "masks": lambda a, b: a.masked_fill(b > 0.0, 4.0) * torch.isfinite(b) + torch.isnan(a),
     "matrices": lambda a, b: (torch.stack([a, b], -1) @ torch.tensor([[1.0, 2.0], [0.0, -3.0]]).double())[..., 1],
+    "dense": lambda a, b: (torch.stack([a, b, a * b, a, b], -1) @ ROTATION.mT @ ROTATION[1:].mT)[..., 2] + b,
+    "affine": lambda a, b: torch.nn.functional.linear(torch.stack([a, b, b.exp(), b, a], -1), ROTATION[:3], ROTATION[0, :3]).prod(-1),
+    "zero": lambda a, b: (ROTATION[0, 0] * 0.0 + torch.isnan((torch.stack([1.0 / (a * 0.0), a, b, a], -1) @ torch.arange(4.0).double()[:, None])[..., 0])).double(),
     "sums": lambda a, b: torch.stack([a, b, a * b], -1).sum(-1) + ((a > 0.0)[..., None] & (b > 0.0)[..., None]).any(-1),
     "products": lambda a, b: torch.cat([a[..., None], b[..., None]], -1).prod(-1),
 }  # fmt: skip
@@ -404,10 +434,10 @@ def test_wrong_instructions_are_refused(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(dispatch, "run_tape", lambda given: calls.append(given) or run_tape(given))
     run(TapedParticleFilter(make_filter()), model, simulate(model))
     given = calls[-1]
-    wrong = [(1, given[1] + 1000), (4, given[4][0]), (5, given[5][:, :1]), (7, given[7].double())]
-    wrong += [(8, torch.tensor([0])), (8, given[8] + 1), (8, given[8] - 100)]
-    wrong += [(10, given[10] * torch.tensor([1, 0, 1, 1, 1, 1, 1])), (3, given[3].float())]
-    changes = [(0, 30), (0, -1), (1, 0), (1, ~0), *product(range(1, 5), (10**6, -(10**6)))]
+    wrong = [(1, given[1] + 1000), (5, given[5][0]), (6, given[6][:, :1]), (8, given[8].double())]
+    wrong += [(9, torch.tensor([0])), (9, given[9] + 1), (9, given[9] - 100), (3, given[3][1:])]
+    wrong += [(11, given[11] * torch.tensor([1, 0, 1, 1, 1, 1, 1])), (4, given[4].float())]
+    changes = [(0, 30), (0, 31), (0, -1), (1, 0), (1, ~0), *product(range(1, 5), (10**6, -(10**6)))]
     for column, value in changes:
         wrong.append((0, given[0].clone()))
         wrong[-1][1][-1, column] = value

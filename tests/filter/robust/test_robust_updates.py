@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from filter_cases import method_of
+from model_cases import Hidden
 from refusals import check_refused
 from scipy import optimize, stats
 from torch import Tensor
@@ -137,12 +138,6 @@ def test_the_factor_on_r_is_the_model_with_that_noise() -> None:
 
 @pytest.mark.parametrize("rule", [EKF, SigmaPointLinearisation(CubaturePoints())])
 def test_the_factor_on_q_is_the_model_with_that_noise(rule: Any) -> None:
-    class Hidden(LinearGaussian):
-        """The noise passes through the rule, instead of being added."""
-
-        def noise_gain(self, u: Any) -> None:
-            return None
-
     model, y = tracker(), measurements()
     parts = model.h, model.r, model.m0, model.l0
     for kind in (LinearGaussian, Hidden):
