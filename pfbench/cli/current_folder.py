@@ -24,17 +24,17 @@ def list_own_files(group: str) -> list[Path]:
 
 
 def add_search_path(words: Sequence[str]) -> list[str]:
-    """Add the folder `conf` to words that choose one of its files, unless they set a search path."""
+    """Add the folder `conf` to words that choose one of its files, unless they set a search path.
+
+    A file with the name of a shipped one counts, too: Hydra's loader then refuses it.
+    """
     if not Path("conf").is_dir() or any(
         re.match(r"[+~]*hydra\.searchpath\b|--config-dir\b|-cd\b", word) for word in words
     ):
         return list(words)
-    from pfbench.job.config import list_groups
-
     for match in filter(None, map(_CHOICE.fullmatch, words)):
-        names = set(match[2].split(",")) - {*list_groups().get(match[1], ())}
         has_knobs = match[1] == "filter" and re.search(r"_tuned\b|tuned_baselines", match[2])
-        if names & {path.stem for path in list_own_files(match[1])} or (
+        if {*match[2].split(",")} & {path.stem for path in list_own_files(match[1])} or (
             has_knobs and list_own_files("tuned")
         ):
             return [*words, "hydra.searchpath=[file://conf]"]

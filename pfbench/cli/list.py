@@ -39,7 +39,7 @@ def list_options(words: Sequence[str]) -> None:
     for name, text in texts.items():
         print(f"{name:24} {text}")
     if not texts:
-        print(f"No shipped {words[0]} fits.")
+        print(f"No {words[0]} fits.")
 
 
 def describe_files(group: str) -> dict[str, str]:

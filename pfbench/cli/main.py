@@ -64,6 +64,7 @@ _COMPOSING = (
     "train",
     "infer",
     "datasheet",
+    "list",
 )  # that may choose files of the current folder
 _ENVIRONMENT = (ENVIRONMENT, "PYTHONSAFEPATH", "PYTHONPATH")
 USAGE = """\

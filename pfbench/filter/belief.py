@@ -71,12 +71,14 @@ class StepInfo(NamedTuple):
             of a step.
         trace: Numbers per run, {name: [R]}, such as `ess` or `resampled`.
         cloud: Computes deviations of the particles from the mean [R, N, d] and log weights [R, N].
-            None for a Gaussian filter.
+            None for a Gaussian filter. Of particles with a covariance, one draw of each.
         nis: Computes the normalised innovation squared under the predicted moments, and the number
             of observed components, [R] each. None if the filter does not support it.
         group_covariance: Computes covariances of groups of components [R, G, s, s] from indices
             [G, s], where that is cheaper than the full covariance.
         has_covariance: False if the filter states no covariance. Its moments are NaN.
+        conditional: Computes standard deviations of particles that are normal distributions, [R, N or 1, d],
+            and the deviations [R, N, d] of the draws in `cloud` from their means. None for points.
     """
 
     mean: Tensor
@@ -87,6 +89,7 @@ class StepInfo(NamedTuple):
     nis: Callable[[], tuple[Tensor, Tensor]] | None = None
     group_covariance: Callable[[Tensor], Tensor] | None = None
     has_covariance: bool = True
+    conditional: Callable[[], tuple[Tensor, Tensor]] | None = None
 
     def covariance_of(self, groups: Tensor) -> Tensor:
         """Return covariances [R, G, s, s] of groups of components, indices [G, s]."""

@@ -501,5 +501,5 @@ def _join_infos(infos: Sequence[StepInfo]) -> StepInfo:
 
     return StepInfo(
         mean, variance, covariance, trace, join_pairs("cloud"), join_pairs("nis"), group_covariance,
-        infos[0].has_covariance,
+        infos[0].has_covariance, join_pairs("conditional"),
     )  # fmt: skip

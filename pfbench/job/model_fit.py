@@ -8,6 +8,7 @@ from __future__ import annotations
 import copy
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from pfbench.job.config import compose_tree, is_simulated_from, list_groups
@@ -63,13 +64,15 @@ def explain_error(
 def list_fitting_models(
     tree: Mapping[str, Any], trusted: Sequence[str] = (), scenario: str = ""
 ) -> dict[str, str]:
-    """List the shipped models that fit the scenario of a configuration.
+    """List the models that fit the scenario of a configuration: the shipped ones and those of its search path.
 
     Returns class of each model by the name of its file.
     """
-    names = list_groups()["model"]
+    names, search_path = _list_names("model", tree)
     # one composition for all: each costs as much as a hundred files
-    nodes = compose_tree([f"+model@shipped.{name}={name}" for name in names])["shipped"]
+    nodes = compose_tree([search_path, *(f"+model@shipped.{name}={name}" for name in names)])[
+        "shipped"
+    ]
     plain, models = _plain_values(tree), _plain_values(nodes)
     if is_simulated_from(plain["scenario"], scenario):
         names = [scenario]
@@ -78,17 +81,27 @@ def list_fitting_models(
 
 
 def list_fitting_scenarios(words: Sequence[str]) -> list[str]:
-    """List the shipped scenarios that fit a model.
+    """List the scenarios that fit a model: the shipped ones and those of a search path among the words.
 
     Returns names of their files.
     """
     fitting = []
-    for name in list_groups()["scenario"]:
+    for name in _list_names("scenario", compose_tree(words))[0]:
         tree = compose_tree([f"scenario={name}", *words])
         is_own = tree.hydra.runtime.choices.get("model") == name
         if (is_own or not is_simulated_from(tree["scenario"], name)) and is_fitting(tree):
             fitting.append(name)
     return fitting
+
+
+def _list_names(group: str, tree: Mapping[str, Any]) -> tuple[list[str], str]:
+    """Return the names of a group, those of the search path included, and the word for this path."""
+    settings = tree.get("hydra") or {"searchpath": [], "runtime": {"config_sources": []}}
+    folders = (Path(source["path"], group) for source in settings["runtime"]["config_sources"])
+    names = {path.stem for folder in folders for path in folder.glob("*.yaml")}
+    return sorted(
+        {*list_groups()[group], *names}
+    ), f"hydra.searchpath=[{','.join(settings['searchpath'])}]"
 
 
 def is_fitting(tree: Mapping[str, Any], trusted: Sequence[str] = ()) -> bool:

@@ -30,7 +30,7 @@ from torch.distributions import Independent, MultivariateNormal, Normal
 from pfbench.core.linear_algebra import factor, jacobian
 from pfbench.core.parameter_checks import require
 from pfbench.core.record import Episode, Record, iterate_steps
-from pfbench.model.base import StateSpaceModel, StaticModel, initial_law
+from pfbench.model.base import ModelWrapper, StateSpaceModel, StaticModel, initial_law
 from pfbench.noise.base import NominalNoise
 from pfbench.results.store import Inputs
 from pfbench.scenario.base import RecordingRegime
@@ -134,14 +134,14 @@ def _initial_root(covariance: Tensor, runs: int, separate: bool) -> Tensor:
 
 def _predict(model: StateSpaceModel, root: Tensor, x: Tensor, u: Any) -> Tensor:
     """Return the root of the predicted bound [G, d, d], at states [R, D]."""
-    chart, noise = model.chart, cast(Any, model.noise)
-    gain = model.noise_gain(u)
+    chart, noise, gain = model.chart, cast(Any, model.noise), model.noise_gain(u)
+    name = type(model.model if isinstance(model, ModelWrapper) else model).__name__
     require(
         gain is not None and isinstance(noise.base_dist, Normal),
-        f"{type(model).__name__}: process noise",
-        "be additive and normal",
-        "another",
-        "The bound does not support this model.",
+        f"{name}: process noise",
+        "be additive with a stated gain, and normal",
+        "no gain" if gain is None else type(noise.base_dist).__name__,
+        f"The bound needs {name}.noise_gain(u) and normal noise.",
     )
     gain = gain * noise.stddev
 

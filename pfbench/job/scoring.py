@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import torch
 from torch import Tensor
@@ -169,17 +169,25 @@ class ScoreRecorder:
     def _score(self, t: int, error: Tensor, info: StepInfo) -> ProperScores:
         """Compute the scores of one step."""
         groups, sd = self.model.groups.values(), self.truth_sd
-        shared_run = torch.zeros(1, dtype=torch.int64, device=error.device)  # same numbers for all
-        draws = PhiloxStream(0, shared_run, error.dtype, t)
         if info.cloud is not None:
             deviation, log_w = info.cloud()
-            if sd is not None:  # particles of the measured truth
+            if sd is not None:  # particles of the measured truth, the same numbers for all runs
+                draws = PhiloxStream(0, error.new_zeros(1, dtype=torch.int64), error.dtype, t)
                 deviation = deviation + sd * draws.normal("measured truth", *deviation.shape[1:])
-            return score_particles(error, deviation, log_w, groups)
+            scores = score_particles(error, deviation, log_w, groups)
+            return scores if info.conditional is None else self._with_mixture(scores, error, info)
         covariance = info.covariance()
         if sd is not None:
             covariance = covariance + torch.diag(sd**2)
         return score_normal(error, covariance, groups)
+
+    def _with_mixture(self, scores: ProperScores, error: Tensor, info: StepInfo) -> ProperScores:
+        """Replace the probabilities below the truth by those of particles with a covariance, without the noise of few draws."""
+        (deviation, log_w), (sd, shift) = cast(Any, info.cloud)(), cast(Any, info.conditional)()
+        total = sd if self.truth_sd is None else torch.hypot(sd, self.truth_sd.expand_as(sd))
+        below = torch.special.ndtr((shift - deviation - error.unsqueeze(1)) / total)
+        pit = normalise_log_weights(log_w).unsqueeze(1) @ below
+        return scores._replace(pit=torch.where((sd > 0.0).any(1), pit.squeeze(1), scores.pit))
 
 
 def _place_sd(

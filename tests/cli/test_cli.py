@@ -265,9 +265,13 @@ MISSING = "hydra.searchpath=[file:///no/such]"
         (("run", "-m", "--filter", "ekf,sir"), "--filter is not an option. Overrides have no dashes: write filter=ekf,sir"),
         (("report", "--study", "x"), "write study=x (pfbench report --help)"),
         (("train", "--filter"), "write filter=VALUE (pfbench train --help)"),
+        (("list", "filter", "scenario=growth"), "words must be pfbench list filter, got scenario=growth"),
+        (("list", "filters"), "error list: group must be one of filter, infer, model"),
+        (("list", "filters"), "got filters. Similar: filter."),
+        (("report", "stdy=nope"), "stdy=nope: key stdy does not exist. Similar: study."),
     ],
 )  # fmt: skip
-def test_each_command_refuses_a_missing_folder_and_a_flag(
+def test_each_command_refuses_a_missing_folder_a_flag_and_a_wrong_word(
     words: tuple[str, ...], message: str, tmp_path: Path
 ) -> None:
     said = pfbench(*words, home=tmp_path)
@@ -415,19 +419,6 @@ def test_list_of_the_models_that_fit_a_recorded_scenario(tmp_path: Path) -> None
     ]
 
 
-def test_list_of_what_fits_needs_the_other_part(tmp_path: Path) -> None:
-    said = pfbench("list", "filter", "scenario=growth", home=tmp_path)
-    assert said.code == 2
-    assert "words must be pfbench list filter, got scenario=growth" in said.err
-
-
-def test_list_of_no_group(tmp_path: Path) -> None:
-    said = pfbench("list", "filters", home=tmp_path)
-    assert said.code == 2
-    assert "error list: group must be one of filter, infer, model" in said.err
-    assert "got filters. Similar: filter." in said.err
-
-
 def test_report_of_a_study_that_does_not_exist(tmp_path: Path) -> None:
     said = pfbench("report", "study=nope", f"reports_dir={tmp_path / 'reports'}", home=tmp_path)
     assert said.code == 2
@@ -435,12 +426,6 @@ def test_report_of_a_study_that_does_not_exist(tmp_path: Path) -> None:
     assert "nope" in said.err
     assert "pfbench run" in said.err
     assert not (tmp_path / "reports").exists()
-
-
-def test_report_with_a_misspelt_key(tmp_path: Path) -> None:
-    said = pfbench("report", "stdy=nope", home=tmp_path)
-    assert said.code == 2
-    assert "stdy=nope: key stdy does not exist. Similar: study." in said.err
 
 
 def test_check_finds_nothing_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -209,12 +209,19 @@ def test_files_of_the_current_folder_are_chosen_by_their_names(
     metas = [store.read_metadata(path) for path in (tmp_path / "results" / "s").glob("*.npz")]
     assert {meta["label"]: meta["particles"] for meta in metas} == {"ekf": None, "small": 20}
     assert "small " in pfbench("list", "filter", home=tmp_path).out
-    unknown = pfbench("run", *WALK, "filter=smallish", home=tmp_path)
-    assert unknown.code == 2
+    assert pfbench("run", *WALK, "filter=smallish", home=tmp_path).code == 2
     (folder / "evil.yaml").write_text("_target_: os.system\n")
     evil = pfbench("run", *WALK, "filter=evil", home=tmp_path)
     assert evil.code == 2
     assert "filter._target_ must be a public class of pfbench" in evil.err
+    (folder / "ekf.yaml").write_text("defaults:\n  - sir\n  - _self_\n")
+    message = "conf/filter/ekf.yaml must have another name than pfbench's own filter ekf"
+    assert message in pfbench("run", "-m", *WALK, "filter=ckf,ekf", home=tmp_path).err
+    for group in ("model", "scenario"):
+        (tmp_path / "conf" / group).mkdir()
+        (tmp_path / "conf" / group / "mine.yaml").write_text("defaults:\n  - linear_walk\n  - _self_\n")  # fmt: skip
+    for words in (("model", "scenario=mine"), ("scenario", "model=mine")):
+        assert "mine " in pfbench("list", *words, home=tmp_path).out
 
 
 def test_completion_offers_commands_and_names(tmp_path: Path) -> None:

@@ -30,9 +30,12 @@ from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.weights import LookAheadWeights
 from pfbench.filter.proposed.swarm import SwarmProposal
+from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
+from pfbench.noise.base import NominalNoise
 from pfbench.results.paper_block import read_paper_block, read_part
+from pfbench.scenario.simulated import ModelSimulation
 from pfbench.testing import (
     check_bounded_weights,
     check_causality,
@@ -223,6 +226,12 @@ def test_a_filter_keeps_its_prediction_where_nothing_is_measured_or_says_why_not
 
     def watch(t: int, info: StepInfo) -> dict[str, Tensor]:
         kept.append((info.mean, info.covariance(), info.cloud))
+        if (
+            info.cloud
+        ):  # it is scored in place of the covariance: 5 standard errors of draws of each particle
+            deviation, log_w = info.cloud()
+            spread = (log_w.softmax(1).unsqueeze(-1) * deviation.square()).sum(1).mean(0)
+            torch.testing.assert_close(spread, info.variance.mean(0), rtol=0.08, atol=0.0)
         return {}
 
     filter_record(method, slow, y, watch=watch)
@@ -236,6 +245,27 @@ def test_a_filter_keeps_its_prediction_where_nothing_is_measured_or_says_why_not
             keeps.append(bool((d.mean(0).abs() <= 4.5 * d.std(0) / 40**0.5 + least + 1e-6).all()))
     completions = read_paper_block("filter", name).get("completions", ())
     assert all(keeps) == (STATED not in " ".join(entry["why"] for entry in completions)), keeps
+
+
+@cache
+def calibration(name: str) -> tuple[Tensor, Tensor]:
+    """Shares of the truth in intervals of 90 % and CRPS of a filter on a linear model, [R] each."""
+    model, method, runs = tracker(), method_of(name), torch.arange(150)
+    if hasattr(method, "particles"):
+        method = replace(method, particles=200)
+    episode = ModelSimulation(model, 5).draw(NominalNoise(), runs, 3)
+    recorder = ScoreRecorder(model, model.assemble(episode.truth), 5)
+    run_filter(method, model, episode.record, PhiloxStream(4, runs), recorder)
+    pit, crps = recorder.arrays()["pit"], recorder.arrays()["crps"]
+    return ((pit - 0.5).abs() < 0.45).double().mean((1, 2)), crps.mean((1, 2))
+
+
+@pytest.mark.parametrize("name", [*EXACT, "ukf", "ekf_bank", "ekf_bank_dense"])
+def test_scores_of_an_exact_filter_are_those_of_the_kalman_filter(name: str) -> None:
+    """On a linear model, within 4.5 standard errors over the runs, and 3 / N of a cloud."""
+    for found, wanted in zip(calibration(name), calibration("ekf"), strict=True):
+        apart = found - wanted
+        assert apart.mean().abs() < 4.5 * apart.std() / 150**0.5 + 3 / 200
 
 
 @dataclass(frozen=True, eq=False)

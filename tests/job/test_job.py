@@ -260,7 +260,7 @@ def test_the_bound_of_a_linear_world_is_kalmans_deviation(
 WHY = {
     "heavy tails": (("noise=student",), "measurement distribution must be normal"),
     "not asked for": (("pcrb=false",), "not requested"),
-    "no additive noise": (("scenario=benes",), "process noise must be additive and normal"),
+    "no additive noise": (("scenario=benes", "noise=outliers"), "needs Benes.noise_gain(u)"),
 }
 
 

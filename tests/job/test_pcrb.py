@@ -456,7 +456,12 @@ class HeavyTailed(Pendulum):
             None,
             r"HeavyTailed: measurement distribution must be normal, got Independent \(heavy tails",
         ),
-        (Benes(), torch.zeros(2, 3, 1), None, r"Benes: process noise must be additive and normal"),
+        (
+            Benes(),
+            torch.zeros(2, 3, 1),
+            None,
+            r"Benes: process noise .* The bound needs Benes\.noise_gain\(u\)",
+        ),
         (
             Pendulum(),
             torch.full((2, 3, 2), torch.nan),

@@ -22,6 +22,7 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.loop import run_filter
+from pfbench.filter.marginal.rao_blackwellised import RaoBlackwellisedFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.scoring import (
     LikelihoodCounter,
@@ -202,10 +203,12 @@ def test_instants_are_spread_evenly_and_the_last_is_among_them(
 
 
 @pytest.mark.parametrize(
-    "method", [GaussianFilter(TaylorLinearisation()), ParticleFilter(400)], ids=["kalman", "sir"]
+    "method",
+    [GaussianFilter(TaylorLinearisation()), ParticleFilter(400), RaoBlackwellisedFilter(50)],
+    ids=["kalman", "sir", "rbpf"],
 )
 def test_an_honest_filter_is_calibrated_and_a_confident_one_is_not(
-    method: GaussianFilter | ParticleFilter,
+    method: GaussianFilter | ParticleFilter | RaoBlackwellisedFilter,
 ) -> None:
     runs = torch.arange(300)
     episode = ModelSimulation(MODEL, 20).draw(NominalNoise(), runs, 3)
@@ -217,7 +220,10 @@ def test_an_honest_filter_is_calibrated_and_a_confident_one_is_not(
         return proud(
             t,
             info._replace(
-                covariance=lambda: 0.36 * info.covariance(), cloud=cloud, group_covariance=None
+                covariance=lambda: 0.36 * info.covariance(),
+                cloud=cloud,
+                group_covariance=None,
+                conditional=None,
             ),
         )
 

@@ -136,6 +136,7 @@ def _in_chart_of_model(report_chart: Chart, chart: Chart, info: StepInfo) -> Ste
         covariance=lambda: weighted.mT @ deviation,
         cloud=lambda: (deviation, log_w),
         group_covariance=None,
+        conditional=None,
     )
 
 

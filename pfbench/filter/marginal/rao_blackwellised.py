@@ -16,7 +16,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor
@@ -27,7 +28,12 @@ from pfbench.core.linear_algebra import factor
 from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief, StepInfo, normalise_log_weights
+from pfbench.filter.belief import (
+    ParticleBelief,
+    StepInfo,
+    compute_once,
+    normalise_log_weights,
+)
 from pfbench.filter.exactness import is_every_part_exact
 from pfbench.filter.linearisation import (
     derivative,
@@ -111,7 +117,7 @@ class RaoBlackwellisedFilter:
     Transition and measurement are linearised at each particle in l and in noise that is not
     additive. This is exact if the model is linear in them given s, otherwise an extended Kalman
     filter per particle. Process and measurement noise must be normal, and the measurement
-    covariance must not depend on l. The reported mean and covariance are those of the mixture,
+    covariance must not depend on l. The reported mean, covariance and scores are those of the mixture,
     including the conditional distributions of l.
 
     Attributes:
@@ -204,7 +210,7 @@ class RaoBlackwellisedFilter:
         )
         cloud, info = inner.step(model, belief, record, draws)
         info = info._replace(nis=None)  # the log ratio already contains the measurement
-        return cloud, _with_conditional(info, cloud, split) if split.linear else info
+        return cloud, _with_conditional(info, cloud, split, draws) if split.linear else info
 
 
 def _combined(columns: list[Tensor], z: Tensor, template: Tensor) -> Tensor:
@@ -215,8 +221,10 @@ def _combined(columns: list[Tensor], z: Tensor, template: Tensor) -> Tensor:
     return shift
 
 
-def _with_conditional(info: StepInfo, belief: ParticleBelief, split: StatePartition) -> StepInfo:
-    """Add the mean conditional covariance of l to the covariance of the particles."""
+def _with_conditional(
+    info: StepInfo, belief: ParticleBelief, split: StatePartition, draws: RandomStream
+) -> StepInfo:
+    """Add the mean conditional covariance of l to the covariance of the particles, and a draw of l to each of them."""
     root, w = belief.memory["root"], normalise_log_weights(belief.log_w)
     conditional_variance = root.square().sum(-1)  # [R, N or 1, l]
     mean = (
@@ -224,15 +232,29 @@ def _with_conditional(info: StepInfo, belief: ParticleBelief, split: StatePartit
         if conditional_variance.shape[1] == 1
         else (w.unsqueeze(-2) @ conditional_variance).squeeze(-2)
     )
-    variance = info.variance + embed_components(mean, split.linear, info.variance.shape[-1])
+    embed = partial(embed_components, indices=split.linear, d=info.variance.shape[-1])
 
     def covariance() -> Tensor:
         shared = root.shape[1] == 1
         p = root[:, 0] @ root[:, 0].mT if shared else (w[..., None, None] * (root @ root.mT)).sum(1)
-        embedding = torch.eye(info.variance.shape[-1], dtype=p.dtype, device=p.device)[split.linear]
-        return info.covariance() + embedding.mT @ p @ embedding
+        return info.covariance() + embed(embed(p.mT).mT)
 
-    return info._replace(variance=variance, covariance=covariance, group_covariance=None)
+    @compute_once
+    def conditional() -> tuple[Tensor, Tensor]:
+        z = draws.normal("conditional", w.shape[1], len(split.linear)).to(root)
+        return embed(conditional_variance.sqrt()), embed((root @ z.unsqueeze(-1)).squeeze(-1))
+
+    def cloud() -> tuple[Tensor, Tensor]:
+        deviation, log_w = cast(Any, info.cloud)()
+        return deviation + conditional()[1], log_w
+
+    return info._replace(
+        variance=info.variance + embed(mean),
+        covariance=covariance,
+        cloud=cloud,
+        group_covariance=None,
+        conditional=conditional,
+    )
 
 
 # --------------------------------------------------------------------------------------------------
