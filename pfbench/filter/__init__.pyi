@@ -55,6 +55,11 @@ from pfbench.filter.guided.guides import (
 )
 from pfbench.filter.guided.initial_guide import GuidedInitialProposal as GuidedInitialProposal
 from pfbench.filter.guided.noise_guide import GuidedNoiseProposal as GuidedNoiseProposal
+from pfbench.filter.guided.twisted import (
+    TwistedParticleFilter as TwistedParticleFilter,
+    TwistedProposal as TwistedProposal,
+    TwistedWeights as TwistedWeights,
+)
 from pfbench.filter.learned.differentiable_resampling import (
     SoftResampler as SoftResampler,
     StopGradientResampler as StopGradientResampler,
