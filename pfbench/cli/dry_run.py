@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from difflib import get_close_matches
 from traceback import walk_tb
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
     from pfbench.core.record import Episode
     from pfbench.job.budget import EpisodeSource
     from pfbench.job.plan import JobPlan
-    from pfbench.scenario import RecordingRegime
 
 _STEPS = 10  # of the trial of a filter
 
@@ -207,7 +207,8 @@ def _is_of_user(error: BaseException | None, packages: Sequence[str]) -> bool:
     """Return whether code of the user raised an error, or got what it does not take."""
     while error is not None:
         modules = (str(f.f_globals.get("__name__")) for f, _ in walk_tb(error.__traceback__))
-        is_own = any(name.startswith(tuple(packages)) for name in modules)
+        # the contracts of `pfbench.testing` are checked for own parts only
+        is_own = any(name.startswith((*packages, "pfbench.testing.")) for name in modules)
         if is_own or isinstance(error, TypeError):
             return True
         error = error.__cause__
@@ -221,11 +222,14 @@ def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:
     from pfbench.job.plan import build_plan
     from pfbench.job.run_job import find_result_path
     from pfbench.job.trust import list_user_packages, trusted_packages
+    from pfbench.testing.models import check_regime_in
+    from pfbench.testing.results import check_is_model
 
     trusted = (*config.trusted, *trusted_packages())
     if find_result_path(config.values, find_inputs(config.values, trusted)).is_file():
         return
     plan = build_plan(config)
+    check_is_model("pfbench.run", plan.model)
     groups = ("scenario", "noise", "filter")
     own_groups = {g for g in groups if list_user_packages(config.values[g], trusted)}
     world = json.dumps([plan.values[name] for name in ("scenario", "noise", "seed")], default=str)
@@ -235,20 +239,34 @@ def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:
         try:
             episodes[world] = plan.draw_episode(plan.runs[:2])
         finally:
-            if "noise" in own_groups:
-                _try_regime(plan.recording_regime)
-    _take_steps(config, plan, episodes[world], is_own="filter" in own_groups)
+            source = plan.recording_regime
+            if "noise" in own_groups and source.channels is not None and source.time is not None:
+                check_regime_in(source.regime, source.channels, source.time)
+    _take_steps(config, plan, episodes[world], own_groups)
 
 
-def _try_regime(source: RecordingRegime) -> None:
-    """Try a noise regime of the user with the channels and times that a scenario gave it."""
-    from pfbench.testing.models import check_regime_in
+def _check_truth(plan: JobPlan, truth: Collection[str]) -> None:
+    """Check that a scenario of the user has a truth of the main group, and misspells no other group of the model."""
+    from pfbench.results.conditions import select_main_group
 
-    if source.channels is not None and source.time is not None:
-        check_regime_in(source.regime, source.channels, source.time)
+    groups = plan.model.groups
+    lacking = [name for name in groups if name not in truth]
+    has_main = select_main_group(list(groups)) in truth
+    wrong = [
+        name
+        for name in truth
+        if name not in groups and (not has_main or get_close_matches(name, lacking, cutoff=0.5))
+    ]
+    is_named = has_main and not wrong
+    assert is_named, (
+        f"{type(plan.scenario).__name__}.draw must name groups of {type(plan.model).__name__} ({', '.join(groups)}), got "
+        f"{', '.join(map(repr, wrong or truth))}. Use these names in the truth of the episode"
+    )
 
 
-def _take_steps(config: JobConfig, plan: JobPlan, episode: Episode, *, is_own: bool) -> None:
+def _take_steps(
+    config: JobConfig, plan: JobPlan, episode: Episode, own_groups: Collection[str]
+) -> None:
     """Take three steps of a filter of the user, else of a bootstrap filter."""
     import torch
 
@@ -256,9 +274,11 @@ def _take_steps(config: JobConfig, plan: JobPlan, episode: Episode, *, is_own: b
     from pfbench.filter import ParticleFilter, run_filter
     from pfbench.job.memory import first_steps
 
+    if "scenario" in own_groups:
+        _check_truth(plan, episode.truth)
     model = plan.make_filter_model(episode).to("cpu", torch.float64)
     model.assemble(episode.truth)
-    method = plan.method if is_own else ParticleFilter(20)
+    method = plan.method if "filter" in own_groups else ParticleFilter(20)
     draws = PhiloxStream(plan.values["seed"], plan.runs[:2])
     try:
         with torch.no_grad():

@@ -259,6 +259,7 @@ def list_repeats(folder: Path, since: float = 0.0) -> list[str]:
             continue
         names = " / ".join(str(note["choices"][key]) for key in ("scenario", "noise", "filter"))
         lines += [f"failed: {names}: {note['message']}", f"  repeat: {format_repeat(note)}"]
+        lines += [] if since else [f"  if another setting has mended it: remove {file}"]
     return lines
 
 

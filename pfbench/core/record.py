@@ -9,6 +9,8 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 from torch import Tensor
 
+from pfbench.core.parameter_checks import require
+
 _Step = TypeVar("_Step")
 
 
@@ -135,6 +137,38 @@ def map_inputs(function: Any, u: Any) -> Any:
         return u
     values = (map_inputs(function, a) if isinstance(a, tuple) else function(a) for a in u)
     return type(u)(*values)
+
+
+def name_inputs(u: Any, name: str = "") -> list[tuple[str, Tensor]]:
+    """Return the input tensors with the names of their fields."""
+    if isinstance(u, Tensor):
+        return [(name, u)]
+    require(
+        isinstance(u, tuple),
+        f"record.u{name}",
+        "be a tensor or a tuple of tensors",
+        type(u).__name__,
+        "Convert it, for instance by torch.as_tensor.",
+    )
+    fields = getattr(u, "_fields", range(len(u)))
+    return [
+        pair
+        for field, value in zip(fields, u, strict=True)
+        for pair in name_inputs(value, f"{name}.{field}")
+    ]
+
+
+def check_inputs(record: Record) -> None:
+    """Check that all inputs have the axes of runs and steps."""
+    runs, steps = record.y.shape[:2]
+    for name, value in name_inputs(record.u):
+        require(
+            value.dim() > 1 and len(value) in (1, runs) and value.shape[1] == steps,
+            f"record.u{name}",
+            f"have the axes [{runs} or 1, {steps}, ...] of runs and steps",
+            list(value.shape),
+            "Write values[None] for the values [T, ...] of all runs.",
+        )
 
 
 class MeasuredTruth(NamedTuple):

@@ -12,6 +12,7 @@ import pandas as pd
 
 from pfbench.core.parameter_checks import require
 from pfbench.door.parts import format_html_table
+from pfbench.job.config import CHOICES
 from pfbench.report.board.entries import build_run_table, name_regimes
 from pfbench.report.board.pack import build_pack, open_court
 from pfbench.report.board.recorded_units import count_drives, describe_drives
@@ -35,7 +36,7 @@ _HEADS = (
     "coverage of 90 % intervals",
     "ms/step",
 )
-_FAILED_HEADS = ("failed filter", "scenario", "message")
+_FAILED_HEADS = ("failed scenario", "noise", "filter", "message", "if it is mended")
 
 
 @dataclass(frozen=True, repr=False)
@@ -46,7 +47,7 @@ class Summary:
         sentence: Result in words.
         caption: Metric, worlds and baseline of the leaderboard.
         rows: Rows of the leaderboard: rank, filter, median error of a single condition, ratio with interval, words, track kept, coverage, ms/step.
-        failures: Filter, scenario and message of each failed job, which the leaderboard lacks.
+        failures: Scenario, noise, filter and message of each failed job, which the leaderboard lacks, and how to remove its note.
     """
 
     sentence: str
@@ -63,7 +64,10 @@ class Summary:
         widths = [max(len(line[k]) for line in lines) for k in range(len(_HEADS) if lines else 0)]
         texts = ["  ".join(f"{v:{w}}" for v, w in zip(line, widths, strict=True)) for line in lines]
         table = "\n".join(text.rstrip() for text in texts)
-        failed = "\n".join(f"failed: {' / '.join(row)}" for row in self.failures)
+        failed = "\n".join(
+            f"failed: {' / '.join(row[:3])}: {row[3]}\n  if another setting has mended it: {row[4]}"
+            for row in self.failures
+        )
         return "\n\n".join(filter(None, (self.sentence, table, self.caption, failed)))
 
     def _repr_html_(self) -> str:
@@ -80,7 +84,9 @@ def summarise_study(
     options: Mapping[str, Any],
 ) -> Summary:
     """Summarise a study by the opening view of its page, and its failed jobs."""
-    failures = tuple((note["filter"], note["scenario"], note["message"]) for note in failed)
+    failures = tuple(
+        (*(note[k] for k in (*CHOICES[:3], "message")), f"remove {note['note']}") for note in failed
+    )
     if not conditions:
         return Summary("No job has finished.", "", (), failures)
     opening = describe_opening(build_pack(study, conditions, ReportOptions(**options)))

@@ -27,6 +27,7 @@ from pfbench.job.config import compose
 from pfbench.noise import NominalNoise
 from pfbench.scenario import ModelSimulation
 from pfbench.testing import LawCheck
+from pfbench.testing.results import check_is_model
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -257,6 +258,7 @@ def _check_turns(model: Any, episode: Episode) -> Mapping[str, LawCheck]:
 
 def _check_model(model: Any, inputs: Any) -> Mapping[str, LawCheck]:
     """Check that a filter can follow data of a model, and the Jacobians that it states."""
+    check_is_model("check", model)
     needed = model.input_type
     require(
         needed is None or isinstance(inputs, needed),

@@ -52,8 +52,8 @@ def make_own(
     Args:
         thing: Filter, stage of a particle filter, model, scenario or noise regime. An object, or its class. Also the class
             of a network that `pfbench.train` trains as a proposal.
-        name: Name in tables and figures. The name of the class by default. A part with a name of pfbench is `own_NAME`
-            where a study chooses it.
+        name: Name in tables and figures. The name of the class by default. A part with a name of pfbench is `Own NAME`,
+            and `own_name` where a study chooses it.
         base: Particle filter that receives a stage.
         **arguments: Arguments of a class. For a scenario also `divergence_threshold`, the error above which a run has
             lost the track.
@@ -72,6 +72,8 @@ def make_own(
             )
         group, stage = find_group(thing)
         title = name or _name_thing(thing, arguments)
+        if _name_file(title) in list_groups()[group]:
+            title = f"Own {title}"
         limit = arguments.pop("divergence_threshold", None) if group == "scenario" else None
         writer = _NodeWriter()
         if stage == "network":
@@ -118,11 +120,13 @@ def find_group(thing: Any) -> tuple[str, str]:
         )
         return "model", ""
     for method, (base, role, inherited) in _BASES.items():
-        if callable(getattr(cls, method, None)) and not all(hasattr(cls, n) for n in inherited):
-            raise ValueError(
-                f"{cls.__name__} must be a subclass of pfbench.{base} to be {role}, "
-                f"got a subclass of {cls.__mro__[1].__name__}. Write class {cls.__name__}({base.partition('.')[2]})."
-            )
+        require(
+            not callable(getattr(cls, method, None)) or all(hasattr(cls, n) for n in inherited),
+            cls.__name__,
+            f"be a subclass of pfbench.{base} to be {role}",
+            f"a subclass of {cls.__mro__[:2][-1].__name__}",
+            f"Write class {cls.__name__}({base.partition('.')[2]}).",
+        )
     if _is_network(cls):
         return "filter", "network"
     methods = {"noise": ("draw_errors",), "scenario": ("draw",), "filter": ("init", "step")}
@@ -218,7 +222,11 @@ class _NodeWriter:
             return self._write_fields(type(value), {})  # a class without arguments
         raise TypeError(
             f"{path} must be numbers, texts, lists or objects of dataclasses, got {describe_value(value)}. "
-            "Pass the class with its arguments: pfbench.own(Class, argument=...)."
+            + (
+                "Pass numbers or a list, such as array.tolist(), and make the object in the class."
+                if "." in path
+                else "Pass the class with its arguments: pfbench.own(Class, argument=...)."
+            )
         )
 
     def write_class(self, cls: type, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -238,10 +246,13 @@ class _NodeWriter:
         if "particles" in required:
             node["particles"] = "${particles}"
             required.remove("particles")
-        if required:
-            raise ValueError(
-                f"{cls.__name__} must receive {', '.join(required)}, got no value. Use own({cls.__name__}, {required[0]}=...)."
-            )
+        require(
+            not required,
+            cls.__name__,
+            f"receive {', '.join(required)}",
+            "no value",
+            f"Use own({cls.__name__}, {'=..., '.join(required)}=...).",
+        )
         return node
 
     def write_network(self, cls: Any, arguments: Mapping[str, Any]) -> dict[str, Any]:
@@ -317,12 +328,10 @@ class _NodeWriter:
         return {**values, stage: [node] if stage == "moves" else node}
 
     def store(self, group: str, title: str, node: dict[str, Any]) -> Part:
-        """Write the file of a part into a folder named by its content. A class with a name of pfbench is `own_NAME`."""
+        """Write the file of a part into a folder named by its content."""
         import yaml
 
-        name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|\W+", "_", title).strip("_").lower()
-        if name in list_groups()[group]:
-            name = f"own_{name}"
+        name = _name_file(title)
         head: dict[str, Any] = {}
         if self.model is not None:
             head = {"defaults": ["_self_", {"override /model@_global_.model": self.model.name}]}
@@ -342,6 +351,11 @@ class _NodeWriter:
         )
 
 
+def _name_file(title: str) -> str:
+    """Return the name of the file of a part."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|\W+", "_", title).strip("_").lower()
+
+
 def _is_without_state(value: object) -> bool:
     """Return whether an object is only its class: a constructor without arguments, and no attributes."""
     cls = type(value)
@@ -351,7 +365,7 @@ def _is_without_state(value: object) -> bool:
 
 def _is_default(field: Any, holder: Any) -> bool:
     """Return whether a field of an object has its default value."""
-    value = getattr(holder, field.name)
-    if field.default_factory is not dataclasses.MISSING:
-        return bool(field.default_factory() == value)
-    return field.default is not dataclasses.MISSING and bool(field.default == value)
+    is_made = field.default_factory is not dataclasses.MISSING
+    default = field.default_factory() if is_made else field.default
+    is_equal = default == getattr(holder, field.name)
+    return bool(is_equal.all() if hasattr(is_equal, "all") else is_equal)  # of an array

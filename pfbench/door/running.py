@@ -8,7 +8,7 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -139,10 +139,13 @@ def _make_part(group: str, item: Any) -> Part:
             kind = find_group(item)[0]
     if group == "scenario" and kind == "model":
         return simulate_model(item)
-    if kind != group:
-        raise ValueError(
-            f"{group} must be a {group}, got the {kind} {item if isinstance(item, Part) else describe_value(item)}. Pass it as {kind}=..."
-        )
+    require(
+        kind == group,
+        group,
+        f"be a {group}",
+        f"the {kind} {item if isinstance(item, Part) else describe_value(item)}",
+        f"Pass it as {kind}=...",
+    )
     return item if isinstance(item, Part) else make_own(item)
 
 
@@ -186,18 +189,25 @@ def continue_jobs(study: Study, runs: int, workers: int, progress: bool) -> None
 def _continue_job(job: JobFile, runs: int, trusted: Sequence[str]) -> JobConfig:
     """Return the configuration of the next runs of a stored job."""
     meta = job.meta
+    check_trusted(meta, trusted)
     values = copy.deepcopy(meta["config"])
     values |= {"runs": runs, "first_run": int(meta["first_run"]) + int(meta["runs"])}
     values |= {"overwrite": False}
-    missing = [name for name in meta.get("trusted", ()) if name not in trusted]
-    if missing:
-        raise ValueError(
-            f"trust must name the packages whose classes the study uses, {', '.join(missing)}, got none of them. "
-            f"If you still trust them, open it by pfbench.study({meta['study']!r}, trust={tuple(missing)})."
-        )
     choices = {group: str(meta["choices"][group]) for group in CHOICES}
     is_shared = bool(meta.get("budget_allocation"))
     return JobConfig(values, choices, is_shared, tuple(trusted))
+
+
+def check_trusted(meta: Mapping[str, Any], trusted: Sequence[str]) -> None:
+    """Check that a study is opened with trust in the packages whose classes a stored job uses."""
+    missing = [name for name in meta.get("trusted", ()) if name not in trusted]
+    require(
+        not missing,
+        "trust",
+        f"name the packages whose classes the study uses, {', '.join(missing)}",
+        "none of them",
+        f"If you still trust them, open it by pfbench.study({meta['study']!r}, trust={tuple(missing)}).",
+    )
 
 
 def _run_jobs(configs: Sequence[JobConfig], workers: int, progress: bool) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pfbench.cli.progress import StudyState, format_repeat, read_state
 from pfbench.core.parameter_checks import require
 from pfbench.door.parts import plain_errors
-from pfbench.job.trust import trusting
+from pfbench.job.trust import trusted_packages, trusting
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -167,13 +167,14 @@ class Study:
         Returns:
             A row per step: time, error, standard deviation, NEES and traces such as the effective sample size.
         """
-        from pfbench.door.running import preserved_process
+        from pfbench.door.running import check_trusted, preserved_process
         from pfbench.job.config import compose
         from pfbench.job.replay import recompute_run, tabulate_traces
         from pfbench.job.run_selection import find_run
 
         with plain_errors(), preserved_process(), trusting(self.trust):
             stored = find_run(self.name, self.results, run, label, choice)
+            check_trusted(stored.result.meta, trusted_packages())
             places = compose([]).values
             names = ("data", "results_dir", "reports_dir", "episode_cache_dir")
             changes = {name: places[name] for name in names}
@@ -230,9 +231,15 @@ class Study:
         return read_state(Path(self.results) / self.name)
 
     def failed(self) -> list[dict[str, str]]:
-        """List the failed jobs, each with its choices, its message and the command that repeats it."""
+        """List the failed jobs, each with its choices, its message, the command that repeats it and the file of its note."""
+        folder = Path(self.results) / self.name
         return [
-            {**note["choices"], "message": note["message"], "repeat": format_repeat(note)}
+            {
+                **note["choices"],
+                "message": note["message"],
+                "repeat": format_repeat(note),
+                "note": str(folder / f"{note['key']}.failed.json"),
+            }
             for note in self.status().failures
         ]
 

@@ -14,7 +14,7 @@ from torch.distributions.constraints import Constraint, is_dependent
 from pfbench.core.density import check_event_dimension
 from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import PhiloxStream, RandomStream
-from pfbench.core.record import Record
+from pfbench.core.record import Record, check_inputs, name_inputs
 from pfbench.core.simulate import draw_initial_state
 from pfbench.filter.health import check_measurement_resolution, uncounted_observation
 from pfbench.filter.linearisation import check_noise_gain
@@ -26,12 +26,13 @@ _STATES = 4  # of each run that the model is tried with
 def check_is_filter(method: object) -> None:
     """Check that an object is an instance with the calls of a filter."""
     calls = (getattr(method, name, None) for name in ("init", "step"))
-    if isinstance(method, type) or not all(map(callable, calls)):
-        kind = f"the class {method.__name__}" if isinstance(method, type) else type(method).__name__
-        raise ValueError(
-            f"method must be a filter, with the calls init and step, got {kind}. Pass an instance, "
-            "such as ParticleFilter(100)."
-        )
+    require(
+        not isinstance(method, type) and all(map(callable, calls)),
+        "method",
+        "be a filter, with the calls init and step",
+        f"the class {method.__name__}" if isinstance(method, type) else type(method).__name__,
+        "Pass an instance, such as ParticleFilter(100).",
+    )
 
 
 def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) -> None:
@@ -40,19 +41,21 @@ def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) ->
     Shapes: record [R, T, Dy].
     """
     for name, item, kind in (("model", model, StateSpaceModel), ("record", record, Record)):
-        if not isinstance(item, kind):
-            class_name = (item if isinstance(item, type) else type(item)).__name__
-            raise ValueError(
-                f"{name} must be a {kind.__name__}, got {class_name}. Pass the arguments in the order "
-                "method, model, record, draws."
-            )
-    y = record.y
-    if y.dim() != 3 or not y.is_floating_point():
-        raise ValueError(
-            "record.y must be a tensor of real numbers with axes [R, T, Dy], got "
-            f"{str(y.dtype).removeprefix('torch.')} {list(y.shape)}. Convert it, for instance by "
-            "y.double()."
+        require(
+            isinstance(item, kind),
+            name,
+            f"be a {kind.__name__}",
+            (item if isinstance(item, type) else type(item)).__name__,
+            "Pass the arguments in the order method, model, record, draws.",
         )
+    y = record.y
+    require(
+        y.dim() == 3 and y.is_floating_point(),
+        "record.y",
+        "be a tensor of real numbers with axes [R, T, Dy]",
+        f"{str(y.dtype).removeprefix('torch.')} {list(y.shape)}",
+        "Convert it, for instance by y.double().",
+    )
     require(y.shape[1] != 0, "record.y", "have at least one time step", "0", "Add measurements.")
     require(
         not bool(torch.isinf(y).any()),
@@ -61,7 +64,7 @@ def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) ->
         "infinity",
         "Mark a missing component as NaN.",
     )
-    runs, steps, _ = y.shape
+    runs = len(y)
     numbers: Any = getattr(draws, "runs", None)
     require(
         not isinstance(numbers, Tensor) or numbers.shape == (runs,),
@@ -77,12 +80,7 @@ def check_record(model: StateSpaceModel, record: Record, draws: RandomStream) ->
         type(record.u).__name__,
         "Define a NamedTuple with a field for each input.",
     )
-    for name, value in _named_inputs(record.u):
-        if value.dim() < 2 or value.shape[0] not in (1, runs) or value.shape[1] != steps:
-            raise ValueError(
-                f"record.u{name} must have the axes [{runs} or 1, {steps}, ...] of runs and steps, "
-                f"got {list(value.shape)}."
-            )
+    check_inputs(record)
     _check_initial("start", record.start, (runs, model.chart.size))
     size = len(model.names)
     _check_initial("spread", record.spread, (runs, size, size))
@@ -113,7 +111,7 @@ class _CheckedState(NamedTuple):
             for a in (*module._buffers.values(), *module._parameters.values())
         ]
         tensors += [record.y, record.start, record.spread]
-        tensors += [value for _, value in _named_inputs(record.u)]
+        tensors += [value for _, value in name_inputs(record.u)]
         present = [a for a in tensors if a is not None]
         identities += [(id(a), a._version) for a in present]
         return _CheckedState(identities, list(map(weakref.ref, present)))
@@ -149,6 +147,13 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
     name = type(model).__name__
     with torch.no_grad(), named_inputs(model):
         distribution: Any = initial_law(model, runs, record.spread)
+        require(
+            tuple(distribution.batch_shape) == (runs,),
+            f"{name}.initial",
+            f"return a distribution of batch shape [R] = {[runs]}",
+            list(distribution.batch_shape),
+            "Use normal_batch(runs, sd, mean).",
+        )
         # a stream of its own, in the precision of the model
         stream = PhiloxStream(0, torch.arange(runs, device=model.anchor.device), model.anchor.dtype)
         x = draw_initial_state(model, distribution, stream, "input check", _STATES, record.start)
@@ -156,27 +161,33 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
         check_event_dimension(step_model.noise, f"{name}.noise", step_model.noise_dim)
         w = torch.nan_to_num(step_model.noise.mean).expand(runs, _STATES, step_model.noise_dim)
         next_x = step_model.propagate(x, first.u, w)
-        if next_x.shape != x.shape or not bool(next_x.isfinite().all(-1).any()):
-            state = list(next_x.shape) if next_x.shape != x.shape else "numbers that are not finite"
-            raise ValueError(
-                f"{name}.propagate must return finite states {list(x.shape)}, got {state} for the "
-                "first step. Check the inputs and the parameters of the model."
-            )
+        state = list(next_x.shape) if next_x.shape != x.shape else "numbers that are not finite"
+        require(
+            next_x.shape == x.shape and bool(next_x.isfinite().all(-1).any()),
+            f"{name}.propagate",
+            f"return finite states {list(x.shape)}",
+            f"{state} for the first step",
+            "Check the inputs and the parameters of the model.",
+        )
         _check_propagation(model, record, x, w, next_x)
         observed = _observe(step_model, next_x, first.u)
         check_event_dimension(observed, f"{name}.observation", width)
     shape = (*observed.batch_shape, *observed.event_shape)
     is_blank = bool(torch.isnan(record.y).all())  # a record without measurements may have any width
-    if shape[-1] != width and not is_blank:
-        raise ValueError(
-            f"record.y must have as many components as {name} observes, {shape[-1]}, got {width}."
-        )
-    if tuple(observed.batch_shape) != (runs, _STATES):
-        raise ValueError(
-            f"{name}.observation must return a distribution of batch shape [R, N] = "
-            f"{[runs, _STATES]}, got {list(observed.batch_shape)}. Compute it from the states x, and "
-            "expand what all particles share."
-        )
+    require(
+        tuple(observed.batch_shape) == (runs, _STATES),
+        f"{name}.observation",
+        f"return a distribution of batch shape [R, N] = {[runs, _STATES]}",
+        list(observed.batch_shape),
+        "Compute it from the states x, with their last axis (x[..., :1], not x[..., 0]), and expand what all particles share.",
+    )
+    require(
+        shape[-1] == width or is_blank,
+        "record.y",
+        f"have as many components as {name} observes, {shape[-1]}",
+        width,
+        "Let both have the same components.",
+    )
     _check_measurements(model, record, observed, next_x)
 
 
@@ -192,13 +203,13 @@ def _check_counts(model: StateSpaceModel, observed: Any) -> None:
     """Check that a model states whether its measurements are discrete."""
     base = observed.base_dist if isinstance(observed, Independent) else observed
     support = getattr(base, "support", None)
-    if getattr(support, "is_discrete", False) and not model.has_counts:
-        name = type(model).__name__
-        raise ValueError(
-            f"{name}.has_counts must be True for discrete measurements, got False with a support of "
-            f"{support}. Set `has_counts = True` in the class: its evidence is a probability, "
-            "which is not compared with densities."
-        )
+    require(
+        model.has_counts or not getattr(support, "is_discrete", False),
+        f"{type(model).__name__}.has_counts",
+        "be True for discrete measurements",
+        f"False with a support of {support}",
+        "Set `has_counts = True` in the class: its evidence is a probability, which is not compared with densities.",
+    )
 
 
 def _check_likelihood(model: StateSpaceModel, record: Record, x: Tensor) -> None:
@@ -297,26 +308,7 @@ def _observe(model: StateSpaceModel, x: Tensor, u: Any) -> Any:
         ) from error
 
 
-def _named_inputs(u: Any, name: str = "") -> list[tuple[str, Tensor]]:
-    """Return the input tensors with the names of their fields."""
-    if isinstance(u, Tensor):
-        return [(name, u)]
-    require(
-        isinstance(u, tuple),
-        f"record.u{name}",
-        "be a tensor or a tuple of tensors",
-        type(u).__name__,
-        "Convert it, for instance by torch.as_tensor.",
-    )
-    fields = getattr(u, "_fields", range(len(u)))
-    return [
-        pair
-        for field, value in zip(fields, u, strict=True)
-        for pair in _named_inputs(value, f"{name}.{field}")
-    ]
-
-
 def _check_initial(name: str, value: Tensor | None, shape: tuple[int, ...]) -> None:
     """Check the shape of the initial states or covariances of the runs."""
-    if value is not None and tuple(value.shape) != shape:
-        raise ValueError(f"record.{name} must have shape {list(shape)}, got {list(value.shape)}.")
+    got = shape if value is None else value.shape
+    require(tuple(got) == shape, f"record.{name}", f"have shape {list(shape)}", list(got))

@@ -240,7 +240,7 @@ def choose_engine(
     if obstacle:
         _say_once(f"engine={engine}: C++ operators, step by step ({obstacle})")
         return "kernels"
-    _say_once(f"engine={engine}: all steps in C++, with a tape of the model")
+    _say_once(f"engine={engine}: all steps in C++, if the model has a tape")
     return "tape"
 
 

@@ -47,7 +47,12 @@ def explain_error(
         "pfbench."
     ):
         return ValueError(
-            "model must be given with a scenario of your own, got that of flights. Use pfbench.run(scenario, filters, model=...)."
+            "model must be given with a scenario of your own, got that of flights. "
+            + (
+                "Use pfbench.run(scenario, filters, model=...)."
+                if str(tree["scenario"]["_target_"]).startswith("own_")
+                else "Add model=NAME, or `override /model@_global_.model: NAME` to the defaults of the scenario."
+            )
         )
     fitting = list_fitting_models(tree, trusted, scenario)
     is_shipped = model in list_groups()["model"]

@@ -6,7 +6,7 @@ The file is long, since the wrappers are part of it: the first step of a model m
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from typing import Any, Self
@@ -20,7 +20,7 @@ from pfbench.core.chart import Chart, EuclideanBlock
 from pfbench.core.density import StandardNormal, dense_normal, log_density, log_normal_density
 from pfbench.core.linear_algebra import gaussian_log_density
 from pfbench.core.parameter_checks import require
-from pfbench.core.record import Record
+from pfbench.core.record import Record, check_inputs
 
 
 @cache
@@ -189,14 +189,16 @@ class StateSpaceModel(nn.Module, ABC):
         """Return the record with inputs that are computed once for all steps.
 
         Raises:
-            ValueError: If the inputs are not those of `input_type`.
+            ValueError: If the inputs are not those of `input_type`, or lack the axes of runs and steps.
         """
-        if self.input_type is not None and not isinstance(record.u, self.input_type):
-            kind = type(record.u).__name__ if record.u else "no inputs"
-            raise ValueError(
-                f"record.u must be {self.input_type.__name__} for {type(self).__name__}, got {kind}. "
-                "Choose a scenario with these inputs: pfbench list scenario model=NAME"
-            )
+        require(
+            self.input_type is None or isinstance(record.u, self.input_type),
+            "record.u",
+            f"be {getattr(self.input_type, '__name__', '')} for {type(self).__name__}",
+            type(record.u).__name__ if record.u else "no inputs",
+            "Choose a scenario with these inputs: pfbench list scenario model=NAME",
+        )
+        check_inputs(record)
         return record
 
     def at_step(self, t: int) -> StateSpaceModel:
@@ -366,17 +368,37 @@ class StaticModel(ModelWrapper):
         return self.model.log_likelihood(y, x, u)
 
 
+def check_components(model: StateSpaceModel) -> None:
+    """Check that each component of a model has a unit, and that each group has components."""
+    name, size = type(model).__name__, len(model.names)
+    must, remedy = (
+        f"have one unit for each of {size} names",
+        "Write '' for a number without a unit.",
+    )
+    require(len(model.units) == size, f"{name}.units", must, model.units, remedy)
+    for group, places in model.groups.items():
+        require(
+            isinstance(places, Sequence) and set(places) <= set(range(size)),
+            f"{name}.groups[{group!r}]",
+            f"be a tuple of components from 0 to {size - 1}",
+            places,
+            "Write (0,) for the first one alone.",
+        )
+
+
 def check_truth_sizes(truth: Mapping[str, Tensor], sizes: Mapping[str, int]) -> None:
     """Check that true values have the components of their groups: one number would fill a vector.
 
     Shapes: truth [R, T, k].
     """
     for name in sizes.keys() & truth.keys():
-        if truth[name].shape[-1] != sizes[name]:
-            raise ValueError(
-                f"truth of {name} must have {sizes[name]} components, as the model, got "
-                f"{truth[name].shape[-1]}. Choose a scenario that fits the model."
-            )
+        require(
+            truth[name].shape[-1] == sizes[name],
+            f"truth of {name}",
+            f"have {sizes[name]} components, as the model",
+            truth[name].shape[-1],
+            "Choose a scenario that fits the model.",
+        )
 
 
 def _mean_of(distribution: Any, name: str) -> Tensor:

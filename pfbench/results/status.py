@@ -255,9 +255,10 @@ def describe_runs(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> str:
     Returns magnitude with unit, counts of `count_statuses`, and the threshold.
     """
     group = main_component_group(meta["state"])
-    count = count_statuses(outputs, meta)
-    threshold = divergence_threshold(meta)
+    lacks_truth = np.isnan(outputs["error"][..., group.places]).all(axis=(1, 2))
+    count, threshold = count_statuses(outputs, meta), divergence_threshold(meta)
     kinds = {
+        "without truth": int((~np.asarray(outputs["lost"], bool) & lacks_truth).sum()),
         "lost": count.lost,
         "diverged": count.diverged,
         "collapsed": count.collapsed,

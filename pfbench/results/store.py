@@ -309,8 +309,8 @@ def check_metadata(path: Path, meta: Any) -> None:
         "Run the job again.",
     )
     missing = [name for name in _META if name not in meta]
-    if missing:
-        raise ValueError(f"{path}: metadata must contain {', '.join(missing)}. Run the job again.")
+    must = f"contain {', '.join(missing)}"
+    require(not missing, f"{path}: metadata", must, "none of them", "Run the job again.")
     for name, (kind, is_valid) in _KINDS.items():
         if name in meta and not is_valid(meta[name]):
             raise ValueError(
@@ -345,10 +345,13 @@ def _find_state_fault(state: Any) -> str:
 def check_arrays(path: Path, meta: Mapping[str, Any], data: Mapping[str, np.ndarray]) -> None:
     """Check the names, types and shapes of the arrays of a result."""
     missing = [name for name in _AXES if name not in data]
-    if missing:
-        raise ValueError(
-            f"{path}: a result must contain the arrays {', '.join(missing)}. Run the job again."
-        )
+    require(
+        not missing,
+        f"{path}: a result",
+        f"contain the arrays {', '.join(missing)}",
+        "none of them",
+        "Run the job again.",
+    )
     for name, value in data.items():
         # the first three are arguments of numpy's savez
         require(
@@ -378,10 +381,13 @@ def check_arrays(path: Path, meta: Mapping[str, Any], data: Mapping[str, np.ndar
         _AXES | {name: axes for name, axes in _OPTIONAL.items() if name in data}
     ).items():
         expected = tuple(size[axis] for axis in axes)
-        if data[name].shape != expected:
-            raise ValueError(
-                f"{path}: {name} must have shape {list(axes)} = {expected}, got {data[name].shape}"
-            )
+        require(
+            data[name].shape == expected,
+            f"{path}: {name}",
+            f"have shape {list(axes)} = {expected}",
+            data[name].shape,
+            "Run the job again.",
+        )
 
 
 def _check_values(path: Path, data: Mapping[str, np.ndarray]) -> None:

@@ -20,7 +20,7 @@ from torch import Tensor
 from typing_extensions import override
 
 import pfbench
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record, take_groups
 from pfbench.core.simulate import (
@@ -117,16 +117,25 @@ def _join_steps(
     `draw_errors` returns the errors of all steps, nominal ones if its second argument is true.
     """
     distributions = [step.distribution for step in steps]
+    require(
+        len(distributions[0].batch_shape) == 2,
+        f"{type(model).__name__}.observation",
+        "return a distribution of batch shape [R, N]",
+        list(distributions[0].batch_shape),
+        "Compute it from the states x, with their last axis (x[..., :1], not x[..., 0]).",
+    )
     shape, span = distributions[0].event_shape, slice(steps[0].t, steps[-1].t + 1)
     states, errors = torch.cat([step.x for step in steps], 1), draw_errors(shape, False)[:, span]
     if all(is_independent_normal(distribution) for distribution in distributions):
         return states, draw_measurements(distributions, stream, "world.receiver", errors)
     missing_mask, nominal = torch.isnan(errors), draw_errors(shape, True)[:, span]
-    if not torch.equal(torch.where(missing_mask, nominal, errors), nominal):
-        raise ValueError(
-            f"noise must be nominal for {type(model).__name__}, whose measurement errors are not "
-            f"independent normal, got {regime_name(noise)}. Choose noise=nominal."
-        )
+    require(
+        torch.equal(torch.where(missing_mask, nominal, errors), nominal),
+        "noise",
+        f"be nominal for {type(model).__name__}, whose measurement errors are not independent normal",
+        regime_name(noise),
+        "Choose noise=nominal.",
+    )
     y = draw_measurements(distributions, stream, "world.receiver", first=steps[0].t)
     return states, torch.where(missing_mask, torch.nan, y)
 

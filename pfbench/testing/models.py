@@ -10,7 +10,13 @@ import torch
 from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import EACH_SATELLITE, Episode, MeasurementChannels, Record
+from pfbench.core.record import (
+    EACH_SATELLITE,
+    Episode,
+    MeasurementChannels,
+    Record,
+    check_inputs,
+)
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.linearisation import find_observation_jacobian, find_propagation_jacobian
 from pfbench.filter.particle.stages import Proposal
@@ -215,6 +221,7 @@ def check_scenario(scenario: Any) -> Mapping[str, LawCheck]:
             f"{name}.draw must return the inputs {inputs.__name__}, which input_type states, got "
             f"{type(episode.record.u).__name__}. Return Record(y, {inputs.__name__}(...))"
         )
+        check_inputs(episode.record)
         return episode.record.y
 
     return _check_alone("the data of a run do not depend on other runs", draw)

@@ -13,7 +13,7 @@ from torch import Tensor
 from pfbench.core.parameter_checks import require_range
 from pfbench.files.table_file import Array
 from pfbench.filter.input_check import check_is_filter
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.base import StateSpaceModel, check_components
 
 
 class LawCheck(NamedTuple):
@@ -118,10 +118,11 @@ def check_subject(tester: str, method: object, model: object, y: object, dimensi
 
 
 def check_is_model(tester: str, model: object) -> None:
-    """Check that a model is an instance of `StateSpaceModel`."""
+    """Check that a model is an instance of `StateSpaceModel`, with units and groups of its components."""
     if not isinstance(model, StateSpaceModel):
         got = describe_subject(model, "linear_walk(1.0, 0.5, 1.0)")
         raise ValueError(f"{tester}: model must be a StateSpaceModel, got {got}")
+    check_components(model)
 
 
 def check_count(tester: str, least: int = 1, **counts: object) -> None:

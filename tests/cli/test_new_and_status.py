@@ -155,6 +155,7 @@ def test_the_state_of_a_study_lists_failed_jobs_with_the_words_that_repeat_them(
     assert sweep.code == 1
     said = pfbench("status", "study=s", home=tmp_path)
     assert said.out.startswith("s: 1 finished, 1 failed\n")
+    assert re.search(r"mended it: remove \S+results/s/\w+\.failed\.json\n", said.out)
     for text in (sweep.out, said.out):
         (repeat,) = re.findall(r"repeat: pfbench (run .*)", text)
         assert {"filter.particles=0", "study=s", *WALK} <= set(repeat.split())

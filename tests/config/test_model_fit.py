@@ -24,7 +24,12 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record, describe_misfit
 from pfbench.filter import CubaturePoints, GaussianFilter, SigmaPointLinearisation, run_filter
 from pfbench.job.config import compose_tree
-from pfbench.job.model_fit import is_fitting, list_fitting_models, list_fitting_scenarios
+from pfbench.job.model_fit import (
+    explain_error,
+    is_fitting,
+    list_fitting_models,
+    list_fitting_scenarios,
+)
 from pfbench.model import LinearGaussian, Pendulum
 from pfbench.noise import NominalNoise
 from pfbench.scenario import ModelSimulation
@@ -310,3 +315,10 @@ def test_names_are_as_many_as_components() -> None:
     for scenario in ("passive_1", "terrain", "flight_300s", "sar_flight_short", "lorenz63"):
         names = job.instantiate(composed(f"scenario={scenario}").scenario).channel_names
         assert len(names) == world(scenario).record.y.shape[-1]
+
+
+def test_a_shipped_model_of_flights_has_the_remedy_of_its_door() -> None:
+    remedies = {"own_s.S": "Use pfbench.run(scenario", "mine.S": "Add model=NAME, or `override"}
+    for target, remedy in remedies.items():
+        tree = {"model": {"_target_": "pfbench.model.InsGnss"}, "scenario": {"_target_": target}}
+        assert remedy in str(explain_error(ValueError(), tree, ()))

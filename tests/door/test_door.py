@@ -128,6 +128,8 @@ def test_a_proposal_of_a_notebook_runs_in_workers_and_is_computed_again(notebook
     assert not np.array_equal(result.data["error"], stored("own")["sir"].data["error"])
     traces = study.replay("defensive", 2)
     assert np.array_equal(traces["error position [m]" if "error position [m]" in traces else traces.columns[1]].to_numpy(), result.data["error"][2, :, 0])  # fmt: skip
+    untrusted = re.escape(f"open it by pfbench.study('own', trust=('{target.partition('.')[0]}',))")
+    check_refused([(untrusted, lambda: pfbench.study("own").replay("defensive", 2))])
     said = command("replay", "study=own", "filter=defensive", "run=2", home=Path.cwd())
     assert f"add trust=[{target.partition('.')[0]}]" in said.err
     place = [f"hydra.searchpath=[own://{next(Path('.cache/own').glob('defensive_*'))}]", f"trust=[{target.partition('.')[0]}]"]  # fmt: skip
@@ -319,6 +321,9 @@ def test_names_of_own_parts(notebook: Notebook) -> None:
     assert node["proposal"]["share"] == 0.4
     assert node["resampler"]["_target_"] == "pfbench.filter.RegularisedResampler"
     assert "Wide PF" in str(study.summary())
+    own = pfbench.own(notebook["Defensive"], "SIR")  # not the shipped one
+    (file,) = Path(own.folders[0]).rglob("own_sir.yaml")
+    assert "name: Own SIR\n" in file.read_text()
 
 
 CLOSURE = """
@@ -348,6 +353,30 @@ BAD_CELLS = {
     f"SD = 1.0\n{WORLD}\nclass Calm(Sea):\n    def draw(self, noise, runs, seed):\n        return super().draw(noise, runs, seed)._replace(record=Record(torch.randn(len(runs), 8, 1)))": (
         "Calm()", "draw of your class must succeed, got AttributeError: 'Episode' object has no attribute '_replace'"
     ),
+    f"SD = 1.0\n{WORLD}\nclass Short(Sea):\n    def draw(self, noise, runs, seed):\n        e = super().draw(noise, runs, seed)\n        return Episode(Record(e.record.y, Ship(torch.ones(8))), e.time, e.truth)": (
+        "Short()", "record.u.speed must have the axes [2 or 1, 8, ...] of runs and steps, got [8]. Write values[None]"
+    ),
+    f"SD = 1.0\n{WORLD}\nclass Other(Sea):\n    def draw(self, noise, runs, seed):\n        e = super().draw(noise, runs, seed)\n        return Episode(e.record, e.time, {{'pos': e.truth['position']}})": (
+        "Other()", "Other.draw must name groups of Line (position), got 'pos'. Use these names"
+    ),
+    f"SD = 1.0\n{WORLD}\nclass Near(Sea):\n    def draw(self, noise, runs, seed):\n        e = super().draw(noise, runs, seed)\n        return Episode(e.record, e.time, {{**e.truth, 'vel': e.truth['position']}})\nclass Line(Line0):\n    def __init__(self):\n        super().__init__()\n        self.groups = {{'position': (0,), 'velocity': (0,)}}".replace("class Line(S", "class Line0(S"): (
+        "Near()", "Near.draw must name groups of Line (position, velocity), got 'vel'. Use these names"
+    ),
+    f"{MODEL}\nclass Bare(Room):\n    def __init__(self):\n        super().__init__()\n        self.units = ()": (
+        "Bare()", "Bare.units must have one unit for each of 1 names, got (). Write ''"
+    ),
+    f"{MODEL}\nclass Whole(Room):\n    def __init__(self):\n        super().__init__()\n        self.groups = {{'temperature': 0}}": (
+        "Whole()", "Whole.groups['temperature'] must be a tuple of components from 0 to 0, got 0. Write (0,)"
+    ),
+    f"{MODEL}\nclass Alone(Room):\n    def initial(self, runs):\n        return independent_normal(self.sd, self.sd)": (
+        "Alone()", "Alone.initial must return a distribution of batch shape [R] = [2], got []. Use normal_batch"
+    ),
+    f"{MODEL}\nclass Flat(Room):\n    def observation(self, x, u):\n        return independent_normal(x[..., 0], self.sd)": (
+        "Flat()", "Flat.observation must return a distribution of batch shape [R, N], got [2]. Compute it from the states x, with their last axis"
+    ),
+    f"SD = 1.0\n{WORLD}\nclass Line(Line0):\n    def observation(self, x, u):\n        return independent_normal(x[..., 0], self.sd)".replace("class Line(S", "class Line0(S"): (
+        "Sea()", "Line.observation must return a distribution of batch shape [R, N] = [2, 4], got [2]. Compute it from the states x, with their last axis"
+    ),
     "class Empty:\n    pass": ("Empty", "must have the methods of a part: filter init and step"),
     "class Call:\n    def __call__(self, x, y):\n        return x": ("Call()", "Got __call__(self, x, y)"),
     "class Plain:\n    def propagate(self, x, u, w):\n        return x": (
@@ -360,8 +389,8 @@ BAD_CELLS = {
         "Lost()", "MISSING must be defined before the class is passed"
     ),
     "import pfbench\nimport numpy\nBIG = numpy.zeros(3)\ndel numpy\nfrom dataclasses import dataclass\n@dataclass(frozen=True)\n"
-    "class Array:\n    values: object\n    def __call__(self, belief):\n        return belief": (
-        "Array(BIG)", "Array.values must be numbers, texts, lists or objects of dataclasses, got ndarray"
+    "class Array:\n    values: object = None\n    def __call__(self, belief):\n        return belief": (
+        "Array(BIG)", "Array.values must be numbers, texts, lists or objects of dataclasses, got ndarray. Pass numbers or a list"
     ),
 }  # fmt: skip
 
@@ -373,9 +402,9 @@ def test_classes_that_no_other_process_can_use_are_refused_in_a_sentence(
     expression, sentence = BAD_CELLS[cell]
     notebook.run(cell)
     thing = eval(expression, vars(notebook.main))
-    kinds = {"draw_errors": "noise", "draw": "scenario"}
+    kinds = {"draw_errors": "noise", "draw": "scenario", "propagate": "scenario"}
     group = next((kinds[name] for name in kinds if hasattr(thing, name)), "filters")
-    model = {"model": notebook["Line"]()} if group == "scenario" else {}
+    model = {"model": notebook["Line"]()} if hasattr(thing, "draw") else {}
     with pytest.raises((ValueError, TypeError), match=re.escape(sentence)):
         pfbench.run(**{"scenario": WALK, "filters": ["sir"], group: [thing], **model, **SMALL})
     assert not Path("results").exists()
@@ -443,7 +472,8 @@ def test_a_failed_job_is_listed_with_the_words_that_repeat_it(
     printed = capsys.readouterr().out
     assert note["repeat"] in printed
     assert note["message"] in repr(study.summary())
-    assert note["message"] in repr(study)
+    mended = f"  if another setting has mended it: remove {Path(note['note']).resolve(strict=True)}"
+    assert f"linear_walk / nominal / sir: {note['message']}\n{mended}" in repr(study)
     assert "1 finished, 0 skipped, 1 failed" in printed
     words = note["repeat"].split()[2:]
     assert "filter.particles=0" in words

@@ -226,6 +226,9 @@ def test_runs_are_counted_by_condition() -> None:
     small = {key[1:3]: view["small_print"] for key, view in views.items()}
     assert "30 paired runs per condition" in small["w0", "nominal"]
     assert "12 to 30 paired runs per condition" in small["all", "all"]
+    data.loc[data["run"] < 10, "rmse"] = np.nan  # as in `compare` and `errors()`
+    (small_print, *_) = (view["small_print"] for view in views_of(data).values())
+    assert "20 paired runs per condition (40 of 120 runs have no truth)" in small_print
 
 
 def test_the_log_score_orders_a_board() -> None:

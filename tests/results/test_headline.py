@@ -44,6 +44,7 @@ def test_a_job_that_diverged_says_so_with_the_limit() -> None:
     ("kind", "change"),
     [
         ("lost", {"lost": np.arange(RUNS) < 2}),
+        ("without truth", {"error": np.where(np.arange(RUNS) < 2, np.nan, 3.0)[:, None, None]}),
         ("collapsed", {"health": np.where(np.arange(RUNS) < 2, 2, 0)}),
         ("heavy-tailed", {"health": np.where(np.arange(RUNS) < 2, 5, 0)}),
         ("implausible", {"health": np.where(np.arange(RUNS) < 2, 6, 0)}),

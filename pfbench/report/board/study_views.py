@@ -182,7 +182,7 @@ def _small_print(runs: StudyRuns, names: StudyFacts) -> str:
     sample = ", ".join((
         format_count(filters, "filter"), _count_worlds(runs.conditions),
         format_count(runs.conditions["regime"].nunique(), "noise regime"),
-        f"{_count_runs(runs)} per condition", format_count(len(seeds), "seed"),
+        _count_runs(runs, names.options.metric), format_count(len(seeds), "seed"),
     ))  # fmt: skip
     return (
         f"{sample}. Ratios are those of Hodges and Lehmann over paired runs, with simultaneous "
@@ -192,11 +192,15 @@ def _small_print(runs: StudyRuns, names: StudyFacts) -> str:
     ).rstrip()
 
 
-def _count_runs(runs: StudyRuns) -> str:
-    """Count the paired runs of a condition, as a range where conditions differ."""
-    counts = runs.present.any(axis=0).sum(axis=1)
-    largest = format_count(int(counts.max()), "paired run")
-    return largest if counts.min() == counts.max() else f"{counts.min()} to {largest}"
+def _count_runs(runs: StudyRuns, metric: str) -> str:
+    """Count the paired runs of a condition, as a range where conditions differ, and those without truth."""
+    counts = (~np.isnan(compute_losses(runs, metric))).any(axis=0).sum(axis=1)
+    total = int(runs.present.any(axis=0).sum())
+    few = "" if counts.min() == counts.max() else f"{counts.min()} to "
+    lacking = f" ({total - counts.sum()} of {total} runs have no truth)" * bool(
+        counts.sum() < total
+    )
+    return f"{few}{format_count(int(counts.max()), 'paired run')} per condition{lacking}"
 
 
 # --------------------------------------------------------------------------------------------------
