@@ -285,7 +285,7 @@ def describe_runs(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> str:
         text += f" of {count.runs} runs"
     if count.diverged and threshold is not None:
         limit = f"{threshold * group.scale:.3g} {group.unit}".rstrip()
-        text += f" (diverged: error above {limit}, five times that of raw measurements)"
+        text += f" (diverged: error above {limit}, the limit of the scenario)"
     k = _largest_k(outputs)
     hints = [HINTS[name].format(k=k) for name in count.marked if name in present]
     return ". ".join([f"{rmse}; {text}", *hints])

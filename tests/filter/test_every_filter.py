@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+import yaml
 from config_cases import GROUPS, RECORDED, composed, list_bases, truncated, world
 from filter_cases import EACH, NAMES, ON_ANY_MODEL, SLOTS, TEXTS, method_of, refusal
 from model_cases import tracker
@@ -49,26 +50,16 @@ pytestmark = pytest.mark.filterwarnings("ignore:ParticleGuideProposal")  # it sa
 
 RUNS, STEPS = torch.arange(2), 3
 CHANGING = EssStepCount(6, 0.6, CountLimits(12, SLOTS, 20))
-BASED = (
-    "cpso_escape_stopped",
-    "cpso_pf",
-    "dmc_density",
-    "dmc_noise",
-    "dmc_optimal",
-    "fmcpf",
-    "fmcpf_each",
-    "rpf_tuned",
-    *("rpf_half", "rpf_epanechnikov", "mcmc_rpf_literal", "qmc_polymerised_literal", "sir_literal"),
-    *(
-        "dmc_reconstructed_literal",
-        "cpso_escape_literal",
-        "pso_pf_literal",
-        "thompson_taylor_literal",
-    ),
-)  # on another of these
-PARTICLES = [
-    name for name in NAMES if "pfbench.filter.ParticleFilter" in TEXTS[name] or name in BASED
-]
+
+
+def is_particle_filter(name: str) -> bool:
+    """Whether a filter, or the one that it changes, is composed of the stages of a particle filter."""
+    entry = yaml.safe_load(TEXTS[name])
+    bases = [base for base in entry.get("defaults", ()) if isinstance(base, str) and base in TEXTS]
+    return entry.get("_target_", "") == "pfbench.filter.ParticleFilter" or any(map(is_particle_filter, bases))  # fmt: skip
+
+
+PARTICLES = [name for name in NAMES if is_particle_filter(name)]
 FIXED_NUMBER = ("sqmc", "guided_start")  # refuse a number that changes, or have points for one
 EXACT_EACH = tuple(name for name in EACH if not name.endswith("_printed"))
 SELDOM_RESAMPLED = (

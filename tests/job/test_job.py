@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import torch
 from command_line import Said, pfbench, process
+from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import InstantiationException
 
 from pfbench import job
 from pfbench.core.record import Episode, Record
 from pfbench.filter.belief import StepInfo
-from pfbench.job.config import compose_tree
 from pfbench.job.pcrb import _missing_reason
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.linear_gaussian import linear_walk
@@ -383,16 +383,13 @@ def test_jobs_run_from_python_without_hydras_global_state(tmp_path: Path) -> Non
 
 
 def test_jobs_run_within_a_hydra_application(tmp_path: Path) -> None:
-    application = GlobalHydra.instance().hydra
-    outcome = job.run(
-        job.compose(
-            [*WALK, "runs=2", "filter=ekf", f"results_dir={tmp_path}", "episode_cache_dir=null"]
-        )
-    )
-    assert GlobalHydra.instance().hydra is application
-    cfg = compose_tree(
-        [*WALK, "runs=2", "filter=ekf", f"results_dir={tmp_path}", "episode_cache_dir=null"]
-    )
+    words = [*WALK, "runs=2", "filter=ekf", f"results_dir={tmp_path}", "episode_cache_dir=null"]
+    job.register_experiments()
+    with initialize_config_dir(str(job.conf_dir()), version_base="1.3"):
+        application = GlobalHydra.instance().hydra
+        outcome = job.run(job.compose(words))
+        assert GlobalHydra.instance().hydra is application
+        cfg = compose("config", words)
     choices = {
         "scenario": "linear_walk",
         "noise": "nominal",

@@ -14,13 +14,14 @@ import pandas as pd
 import pytest
 import synthetic_results as synthetic
 from checkout import ROOT
+from page_packs import unpack
 
 from pfbench.cli.compose import count_planned_jobs, read_sweep
 from pfbench.report.board.entries import StudyFacts
 from pfbench.report.board.pack import build_pack, decide_parts, read_study
 from pfbench.report.journal.ratio_figures import render_headline
 from pfbench.report.options import ReportOptions
-from pfbench.report.study_page.page_writer import render_markdown
+from pfbench.report.study_page.page_writer import render_markdown, render_page
 from pfbench.results.conditions import load_conditions
 
 RUNS, NOISE = 40, 0.3
@@ -75,6 +76,9 @@ def test_each_world_has_its_own_sentence_and_table_in_its_own_order(invented: An
     # geometric mean over 40 pairs, standard error NOISE * sqrt(2 / 40) = 0.067
     assert abs(np.log(float(ratios[0])) - 1.2) < 4 * 0.067
     assert ratios[1] == "1"  # the baseline is the last of the second world
+    data = render_page({"downloads": (), **pack})["index.html"].partition('id="data"')[2]
+    opening = unpack(data.partition(">")[2].partition("<")[0])["opening"]
+    assert opening[1] == next(iter(LEVELS))  # the view of the first sentence, not of all worlds
 
 
 def test_the_picture_has_a_panel_for_each_world(invented: Any) -> None:

@@ -37,8 +37,8 @@ _SMALLEST_GAIN = 1e-6  # of twice the log density of the path; the search ends b
 class NormalGuide(NamedTuple):
     """Normal approximation of a step and of all measurements from it on, about a path.
 
-    With e the deviation of x_t-1 from the path, log p(y_t:T | x_t-1) is about -e' L e / 2 + l' e, and the standardised
-    noise of the step given y_t:T is about N(shift - gain e, root root').
+    Let e be the deviation of x_t-1 from the path. Then log p(y_t:T | x_t-1) is about -e' L e / 2 + l' e. The
+    standardised noise of the step given y_t:T is about N(shift - gain e, root root').
 
     Attributes:
         centre: State of the path before the step, [R, D].
@@ -143,9 +143,9 @@ def _curvature(model: StateSpaceModel, record: Record, x: Tensor) -> tuple[Tenso
         value = model.log_likelihood(record.y, model.chart.add(x, c), record.u).sum()
         (score,) = torch.autograd.grad(value, c, create_graph=True)
         rows = [
-            torch.autograd.grad(part, c, retain_graph=True)[0]
-            for part in score.sum((0, 1))
-            if part.requires_grad
+            torch.autograd.grad(slope, c, retain_graph=True)[0]
+            for slope in score.sum((0, 1))
+            if slope.requires_grad
         ]
     score = score.detach().squeeze(1)
     hessian = torch.cat(rows, 1) if rows else torch.zeros_like(score).diag_embed()
@@ -274,17 +274,16 @@ def _draw(guide: NormalGuide, e: Tensor, z: Tensor, fraction: float, active_mask
 class TwistedParticleFilter(ParticleFilter):
     """Particle filter whose resampling and noise follow a normal approximation of the smoothed paths of the record.
 
-    The approximation is that of Laplace about the most probable initial state and noise, so that models with singular
-    process noise are no special case. Weights correct it: the evidence is unbiased and the estimates converge to
-    p(x_t | y_1:t) for any approximation. The particles of a step depend on later measurements, however, so that this
-    is a method for evidence and parameters, not for online use. On linear-Gaussian models the evidence is exact with any
-    number of particles if each step resamples.
+    The approximation is that of Laplace about the most probable initial state and noise. Process noise may be singular.
+    Weights correct it: the evidence is unbiased and the estimates converge to p(x_t | y_1:t) for any approximation. The
+    particles of a step depend on later measurements, however. This is a method for evidence and parameters, not for online
+    use. On linear-Gaussian models the evidence is exact with any number of particles if each step resamples.
 
     Attributes:
         passes: Number of Gauss-Newton steps of the fit.
 
     Raises:
-        ValueError: If passes is no count, or the stages do not fit.
+        ValueError: If passes is not a count, or the stages do not fit.
 
     References:
         Guarniero, Johansen and Lee 2017, the iterated auxiliary particle filter. Vihola, Helske and Franks 2020 (psi-APF).

@@ -137,14 +137,14 @@ def format_interval_level(alpha: float) -> str:
     return f"{100 * (1 - alpha):g} %"
 
 
-def round_values(values: Any) -> Any:
-    """Round numbers to four digits, but none to 1 that is not 1; a number that is not finite becomes None."""
+def round_values(values: Any, digits: int = 4) -> Any:
+    """Round numbers to some digits, but none to 1 that is not 1; a number that is not finite becomes None."""
     if isinstance(values, dict):
-        return {key: round_values(value) for key, value in values.items()}
+        return {key: round_values(value, digits) for key, value in values.items()}
     if isinstance(values, list):
-        return [round_values(value) for value in values]
+        return [round_values(value, digits) for value in values]
     if isinstance(values, float):
-        digits = 4 if abs(values - 1.0) > 1e-3 else 9
+        digits = digits if abs(values - 1.0) > 1e-3 else 9
         return float(f"{values:.{digits}g}") if math.isfinite(values) else None
     return None if values == "" else values
 

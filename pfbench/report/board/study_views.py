@@ -100,8 +100,11 @@ def _make_view(
 
 
 def _round_row(row: BoardRow, has_limit: bool) -> BoardRow:
-    """Return the values of a row for the page: no track without a divergence threshold, an open interval as infinity."""
-    rounded: BoardRow = round_values(row if has_limit else {**row, "track": math.nan})
+    """Return the values of a row for the page: no track without a divergence threshold, an open interval as infinity.
+
+    Pages print three digits. A number that was rounded to four before could have another third one than its sentence.
+    """
+    rounded: BoardRow = round_values(row if has_limit else {**row, "track": math.nan}, 8)
     return rounded | ({"ratio_high": math.inf} if row["ratio_high"] == math.inf else {})
 
 

@@ -167,7 +167,7 @@ def _show_verdict(view: View, label: str, verdicts: Mapping[str, Verdict | None]
         return {**ends, "verdict": LOSES_TRACK, "words": track}
     a, b, both, loses = verdict.lost
     words = word_verdict(verdict, view.court.margin)
-    if math.isnan(verdict.ratio) and a + b:  # its reason has labels
+    if math.isnan(verdict.ratio) and a + b + both:  # its reason has labels
         counts = f"({a + both} of {verdict.n}, the baseline {b + both})"
         words = f"{word_verdict(verdict._replace(reason=''), view.court.margin)}{'' if loses else ', lost runs'} {counts}"
     return {**ends, "verdict": verdict.word, "words": ", ".join(filter(None, (words, track)))}

@@ -81,7 +81,8 @@ def render_page(pack: Mapping[str, Any], name: str = "index.html") -> dict[str, 
         "data": "",
     }
     html = template_environment(_HERE, is_html=True).get_template("page.html.jinja")
-    script_data = {key: value for key, value in pack.items() if key not in _STATIC}
+    values = {key: value for key, value in pack.items() if key not in _STATIC}
+    script_data = {**values, "opening": list(find_opening(pack))}
     data = encode_pack(script_data, PAGE_BYTES - len(html.render(context).encode()))
     markdown = "report.md" if name == "index.html" else f"{Path(name).stem}.md"
     return {
@@ -382,7 +383,6 @@ def encode_pack(pack: Mapping[str, Any], limit: int) -> str:
     """
     base = {
         **pack,
-        "opening": list(find_opening(pack)),
         "views": _encode_views(pack["views"]),
         "planned": _encode(pack["planned"]),
         "curves": _nest(pack["curves"]),

@@ -18,17 +18,19 @@ from torch import Tensor, distributions as dist
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.exactness import has_evidence
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.guided.guides import SharedGuideProposal
-from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.robust.observation_updates import (
+from pfbench.filter import (
+    FilterResult,
+    GaussianFilter,
+    GuidedNoiseProposal,
+    InnovationGate,
     MixtureObservationUpdate,
+    SharedGuideProposal,
     StudentObservationUpdate,
+    StudentUpdate,
+    run_filter,
+    smooth,
 )
-from pfbench.filter.robust.updates import InnovationGate, StudentUpdate
-from pfbench.filter.smoothing.gaussian_smoother import smooth
+from pfbench.filter.exactness import has_evidence
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.noise import base as errors
 

@@ -22,16 +22,22 @@ from refusals import check_refused
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.loop import run_filter
-from pfbench.filter.moves.metropolis import MetropolisHastings
-from pfbench.filter.moves.path_kernels import LastStateKernel, LikelihoodRatioKernel
-from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.regularised_resampling import GaussianSmoothing
+from pfbench.filter import (
+    CountLimits,
+    EssResampler,
+    EssStepCount,
+    FixedCount,
+    GaussianSmoothing,
+    LastStateKernel,
+    LikelihoodRatioKernel,
+    MetropolisHastings,
+    ParticleBelief,
+    ParticleFilter,
+    SwarmProposal,
+    Systematic,
+    run_filter,
+)
 from pfbench.filter.particle.sqmc import HaltonPoints, halton_points
-from pfbench.filter.particle.stages import EssResampler, FixedCount, Systematic
-from pfbench.filter.proposed.swarm import SwarmProposal
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.results.paper_block import (
     METHOD_FORMS,

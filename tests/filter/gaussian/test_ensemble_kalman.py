@@ -18,18 +18,26 @@ from torch.distributions import Distribution
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.gaussian.ensemble_kalman import (
+from pfbench.filter import (
+    BootstrapProposal,
     EnsembleKalmanFilter,
     EnsembleTransformUpdate,
     EnsembleUpdate,
+    FilterResult,
+    ParticleBelief,
     PerturbedObservationUpdate,
+    run_filter,
 )
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle.stages import BootstrapProposal
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.model import (
+    Benes,
+    LinearGaussian,
+    Lorenz63,
+    Pendulum,
+    StateSpaceModel,
+    StochasticVolatility,
+    UnivariateGrowth,
+    linear_walk,
+)
 
 ANALYSES: dict[str, EnsembleUpdate] = {
     "perturbed": PerturbedObservationUpdate(),

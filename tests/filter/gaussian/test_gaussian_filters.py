@@ -18,12 +18,9 @@ from refusals import check_refused
 from torch import Tensor
 from torch.distributions import Distribution, Independent, Normal
 
-from pfbench.core.chart import wrap_angle
+from pfbench.core import PhiloxStream, Record, wrap_angle
 from pfbench.core.linear_algebra import factor
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.belief import GaussianBelief
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter import FilterResult, GaussianBelief, GaussianFilter, run_filter
 from pfbench.filter.gaussian.innovation import Innovation
 from pfbench.filter.gaussian.kalman_update import kalman_gain_update
 from pfbench.filter.gaussian.linearisation_rules import (
@@ -39,10 +36,16 @@ from pfbench.filter.gaussian.linearisation_rules import (
     UnscentedPoints,
 )  # fmt: skip
 from pfbench.filter.linearisation import compute_additive_gain
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, UnivariateGrowth
+from pfbench.model import (
+    Benes,
+    LinearGaussian,
+    Lorenz63,
+    Pendulum,
+    StateSpaceModel,
+    UnivariateGrowth,
+    linear_walk,
+    local_level,
+)
 from pfbench.noise.base import NominalNoise
 from pfbench.ppl.model_batch import ModelBatch
 from pfbench.scenario.simulated import ModelSimulation

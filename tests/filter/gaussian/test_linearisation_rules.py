@@ -13,11 +13,11 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.filter import (
     AxisDegree3,
     AxisDegree5,
     CubaturePoints,
+    GaussianFilter,
     RadialDegree5,
     SigmaPointLinearisation,
     SimplexDegree3,
@@ -25,8 +25,8 @@ from pfbench.filter.gaussian.linearisation_rules import (
     SphericalRadialPoints,
     SphericalRule,
     UnscentedPoints,
+    run_filter,
 )
-from pfbench.filter.loop import run_filter
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.textbook import Lorenz63
 

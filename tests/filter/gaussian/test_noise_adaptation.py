@@ -17,16 +17,14 @@ from scipy.optimize import minimize
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
-from pfbench.core.chart import wrap_angle
+from pfbench.core import PhiloxStream, Record, wrap_angle
 from pfbench.core.density import independent_normal, normal_batch
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.belief import GaussianBelief
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.innovation import Innovation, principal_axes
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.filter import (
     AxisDegree3,
     AxisDegree5,
+    FilterResult,
+    GaussianBelief,
+    GaussianFilter,
     LinearisationRule,
     RadialDegree3,
     RadialDegree5,
@@ -35,7 +33,9 @@ from pfbench.filter.gaussian.linearisation_rules import (
     SimplexDegree5,
     SphericalRadialPoints,
     TaylorLinearisation,
+    run_filter,
 )
+from pfbench.filter.gaussian.innovation import Innovation, principal_axes
 from pfbench.filter.gaussian.noise_adaptation import (
     AdaptiveFactorGain,
     BoundedRatioGain,
@@ -44,7 +44,6 @@ from pfbench.filter.gaussian.noise_adaptation import (
     MatrixNoiseAdaptation,
     ScalarNoiseAdaptation,
 )
-from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
 

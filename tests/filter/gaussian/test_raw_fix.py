@@ -15,11 +15,8 @@ from torch import Tensor
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
+from pfbench.filter import FilterResult, GaussianFilter, RawFix, TaylorLinearisation, run_filter
 from pfbench.filter.exactness import has_covariance, has_evidence
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.gaussian.raw_fix import RawFix
-from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 from pfbench.model.textbook import StochasticVolatility, TimeIndexInputs, UnivariateGrowth
 from pfbench.noise.base import NominalNoise

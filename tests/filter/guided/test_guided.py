@@ -17,41 +17,44 @@ from torch.distributions import Independent, MultivariateNormal, Normal, Student
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief, ess, weighted_mean_cov
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
-    AxisDegree3,
-    CubaturePoints,
-    RadialDegree3,
-    RadialDegree5,
-    SigmaPointLinearisation,
-    SimplexDegree3,
-    SphericalRadialPoints,
-    TaylorLinearisation,
-    UnscentedPoints,
-)
-from pfbench.filter.gaussian.noise_adaptation import (
+from pfbench.filter import (
     AdaptiveFactorGain,
+    AdditiveTempering,
+    AxisDegree3,
+    BootstrapProposal,
     BoundedRatioGain,
     ConstrainedNoiseAdaptation,
+    CountLimits,
+    CubaturePoints,
+    EssResampler,
+    EssStepCount,
     FadingMemory,
-)
-from pfbench.filter.guided.guides import ParticleGuideProposal, SharedGuideProposal
-from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.sqmc import SobolPoints
-from pfbench.filter.particle.stages import BootstrapProposal, EssResampler, Proposal, Systematic
-from pfbench.filter.particle.weights import (
-    AdditiveTempering,
+    FilterResult,
+    GaussianFilter,
+    GuidedNoiseProposal,
+    MarginalRatioCorrection,
+    ParticleFilter,
+    ParticleGuideProposal,
     PowerTempering,
+    Proposal,
+    RadialDegree3,
+    RadialDegree5,
+    ReconstructedProposal,
+    SharedGuideProposal,
+    SigmaPointLinearisation,
+    SimplexDegree3,
+    SobolPoints,
+    SphericalRadialPoints,
+    Systematic,
+    TaylorLinearisation,
     TemperedPosterior,
     TemperedWeights,
     Tempering,
     UniformTempering,
+    UnscentedPoints,
+    run_filter,
 )
-from pfbench.filter.proposed.reconstructed import MarginalRatioCorrection, ReconstructedProposal
+from pfbench.filter.belief import ParticleBelief, ess, weighted_mean_cov
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.model.textbook import Lorenz63, Pendulum, TimeIndexInputs, UnivariateGrowth

@@ -12,19 +12,19 @@ from refusals import check_refused
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.filter import (
     CubaturePoints,
+    FadingMemory,
+    GaussianFilter,
+    GuidedInitialProposal,
+    MetropolisHastings,
+    NoiseFlowKernel,
+    ParticleFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
+    run_filter,
 )
-from pfbench.filter.gaussian.noise_adaptation import FadingMemory
-from pfbench.filter.guided.initial_guide import GuidedInitialProposal
-from pfbench.filter.loop import run_filter
-from pfbench.filter.moves.metropolis import MetropolisHastings
-from pfbench.filter.moves.path_kernels import NoiseFlowKernel
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.noise.base import NominalNoise
 from pfbench.testing import check_evidence, run_kalman_filter

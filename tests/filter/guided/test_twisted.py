@@ -8,12 +8,18 @@ from refusals import check_refused
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.guided.twisted import TwistedParticleFilter, TwistedProposal, TwistedWeights
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.stages import EssResampler, Systematic
+from pfbench.filter import (
+    EssResampler,
+    FilterResult,
+    GaussianFilter,
+    ParticleFilter,
+    Systematic,
+    TaylorLinearisation,
+    TwistedParticleFilter,
+    TwistedProposal,
+    TwistedWeights,
+    run_filter,
+)
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.model.textbook import StochasticVolatility
 from pfbench.testing import check_evidence

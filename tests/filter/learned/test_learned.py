@@ -27,20 +27,23 @@ from torch.distributions import (
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.filter import (
+    BootstrapProposal,
     CubaturePoints,
+    DiagonalNormalHead,
+    EssResampler,
+    GaussianFilter,
+    GuidedNoiseProposal,
+    LearnedRandomWalk,
+    ParticleBelief,
+    ParticleFilter,
+    ProposalSample,
     SigmaPointLinearisation,
+    Systematic,
     TaylorLinearisation,
 )
-from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.learned import checkpoint
 from pfbench.filter.learned.differentiable_resampling import sample_from
-from pfbench.filter.learned.mcmc_kernel import LearnedRandomWalk
-from pfbench.filter.learned.networks import (
-    DiagonalNormalHead,
-)
 from pfbench.filter.learned.proposal import (
     PAST,
     InnovationFeature,
@@ -50,13 +53,6 @@ from pfbench.filter.learned.proposal import (
     make_feature_context,
 )
 from pfbench.filter.moves.metropolis import MetropolisHastings, StateHistory
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.stages import (
-    BootstrapProposal,
-    EssResampler,
-    ProposalSample,
-    Systematic,
-)
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.testing import (

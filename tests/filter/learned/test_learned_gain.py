@@ -20,14 +20,17 @@ from torch.distributions import Cauchy, Distribution, Independent
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
+from pfbench.filter import (
+    EvidenceLowerBound,
+    LearnedProposal,
+    ParticleFilter,
+    SkipMlp,
+    StateErrorLoss,
+)
 from pfbench.filter.exactness import check_has_evidence, has_covariance, has_evidence
 from pfbench.filter.health import HEALTH
 from pfbench.filter.learned.gain_filter import GainInputs, LearnedGain, LearnedGainFilter
-from pfbench.filter.learned.networks import SkipMlp
-from pfbench.filter.learned.objectives import EvidenceLowerBound, StateErrorLoss
-from pfbench.filter.learned.proposal import LearnedProposal
 from pfbench.filter.loop import FilterResult, apply_feedback, run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.learn.trainer import Training, TrainingState
 from pfbench.learn.training_data import TrainingData, draw_training_data

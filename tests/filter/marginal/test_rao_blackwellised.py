@@ -18,26 +18,37 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent
 
 from pfbench import job
-from pfbench.core.chart import Chart
+from pfbench.core import Chart, Episode, PhiloxStream, Record, map_inputs
 from pfbench.core.density import independent_normal, normal_batch
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode, Record, map_inputs
-from pfbench.filter import linearisation
-from pfbench.filter.belief import normalise_log_weights
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.filter import (
+    EssResampler,
+    FilterResult,
+    GaussianFilter,
+    ParticleFilter,
+    RegularisedResampler,
+    Systematic,
+    TaylorLinearisation,
+    linearisation,
+    normalise_log_weights,
+    run_filter,
+)
 from pfbench.filter.marginal.rao_blackwellised import (
     MarginalisedProposal,
     RaoBlackwellisedFilter,
     StatePartition,
     partition_state,
 )
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.filter.whitening import condition_on, kalman_update_root
 from pfbench.job.config import compose_tree
+from pfbench.model import (
+    InsGnss,
+    LinearGaussian,
+    Lorenz63,
+    Pendulum,
+    StateSpaceModel,
+    UnivariateGrowth,
+    linear_walk,
+)
 from pfbench.model.azimuth import (
     ErrorEquations,
     ExactErrorEquations as ExactForm,
@@ -46,10 +57,6 @@ from pfbench.model.azimuth import (
     SinsGpsAzimuth,
     TrapezoidDiscretisation,
 )
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.ins_gnss import InsGnss
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.textbook import Lorenz63, Pendulum, UnivariateGrowth
 from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, turn

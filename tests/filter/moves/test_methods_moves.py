@@ -13,19 +13,21 @@ import torch
 from move_cases import Always, moving
 from torch import Tensor
 
-from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.loop import FilterResult
-from pfbench.filter.moves.metropolis import McmcKernel, MetropolisHastings
-from pfbench.filter.moves.path_kernels import (
+from pfbench.filter import (
+    EssResampler,
+    FilterResult,
     LastStateKernel,
+    McmcKernel,
+    MetropolisHastings,
     NoiseFlowGibbsKernel,
     NoiseFlowKernel,
+    ParticleBelief,
+    ParticleFilter,
     PathBlockKernel,
+    RegularisedResampler,
+    SmoothedSegment,
+    Systematic,
 )
-from pfbench.filter.moves.path_proposals import SmoothedSegment
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.testing import filter_record, run_kalman_filter
 

@@ -19,13 +19,21 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, Laplace
 
 from pfbench import job
-from pfbench.core.chart import Chart, QuaternionBlock
+from pfbench.core import Chart, PhiloxStream, QuaternionBlock, Record
 from pfbench.core.density import ChartNormal, independent_normal, normal_batch
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief
+from pfbench.filter import (
+    BootstrapProposal,
+    EpanechnikovSmoothing,
+    EssResampler,
+    GaussianSmoothing,
+    ParticleBelief,
+    ParticleFilter,
+    ProposalSample,
+    RegularisedResampler,
+    Systematic,
+    run_filter,
+)
 from pfbench.filter.linearisation import derivative
-from pfbench.filter.loop import run_filter
 from pfbench.filter.moves.metropolis import (
     KernelCycle,
     McmcKernel,
@@ -50,22 +58,18 @@ from pfbench.filter.moves.path_proposals import (
     SmoothedSegment,
     driving_noise,
 )
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.regularised_resampling import (
-    EpanechnikovSmoothing,
-    GaussianSmoothing,
-    RegularisedResampler,
-)
-from pfbench.filter.particle.stages import (
-    BootstrapProposal,
-    EssResampler,
-    ProposalSample,
-    Systematic,
-)
 from pfbench.job.config import compose_tree
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.model import (
+    Benes,
+    LinearGaussian,
+    Lorenz63,
+    Pendulum,
+    StateSpaceModel,
+    StochasticVolatility,
+    UnivariateGrowth,
+    linear_walk,
+    local_level,
+)
 from pfbench.noise.base import NominalNoise
 from pfbench.testing import (
     PathPosterior,

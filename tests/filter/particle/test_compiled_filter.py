@@ -18,20 +18,24 @@ from pfbench.core.density import independent_normal
 from pfbench.core.linear_algebra import affine_map
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
+from pfbench.filter import (
+    CountLimits,
+    EssResampler,
+    EssStepCount,
+    LookAheadWeights,
+    ParticleFilter,
+    PowerLikelihoodUpdate,
+    Proposal,
+    Stratified,
+    Systematic,
+    run_filter,
+)
 from pfbench.filter.belief import StepInfo
-from pfbench.filter.loop import run_filter
 from pfbench.filter.particle import compiled_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
-from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import Stratified
-from pfbench.filter.particle.stages import EssResampler, Proposal, Systematic
-from pfbench.filter.particle.weights import LookAheadWeights, PowerLikelihoodUpdate
 from pfbench.job.scoring import LikelihoodCounter
 from pfbench.kernels import cuda, dispatch, step_compiler
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.textbook import UnivariateGrowth
+from pfbench.model import LinearGaussian, StateSpaceModel, UnivariateGrowth, linear_walk
 from pfbench.results import store
 
 

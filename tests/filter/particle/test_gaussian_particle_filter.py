@@ -15,22 +15,28 @@ from model_cases import Turning, measurements
 from scipy import stats
 from torch import Tensor
 
-from pfbench.core.chart import Chart
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle.gaussian_particle_filter import (
+from pfbench.core import Chart, PhiloxStream, Record
+from pfbench.filter import (
+    FilterResult,
     GaussianPredictionProposal,
     GaussianResampler,
+    HaltonPoints,
+    IidPoints,
+    LookAheadWeights,
+    ParticleFilter,
+    PointSet,
+    SobolPoints,
+    run_filter,
 )
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.sqmc import HaltonPoints, SobolPoints
-from pfbench.filter.particle.stages import IidPoints, PointSet
-from pfbench.filter.particle.weights import LookAheadWeights
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.textbook import Lorenz63, Pendulum, UnivariateGrowth
+from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
+from pfbench.model import (
+    LinearGaussian,
+    Lorenz63,
+    Pendulum,
+    StateSpaceModel,
+    UnivariateGrowth,
+    linear_walk,
+)
 
 WALK = linear_walk(1.0, 0.5, 1.0)
 STEPS = 20

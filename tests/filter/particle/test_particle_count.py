@@ -15,25 +15,25 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import Multinomial, Stratified
-from pfbench.filter.particle.stages import (
-    AuxiliaryWeights,
-    EssResampler,
-    PosteriorWeights,
-    ResamplingScheme,
-    Systematic,
-)
-from pfbench.filter.particle.weights import (
+from pfbench.filter import (
     AdditiveTempering,
+    AuxiliaryWeights,
+    CountLimits,
+    EssResampler,
+    EssStepCount,
+    Multinomial,
+    ParticleBelief,
+    ParticleFilter,
+    PosteriorWeights,
     PowerTempering,
+    ResamplingScheme,
+    Stratified,
+    Systematic,
     TemperedPosterior,
     TemperedWeights,
     Tempering,
     UniformTempering,
+    run_filter,
 )
 from pfbench.kernels import dispatch
 from pfbench.model.linear_gaussian import linear_walk

@@ -22,6 +22,27 @@ from torch.distributions import Distribution, Independent
 
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record
+from pfbench.filter import (
+    BayesWeightUpdate,
+    BootstrapProposal,
+    EssResampler,
+    GaussianPredictionProposal,
+    GaussianResampler,
+    LookAheadWeights,
+    MetropolisHastings,
+    Multinomial,
+    NoiseFlowKernel,
+    ParticleFilter,
+    PosteriorWeights,
+    PowerLikelihoodUpdate,
+    ProposalSample,
+    RegularisedResampler,
+    ResamplingScheme,
+    Residual,
+    Stratified,
+    Systematic,
+    run_filter,
+)
 from pfbench.filter.belief import (
     ParticleBelief,
     count_distinct_ancestors,
@@ -29,33 +50,18 @@ from pfbench.filter.belief import (
     normalise_log_weights,
 )
 from pfbench.filter.exactness import has_evidence
-from pfbench.filter.loop import run_filter
-from pfbench.filter.moves.metropolis import MetropolisHastings
-from pfbench.filter.moves.path_kernels import NoiseFlowKernel
-from pfbench.filter.particle.gaussian_particle_filter import (
-    GaussianPredictionProposal,
-    GaussianResampler,
-)
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import Multinomial, Residual, Stratified
-from pfbench.filter.particle.stages import (
-    BayesWeightUpdate,
-    BootstrapProposal,
-    EssResampler,
-    PosteriorWeights,
-    ProposalSample,
-    ResamplingScheme,
-    Systematic,
-)
-from pfbench.filter.particle.weights import (
-    LookAheadWeights,
-    PowerLikelihoodUpdate,
-)
 from pfbench.kernels import dispatch
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.model import (
+    Benes,
+    LinearGaussian,
+    Lorenz63,
+    Pendulum,
+    StateSpaceModel,
+    StochasticVolatility,
+    UnivariateGrowth,
+    linear_walk,
+    local_level,
+)
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.simulated import ModelSimulation
 from pfbench.testing import check_convergence, check_evidence, filter_record, reference_moments

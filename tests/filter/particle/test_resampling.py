@@ -15,6 +15,15 @@ from scipy import stats
 from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream, RandomStream
+from pfbench.filter import (
+    EssResampler,
+    Multinomial,
+    RegularisedResampler,
+    ResamplingScheme,
+    Residual,
+    Stratified,
+    Systematic,
+)
 from pfbench.filter.belief import (
     ComputedWeights,
     ParticleBelief,
@@ -23,9 +32,6 @@ from pfbench.filter.belief import (
     weighted_mean_cov,
 )
 from pfbench.filter.particle import resampling
-from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import Multinomial, Residual, Stratified
-from pfbench.filter.particle.stages import EssResampler, ResamplingScheme, Systematic
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.testing import check_resampling
 

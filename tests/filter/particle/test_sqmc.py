@@ -13,9 +13,15 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter import (
+    EssResampler,
+    LookAheadWeights,
+    ParticleBelief,
+    ParticleFilter,
+    PointSet,
+    Systematic,
+    run_filter,
+)
 from pfbench.filter.particle.sqmc import (
     HaltonPoints,
     HilbertSortedResampler,
@@ -25,8 +31,6 @@ from pfbench.filter.particle.sqmc import (
     compute_hilbert_index,
     compute_hilbert_order,
 )
-from pfbench.filter.particle.stages import EssResampler, PointSet, Systematic
-from pfbench.filter.particle.weights import LookAheadWeights
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
 
 WALK = linear_walk(1.0, 0.5, 1.0)

@@ -19,27 +19,32 @@ from pfbench import job
 from pfbench.core.linear_algebra import affine_map
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
+from pfbench.filter import (
+    EssResampler,
+    FilterResult,
+    ParticleFilter,
+    Stratified,
+    Systematic,
+    run_filter,
+)
 from pfbench.filter.belief import ParticleBelief, StepInfo
-from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle import taped_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import Stratified
-from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.filter.particle.taken_steps import tensors_in
 from pfbench.filter.particle.tape import NoTapeError, record_tape
 from pfbench.filter.particle.taped_filter import TapedParticleFilter
 from pfbench.job.scoring import LikelihoodCounter
 from pfbench.kernels import dispatch
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.ins_gnss import LooseStep
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.textbook import (
+from pfbench.model import (
     Benes,
+    LinearGaussian,
     Lorenz63,
     Pendulum,
+    StateSpaceModel,
     StochasticVolatility,
     UnivariateGrowth,
+    linear_walk,
 )
+from pfbench.model.ins_gnss import LooseStep
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.simulated import ModelSimulation
 

@@ -17,19 +17,22 @@ from scipy import stats
 from torch import Tensor
 
 from pfbench import job
-from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, QuaternionBlock
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import AngleBlock, Chart, EuclideanBlock, PhiloxStream, QuaternionBlock, Record
+from pfbench.filter import (
+    EssResampler,
+    HaltonPoints,
+    IidPoints,
+    LookAheadWeights,
+    ParticleFilter,
+    SobolPoints,
+    Systematic,
+    run_filter,
+)
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.regularised_resampling import (
     ThompsonTaylorResampler,
     nearest_neighbours,
 )
-from pfbench.filter.particle.sqmc import HaltonPoints, SobolPoints
-from pfbench.filter.particle.stages import EssResampler, IidPoints, Systematic
-from pfbench.filter.particle.weights import LookAheadWeights
 from pfbench.filter.proposed.polymerised import (
     AxisAlignedCells,
     CellPartition,
@@ -45,10 +48,15 @@ from pfbench.filter.proposed.polymerised import (
 from pfbench.filter.whitening import whiten
 from pfbench.job.config import compose_tree
 from pfbench.job.pcrb import compute_posterior_bound
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.passive_location import PassiveLocation
-from pfbench.model.textbook import Lorenz63, Pendulum, UnivariateGrowth
+from pfbench.model import (
+    LinearGaussian,
+    Lorenz63,
+    PassiveLocation,
+    Pendulum,
+    StateSpaceModel,
+    UnivariateGrowth,
+    linear_walk,
+)
 from pfbench.noise.base import NominalNoise
 
 N = 400

@@ -18,29 +18,38 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief, normalise_log_weights
-from pfbench.filter.linearisation import linearised_innovation, measurement_jacobian
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.stages import (
+from pfbench.filter import (
     BootstrapProposal,
+    DmcController,
     EssResampler,
-    Proposal,
-    ProposalSample,
-    Systematic,
-)
-from pfbench.filter.proposed.dmc_controller import DmcController, OneStepResponse, StaticResponse
-from pfbench.filter.proposed.reconstructed import (
     MarginalRatioCorrection,
     NoWeightCorrection,
+    OneStepResponse,
+    ParticleBelief,
+    ParticleFilter,
+    Proposal,
+    ProposalSample,
     ReconstructedNoiseProposal,
     ReconstructedProposal,
+    StaticResponse,
+    Systematic,
     TransitionRatioCorrection,
     WeightCorrection,
+    normalise_log_weights,
 )
-from pfbench.model.azimuth import PrintedErrorEquations, SinsGpsAzimuth, TrapezoidDiscretisation
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.filter.linearisation import linearised_innovation, measurement_jacobian
+from pfbench.model import (
+    Benes,
+    LinearGaussian,
+    Lorenz63,
+    Pendulum,
+    PrintedErrorEquations,
+    SinsGpsAzimuth,
+    StateSpaceModel,
+    StochasticVolatility,
+    TrapezoidDiscretisation,
+    UnivariateGrowth,
+)
 from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.testing import check_evidence, filter_record, reference_moments

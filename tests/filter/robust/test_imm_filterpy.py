@@ -11,16 +11,16 @@ import torch
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import StepInfo
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.filter import (
     CubaturePoints,
+    InteractingModelFilter,
     LinearisationRule,
+    NoiseHypotheses,
     SigmaPointLinearisation,
     TaylorLinearisation,
+    run_filter,
 )
-from pfbench.filter.loop import run_filter
-from pfbench.filter.robust.hypotheses import NoiseHypotheses
-from pfbench.filter.robust.multiple_models import InteractingModelFilter
+from pfbench.filter.belief import StepInfo
 from pfbench.model.linear_gaussian import LinearGaussian
 
 kalman = pytest.importorskip(

@@ -14,10 +14,13 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.robust.hypotheses import NoiseHypotheses
+from pfbench.filter import (
+    FilterResult,
+    GaussianFilter,
+    NoiseHypotheses,
+    TaylorLinearisation,
+    run_filter,
+)
 from pfbench.filter.robust.multiple_models import (
     GaussianSumFilter,
     InteractingModelFilter,

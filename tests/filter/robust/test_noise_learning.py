@@ -13,15 +13,16 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.exactness import has_evidence
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.innovation import NoiseAdaptation
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.robust.noise_learning import (
+from pfbench.filter import (
+    FilterResult,
+    GaussianFilter,
+    NoiseAdaptation,
     SageHusaAdaptation,
+    TaylorLinearisation,
     VariationalNoiseAdaptation,
+    run_filter,
 )
+from pfbench.filter.exactness import has_evidence
 from pfbench.model.linear_gaussian import LinearGaussian
 
 Q, R0 = 0.25, 2.0

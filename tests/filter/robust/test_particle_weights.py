@@ -16,18 +16,19 @@ from torch.distributions import Distribution, Laplace, MultivariateNormal
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.exactness import has_evidence
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.robust.particle_weights import RobustWeightUpdate
-from pfbench.filter.robust.robust_update import huber_log_density, student_log_density
-from pfbench.filter.robust.updates import (
+from pfbench.filter import (
     CorrentropyUpdate,
+    FilterResult,
     HuberUpdate,
     InnovationGate,
+    ParticleFilter,
+    RobustWeightUpdate,
     StudentUpdate,
     WeightedLikelihoodUpdate,
+    run_filter,
 )
+from pfbench.filter.exactness import has_evidence
+from pfbench.filter.robust.robust_update import huber_log_density, student_log_density
 from pfbench.model.linear_gaussian import LinearGaussian
 
 Q, DOF = 0.25, 3.0

@@ -16,17 +16,24 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.belief import GaussianBelief
+from pfbench.filter import (
+    CorrentropyUpdate,
+    CubaturePoints,
+    FilterResult,
+    GaussianBelief,
+    GaussianFilter,
+    HuberUpdate,
+    InnovationGate,
+    ScaledNoise,
+    SigmaPointLinearisation,
+    StudentUpdate,
+    TaylorLinearisation,
+    WeightedLikelihoodUpdate,
+    run_filter,
+)
 from pfbench.filter.exactness import check_has_evidence, has_evidence
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.innovation import Innovation, NoiseAdaptation
 from pfbench.filter.gaussian.kalman_update import kalman_gain_update
-from pfbench.filter.gaussian.linearisation_rules import (
-    CubaturePoints,
-    SigmaPointLinearisation,
-    TaylorLinearisation,
-)
-from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.robust.robust_update import (
     WeightFunction,
     cauchy_weight,
@@ -35,14 +42,6 @@ from pfbench.filter.robust.robust_update import (
     threshold_for_efficiency,
     threshold_table,
     welsch_weight,
-)
-from pfbench.filter.robust.updates import (
-    CorrentropyUpdate,
-    HuberUpdate,
-    InnovationGate,
-    ScaledNoise,
-    StudentUpdate,
-    WeightedLikelihoodUpdate,
 )
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.ppl.likelihood import FilterLikelihood

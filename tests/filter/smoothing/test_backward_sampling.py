@@ -13,13 +13,16 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.moves.metropolis import MetropolisHastings
-from pfbench.filter.moves.path_kernels import NoiseFlowKernel
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.stages import EssResampler, Systematic
+from pfbench.filter import (
+    EssResampler,
+    GaussianFilter,
+    MetropolisHastings,
+    NoiseFlowKernel,
+    ParticleFilter,
+    RegularisedResampler,
+    Systematic,
+    TaylorLinearisation,
+)
 from pfbench.filter.smoothing.backward_sampling import (
     BackwardSampler,
     BackwardStep,

@@ -9,15 +9,15 @@ from smoothing_cases import SINGULAR, Tumbler, dense, record_of
 from torch import Tensor
 
 from pfbench.core.record import Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.filter import (
     CubaturePoints,
+    FadingMemory,
+    GaussianFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
     UnscentedPoints,
+    smooth,
 )
-from pfbench.filter.gaussian.noise_adaptation import FadingMemory
-from pfbench.filter.smoothing.gaussian_smoother import smooth
 from pfbench.model.base import ModelWrapper, StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
 

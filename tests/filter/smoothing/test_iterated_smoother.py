@@ -11,17 +11,18 @@ from torch import Tensor
 
 from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.record import Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.filter import (
     AxisDegree3,
     CubaturePoints,
+    FadingMemory,
+    GaussianFilter,
     RadialDegree5,
     SigmaPointLinearisation,
     SphericalRadialPoints,
     TaylorLinearisation,
+    smooth,
+    smooth_iteratively,
 )
-from pfbench.filter.gaussian.noise_adaptation import FadingMemory
-from pfbench.filter.smoothing.gaussian_smoother import smooth, smooth_iteratively
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
 

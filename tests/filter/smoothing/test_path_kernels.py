@@ -13,16 +13,16 @@ from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.smoothing.gaussian_smoother import smooth_iteratively
-from pfbench.filter.smoothing.noise_space import (
+from pfbench.filter import (
     ConditionalSmcKernel,
     CrankNicolsonKernel,
+    GaussianFilter,
     NoiseSpace,
     PathKernel,
+    TaylorLinearisation,
     fit_path_laplace,
     sample_smoothed_paths,
+    smooth_iteratively,
 )
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.simulated import ModelSimulation

@@ -22,11 +22,19 @@ from torch.distributions import Distribution
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Episode, Record, map_inputs
-from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.stages import EssResampler, Systematic
-from pfbench.filter.proposed.swarm import ChiSquareStopping, SwarmLimits, SwarmProposal
+from pfbench.filter import (
+    ChiSquareStopping,
+    EssResampler,
+    FilterResult,
+    MixtureWeighting,
+    ParticleBelief,
+    ParticleFilter,
+    PrintedWeighting,
+    SwarmLimits,
+    SwarmProposal,
+    Systematic,
+    run_filter,
+)
 from pfbench.filter.proposed.swarm_coordinates import (
     AllComponents,
     LikelihoodFitness,
@@ -48,14 +56,17 @@ from pfbench.filter.proposed.swarm_motion import (
     logistic_map,
     safe_seeds,
 )
-from pfbench.filter.proposed.swarm_weighting import (
-    MixtureWeighting,
-    PrintedWeighting,
-)
 from pfbench.job.config import compose_tree
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.model import (
+    Benes,
+    LinearGaussian,
+    Lorenz63,
+    Pendulum,
+    StateSpaceModel,
+    StochasticVolatility,
+    UnivariateGrowth,
+    linear_walk,
+)
 from pfbench.noise.base import NominalNoise
 
 ALWAYS = EssResampler(Systematic(), 1.0)
