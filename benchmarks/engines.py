@@ -95,7 +95,7 @@ def write_page() -> None:
         print(rows[-1], flush=True)
     intro = __doc__.split("\n")[0] if __doc__ else ""
     head = "| scenario | R x N x T | kernels | tape | compiled | kernels / tape | first: kernels | first: tape | first: compiled |"
-    lines = ["# Engines of SIR", "", f"{intro} Medians of {ROUNDS} rounds in ms, under load of other processes: ratios compare.", ""]  # fmt: skip
+    lines = ["# Engines of SIR", "", f"{intro} Medians of {ROUNDS} rounds in ms.", ""]  # fmt: skip
     lines += [head, "|" + "---|" * 9, *rows, "", "Written by `python benchmarks/engines.py`.", ""]
     PAGE.write_text("\n".join(lines))
 
