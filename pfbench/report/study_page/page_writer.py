@@ -23,7 +23,6 @@ from pfbench.report.writers import DASH, format_short, template_environment
 from pfbench.results.conditions import drop_settings
 from pfbench.results.looks import describe_foreign_knobs, find_stored_world
 
-# --------------------------------------------------------------------------------------------------
 # Writer of the report page: index.html with all data, and report.md of one screen.
 
 PAGE_BYTES = 1_500_000
@@ -147,7 +146,6 @@ def _group_files(downloads: Sequence[Mapping[str, Any]]) -> list[tuple[str, list
     return list(groups.items())
 
 
-# --------------------------------------------------------------------------------------------------
 # Sentence, table and decisions of a page before its script runs.
 
 SIGNS = {
@@ -372,7 +370,7 @@ def select_equal_time(pack: Mapping[str, Any]) -> tuple[float, list[str]]:
 # --------------------------------------------------------------------------------------------------
 # Data of a page as text: JSON in gzip and base 64, which every browser reads.
 
-_DIGITS = 3  # of the numbers of figures; tables have four
+_DIGITS = 3  # of the numbers of figures; tables round those of the pack
 
 
 def encode_pack(pack: Mapping[str, Any], limit: int) -> str:
