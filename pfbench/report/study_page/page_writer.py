@@ -320,7 +320,6 @@ def _scope(pack: Mapping[str, Any], kind: str, key: str, noun: str) -> str:
     return str(items[0]["name"]) if len(items) == 1 else f"all {len(items)} {noun}s"
 
 
-# --------------------------------------------------------------------------------------------------
 # Choice of filters at equal time, from a study with several numbers of particles of the same filters.
 
 _LEAST = 2  # filters with several numbers of particles
