@@ -22,7 +22,6 @@ from pfbench.filter import (
     TwistedParticleFilter,
     run_filter,
 )
-from pfbench.job.plan import build_plan, read_versions
 
 PAGE = Path(__file__).with_suffix(".md")
 SCENARIOS = ("stochastic_volatility", "gps_ins_inflated", "growth")
@@ -47,7 +46,7 @@ def measure(scenario: str) -> list[str]:
         f"seed={SEED}",
         "episode_cache_dir=null",
     ]
-    plan = build_plan(job.compose(words))
+    plan = job.build_plan(job.compose(words))
     episode = plan.draw_episode(torch.arange(1))
     model, rows = plan.make_filter_model(episode), []
     record = episode.record.select_runs(torch.zeros(BATCH, dtype=torch.long))
@@ -79,7 +78,7 @@ def main() -> None:
     rows = [row for scenario in SCENARIOS for row in measure(scenario)]
     end = [
         "",
-        f"Written by `python benchmarks/look_ahead.py`, commit {read_versions()['commit']}.",
+        f"Written by `python benchmarks/look_ahead.py`, commit {job.read_versions()['commit']}.",
         "",
     ]
     PAGE.write_text("\n".join([*head, *rows, *end]), encoding="utf-8")
