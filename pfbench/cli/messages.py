@@ -106,13 +106,10 @@ def suggest_similar(name: str, options: Sequence[str]) -> str:
     def similarity(a: str, b: str) -> float:
         return difflib.SequenceMatcher(None, a, b).ratio()
 
-    def last_part(key: str) -> str:
-        return key.rpartition(".")[2]
-
     scores = {
         option: similarity(option, name)
         for option in options
-        if similarity(last_part(option), last_part(name)) >= 0.6
+        if similarity(option.rpartition(".")[2], name.rpartition(".")[2]) >= 0.6
     }
     best = [option for option, score in scores.items() if score > max(scores.values()) - 0.1]
     return f" Similar: {', '.join(best[:3])}." if best else ""
@@ -167,8 +164,13 @@ def _format_unknown_key(name: str, words: Sequence[str]) -> str:
             f"{override}: not all jobs of this sweep have the key {name}. "
             "Run those without it in a separate sweep."
         )
-    similar = suggest_similar(name, [key for key in keys if key != name])
-    return f"{override}: key {name} does not exist.{similar or _ALL_KEYS}"
+    part, _, last = name.rpartition(".")
+    others = [key for key in keys if key != name and not key.endswith("._target_")]
+    nearby = [key for key in others if part and key.rpartition(".")[0] == part]
+    moved = [key for key in others if key.rpartition(".")[2] == last]  # the key of another part
+    choices = f" Keys of {part}: {', '.join(nearby)}." if nearby else _ALL_KEYS
+    options = [*nearby, *moved] if nearby else others
+    return f"{override}: key {name} does not exist.{suggest_similar(name, options) or choices}"
 
 
 def _composed_keys(words: Sequence[str], excluded: str) -> list[str]:
@@ -177,18 +179,16 @@ def _composed_keys(words: Sequence[str], excluded: str) -> list[str]:
     from pfbench.job.config import compose
 
     others = [word for word in words if "=" in word and excluded not in word]
-    keys: dict[str, None] = {}
     try:
         alternatives = expand_sweep([word for word in others if not word.startswith("hydra")])
         first = [options[0] for options in alternatives]
-        for i, options in enumerate(alternatives):
-            for option in options[1:]:
-                composed = compose([*first[:i], option, *first[i + 1 :]])
-                keys |= dict.fromkeys(_dotted_keys(composed.values))
-        keys |= dict.fromkeys(_dotted_keys(compose(first).values))
+        jobs = [first, *(
+            [*first[:i], option, *first[i + 1 :]]
+            for i, options in enumerate(alternatives) for option in options[1:]
+        )]  # fmt: skip
+        return list(dict.fromkeys(key for job in jobs for key in _dotted_keys(compose(job).values)))
     except Exception:  # with a second mistake, a suggestion would only confuse
         return []
-    return list(keys)
 
 
 def _dotted_keys(node: Any, path: str = "") -> Iterator[str]:

@@ -30,7 +30,8 @@ def plain_errors(words: Sequence[str] = ()) -> Iterator[None]:
         translated = ValueError(message)
         for note in notes_of(error):
             translated.add_note(note)
-        raise translated from error
+        is_hydra = type(error).__module__.partition(".")[0] in ("hydra", "omegaconf")
+        raise translated from None if is_hydra else error  # whose traceback is as long as a page
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,8 @@ class Study:
             group: Group of the state. The main group by default.
 
         Returns:
-            Errors in the unit of the group. Rows of several conditions have their names in the index.
+            Errors in displayed units: arcmin for rad, deg/h for rad/s, mg for m/s^2, else those of the model.
+            `attrs["unit"]` names that of each scenario. Rows of several conditions have their names in the index.
         """
         from pfbench.results.frame import list_main_groups
 
@@ -81,11 +82,15 @@ class Study:
             f"{group!r}",
             "Leave it out for the main group.",
         )
-        keys = zip(frame["scenario"], frame["noise"], frame["model"], strict=True)
-        selected = [group or mains[key] for key in keys]
+        selected = [
+            group or mains[key]
+            for key in zip(frame["scenario"], frame["noise"], frame["model"], strict=True)
+        ]
         rows = frame[(frame["group"] == selected) & (frame["component"] == "norm")]
         index = [n for n in ("scenario", "noise", "model") if rows[n].nunique() > 1]
-        return rows.pivot_table("value", [*index, "run"], "label", observed=True)
+        table = rows.pivot_table("value", [*index, "run"], "label", observed=True)
+        table.attrs["unit"] = dict(zip(rows["scenario"], rows["unit"], strict=True))
+        return table
 
     def summary(self, **options: Any) -> Summary:
         """Summarise the study as the first view of its report.

@@ -161,9 +161,12 @@ def render_study(
     stored = (folder / HEADLINE).read_bytes() if (folder / HEADLINE).is_file() else b""
     headline = render_headline(pack, stored)
     pack["headline"] = "Error of each filter relative to the baseline" if headline else ""
-    if headline and pack.get("world_orders"):
+    if headline and (orders := pack.get("world_orders")):
         pack["headline"] += ", in each world"
-        pack["world_picture"] = writers.format_data_address("svg", headline)
+        pack["world_pictures"] = [
+            writers.format_data_address("svg", render_headline({**pack, "world_orders": [order]}))
+            for order in orders
+        ]
     files: Files = {
         "verdicts.csv": format_verdicts(pack),
         "decisions.csv": format_csv(

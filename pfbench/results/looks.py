@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from pfbench.results.conditions import Condition, parse_label
+from pfbench.results.conditions import Condition, main_component_group, parse_label
 from pfbench.results.paper_block import (
     MARKERS,
     add_world,
@@ -79,8 +79,8 @@ class PartName:
         key: Key in results.
         name: Name in tables and figures.
         words: Description for a sentence.
-        unit: Unit of the main group; empty for a regime.
-        limit: Error above which a run has lost the track, in `unit`; None without a limit.
+        unit: Displayed unit of the main group.
+        limit: Error above which a run has lost the track, in SI units; None without a limit.
         family: Scenarios of one trajectory have the same family.
     """
 
@@ -162,7 +162,7 @@ def study_part_names(conditions: Sequence[Condition], group: str) -> dict[str, P
             key,
             _add_text(str(block.get("name", plain)), settings.get(key)),
             _add_text(str(block.get("words", plain)), settings.get(key)),
-            str(block.get("unit", "")),
+            main_component_group(condition.jobs[0].meta["state"]).unit,
             None if limit is None else float(limit),
             str(stored.get("family") or plain),
         )

@@ -36,9 +36,9 @@ _COLOUR = re.compile(r"#[0-9a-f]{6}")
 _ENTRIES = {"cites": ({"keys", "place"}, set()), "completions": ({"keys", "why"}, {"printed"})}
 
 # keys of the node by part, each with its requirement
-_TEXTS = ("name", "long_name", "summary", "words", "unit", "cite", "family", "tuning", "form_of")
+_TEXTS = ("name", "long_name", "summary", "words", "cite", "family", "tuning", "form_of")
 _KEYS = {
-    "scenario": ("name", "words", "unit", "family", "divergence_threshold"),
+    "scenario": ("name", "words", "family", "divergence_threshold"),
     "noise": ("name", "words", "family"),
     "filter": (
         "name", "long_name", "summary", "family", "proposed", "form", "form_of", "colour", "marker", "cite",

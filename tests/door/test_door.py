@@ -439,6 +439,8 @@ def test_an_object_of_an_earlier_definition_is_refused(notebook: Notebook) -> No
         (lambda: pfbench.run(WALK, "sir", runs=0), "runs must be a whole number of at least 1, got 0"),
         (lambda: pfbench.run(WALK, "sir", particles=1e3), "particles must be a whole number of at least 2, got 1000.0. Write it"),
         (lambda: pfbench.run(WALK, "sir", partcles=3), "partcles=3: key partcles does not exist. Similar: particles"),
+        (lambda: pfbench.run(WALK, "sir", filter__resampler__foo=3), "does not exist. Keys of filter.resampler: filter.resampler.ess_threshold, "),
+        (lambda: pfbench.run(WALK, "sir", noise__ess_threshold=3), "does not exist. Similar: filter.resampler.ess_threshold"),
         (lambda: pfbench.run(WALK, "sir", study="a/b"), "study must be a name of letters"),
         (lambda: pfbench.run(WALK, "sir", particles=object()), "particles must be a number, a text, a list or a dictionary"),
         (lambda: pfbench.study("nothing"), "study must be a study with results, got nothing"),
@@ -458,8 +460,8 @@ def test_bad_input_is_a_sentence(home: Path, call, sentence: str) -> None:
 def test_unknown_keys_have_the_sentence_of_the_command_line(home: Path) -> None:
     with pytest.raises(ValueError, match="key partcles") as caught:
         pfbench.run(WALK, "sir", partcles=3, study="s")
-    said = command("run", *WALK_WORDS, "filter=sir", "partcles=3", "study=s", home=home)
-    assert str(caught.value) in said.err
+    assert str(caught.value) in command("run", *WALK_WORDS, "filter=sir", "partcles=3", "study=s", home=home).err  # fmt: skip
+    assert caught.value.__suppress_context__  # without the traceback of Hydra
 
 
 def test_a_failed_job_is_listed_with_the_words_that_repeat_it(
@@ -523,7 +525,10 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> pfbench.Study:
 
 def test_errors_are_those_of_the_files(study: pfbench.Study) -> None:
     errors = study.errors()
-    assert errors.index.names == ["noise", "run"]
+    assert (errors.index.names, errors.attrs) == (
+        ["noise", "run"],
+        {"unit": dict.fromkeys(study.table("rmse")["scenario"], "m")},
+    )
     for condition in study.conditions():
         for job in condition.jobs:
             group = main_component_group(job.meta["state"])

@@ -95,11 +95,10 @@ def test_every_method_states_its_own_name_and_look() -> None:
 
 
 def test_scenarios_and_regimes_state_their_names() -> None:
-    for group, keys in (("scenario", {"name", "words", "unit"}), ("noise", {"name", "words"})):
-        names = list_named_parts(group)
-        blocks = {name: read_paper_block(group, name) for name in names}
+    for group, keys in (("scenario", {"name", "words"}), ("noise", {"name", "words"})):
+        blocks = {name: read_paper_block(group, name) for name in list_named_parts(group)}
         assert {name for name, block in blocks.items() if not keys <= set(block)} == set()
-        assert len({block["name"] for block in blocks.values()}) == len(names)
+        assert len({block["name"] for block in blocks.values()}) == len(blocks)
 
 
 def test_a_study_of_several_worlds_names_the_data_of_all_tunings() -> None:

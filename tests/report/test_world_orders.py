@@ -130,5 +130,7 @@ def test_the_picture_of_the_readme_is_that_of_the_demo(
     )
     names = [[text for text in texts if not text[0].isdigit()] for texts in (stored, fresh)]
     assert names[0] == names[1]
+    # of one world each, so that a narrow screen shows both
+    assert (tmp_path / "reports/quickstart/index.html").read_text().count('<img class="world"') == 2
     numbers = [[float(t) for t in texts if re.fullmatch(r"\d\.\d\d", t)] for texts in (stored, fresh)]  # fmt: skip
     assert numbers[0] == pytest.approx(numbers[1], abs=0.05)

@@ -236,7 +236,7 @@ def _draw_diamond(axis: Axes, y: int, pair: Pack, colour: str, limits: tuple[flo
 # Static figure of a published study: the leaderboard, drawn as for a paper.
 
 HEADLINE = "headline.svg"
-_WIDTH, _WIDE = "150mm", "210mm"
+_WIDTH, _WORLD_WIDTH = "150mm", 105  # of all worlds together, and of each [mm]
 _NUMBER = re.compile(r"(?<![\w#.])-?\d+\.\d+(?!\w)")  # not in names
 _EQUAL_WITHIN = 1e-3  # units of the drawing
 _SVG: Any = {"svg.hashsalt": "pfbench", "svg.fonttype": "none"}  # equal bytes, text as text
@@ -254,9 +254,10 @@ def render_headline(pack: Pack, stored: bytes = b"") -> bytes:
     opening = next(iter(pack["views"].values()))
     if all(row["ratio"] is None for row in opening["rows"]):
         return b""
-    width = _WIDE if pack.get("world_orders") else _WIDTH
+    worlds = pack.get("world_orders")
+    width = f"{_WORLD_WIDTH * len(worlds)}mm" if worlds else _WIDTH
     setting, buffer = FigureSetting(find_page_format(width=width)), io.BytesIO()
-    plot = plot_worlds if pack.get("world_orders") else plot_leaderboard
+    plot = plot_worlds if worlds else plot_leaderboard
     with setting.applied(), matplotlib.rc_context(_SVG):
         plot(pack, setting).savefig(buffer, format="svg", metadata={"Date": None})
     drawing = buffer.getvalue()

@@ -29,7 +29,7 @@ PAGE_BYTES = 1_500_000
 _HERE = Path(__file__).parent
 _SCRIPTS = ("kit", "state", "board", "cost", "pairs", "worlds", "time", "runs", "main")
 _OPTIONAL = (
-    "paper_figures", "failures", "definitions", "filter_notes", "choices", "warnings", "world_orders", "world_picture",
+    "paper_figures", "failures", "definitions", "filter_notes", "choices", "warnings", "world_orders", "world_pictures",
     "recorded",
 )  # fmt: skip
 _STATIC = (
