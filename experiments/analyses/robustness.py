@@ -105,7 +105,7 @@ def read_study(name: str) -> Study:
         if key.metric == "rmse" and "all" not in (key.world, key.regime) and row["verdict"] != "missing"
     ])  # fmt: skip
     rows = rows.drop_duplicates(["world", "regime", "filter"])
-    rows = rows.astype(dict.fromkeys(("rank", "track", "coverage", "ms"), float))
+    rows = rows.astype(dict.fromkeys(("rank", "track", "coverage"), float))
     return Study(table, rows, StudyFacts.from_pack(pack))
 
 
@@ -138,7 +138,7 @@ def _world_table(study: Study, world: str) -> str:
     runs = study.runs[study.runs["scenario"] == world]
     errors = {key: part["rmse"].to_numpy() for key, part in runs.groupby(["regime", "filter"])}
     regimes = list(dict.fromkeys(regime for regime, _ in rows))
-    lines = markdown_head("filter", *(f"{r} [{runs['unit'].iloc[0]}]" for r in regimes), "ms/step")
+    lines = markdown_head("filter", *(f"{r} [{runs['unit'].iloc[0]}]" for r in regimes))
     ranks: dict[str, list[float]] = {}
     for row in rows.values():
         place = len(rows) if np.isnan(row["rank"]) else row["rank"]  # after all that keep track
@@ -151,10 +151,9 @@ def _world_table(study: Study, world: str) -> str:
             key: f"{format_median(errors[key])}, {_percent(rows[key]['track'])} / {_percent(rows[key]['coverage'])} %"
             for key in present
         }
-        times = float(np.median([rows[key]["ms"] for key in present]))
         words = (cells.get((regime, label), missing) for regime in regimes)
         tier = " (B)" if study.facts.looks[label].tuning else ""
-        lines.append(markdown_row(f"`{label}`{tier}", *words, _digits(times)))
+        lines.append(markdown_row(f"`{label}`{tier}", *words))
     return "\n".join([*lines, "", _describe_limit(world)])
 
 
