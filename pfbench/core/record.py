@@ -112,6 +112,11 @@ def iterate_steps(
             yield t, model.at_step(t), record.at_step(t)
 
 
+def is_constant(model: SteppedModel, record: Record, first: int) -> bool:
+    """Return whether a model is the same in all steps of a record from one on."""
+    return all(model.at_step(t) is model for t in range(first, record.y.shape[1]))
+
+
 _GROUP = 256  # steps
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.random_stream import PhiloxStream, RandomStream
-from pfbench.core.record import Record
+from pfbench.core.record import Record, is_constant
 from pfbench.filter.belief import (
     ComputedWeights,
     KeptSteps,
@@ -138,8 +138,7 @@ class TapedParticleFilter(WholeStepFilter):
         try:
             if type(draws) is not PhiloxStream or draws.dtype != torch.float64 or belief.memory:
                 raise NoTapeError("its random numbers or its particles are not those of a tape")
-            changes = any(model.at_step(k) is not model for k in range(t + 1, record.y.shape[1]))
-            reason = "its model changes from step to step" if changes else ""
+            reason = None if is_constant(model, record, t + 1) else "its model changes by step"
             if reason := reason or find_obstacle(self.method, model):
                 raise NoTapeError(reason)
             stream, x = draws.select_runs(_FEW), to_storage(belief.x[_FEW, _FEW]).permute(1, 2, 0)
@@ -152,8 +151,10 @@ class TapedParticleFilter(WholeStepFilter):
         except Exception as error:  # NoTapeError, or of a model that takes batches of one size only
             self._refused.add(model)
             kind = "" if isinstance(error, NoTapeError) else f"{type(error).__name__}: "
-            reason = f"{kind}{error}".splitlines()[0]
-            log.info("C++ operators, step by step: no tape of the model (%s)", reason)
+            log.info(
+                "C++ operators, step by step: no tape of the model (%s)",
+                f"{kind}{error}".splitlines()[0],
+            )
             return
         while len(self._passes) >= _PASSES:
             self._passes.pop(next(iter(self._passes)))
