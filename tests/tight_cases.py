@@ -70,22 +70,23 @@ def kalman(model: SinsGnssTight, record: Record) -> tuple[Tensor, Tensor, Tensor
         u: TightStep = seen.u
         phi, gain = model.transition_matrix(u), model.noise_gain(u)
         mean, p = (phi @ mean.unsqueeze(-1)).squeeze(-1), phi @ p @ phi.mT + gain @ gain.mT
-        s, c, o = u.sine, u.cosine, torch.zeros_like(u.sine)
+        sight = u.sight
+        s, c, o = sight.sine, sight.cosine, torch.zeros_like(sight.sine)
         east, north, up = (torch.stack(axis, -1) for axis in ((o, o + 1, o), (-s, o, c), (c, o, s)))
         h = torch.zeros(runs, 2 * count, 17, dtype=torch.float64)
-        h[:, :count, 6:9] = u.line @ torch.stack([north, east, up], -1)
-        h[:, count:, 3:6] = u.line @ torch.stack([east, north, up], -1)
+        h[:, :count, 6:9] = sight.line @ torch.stack([north, east, up], -1)
+        h[:, count:, 3:6] = sight.line @ torch.stack([east, north, up], -1)
         # the line turns with the place, (w - e (e.w)) / r, and so do the level axes of the velocity
         turn = (
-            u.closing - u.line * (u.line * u.closing).sum(-1, keepdim=True)
-        ) / u.distance.unsqueeze(-1)
+            sight.closing - sight.line * (sight.line * sight.closing).sum(-1, keepdim=True)
+        ) / sight.distance.unsqueeze(-1)
         h[:, count:, 6:9] = turn @ torch.stack([north, east, up], -1)
         r_m, r_n = earth.radii(torch.asin(s))
         for axis, tilt in (
-            (6, (-1 / (r_m + u.height), o, o)),
-            (7, (o, 1 / (r_n + u.height), s / c / (r_n + u.height))),
+            (6, (-1 / (r_m + sight.height), o, o)),
+            (7, (o, 1 / (r_n + sight.height), s / c / (r_n + sight.height))),
         ):
-            level = torch.linalg.cross(torch.stack(tilt, -1), u.vel)
+            level = torch.linalg.cross(torch.stack(tilt, -1), sight.vel)
             h[:, count:, axis] += (h[:, count:, 3:6] @ level.unsqueeze(-1)).squeeze(-1)
         h[:, :count, 15] = h[:, count:, 16] = -1.0
         there = ~seen.y.isnan()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -14,7 +14,6 @@ import yaml
 
 from pfbench.claims.claim_list import PrintedClaim, read_printed_claims
 from pfbench.claims.measures import Measure
-from pfbench.core.parameter_checks import require
 from pfbench.job.readings import CENTRAL_READING, read_reading_table
 
 # --------------------------------------------------------------------------------------------------
@@ -26,12 +25,8 @@ COLUMNS = (PUBLISHED, REPAIRED)
 DIRECTION_PART, SIZE_PART = "direction", "size"
 TIMING = "seconds_per_step"
 METHOD = "method"
-_KEYS = {
-    *("compare", "windows", "toy", "method", "word", "why", "proved", "without"),
-}
 _SIDE_KEYS = {"metric": "metric", "group": "group", "component": "component", "from": "start", "to": "end", "settled": "settled"}  # fmt: skip
 _LISTS = ("a", "b", "group", "component", "metric", "settled", "worlds")
-_ENTRY_KEYS = {*_SIDE_KEYS, *(f"b_{key}" for key in _SIDE_KEYS), *_LISTS, "printed", "level", "form", "pairs", "rows", "kind", "within"}  # fmt: skip
 
 
 class Side(NamedTuple):
@@ -122,34 +117,9 @@ class ClaimPlan(NamedTuple):
 
 
 @cache
-def read_paper_settings() -> Mapping[str, Mapping[str, Any]]:
-    """Read the settings of each paper: forms, numbers of runs, prices, and filters of single readings."""
-    return yaml.safe_load(_DATA.read_text(encoding="utf-8"))["papers"]
-
-
-@cache
-def read_seven() -> Sequence[Mapping[str, str]]:
-    """Read the seven methods: name, filter, the claim that it beats its own baseline, and a description."""
-    return yaml.safe_load(_DATA.read_text(encoding="utf-8"))["seven"]
-
-
-@cache
-def read_setting_texts() -> Mapping[str, str]:
-    """Read the words of sides as a reader sees them."""
-    return yaml.safe_load(_DATA.read_text(encoding="utf-8"))["settings"]
-
-
-@cache
-def read_amendments() -> tuple[str, Sequence[Mapping[str, Any]]]:
-    """Read the commit that fixed the claims, and what was corrected since: claims, what, and the word before."""
-    content = yaml.safe_load(_DATA.read_text(encoding="utf-8"))
-    return content["fixed_in"], content["amended"]
-
-
-@cache
-def read_objections() -> Sequence[Mapping[str, Any]]:
-    """Read objections that runs do not settle: claims, and what is disputed."""
-    return yaml.safe_load(_DATA.read_text(encoding="utf-8"))["disputed"]
+def read_claim_data() -> Mapping[str, Any]:
+    """Read the file of the claims: settings of papers, lines of claims, texts of settings, the seven methods, corrections."""
+    return yaml.safe_load(_DATA.read_text(encoding="utf-8"))
 
 
 @cache
@@ -164,33 +134,16 @@ def read_readings(paper: str) -> Mapping[str, Reading]:
     return {CENTRAL_READING: entries_read[CENTRAL_READING], **entries_read}
 
 
-def read_plans(path: Path = _DATA) -> list[ClaimPlan]:
-    """Read what decides each of the 88 claims, in their order.
-
-    Raises ValueError if the entry of a claim is missing, or has other keys.
-    """
-    entries = yaml.safe_load(path.read_text(encoding="utf-8"))["claims"]
-    claims = read_printed_claims()
-    if set(entries) != {claim.id for claim in claims}:
-        wrong = sorted(set(entries) ^ {claim.id for claim in claims})
-        raise ValueError(
-            f"{path.name}: claims must be those of claims_2.yaml, got or missing {wrong}. Correct them."
-        )
-    return [_parse_plan(path, claim, entries[claim.id]) for claim in claims]
+def read_plans() -> list[ClaimPlan]:
+    """Read what decides each of the 88 claims, in their order."""
+    lines = read_claim_data()["claims"]
+    return [_parse_plan(claim, lines[claim.id]) for claim in read_printed_claims()]
 
 
-def _parse_plan(path: Path, claim: PrintedClaim, entry: Mapping[str, Any]) -> ClaimPlan:
+def _parse_plan(claim: PrintedClaim, entry: Mapping[str, Any]) -> ClaimPlan:
     """Parse the entry of a claim."""
     rows = entry.get("compare", ())
-    wrong = sorted({*entry} - _KEYS) + sorted({key for row in rows for key in row} - _ENTRY_KEYS)
-    require(
-        not wrong and bool(rows) != ("word" in entry),
-        f"{path.name}: {claim.id}",
-        "have comparisons or a word, and other keys",
-        wrong or sorted(entry),
-        "Correct them.",
-    )
-    forms = entry.get("method", read_paper_settings()[claim.paper]["method"])
+    forms = entry.get("method", read_claim_data()["papers"][claim.paper]["method"])
     has_forms = METHOD in str(rows) or "form" in str(rows)
     parts: dict[tuple[str, str], tuple[LineComparison, ...]] = {}
     for column in forms if has_forms else (PUBLISHED,):
@@ -299,7 +252,7 @@ def make_cell(plan: ClaimPlan, reading: str, side: Side) -> tuple[str, ...]:
     paper = plan.claim.paper
     if plan.toy:
         return (*plan.toy, f"filter={side.filter}", *side.words)
-    settings = read_paper_settings()[paper]
+    settings = read_claim_data()["papers"][paper]
     limits: Mapping[str, Sequence[str]] = settings.get("only", {})
     concerned = read_readings(paper)[reading].filters
     if side.filter not in limits.get(reading, concerned or (side.filter,)):
@@ -341,24 +294,10 @@ class Proof:
     test: str
 
 
-def read_proofs(path: Path = _PROOFS) -> list[Proof]:
+def read_proofs() -> list[Proof]:
     """Read the proofs.
-
-    Args:
-        path: Data file.
 
     Returns:
         The proofs, in the order of the file.
-
-    Raises:
-        ValueError: If an entry has other keys.
     """
-    names = {item.name for item in fields(Proof)}
-    rows = yaml.safe_load(path.read_text(encoding="utf-8"))
-    for row in rows:
-        if set(row) != names:
-            raise ValueError(
-                f"{path.name}: {row.get('id')} must have the keys {', '.join(sorted(names))}, got "
-                f"{', '.join(sorted(row))}. Correct them."
-            )
-    return [Proof(**row) for row in rows]
+    return [Proof(**row) for row in yaml.safe_load(_PROOFS.read_text(encoding="utf-8"))]

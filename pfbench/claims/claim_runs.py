@@ -22,9 +22,8 @@ from pfbench.claims.claim_lines import (
     apply_window,
     list_dots,
     make_cell,
-    read_paper_settings,
+    read_claim_data,
     read_readings,
-    read_setting_texts,
 )
 from pfbench.claims.measures import METRIC_WORDS, OFF_TRACK, Measure
 from pfbench.claims.words import (
@@ -163,7 +162,7 @@ class ClaimRuns:
 
 def list_batches(paper: str, stage: str) -> list[Batch]:
     """List the runs of a cell at a stage: the first look, all seeds of a central reading, or of one that turns."""
-    counts = read_paper_settings()[paper]["runs"]
+    counts = read_claim_data()["papers"][paper]["runs"]
     first, number = counts[SCREEN], counts.get(stage, 0)
     screen = [Batch(SEEDS[0], 0, first)]
     if stage == SCREEN:
@@ -307,7 +306,7 @@ def _join_pair(
     a, b = (next(matches) if side.filter else (np.full(n, side.number), np.zeros(n, bool)) for side in (c.a, c.b))  # fmt: skip
     if c.a.measure.metric == OFF_TRACK and n and max(a[0].max(), b[0].max()) <= 1.0:
         return VACUOUS
-    first = read_paper_settings()[plan.claim.paper]["runs"][SCREEN]
+    first = read_claim_data()["papers"][plan.claim.paper]["runs"][SCREEN]
     early = common - SEEDS[0] * 2**32 < first
     return ClaimSample(c.kind, a[0], b[0], a[1], b[1], early, c.printed, describe_sides(c))
 
@@ -316,7 +315,7 @@ def describe_sides(c: LineComparison) -> str:
     """Describe a comparison for a reader: what is divided by what, its components and its time."""
     filtered = [side for side in (c.a, c.b) if side.filter]
     quantities = [describe_quantity(side.measure) for side in filtered]
-    is_common, texts = len(set(quantities)) == 1, read_setting_texts()
+    is_common, texts = len(set(quantities)) == 1, read_claim_data()["settings"]
     names = [
         " ".join([_name_filter(side.filter), *(texts[word] for word in side.words)])
         if side.filter
@@ -399,5 +398,5 @@ def estimate_seconds(paper: str, cell: Cell, runs: ClaimRuns) -> float:
         for record in runs.find(cell) or [r for r in runs.records if f"filter={name}" in r.cell and r.cell[0][:11] == cell[0][:11]]
         if not record.failed
     ]  # fmt: skip
-    prices = read_paper_settings()[paper]["seconds"]
+    prices = read_claim_data()["papers"][paper]["seconds"]
     return float(np.median(measured)) if measured else float(prices.get(name, prices["_"]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from pfbench.claims.claim_lines import (
@@ -14,7 +14,7 @@ from pfbench.claims.claim_lines import (
     SIZE_PART,
     ClaimPlan,
     list_dots,
-    read_paper_settings,
+    read_claim_data,
     read_readings,
 )
 from pfbench.claims.claim_list import KINDS, find_tipping_bound
@@ -85,7 +85,7 @@ def conclude(plan: ClaimPlan, decisions: Decisions) -> ClaimWord:
         (column, portion): decisions[plan.claim.id, column, portion]
         for column, portion in plan.parts
     }
-    main = {column: _choose_part(by_part, column) for column in COLUMNS}
+    main = {c: by_part.get((c, DIRECTION_PART)) or by_part.get((c, SIZE_PART)) for c in COLUMNS}
     published, repaired = main[PUBLISHED], main[REPAIRED]
     assert published is not None  # each claim has a published column
     size = by_part.get((PUBLISHED, SIZE_PART))
@@ -100,13 +100,6 @@ def conclude(plan: ClaimPlan, decisions: Decisions) -> ClaimWord:
         published.factors,
         published,
     )
-
-
-def _choose_part(
-    by_part: Mapping[tuple[str, str], ClaimDecision], column: str
-) -> ClaimDecision | None:
-    """Choose the decision of a column: that of the direction, else that of the number."""
-    return by_part.get((column, DIRECTION_PART)) or by_part.get((column, SIZE_PART))
 
 
 def _explain(plan: ClaimPlan, decision: ClaimDecision) -> str:
@@ -203,5 +196,5 @@ def count_by_paper(lines: Sequence[ClaimWord]) -> dict[str, dict[str, int]]:
             state: sum(line.state == state and line.plan.claim.paper == paper for line in lines)
             for state in (*WORDS, NOT_RUN)
         }
-        for paper in read_paper_settings()
+        for paper in read_claim_data()["papers"]
     }

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pfbench.claims.claim_lines import TIMING, ClaimPlan, list_dots, read_paper_settings
+from pfbench.claims.claim_lines import TIMING, ClaimPlan, list_dots, read_claim_data
 from pfbench.claims.claim_runs import (
     CENTRE,
     CLAIMS_STUDY,
@@ -193,7 +193,7 @@ def run_claim_task(task: Task, results: str) -> StoredValues:
 
 def may_refuse(task: Task) -> bool:
     """Return whether the error of a job is an outcome: that of a form that refuses to run, by a proof."""
-    forms = read_paper_settings()[task.paper].get("refuses", ())
+    forms = read_claim_data()["papers"][task.paper].get("refuses", ())
     return any(f"filter={name}" in task.cell for name in forms)
 
 

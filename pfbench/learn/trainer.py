@@ -315,20 +315,14 @@ def _detach(value: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Training:
-    """Settings of a training.
+class Optimisation:
+    """Settings of the updates of the weights of a training.
 
     Attributes:
         objective: Loss function.
         resampler: Resampler of the filter during training. It decides which gradient passes
             through resampling.
         particles: Number of particles during training.
-        training_runs: Number of training runs of each noise regime.
-        validation_runs: Number of validation runs of each noise regime, used for early stopping.
-        noise_regimes: Names of the noise regimes of a mixture. Empty for the chosen noise regime.
-        seed: Seed of the training runs and of all other random numbers. The validation runs use
-            the next one.
-        max_steps: Number of steps of each record to use. None for all.
         gradient_steps: Number of steps through which a gradient passes before it is cut and the
             weights are updated. None for all.
         epochs: Maximum number of epochs.
@@ -336,26 +330,41 @@ class Training:
         learning_rate: Learning rate of Adam (Kingma and Ba 2015).
         max_grad_norm: Maximum norm of a gradient.
         patience_epochs: Number of epochs without a lower validation loss before training stops.
-        checkpoint_path: Path of the checkpoint. None for the folder of the results.
-
-    Raises:
-        ValueError: If a value is out of range.
     """
 
     objective: Objective = field(default_factory=EvidenceLowerBound)
     resampler: Resampler = field(default_factory=lambda: EssResampler(Systematic(), 1.0))
     particles: int = 32
-    training_runs: int = 64
-    validation_runs: int = 32
-    noise_regimes: Sequence[str] = ()
-    seed: int = 1001
-    max_steps: int | None = None
     gradient_steps: int | None = 5
     epochs: int = 50
     batch_size: int = 16
     learning_rate: float = 1e-3
     max_grad_norm: float = 10.0
     patience_epochs: int = 10
+
+
+@dataclass(frozen=True)
+class Training(Optimisation):
+    """Settings of a training: its runs, and the updates of the weights.
+
+    Attributes:
+        training_runs: Number of training runs of each noise regime.
+        validation_runs: Number of validation runs of each noise regime, used for early stopping.
+        noise_regimes: Names of the noise regimes of a mixture. Empty for the chosen noise regime.
+        seed: Seed of the training runs and of all other random numbers. The validation runs use
+            the next one.
+        max_steps: Number of steps of each record to use. None for all.
+        checkpoint_path: Path of the checkpoint. None for the folder of the results.
+
+    Raises:
+        ValueError: If a value is out of range.
+    """
+
+    training_runs: int = 64
+    validation_runs: int = 32
+    noise_regimes: Sequence[str] = ()
+    seed: int = 1001
+    max_steps: int | None = None
     checkpoint_path: str | None = None
 
     def __post_init__(self) -> None:

@@ -346,7 +346,7 @@ class TightMemsInputs(NamedTuple):
     Geometry is relative to a position that is fixed to the ground.
 
     Attributes:
-        turn, push, shift, jacobian, bias, gravity, duration: See `PreintegratedImu`.
+        increments: Preintegrated IMU.
         line: Unit vectors to the satellites, East, North, Up, [R or 1, T, S, 3].
         reach: Distances of the satellites, [R or 1, T, S], m.
         velocity: Velocities of the satellites, East, North, Up, [R or 1, T, S, 3], m/s.
@@ -355,24 +355,13 @@ class TightMemsInputs(NamedTuple):
         rate_sd: Standard deviation stated by the receiver, [R or 1, T, S], m/s.
     """
 
-    turn: Tensor
-    push: Tensor
-    shift: Tensor
-    jacobian: Tensor
-    bias: Tensor
-    gravity: Tensor
-    duration: Tensor
+    increments: PreintegratedImu
     line: Tensor
     reach: Tensor
     velocity: Tensor
     other_system: Tensor
     range_sd: Tensor
     rate_sd: Tensor
-
-    @property
-    def increments(self) -> PreintegratedImu:
-        """The preintegrated IMU data."""
-        return PreintegratedImu(*self[: len(PreintegratedImu._fields)])
 
 
 class StrapdownTight(StrapdownModel):
@@ -422,15 +411,14 @@ class StrapdownTight(StrapdownModel):
     def propagate(self, x: Tensor, u: TightMemsInputs, w: Tensor) -> Tensor:
         motion, bias, drift, inter_system = x.split([_MOTION_TIGHT, 1, 1, 1], -1)
         motion = self.motion.propagate(motion, u.increments, w[..., :_DRIVEN_TIGHT])
-        clock = torch.cat([bias + drift * u.duration[:, None, None], drift, inter_system], -1)
-        return torch.cat(
-            [motion, clock + w[..., _DRIVEN_TIGHT:] @ self._clock_gain(u.duration).mT], -1
-        )
+        span = u.increments.duration
+        clock = torch.cat([bias + drift * span[:, None, None], drift, inter_system], -1)
+        return torch.cat([motion, clock + w[..., _DRIVEN_TIGHT:] @ self._clock_gain(span).mT], -1)
 
     @override
     def noise_gain(self, u: TightMemsInputs) -> Tensor:
-        motion, clock = self.motion.noise_gain(u.increments), self._clock_gain(u.duration)
-        return block_diagonal(motion, clock)
+        clock = self._clock_gain(u.increments.duration)
+        return block_diagonal(self.motion.noise_gain(u.increments), clock)
 
     def _clock_gain(self, duration: Tensor) -> Tensor:
         """Return the noise gain of bias, drift and inter-system bias [R or 1, 3, 3]."""

@@ -14,38 +14,22 @@ from pfbench.nav.ranging import ReceiverClock
 
 
 @dataclass(frozen=True)
-class StrapdownTuning:
-    """Parameters that filters assume for the sensors, the receiver and the start.
+class StrapdownStart:
+    """Standard deviations that filters assume at the start.
 
     Attributes:
-        gyro_density: Effective root density with vibration, rad/s/sqrt(Hz).
-        accelerometer_density: Effective root density with vibration, m/s^2/sqrt(Hz).
-        gyro_bias_walk: Random walk of the bias, rad/s/sqrt(s).
-        accelerometer_bias_walk: Random walk of the bias, m/s^2/sqrt(s).
-        position_sd: Standard deviation of a fix, East, North, Up, m.
-        velocity_sd: Standard deviation of velocity, East, North, Up, m/s. None if not measured.
-        attitude_sd_deg: Initial, about right (pitch), forward (roll), up (yaw) axis, deg.
+        attitude_sd_deg: About right (pitch), forward (roll), up (yaw) axis, deg.
         initial_velocity_sd: East, North, Up, m/s.
         initial_position_sd: East, North, Up, m.
-        gyro_bias_sd_deg_s: Initial standard deviation of each axis, deg/s.
-        accelerometer_bias_sd: Initial standard deviation of each axis, m/s^2.
-        gyro_bias_deg_s: Nominal bias in the axes of the files (forward, right, down), deg/s.
-        accelerometer_bias: Nominal bias in the axes of the files (forward, right, down), m/s^2.
+        gyro_bias_sd_deg_s: Of each axis, deg/s.
+        accelerometer_bias_sd: Of each axis, m/s^2.
     """
 
-    gyro_density: float
-    accelerometer_density: float
-    gyro_bias_walk: float
-    accelerometer_bias_walk: float
-    position_sd: Sequence[float]
-    velocity_sd: Sequence[float] | None
     attitude_sd_deg: Sequence[float]
     initial_velocity_sd: Sequence[float]
     initial_position_sd: Sequence[float]
     gyro_bias_sd_deg_s: float
     accelerometer_bias_sd: float
-    gyro_bias_deg_s: Sequence[float] = (0.0, 0.0, 0.0)
-    accelerometer_bias: Sequence[float] = (0.0, 0.0, 0.0)
 
     @property
     def initial_sd(self) -> Tensor:
@@ -63,6 +47,31 @@ class StrapdownTuning:
         ]
         blocks += [check_positive("tuning.accelerometer_bias_sd", [self.accelerometer_bias_sd] * 3)]
         return torch.cat(blocks)
+
+
+@dataclass(frozen=True)
+class StrapdownTuning(StrapdownStart):
+    """Parameters that filters assume for the sensors and the receiver, and for the start.
+
+    Attributes:
+        gyro_density: Effective root density with vibration, rad/s/sqrt(Hz).
+        accelerometer_density: Effective root density with vibration, m/s^2/sqrt(Hz).
+        gyro_bias_walk: Random walk of the bias, rad/s/sqrt(s).
+        accelerometer_bias_walk: Random walk of the bias, m/s^2/sqrt(s).
+        position_sd: Standard deviation of a fix, East, North, Up, m.
+        velocity_sd: Standard deviation of velocity, East, North, Up, m/s. None if not measured.
+        gyro_bias_deg_s: Nominal bias in the axes of the files (forward, right, down), deg/s.
+        accelerometer_bias: Nominal bias in the axes of the files (forward, right, down), m/s^2.
+    """
+
+    gyro_density: float
+    accelerometer_density: float
+    gyro_bias_walk: float
+    accelerometer_bias_walk: float
+    position_sd: Sequence[float]
+    velocity_sd: Sequence[float] | None
+    gyro_bias_deg_s: Sequence[float] = (0.0, 0.0, 0.0)
+    accelerometer_bias: Sequence[float] = (0.0, 0.0, 0.0)
 
     @property
     def measurement_sd(self) -> Tensor:

@@ -105,19 +105,13 @@ class TightStep(NamedTuple):
         phi: Transition from the first fifteen errors, [R, T, 9, 15].
         gain: Lower triangular root of the noise, [R, T, 9, 9].
         duration: [R or 1, T], s.
-        sine, cosine, height, vel, distance, line, closing: See `SatelliteGeometry`.
+        sight: Geometry at the end.
     """
 
     phi: Tensor
     gain: Tensor
     duration: Tensor
-    sine: Tensor
-    cosine: Tensor
-    height: Tensor
-    vel: Tensor
-    distance: Tensor
-    line: Tensor
-    closing: Tensor
+    sight: SatelliteGeometry
 
 
 class SinsGnssTight(_TightModel):
@@ -171,7 +165,7 @@ class SinsGnssTight(_TightModel):
             for i in range(0, steps, _EPOCHS)
         ]
         phi, gain = (torch.cat(a, 1) for a in zip(*blocks, strict=True))
-        return record._replace(u=TightStep(phi, gain, u.duration, *u.sight))
+        return record._replace(u=TightStep(phi, gain, u.duration, u.sight))
 
     def discretise(self, u: RangingInputs) -> tuple[Tensor, Tensor]:
         """Compute transition [..., 9, 15] and noise gain [..., 9, 9] of nine errors.
@@ -260,7 +254,7 @@ class SinsGnssTight(_TightModel):
 
     @override
     def observation(self, x: Tensor, u: TightStep) -> Distribution:
-        mean = predict_measurement(x[..., 6:9], x[..., 3:6], x[..., 15:], SatelliteGeometry(*u[3:]))
+        mean = predict_measurement(x[..., 6:9], x[..., 3:6], x[..., 15:], u.sight)
         return independent_normal(mean, self.r)
 
     @override
@@ -280,8 +274,7 @@ class NonlinearTightStep(NamedTuple):
     Attributes:
         dcm: Body to level at mid-interval, [R, T, 3, 3].
         pos, pos_start, pos_end, vel, w_in, f, duration: See `InsIntervals`.
-        sine, cosine, height, vel_end, distance, line, closing: See `SatelliteGeometry`, whose `vel`
-            is `vel_end`.
+        sight: Geometry at the end.
     """
 
     dcm: Tensor
@@ -292,13 +285,7 @@ class NonlinearTightStep(NamedTuple):
     w_in: Tensor
     f: Tensor
     duration: Tensor
-    sine: Tensor
-    cosine: Tensor
-    height: Tensor
-    vel_end: Tensor
-    distance: Tensor
-    line: Tensor
-    closing: Tensor
+    sight: SatelliteGeometry
 
 
 class SinsGnssTightNl(_TightModel):
@@ -353,7 +340,7 @@ class SinsGnssTightNl(_TightModel):
         u = self.ranging_inputs(record)
         dcm = error_dynamics.mid_interval(u.intervals).dcm
         interval = (dcm, u.pos, u.pos_start, u.pos_end, u.vel, u.w_in, u.f, u.duration)
-        return record._replace(u=NonlinearTightStep(*interval, *u.sight))
+        return record._replace(u=NonlinearTightStep(*interval, u.sight))
 
     @override
     def propagate(self, x: Tensor, u: NonlinearTightStep, w: Tensor) -> Tensor:
@@ -376,9 +363,7 @@ class SinsGnssTightNl(_TightModel):
 
     @override
     def observation(self, x: Tensor, u: NonlinearTightStep) -> Distribution:
-        mean = predict_measurement(
-            x[..., 7:10], x[..., 4:7], x[..., 16:], SatelliteGeometry(*u[8:])
-        )
+        mean = predict_measurement(x[..., 7:10], x[..., 4:7], x[..., 16:], u.sight)
         return independent_normal(mean, self.r)
 
     @override

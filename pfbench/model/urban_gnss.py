@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
@@ -223,8 +223,8 @@ _CHART = Chart((EuclideanBlock(3), AngleBlock(1), EuclideanBlock(5)))
 
 
 @dataclass(frozen=True)
-class UrbanTuning:
-    """Parameters that the filter assumes for odometry, clock and initial state.
+class UrbanDensities:
+    """Root densities of the noise that the filter assumes for odometry and clock.
 
     Attributes:
         distance_density: Error of the wheel distance, m/sqrt(s).
@@ -237,13 +237,6 @@ class UrbanTuning:
             small positive value.
         yaw_bias_density: Random walk of the yaw-rate bias, rad/s/sqrt(s). A particle filter needs a
             small positive value.
-        initial_position_sd: Initial position, East, North, Up, m, [3].
-        initial_heading_sd_deg: Initial heading, degrees.
-        initial_clock_sd: Initial clock bias, m.
-        initial_drift_sd: Initial clock drift, m/s.
-        initial_inter_system_sd: Initial inter-system bias, m.
-        initial_scale_sd: Initial wheel scale error, dimensionless.
-        initial_yaw_bias_sd: Initial yaw-rate bias, rad/s.
     """
 
     distance_density: float
@@ -254,13 +247,6 @@ class UrbanTuning:
     inter_system_density: float
     scale_density: float
     yaw_bias_density: float
-    initial_position_sd: Sequence[float]
-    initial_heading_sd_deg: float
-    initial_clock_sd: float
-    initial_drift_sd: float
-    initial_inter_system_sd: float
-    initial_scale_sd: float
-    initial_yaw_bias_sd: float
 
     @property
     def density(self) -> Tensor:
@@ -269,17 +255,30 @@ class UrbanTuning:
         Raises:
             ValueError: If a density is not positive.
         """
-        names = [
-            "distance",
-            "heading",
-            "height",
-            "clock",
-            "drift",
-            "inter_system",
-            "scale",
-            "yaw_bias",
-        ]
-        return self._positive([f"{name}_density" for name in names])
+        return _check_positive(self, [item.name for item in fields(UrbanDensities)])
+
+
+@dataclass(frozen=True)
+class UrbanTuning(UrbanDensities):
+    """Parameters that the filter assumes for odometry, clock and initial state.
+
+    Attributes:
+        initial_position_sd: Initial position, East, North, Up, m, [3].
+        initial_heading_sd_deg: Initial heading, degrees.
+        initial_clock_sd: Initial clock bias, m.
+        initial_drift_sd: Initial clock drift, m/s.
+        initial_inter_system_sd: Initial inter-system bias, m.
+        initial_scale_sd: Initial wheel scale error, dimensionless.
+        initial_yaw_bias_sd: Initial yaw-rate bias, rad/s.
+    """
+
+    initial_position_sd: Sequence[float]
+    initial_heading_sd_deg: float
+    initial_clock_sd: float
+    initial_drift_sd: float
+    initial_inter_system_sd: float
+    initial_scale_sd: float
+    initial_yaw_bias_sd: float
 
     @property
     def initial_sd(self) -> Tensor:
@@ -292,16 +291,16 @@ class UrbanTuning:
         position = check_three_positive(
             "scenario.tuning.initial_position_sd", self.initial_position_sd
         )
-        heading = self._positive(["initial_heading_sd_deg"]) * (math.pi / 180.0)
-        return torch.cat(
-            [position, heading, self._positive([f"initial_{name}_sd" for name in names])]
-        )
+        heading = _check_positive(self, ["initial_heading_sd_deg"]) * (math.pi / 180.0)
+        others = _check_positive(self, [f"initial_{name}_sd" for name in names])
+        return torch.cat([position, heading, others])
 
-    def _positive(self, names: Sequence[str]) -> Tensor:
-        """Return attributes after a check that they are positive."""
-        return torch.cat(
-            [check_positive(f"scenario.tuning.{name}", [getattr(self, name)]) for name in names]
-        )
+
+def _check_positive(tuning: UrbanDensities, names: Sequence[str]) -> Tensor:
+    """Return attributes after a check that they are positive."""
+    return torch.cat(
+        [check_positive(f"scenario.tuning.{name}", [getattr(tuning, name)]) for name in names]
+    )
 
 
 class UrbanGnss(StateSpaceModel):

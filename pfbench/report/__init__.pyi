@@ -27,10 +27,7 @@ from pfbench.report.stored_study import (
     format_runs as format_runs,
     read_stored_study as read_stored_study,
 )
-from pfbench.report.study_page.page_writer import (
-    render_markdown as render_markdown,
-    render_page as render_page,
-)
+from pfbench.report.study_page.page_writer import render_page as render_page
 from pfbench.report.study_report import (
     find_overviews as find_overviews,
     rebuild_page as rebuild_page,

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from pfbench.core.parameter_checks import require
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import scenario_figures, writers
-from pfbench.report.page_kit import Block, render_blocks, with_heading
+from pfbench.report.page_kit import Block, with_heading, write_page
 from pfbench.report.writers import format_number
 from pfbench.results import status, store
 from pfbench.results.conditions import component_groups
@@ -48,10 +48,8 @@ def write_datasheet(
         for stem, table in tables.items():
             if len(table):
                 writers.write_table(folder, stem, table)
-        pages = render_blocks(f"{title}: datasheet", list_blocks(title, sheet, drawings, tables))
-        for file_name, page in pages.items():
-            folder.write(file_name, page)
-        return folder.path / "index.html"
+        blocks = list_blocks(title, sheet, drawings, tables)
+        return write_page(folder, f"{title}: datasheet", blocks)
 
 
 def list_blocks(
@@ -86,7 +84,7 @@ def list_blocks(
             ("time [s]", f"{format_number(seconds['world'])} for the data, {format_number(seconds['measures'])} for the datasheet"),
         ]),
         *with_heading(Block("part", "Modelling choices"), Block("list", meta.get("modelling_choices", ()))),
-        Block("code", json.dumps(meta["config"]["scenario"], indent=1), "Settings of the scenario"),
+        Block("folded", json.dumps(meta["config"]["scenario"], indent=1), "Settings of the scenario"),
     ]  # fmt: skip
 
 

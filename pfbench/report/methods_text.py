@@ -140,7 +140,13 @@ def write_methods(pack: Pack) -> list[str]:
         *_describe_design(facts),
         *_describe_particles(facts, names),
         *_describe_decisions(facts, len(pack["planned"])),
-        *_describe_times(facts),
+        *(
+            [
+                f"Times per step are medians of {facts.rounds} or more rounds in which the filters took turns."
+            ]
+            if facts.rounds
+            else ()
+        ),
         *_describe_software(facts),
     ]
     return [" ".join(done), " ".join(["Not done:", *_list_limits(facts)])]
@@ -224,12 +230,6 @@ def _describe_decisions(facts: SimpleNamespace, pairs: int) -> list[str]:
         "and Pearson. Loses more: McNemar's exact test with Holm's correction.",
         f"Two families share the pairs of a table: {planned}the filters against the first baseline, and all other pairs.",
     ]
-
-
-def _describe_times(facts: SimpleNamespace) -> list[str]:
-    """Describe how times per step were measured in rounds; empty if they were not."""
-    text = f"Times per step are medians of {facts.rounds} or more rounds in which the filters took turns."
-    return [text] if facts.rounds else []
 
 
 def _describe_software(facts: SimpleNamespace) -> list[str]:

@@ -47,11 +47,6 @@ _PHASES = {
 }
 
 
-def is_uncommitted(meta: Mapping[str, Any]) -> bool:
-    """Return whether a job was computed in a checkout with changes that no commit has."""
-    return str(_value_at(meta, "versions.commit") or "").endswith("-dirty")
-
-
 def list_builds(metadata: Iterable[Mapping[str, Any]]) -> list[str]:
     """List the builds of jobs, for people: commits, or digests of the sources without git."""
     builds = (

@@ -7,45 +7,21 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from decimal import ROUND_HALF_UP, Context, Decimal
-from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 import pandas as pd
-from markupsafe import Markup
 
 from pfbench.files.escapes import (
-    escape_code_block,
     escape_csv,
     escape_html,
     escape_latex,
     escape_markdown,
 )
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report import provenance
 from pfbench.results.plotting import FigureSpec, draw_figure, format_slug
 
 DASH = "–"
-_HERE = Path(__file__).parent
-
-
-def render_template(
-    template: str,
-    folder: RecordedFolder,
-    context: Mapping[str, Any],
-    home: Path = _HERE,
-) -> Path:
-    """Write a page as Markdown and HTML from templates.
-
-    Returns path of the HTML page.
-    """
-    css = (_HERE / "style.css").read_text(encoding="utf-8")
-    for kind, name in (("md", "report.md"), ("html", "index.html")):
-        environment = template_environment(home, is_html=kind == "html")
-        page = environment.get_template(f"{template}.{kind}.jinja").render({**context, "css": css})
-        folder.write(name, page)
-    return folder.path / "index.html"
 
 
 def render_figures(
@@ -94,43 +70,13 @@ def format_data_address(suffix: str, content: bytes) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
-def to_json_types(value: Any, digits: int | None = None) -> Any:
+def to_json_types(value: Any) -> Any:
     """Convert a value to JSON types, with infinity as text."""
     if isinstance(value, Mapping):
-        return {name: to_json_types(item, digits) for name, item in value.items()}
+        return {name: to_json_types(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
-        return [to_json_types(item, digits) for item in value]
-    if not isinstance(value, float):
-        return value
-    if not math.isfinite(value):
-        return str(value)
-    return value if digits is None else float(f"{value:.{digits}g}")
-
-
-def template_environment(home: Path, *, is_html: bool) -> jinja2.Environment:
-    """Return the environment of templates of HTML or Markdown. Each value is escaped once."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(home),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        finalize=None if is_html else _escape_value,
-    )
-    environment.filters |= {
-        "table": lambda table: Markup(format_html(table)),
-        "pipe": lambda table: Markup(format_markdown(table)),
-        "code": lambda text: Markup(escape_code_block(text)),
-        "number": format_number,
-    }
-    environment.filters["name_build"] = provenance.name_build
-    return environment
-
-
-def _escape_value(value: Any) -> Markup:
-    """Escape a value of a Markdown template, unless a template or a table made it."""
-    return value if hasattr(value, "__html__") else Markup(escape_markdown(str(value)))
+        return [to_json_types(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 # --------------------------------------------------------------------------------------------------

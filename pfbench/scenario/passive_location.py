@@ -131,7 +131,49 @@ _KINDS = ("angle", "angle", "rate", "rate", "rate")
 
 
 @dataclass(frozen=True)
-class PassiveLocationScenario(Scenario):
+class EmitterPass:
+    """Straight level flight past an emitter that moves on the ground.
+
+    Attributes:
+        target_position: Emitter position at time 0, m, [2]. The height is 0.
+        target_velocity: Emitter velocity at time 0, m/s, [2].
+        aircraft_position: Aircraft position at time 0, m, [3].
+        aircraft_velocity: Aircraft velocity, m/s, [3].
+    """
+
+    target_position: Sequence[float]
+    target_velocity: Sequence[float]
+    aircraft_position: Sequence[float]
+    aircraft_velocity: Sequence[float]
+
+    def __post_init__(self) -> None:
+        _require_lengths(
+            self, target_position=2, target_velocity=2, aircraft_position=3, aircraft_velocity=3
+        )
+        require(
+            math.hypot(*self.aircraft_velocity[:2]) > 0.0,
+            "scenario.aircraft_velocity",
+            "have a horizontal component",
+            list(self.aircraft_velocity),
+            "Set an East or North velocity.",
+        )
+
+
+def _require_lengths(scenario: EmitterPass, **lengths: int) -> None:
+    """Require attributes to have so many finite numbers."""
+    for name, length in lengths.items():
+        values = getattr(scenario, name)
+        require(
+            len(values) == length and all(map(math.isfinite, values)),
+            f"scenario.{name}",
+            f"have {length} finite numbers",
+            list(values),
+            "Correct the list.",
+        )
+
+
+@dataclass(frozen=True)
+class PassiveLocationScenario(EmitterPass, Scenario):
     """Straight level flight past a manoeuvring emitter on the ground.
 
     The scenario is from Pu and Qin, "Application of quasi Monte Carlo polymerization re-sampling
@@ -147,10 +189,6 @@ class PassiveLocationScenario(Scenario):
     acceleration. It is common to all runs, is accurate to 0.1 %, and defines relative errors.
 
     Attributes:
-        target_position: Emitter position at time 0, m, [2]. The height is 0.
-        target_velocity: Emitter velocity at time 0, m/s, [2].
-        aircraft_position: Aircraft position at time 0, m, [3].
-        aircraft_velocity: Aircraft velocity, m/s, [3].
         measurement_sd: Standard deviations of bearing and elevation, rad; their rates, rad/s; and
             Doppler rate, Hz/s, [5].
         ownship_position_sd: Position error of the aircraft's navigation, m, [3].
@@ -173,10 +211,6 @@ class PassiveLocationScenario(Scenario):
             velocity. `draw` raises it if the regime removes the first measurement.
     """
 
-    target_position: Sequence[float]
-    target_velocity: Sequence[float]
-    aircraft_position: Sequence[float]
-    aircraft_velocity: Sequence[float]
     measurement_sd: Sequence[float]
     ownship_position_sd: Sequence[float]
     carrier_frequency: float
@@ -192,22 +226,8 @@ class PassiveLocationScenario(Scenario):
     channel_names, input_type = PassiveLocation.channel_names, PlatformInputs
 
     def __post_init__(self) -> None:
-        sizes = {
-            "target_position": 2,
-            "target_velocity": 2,
-            "aircraft_position": 3,
-            "aircraft_velocity": 3,
-        }
-        sizes |= {"measurement_sd": 5, "ownship_position_sd": 3, "range_limits": 2}
-        for name, size in sizes.items():
-            values = getattr(self, name)
-            require(
-                len(values) == size and all(map(math.isfinite, values)),
-                f"scenario.{name}",
-                f"have {size} finite numbers",
-                list(values),
-                "Correct the list.",
-            )
+        super().__post_init__()
+        _require_lengths(self, measurement_sd=5, ownship_position_sd=3, range_limits=2)
         for name in ("carrier_frequency", "velocity_sd", "interval_s", "measurement_sd"):
             values = getattr(self, name)
             require(
@@ -232,13 +252,6 @@ class PassiveLocationScenario(Scenario):
             "be [nearest, farthest] with 0 < nearest < farthest",
             list(self.range_limits),
             "Correct the limits.",
-        )
-        require(
-            math.hypot(*self.aircraft_velocity[:2]) > 0.0,
-            "scenario.aircraft_velocity",
-            "have a horizontal component",
-            list(self.aircraft_velocity),
-            "Set an East or North velocity.",
         )
         require_ranges("scenario", self, steps="[1, inf]")
 

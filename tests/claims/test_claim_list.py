@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from functools import cache
-from pathlib import Path
 
 import pytest
-import yaml
 from config_cases import GROUPS
 
 from pfbench.claims.claim_lines import read_proofs
@@ -55,30 +53,10 @@ def test_each_factor_of_a_paper_touches_a_claim() -> None:
         assert list_factors(paper) - {"pair"} <= touched
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ("kind: best", r"kind must be one of better, much better, same, number"),
-        ("colour: red", r"must have other keys, got or missing \['colour'\]"),
-        ("mark: 'odd: x'", r"mark must begin with circular, vacuous, lost"),
-        ("id: C000-2", r"id must be unique, got C000-2"),
-    ],
-)
-def test_a_wrong_claim_is_told(change: str, message: str, tmp_path: Path) -> None:
-    row = {
-        "id": "C000-1",
-        "words": "a",
-        "section": "b",
-        "kind": "better",
-        "figure": "c",
-        "a": "sir",
-        "factors": [],
-    }
-    rows = [row | yaml.safe_load(change), row | {"id": "C000-2"}]
-    file = tmp_path / "claims.yaml"
-    file.write_text(yaml.safe_dump(rows))
-    with pytest.raises(ValueError, match=message):
-        read_printed_claims(file)
+def test_claims_have_a_kind_a_known_mark_and_a_name_of_their_own() -> None:
+    assert len({claim.id for claim in CLAIMS}) == len(CLAIMS)
+    assert {claim.kind for claim in CLAIMS} == set(KINDS)
+    assert {claim.mark.split(":")[0] for claim in CLAIMS} <= {"circular", "vacuous", "lost", ""}
 
 
 def test_where_a_decision_turns() -> None:

@@ -23,9 +23,7 @@ from pfbench.claims.claim_lines import (
     COLUMNS,
     list_dots,
     make_cell,
-    read_amendments,
-    read_objections,
-    read_paper_settings,
+    read_claim_data,
     read_plans,
     read_readings,
 )
@@ -173,7 +171,7 @@ def test_each_claim_has_comparisons_or_a_word_with_a_reason() -> None:
                 assert sides
                 assert all(side.filter in GROUPS["filter"] for side in sides), plan.claim.id
                 assert c.kind != "size" or 0 < c.printed < 1
-    for paper, settings in read_paper_settings().items():
+    for paper, settings in read_claim_data()["papers"].items():
         # no repair of the method of paper 003 is admitted
         assert set(settings["method"]) == set(COLUMNS[: 1 if paper == "003" else 2])
         assert set(settings.get("instead", {})) | set(settings.get("only", {})) <= set(
@@ -213,16 +211,15 @@ def test_each_cell_composes_and_builds_its_filter(paper: str) -> None:
             assert job.instantiate(config.values[group]) is not None, (cell, group)
 
 
-def test_wrong_entries_are_told(tmp_path: Path) -> None:
-    text = (ROOT / "pfbench" / "claims" / "claim_lines.yaml").read_text()
-    file = tmp_path / "claim_lines.yaml"
-    file.write_text(text.replace("metric: iterations", "metrics: iterations"))
-    check_refused(
-        [(r"004-C7 must have comparisons or a word.*metrics", lambda: read_plans(file))],
-        remedy=False,
-    )
-    file.write_text(re.sub(r"\n  C001-10:.*", "", text))
-    check_refused([(r"got or missing \['C001-10'\]", lambda: read_plans(file))], remedy=False)
+def test_no_key_of_a_line_is_ignored() -> None:
+    """A planted misspelling, such as `metrics`, would decide another quantity in silence."""
+    lines = read_claim_data()["claims"]
+    assert set(lines) == set(PLANS)
+    assert {key for line in lines.values() for key in line} == set(["compare", "windows", "toy", "method", "word", "why", "proved", "without"])  # fmt: skip
+    side = {"metric", "group", "component", "from", "to", "settled"}
+    known = {*side, *(f"b_{key}" for key in side), *["a", "b", "worlds", "printed", "level", "form", "pairs", "rows", "kind", "within"]}  # fmt: skip
+    rows = [row for line in lines.values() for row in line.get("compare", ())]
+    assert {key for row in rows for part in (row, *row.get("rows", ())) for key in part} <= known
 
 
 # stored values
@@ -413,9 +410,10 @@ def take_half(record: StoredValues, half: int) -> StoredValues:
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a cell of paper 001 have twelve runs."""
-    settings = {k: {**v, "runs": {"screen": 12, "centre": 14, "mover": 2}} for k, v in read_paper_settings().items()}  # fmt: skip
-    monkeypatch.setattr(claim_lines, "read_paper_settings", lambda: settings)
-    monkeypatch.setattr(claim_runs, "read_paper_settings", lambda: settings)
+    data, runs = read_claim_data(), {"screen": 12, "centre": 14, "mover": 2}
+    papers = {k: {**v, "runs": runs} for k, v in data["papers"].items()}
+    for module in (claim_lines, claim_runs):
+        monkeypatch.setattr(module, "read_claim_data", lambda: {**data, "papers": papers})
 
 
 @pytest.mark.slow
@@ -561,7 +559,7 @@ def test_the_page_says_what_is_not_run_and_at_what_price(tmp_path: Path) -> None
 
 def test_an_objection_stands_at_its_claims_and_in_the_list(tmp_path: Path) -> None:
     text = write_claims(tmp_path, tmp_path / "out").read_text()
-    for row in read_objections():
+    for row in read_claim_data()["disputed"]:
         assert set(row["claims"]) <= set(PLANS)
         assert text.count(row["what"].replace("'", "&#39;")) == len(row["claims"]) + 1
 
@@ -580,7 +578,7 @@ def test_what_a_claim_must_show_is_that_of_its_comparisons() -> None:
 
 
 def test_corrections_after_the_first_runs_are_on_the_page(tmp_path: Path) -> None:
-    _, amendments = read_amendments()
+    amendments = read_claim_data()["amended"]
     assert {name for row in amendments for name in row["claims"]} <= set(PLANS)
     page = write_claims(tmp_path, tmp_path / "out")
     for text in (page.read_text(), (page.parent / "report.md").read_text()):
@@ -591,7 +589,7 @@ def test_a_sentence_of_a_paper_names_proofs_of_that_paper() -> None:
     from pfbench.claims import read_proofs
 
     proofs = {proof.id: proof.paper for proof in read_proofs()}
-    for paper, settings in read_paper_settings().items():
+    for paper, settings in read_claim_data()["papers"].items():
         named = re.findall(r"P\d+", settings["sentence"])
         assert named
         assert {proofs[name] for name in named} == {paper}

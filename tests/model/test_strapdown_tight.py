@@ -11,14 +11,14 @@ from refusals import check_refused
 from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core.record import Record, map_inputs
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
 from pfbench.model.strapdown import StrapdownTight, StrapdownTotal, TightMemsInputs
 from pfbench.model.strapdown_tuning import RangeErrorModel, StrapdownTuning, TightTuning
 from pfbench.nav.ranging import ReceiverClock
-from pfbench.nav.strapdown import preintegrate
+from pfbench.nav.strapdown import PreintegratedImu, preintegrate
 
 MOTION = StrapdownTuning(
     gyro_density=2e-3,
@@ -70,9 +70,7 @@ def inputs(steps: int, duration: float = 0.25) -> TightMemsInputs:
     stated = 0.2 + normal(5, 1, steps, S).abs()
     gravity = torch.full((1, steps), 9.8, dtype=torch.float64)
     return TightMemsInputs(
-        *imu,
-        gravity,
-        spans.sum(-1),
+        PreintegratedImu(*imu, gravity, spans.sum(-1)),
         place / reach[..., None],
         reach,
         velocity,
@@ -96,7 +94,7 @@ def states(model: StrapdownTight, runs: int = 2, particles: int = 5) -> Tensor:
 
 
 def step(u: TightMemsInputs, t: int = 0) -> TightMemsInputs:
-    return TightMemsInputs(*(leaf[:, t] for leaf in u))
+    return map_inputs(lambda leaf: leaf[:, t], u)
 
 
 # what is seen
@@ -131,9 +129,7 @@ def test_single_precision_is_enough() -> None:
     model, u = StrapdownTight(BELIEVED), step(inputs(1))
     x = states(model)
     exact = model.observation(x, u).mean
-    single = (
-        model.float().observation(x.float(), TightMemsInputs(*(leaf.float() for leaf in u))).mean
-    )
+    single = model.float().observation(x.float(), map_inputs(lambda leaf: leaf.float(), u)).mean
     assert single.dtype == torch.float32
     # 500 m and 2 km/s in 24 bits, some roundings each
     assert (single - exact).abs()[..., :S].max() < 1e-3

@@ -21,7 +21,8 @@ from pfbench.report.board.entries import StudyFacts
 from pfbench.report.board.pack import build_pack, decide_parts, read_study
 from pfbench.report.journal.ratio_figures import render_headline
 from pfbench.report.options import ReportOptions
-from pfbench.report.study_page.page_writer import render_markdown, render_page
+from pfbench.report.page_kit import render_markdown
+from pfbench.report.study_page.page_writer import describe_page, list_study_blocks, render_page
 from pfbench.results.conditions import load_conditions
 
 RUNS, NOISE = 40, 0.3
@@ -63,7 +64,7 @@ def build(invented: Any, worlds: list[str], seed: int = 1) -> dict[str, Any]:
 def test_each_world_has_its_own_sentence_and_table_in_its_own_order(invented: Any) -> None:
     pack = build(invented, list(LEVELS))
     assert [order["world"] for order in pack["world_orders"]] == list(LEVELS)
-    text = render_markdown(pack)
+    text = render_markdown(list_study_blocks(describe_page(pack)))
     firsts = [line.split("|")[2].strip() for line in text.splitlines() if line.startswith("| 1 | ")]
     assert firsts[0] == "EKF"
     assert firsts[1] in ("UKF", "RPF")
@@ -99,7 +100,7 @@ def test_the_picture_has_a_panel_for_each_world(invented: Any) -> None:
 def test_one_world_or_many_have_one_table(invented: Any, worlds: list[str]) -> None:
     pack = build(invented, worlds)
     assert pack["world_orders"] == []
-    assert render_markdown(pack).count("| # | filter |") == 1
+    assert render_markdown(list_study_blocks(describe_page(pack))).count("| # | filter |") == 1
 
 
 def test_a_filter_that_ties_with_the_first_is_rarely_called_worse(invented: Any) -> None:

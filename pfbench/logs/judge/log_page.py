@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -14,6 +15,7 @@ from matplotlib.figure import Figure
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.logs.doctor.finding import Finding, LogDiagnosis, Picture
 from pfbench.report import writers
+from pfbench.report.page_kit import Block, write_page
 from pfbench.results.plotting import FigureSpec, format_slug, stacked_axes
 
 _ABOUT = {
@@ -48,19 +50,28 @@ def write_log_page(
             _describe(number, finding, folder, formats)
             for number, finding in enumerate(diagnosis.findings, 1)
         ]
-        context = {
-            "name": source["name"],
-            "findings": findings,
-            "facts": [
-                {"name": key, "value": f"{value:.4g}" if isinstance(value, float) else json.dumps(value)}
-                for key, value in sorted(diagnosis.facts.items())
-            ],
-            "settings": suggested,
-            "mends": bool(diagnosis.settings),
-            "remaining": ", ".join(dict.fromkeys(diagnosis.remaining)),
-            "command": describe_run(folder.path, source["root"]),
-        }  # fmt: skip
-        return writers.render_template("log_page", folder, context, Path(__file__).parent)
+        mends = (
+            "The file scenario/suggested.yaml mends what has a remedy by keys."
+            if diagnosis.settings
+            else "No finding has a remedy by keys."
+        )
+        remaining = ", ".join(dict.fromkeys(diagnosis.remaining))
+        blocks = [
+            Block("title", f"Log {source['name']}"),
+            Block("text", f"{len(findings)} findings. Each states its statistic, threshold, evidence and remedy."),
+            Block("heading", "Findings"),
+            Block("text", "" if findings else "No check speaks."),
+            *itertools.chain.from_iterable(findings),
+            Block("heading", "Suggested settings"),
+            Block("text", mends + (f" Left with these settings: {remaining}." if remaining else "")),
+            Block("code", suggested),
+            Block("code", describe_run(folder.path, source["root"])),
+            Block("heading", "Facts"),
+            Block("terms", [
+                (key, f"{value:.4g}" if isinstance(value, float) else json.dumps(value)) for key, value in sorted(diagnosis.facts.items())
+            ]),
+        ]  # fmt: skip
+        return write_page(folder, f"Log {source['name']}: findings", blocks)
 
 
 def describe_run(folder: Path, root: Path) -> str:
@@ -106,27 +117,25 @@ def _plain(value: Any) -> Any:
     return float(value) if isinstance(value, float) else value
 
 
-def _describe(number: int, finding: Finding, folder: RecordedFolder, formats: Sequence[str]) -> dict[str, Any]:  # fmt: skip
-    """Return what a template shows of a finding."""
-    settings = finding.settings
-    drawing = None
+def _describe(number: int, finding: Finding, folder: RecordedFolder, formats: Sequence[str]) -> list[Block]:  # fmt: skip
+    """Return the blocks of a finding."""
+    drawings: list[dict[str, Any]] = []
     if finding.picture is not None:
         caption = f"{finding.check}: {finding.evidence}."
         figure = FigureSpec(f"{number:02d}_{format_slug(finding.check)}", caption, partial(_draw, finding.picture))  # fmt: skip
-        (drawing,) = writers.write_figures([figure], "finding", folder, formats)
-    return {
-        "check": finding.check,
-        "level": finding.level,
-        "about": _ABOUT[finding.level],
-        "numbers": f"{finding.statistic:.4g} {finding.unit}, threshold {finding.threshold:g}",
-        "evidence": finding.evidence,
-        "remedy": finding.remedy,
-        "explanations": list(finding.explanations),
-        "settings": yaml.safe_dump(_plain({"scenario": settings}), default_flow_style=None, width=100).rstrip()
-        if settings
-        else "",
-        "drawing": drawing,
-    }  # fmt: skip
+        drawings = writers.write_figures([figure], "finding", folder, formats)
+    mending = yaml.safe_dump(
+        _plain({"scenario": finding.settings}), default_flow_style=None, width=100
+    ).rstrip()
+    return [
+        Block("part", f"{number}. {finding.check} ({finding.level})"),
+        Block("alarm" if finding.level == "refuse" else "text", f"{finding.evidence}."),
+        Block("text", f"Statistic: {finding.statistic:.4g} {finding.unit}, threshold {finding.threshold:g}. {_ABOUT[finding.level]}"),
+        Block("list", [f"It can be: {text}" for text in finding.explanations]),
+        Block("text", finding.remedy and f"{finding.remedy}."),
+        Block("code", mending if finding.settings else ""),
+        Block("figures", drawings),
+    ]  # fmt: skip
 
 
 def _draw(picture: Picture) -> Figure:

@@ -23,6 +23,7 @@ from pfbench.logs.judge.pair_verdicts import PairVerdict, cap_of
 from pfbench.logs.judge.reference_track import LEAST_SHARE
 from pfbench.logs.judge.sequence_results import SequenceResults
 from pfbench.report import writers
+from pfbench.report.page_kit import Block, with_heading, write_page
 from pfbench.results.conditions import component_groups
 from pfbench.results.metrics import compute_metric, data_by_scope, metric_definitions, table_columns
 from pfbench.results.plotting import INSTANTS, FigureSpec, stacked_axes, use_log_if_wide
@@ -51,16 +52,10 @@ def write_judgement(
         "verdicts": tabulate_verdicts(judgement.pairs),
         "files": files_table(judgement.sequences),
     }
-    context: dict[str, Any] = {
-        "name": name,
-        "head": describe_material(judgement),
-        "summary": list(describe_judgement(judgement)),
-        "notes": list(describe_notes(judgement, options)),
-        "limits": list(describe_limits(judgement)),
-        "definitions": [d for d in metric_definitions() if d.startswith(("CRPS", "coverage"))],
-        "sensors": "CRPS [m]" in tables["accuracy"],
-        **tables,
-    }
+    has_sensors = "CRPS [m]" in tables["accuracy"]
+    definitions = [
+        d for d in metric_definitions() if has_sensors and d.startswith(("CRPS", "coverage"))
+    ]
     text = json.dumps(decisions_as_json(judgement, options), indent=1, allow_nan=False)
     with RecordedFolder(Path(out) / name) as folder:
         folder.write("decisions.json", text + "\n")
@@ -68,8 +63,25 @@ def write_judgement(
             if len(content):
                 writers.write_table(folder, table, content)
         figures = error_figures(judgement.sequences)
-        context["drawings"] = writers.write_figures(figures, "judge", folder, formats)
-        return writers.render_template("judge", folder, context, Path(__file__).parent)
+        blocks = [
+            Block("title", f"Trajectories of programs: {name}"),
+            Block("text", describe_material(judgement)),
+            Block("heading", "Summary"),
+            *(Block("alarm", sentence) for sentence in describe_notes(judgement, options)),
+            Block("list", list(describe_judgement(judgement))),
+            *with_heading(
+                Block("heading", "Errors over time"), Block("figures", writers.write_figures(figures, "judge", folder, formats))
+            ),
+            Block("heading", "Accuracy"),
+            Block("table", tables["accuracy"]),
+            *with_heading(Block("heading", "Verdicts"), Block("table", tables["verdicts"])),
+            Block("heading", "Reach of the verdicts"),
+            Block("list", list(describe_limits(judgement))),
+            Block("heading", "Files"),
+            Block("table", tables["files"]),
+            *with_heading(Block("heading", "Definitions"), Block("list", definitions)),
+        ]  # fmt: skip
+        return write_page(folder, f"Trajectories of programs: {name}", blocks)
 
 
 def decisions_as_json(judgement: Judgement, options: JudgeOptions) -> dict[str, Any]:
@@ -84,10 +96,7 @@ def _to_dict(pair: PairVerdict) -> dict[str, Any]:
     """Return a verdict in JSON types; a number that is not finite becomes text."""
     values = {**pair._asdict(), **pair.verdict.to_row(), "sequences": list(pair.sequences)}
     del values["verdict"]
-    return {
-        key: str(value) if isinstance(value, float) and not math.isfinite(value) else value
-        for key, value in values.items()
-    }
+    return writers.to_json_types(values)
 
 
 def describe_material(judgement: Judgement) -> str:

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from pfbench.files.recorded_folder import RecordedFolder
 from pfbench.report import writers
+from pfbench.report.page_kit import Block, with_heading, write_page
 from pfbench.results.plotting import FigureSpec, format_slug, stacked_axes
 
 if TYPE_CHECKING:
@@ -122,15 +123,22 @@ def write_track_page(
         if estimate.centre is not None:
             folder.write("track.gpx", estimate.to_gpx())
             folder.write("track.kml", estimate.to_kml())
-        context = {
-            "name": estimate.name,
-            "lines": describe_track(estimate),
-            "notes": list(dict.fromkeys(estimate.notes)),
-            "figures": writers.write_figures(_list_figures(estimate), "track", folder, formats),
-            "files": [f"{format_slug(name)}.csv" for name in estimate.tracks()],
-            "has_place": estimate.centre is not None,
-        }
-        return writers.render_template("track_page", folder, context, Path(__file__).parent)
+        files = [f"{format_slug(name)}.csv" for name in estimate.tracks()]
+        no_place = "No GPX and KML: the log has local positions. Set scenario.origin=[lat_deg,lon_deg,h_m]."
+        head = "Errors are not known without a reference. Distances to held-out fixes contain the errors of these fixes."
+        blocks = [
+            Block("title", f"Track of {estimate.name}"),
+            Block("text", head),
+            Block("heading", "What the log says"),
+            Block("list", describe_track(estimate)),
+            Block("heading", "Pictures"),
+            Block("figures", writers.write_figures(_list_figures(estimate), "track", folder, formats)),
+            Block("heading", "Files"),
+            Block("links", files if estimate.centre is None else [*files, "track.gpx", "track.kml"]),
+            Block("text", no_place if estimate.centre is None else ""),
+            *with_heading(Block("heading", "Notes"), Block("list", list(dict.fromkeys(estimate.notes)))),
+        ]  # fmt: skip
+        return write_page(folder, f"Track of {estimate.name}", blocks)
 
 
 def _list_figures(estimate: TrackEstimate) -> list[FigureSpec]:

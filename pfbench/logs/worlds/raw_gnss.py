@@ -412,7 +412,7 @@ class RecordedWalk(RecordedScenario):
         )
         record = Record(
             y,
-            TightMemsInputs(*motion.record.u, *make_sky_inputs(gnss_log)),
+            TightMemsInputs(motion.record.u, *make_sky_inputs(gnss_log)),
             self._draw_start(motion.record.start, draws),
         )
         azimuth, elevation = (

@@ -163,7 +163,8 @@ def describe_versions(conditions: Sequence[Condition]) -> dict[str, str]:
 def describe_uncommitted(conditions: Sequence[Condition]) -> str:
     """State how many jobs were computed by code that no commit has; empty if none was."""
     metadata = [job.meta for c in conditions for job in c.jobs]
-    number = sum(provenance.is_uncommitted(meta) for meta in metadata)
+    commits = [str(meta.get("versions", {}).get("commit") or "") for meta in metadata]
+    number = sum(commit.endswith("-dirty") for commit in commits)
     return f"{number} of {len(metadata)} jobs are of uncommitted code." if number else ""
 
 

@@ -232,11 +232,6 @@ class PageFormat(NamedTuple):
         }
 
 
-def _millimetres(value: float) -> float:
-    """Convert millimetres to TeX points."""
-    return value * _POINTS_PER_MM
-
-
 def _own_geometry(text: float, gap: float, height: float) -> str:
     """Return the package that sets the widths of an article."""
     return (
@@ -246,8 +241,8 @@ def _own_geometry(text: float, gap: float, height: float) -> str:
 
 
 _TIMES = r"\usepackage{mathptmx}"
-_ELSEVIER = (_millimetres(90), _millimetres(190), 690.0)
-_SPRINGER = (_millimetres(84), _millimetres(174), 660.0)
+_ELSEVIER = (90 * _POINTS_PER_MM, 190 * _POINTS_PER_MM, 690.0)
+_SPRINGER = (84 * _POINTS_PER_MM, 174 * _POINTS_PER_MM, 660.0)
 JOURNALS = {
     "ieee": PageFormat(
         "ieee", 252.0, 516.0, 690.0, True, 8.0, 7.0,

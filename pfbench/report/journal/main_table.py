@@ -77,7 +77,9 @@ def _make_table(pack: Pack, worlds: Sequence[str], regime: str, name: str) -> La
 
 def _make_head(pack: Pack, columns: Sequence[ErrorColumn]) -> list[list[LatexCell]]:
     """Build the head: the names of worlds with units, in lines of about equal width."""
-    lines = [_break_name(_name_world(pack, column)) for column in columns]
+    lines = [
+        _break_name(f"{name_of(pack, 'worlds', c.world)}{f' ({c.unit})' if c.unit else ''}") for c in columns
+    ]  # fmt: skip
     upper = [text_cell(""), *(text_cell(line[0], span=2) for line in lines)]
     lower = [text_cell("Method"), *(text_cell(line[1], span=2) for line in lines)]
     return [upper, lower] if any(line[0] for line in lines) else [lower]
@@ -88,11 +90,6 @@ def _break_name(name: str) -> tuple[str, str]:
     words = name.split(" ")
     breaks = [(" ".join(words[:i]), " ".join(words[i:])) for i in range(1, len(words))]
     return min(breaks, key=lambda lines: max(map(len, lines)), default=("", name))
-
-
-def _name_world(pack: Pack, column: ErrorColumn) -> str:
-    """Return the name of the world of a column with its unit."""
-    return f"{name_of(pack, 'worlds', column.world)}{f' ({column.unit})' if column.unit else ''}"
 
 
 def _error_cells(columns: Sequence[ErrorColumn], key: str) -> list[LatexCell]:

@@ -26,9 +26,18 @@ from pfbench.report.overview.tables import (
     list_world_notes,
     tell_story,
 )
+from pfbench.report.page_kit import (
+    Block,
+    make_rows,
+    name_generator,
+    plain,
+    render_markdown,
+    render_template,
+    with_heading,
+)
 from pfbench.report.papers.figures import list_paper_pages
 from pfbench.report.study_page.page_writer import describe_page_knobs
-from pfbench.report.writers import format_csv, format_data_address, template_environment
+from pfbench.report.writers import format_csv, format_data_address
 from pfbench.results.conditions import parse_label
 from pfbench.results.looks import find_looks
 from pfbench.results.paper_block import read_paper_block
@@ -92,17 +101,54 @@ def render_overview(
         "decided": sum(pair.verdict.word in ("better", "worse") for pair in overview.pairs),
         "papers": list_paper_pages(overview.methods),
         "board": BOARD_PAGE,
-        "css": Markup(
-            "\n".join(
-                path.read_text(encoding="utf-8")
-                for path in (_HERE.parent / "style.css", _HERE / "page.css")
-            )
-        ),
+        "title": f"{pack['title']} – pfbench",
     }
-    for kind, name in (("html", "index.html"), ("md", "report.md")):
-        environment = template_environment(_HERE, is_html=kind == "html")
-        files[name] = environment.get_template(f"page.{kind}.jinja").render(context)
+    files["index.html"] = render_template(_HERE, context)
+    files["report.md"] = render_markdown(list_overview_blocks(context))
     return files
+
+
+def list_overview_blocks(page: Mapping[str, Any]) -> list[Block]:
+    """List the blocks of report.md."""
+    pack, overview = page["pack"], page["overview"]
+    printed = " The methods are repaired where a printed form fails; as printed they have a table in index.html."
+    heads = (
+        "method", "in one line", "better than the best Kalman filter", "equal to it", "not decided", "worse",
+        "time of a step / that of the best Kalman filter, median over worlds (range); / that of SIR",
+    )  # fmt: skip
+    columns = ("name", "is", "wins", "equal", "open", "loses", "time")
+    return [
+        Block("title", pack["title"]),
+        Block("text", page["headline"]),
+        Block("text", page["setting"] + printed * page["has_printed"]),
+        Block("text", page["foreign_knobs"]),
+        Block("text", Markup("![Ratio of the error of each method to that of the best Kalman filter, in each world](heat_map.svg)")),
+        Block("text", Markup("![Worlds in which each method is better and worse than each other](matrices.svg)")),
+        *with_heading(
+            Block("text", "Before you quote a number of these worlds:"), Block("list", [f"{name}: {text}." for name, text in page["notes"]])
+        ),
+        make_rows(heads, [[story[name] for name in columns] for story in page["stories"]]),
+        Block("text", "†: not shown to be better than every single Kalman filter of that world."),
+        *with_heading(
+            Block("text", "The figures of the papers from our runs, with the numbers that the papers print as crosses:"),
+            Block("list", [Markup(f"[{plain(p['paper'])}](../{p['study']}/report.md): {plain(p['figures'])}") for p in page["papers"]]),
+        ),
+        Block("text", (
+            f"{page['decided']} of {len(overview.pairs)} comparisons of two methods in a world are decided. Wilcoxon's signed-rank test, "
+            f"the t test of the mean without {page['trim']} at each end and the sign test reject and agree in sign, each with Holm's "
+            "correction. Each world is a family (level 5 %), as on its page. It has all filters against the best Kalman filter, the UKF "
+            "and the baseline. It also has methods with the baselines of their papers, and all pairs of methods. Ratios are those of "
+            "Hodges and Lehmann. Equal: the simultaneous interval is between 1/1.05 and 1.05. Loses track: fewer than 80 % of runs keep "
+            "it, by an exact binomial test with Holm's correction over the filters of a world. Better than every single Kalman filter: "
+            "the largest p value of all three tests against each of them, with Holm's correction over all cells."
+        )),
+        *(Block("text", f"Not on this page: {name}, since {reason}") for name, reason in overview.left_out.items()),
+        *(Block("text", f"Not on this page: {text}") for text in page["failures"]),
+        Block("text", Markup(
+            "All filters and noise regimes: [worlds.md](worlds.md). Numbers: cells.csv and pairs.csv, written by "
+            f"`pfbench report study={plain(pack['study'])}`. {plain(name_generator(pack))}."
+        )),
+    ]  # fmt: skip
 
 
 def choose_level(overviews: Mapping[TabKey, Overview]) -> TabKey:

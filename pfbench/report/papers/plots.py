@@ -207,11 +207,6 @@ def select_valid(result: store.JobResult, values: np.ndarray) -> np.ndarray:
     return values[~result.data["lost"]].astype(np.float64)
 
 
-def average_over_time(values: np.ndarray) -> np.ndarray:
-    """Compute the mean over time of each run, [n]."""
-    return error_measures.mean_per_run(values, np.zeros(len(values), dtype=bool))
-
-
 # --------------------------------------------------------------------------------------------------
 # Curves, points, scales and legends of all plots.
 

@@ -25,6 +25,7 @@ from pfbench.results.plotting import (
     line_styles,
 )
 from pfbench.results.step_times import StepTimes
+from pfbench.stats.error_measures import mean_per_run
 
 _FIRST = (
     " Dashed black: 80 % of runs before correction, at the first step. "
@@ -342,7 +343,7 @@ def _make_experiment_figure(
     source: PaperFigureInput, values: Sequence[Mapping[str, np.ndarray]], label: str, quantity: str
 ) -> FigureSpec:
     """Return the figure of a mean over time of each run, by experiment."""
-    means = [{n: plots.average_over_time(v) for n, v in runs.items()} for runs in values]
+    means = [{n: mean_per_run(v, np.zeros(len(v), dtype=bool)) for n, v in runs.items()} for runs in values]  # fmt: skip
     text = f"{source.format_head(*source.data)}: {quantity}, by experiment. "
     text += source.describe_runs(*source.data, has_curves=False)
     columns = _arrange_experiments(source, means)

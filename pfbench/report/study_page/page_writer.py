@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import base64
 import gzip
+import itertools
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from decimal import ROUND_HALF_UP, Decimal
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,17 @@ from markupsafe import Markup, escape
 from pfbench.report.board.recorded_units import describe_records, list_questions
 from pfbench.report.journal.study_pack import name_of
 from pfbench.report.methods_text import write_methods
+from pfbench.report.page_kit import (
+    Block,
+    make_rows,
+    name_generator,
+    plain,
+    render_markdown,
+    render_template,
+    with_heading,
+)
 from pfbench.report.papers.figures import list_page_figures
-from pfbench.report.writers import DASH, format_short, template_environment
+from pfbench.report.writers import DASH, format_short
 from pfbench.results.conditions import drop_settings
 from pfbench.results.looks import describe_foreign_knobs, find_stored_world
 
@@ -56,11 +66,12 @@ def render_page(pack: Mapping[str, Any], name: str = "index.html") -> dict[str, 
         pack: Data of the page.
         name: Name of the file of the page.
     """
-    pack = {**dict.fromkeys(_OPTIONAL, ()), **pack}
-    pack["budgets"] = offer_budgets(pack)
+    page = describe_page(pack)
+    page["pack"] = pack = {**page["pack"], "budgets": offer_budgets(page["pack"])}
     names = {look["key"]: look["name"] for look in pack["filters"]}
     context = {
-        **_describe_page(pack),
+        **page,
+        "title": f"{pack['title']} – pfbench",
         "methods": write_methods(pack),
         "notes": [{**note, "name": names[note["filter"]]} for note in pack["filter_notes"]],
         "files": _group_files(pack["downloads"]),
@@ -69,40 +80,112 @@ def render_page(pack: Mapping[str, Any], name: str = "index.html") -> dict[str, 
             for key, anchor, title in _SECTIONS
             if pack[key] and not (anchor == "worlds" and len(pack["cells"]) < 2)
         ],
-        "css": Markup(
-            "\n".join(
-                path.read_text(encoding="utf-8")
-                for path in (_HERE.parent / "style.css", _HERE / "page.css")
-            )
-        ),
         "colours": Markup(_format_colours(pack["filters"])),
         "script": Markup("\n".join(_read_script(script) for script in _SCRIPTS)),
         "data": "",
     }
-    html = template_environment(_HERE, is_html=True).get_template("page.html.jinja")
     values = {key: value for key, value in pack.items() if key not in _STATIC}
     script_data = {**values, "opening": list(find_opening(pack))}
-    data = encode_pack(script_data, PAGE_BYTES - len(html.render(context).encode()))
+    data = encode_pack(script_data, PAGE_BYTES - len(render_template(_HERE, context).encode()))
     markdown = "report.md" if name == "index.html" else f"{Path(name).stem}.md"
     return {
-        name: html.render({**context, "data": Markup(data)}),
-        markdown: render_markdown(pack),
+        name: render_template(_HERE, {**context, "data": Markup(data)}),
+        markdown: render_markdown(list_study_blocks(page)),
     }
 
 
-def render_markdown(pack: Mapping[str, Any]) -> str:
-    """Render the page of a study as Markdown, one screen.
+def list_study_blocks(page: Mapping[str, Any]) -> list[Block]:
+    """List the blocks of `describe_page` as Markdown, one screen."""
+    pack, opening = page["pack"], page["opening"]
+    heads = [
+        "#",
+        "filter",
+        "ratio",
+        "verdict",
+        "track kept",
+        "coverage of 90 % intervals",
+        "ms/step",
+    ]
+    heads += ["ratio of ms/step"] * opening["has_costs"]
+    of_pairs = ("pair", "ratio", f"simultaneous {page['level']} % interval", "verdict")
+    pairs = [
+        [pair[name] for name in ("pair", "effect", "interval", "word")] for pair in page["planned"]
+    ]
+    headline = pack.get("headline", "")
+    picture = Markup(f"![{plain(headline)}](headline.svg)") if headline else ""
+    return [
+        Block("title", pack["title"]),
+        *(Block("text", text) for text in opening["texts"]),
+        *(Block("text", opening[name]) for name in ("warnings", "overconfidence", "foreign_knobs", "small_print")),
+        Block("text", picture),
+        *itertools.chain.from_iterable(
+            (Block("text", table["caption"]), make_rows(heads, [_list_cells(row)[: len(heads)] for row in table["rows"]]))
+            for table in opening["tables"]
+        ),
+        *_list_figures(page["figures"]),
+        *with_heading(Block("text", "Compared in advance, each method with its own baselines:"), make_rows(of_pairs, pairs)),
+        *_list_records(page),
+        *with_heading(Block("text", "Failed jobs:"), Block("list", [
+            f"{failure['key']}: {' / '.join(failure['choices'][name] for name in ('scenario', 'noise', 'filter'))}: {failure['message']}"
+            for failure in pack["failures"]
+        ])),
+        *with_heading(Block("text", "Modelling choices:"), Block("list", [f"{choice['text']} ({choice['filters']})" for choice in page["choices"]])),
+        Block("text", Markup(
+            "Figures, single runs, methods, provenance and downloads: index.html, written by "
+            f"`pfbench report study={plain(pack['study'])}`. {plain(name_generator(pack))}."
+        )),
+    ]  # fmt: skip
 
-    Args:
-        pack: Data of the page.
-    """
-    pack = {"headline": "", "failures": (), "choices": (), "paper_figures": (), **pack}
-    template = template_environment(_HERE, is_html=False).get_template("report.md.jinja")
-    return template.render(_describe_page(pack))
+
+def _list_cells(row: Mapping[str, Any]) -> list[str]:
+    """List the cells of a row in Markdown."""
+    name = f"{row['name']}{' (proposed)' if row['proposed'] else ''}"
+    ratio, cost = f"{row['ratio']} {row['interval']}", f"{row['cost']} {row['cost_interval']}"
+    return [
+        row["rank"],
+        name,
+        ratio,
+        row["words"],
+        row["track"],
+        row["calibration"],
+        row["ms"],
+        cost,
+    ]
 
 
-def _describe_page(pack: Mapping[str, Any]) -> dict[str, Any]:
+def _list_figures(figures: Sequence[Mapping[str, Any]]) -> Iterable[Block]:
+    """List the figures of the paper, or links to the studies that have them."""
+    blocks = itertools.chain.from_iterable(
+        [Block("text", Markup(f"{plain(f['title'])}: [{plain(f['study'])}](../{f['study']}/report.md)"))]
+        if "study" in f
+        else [Block("text", Markup(f"![{plain(f['alt'])}]({f['file']})")), Block("text", f["caption"])]
+        for f in figures
+    )  # fmt: skip
+    end = Block("heading", "Comparisons and choices")
+    return with_heading(Block("heading", "Figures of the paper"), *blocks, end) if figures else ()
+
+
+def _list_records(page: Mapping[str, Any]) -> Iterable[Block]:
+    """List what the study says of recordings."""
+    heads = ("against {}", "starts and random numbers", "blocks of time", "drives")
+    blocks = itertools.chain.from_iterable(
+        (
+            Block("text", Markup(f"{plain(record['title'])}. {plain(record['source'])}")),
+            make_rows(
+                [head.format(record["baseline"]) for head in heads],
+                [[row[name] for name in ("name", "starts", "blocks", "drives")] for row in record["rows"]],
+            ),
+        )
+        for record in page["records"]
+    )  # fmt: skip
+    return with_heading(
+        Block("heading", "Recorded data"), Block("list", page["questions"]), *blocks
+    )
+
+
+def describe_page(pack: Mapping[str, Any]) -> dict[str, Any]:
     """Return what both forms of a page show."""
+    pack = {**dict.fromkeys(_OPTIONAL, ()), **pack}
     return {
         "pack": pack,
         "opening": describe_opening(pack),
@@ -202,7 +285,12 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "sentence": format_sentence(view["sentence"]),
         "worlds": [format_sentence(order["sentence"]) for order in orders],
-        "texts": (texts := [_remove_marks(order["sentence"]) for order in orders or [view]]),
+        "texts": (
+            texts := [
+                source["sentence"].replace("[[", "").replace("]]", "")
+                for source in orders or [view]
+            ]
+        ),
         "text": "\n".join(texts),
         "small_print": everywhere["small_print"],
         "warnings": " ".join(pack.get("warnings", ())),
@@ -255,11 +343,6 @@ def describe_overconfidence(pack: Mapping[str, Any]) -> str:
     others = len(notes) - len(counts)
     end = f" and {others} other {'filter' if others == 1 else 'filters'}" if others else ""
     return f"Severely overconfident runs: {', '.join(counts)}{end}."
-
-
-def _remove_marks(text: str) -> str:
-    """Return a sentence without the brackets of names."""
-    return text.replace("[[", "").replace("]]", "")
 
 
 def _heads(baseline: str) -> list[dict[str, str]]:

@@ -218,8 +218,9 @@ OUTAGES = ((130.0, 160.0), (200.0, 230.0), (290.0, 320.0))
 
 def car(fix_sd: list[float], known: Constraints, **changes: Any) -> UserLog:
     tuning = StrapdownTuning(
-        2e-3, 2e-2, 1e-5, 2e-4, [max(a, 0.05) for a in fix_sd], None, [1.0, 1.0, 5.0], [0.2] * 3,
-        [1.5] * 3, 0.5, 0.2,
+        gyro_density=2e-3, accelerometer_density=2e-2, gyro_bias_walk=1e-5, accelerometer_bias_walk=2e-4,
+        position_sd=[max(a, 0.05) for a in fix_sd], velocity_sd=None, attitude_sd_deg=[1.0, 1.0, 5.0],
+        initial_velocity_sd=[0.2] * 3, initial_position_sd=[1.5] * 3, gyro_bias_sd_deg_s=0.5, accelerometer_bias_sd=0.2,
     )  # fmt: skip
     return UserLog(
         DATA, "car_rtk_mems", tuning, FixReceiver(position_sd=fix_sd), 0.5, 40.0, 380.0,

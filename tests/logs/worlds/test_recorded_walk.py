@@ -20,14 +20,14 @@ from torch import Tensor
 
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream, RandomStream
-from pfbench.core.record import Episode, MeasurementChannels
+from pfbench.core.record import Episode, MeasurementChannels, map_inputs, name_inputs
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
 from pfbench.job.config import compose_tree
 from pfbench.logs.sky.raw_gnss import RawGnss, RawGnssTuning
 from pfbench.logs.worlds.raw_gnss import RawGnssReceiver, RecordedWalk
-from pfbench.model.strapdown import StrapdownTight, TightMemsInputs
+from pfbench.model.strapdown import StrapdownTight
 from pfbench.model.strapdown_tuning import RangeErrorModel, TightTuning
 from pfbench.nav import earth
 from pfbench.nav.orbits import WalkerConstellation, azimuth_elevation, receive_signals
@@ -151,14 +151,14 @@ def test_low_and_missing_satellites_are_not_seen_and_harm_nothing(
     assert len(set(spelled)) == satellites
     assert all(re.fullmatch(r"[GEW]\d\d", name) for name in spelled)
     assert float(torch.rad2deg(episode.datasheet["elevation"]).nan_to_num(90.0).min()) >= 20.0
-    assert all(torch.isfinite(leaf).all() for leaf in episode.record.u)
+    assert all(torch.isfinite(leaf).all() for _, leaf in name_inputs(episode.record.u))
     each = torch.isnan(episode.record.y[0, 3::4])
     assert torch.equal(each.any(-1).nonzero()[:, 0], torch.arange(8, 12))  # 9 s to 12 s
     assert torch.equal(each[:, :satellites], each[:, satellites:])
     model = StrapdownTight(BELIEVED)
     record = episode.record
     short = record._replace(
-        y=record.y[:, 28:44], u=TightMemsInputs(*(leaf[:, 28:44] for leaf in record.u))
+        y=record.y[:, 28:44], u=map_inputs(lambda leaf: leaf[:, 28:44], record.u)
     )
     estimate = run_filter(
         GaussianFilter(TaylorLinearisation()), model, short, PhiloxStream(1, numbers(0))
