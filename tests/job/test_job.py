@@ -431,8 +431,8 @@ REFUSED = {
     "seed=99999999999": "seed must be from 0 to 2**32 - 1, got 99999999999. Set seed=1.",
     "seed=-1": "seed must be a whole number of at least 0, got -1. Set seed=1.",
     "filter.particles=0": "filter.particles must be a whole number of at least 2, got 0. Use 2 or more, without a point or exponent.",
-    "particles=0": "filter.particles must be a whole number of at least 2, got 0. Use 2 or more, without a point or exponent.",
-    "particles=many": "filter.particles must be a whole number of at least 2, got 'many'. Use 2 or more",
+    "particles=0": "particles must be a whole number of at least 2, got 0. Set particles=500.",
+    "particles=many": "particles must be a whole number of at least 2, got many. Set particles=500.",
     "scenario.steps=0": "scenario.steps must be a whole number of at least 1, got 0. Change",
 }
 
