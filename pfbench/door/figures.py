@@ -69,7 +69,7 @@ def select_condition(conditions: Sequence[Condition], choice: Mapping[str, Any])
 def _draw_cost(ax: Axes, pack: Pack, condition: Condition, choice: Mapping[str, Any]) -> None:
     """Draw the median error of each filter against its time per step."""
     require(
-        all(note["is_timed"] for note in pack["filter_notes"]),
+        any(row["ms"] for row in next(iter(pack["views"].values()))["rows"]),
         "a cost",
         "be a time after warm-up steps",
         "jobs of an earlier version without",

@@ -271,7 +271,7 @@ def find_witness(rows: pd.DataFrame, stored: pd.DataFrame) -> str:
     stored = stored[stored["filter"] != _NO_WITNESS]
     both = _pair(rows, stored)
     if both.empty:
-        fastest = stored.groupby("filter", observed=True)["ms"].median().idxmin()
+        fastest = stored.groupby("filter", observed=True)["ms"].median().fillna(np.inf).idxmin()
         raise ValueError(
             f"a filter of the published study must run again as a witness. Add filter={parse_label(str(fastest))[0]} to your study"
         )

@@ -130,7 +130,7 @@ def build_pack(
         "bibtex": "@misc{a,\n title = {A},\n}",
         "filter_notes": [
             {"filter": key, "particles": "100", "is_exact": i % 2 == 0, "runs": runs, "lost": 0, "diverged": None,
-             "has_bounded_weights": (True, False, None)[i % 3], "collapsed": i, "severely_overconfident": 0, "is_timed": True} for i, key in enumerate(keys)
+             "has_bounded_weights": (True, False, None)[i % 3], "collapsed": i, "severely_overconfident": 0} for i, key in enumerate(keys)
         ],
         "choices": [{"text": "the noise is inflated", "filters": "all filters"}],
         "provenance": [["commit", "0" * 7], ["device", "cpu"]],

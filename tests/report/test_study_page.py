@@ -114,12 +114,14 @@ def test_first_lines_name_severely_overconfident_runs(tmp_path):
 
 
 def test_a_page_tells_exact_filters_from_bounded_weights(tmp_path):
-    """A dash for what an older result does not state, and for a page stored before there was the flag."""
-    pack = page_packs.build_pack(6)
-    assert 'id="cost"' in page_packs.write(pack, tmp_path).read_text()
-    del pack["filter_notes"][4]["has_bounded_weights"], pack["filter_notes"][4]["is_timed"]
-    page = page_packs.write(pack, tmp_path).read_text()
-    assert ('id="cost"' in page, "<code>pfbench cost study=" in page) == (False, True)
+    """A dash for what an older result does not state; no times where they hold the first steps of a process."""
+    pack, parts = page_packs.build_pack(6), ('id="cost"', ">ms/step<", "<code>pfbench cost study=")
+    assert [part in page_packs.write(pack, tmp_path).read_text() for part in parts] == [True, True, False]  # fmt: skip
+    del pack["filter_notes"][4]["has_bounded_weights"]
+    page = page_packs.write({**pack, "views": {
+        key: {**view, "rows": [{**row, "ms": None} for row in view["rows"]]} for key, view in pack["views"].items()
+    }}, tmp_path).read_text()  # fmt: skip
+    assert [part in page for part in parts] == [False, False, True]
     rows = re.findall(r"<td>(yes|no)</td><td>(yes|no|–)</td>", page)
     bounded = ["yes", "no", "–", "yes", "–", "–"]
     assert rows == list(zip(["yes", "no"] * 3, bounded, strict=True))

@@ -19,7 +19,7 @@ from pfbench.results.frame import drop_before
 from pfbench.results.looks import MethodLook, PartName, add_tuning, find_looks
 from pfbench.results.metrics import MetricInput, page_metrics
 from pfbench.results.paper_block import list_named_parts
-from pfbench.results.step_times import STEP_TIME, StepTimes
+from pfbench.results.step_times import STEP_TIME, WARM_UP, StepTimes
 from pfbench.results.store import SAME_LIKELIHOODS, SAME_N
 
 # --------------------------------------------------------------------------------------------------
@@ -273,7 +273,7 @@ def job_rows(
     condition, regime, label = origin
     meta, lost = result.meta, np.asarray(result.data["lost"], dtype=bool)
     group = main_component_group(meta["state"])
-    particles = meta.get("particles")
+    particles, rounds, seconds = meta.get("particles"), meta.get(STEP_TIME), meta["seconds"]
     components = {
         name: entry.component
         for name, entry in page_metrics().items()
@@ -293,7 +293,11 @@ def job_rows(
         "unit": group.unit,
         "group": group.group,
         **dict(_metric_columns(result, group, lost, components)),
-        "ms": 1e3 * float(meta.get(STEP_TIME, {}).get("median", meta["seconds"]["per_step"])),
+        # NaN for a time that holds the first steps of a process
+        "ms": 1e3
+        * float(
+            rounds["median"] if rounds else seconds["per_step"] if WARM_UP in seconds else math.nan
+        ),
     }
     return pd.DataFrame(columns)
 

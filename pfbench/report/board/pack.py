@@ -61,7 +61,7 @@ from pfbench.results.looks import (
 from pfbench.results.metrics import page_metrics
 from pfbench.results.paper_block import REFERENCES
 from pfbench.results.status import count_statuses
-from pfbench.results.step_times import STEP_TIME, WARM_UP, StepTimes
+from pfbench.results.step_times import StepTimes
 from pfbench.results.store import JobResult, list_failures
 from pfbench.stats.court import Court, fix_pairs
 from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
@@ -319,7 +319,7 @@ def note_job(label: str, result: JobResult) -> dict[str, Any]:
     meta, status = result.meta, count_statuses(result.data, result.meta)._asdict()
     return {
         "filter": label, **{name: int(status[name] or 0) for name in _COUNTS}, "has_limit": status["diverged"] is not None,
-        "is_timed": WARM_UP in meta["seconds"] or STEP_TIME in meta, "particles": meta.get("particles"),
+        "particles": meta.get("particles"),
         "is_exact": bool(meta.get("is_exact")), "has_bounded_weights": meta.get("has_bounded_weights"),
         "truth": meta.get("measured_truth"), "choices": [str(text) for text in meta.get("modelling_choices", ())],
     }  # fmt: skip
@@ -344,7 +344,7 @@ def join_notes(notes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         entries.append({
             "filter": label, "particles": " or ".join(particles), "is_exact": all(job["is_exact"] for job in jobs),
             "has_bounded_weights": None if None in bounded else all(bounded),
-            "is_timed": all(job["is_timed"] for job in jobs), **counts,
+            **counts,
             "diverged": counts["diverged"] if any(job["has_limit"] and job["runs"] for job in jobs) else None,
         })  # fmt: skip
     return entries

@@ -95,7 +95,7 @@ def _make_view(
     return View(
         court, mask, "", "", describe_filters(runs, facts.options.alpha), times,
         all(name is None or name.limit is not None for name in worlds), (world, regime), groups.loc[keys],
-        _describe_scope(runs.conditions, facts), f"{notes} {_describe_timing(runs, times, court.alpha)}",
+        _describe_scope(runs.conditions, facts), f"{notes} {_describe_timing(runs, times, court.alpha)}".rstrip(),
     )  # fmt: skip
 
 
@@ -164,7 +164,7 @@ def _describe_timing(
 ) -> str:
     """Describe how the times per step of a view were measured."""
     if not all(set(runs.filters) <= set(by_label) for by_label in times):
-        return "ms/step: one timing per job of all its runs, which other programs can change."
+        return "" if np.isnan(runs.values["ms"]).all() else "ms/step: one timing per job of all its runs, which other programs can change."  # fmt: skip
     rounds = sorted({t.seconds.size for by_label in times for t in by_label.values()})
     number = str(rounds[0]) if len(rounds) == 1 else f"{rounds[0]} to {rounds[-1]}"
     return (

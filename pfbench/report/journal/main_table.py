@@ -293,7 +293,11 @@ def make_cost_table(pack: Pack, particles: Mapping[str, str]) -> LatexTable:
     caption = (
         r"Cost and reliability over all conditions: particles \textit{N}, time per step of a batch of runs, share of runs "
         rf"that keep track, lost runs of {runs}, coverage of 90\,\% intervals. \textsuperscript{{*}}: proposed methods. "
-        + (_ROUNDS if has_rounds else "Times: one timing per job.")
+        + (
+            _ROUNDS
+            if has_rounds
+            else "Times: one timing per job, none of one with its first steps."
+        )
     )
     return LatexTable("cost", caption, columns, [[text_cell(text) for text in head]], groups)
 

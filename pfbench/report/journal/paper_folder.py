@@ -67,7 +67,6 @@ def select_figures(pack: Pack) -> dict[str, Plot]:
     """
     rows = find_rows(pack).values()
     has_ratio = any(is_number(row["ratio"]) for row in rows)
-    has_cost = any(is_number(row["ratio"]) and is_number(row["ms"]) for row in rows)
     regime = str(pack["regimes"][0]["key"]) if pack["regimes"] else ""
     plots: dict[str, tuple[Plot, bool]] = {
         "leaderboard": (plot_leaderboard, has_ratio),
@@ -75,7 +74,7 @@ def select_figures(pack: Pack) -> dict[str, Plot]:
         "planned": (plot_planned, bool(list_pairs(pack))),
         "cost": (
             plot_error_against_cost,
-            has_cost and all(n.get("is_timed") for n in pack["filter_notes"]),
+            any(is_number(row["ratio"]) and is_number(row["ms"]) for row in rows),
         ),
         "calibration": (plot_calibration, bool(pack["calibration"].get((ALL, ALL)))),
     }

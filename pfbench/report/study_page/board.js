@@ -2,6 +2,7 @@
 const signs = { better: "▲", equal: "≈", "equal in kept runs": "≈", identical: "≈", "not decided": "?", worse: "▼", "loses track": "✕", missing: "–" };
 const few = new Set(["rank", "filter", "ratio", "verdict", "track"]); // columns of a telephone
 const numeric = new Set(["rank", "ratio", "track", "ms"]);
+const isTimed = () => view().rows.some((row) => row.ms !== null);
 
 function heads() {
   const baseline = looks[state.baseline].name;
@@ -25,7 +26,7 @@ function heads() {
     { key: "verdict", text: "Verdict", small: "jointly", value: (row) => row.rank },
     { key: "track", text: "Track kept", value: (row) => row.track },
     { key: "calibration", text: "Coverage", small: "90 % intervals", value: (row) => row.coverage },
-    { key: "ms", text: "ms/step", value: (row) => row.ms },
+    ...(isTimed() ? [{ key: "ms", text: "ms/step", value: (row) => row.ms }] : []),
   ];
   return all.map((head) => ({
     ...head,
@@ -124,15 +125,8 @@ function details(row, span) {
     ["Lost runs", row.lost === null ? "–" : row.lost],
     ["Coverage of 90 % intervals", percent(row.coverage)],
     ["NEES per degree of freedom", short(row.nees)],
-    ["ms per step", `${short(row.ms)} ${quartiles(row)}`],
-    ...(row.cost > 0
-      ? [
-          [
-            `ms per step ÷ ${looks[state.baseline].name}`,
-            `${short(row.cost)} ${interval(row.cost_low, row.cost_high)}`,
-          ],
-        ]
-      : []),
+    ...(row.ms === null ? [] : [["ms per step", `${short(row.ms)} ${quartiles(row)}`]]),
+    ...(row.cost > 0 ? [[`ms per step ÷ ${looks[state.baseline].name}`, `${short(row.cost)} ${interval(row.cost_low, row.cost_high)}`]] : []),
   ];
   if (cellsInView().length > 1) {
     for (const cell of cellsInView()) {
@@ -191,7 +185,7 @@ function drawBoard() {
         `<td class="number"><b>${end(row.ratio)}</b> <span class="interval faint">${interval(row.ratio_low, row.ratio_high)}</span></td>` +
         `<td class="desk scale">${drawBar(row)}</td><td class="verdict ${row.verdict.replaceAll(" ", "_")}">${signs[row.verdict] || ""} ${esc(row.words)}</td>` +
         `<td class="number">${percent(row.track)}</td><td class="desk">${percent(row.coverage)}${row.calibration ? ", " : ""}<span class="not_decided">${esc(row.calibration || "")}</span></td>` +
-        `<td class="number desk"${row.cost > 0 ? ` title="ratio ${short(row.cost)} ${interval(row.cost_low, row.cost_high)}"` : ""}>${short(row.ms)}${row.ms_low > 0 ? ` <span class="interval faint">${quartiles(row)}</span>` : ""}</td></tr>${open ? details(row, columns.length) : ""}`
+        (isTimed() ? `<td class="number desk"${row.cost > 0 ? ` title="ratio ${short(row.cost)} ${interval(row.cost_low, row.cost_high)}"` : ""}>${short(row.ms)}${row.ms_low > 0 ? ` <span class="interval faint">${quartiles(row)}</span>` : ""}</td>` : "") + `</tr>${open ? details(row, columns.length) : ""}`
       );
     })
     .join("");

@@ -104,9 +104,8 @@ def list_study_blocks(page: Mapping[str, Any]) -> list[Block]:
         "verdict",
         "track kept",
         "coverage of 90 % intervals",
-        "ms/step",
     ]
-    heads += ["ratio of ms/step"] * opening["has_costs"]
+    heads += ["ms/step"] * opening["is_timed"] + ["ratio of ms/step"] * opening["has_costs"]
     of_pairs = ("pair", "ratio", f"simultaneous {page['level']} % interval", "verdict")
     pairs = [
         [pair[name] for name in ("pair", "effect", "interval", "word")] for pair in page["planned"]
@@ -282,6 +281,7 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
     orders = pack.get("world_orders", ())
     caption = f"{'; '.join(parts)}."
     tables = [_table_of_world(pack, key, order["world"], names) for order in orders]
+    is_timed = any(row["ms"] is not None for row in view["rows"])
     return {
         "sentence": format_sentence(view["sentence"]),
         "worlds": [format_sentence(order["sentence"]) for order in orders],
@@ -297,10 +297,10 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
         "foreign_knobs": describe_page_knobs(pack),
         "overconfidence": describe_overconfidence(pack),
         "caption": caption,
-        "heads": _heads(names[baseline]["name"]),
+        "heads": _heads(names[baseline]["name"])[: None if is_timed else -1],
         "rows": (rows := [_row(row, names[row["filter"]]) for row in view["rows"]]),
         "tables": tables or [{"caption": caption, "rows": rows}],
-        "is_timed": all(note.get("is_timed") for note in pack["filter_notes"]),
+        "is_timed": is_timed,
         "has_costs": any(row.get("cost") is not None for row in view["rows"]),
     }
 
