@@ -158,9 +158,9 @@ function drawBoard() {
   const scope = (axis, items, noun) =>
     state[axis] !== "all"
       ? named(items, state[axis])
-      : items.length === 1
-        ? items[0].name
-        : `all ${items.length} ${noun}s`;
+      : items.length > 4
+        ? `all ${items.length} ${noun}s`
+        : items.map((item) => item.name).join(", ") + (items.length > 1 ? " together" : "");
   find("#caption").textContent =
     `${metricOf().name}; ${scope("world", data.worlds, "scenario")}; ${scope("regime", data.regimes, "noise regime")}; ratio to ${looks[state.baseline].name}${budgetOf().words ? `; ${budgetOf().words}` : ""}.`;
   const columns = heads();

@@ -234,7 +234,7 @@ SIGNS = {
     "better": "▲", "equal": "≈", "equal in kept runs": "≈", "identical": "≈", "not decided": "?", "worse": "▼", "loses track": "✕",
     "missing": "–", "baseline": "",
 }  # fmt: skip
-_NAMED = 4  # filters with severely overconfident runs in the first lines
+_NAMED = 4  # filters with severely overconfident runs in the first lines; scenarios or regimes in a caption
 
 
 def format_share(value: float | None) -> str:
@@ -362,7 +362,6 @@ def _row(row: Mapping[str, Any], look: Mapping[str, Any]) -> dict[str, Any]:
     if row["value"] is not None:
         unit, interval = row["unit"] or "", format_interval(row["low"], row["high"])
         value = f"{format_short(row['value'])} {unit} {interval}"
-    calibration = row["calibration"] or ""
     return {
         "rank": DASH if row["rank"] is None else str(row["rank"]),
         "name": look["name"],
@@ -373,7 +372,7 @@ def _row(row: Mapping[str, Any], look: Mapping[str, Any]) -> dict[str, Any]:
         "verdict": row["verdict"].replace(" ", "_"),
         "words": f"{SIGNS[row['verdict']]} {row['words']}".strip(),
         "track": format_share(row["track"]),
-        "calibration": ", ".join(filter(None, (format_share(row["coverage"]), calibration))),
+        "calibration": ", ".join(filter(None, (format_share(row["coverage"]), row["calibration"]))),
         "ms": f"{format_short(row['ms'])} {format_interval(row.get('ms_low'), row.get('ms_high'))}".rstrip(),
         "cost": format_short(row.get("cost")),
         "cost_interval": format_interval(row.get("cost_low"), row.get("cost_high")),
@@ -396,11 +395,12 @@ def describe_pairs(pack: Mapping[str, Any]) -> list[dict[str, str]]:
 
 
 def _scope(pack: Mapping[str, Any], kind: str, key: str, noun: str) -> str:
-    """Return the name of a key, or how many there are."""
+    """Return the name of a key, the names of all of a few, or how many there are."""
     if key != "all":
         return name_of(pack, kind, key)
-    items = pack[kind]
-    return str(items[0]["name"]) if len(items) == 1 else f"all {len(items)} {noun}s"
+    names = ", ".join(str(item["name"]) for item in pack[kind])
+    several = f"{names} together" if len(pack[kind]) <= _NAMED else f"all {len(pack[kind])} {noun}s"
+    return several if len(pack[kind]) > 1 else names
 
 
 # Choice of filters at equal time, from a study with several numbers of particles of the same filters.
