@@ -31,6 +31,7 @@ from torch.distributions import (
 
 from pfbench.core.chart import Chart
 from pfbench.core.density import check_event_dimension
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record, iterate_steps
 
@@ -125,6 +126,17 @@ def draw_initial_state(
     return model.chart.add(origin.unsqueeze(1), shift)
 
 
+def check_state_shape(model: str, before: Tensor, after: Tensor, w: Tensor) -> None:
+    """Check that a step of a model keeps the shape of the states."""
+    require(
+        after.shape == before.shape,
+        f"{model}.propagate",
+        f"return states {list(before.shape)} for noise {list(w.shape)}",
+        list(after.shape),
+        "Return one component for each of its names; noise_dim is the number of components of the noise.",
+    )
+
+
 def simulate_steps(
     model: SimulatedModel,
     record: Record,
@@ -142,7 +154,8 @@ def simulate_steps(
     for t, step_model, step in iterate_steps(model, record):
         factor = None if scale is None else scale[t]
         w = draw_noise_values(model.noise, stream.at_step(t + 1), purpose, 1, factor)
-        x = step_model.propagate(x, step.u, w)
+        before, x = x, step_model.propagate(x, step.u, w)
+        check_state_shape(name, before, x, w)
         distribution = model.observation(x, step.u)
         check_event_dimension(distribution, f"{name}.observation")
         yield SimulatedStep(t, step, x, w, distribution)

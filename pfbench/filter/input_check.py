@@ -15,7 +15,7 @@ from pfbench.core.density import check_event_dimension
 from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Record, check_inputs, name_inputs
-from pfbench.core.simulate import draw_initial_state
+from pfbench.core.simulate import check_state_shape, draw_initial_state
 from pfbench.filter.health import check_measurement_resolution, uncounted_observation
 from pfbench.filter.linearisation import check_noise_gain
 from pfbench.model.base import ModelWrapper, StateSpaceModel, initial_law, named_inputs
@@ -161,12 +161,12 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
         check_event_dimension(step_model.noise, f"{name}.noise", step_model.noise_dim)
         w = torch.nan_to_num(step_model.noise.mean).expand(runs, _STATES, step_model.noise_dim)
         next_x = step_model.propagate(x, first.u, w)
-        state = list(next_x.shape) if next_x.shape != x.shape else "numbers that are not finite"
+        check_state_shape(name, x, next_x, w)
         require(
-            next_x.shape == x.shape and bool(next_x.isfinite().all(-1).any()),
+            bool(next_x.isfinite().all(-1).any()),
             f"{name}.propagate",
-            f"return finite states {list(x.shape)}",
-            f"{state} for the first step",
+            "return finite states",
+            "numbers that are not finite for the first step",
             "Check the inputs and the parameters of the model.",
         )
         _check_propagation(model, record, x, w, next_x)

@@ -168,8 +168,9 @@ def compare_with_published(conditions: Sequence[Condition], folder: Path) -> Pub
     options = StudyFacts.from_pack(study.pack).options
     table = build_run_table(conditions, options.start_time_s)
     compared = compare_tables(table, study)
-    names = {label: look.name for label, look in study_looks(conditions).items()}
-    compared = compared._replace(names=names)
+    compared = compared._replace(
+        names={label: look.name for label, look in study_looks(conditions).items()}
+    )
     if not compared.verdicts:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in compared.left_out.items())
         raise ValueError(
@@ -204,6 +205,12 @@ def compare_tables(table: pd.DataFrame, study: StoredStudy) -> PublishedComparis
     for name, rows, stored in members:
         both, pairs[name] = _make_pairs(rows, stored)
         joined.append(both.assign(family=name, scenario=name, regime=""))
+        others = stored[~stored["filter"].isin([b for _, b in pairs[name]])]
+        if numbers := sorted({int(n) for n in others["particles"].dropna()}):
+            left_out[f"A part of {name}"] = (
+                f"{others['filter'].nunique()} published filters have {', '.join(map(str, numbers))} particles, the own ones another "
+                "number. Set particles=NUMBER to meet them"
+            )
     worlds = _open_worlds(joined, pairs)
     verdicts = {name: [worlds[name].find(*pair) for pair in some] for name, some in pairs.items()}
     counts = {int(n) for _, rows, _ in members for n in rows["particles"].dropna()}

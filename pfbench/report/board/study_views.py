@@ -340,7 +340,7 @@ def _describe_ties(
     """Say which filters are not shown to be worse than the first one of a world."""
     first = f"[[{looks[best].name}]]"
     if not ties:
-        return f"All others are worse than {first}."
+        return f"All others are worse than {first}." if others else ""
     names = ", ".join(f"[[{looks[label].name}]]" for label in ties)
     verb = "is" if len(ties) == 1 else "are"
     end = "" if len(ties) == others else " All others are."

@@ -246,6 +246,8 @@ def describe_view(
     others = [row for row in rows if row["verdict"] not in (BASE, MISSING)]
     if not others:
         value = next((row for row in rows if row["filter"] == baseline), rows[0])
+        if value["verdict"] == MISSING:
+            return f"{base} has no runs {where}, so that no filter is compared with it."
         number = (
             ""
             if math.isnan(value["value"])

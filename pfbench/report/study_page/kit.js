@@ -20,12 +20,12 @@ const tidy = (value) =>
   short(value, 6)
     .replace(/(\.\d*?)0+$/, "$1")
     .replace(/\.$/, "");
-const percent = (share) => (share === null || share === undefined ? "–" : `${(100 * share).toFixed(0)} %`);
+const percent = (share) => (share === null || share === undefined ? "–" : `${Math.round(Number((100 * share).toFixed(4)))} %`); // of single precision or double
 const end = (value) => (short(value) !== "1.00" ? short(value) : value === 1 ? "1" : short(value, 4)); // exactly 1: a test stops there
 const interval = (low, high) => (low === null || high === null || low === undefined ? "" : `[${end(low)}, ${end(high)}]`);
-const change = (ratio) => {
+const change = (ratio, largest = ratio) => {
   const value = 100 * (ratio - 1);
-  return ratio >= 2 ? `${short(ratio)} ×` : `${value > 0 ? "+" : value < 0 ? "−" : ""}${short(Math.abs(value))} %`;
+  return largest >= 2 ? `${short(ratio)} ×` : `${value > 0 ? "+" : value < 0 ? "−" : ""}${short(Math.abs(value))} %`;
 };
 
 // Scales from values to pixels, and their ticks.

@@ -241,7 +241,7 @@ def format_share(value: float | None) -> str:
     """Format a share as percent."""
     if value is None:
         return DASH
-    return f"{Decimal(100 * value).quantize(Decimal(1), ROUND_HALF_UP)} %"
+    return f"{Decimal(round(100 * value, 4)).quantize(Decimal(1), ROUND_HALF_UP)} %"  # of single precision or double
 
 
 def format_interval(low: float | None, high: float | None) -> str:

@@ -14,8 +14,8 @@ function forest(part, pairs) {
   const width = widthOf(part);
   const narrow = width < 800;
   const wordsOf = (pair) => {
-    const range = pair.low !== null && pair.high !== null ? `[${change(pair.low)}, ${change(pair.high)}]` : "";
-    return [change(pair.estimate), range, pair.word].filter(Boolean).join(" ");
+    const range = pair.low !== null && pair.high !== null ? `[${change(pair.low, pair.high)}, ${change(pair.high)}]` : "";
+    return [change(pair.estimate, pair.high), range, pair.word].filter(Boolean).join(" ");
   };
   const widest = Math.max(...pairs.map((pair) => textWidth(wordsOf(pair), 11.5)));
   const [left, right] = narrow ? [8, 8] : [Math.min(310, width * 0.27), Math.ceil(widest) + 16];
@@ -47,10 +47,10 @@ function forest(part, pairs) {
     const [a, b] = [looks[pair.a], looks[pair.b]];
     const names = `${a.name}${narrow ? " / " : " against "}${b.name}`;
     const known = pair.low !== null && pair.high !== null;
-    const range = known ? `[${change(pair.low)}, ${change(pair.high)}]` : pair.reason ? `(${pair.reason})` : "";
-    const words = `${change(pair.estimate)} ${range}`;
+    const range = known ? `[${change(pair.low, pair.high)}, ${change(pair.high)}]` : pair.reason ? `(${pair.reason})` : "";
+    const words = `${change(pair.estimate, pair.high)} ${range}`;
     const small = pair.cells.filter((cell) => shown(cell.estimate));
-    const verdict = `${change(pair.estimate)} ${pair.word}`;
+    const verdict = `${change(pair.estimate, pair.high)} ${pair.word}`;
     const size = narrow ? 11.5 : 12;
     const lines = wrap(names, narrow ? width - left - textWidth(verdict, 11.5) - 10 : left - 12, size);
     const rise = narrow ? 3.5 + 12.5 * lines.length : 0;
