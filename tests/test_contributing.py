@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import ast
+import os
 import re
 import shlex
+import shutil
+import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
-from importlib import import_module
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +22,6 @@ from checkout import ROOT
 from command_line import pfbench
 
 import pfbench as package
-from pfbench.core.lazy_import import lazy_attributes
 from pfbench.report.papers import figures
 from pfbench.results import metrics, store
 
@@ -130,22 +133,6 @@ def small_study(home: Path) -> None:
     assert printed.code == 0, printed.err
 
 
-@pytest.mark.parametrize("title", [title for title, body in RECIPES.items() if "_target_" in body])
-def test_the_named_door_makes_the_class_of_a_recipe_public(
-    title: str, folder: Path, tmp_path: Path
-) -> None:
-    """One line in the stub that the last sentence names, and the short `_target_` finds the class."""
-    body = RECIPES[title]
-    (door,) = re.findall(r"`(pfbench/\w+/__init__\.\w+)`", body.partition("To contribute it")[2])
-    home, name = re.findall(r"_target_: (mylab\.\w+)\.(\w+)", body)[0]
-    stub = (ROOT / door).read_text() + f"from {home} import {name} as {name}\n"
-    (tmp_path / Path(door).name).write_text(stub)
-    package_name = str(Path(door).parent).replace("/", ".")
-    get, _, names = lazy_attributes(package_name, str(tmp_path / "__init__.py"))
-    assert get(name).__module__ == home
-    assert names == sorted({*import_module(package_name).__all__, name})
-
-
 def test_every_kind_of_part_has_a_recipe() -> None:
     kinds = "resampling scheme, filter, model, scenario, noise regime, metric, report figure"
     assert list(RECIPES) == [f"Add a {kind}" for kind in kinds.split(", ")]
@@ -193,3 +180,110 @@ def test_workflows_cover_the_allowed_versions() -> None:
     assert f"torch=={oldest}.*" in matrix["torch"]
     hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
     assert [repo["repo"] for repo in hooks] == ["local"]  # nothing is downloaded
+
+
+# contributed by script in a copy of the checkout
+
+WRITTEN = dict(FILE.findall(TEXT))
+
+
+def contribute(path: Path, source: str, before: str = "") -> None:
+    """Add what a source of a recipe defines to a file, before a line or at its end, and the imports that the file lacks."""
+    text = path.read_text()
+    has = set(re.findall(r"\w+", text.partition("\n\n\n")[0]))
+    imports, _, code = source.rpartition("\n\n\n") if source.count("\n\n\n") == 1 else source.partition("\n\n\n")  # fmt: skip
+    nodes = [n for n in ast.parse(imports).body if isinstance(n, ast.Import | ast.ImportFrom)]
+    for node in nodes:
+        node.names = [alias for alias in node.names if (alias.asname or alias.name) not in has]
+    lines = [f"{ast.unparse(node)}\n" for node in nodes if node.names]
+    head, mark, rest = text.partition("from __future__ import annotations\n")
+    place = rest.index(before) if before else len(rest)
+    path.write_text(f"{head}{mark}{''.join(lines)}{rest[:place]}\n\n{code}\n\n{rest[place:]}")
+
+
+def add_entry(path: Path, table: str, end: str, entry: str) -> None:
+    """Add an entry at the end of a table."""
+    text = path.read_text()
+    place = text.index(end, text.index(table))
+    path.write_text(f"{text[:place]}\n    {entry},{text[place:]}")
+
+
+def add_class(tree: Path, source: str, module: str, yaml_file: str = "") -> None:
+    """Add the class of a recipe to a module, its name to the door of the folder, and a file of `conf` that names it there."""
+    room, path = module.split("/")[0], tree / "pfbench" / module
+    contribute(path, WRITTEN[source]) if path.exists() else path.write_text(WRITTEN[source])
+    name = re.findall(r"^class (\w+)", WRITTEN[source], re.M)[-1]
+    door = path.parents[module.count("/") - 1] / "__init__.pyi"
+    home = f"pfbench.{module.removesuffix('.py').replace('/', '.')}"
+    door.write_text(f"{door.read_text()}from {home} import {name} as {name}\n")
+    if yaml_file:
+        text = re.sub(rf"mylab\.\w+\.{name}", f"pfbench.{room}.{name}", WRITTEN[yaml_file])
+        (tree / yaml_file).write_text(text)
+
+
+def add_metric(tree: Path) -> None:
+    path = tree / "pfbench" / "results" / "metrics.py"
+    code, _, entry = WRITTEN_METRIC.partition("\n\n\nMEDIAN_ERROR = ")
+    contribute(path, f"\n\n\n{code.partition(chr(10) * 3)[2]}", "METRICS: ")
+    add_entry(path, "METRICS: ", "\n)", entry.partition("  # fmt")[0])
+
+
+def add_figure(tree: Path) -> None:
+    path = tree / "pfbench" / "report" / "papers" / "figures.py"
+    contribute(path, WRITTEN["mylab/final_error.py"], "FIGURES: ")
+    (entry,) = re.findall(r"^FINAL_ERROR = (.*?^\))", TEXT, re.M | re.DOTALL)
+    add_entry(path, "FIGURES: ", "\n}  # fmt", f'"final-error": {entry}')
+
+
+def add_world(tree: Path) -> None:
+    """Add the scenario of the recipe, and the model that it has."""
+    add_class(
+        tree, "mylab/open_window.py", "scenario/open_window.py", "conf/scenario/open_window.yaml"
+    )
+    add_class(tree, "mylab/room.py", "model/room.py", "conf/model/room.yaml")
+    (tree / "conf/scenario/room.yaml").write_text(WRITTEN["conf/scenario/room.yaml"])
+
+
+WRITTEN_METRIC = dict(BLOCK.findall(RECIPES["Add a metric"]))["python"]
+CONTRIBUTIONS: dict[str, tuple[Callable[[Path], None], int, str]] = {
+    "resampler": (partial(add_class, source="mylab/resampling.py", module="filter/particle/resampling.py"), 2, "filter/particle/test_resampling.py"),
+    "filter": (partial(add_class, source="mylab/weights.py", module="filter/particle/weights.py", yaml_file="conf/filter/robust_rpf.yaml"), 3, "test_configs.py"),
+    "noise regime": (partial(add_class, source="mylab/noise.py", module="noise/time_windows.py", yaml_file="conf/noise/growing.yaml"), 3, "test_configs.py"),
+    "scenario and model": (add_world, 7, "test_configs.py"),
+    "metric": (add_metric, 1, "report/test_report_metrics.py"),
+    "figure": (add_figure, 1, "report/test_paper_figures.py"),
+}  # fmt: skip
+
+
+def ask_git(tree: Path, *words: str) -> str:
+    command = ["git", "-c", "user.name=x", "-c", "user.email=x@x", *words]
+    return subprocess.run(command, cwd=tree, capture_output=True, text=True, check=True).stdout
+
+
+def copy_checkout(tree: Path) -> None:
+    """Copy the files of the checkout that git knows or would know, and commit them."""
+    for name in ask_git(ROOT, "ls-files", "-co", "--exclude-standard", "-z").split("\0"):
+        if (ROOT / name).is_file():
+            (tree / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, tree / name)
+    ask_git(tree, "init", "-q")
+    for words in (("add", "-A"), ("commit", "-qm", "x")):
+        ask_git(tree, *words)
+
+
+@pytest.mark.parametrize("name", CONTRIBUTIONS)
+def test_a_contribution_changes_few_files_and_passes_the_checks(name: str, tmp_path: Path) -> None:
+    (add, files, check), tree = CONTRIBUTIONS[name], tmp_path / "tree"
+    copy_checkout(tree)
+    add(tree)
+    for words in (("check", "--fix", "-q"), ("format", "-q")):
+        subprocess.run([sys.executable, "-m", "ruff", *words, "pfbench"], cwd=tree, check=True)
+    changed = ask_git(tree, "status", "--porcelain").splitlines()
+    assert len(changed) == files, changed
+    paths = [f"tests/{file}" for file in ("test_house.py", "test_public_names.py", "test_language.py", check)]  # fmt: skip
+    words = ["-q", "-n", "0", "-x", "-p", "no:cacheprovider", "-k"]
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", *words, "not budget and not ceilings", *paths],
+        cwd=tree, env={**os.environ, "PYTHONPATH": str(tree)}, capture_output=True, text=True,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stdout[-3000:]

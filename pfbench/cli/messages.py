@@ -164,12 +164,12 @@ def _format_unknown_key(name: str, words: Sequence[str]) -> str:
             f"{override}: not all jobs of this sweep have the key {name}. "
             "Run those without it in a separate sweep."
         )
-    part, _, last = name.rpartition(".")
+    parent, _, last = name.rpartition(".")
     others = [key for key in keys if key != name and not key.endswith("._target_")]
-    nearby = [key for key in others if part and key.rpartition(".")[0] == part]
-    moved = [key for key in others if key.rpartition(".")[2] == last]  # the key of another part
-    choices = f" Keys of {part}: {', '.join(nearby)}." if nearby else _ALL_KEYS
-    options = [*nearby, *moved] if nearby else others
+    nearby = [key for key in others if parent and key.rpartition(".")[0] == parent]
+    elsewhere = [key for key in others if key.rpartition(".")[2] == last]  # the key of another part
+    choices = f" Keys of {parent}: {', '.join(nearby)}." if nearby else _ALL_KEYS
+    options = [*nearby, *elsewhere] if nearby else others
     return f"{override}: key {name} does not exist.{suggest_similar(name, options) or choices}"
 
 

@@ -2,7 +2,7 @@
 
 Hydra reads and parses all files of a configuration for each composition. A command composes several times, and a sweep or
 `pfbench check` hundreds of times. Here the loaded files are kept, and so is the merged start of all compositions: Hydra's
-own settings and `conf/config.yaml`. All else is Hydra's. `tests/config/test_composition.py` compares the results.
+own settings and `conf/config.yaml`. All else is Hydra's. `tests/config/test_shared_loader.py` compares the results.
 """
 
 from __future__ import annotations

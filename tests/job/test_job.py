@@ -4,23 +4,36 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
-from command_line import Said, pfbench, process
+from command_line import Said, pfbench, plant_programs, process, run_git as git
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import InstantiationException
+from pfbench.experiments.study_parts import ResumableResults
 
 from pfbench import job
 from pfbench.core.record import Episode, Record
+from pfbench.files.escapes import (
+    WIDTH,
+    markdown_bullets,
+    markdown_head,
+    markdown_paragraph,
+    markdown_row,
+)
 from pfbench.filter.belief import StepInfo
+from pfbench.job import trust
 from pfbench.job.pcrb import _missing_reason
+from pfbench.job.plan import describe_commit
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.linear_gaussian import linear_walk
+from pfbench.ppl.parameter_posterior import ParameterPosterior
 
 WALK = ("scenario=linear_walk", "scenario.steps=25", "particles=100")
 FIELDS = {"time", "error", "sd", "nees", "log_evidence", "lost", "meta"}
@@ -529,3 +542,138 @@ def test_a_collapsed_cloud_is_infinitely_wrong_and_no_truth_is_unknown() -> None
     nees = ScoreRecorder(model, truth)(0, info)["nees"][:, 0].tolist()
     assert nees[:2] == [0.5, math.inf]
     assert math.isnan(nees[2])
+
+
+def never() -> None:
+    raise AssertionError("made twice")
+
+
+def test_what_is_done_is_not_done_again(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "told.json"
+    first = ResumableResults(path, {"draws": 3, "wide": (1.0, 2.0)})
+    assert first("a", lambda: [0.1, 1e-300]) == [0.1, 1e-300]
+    with pytest.raises(KeyboardInterrupt):
+        first("b", lambda: (_ for _ in ()).throw(KeyboardInterrupt))
+    again = ResumableResults(path, {"draws": 3, "wide": (1.0, 2.0)})
+    assert again("a", never) == [0.1, 1e-300]
+    assert again("b", lambda: 2) == 2
+    assert [file.name for file in path.parent.iterdir()] == ["told.json"]
+
+
+def test_another_call_and_half_a_file_begin_anew(tmp_path: Path) -> None:
+    path = tmp_path / "told.json"
+    ResumableResults(path, {"draws": 3})("a", lambda: 1)
+    assert ResumableResults(path, {"draws": 4})("a", lambda: 2) == 2
+    path.write_text(path.read_text()[:-3])
+    assert ResumableResults(path, {"draws": 4})("a", lambda: 3) == 3
+
+
+def test_a_posterior_is_heard_as_it_was_told(tmp_path: Path) -> None:
+    draws = {
+        "a": torch.randn(2, 5, dtype=torch.float64),
+        "b": torch.rand(2, 5, dtype=torch.float64) / 3.0,
+    }
+    for accepted in (torch.tensor([0.1, 1 / 3], dtype=torch.float64), None):
+        posterior = ParameterPosterior(draws, accepted, "made")
+        pieces = ResumableResults(tmp_path / "told.json", {"accepted": accepted is not None})
+        pieces("posterior", posterior.to_dict)
+        heard = ParameterPosterior.from_dict(
+            ResumableResults(pieces.path, pieces.state["request"])("posterior", never)
+        )
+        for name, a in draws.items():
+            assert torch.equal(heard.draws[name], a)
+        assert heard.method == "made"
+        assert (heard.accepted is None) == (accepted is None)
+        assert accepted is None or torch.equal(heard.accepted, accepted)
+
+
+def test_prose_fits_an_editor_and_tables_have_a_head() -> None:
+    text = "a word-with-hyphens " * 40
+    lines = [*markdown_paragraph(text), *markdown_bullets(text, "short")]
+    assert max(map(len, lines)) <= WIDTH
+    assert " ".join(markdown_paragraph(text)).split() == text.split()
+    assert lines[-2:] == ["- short", ""]
+    assert [*markdown_head("a", "b"), markdown_row(1, math.pi)] == [
+        "| a | b |",
+        "| --- | --- |",
+        f"| 1 | {math.pi} |",
+    ]
+
+
+needs_git = pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
+
+
+@needs_git
+def test_only_files_that_decide_results_mark_a_commit(tmp_path: Path) -> None:
+    decide = ("pfbench/a.py", "conf/b.yaml", "experiments/e.yaml", "setup.py")
+    others = ("reports/x/report.md", "docs/c.md", "experiments/analyses/d.json")
+    assert describe_commit(tmp_path) == ""
+    for name in decide + others:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("old")
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-qm", "first")
+    commit = git(tmp_path, "rev-parse", "--short", "HEAD")
+    (tmp_path / "pfbench" / "a.py").touch()
+    for name in others:
+        (tmp_path / name).write_text("new")
+    assert describe_commit(tmp_path) == commit
+    for name in decide:
+        (tmp_path / name).write_text("new")
+        assert describe_commit(tmp_path) == f"{commit}-dirty", name
+        git(tmp_path, "add", name)
+        assert describe_commit(tmp_path) == f"{commit}-dirty", name
+        git(tmp_path, "reset", "-q", "--hard")
+
+
+@needs_git
+def test_the_repository_of_another_project_is_not_that_of_pfbench(tmp_path: Path) -> None:
+    """As of an environment in the folder of a user's project."""
+    inside = tmp_path / "env" / "site-packages"
+    inside.mkdir(parents=True)
+    (tmp_path / "a.txt").write_text("theirs")
+    git(tmp_path, "init", "-q")
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-qm", "first")
+    assert describe_commit(tmp_path) != ""
+    assert describe_commit(inside) == ""
+    ran = plant_programs(tmp_path)
+    subprocess.run(["git", "-C", str(tmp_path), "diff", "HEAD"], capture_output=True)
+    assert ran.exists()  # the programs do run
+    ran.unlink()
+    assert describe_commit(tmp_path) == git(tmp_path, "rev-parse", "--short", "HEAD")
+    assert describe_commit(inside) == ""
+    assert not ran.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "is_same"),
+    [
+        ("a.py", "x = 1\n", True),  # written again
+        ("__pycache__/a.pyc", "other", True),
+        ("kernels/operators_avx2.so", "other", True),
+        ("a.py", "x = 2\n", False),
+        ("kernels/b.cpp", "int x;", False),
+        ("conf/noise/n.yaml", "sd: 2", True),
+        ("experiments/e.yaml", "runs: 2", True),
+    ],
+)
+@needs_git
+def test_two_wheels_of_other_sources_are_other_builds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, text: str, is_same: bool
+) -> None:
+    """Without git, whatever the times and the compiled files are."""
+    files = {"a.py": "x = 1\n", "conf/noise/n.yaml": "sd: 1", "experiments/e.yaml": "runs: 1"}
+
+    def build(folder: Path, files: dict[str, str]) -> str:
+        for file, content in files.items():
+            (folder / file).parent.mkdir(parents=True, exist_ok=True)
+            (folder / file).write_text(content)
+        monkeypatch.setattr(trust, "PACKAGE", folder)
+        monkeypatch.setattr(trust, "conf_dir", lambda: folder / "conf")
+        monkeypatch.setattr(trust, "experiments_dir", lambda: folder / "experiments")
+        return trust.hash_package.__wrapped__()
+
+    first = build(tmp_path / "one", files)
+    assert (build(tmp_path / "two", {**files, name: text}) == first) == is_same

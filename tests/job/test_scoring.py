@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -10,9 +11,11 @@ from typing import Any
 import pytest
 import scoringrules
 import torch
+from checkout import ROOT
 from scipy import stats
 from torch import Tensor
 
+from pfbench import job
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import MeasuredTruth
@@ -24,6 +27,7 @@ from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
 from pfbench.filter.loop import run_filter
 from pfbench.filter.marginal.rao_blackwellised import RaoBlackwellisedFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.job.raw_estimate import RawEstimate, compute_raw_estimate
 from pfbench.job.scoring import (
     LikelihoodCounter,
     ScoreRecorder,
@@ -34,6 +38,7 @@ from pfbench.job.scoring import (
 from pfbench.kernels import dispatch
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.noise.base import NominalNoise
+from pfbench.results.paper_block import read_paper_block
 from pfbench.scenario.simulated import ModelSimulation
 
 MODEL = linear_walk(1.0, 0.3, 1.0)
@@ -358,3 +363,32 @@ def test_errors_of_a_measured_truth_are_part_of_all_scores(*, is_cloud: bool) ->
         abs(float(crps.mean()) - total / math.sqrt(math.pi))
         < 5 * spread / math.sqrt(count * size) + total / 400
     )
+
+
+def test_the_raw_error_of_a_measured_position_is_that_of_a_normal_variable() -> None:
+    """The sd is 1. The largest twentieth of the squares is left out."""
+    limit = stats.chi2.ppf(0.95, 1)
+    square = (0.95 - 2.0 * limit**0.5 * stats.norm.pdf(limit**0.5)) / 0.95
+    plan = job.build_plan(job.compose(["scenario=linear_walk", "runs=100", "pcrb=false"]))
+    with torch.no_grad():
+        episode = plan.draw_episode(plan.runs)
+        truth = plan.model.assemble(episode.truth)
+        raw = compute_raw_estimate(plan.model, truth, episode.record, (0,))
+    se = 0.5 / 4000**0.5  # relative, of 40 windows in 100 runs; squares vary by 0.97 of their mean
+    assert raw.steps == 1
+    assert raw.rmse == pytest.approx(square**0.5, rel=4 * se)
+    assert raw.threshold == 5.0 * raw.rmse
+    assert RawEstimate(raw.rmse, 1, 6.0 * raw.rmse).threshold == pytest.approx(3.0 * raw.rmse)
+
+
+def test_a_scenario_has_the_threshold_of_the_table_or_none() -> None:
+    """None where it does not tell the better of two correct filters from the worse of two wrong ones."""
+    text = (ROOT / "docs" / "scenarios.md").read_text()
+    lines = re.findall(r"^\| (\w+ \| .*) \|$", text, re.MULTILINE)
+    rows = [line.split(" | ") for line in lines if "raw estimate" not in line]
+    assert len(rows) > 40
+    for name, _, _, _, _, cell, _, _, *shares in rows:
+        stored = read_paper_block("scenario", name).get("divergence_threshold")
+        assert stored == (None if "none" in cell else float(cell)), name
+        ekf, sir, *wrong = (float(share) if share != "–" else 100.0 for share in shares)
+        assert ("none" in cell) == (min(ekf, sir) > 10.0 or max(wrong) < 50.0), name

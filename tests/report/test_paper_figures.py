@@ -117,7 +117,10 @@ def jobs_of(study: str) -> Iterator[tuple[str, str]]:
         yield noise, f"{label}[{settings}]" if settings else label
 
 
-@pytest.mark.parametrize("name", FIGURES)
+OF_PAPERS = [name for name in FIGURES if re.match(r"\d{3}-", name)]  # others are of any study
+
+
+@pytest.mark.parametrize("name", OF_PAPERS)
 def test_a_study_runs_each_filter_that_a_figure_names(name: str) -> None:
     """SIR was missing in three figures, whose study runs `sir_printed`."""
     figure = FIGURES[name]
@@ -129,7 +132,7 @@ def test_a_study_runs_each_filter_that_a_figure_names(name: str) -> None:
         assert set(figure.filters) & {label for _, label in jobs_of(study)}, study
 
 
-@pytest.mark.parametrize("name", [name for name, figure in FIGURES.items() if figure.groups])
+@pytest.mark.parametrize("name", [name for name in OF_PAPERS if FIGURES[name].groups])
 def test_the_state_has_the_groups_that_a_figure_names(name: str) -> None:
     figure = FIGURES[name]
     words = [f"noise={figure.noise}"] if figure.noise else []
@@ -147,13 +150,14 @@ def test_the_state_has_the_groups_that_a_figure_names(name: str) -> None:
 def test_a_panel_has_four_curves_at_most_and_each_printed_number_has_a_filter_and_a_source() -> (
     None
 ):
-    assert len(FIGURES) == 27
+    assert {name[:3] for name in OF_PAPERS} == {"000", "001", "002", "003", "004"}
     for name, figure in FIGURES.items():
         assert all(1 <= len(column) <= 4 for column in figure.columns), name
         assert len(figure.titles) in (1, len(figure.columns)), name
         assert {p.filter for p in figure.printed} <= {*figure.filters, ""}, name
         assert bool(figure.printed) == bool(re.search(r"Cross(es)?: ", figure.source)), name
-        assert any(char.isdigit() for char in figure.title) or "section" in figure.title
+        is_placed = any(char.isdigit() for char in figure.title) or "section" in figure.title
+        assert is_placed or name not in OF_PAPERS, name
 
 
 def test_numbers_in_the_captions_are_those_of_the_crosses() -> None:

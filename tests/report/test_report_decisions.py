@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -11,8 +13,12 @@ import pandas as pd
 import pytest
 import synthetic_results as synthetic
 
-from pfbench.report import read_stored_study, study_report
+from pfbench.report import provenance, read_stored_study, study_report
+from pfbench.report.board.entries import StudyFacts
+from pfbench.report.board.pack import build_pack, decide_parts, read_study
+from pfbench.report.options import ReportOptions
 from pfbench.results import store
+from pfbench.results.conditions import load_conditions
 from pfbench.results.paper_block import plan_installed_pairs
 from pfbench.stats.study_runs import arrange_runs, compare_filters, compute_losses
 
@@ -130,3 +136,114 @@ def test_a_page_without_enough_data_states_why(case: str, tmp_path: Path) -> Non
     shown = {"one run": "not decided, 1 run, 10 are required", "all lost": "loses runs in 100 % of runs", "identical": "identical, all runs agree"}  # fmt: skip
     assert shown[case] in text
     assert "nan" not in text.replace("provenance", "")
+
+
+NOISES = ("nominal", "surge", "heavy", "outage", "jam")
+METHODS = synthetic.METHODS[1:]
+
+
+def study(folder: Path, turn: int = 0) -> Path:
+    """The same jobs, written in another order, by other workers, at other times."""
+    jobs = [(noise, method) for noise in NOISES for method in METHODS]
+    for k, (noise, method) in enumerate(jobs[turn:] + jobs[:turn]):
+        path = synthetic.write(folder, method, noise=noise, runs=16, steps=8)
+        if turn:
+            meta, arrays = store.read_result(path)
+            meta |= {
+                "host": f"worker {k % 5}",
+                "threads": 1 + k % 3,
+                "created": f"2027-01-{1 + k:02}T00:00:00+00:00",
+            }
+            store.write_result(path, meta, arrays)
+            os.utime(path, (10**9 - k, 10**9 - k))
+    return folder
+
+
+Stored = tuple[dict[str, object], pd.DataFrame]
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> Stored:
+    """Pack and runs of a study."""
+    conditions = load_conditions("demo", study(tmp_path_factory.mktemp("results") / "demo").parent)
+    options = ReportOptions()
+    data = read_study(conditions, options)
+    return build_pack("demo", conditions, options, data), data.table
+
+
+def decide(stored: Stored, table: pd.DataFrame) -> pd.DataFrame:
+    parts = decide_parts(table, StudyFacts.from_pack(stored[0]))
+    return pd.DataFrame(parts["decisions"]).set_index(["a", "b"])
+
+
+def test_the_order_of_rows_changes_no_verdict(stored: Stored) -> None:
+    mixed, first = (decide(stored, table) for table in (stored[1].sample(frac=1, random_state=1), stored[1]))  # fmt: skip
+    pd.testing.assert_frame_equal(mixed, first, check_exact=False, rtol=1e-9)
+
+
+def test_the_numbers_of_the_runs_change_no_verdict(stored: Stored) -> None:
+    """The same runs made in another order: each has another number, the same for all filters."""
+    table, number = stored[1], np.random.default_rng(4).permutation(16)
+    renamed = table.assign(run=number[table["run"].to_numpy()])
+    first = decide(stored, table)
+    pd.testing.assert_frame_equal(decide(stored, renamed), first, check_exact=False, rtol=1e-9)
+    one = table["run"].where(table["filter"] != "ukf", renamed["run"])
+    apart = decide(stored, table.assign(run=one))  # they are paired by it
+    widths = [math.log(t.loc[("cofm_amssrcpf", "ukf"), "high"] / t.loc[("cofm_amssrcpf", "ukf"), "low"]) for t in (first, apart)]  # fmt: skip
+    assert widths[1] > 1.2 * widths[0]
+
+
+@pytest.mark.slow
+def test_order_of_files_and_workers_change_no_verdict(tmp_path: Path) -> None:
+    said = []
+    for turn in (0, 7):
+        folder = study(tmp_path / f"results{turn}" / "demo", turn)
+        made = study_report.write_report("demo", folder.parent, tmp_path / f"reports{turn}")
+        said.append([(made.parent / f"{name}.csv").read_text() for name in ("decisions", "consistency", "metrics", "verdicts")])  # fmt: skip
+        assert ("worker 3" in made.read_text()) is bool(turn)
+    assert said[0] == said[1]
+    assert len(said[0][0].splitlines()) == 4  # all pairs of three filters
+
+
+def test_a_budget_that_was_not_kept_is_not_claimed():
+    def job(particles, per_step=1e-3, **config):
+        return {
+            "key": "k",
+            "particles": particles,
+            "seconds": {"per_step": per_step},
+            "config": config,
+        }
+
+    def said(*jobs):
+        return provenance.format_budget(jobs).removeprefix("Budget: ")
+
+    assert said(job(100), job(None)) == "particles (100 particles in each particle filter)."
+    more = job(400) | {"label": "more"}
+    assert "not met by more (4 times the target) (100 to 400 part" in said(job(100), job(100), more)
+    used = [{"least": low, "mean": mean, "most": 200} for low, mean in ((100, 120.0), (110, 140.0))]
+    changing = [{**job(200), "label": "grows", "particles_used": one} for one in used]
+    assert "grows (1.2 to 1.4 times the target)" in said(*[job(100)] * 3, *changing)
+    kind = "time"
+    alike = [job(100, budget=kind), job(100, 1.05e-3, budget=kind), job(9, 1.1e-3, budget=kind)]
+    deterministic = job(None, 1e-5, budget=kind)  # no number of particles to keep it by
+    assert said(*alike, deterministic) == f"{kind} (1 to 1.1 ms per step in each particle filter)."
+    dear = job(9, 5e-3, budget=kind) | {"label": "dear"}
+    assert f"{kind} not met by dear (4.7 times the target) (1 to 5 ms" in said(*alike, dear)
+    priced = [{**one, "budget_allocation": {"price": 1e-3}} for one in alike]
+    slow = [
+        {**job(9, k * 1e-2, budget=kind), "budget_allocation": {"price": 1e-2}} for k in (1, 1.1)
+    ]  # a cell where SIR takes longer
+    assert "not met" not in said(*priced, *slow)
+    twice = [{**dear, "budget_allocation": {"price": price}} for price in (1e-3, 2e-3)]
+    assert "not met by dear (2.5 to 5 times the target)" in said(*priced, *twice)
+    counted = [
+        {**job(n, budget=store.BUDGETS[2]), "likelihoods_per_step": n * k}
+        for n, k in ((100, 1.0), (10, 11.0))
+    ]
+    assert (
+        said(*counted) == "likelihoods (100 to 110 likelihoods per step in each particle filter)."
+    )
+    assert "do not count them" in said(*counted, job(1, budget=store.BUDGETS[2]))
+    assert "differs between jobs" in said(job(100), job(100, budget=kind))
+    with pytest.raises(ValueError, match=r"must be one of .* got fair"):
+        said(job(1, budget="fair"))

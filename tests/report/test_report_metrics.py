@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import synthetic_results as synthetic
-from scipy import stats
 
 from pfbench.report.study_report import summarise_metrics
 from pfbench.results import conditions, frame, metrics, status, store
 from pfbench.results.conditions import component_groups
-from pfbench.stats import rank_tests
 
 
 @pytest.fixture(scope="module")
@@ -18,35 +16,6 @@ def results(tmp_path_factory):
     root = tmp_path_factory.mktemp("results")
     synthetic.study(root / "demo", runs=8, steps=20)
     return root
-
-
-def test_one_entry_adds_a_metric_to_the_frame_the_summary_and_the_definitions(results, monkeypatch):
-    def final_error(data):
-        last = data.select("error")[:, -1]
-        return {"norm": np.where(data.lost, np.inf, np.linalg.norm(last, axis=-1))}
-
-    entry = metrics.Metric(
-        "final_error",
-        final_error,
-        "components",
-        metrics.GROUP_UNIT,
-        "lower",
-        "Error at the last step.",
-        head="final error",
-    )
-    monkeypatch.setattr(metrics, "METRICS", (*metrics.METRICS, entry))
-    rows = frame.load_frame("demo", results).query("metric == 'final_error'")
-    assert set(rows.group) == {"attitude", "velocity", "position"}
-    assert set(rows[rows.group == "attitude"].unit) == {"arcmin"}
-    assert np.isinf(rows.value[rows.lost]).all()
-    (condition,) = conditions.load_conditions("demo", results)
-    sir = next(job.load() for job in condition.jobs if job.label == "sir")
-    group = next(g for g in component_groups(sir.meta["state"]) if g.group == "position")
-    mean = rows[(rows.group == "position") & (rows.label == "sir") & ~rows.lost].value.mean()
-    assert metrics.table_columns(sir, group)["final error [m]"] == pytest.approx(mean)
-    summary = summarise_metrics(rows).set_index(["filter", "group"])
-    assert summary.loc[("sir", "position"), "mean"] == pytest.approx(mean)
-    assert "final error: Error at the last step." in metrics.metric_definitions()
 
 
 def test_probabilities_of_counts_are_not_compared_with_densities(results):
@@ -71,27 +40,6 @@ def test_the_table_of_metrics_is_complete():
     for metric in metrics.METRICS:
         assert metric.direction in ("lower", "higher", "target"), metric.name
         assert metric.caption.endswith("."), metric.name
-
-
-@pytest.mark.parametrize("alternative", ["two-sided", "greater", "less"])
-@pytest.mark.parametrize("n", [1, 2, 7, 13, 14, 40, 50, 51, 90])
-def test_signed_rank_tests_of_many_pairs_are_those_of_scipy(n, alternative):
-    rng = np.random.default_rng(n)
-    d = rng.normal(0.3, 1, (9, n))
-    d[3:6] = np.round(d[3:6], 1)  # some ties and zeros
-    d[6:] = np.round(d[6:])  # many
-    statistic, p = rank_tests.wilcoxon_signed_rank_rows(d, alternative)
-    # scipy permutes ties of few differences, for seconds: one row without and one with ties
-    checked = (0, {"two-sided": 3, "greater": 6, "less": 4}[alternative]) if n == 13 else range(9)
-    for k, (row, t, value) in enumerate(zip(d, statistic, p, strict=True)):
-        if row.any() and k in checked:
-            expected = stats.wilcoxon(row, alternative=alternative, zero_method="zsplit")
-            assert (t, value) == pytest.approx((expected.statistic, expected.pvalue), rel=1e-11)
-        assert rank_tests.wilcoxon_signed_rank(row, alternative) == (
-            t,
-            value,
-        )  # alone as among others
-    assert rank_tests.wilcoxon_signed_rank(np.zeros(n)).p == 1
 
 
 def test_a_run_is_diverged_if_its_error_exceeds_the_threshold_in_a_tenth_of_the_steps_or_at_the_end():

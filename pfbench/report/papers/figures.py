@@ -1,6 +1,6 @@
 """Figures of the papers from our results: medians over runs with one band, and crosses at printed numbers.
 
-Names contain the number of the paper and of the figure: "000-2" is figure 2 of paper 000. Each entry of the catalogue names
+Names contain the number of the paper and of the figure: "000-2" is figure 2 of paper 000. A figure of no paper has another name. Each entry of the catalogue names
 the studies that show it. `report.paper_figures` selects other figures, or none.
 """
 
@@ -89,9 +89,9 @@ def list_page_figures(study: str, entries: Sequence[Mapping[str, Any]]) -> list[
 
 def list_paper_pages(methods: Sequence[str]) -> list[dict[str, Any]]:
     """List the first study of the paper of each method, with the titles of the figures that its page shows or links to."""
-    pages = []
-    names = {parse_label(method)[0] for method in methods}
-    for paper, entries in groupby(FIGURES.items(), key=lambda entry: entry[0][:3]):
+    pages, names = [], {parse_label(method)[0] for method in methods}
+    of_papers = filter(lambda entry: entry[0][:3].isdigit(), FIGURES.items())
+    for paper, entries in groupby(of_papers, key=lambda entry: entry[0][:3]):
         members = [figure for _, figure in entries]
         filters = {parse_label(label)[0] for figure in members for label in figure.filters}
         titles = [figure.title.partition(", ") for figure in members]

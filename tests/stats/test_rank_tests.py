@@ -1,10 +1,12 @@
-"""The statistics against numbers that R prints in its help pages, and a filter against itself."""
+"""Rank tests against scipy, statsmodels and numbers that R prints, and a filter against itself."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+from scipy import stats
+from statsmodels.stats.multitest import multipletests
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.filter.loop import run_filter
@@ -57,3 +59,47 @@ def test_a_filter_under_two_names_beats_itself_as_seldom_as_alpha() -> None:
     error = 4 * np.sqrt(alpha * (1 - alpha) / studies)
     assert share_of_wins(one, other) == pytest.approx(alpha, abs=error)
     assert share_of_wins(one, poor) > 0.5
+
+
+@pytest.mark.parametrize("alternative", ["two-sided", "greater", "less"])
+@pytest.mark.parametrize("n", [1, 2, 7, 13, 14, 40, 50, 51, 90])
+def test_signed_rank_tests_of_many_pairs_are_those_of_scipy(n, alternative):
+    rng = np.random.default_rng(n)
+    d = rng.normal(0.3, 1, (9, n))
+    d[3:6] = np.round(d[3:6], 1)  # some ties and zeros
+    d[6:] = np.round(d[6:])  # many
+    statistic, p = rank_tests.wilcoxon_signed_rank_rows(d, alternative)
+    # scipy permutes ties of few differences, for seconds: one row without and one with ties
+    checked = (0, {"two-sided": 3, "greater": 6, "less": 4}[alternative]) if n == 13 else range(9)
+    for k, (row, t, value) in enumerate(zip(d, statistic, p, strict=True)):
+        if row.any() and k in checked:
+            expected = stats.wilcoxon(row, alternative=alternative, zero_method="zsplit")
+            assert (t, value) == pytest.approx((expected.statistic, expected.pvalue), rel=1e-11)
+        assert rank_tests.wilcoxon_signed_rank(row, alternative) == (
+            t,
+            value,
+        )  # alone as among others
+    assert rank_tests.wilcoxon_signed_rank(np.zeros(n)).p == 1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_holm_is_that_of_statsmodels(seed):
+    p = np.random.default_rng(seed).random(12) ** 3
+    p[3] = p[7]
+    np.testing.assert_allclose(rank_tests.holm(p), multipletests(p, method="holm")[1])
+
+
+def test_a_lost_run_outranks_any_other():
+    a, b = np.zeros(9), np.full(9, 14.0)
+    a[0], b[0] = np.inf, 0.0
+    d = comparison.subtract_losses(a, b)
+    # a wins 8 pairs by a factor of a million and loses one run: that pair holds the largest rank, 9 of 45.
+    assert rank_tests.wilcoxon_signed_rank(d).statistic == 9
+    assert comparison.subtract_losses(b, a).tolist() == (-d).tolist()
+
+
+def test_rounding_decides_nothing():
+    a = np.linspace(0, 1, 30)
+    # in every run the same way, but less than single precision tells
+    assert rank_tests.wilcoxon_signed_rank(comparison.subtract_losses(a, a + 1e-7)).p == 1.0
+    assert rank_tests.wilcoxon_signed_rank(comparison.subtract_losses(a, a + 1e-5)).p < 1e-5
