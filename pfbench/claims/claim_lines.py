@@ -16,9 +16,6 @@ from pfbench.claims.claim_list import PrintedClaim, read_printed_claims
 from pfbench.claims.measures import Measure
 from pfbench.job.readings import CENTRAL_READING, read_reading_table
 
-# --------------------------------------------------------------------------------------------------
-# Lines of each claim: comparisons of filters in the readings of its paper, read from claim_lines.yaml.
-
 _DATA = Path(__file__).with_name("claim_lines.yaml")
 PUBLISHED, REPAIRED = "published", "repaired"
 COLUMNS = (PUBLISHED, REPAIRED)

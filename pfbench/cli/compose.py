@@ -16,9 +16,6 @@ from pfbench.job.config import CHOICES, JobConfig, compose, compose_tree, expand
 from pfbench.job.trust import UntrustedConfigError, check_study, trusted_packages
 from pfbench.results.paper_block import PAPER, experiments_dir, list_named_parts
 
-# --------------------------------------------------------------------------------------------------
-# Configurations of commands: sweeps, experiments and descriptions of files.
-
 
 def compose_study(words: Sequence[str]) -> JobConfig:
     """Compose the configuration of a study, with its experiment if it exists.

@@ -16,9 +16,6 @@ from typing import Any
 from pfbench.files.escapes import ESCAPED
 from pfbench.job.trust import WRITTEN
 
-# --------------------------------------------------------------------------------------------------
-# Error messages of the command line: key, value and remedy.
-
 # extra of the package that installs a launcher
 _EXTRAS = {"ray": "ray", "submitit": "slurm", "joblib": "launch"}
 # errors of the file system: remedy

@@ -28,9 +28,6 @@ from pfbench.job.config import CHOICES, JobConfig, expand_filter_sets, register_
 from pfbench.job.trust import ENVIRONMENT
 from pfbench.results.paper_block import conf_dir
 
-# --------------------------------------------------------------------------------------------------
-# Command `pfbench run`: one job, or a sweep.
-
 HELP = """\
 pfbench run [-m] key=value ...
 

@@ -12,9 +12,6 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-# --------------------------------------------------------------------------------------------------
-# Addition, subtraction and means of states: Euclidean components, angles and quaternions.
-#
 # A chart maps states x [..., D] to differences d [..., d], the coordinates of covariances and kernels.
 # The dimension d is smaller than D if the state has a quaternion. Each block applies to its components.
 

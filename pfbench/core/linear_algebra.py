@@ -14,9 +14,6 @@ from torch.distributions import Independent, MultivariateNormal, Normal
 from pfbench.kernels import dispatch
 from pfbench.kernels.dispatch import compilable, is_capturing, use_kernels
 
-# --------------------------------------------------------------------------------------------------
-# Batched square roots and densities of covariances, with a mask instead of exceptions.
-
 _LOG_2PI = math.log(2.0 * math.pi)
 
 

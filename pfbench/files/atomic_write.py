@@ -14,9 +14,6 @@ from uuid import uuid4
 
 import numpy as np
 
-# --------------------------------------------------------------------------------------------------
-# Writing of files: an interruption leaves the old or the new file, never a partial one.
-
 
 def write_atomically(path: Path, fill: Callable[[IO[bytes]], Any]) -> None:
     """Write a file under a temporary name and rename it.

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import gc
 
-# --------------------------------------------------------------------------------------------------
-# Start of the work of a command: an error before it refuses the input, an error after it is a failure.
-#
 # Work starts when the first run of a job is computed, when the first epoch of a training is, or when the first file is
 # written. Until then nothing is stored. Words, configurations, input files, plans and the data of a job are checked before.
 

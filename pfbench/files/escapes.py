@@ -8,9 +8,6 @@ import unicodedata
 from html import escape
 from typing import Any
 
-# --------------------------------------------------------------------------------------------------
-# Escapes of text from results, names and configurations, one per format of a report.
-#
 # Labels, names of states, units and error messages come from files that another person may have
 # written. Each writer escapes them with the function of its format.
 

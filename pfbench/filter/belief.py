@@ -16,9 +16,6 @@ from pfbench.kernels import dispatch
 from pfbench.kernels.dispatch import compilable
 from pfbench.model.base import StateSpaceModel
 
-# --------------------------------------------------------------------------------------------------
-# Belief, which the next step needs, and information of a step for reports.
-
 
 class ParticleBelief(NamedTuple):
     """Weighted particles.

@@ -29,10 +29,7 @@ from pfbench.filter.input_check import check_is_filter, check_model_once, check_
 from pfbench.filter.particle.stages import WEIGHT_UPDATE_MEMORY
 from pfbench.model.base import StateSpaceModel, named_inputs
 
-# --------------------------------------------------------------------------------------------------
-# The time loop of every filter: `FilterPass` steps a belief through a record.
-#
-# `run_filter`, training, online inference and filters that take several steps together all use it.
+# `run_filter`, training, online inference and filters that take several steps together all use `FilterPass`.
 
 Watch = Callable[[int, StepInfo], dict[str, Tensor]]
 

@@ -8,9 +8,6 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-# --------------------------------------------------------------------------------------------------
-# Coordinates in which a covariance is the unit matrix.
-
 LOG_2PI = math.log(2.0 * math.pi)
 
 

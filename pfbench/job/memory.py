@@ -27,9 +27,6 @@ from pfbench.filter.loop import Watch, run_filter
 from pfbench.model.base import StateSpaceModel
 from pfbench.scenario.oracle_noise import OracleNoiseModel
 
-# --------------------------------------------------------------------------------------------------
-# Memory of this machine, control group or GPU: free, used, counted and released.
-
 GIB, MIB = 1 << 30, 1 << 20
 
 _USABLE_SHARE = 0.8  # of free memory: allocators and libraries are not counted [ours]

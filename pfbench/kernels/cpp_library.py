@@ -15,9 +15,6 @@ import torch
 
 from pfbench.kernels.library_build import build_library, find_variants, name_library
 
-# --------------------------------------------------------------------------------------------------
-# Library of the C++ operators: choice of the variant, compilation where none came with the package, loading.
-
 log = logging.getLogger("pfbench")
 _WITH_PACKAGE = Path(__file__).parent
 

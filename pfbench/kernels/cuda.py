@@ -17,9 +17,6 @@ from torch import Tensor
 
 from pfbench.kernels.manifest import check_first
 
-# --------------------------------------------------------------------------------------------------
-# Compilation of the kernels of particles.cu by torch's NVRTC, and their launch.
-
 _SOURCES = Path(__file__).parent / "src"
 
 

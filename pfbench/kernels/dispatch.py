@@ -16,9 +16,6 @@ from pfbench.kernels import cuda
 from pfbench.kernels.cpp_library import is_library_loaded, load_library, use_private_cache
 from pfbench.kernels.manifest import Operator, check_arguments, read_operators
 
-# --------------------------------------------------------------------------------------------------
-# Choice between torch operations and operators for the inner loops over particles.
-#
 # A compilable function takes tensors, the first argument among them, and integers. It returns
 # tensors. Each of its torch operations is a pass over all particles. The C++ operators make one pass. They
 # are the default on the CPU. On other devices they are compiled on request, which takes some seconds:

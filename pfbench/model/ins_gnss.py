@@ -20,9 +20,6 @@ from pfbench.nav.aiding import LOOSE_CHANNELS, AlignmentErrors, GnssReceiver, Pr
 from pfbench.nav.imu_errors import ImuErrors
 from pfbench.nav.strapdown import InsIntervals
 
-# --------------------------------------------------------------------------------------------------
-# Components, initial distribution and process noise that models of INS errors share.
-
 _AXES = {
     "attitude": (("E", "N", "U"), "rad"),
     "velocity": (("E", "N", "U"), "m/s"),

@@ -22,9 +22,6 @@ from pfbench.model.relative_ranges import RAW_CHANNELS, predict_raw
 from pfbench.model.strapdown_tuning import AidedTuning, StrapdownTuning, TightTuning
 from pfbench.nav.strapdown import PreintegratedImu, rotate
 
-# --------------------------------------------------------------------------------------------------
-# Total-state loosely coupled INS/GNSS for MEMS sensors.
-#
 # With gyro biases of a degree per second an open-loop INS, and an error state about it, is useless
 # after seconds. The state is therefore the motion with the sensor biases. IMU data enter as
 # increments over a filter interval, with first-order bias corrections (`preintegration`). A step

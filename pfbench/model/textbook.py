@@ -17,10 +17,7 @@ from pfbench.core.parameter_checks import as_float64, check_positive, require_ra
 from pfbench.core.record import Record, name_channels
 from pfbench.model.base import StateSpaceModel
 
-# --------------------------------------------------------------------------------------------------
-# Scalar nonlinear models from the literature, for tests and tutorials.
-#
-# Their posteriors can be computed in closed form or on a grid.
+# Posteriors of scalar models can be computed in closed form or on a grid.
 
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 

@@ -31,9 +31,6 @@ from pfbench.core.parameter_checks import (
 from pfbench.core.record import EACH_SATELLITE
 from pfbench.model.base import StateSpaceModel
 
-# --------------------------------------------------------------------------------------------------
-# Inputs of urban positioning, and distributions of pseudoranges with and without line of sight.
-
 _LOG_ROOT_2PI = 0.5 * math.log(2.0 * math.pi)
 
 

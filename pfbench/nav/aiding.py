@@ -18,9 +18,6 @@ from pfbench.nav import earth
 from pfbench.nav.imu_errors import DEG_H, UG
 from pfbench.nav.strapdown import InsIntervals
 
-# --------------------------------------------------------------------------------------------------
-# Aiding of an INS: sensor protocol, GNSS fixes, initial errors, process noise.
-
 ARCMIN = math.pi / 180.0 / 60.0
 POSITION_DIFFERENCES = name_channels("INS minus measured position", ("North", "East", "Up"), "m")
 VELOCITY_DIFFERENCES = name_channels("INS minus measured velocity", ("East", "North", "Up"), "m/s")

@@ -8,9 +8,6 @@ from torch import Tensor
 from pfbench.core import chart
 from pfbench.nav import attitude
 
-# --------------------------------------------------------------------------------------------------
-# The WGS-84 Earth: radii, normal gravity, rates of the level frame, coordinates.
-#
 # Positions are pos [..., 3] = (latitude, longitude, height) in rad, rad, m. Velocities are
 # v [..., 3] = (East, North, Up) in m/s. Every function broadcasts over leading axes.
 

@@ -22,9 +22,6 @@ from pfbench.nav.trajectory import (
     integrate_motion,
 )
 
-# --------------------------------------------------------------------------------------------------
-# Trajectories from manoeuvres: a sequence of segments.
-#
 # A segment changes speed, climb angle and heading by a given amount. Speed changes linearly (or
 # smoothly). Angles change by the quintic u^3 (10 - 15 u + 6 u^2), so angular rate and angular
 # acceleration are continuous and zero at the joints [ours].

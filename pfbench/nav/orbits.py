@@ -13,9 +13,6 @@ from typing_extensions import override
 from pfbench.core.parameter_checks import require
 from pfbench.nav import earth
 
-# --------------------------------------------------------------------------------------------------
-# Navigation satellites: orbital motion, nominal constellations, received signals.
-#
 # Positions and velocities are Earth-fixed [m, m/s], velocities relative to the rotating Earth.
 # Time is in seconds from the start of the scenario.
 

@@ -25,9 +25,6 @@ from pfbench.nav.orbits import (
 )
 from pfbench.nav.strapdown import InsIntervals
 
-# --------------------------------------------------------------------------------------------------
-# Clock of a GNSS receiver: bias and drift in metres.
-
 
 @dataclass(frozen=True)
 class ReceiverClock:

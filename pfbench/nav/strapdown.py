@@ -11,9 +11,6 @@ from torch import Tensor
 from pfbench.core.parameter_checks import require
 from pfbench.nav import attitude, earth
 
-# --------------------------------------------------------------------------------------------------
-# INS mechanisation: attitude, velocity and position from sensor increments.
-#
 # Two-sample (or one-sample) mechanisation in East, North, Up with coning, rotation and sculling
 # corrections [Savage 1998, "Strapdown inertial navigation integration algorithm design", parts 1
 # and 2; Yan Gongmin, PSINS].

@@ -17,9 +17,6 @@ from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
 
-# --------------------------------------------------------------------------------------------------
-# Protocol of noise regimes, and the process noise of a step.
-
 _SAMPLES = 20  # samples of process noise within a step
 
 

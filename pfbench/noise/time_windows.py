@@ -15,9 +15,6 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels
 from pfbench.noise.base import ErrorDistribution, LayeredRegime, NoiseRegime, NominalNoise
 
-# --------------------------------------------------------------------------------------------------
-# Time windows in which a noise regime acts.
-
 Windows = Sequence[Sequence[float | None]]
 """Pairs (from, to) in s, from inclusive, to exclusive, in order. None is the end of the record."""
 

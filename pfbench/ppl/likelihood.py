@@ -21,9 +21,6 @@ from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.ppl.model_batch import ModelBatch
 from pfbench.ppl.parameterised_model import ParameterisedModel
 
-# --------------------------------------------------------------------------------------------------
-# Marginal likelihoods of models: by a filter, or by Pyro's GaussianHMM.
-
 
 class MarginalLikelihood(Protocol):
     """A function that computes log p(y_1:T) of each run of a record under a model.

@@ -21,9 +21,6 @@ from pfbench.ppl.parameterised_model import ParameterisedModel, check_counts, ch
 from pfbench.ppl.pyro_program import simulate
 from pfbench.results.plotting import COLUMN, RC, add_legend, line_styles
 
-# --------------------------------------------------------------------------------------------------
-# Posterior draws of parameters: table, convergence diagnostics and plot.
-
 WELL_MIXED = 1.05  #: upper limit of split r-hat for chains that agree
 
 

@@ -15,10 +15,7 @@ from pfbench.results.status import divergence_threshold, scenario_family
 from pfbench.results.step_times import STEP_TIME
 from pfbench.stats.sentences import format_count
 
-# --------------------------------------------------------------------------------------------------
-# Facts of a study from which its methods paragraph is written: numbers, words and lists, computed once.
-#
-# They are stored with the data of the page. Pairs and names of filters are not among them, since a stored page decides
+# Facts are stored with the data of the page. Pairs and names of filters are not among them, since a stored page decides
 # and names them again.
 
 _VERSIONS = ("pfbench", "commit", "python", "torch", "numpy")

@@ -17,9 +17,6 @@ from pfbench.results.conditions import Condition
 from pfbench.results.store import BUDGETS, SAME_LIKELIHOODS, SAME_N, SAME_TIME
 from pfbench.stats.study_runs import natural_sort_key
 
-# --------------------------------------------------------------------------------------------------
-# Provenance of a report: versions, seeds, time of the jobs, training, choices and citation.
-
 _SHARED = (
     ("pfbench", "versions.pfbench"),
     ("commit", "versions.commit"),

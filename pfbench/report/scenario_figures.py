@@ -27,9 +27,6 @@ from pfbench.results.plotting import (
 )
 from pfbench.results.status import divergence_threshold
 
-# --------------------------------------------------------------------------------------------------
-# Figures of a datasheet: track, sensors, satellites, residuals, spread of the runs.
-
 _BOUND: Any = {"color": "black", "ls": (0, (4, 1.5)), "lw": 0.9}
 _AXES = ("right", "forward", "up")
 _LIMIT = 5.0  # standard deviations, limit of a histogram

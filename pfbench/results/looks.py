@@ -19,10 +19,7 @@ from pfbench.results.paper_block import (
     read_world,
 )
 
-# --------------------------------------------------------------------------------------------------
-# Names and looks of methods, scenarios and regimes: one look per method in every figure and page.
-#
-# They come from the node `paper` of the configuration files. Hue shows the family, shade and marker
+# Looks come from the node `paper` of the configuration files. Hue shows the family, shade and marker
 # for the method. Marks of proposed methods are filled and their lines solid. Marks of other methods
 # are hollow and their lines dashed.
 

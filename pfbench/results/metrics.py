@@ -34,9 +34,6 @@ from pfbench.stats.error_measures import (
     rmse_per_run,
 )
 
-# --------------------------------------------------------------------------------------------------
-# Values of the metrics, one function each, from the arrays of a job.
-
 _PARTICLE_COUNTS = ("ess", "ancestors", "unique")  # divided by the number of particles
 
 

@@ -16,10 +16,7 @@ import yaml
 import pfbench
 from pfbench.core.parameter_checks import require
 
-# --------------------------------------------------------------------------------------------------
-# The node `paper` of a configuration file: names and limits for reports, not for the computation.
-#
-# A scenario, a noise regime or a filter may have this node. It is not passed to the class of the part
+# A scenario, a noise regime or a filter may have the node `paper`. It is not passed to the class of the part
 # and does not enter the key of a job. It belongs to its own file: a part that another part contains
 # does not have it.
 

@@ -20,9 +20,6 @@ from typing_extensions import override
 from pfbench.results.looks import MethodLook, find_looks
 from pfbench.results.paper_block import MARKERS
 
-# --------------------------------------------------------------------------------------------------
-# Common parts of figures: size, palette, line styles, legends, quantiles over runs.
-
 COLUMN = 3.5  #: inches, width of a column of print
 CURVE_RANGE = 1e4  # of an axis, above the typical value of the best filter
 INSTANTS = 180  # points of a curve at most: a column of print is 250 points wide

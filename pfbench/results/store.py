@@ -28,9 +28,6 @@ from pfbench.files.command_start import start_work
 from pfbench.files.limits import LimitError, check_zip, find_input
 from pfbench.kernels.generator_version import GENERATOR_VERSION
 
-# --------------------------------------------------------------------------------------------------
-# Results on disk: one `<key>.npz` per job, readable with numpy alone, written atomically.
-#
 # A file holds `meta`, a JSON text, and plain arrays without pickles. A failed job leaves
 # `<key>.failed.json` in the same folder.
 

@@ -23,9 +23,6 @@ from pfbench.scenario.base import Scenario
 from pfbench.scenario.closed_loop import ClosedLoopIns
 from pfbench.scenario.simulated import Arrays, load_or_build
 
-# --------------------------------------------------------------------------------------------------
-# Simulated flights with an INS and aiding sensors.
-
 
 @dataclass(frozen=True)
 class SimulatedFlight(Scenario):

@@ -27,9 +27,6 @@ from pfbench.model.passive_location import (
 from pfbench.noise.base import NoiseRegime, process_variance_factors
 from pfbench.scenario.base import Scenario, regime_name
 
-# --------------------------------------------------------------------------------------------------
-# Initial distribution of a passively located emitter, given the first measurement.
-
 
 class FirstMeasurement(NamedTuple):
     """First measurement of an emitter, with the prior information.

@@ -15,9 +15,6 @@ from pfbench.stats.sentences import format_count
 POWER = 0.8
 
 
-# --------------------------------------------------------------------------------------------------
-# Runs and worlds that a study requires, and differences that a planned study can show.
-
 _HALVINGS = 60
 _MOST = 100_000
 

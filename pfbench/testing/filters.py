@@ -37,9 +37,6 @@ from pfbench.testing.results import (
     takes_arguments,
 )
 
-# --------------------------------------------------------------------------------------------------
-# Tests of filters by averages over runs: unbiased evidence, and convergence.
-
 
 def filter_record(
     method: Filter, model: StateSpaceModel, y: Tensor, seed: int = 1, **options: Any

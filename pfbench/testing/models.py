@@ -33,9 +33,6 @@ from pfbench.testing.results import (
     find_kind,
 )
 
-# --------------------------------------------------------------------------------------------------
-# Test of the derivatives that a model states: they equal finite differences.
-
 
 def check_jacobians(
     model: StateSpaceModel, x: Tensor, u: Any, step: float = 1e-4, limit: float = 1e-5

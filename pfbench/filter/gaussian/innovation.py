@@ -20,9 +20,6 @@ from pfbench.filter.gaussian.linearisation_rules import (
 from pfbench.filter.linearisation import around_first, check_moments, find_observation_jacobian
 from pfbench.model.base import StateSpaceModel
 
-# --------------------------------------------------------------------------------------------------
-# Innovation of a Gaussian filter, and the adaptations that change it.
-
 _SMALLEST_WEIGHT = 1e-12  # of a reweighted component: R times 1e12
 
 

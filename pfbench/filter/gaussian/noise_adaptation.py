@@ -27,9 +27,6 @@ from pfbench.filter.gaussian.innovation import (
 from pfbench.filter.gaussian.kalman_update import kalman_gain_update
 from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
 
-# --------------------------------------------------------------------------------------------------
-# Noise adaptations of Gaussian filters: fading memory, and constrained R and Q.
-#
 # The paper [COFM-AMSSRCPF 2024, Measurement and Control] describes its equations in prose only.
 # Choices that it leaves open are marked [ours].
 

@@ -46,9 +46,6 @@ from pfbench.filter.whitening import (
 from pfbench.kernels.dispatch import is_capturing
 from pfbench.model.base import ModelWrapper, StateSpaceModel, StaticModel
 
-# --------------------------------------------------------------------------------------------------
-# Proposal from one Gaussian guide filter for all particles of a run.
-#
 # [COFM-AMSSRCPF 2024, Measurement and Control] defines the importance density by "mean and
 # variance" of a cubature filter. It does not state whether the filter is one for the particle
 # set (here), one for each particle (guided_particles), or one for its noise (guided_noise).

@@ -32,9 +32,6 @@ from pfbench.filter.robust.hypotheses import (
 from pfbench.filter.whitening import split_root
 from pfbench.model.base import StateSpaceModel
 
-# --------------------------------------------------------------------------------------------------
-# Bank of Gaussian filters that start from the components of a Gaussian sum of the initial distribution.
-#
 # References:
 #     D. L. Alspach, H. W. Sorenson 1972, "Nonlinear Bayesian estimation using Gaussian sum
 #         approximations".

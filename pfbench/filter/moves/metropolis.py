@@ -21,9 +21,6 @@ from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
 from pfbench.filter.exactness import is_every_part_exact
 from pfbench.model.base import StateSpaceModel, StaticModel
 
-# --------------------------------------------------------------------------------------------------
-# Histories that particles store for MCMC kernels, and how they grow step by step.
-#
 # A particle stores everything that a kernel reads. Kernels do not look up parents.
 
 

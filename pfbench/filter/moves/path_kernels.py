@@ -42,9 +42,6 @@ from pfbench.filter.particle.regularised_resampling import GaussianSmoothing, Sm
 from pfbench.filter.whitening import compute_half_square, whiten
 from pfbench.model.base import StateSpaceModel
 
-# --------------------------------------------------------------------------------------------------
-# Sufficient statistics of paths under fixed noises, for kernels that shift x_t.
-
 
 @dataclass(frozen=True)
 class PathStatistics(PathHistory):

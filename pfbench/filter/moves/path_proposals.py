@@ -25,9 +25,6 @@ from pfbench.filter.moves.metropolis import get_transition, stack_history
 from pfbench.filter.particle.stages import draw_noise
 from pfbench.model.base import StateSpaceModel
 
-# --------------------------------------------------------------------------------------------------
-# Segments of a path: densities, and proposals that ignore the measurements.
-
 
 class PathSegment(NamedTuple):
     """End of a path.

@@ -18,9 +18,6 @@ from pfbench.filter.particle.stages import EssResampler, Resampler
 from pfbench.filter.whitening import whiten
 from pfbench.model.base import StateSpaceModel
 
-# --------------------------------------------------------------------------------------------------
-# Regularised resampling: copies plus a step of a smoothing kernel.
-
 
 class SmoothingKernel(Protocol):
     """Symmetric density K(e) of d whitened coordinates, for particles x + h A e."""

@@ -35,10 +35,7 @@ from pfbench.filter.particle.stages import (
 )
 from pfbench.model.base import StateSpaceModel
 
-# --------------------------------------------------------------------------------------------------
-# Point sets: independent points, or low-discrepancy points with random shifts.
-#
-# Each draw has a new shift. Each shifted point is uniform, so averages are unbiased and their spread
+# Each draw of a point set has a new shift. Each shifted point is uniform, so averages are unbiased and their spread
 # over runs is a valid error. The base set is fixed and cached. The shift comes from the counter-based
 # stream, so the points of a run depend only on seed, run, step and label.
 

@@ -28,9 +28,6 @@ from pfbench.kernels import dispatch
 from pfbench.kernels.dispatch import compilable, is_capturing
 from pfbench.model.base import StateSpaceModel
 
-# --------------------------------------------------------------------------------------------------
-# Resampling probabilities: the weights themselves by default.
-
 
 class AuxiliaryWeights(Protocol):
     """Resampling probabilities of the particles at t-1, given the record at t."""

@@ -30,9 +30,6 @@ from pfbench.filter.particle.stages import PointSet, Resampler, Systematic
 from pfbench.filter.whitening import whiten
 from pfbench.model.base import StateSpaceModel
 
-# --------------------------------------------------------------------------------------------------
-# Partitions of the state space into cells, batched, by differences from the mean.
-
 
 class CellPartition(Protocol):
     """Partition into cells along each axis."""

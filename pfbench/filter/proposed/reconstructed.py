@@ -39,9 +39,6 @@ from pfbench.filter.proposed.dmc_controller import (
 from pfbench.filter.whitening import compute_half_square, whitening_basis
 from pfbench.model.base import StateSpaceModel, StaticModel
 
-# --------------------------------------------------------------------------------------------------
-# Weight corrections of reconstructed particles.
-#
 # As printed the weights do not include the shift. The filter is then exact for another model, in
 # which the data count twice [particle filter with state reconstruction by Dynamic Matrix Control;
 # Akyildiz and Miguez 2020]. The corrections are [ours].

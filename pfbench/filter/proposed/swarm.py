@@ -55,9 +55,6 @@ from pfbench.filter.proposed.swarm_weighting import MixtureWeighting, SwarmWeigh
 from pfbench.kernels.dispatch import is_capturing
 from pfbench.model.base import StateSpaceModel
 
-# --------------------------------------------------------------------------------------------------
-# Velocity and position limits, and the stopping rule of a particle swarm.
-
 
 @dataclass(frozen=True)
 class SwarmLimits:

@@ -21,10 +21,7 @@ _VARIATIONAL = {
     "iterations": "whole [1, inf) Use 4.",
 }
 
-# --------------------------------------------------------------------------------------------------
-# Adaptive measurement noise: the variance of each component is learned from the measurements.
-#
-# Suited to noise that changes slowly. After a single outlier the learned variance stays too large for
+# Learned noise suits noise that changes slowly. After a single outlier the learned variance stays too large for
 # the length of the memory. Missing components do not change the memory.
 
 

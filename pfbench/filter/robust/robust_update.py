@@ -30,9 +30,6 @@ from pfbench.filter.gaussian.kalman_update import kalman_gain_update
 from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
 from pfbench.filter.whitening import LOG_2PI
 
-# --------------------------------------------------------------------------------------------------
-# Groups of measurement components that a robust update judges together.
-
 GROUPINGS = ("all", "sensor", "component", "satellite")
 DOWNWEIGHTED = 0.5  # a fix whose weight is below this counts as downweighted [ours]
 

@@ -37,9 +37,6 @@ from pfbench.filter.robust.robust_update import (
 
 _ITERATIONS = {"iterations": "whole [1, inf) Use 4."}
 
-# --------------------------------------------------------------------------------------------------
-# M-estimation of the whitened state by iterated reweighting: Huber and maximum correntropy.
-
 
 @dataclass(frozen=True)
 class MEstimationUpdate(ResidualLoss):

@@ -21,9 +21,6 @@ from pfbench.filter.smoothing.backward_sampling import draw_by_weight
 from pfbench.filter.smoothing.gaussian_smoother import check_no_feedback
 from pfbench.model.base import StateSpaceModel, initial_law
 
-# --------------------------------------------------------------------------------------------------
-# Paths of a model as vectors of standard normal numbers: initial state and driving noise.
-#
 # A singular model does not have a transition density of its states. Its paths have a density in these
 # numbers: a standard normal one times the likelihood of all measurements.
 

@@ -18,9 +18,6 @@ from pfbench.results.looks import MethodLook
 from pfbench.results.store import JobResult
 from pfbench.stats.error_measures import Array
 
-# --------------------------------------------------------------------------------------------------
-# Curves over time, calibration and single runs of the page of a study.
-
 CURVE_INSTANTS, FEW_CURVE_INSTANTS = 60, 24
 _MANY = 300  # filters times conditions, from which curves have few instants
 

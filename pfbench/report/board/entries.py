@@ -22,9 +22,6 @@ from pfbench.results.paper_block import list_named_parts
 from pfbench.results.step_times import STEP_TIME, WARM_UP, StepTimes
 from pfbench.results.store import SAME_LIKELIHOODS, SAME_N
 
-# --------------------------------------------------------------------------------------------------
-# Entries of the data of a page: filters, parts, metrics and planned pairs.
-
 _BUDGET_NAMES = {"particles": "Equal N", "time": "Equal time", "likelihoods": "Equal likelihoods"}
 
 

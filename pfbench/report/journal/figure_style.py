@@ -16,9 +16,6 @@ from matplotlib.figure import Figure
 from pfbench.core.parameter_checks import require
 from pfbench.results.plotting import set_plain_ticks
 
-# --------------------------------------------------------------------------------------------------
-# Marks, scales and sizes of all figures of a paper.
-
 ROW = 0.135  # inches, height of a row with a name
 MARGIN = 0.42  # inches, axis below the rows
 DAGGER = "†"

@@ -35,9 +35,6 @@ from pfbench.report.journal.table_layout import (
 )
 from pfbench.report.writers import format_short
 
-# --------------------------------------------------------------------------------------------------
-# Main table of a paper: errors of all filters in all conditions.
-
 _DAGGER = r"\rlap{\textsuperscript{\textdagger}}"
 
 

@@ -39,9 +39,6 @@ from pfbench.report.journal.study_pack import (
 )
 from pfbench.results.plotting import format_axis_label, set_plain_ticks
 
-# --------------------------------------------------------------------------------------------------
-# Figures of ratios: leaderboard, planned pairs, and error against cost.
-
 _GREY = "0.45"
 _HALF_DIAMOND = 0.26  # rows
 _FAR = 5e3  # m; from there errors are in km
