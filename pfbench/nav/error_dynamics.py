@@ -66,7 +66,7 @@ def error_rate(
     d_en = w_en - earth.transport_rate(pos_t[..., 0], pos_t[..., 2], v_t)
 
     w = w_ie + w_en
-    turn = w - _multiply_transposed(m, w - d_ie - d_en)
+    turn = w - _multiply(m.transpose(-1, -2), w - d_ie - d_en)
     push = f - _multiply(m, f) - _cross(2 * d_ie + d_en, v_t) - _cross(2 * w_ie + w_en, dv)
     if gyro is not None:
         turn = turn - _multiply(dcm, gyro)
@@ -193,10 +193,6 @@ def _matrix(*entries: Tensor) -> Tensor:
 
 def _multiply(m: Tensor, a: Tensor) -> Tensor:
     return (m @ a.unsqueeze(-1)).squeeze(-1)
-
-
-def _multiply_transposed(m: Tensor, a: Tensor) -> Tensor:
-    return _multiply(m.transpose(-1, -2), a)
 
 
 def _cross(a: Tensor, b: Tensor) -> Tensor:

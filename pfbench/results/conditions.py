@@ -101,7 +101,7 @@ def load_conditions(
         _check_equal(items, _BUILD, "the study")
     groups = {group[0][0]: group for group in find_consecutive_parts(items)}
     items = [(path, join_metadata([meta for _, meta in group])) for path, group in groups.items()]
-    items.sort(key=lambda item: (_condition_key(item[1]), *_job_order(item[1])))
+    items.sort(key=lambda item: (_condition_key(item[1]), *(item[1][name] for name in ("label", "seed", "key"))))  # fmt: skip
     items = add_step_times(items, Path(results) / study)
     separated, settings = _separate_conditions(items, same_data, allow_mixed_versions)
     conditions = []
@@ -183,11 +183,6 @@ def _condition_key(meta: Mapping[str, Any]) -> tuple[str, str, str]:
     """Return scenario, noise and model of a job."""
     choices = meta["choices"]
     return str(choices["scenario"]), str(choices["noise"]), str(choices.get("model", ""))
-
-
-def _job_order(meta: Mapping[str, Any]) -> tuple[Any, ...]:
-    """Return the sorting key of a job within its condition."""
-    return meta["label"], meta["seed"], meta["key"]
 
 
 def _group_by_label(items: Sequence[_Described]) -> dict[str, list[Mapping[str, Any]]]:

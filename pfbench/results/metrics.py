@@ -349,7 +349,7 @@ def table_columns(result: store.JobResult, group: ComponentGroup) -> dict[str, f
         if metric.scope == "components" and metric.head:
             values = metric.compute(data).get(metric.component)
             if values is not None:
-                mean = _mean_of_valid(values, data.lost)
+                mean = float(finite_mean(np.asarray(values)[~data.lost], axis=0))
                 columns[metric.column_head(group.unit)] = metric.factor * mean
     return columns
 
@@ -357,11 +357,6 @@ def table_columns(result: store.JobResult, group: ComponentGroup) -> dict[str, f
 def metric_definitions() -> list[str]:
     """List the definitions of the metrics that have a column in tables."""
     return [f"{metric.head}: {metric.caption}" for metric in METRICS if metric.head]
-
-
-def _mean_of_valid(values: Array, lost: Flags) -> float:
-    """Average values [R] over valid runs."""
-    return float(finite_mean(np.asarray(values)[~lost], axis=0))
 
 
 _INTERVAL = (

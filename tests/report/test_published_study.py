@@ -45,7 +45,9 @@ def test_verdicts_are_those_of_one_study_of_all_filters(
         joint = pfbench.study("all").compare(verdict.a, verdict.b)
         assert verdict.ratio == pytest.approx(joint.ratio, rel=1e-5)
         assert verdict.n == 12
-    assert "apf against 3 filters" in str(compared)
+    assert ("apf against 3 filters" in str(compared), "A part" in str(compared)) == (True, False)
+    other = pfbench.run("linear_walk", ["ukf", "apf"], scenario__steps=20, study="other", **{**WORLD, "particles": 40})  # fmt: skip
+    assert "2 published filters have 50 particles, the own ones another number" in str(other.against("public"))  # fmt: skip
     compare_study(["study=mine", "published=public"])
     assert "ukf has the errors of the published study" in capsys.readouterr().out
     table = pd.read_csv(home / "reports" / "mine" / "published.csv")

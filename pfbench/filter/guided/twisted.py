@@ -293,6 +293,11 @@ class TwistedParticleFilter(ParticleFilter):
     proposal: Proposal = field(default_factory=TwistedProposal)
     passes: int = 10
 
+    @property
+    @override
+    def is_exact(self) -> bool:
+        return super().is_exact
+
     def __post_init__(self) -> None:
         super().__post_init__()
         require_ranges("filter", self, passes="whole [0, inf) Use 10.")

@@ -92,7 +92,7 @@ class EssStepCount(ParticleCount):
 
     @override
     def __call__(self, belief: ParticleBelief) -> Tensor:
-        n = _active_count(belief)
+        n = (belief.log_w > -torch.inf).sum(1, keepdim=True).to(belief.log_w)  # active particles
         if self.increment == 0:
             return torch.full_like(n, self.limits.initial)
         effective = n if self.before_weights else ess(belief.log_w).unsqueeze(1)
@@ -102,8 +102,3 @@ class EssStepCount(ParticleCount):
             n - self.increment,
         )
         return number.clamp(self.limits.minimum, self.limits.maximum)
-
-
-def _active_count(belief: ParticleBelief) -> Tensor:
-    """Return the number of active particles [R, 1], as float."""
-    return (belief.log_w > -torch.inf).sum(1, keepdim=True).to(belief.log_w)

@@ -54,7 +54,8 @@ class Residual(ResamplingScheme):
 
     @override
     def __call__(self, a: Tensor, n: Tensor, draws: RandomStream) -> Tensor:
-        expected = _expected_copies(a, n)
+        # in float64: in float32 the weights of 1e6 particles sum to 1 within 5 slots
+        expected = a.double() * (n / a.sum(1, keepdim=True, dtype=torch.float64))
         # 49 (1/49) < 1: without this tolerance all copies of equal weights would be random
         certain = torch.floor(expected * (1.0 + 4.0 * torch.finfo(a.dtype).eps))
         missing = n - certain.sum(1, keepdim=True).long()
@@ -64,14 +65,6 @@ class Residual(ResamplingScheme):
         slots = torch.arange(a.shape[1], device=a.device)
         counts = certain.long().scatter_add(1, index, (slots < missing).long())
         return slots_below(counts.cumsum(1), n)
-
-
-def _expected_copies(a: Tensor, n: Tensor) -> Tensor:
-    """Return expected copies [R, N], in float64.
-
-    In float32 the weights of 1e6 particles sum to 1 within 5 slots.
-    """
-    return a.double() * (n / a.sum(1, keepdim=True, dtype=torch.float64))
 
 
 def _cumulative(a: Tensor) -> Tensor:

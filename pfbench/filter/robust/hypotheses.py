@@ -72,7 +72,11 @@ class NoiseHypotheses:
         rows = [list(r) if _is_row(r) else r for r in matrix] if _is_row(matrix) else [matrix]
         is_square = len(rows) == m and all(_is_row(row) and len(row) == m for row in rows)
         require(
-            is_square and all(_is_distribution(row) for row in rows),
+            is_square
+            and all(
+                min(row) >= 0.0 and max(row) <= 1.0 and abs(sum(row) - 1.0) <= _ROUNDING
+                for row in rows
+            ),
             "hypotheses.transition",
             f"be {m} rows of {m} probabilities with sum 1",
             rows,
@@ -99,11 +103,6 @@ class NoiseHypotheses:
 def _is_row(row: Any) -> bool:
     """Return whether a row of a matrix is a sequence."""
     return isinstance(row, Sequence) and not isinstance(row, str)
-
-
-def _is_distribution(row: Sequence[float]) -> bool:
-    """Return whether numbers are probabilities with sum 1."""
-    return all(0.0 <= p <= 1.0 for p in row) and abs(sum(row) - 1.0) <= _ROUNDING
 
 
 class Branches(NamedTuple):

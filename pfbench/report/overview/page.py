@@ -91,7 +91,12 @@ def render_overview(
         "format_error": figures.format_reference_error,
         "format_reference": figures.format_reference,
         "filters": [overview.names[label] for label in overview.columns],
-        "stories": [tell_story(overview, m, _summary(m)) for m in overview.methods],
+        "stories": [
+            tell_story(
+                overview, m, str(read_paper_block("filter", parse_label(m)[0]).get("summary", ""))
+            )
+            for m in overview.methods
+        ],
         "rivals": list_rivals(overview),
         "count": spell_number(len(overview.methods)),
         "pictures": {
@@ -427,8 +432,3 @@ def list_verdicts(overview: Overview) -> pd.DataFrame:
 def list_comparisons(overview: Overview) -> pd.DataFrame:
     """List all pairs of methods in each world."""
     return pd.DataFrame([{"world": p.world, **p.verdict.to_row()} for p in overview.pairs])
-
-
-def _summary(label: str) -> str:
-    """Return the line of a method that its file states."""
-    return str(read_paper_block("filter", parse_label(label)[0]).get("summary", ""))
