@@ -1,6 +1,6 @@
-"""Shares of verdicts of judge on simulated programs: the tables of docs/judge.md.
+"""Shares of verdicts of judge on simulated programs: the table of docs/judge.md.
 
-`PYTHONPATH=.:tests python tests/judge_rates.py [STUDIES]` prints them. Errors of both programs are drawn from the same
+`PYTHONPATH=.:tests python tests/judge_rates.py [STUDIES]` prints it. Errors of both programs are drawn from the same
 law in three axes. A rate of false verdicts counts "better" and "worse" of two such programs, and "equal" where one has
 errors that are larger by the margin.
 """
@@ -15,11 +15,11 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.fft import dct
 from scipy.signal import lfilter
 from scipy.special import bdtr, stdtr
 
 from pfbench.logs.judge.judge_options import JudgeOptions
+from pfbench.logs.judge.nuisance import remove_nuisance
 from pfbench.logs.judge.pair_verdicts import PairVerdict, judge_pairs
 from pfbench.results.store import JobResult
 from pfbench.stats.comparison import EQUALITY_MARGIN, LOG_TOLERANCE, MIN_RUNS
@@ -28,7 +28,6 @@ from pfbench.stats.time_blocks import (
     BLOCKS,
     MIN_EFFECTIVE,
     block_losses,
-    remove_drift,
     variance_ratio,
 )
 
@@ -117,6 +116,37 @@ def recorded(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
     return np.fft.irfft(drawn, 2 * STEPS)[..., :STEPS]
 
 
+def sine(periods: float) -> Draw:
+    """An oscillation of one amplitude and phase a run, as Schuler's, with some noise."""
+
+    def draw(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+        size, phase = rng.normal(size=(*shape, 1)), rng.uniform(0.0, 2 * np.pi, (*shape, 1))
+        turn = 2 * np.pi * periods * np.arange(STEPS) / STEPS
+        return size * np.sin(turn + phase) + math.sqrt(0.1) * slow(0.005)(rng, shape)
+
+    return draw
+
+
+def _drive() -> np.ndarray:
+    """A path with bends at 10 m/s, m, [STEPS, 3]."""
+    share = np.arange(STEPS) / STEPS
+    yaw = 0.5 + 1.2 * np.sin(6 * np.pi * share) + 4.0 * share
+    return np.cumsum(5.0 * np.stack([np.cos(yaw), np.sin(yaw), np.zeros(STEPS)], -1), axis=0)
+
+
+PATH = _drive()
+
+
+def formed(matrix: list[list[float]]) -> Draw:
+    """An error in the form of the path from its start, of one size a run, with some noise."""
+    form = (PATH - PATH[0]) @ np.array(matrix).T
+
+    def draw(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+        return 0.01 * rng.normal(size=(shape[0], 1, 1)) * form.T + slow(0.005)(rng, shape)
+
+    return draw
+
+
 LAWS: dict[str, Draw] = {
     "white": white,
     **{f"correlation time {100 * t:g} %": slow(t) for t in (0.01, 0.02, 0.05, 0.1, 0.2)},
@@ -136,6 +166,9 @@ LAWS: dict[str, Draw] = {
     "size varies in 5 %": sized((0.05, 1.0)),
     "size varies in 10 %": sized((0.1, 1.0)),
     "size varies in 0.5 and 10 %": sized((0.005, 0.7), (0.1, 0.5)),
+    **{f"sine of T / {n:g}": sine(n) for n in (3.0, 7.5, 8.0)},
+    "yaw of 0.01 rad": formed([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]),
+    "scale of 1 %": formed([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]),
 }  # fmt: skip
 
 
@@ -188,6 +221,7 @@ def judge_study(error: np.ndarray, lost: np.ndarray) -> PairVerdict:
         SimpleNamespace(
             name=f"s{k}",
             epochs=epochs,
+            reference=SimpleNamespace(interpolate_position=lambda _: PATH),
             run_names={"a": ("",), "b": ("",)},
             results={
                 name: JobResult(META, {"error": e[None], "lost": np.array([gone])})
@@ -221,8 +255,8 @@ def judge_studies(error: np.ndarray, lost: np.ndarray) -> Words:
         loss = np.log(np.minimum(np.where(lost, CAP, rmse), CAP))
         return _words(loss[..., 0] - loss[..., 1], np.ones(len(error)))
     parts = []
-    for change in (np.asarray, remove_drift):
-        loss = block_losses(change(error)[..., None, :, :], BLOCKS // sequences, CAP)
+    for change in (lambda error, _: error, remove_nuisance):
+        loss = block_losses(change(error, PATH)[..., None, :, :], BLOCKS // sequences, CAP)
         d = (loss[:, :, 0] - loss[:, :, 1]).reshape(len(error), -1)
         parts.append(_words(d, variance_ratio(d)))
     whole, steady = parts
@@ -301,94 +335,14 @@ def rates(row: Row, studies: int) -> Rates:
     return Rates(float(same.mean()), float(margin.mean()), float(smaller.mean()), float(np.median(effective)))  # fmt: skip
 
 
-# --------------------------------------------------------------------------------------------------
-# Other methods for one record, from squared errors [2, STEPS]: p-values, 0 or 1 for a quantile alone.
-
-Method = Callable[[np.ndarray], float]
-
-
-def _log_ratio(square: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return the log ratio of the root mean squares, and its influence values [T]."""
-    mean = square.mean(axis=1)
-    return 0.5 * math.log(mean[0] / mean[1]), 0.5 * (square[0] / mean[0] - square[1] / mean[1])
-
-
-def one_scale_bootstrap(square: np.ndarray) -> float:
-    """Stationary bootstrap with blocks of 8 correlation times, the first lag with a correlation below 1/e."""
-    ratio, u = _log_ratio(square)
-    n = u.size
-    covariance = np.fft.irfft(np.abs(np.fft.rfft(u, 2 * n)) ** 2, 2 * n)[:n] / n
-    length = min(8.0 * float((covariance < math.exp(-1) * covariance[0]).argmax()), n / 2)
-    circular = np.fft.irfft(np.abs(np.fft.rfft(u)) ** 2, n) / n
-    lag = np.arange(1, n)
-    weight = (1 - lag / n) * (1 - 1 / length) ** lag
-    blocks = n / length
-    if blocks < 6:
-        return 1.0
-    correction = (1 + 1 / blocks) / (1 - 1 / blocks) ** 2
-    variance = correction * (circular[0] + 2 * (weight * circular[1:]).sum()) / n
-    return float(2 * stdtr(0.75 * blocks - 1, -abs(ratio) / math.sqrt(max(variance, 1e-300))))
-
-
-def plain_blocks(blocks: int) -> Method:
-    """Blocks that count as independent."""
-
-    def p_value(square: np.ndarray) -> float:
-        d = np.subtract(*block_losses(np.sqrt(square)[:, None, :, None], blocks, CAP))
-        return 1.0 - abs(float(_words(d[None], np.ones(1), 0.0).sign[0]))
-
-    return p_value
-
-
-def cosines(count: int) -> Method:
-    """Variance of the slowest cosines, with Student's distribution."""
-
-    def p_value(square: np.ndarray) -> float:
-        ratio, u = _log_ratio(square)
-        variance = float((dct(u, norm="ortho")[1 : count + 1] ** 2).mean()) / u.size
-        return float(2 * stdtr(count, -abs(ratio) / math.sqrt(variance)))
-
-    return p_value
-
-
-def partial_sums(square: np.ndarray) -> float:
-    """Partial sums in place of a variance (Shao 2010); 45.4 is the quantile of 95 %."""
-    ratio, u = _log_ratio(square)
-    return float(ratio**2 * u.size**3 < 45.4 * (np.cumsum(u) ** 2).sum())
-
-
-METHODS: dict[str, Method] = {
-    "bootstrap of one scale": one_scale_bootstrap,
-    "30 plain blocks": plain_blocks(30),
-    "10 plain blocks": plain_blocks(10),
-    "8 cosines": cosines(8),
-    "4 cosines": cosines(4),
-    "partial sums": partial_sums,
-}
-
-
-def alarms(methods: dict[str, Method], row: Row, studies: int) -> list[list[float]]:
-    """Return the shares of decisions of each method on one record: of equal programs, and at 30 %."""
-    counts = np.zeros((len(methods), 2))
-    for error, _ in draw_studies(row, studies):
-        for k, ratio in enumerate((1.0, 0.7)):
-            square = (scale_first(error, ratio)[:, 0] ** 2).sum(-1)
-            counts[:, k] += [sum(m(s) < 0.05 for s in square) for m in methods.values()]
-    return (counts / studies).tolist()
-
-
 def main(studies: int) -> None:
-    """Print both tables."""
+    """Print the table."""
     head = ("errors", "sequences", "lost [%]", "independent units", "called different", "called equal at 5 %", "decided at 30 %")  # fmt: skip
     print(f"| {' | '.join(head)} |\n|{' --- |' * len(head)}")
     for row in ROWS:
         rate = rates(row, studies)
         cells = [row.law, row.sequences, f"{100 * row.lost:g}", f"{rate.effective:.0f}"]
         print(f"| {' | '.join(map(str, [*cells, *(f'{x:.3f}' for x in rate[:3])]))} |", flush=True)
-    print(f"\n| errors of one record | {' | '.join(METHODS)} |\n|{' --- |' * (len(METHODS) + 1)}")
-    for law in LAWS:
-        shares = alarms(METHODS, Row(law), studies)
-        print(f"| {law} | {' | '.join(f'{a:.3f}, {b:.3f}' for a, b in shares)} |", flush=True)
 
 
 if __name__ == "__main__":

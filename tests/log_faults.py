@@ -30,26 +30,42 @@ class Fault(NamedTuple):
     also: tuple[str, ...] = ()
 
 
-def late(table: str, seconds: float) -> Callable[[Tables], None]:
+def changed(
+    table: str, change: Callable[[pd.DataFrame, np.ndarray], pd.DataFrame]
+) -> Callable[[Tables], None]:
+    """Change a table by a function of its rows and their places in time, from 0 to 1."""
+
     def plant(log: Tables) -> None:
-        log[table]["t"] += seconds
+        t = log[table]["t"].to_numpy()
+        log[table] = change(log[table].copy(), (t - t[0]) / np.ptp(t)).reset_index(drop=True)
 
     return plant
+
+
+def law(
+    table: str, column: str, size: Callable[[np.ndarray], np.ndarray]
+) -> Callable[[Tables], None]:
+    """Add a function of the place in time, from 0 to 1, to a column."""
+    return changed(table, lambda rows, s: rows.assign(**{column: rows[column] + size(s)}))
+
+
+def late(table: str, seconds: float) -> Callable[[Tables], None]:
+    return law(table, "t", lambda _: np.asarray(seconds))
 
 
 def scaled(table: str, columns: Sequence[str], factor: float) -> Callable[[Tables], None]:
-    def plant(log: Tables) -> None:
-        log[table][list(columns)] *= factor
-
-    return plant
+    return changed(table, lambda rows, _: rows.assign(**(rows[list(columns)] * factor)))
 
 
 def added(table: str, column: str, value: float, row: float | None = None) -> Callable[[Tables], None]:  # fmt: skip
-    def plant(log: Tables) -> None:
-        rows = slice(None) if row is None else int(row * len(log[table]))
-        log[table].loc[rows, column] = log[table][column].loc[rows] + value
+    """Add a value to a column, or to one of its rows at a share of them."""
 
-    return plant
+    def size(s: np.ndarray) -> np.ndarray:
+        return value * (
+            (np.arange(len(s)) == int(row * len(s))) if row is not None else np.ones(len(s))
+        )
+
+    return law(table, column, size)
 
 
 def mixed(table: str, columns: Sequence[str], order: Sequence[str]) -> Callable[[Tables], None]:
@@ -71,27 +87,18 @@ def both(*plants: Callable[[Tables], None]) -> Callable[[Tables], None]:
     return plant
 
 
-def drift(log: Tables) -> None:
-    t = log["imu"]["t"]
-    log["imu"]["t"] = t[0] + (t - t[0]) * 1.001
-
-
 def jump(seconds: float) -> Callable[[Tables], None]:
-    def plant(log: Tables) -> None:
-        t = log["imu"]["t"]
-        log["imu"]["t"] = t + seconds * (t > t.median())
-
-    return plant
+    return changed(
+        "imu", lambda rows, _: rows.assign(t=rows.t + seconds * (rows.t > rows.t.median()))
+    )
 
 
 def gap(table: str, seconds: float) -> Callable[[Tables], None]:
-    def plant(log: Tables) -> None:
-        t = log[table]["t"]
-        width = min(seconds, 0.25 * (t.iloc[-1] - t.iloc[0]))
-        keep = (t < t.median()) | (t > t.median() + width)
-        log[table] = log[table][keep].reset_index(drop=True)
+    def change(rows: pd.DataFrame, _: np.ndarray) -> pd.DataFrame:
+        width = min(seconds, 0.25 * (rows.t.iloc[-1] - rows.t.iloc[0]))
+        return rows[(rows.t < rows.t.median()) | (rows.t > rows.t.median() + width)]
 
-    return plant
+    return changed(table, change)
 
 
 def step_back(log: Tables) -> None:
@@ -187,16 +194,6 @@ def mounted(*angles: float) -> Callable[[Tables], None]:
     return plant
 
 
-def drifting(log: Tables) -> None:
-    t = log["gnss"]["t"]
-    log["gnss"]["pe"] += 20.0 * (t - t.iloc[0]) / np.ptp(t)
-
-
-def bias_drift(log: Tables) -> None:
-    t = log["imu"]["t"]
-    log["imu"]["wz"] += np.radians(3.0) * ((t - t.iloc[0]) / np.ptp(t) - 0.5)
-
-
 def force_late(log: Tables) -> None:
     t = log["imu"]["t"]
     for column in FORCE:
@@ -205,12 +202,9 @@ def force_late(log: Tables) -> None:
 
 def shifted(table: str, column: str, metres: float, seconds: float) -> Callable[[Tables], None]:
     """Shift a column for some time from the middle of the log on."""
-
-    def plant(log: Tables) -> None:
-        after = log[table]["t"] - log[table]["t"].median()
-        log[table][column] += metres * ((after >= 0.0) & (after < seconds))
-
-    return plant
+    return changed(table, lambda rows, _: rows.assign(**{
+        column: rows[column] + metres * (rows.t - rows.t.median()).between(0.0, seconds, inclusive="left")
+    }))  # fmt: skip
 
 
 def without_gravity(log: Tables) -> None:
@@ -229,7 +223,11 @@ FAULTS = {
     "imu clock +18 s": Fault(late("imu", 18.0), "imu clock"),
     "imu clock +0.1 s": Fault(late("imu", 0.1), "imu clock"),
     "imu clock +0.03 s": Fault(late("imu", 0.03), "imu clock"),
-    "imu clock 1000 ppm fast": Fault(drift, "imu clock drift", ("imu clock",)),
+    "imu clock 1000 ppm fast": Fault(
+        changed("imu", lambda rows, _: rows.assign(t=rows.t[0] + (rows.t - rows.t[0]) * 1.001)),
+        "imu clock drift",
+        ("imu clock",),
+    ),
     "imu clock slip 0.09 s": Fault(jump(0.09), "imu clock drift", ("imu clock", "imu gap")),
     "imu clock jump 1 s": Fault(jump(1.0), "imu gap", _LATE),
     "imu gap 0.5 s": Fault(gap("imu", 0.5), "imu gap"),
@@ -293,14 +291,22 @@ FAULTS = {
         ("fix axes",),
     ),
     "fixes turned 12 deg": Fault(turned("gnss", 12.0, POSITION), "fix turn"),
-    "fixes drift 20 m": Fault(drifting, "slow errors", ("fix shift", "gnss clock")),
+    "fixes drift 20 m": Fault(
+        law("gnss", "pe", lambda s: 20.0 * s), "slow errors", ("fix shift", "gnss clock")
+    ),
     "fixes off 15 m for 10 s": Fault(shifted("gnss", "pn", 15.0, 10.0), "slow errors"),
     "reference jumps 8 m": Fault(
         shifted("reference", "pn", 8.0, np.inf), "slow errors", ("fix shift",)
     ),
-    "gyro bias drifts 3 deg/s": Fault(bias_drift, "gyro bias drift"),
+    "gyro bias drifts 3 deg/s": Fault(
+        law("imu", "wz", lambda s: np.radians(3.0) * (s - 0.5)), "gyro bias drift"
+    ),
     "force late 0.2 s": Fault(force_late, "force clock"),
-    "fy of zero": Fault(scaled("imu", ["fy"], 0.0), "dead axis", ("accelerometer bias", "axes")),
+    "fy of zero": Fault(
+        scaled("imu", ["fy"], 0.0),
+        "dead axis",
+        ("accelerometer bias", "accelerometer bias drift", "axes"),
+    ),
     "fixes in feet": Fault(scaled("gnss", POSITION, 1 / 0.3048), "fix scale"),
     "reference turned 12 deg": Fault(
         both(
@@ -312,6 +318,15 @@ FAULTS = {
     "sensor backwards": Fault(body("-x", "-y", "z"), "axes"),
     "sensor tilted 10 deg": Fault(mounted(0.0, 10.0, 0.0), "mounting"),
     "sensor turned 20 deg": Fault(mounted(0.0, 0.0, 20.0), "mounting"),
+    "attitude in 0.1 deg": Fault(scaled("reference", ANGLES, 1800 / np.pi), "unit of attitude"),
+    "fx jumps 2 m/s^2": Fault(
+        law("imu", "fx", lambda s: 2.0 * (s > 0.4)), "accelerometer bias drift"
+    ),
+    "wz cut off": Fault(
+        changed("imu", lambda rows, _: rows.assign(wz=rows.wz.clip(upper=0.6 * rows.wz.max()))),
+        "saturated axis",
+        ("gyro scale", "axes", "imu clock", "imu clock drift"),
+    ),
 }
 
 # logs by the name of a fault test: folder, tables, flight, sensor

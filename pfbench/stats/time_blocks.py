@@ -117,13 +117,16 @@ def compare_blocks(a: tuple[str, Array], b: tuple[str, Array]) -> BlockEffect:
     return BlockEffect(compare((a[0], b[1] + spread), b, "block"), len(d) / ratio)
 
 
-def withhold(verdict: Verdict, steady: Verdict, effective: float) -> Verdict:
+def withhold(
+    verdict: Verdict, steady: Verdict, effective: float, cause: str = "the mean error and the drift"
+) -> Verdict:
     """Return the verdict on blocks, undecided where one record cannot carry its word.
 
     Args:
         verdict: Verdict on the errors.
-        steady: Verdict without the mean error and the drift of each run.
+        steady: Verdict without what is one draw of each run.
         effective: Number of independent blocks.
+        cause: What that is.
     """
     reason = ""
     if verdict.word in (NO_DECISION, SAME_RUNS):
@@ -133,7 +136,7 @@ def withhold(verdict: Verdict, steady: Verdict, effective: float) -> Verdict:
         reason = f"errors vary slowly: {count}, {MIN_EFFECTIVE:g} are required"
     elif steady.word != verdict.word:
         reason = (
-            "the difference rests on the mean error and the drift of the run, which one record cannot "
+            f"the difference rests on {cause} of the run, which one record cannot "
             "tell from those of another run"
         )
     return verdict._replace(word=NO_DECISION, reason=reason) if reason else verdict

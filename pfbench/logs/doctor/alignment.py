@@ -30,7 +30,7 @@ from pfbench.logs.doctor.turn_search import (
     select_nodes,
     turns_between,
 )
-from pfbench.logs.units import DEGREE
+from pfbench.logs.units import DEGREE, UNIT_FACTORS
 
 _GAIN = 0.15  # of the score by another unit
 _CERTAIN = 0.9  # score at which no other unit is tried, and that of a piece of the log
@@ -43,10 +43,12 @@ _LEAST_COST, _CLEAR_COST = (
 )  # (m/s^2)^2 of a wrong attitude, and the part that the true one may leave
 _COLUMNS = ("roll", "pitch", "yaw")
 _STRAIGHT = 0.35  # part of the spread that a drift may leave
-_UNITS = {
-    "": (1.0, 1.0, 1.0),
-    "roll, pitch, yaw": (DEGREE, DEGREE, DEGREE),
-    "yaw": (1.0, 1.0, DEGREE),
+# columns and names of units of the attitude
+_RADIANS = ("", "")
+_UNITS = {_RADIANS: 1.0} | {
+    (columns, unit): factor
+    for unit, factor in (UNIT_FACTORS["angle"] | UNIT_FACTORS["rare angle"]).items()
+    for columns in (", ".join(_COLUMNS), "yaw")
 }
 
 
@@ -81,10 +83,6 @@ class Alignment:
         """Turns of the IMU over those of the reference."""
         true, measured = self.pair
         return float(np.sqrt((measured**2).sum() / max(float((true**2).sum()), 1e-300)))
-
-    def over(self, log: RawLog) -> Alignment:
-        """Return the alignment of the same log with other velocities."""
-        return replace(self, log=log)
 
 
 def align_clocks(log: RawLog, facts: dict[str, Any]) -> tuple[Alignment | None, list[Finding]]:
@@ -189,32 +187,40 @@ def _has_turns(search: TurnSearch, turns: Array) -> bool:
 
 def _find_unit(
     log: RawLog, search: TurnSearch, nodes: NDArray[np.intp]
-) -> tuple[str, float, float]:
-    """Return the columns in degrees, '' for none, with the offset and the score of their turns.
+) -> tuple[tuple[str, str], float, float]:
+    """Return columns in another unit and its name, '' for none, with the offset and the score of their turns.
 
-    A yaw within a turn is in radians: a short log without turns can agree with any unit.
+    A yaw within a turn is in radians: a short log without turns can agree with any unit. Units that agree as well are
+    told apart by the size of the turns, of a gyroscope in rad/s or in deg/s.
     """
     results = []
     is_within_a_turn = float(np.abs(log.reference.angles[:, 2]).max()) <= 2.0 * np.pi
-    for unit, factor in _UNITS.items():
-        offset, score = search.find(turns_between(dcm_of(log.reference.angles * factor), nodes))
-        results.append((unit, offset, score))
-        if not unit and (score > _CERTAIN or is_within_a_turn):
+    for unit in _UNITS:
+        turns = turns_between(dcm_of(_in_radians(log.reference.angles, unit)), nodes)
+        offset, score = search.find(turns)
+        pair = search.pairs(turns, offset)
+        size = np.linalg.norm(pair[1]) / max(float(np.linalg.norm(pair[0])), 1e-300) if pair else 0.0  # fmt: skip
+        miss = min(abs(np.log(max(size * f, 1e-300))) for f in (1.0, DEGREE))
+        results.append((unit, offset, score, score - miss))
+        if unit == _RADIANS and (score > _CERTAIN or is_within_a_turn):
             break
-    best = max(results, key=lambda result: result[2])
-    return best if best[2] > results[0][2] + _GAIN else results[0]
+    best = max(results, key=lambda result: result[3])
+    return best[:3] if best[2] > results[0][2] + _GAIN else results[0][:3]
 
 
-def _convert_attitude(log: RawLog, unit: str, score: float) -> tuple[RawLog, list[Finding]]:
-    """Convert the attitude to radians, and name the columns in degrees."""
-    if not unit:
+def _in_radians(angles: Array, unit: tuple[str, str]) -> Array:
+    """Convert the columns that are in a unit."""
+    return angles * [_UNITS[unit] if name in unit[0] else 1.0 for name in _COLUMNS]
+
+
+def _convert_attitude(log: RawLog, unit: tuple[str, str], score: float) -> tuple[RawLog, list[Finding]]:  # fmt: skip
+    """Convert the attitude to radians, and name the columns in another unit."""
+    if unit == _RADIANS:
         return log, []
-    reference, verb = log.reference, "is" if unit == "yaw" else "are"
-    text = f"{log.names[2]}: {unit} {verb} in degrees: turns then agree with the IMU to a score of {score:.3f}"
-    finding = _describe_unit(log, unit, (score, _CERTAIN, "score"), text, DEGREE)
-    return log._replace(reference=reference._replace(angles=reference.angles * _UNITS[unit])), [
-        finding
-    ]
+    reference, (columns, name) = log.reference, unit
+    text = f"{log.names[2]}: {columns} {'is' if columns == 'yaw' else 'are'} in {name}: turns then agree with the IMU to a score of {score:.3f}"
+    finding = _describe_unit(log, columns, (score, _CERTAIN, "score"), text, _UNITS[unit])
+    return log._replace(reference=reference._replace(angles=_in_radians(reference.angles, unit))), [finding]  # fmt: skip
 
 
 def _describe_unit(
@@ -356,7 +362,7 @@ def _find_step(log: RawLog, search: TurnSearch, turns: Array, offset: float) -> 
     for stretch in (search.nodes[1:] + offset < time[i], search.nodes[:-1] + offset > time[i + 1]):
         if (stretch & search.usable).sum() < FEWEST_TURNS:
             return None
-        lag, score = _find_near(search, turns, offset, stretch)
+        lag, score = search.find(turns, offset, stretch, reach=1.5)
         if score < _CERTAIN:
             return None
         lags.append(lag)
@@ -364,12 +370,3 @@ def _find_step(log: RawLog, search: TurnSearch, turns: Array, offset: float) -> 
     if abs(after - before - excess) > max(0.02, 0.2 * excess):
         return None
     return [[round(float(time[i]), 6), round(before, 4)], [round(float(time[i + 1]), 6), round(before + excess, 4)]]  # fmt: skip
-
-
-def _find_near(
-    search: TurnSearch, turns: Array, offset: float, stretch: NDArray[np.bool_]
-) -> tuple[float, float]:
-    """Find the offset and the score of a stretch of the log within 1.5 s."""
-    grid = offset + np.arange(-1.5, 1.51, 0.1)
-    scores = [search.score(turns, float(a), stretch) for a in grid]
-    return search.find(turns, float(grid[int(np.argmax(scores))]), stretch)

@@ -6,10 +6,14 @@ import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.table_file import Array
 
 _BODY, _LEVEL = ("x", "y", "z"), ("n", "e", "d")
+ENU_TO_NED: Array = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+FLU_TO_FRD: Array = np.diag([1.0, -1.0, -1.0])  # a body with forward, left, up
 
 
 # the signed permutations, those near the identity first
@@ -33,18 +37,32 @@ def name_axes(matrix: Array, is_level: bool = False) -> list[str]:
     ]
 
 
-def parse_axes(names: Sequence[str], is_level: bool = False) -> Array | None:
-    """Return the signed permutation that takes the named axes; None if they are not three different axes."""
-    letters = _LEVEL if is_level else _BODY
-    matrix = np.zeros((3, 3))
-    if len(names) != 3:
-        return None
-    for i, name in enumerate(names):
-        letter = str(name).removeprefix("-")
-        if letter not in letters:
-            return None
-        matrix[i, letters.index(letter)] = -1.0 if str(name).startswith("-") else 1.0
-    return matrix if (np.abs(matrix).sum(0) == 1.0).all() else None
+def axes_matrix(key: str, axes: Sequence[str | float], is_level: bool = False) -> Array:
+    """Return the matrix from recorded to body or level axes, [3, 3].
+
+    Args:
+        key: Name of a sensor or a frame, for the message.
+        axes: Recorded axes such as [x, -y, -z], three angles of a sensor, or one turn of a frame, deg.
+        is_level: Whether these are axes of a frame.
+
+    Raises:
+        ValueError: If they are not three different axes, or angles.
+    """
+    if len(axes) == (1 if is_level else 3) and all(isinstance(a, int | float) for a in axes):
+        angles = [-float(axes[0]), 0.0, 0.0] if is_level else [float(a) for a in axes[::-1]]
+        return np.asarray(Rotation.from_euler("ZYX", angles, degrees=True).as_matrix())
+    letters, matrix = _LEVEL if is_level else _BODY, np.zeros((3, 3))
+    for row, name in zip(matrix, map(str, axes), strict=False):
+        if name.removeprefix("-") in letters:
+            row[letters.index(name.removeprefix("-"))] = -1.0 if name[0] == "-" else 1.0
+    require(
+        len(axes) == 3 and (np.abs(matrix).sum(0) == 1.0).all() and (np.abs(matrix).sum(1) == 1.0).all(),
+        f"scenario.corrections.{'level_axes' if is_level else 'mounting'}.{key}",
+        f"be three different axes such as {'[e, n, -d], or a turn in deg' if is_level else '[x, -y, -z], or roll, pitch, yaw in deg'}",
+        list(axes),
+        f"Name the recorded axes that are {'North, East, Down' if is_level else 'forward, right, down'}.",
+    )  # fmt: skip
+    return matrix
 
 
 # name of the setting: what is wrong, and the angles (roll, pitch, yaw) that are right

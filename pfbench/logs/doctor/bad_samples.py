@@ -17,6 +17,7 @@ _COLUMNS = ("fx", "fy", "fz", "wx", "wy", "wz")
 _BLOCK = 50  # differences of a local level
 _FEWEST = 50  # differences
 _LARGEST = (320.0, 70.0)  # m/s^2 and rad/s: absurd, ten times what platforms reach
+_AWAY = 0.2  # of the range: distance of a saturated value from the median
 _OF_USUAL = 10.0  # times the value that 99 % of the samples do not reach
 
 
@@ -117,6 +118,7 @@ def _check_stuck(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
     duration = float(imu.time[last] - imu.time[first])
     facts["stuck"] = duration
     yield from _check_dead(log, samples, duration)
+    yield from _check_saturated(log, samples)
     if duration > limit_of("stuck samples"):
         around = slice(max(0, 2 * first - last), 2 * last - first)
         yield Finding(
@@ -147,6 +149,29 @@ def _check_dead(log: RawLog, samples: Array, stuck: float) -> Iterator[Finding]:
             explanations=("a broken axis", "a column of another message", "a saturated axis"),
             picture=Picture("t [s]", _COLUMNS[k], (thin_curve(_COLUMNS[k], time, samples[:, k]),), (start,)),
         )  # fmt: skip
+
+
+def _check_saturated(log: RawLog, samples: Array) -> Iterator[Finding]:
+    """Check for a column that stops at its largest or smallest value, far from the usual one."""
+    for column, values in zip(_COLUMNS, samples.T, strict=True):
+        levels, counts = np.unique(values[np.isfinite(values)], return_counts=True)
+        if len(levels) < _FEWEST:
+            continue
+        # rounded values repeat, too, and those nearer to the usual one more often
+        excess = np.where(
+            np.abs(levels[[0, -1]] - np.median(values)) > _AWAY * (levels[-1] - levels[0]),
+            counts[[0, -1]] / counts[[1, -2]], 0.0,
+        )  # fmt: skip
+        end = -int(excess.argmax())
+        if excess.max() > limit_of("saturated axis"):
+            start = float(log.imu.time[int(np.argmax(values == levels[end]))])
+            yield Finding(
+                "saturated axis", WARN, float(counts[end]), limit_of("saturated axis"), "samples",
+                f"{log.names[0]}: column {column} stops at {levels[end]:.6g} in {counts[end]} samples, the first at "
+                f"t = {start:.3f}",
+                "Record again with a larger range of the sensor: no correction gives back what is cut off",
+                picture=Picture("t [s]", column, (thin_curve(column, log.imu.time, values),), (start,)),
+            )  # fmt: skip
 
 
 def _describe_bad(log: RawLog, column: str, values: Array, bad: BadSamples) -> Iterator[Finding]:

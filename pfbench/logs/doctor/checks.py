@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from pfbench.logs.doctor.alignment import align_clocks
@@ -13,14 +14,14 @@ from pfbench.logs.doctor.fix_checks import check_codes, check_fixes
 from pfbench.logs.doctor.force_unit import check_force_unit
 from pfbench.logs.doctor.force_windows import integrate_force
 from pfbench.logs.doctor.raw_log import RawLog, dcm_of
-from pfbench.logs.doctor.reference_checks import check_reference, drop_wrong_rows
+from pfbench.logs.doctor.reference_checks import check_reference, check_rows
 from pfbench.logs.doctor.specific_force import check_force_and_rate
 
 FEWEST_ROWS = 10  # of a table
 # checks that need no reference; the others compare IMU or fixes with it
 WITHOUT_REFERENCE = (
     "time order", "repeated times", "imu gap", "imu jitter", "imu rate", "fix hole", "absurd samples", "stuck samples",
-    "spikes", "unit of force", "fix codes", "turn of the course",
+    "dead axis", "saturated axis", "spikes", "unit of force", "fix codes", "turn of the course",
 )  # fmt: skip
 
 
@@ -32,8 +33,8 @@ def run_checks(log: RawLog) -> tuple[list[Finding], dict[str, Any], RawLog]:
     facts: dict[str, Any] = {}
     findings = list(check_clocks(log, facts))
     log = sort_tables(log)
-    if len(log.reference.time) > 2:
-        log = log._replace(reference=drop_wrong_rows(log.reference))
+    log, more = check_rows(log)
+    findings += more
     if len(log.imu.time) < FEWEST_ROWS or 0 < len(log.reference.time) < FEWEST_ROWS:
         return findings, facts, log
     log, more = check_samples(log, facts)
@@ -50,7 +51,7 @@ def run_checks(log: RawLog) -> tuple[list[Finding], dict[str, Any], RawLog]:
     log, more = check_force_unit(log, windows, facts)
     findings += more
     if aligned:
-        log, more = check_force_and_rate(aligned.over(log), facts)
+        log, more = check_force_and_rate(replace(aligned, log=log), facts)
         findings += more
     findings += check_fixes(log, facts)
     return findings, facts, log

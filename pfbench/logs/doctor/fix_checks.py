@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,14 @@ from pfbench.logs.doctor.finding import (
     describe_change,
     thin_curve,
 )
-from pfbench.logs.doctor.raw_log import RawLog, correlate_neighbours, dcm_of, interpolate_columns
+from pfbench.logs.doctor.motion_search import MotionSearch
+from pfbench.logs.doctor.raw_log import (
+    RawLog,
+    correlate_neighbours,
+    dcm_of,
+    interpolate_columns,
+    take_rows,
+)
 from pfbench.logs.doctor.thresholds import (
     LEAST_OUTLIER,
     REFUSED_OFFSET,
@@ -29,15 +36,21 @@ from pfbench.logs.doctor.thresholds import (
 from pfbench.logs.units import find_units
 
 _Mask = NDArray[np.bool_]
-_MOST, _FEWEST, _LEAST_SHARE = 400, 12, 0.4  # compared fixes
-_COARSE = np.unique(np.round(np.r_[np.arange(-25.0, 25.0, 0.5), np.arange(-1.5, 1.5, 0.1)], 3))
+_FEWEST = 12  # compared fixes
+_LATEST = 25.0  # s; more than the leap seconds
+_GROUND = np.array([1.0, 1.0, 0.0])
 _GAIN = 0.8  # of the spread that an offset must leave at most
 _CLIP, _MARGIN = 30.0, 12.0  # m of an increment, and variances of the noise
 _NEIGHBOURS = 10  # fixes on each side of a local level
 _MOST_OUTLIERS = 0.05  # share of fixes
 _AXES = ("North", "East", "Down")
-_FRAME = 0.3  # part of the distances that a turn or a unit may leave
+_FRAME, _LEAST_FRAME = (
+    0.3,
+    0.5,
+)  # part of the distances that a turn or a unit may leave, and m of them
 _BLOCK_S, _FEWEST_OF_BLOCK = 10.0, 5  # s and fixes of a block
+_CLEAR = 3.0  # median deviations of a shift
+_HELD = 0.1  # of the limit: motion during other fixes of a receiver that freezes
 _REACH = 2.5  # median steps of the reference: longer ones are gaps
 
 
@@ -56,22 +69,16 @@ class FixErrors(NamedTuple):
 
 
 class JointFit(NamedTuple):
-    """Fit of lever arm, time offset and constant shift, with standard errors.
+    """Fit of the fixes.
 
     Attributes:
-        lever: Lever arm, forward, right, down, m, [3].
-        lever_error: Its standard errors, m, [3].
-        offset: Delay of the fixes, s.
-        offset_error: Its standard error, s.
-        shift: Constant shift, m, [3].
+        solution: Lever arm forward, right, down, m; delay, s; shift, m; and what else is fitted, [7 or more].
+        sd: Standard errors.
         deviation: Standard deviation of the fixes, m, [3].
     """
 
-    lever: Array
-    lever_error: Array
-    offset: float
-    offset_error: float
-    shift: Array
+    solution: Array
+    sd: Array
     deviation: Array
 
 
@@ -80,23 +87,23 @@ def check_fixes(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
     yield from check_codes(log)
     if len(log.fixes.time) < _FEWEST:
         return
-    frame = list(_check_frame(log, facts))
+    frame = list(check_frame(log, facts))
     yield from frame
     if frame:
         return
     errors = _find_coarse_offset(log)
-    errors = _prefer_axes(log, errors) if errors.offset else errors
-    yield from _check_common_time(log, errors)
     if errors.inside.sum() < _FEWEST:
         return
     axes = list(_check_axes(log, errors, facts))
     yield from axes
     if axes:
         return
-    jumps = find_jumps(errors.error, errors.inside)
-    yield from _check_outliers(log, errors, jumps, facts)
-    yield from _check_frozen(log, errors, facts)
-    yield from _check_joint(log, errors, jumps.mask, facts)
+    frozen = yield from _check_frozen(log, errors, facts)
+    if frozen.any():  # which look late
+        log = log._replace(fixes=take_rows(log.fixes, ~frozen))
+        errors = _find_coarse_offset(log)
+    outliers = yield from _check_outliers(log, errors, facts)
+    yield from _check_joint(log, errors, outliers, facts)
 
 
 def check_codes(log: RawLog) -> Iterator[Finding]:
@@ -130,22 +137,20 @@ def reference_at(log: RawLog, at: Array) -> Array:
     return interpolate_columns(at, log.reference.time, log.reference.position)
 
 
-def _compare(log: RawLog, offset: float) -> FixErrors:
+def compare_at(log: RawLog, offset: float) -> FixErrors:
     """Compare the fixes with the reference at an offset."""
     at, time = log.fixes.time - offset, log.reference.time
     inside = (at >= time[0]) & (at <= time[-1])
     return FixErrors(offset, log.fixes.position - reference_at(log, at), inside)
 
 
-def _check_frame(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
-    """Check that the fixes are not turned about the vertical, or in another unit, against the reference.
+def _fit_frame(log: RawLog, plain: FixErrors) -> tuple[complex, Array, Array, bool]:
+    """Fit turn and scale of the fixes about their means.
 
-    A turn or a factor explains them if it leaves a small part of the distances that remain after a shift.
+    Returns the factor, fixes and reference without means as complex numbers, and whether the factor explains the fixes, and
+    no order of axes does.
     """
-    plain = _compare(log, 0.0)
     used = np.flatnonzero(plain.inside)
-    if len(used) < _FEWEST:
-        return
     for _ in range(3):
         fixes, error = (a[used, :2] @ [1.0, 1j] for a in (log.fixes.position, plain.error))
         measured, expected = (z - z.mean() for z in (fixes, fixes - error))
@@ -154,11 +159,27 @@ def _check_frame(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
         keep = rest <= 4.0 * np.median(rest) + 1e-9
         before = float(np.sqrt(np.square(np.abs(measured - expected)[keep]).mean()))
         after, used = float(np.sqrt(np.square(rest[keep]).mean())), used[keep]
+    recorded, true = (a - a.mean(0) for a in (log.fixes.position[used], (log.fixes.position - plain.error)[used]))  # fmt: skip
+    ordered = min(float(np.sqrt(np.square((recorded - true @ m.T)[:, :2]).sum(1).mean())) for m in BODY_ORDERS)  # fmt: skip
+    is_explained = after <= min(_FRAME * before, 2.0 * ordered) and before > _LEAST_FRAME
+    return factor, measured, expected, is_explained and bool(factor)
+
+
+def check_frame(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
+    """Check that the fixes are not turned about the vertical, or in another unit, against the reference.
+
+    A turn or a factor explains them if it leaves a small part of the distances that remain after a shift.
+    """
+    plain = compare_at(log, 0.0)
+    if plain.inside.sum() < _FEWEST:
+        return
+    factor, measured, expected, is_explained = _fit_frame(log, plain)
+    factor *= _refine_frame(log, factor) if is_explained else 1.0
     scale, turn = float(np.abs(factor)), float(np.rad2deg(np.angle(factor)))
     facts["turn and scale of fixes"] = [round(turn, 3), round(scale, 4)]
     quarter = abs((turn + 45.0) % 90.0 - 45.0)  # orders of axes have their own check
     is_turned, is_scaled = quarter > limit_of("fix turn"), abs(scale - 1.0) > limit_of("fix scale")
-    if after > _FRAME * before or before < limit_of("fix shift") * _FRAME:
+    if not is_explained:
         return
     name, units = log.names[1], find_units("length", scale, limit_of("fix scale"))
     picture = Picture("North [m]", "East [m]", tuple(
@@ -180,6 +201,19 @@ def _check_frame(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
             {"corrections": {"level_axes": {"gnss": [round(turn, 3)]}}},
             ("grid North in place of true or magnetic North",), picture,
         )  # fmt: skip
+
+
+def _refine_frame(log: RawLog, factor: complex) -> complex:
+    """Return turn and scale that lever arm, offset and shift leave, if the fixes had those of a factor."""
+    level = (log.fixes.position[:, :2] @ [1.0, 1j]) / factor
+    position = np.stack([level.real, level.imag, log.fixes.position[:, 2]], -1)
+    errors = compare_at(log._replace(fixes=log.fixes._replace(position=position)), 0.0)
+    used, at = errors.inside & ~find_jumps(errors.error, errors.inside)[2], log.fixes.time
+    forms = position[:, [1, 0]] * [-1.0, 1.0], position[:, :2]
+    columns = np.stack([np.pad(form - form[used].mean(0), ((0, 0), (0, 1))) for form in forms], -1)
+    design = np.concatenate([_make_design(log, at), columns], -1)
+    turn, stretch = _fit_jointly(errors.error[used], design[used]).solution[7:]
+    return 1.0 + stretch + 1j * turn
 
 
 def _check_slow(log: RawLog, at: Array, rest: Array, facts: dict[str, Any]) -> Iterator[Finding]:
@@ -211,63 +245,20 @@ def _check_slow(log: RawLog, at: Array, rest: Array, facts: dict[str, Any]) -> I
 
 
 def _find_coarse_offset(log: RawLog) -> FixErrors:
-    """Find the offset at which the fixes move as the reference, to 0.05 s; 0 if it gains little."""
-    time, position = log.fixes.time, log.fixes.position
-    used = np.linspace(0, len(time) - 1, min(len(time), _MOST)).astype(int)
-
-    def spread(offset: float) -> float:
-        at = time[used] - offset
-        inside = (at >= log.reference.time[0]) & (at <= log.reference.time[-1])
-        if inside.sum() < max(_FEWEST, _LEAST_SHARE * len(used)):
-            return np.inf
-        level = (position[used][inside] - reference_at(log, at[inside]))[:, :2]
-        return float(np.median(np.linalg.norm(level - np.median(level, 0), axis=1)))
-
-    spreads = np.array([spread(float(a)) for a in _COARSE])
-    best, plain = float(_COARSE[spreads.argmin()]), spread(0.0)
-    if not np.isfinite(spreads.min()) or spreads.min() > _GAIN * plain:
-        return _compare(log, 0.0)
-    fine = best + np.arange(-0.5, 0.501, 0.05)
-    return _compare(log, float(fine[int(np.argmin([spread(float(a)) for a in fine]))]))
+    """Find the offset at which the fixes move over the ground as the reference; 0 if it gains little."""
+    fixes, reference = log.fixes, log.reference
+    motion = MotionSearch(fixes.time, fixes.position * _GROUND, reference.time, lambda at: reference_at(log, at) * _GROUND)  # fmt: skip
+    spread, shift = motion.search(-_LATEST, _LATEST)
+    is_late = np.isfinite(spread) and spread <= _GAIN * motion.spread(0.0)
+    late = compare_at(log, -shift if is_late else 0.0)
+    return _prefer_axes(log, late) if late.offset else late
 
 
-def _check_common_time(log: RawLog, errors: FixErrors) -> Iterator[Finding]:
-    """Check that the tables have a time in common."""
-    times = (log.imu.time, log.fixes.time, log.reference.time)
-    common = float(min(t[-1] for t in times) - max(t[0] for t in times))
-    if common >= limit_of("overlap") or errors.offset:
-        return
-    spans = ", ".join(
-        f"{name} t = {t[0]:.1f} to {t[-1]:.1f}" for name, t in zip(log.names, times, strict=True)
-    )
-    yield Finding(
-        "overlap", REFUSE, common, limit_of("overlap"), "s",
-        f"the tables have {max(common, 0.0):.1f} s in common: {spans}",
-        "Use the same clock in all tables", explanations=("different clocks", "parts of different drives"),
-        picture=Picture("t [s]", "table", tuple(
-            (name, np.array([t[0], t[-1]]), np.array([i, i])) for i, (name, t) in enumerate(zip(log.names, times, strict=True))
-        )),
-    )  # fmt: skip
+def _compare_increments(log: RawLog, errors: FixErrors) -> tuple[Array, Array, Array, Array] | None:
+    """Compare the motion of fixes and reference over about two seconds for all orders of axes; None with few fixes.
 
-
-class Increments(NamedTuple):
-    """Motion over about two seconds.
-
-    Attributes:
-        measured: Motion of the fixes, m, [p, 3].
-        true: Motion of the reference, m, [p, 3].
-        time: Ends of the increments, s, [p].
-        costs: Clipped squared differences with each order of axes, m^2, [48].
+    Returns the motion of both, m, [p, 3], the ends, s, [p], and the clipped squared differences of each order, m^2, [48].
     """
-
-    measured: Array
-    true: Array
-    time: Array
-    costs: Array
-
-
-def _compare_increments(log: RawLog, errors: FixErrors) -> Increments | None:
-    """Compare the motion of fixes and reference for all orders of axes; None with few fixes."""
     time = log.fixes.time
     rows = np.flatnonzero(errors.inside)[:: max(1, round(2.0 / float(np.median(np.diff(time)))))]
     if len(rows) <= 9:
@@ -276,18 +267,18 @@ def _compare_increments(log: RawLog, errors: FixErrors) -> Increments | None:
     true = np.diff(reference_at(log, time[rows] - errors.offset), axis=0)
     squares = (np.square(measured - true @ m.T).sum(1) for m in BODY_ORDERS)
     costs = np.array([float(np.minimum(square, _CLIP**2).sum()) for square in squares])
-    return Increments(measured, true, time[rows][1:], costs)
+    return measured, true, time[rows][1:], costs
 
 
 def _prefer_axes(log: RawLog, late: FixErrors) -> FixErrors:
     """Return the comparison without an offset, if other axes explain the fixes better than the offset."""
-    plain = _compare(log, 0.0)
+    plain = compare_at(log, 0.0)
     with_offset, without = (_compare_increments(log, errors) for errors in (late, plain))
     if without is None:
         return late
     with_offset = with_offset or without
-    other_axes = float(without.costs.min()) / len(without.time)
-    same_axes = float(with_offset.costs[0]) / len(with_offset.time)
+    other_axes = float(without[3].min()) / len(without[2])
+    same_axes = float(with_offset[3][0]) / len(with_offset[2])
     is_better = limit_of("fix axes") * other_axes < same_axes
     return plain if is_better else late
 
@@ -319,25 +310,7 @@ def _check_axes(log: RawLog, errors: FixErrors, facts: dict[str, Any]) -> Iterat
     )  # fmt: skip
 
 
-# --------------------------------------------------------------------------------------------------
-# Single wrong fixes and fixes that do not move.
-
-
-class Jumps(NamedTuple):
-    """Jumps of fixes there and back.
-
-    Attributes:
-        size: Smaller distance of each error to those of its neighbours, m, [m].
-        level: Local level, m, [m].
-        mask: Outliers, [m].
-    """
-
-    size: Array
-    level: Array
-    mask: _Mask
-
-
-def find_jumps(error: Array, inside: _Mask) -> Jumps:
+def find_jumps(error: Array, inside: _Mask) -> tuple[Array, Array, _Mask]:
     """Find fixes that are far from both neighbours, compared with 21 fixes around.
 
     Args:
@@ -345,7 +318,7 @@ def find_jumps(error: Array, inside: _Mask) -> Jumps:
         inside: Fixes in the time of the reference, [m].
 
     Returns:
-        Jumps.
+        Smaller distance of each error to those of its neighbours, and local level, m, [m]; mask of the outliers, [m].
     """
     size = np.zeros(len(error))
     step = np.linalg.norm(np.diff(error, axis=0), axis=1)
@@ -356,26 +329,26 @@ def find_jumps(error: Array, inside: _Mask) -> Jumps:
     mask = inside & (size > np.maximum(LEAST_OUTLIER, limit_of("fix outliers") * level))
     if mask.mean() > _MOST_OUTLIERS:  # another kind of error
         mask = np.zeros_like(mask)
-    return Jumps(size, level, mask)
+    return size, level, mask
 
 
-def _check_outliers(log: RawLog, errors: FixErrors, jumps: Jumps, facts: dict[str, Any]) -> Iterator[Finding]:  # fmt: skip
-    """Check for single wrong fixes."""
-    facts["jump of a fix"] = float((jumps.size / jumps.level)[errors.inside].max())
-    if not jumps.mask.any():
-        return
-    i = int(np.argmax(np.where(jumps.mask, jumps.size, 0.0)))
-    time = log.fixes.time
-    yield Finding(
-        "fix outliers", TELL, float(jumps.size[i] / jumps.level[i]), limit_of("fix outliers"), "times the level",
-        f"{log.names[1]}: {int(jumps.mask.sum())} fixes jump there and back, the largest by {jumps.size[i]:.0f} m in "
-        f"{log.row(1, i)} (t = {time[i]:.2f})",
-        "Remove these rows, or set scenario.corrections.drop=[outliers]",
-        {"corrections": {"drop": ["outliers"]}},
-        picture=Picture("t [s]", "fix minus reference, horizontal [m]", (
-            thin_curve(log.names[1], time[errors.inside], np.linalg.norm(errors.error[errors.inside, :2], axis=1)),
-        ), (float(time[i]),)),
-    )  # fmt: skip
+def _check_outliers(log: RawLog, errors: FixErrors, facts: dict[str, Any]) -> Generator[Finding, None, _Mask]:  # fmt: skip
+    """Check for single wrong fixes; return their mask, [m]."""
+    (size, level, wrong), time = find_jumps(errors.error, errors.inside), log.fixes.time
+    facts["jump of a fix"] = float((size / level)[errors.inside].max())
+    if wrong.any():
+        i = int(np.argmax(np.where(wrong, size, 0.0)))
+        yield Finding(
+            "fix outliers", TELL, float(size[i] / level[i]), limit_of("fix outliers"), "times the level",
+            f"{log.names[1]}: {int(wrong.sum())} fixes jump there and back, the largest by {size[i]:.0f} m in "
+            f"{log.row(1, i)} (t = {time[i]:.2f})",
+            "Remove these rows, or set scenario.corrections.drop=[outliers]",
+            {"corrections": {"drop": ["outliers"]}},
+            picture=Picture("t [s]", "fix minus reference, horizontal [m]", (
+                thin_curve(log.names[1], time[errors.inside], np.linalg.norm(errors.error[errors.inside, :2], axis=1)),
+            ), (float(time[i]),)),
+        )  # fmt: skip
+    return wrong
 
 
 def find_frozen(position: Array, motion: Array) -> _Mask:
@@ -389,38 +362,37 @@ def find_frozen(position: Array, motion: Array) -> _Mask:
         Mask of repeated fixes, [m].
     """
     is_equal = (np.diff(position, axis=0) == 0.0).all(1)
-    frozen = np.zeros(len(position), bool)
     edges = np.flatnonzero(np.diff(np.r_[False, is_equal, False].astype(int)))
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
-        if motion[first:last].sum() > limit_of("frozen fixes"):
-            frozen[first + 1 : last + 1] = True
+    runs = [(first, last, motion[first:last].sum()) for first, last in zip(edges[::2], edges[1::2], strict=True)]  # fmt: skip
+    largest = max((distance for _, _, distance in runs), default=0.0)
+    frozen = np.zeros(len(position), bool)
+    for first, last, distance in runs if largest > limit_of("frozen fixes") else ():
+        frozen[first + 1 : last + 1] = distance > _HELD * limit_of(
+            "frozen fixes"
+        )  # slower ones, too
     return frozen
 
 
-def _check_frozen(log: RawLog, errors: FixErrors, facts: dict[str, Any]) -> Iterator[Finding]:
-    """Check for fixes that do not move."""
+def _check_frozen(
+    log: RawLog, errors: FixErrors, facts: dict[str, Any]
+) -> Generator[Finding, None, _Mask]:
+    """Check for fixes that do not move; return their mask, [m]."""
     time, position = log.fixes.time, log.fixes.position
     motion = np.linalg.norm(np.diff(reference_at(log, time - errors.offset), axis=0), axis=1)
     frozen = find_frozen(position, motion)
     distance = float(motion[frozen[1:]].sum())
     facts["frozen while moving [m]"] = distance
-    if not frozen.any():
-        return
-    i = int(np.argmax(frozen))
-    yield Finding(
-        "frozen fixes", WARN, distance, limit_of("frozen fixes"), "m",
-        f"{log.names[1]}: {int(frozen.sum())} fixes equal the one before while the reference moves {distance:.1f} m, "
-        f"the first is {log.row(1, i)} (t = {time[i]:.2f})",
-        "Remove these rows, or set scenario.corrections.drop=[frozen]",
-        {"corrections": {"drop": ["frozen"]}},
-        picture=Picture("t [s]", "fix minus reference, horizontal [m]", (
-            thin_curve(log.names[1], time[errors.inside], np.linalg.norm(errors.error[errors.inside, :2], axis=1)),
-        ), (float(time[i]),)),
-    )  # fmt: skip
-
-
-# --------------------------------------------------------------------------------------------------
-# Lever arm, time offset and constant shift in one fit.
+    if frozen.any():
+        i = int(np.argmax(frozen))
+        yield Finding(
+            "frozen fixes", WARN, distance, limit_of("frozen fixes"), "m",
+            f"{log.names[1]}: {int(frozen.sum())} fixes equal the one before while the reference moves {distance:.1f} m, "
+            f"the first is {log.row(1, i)} (t = {time[i]:.2f})",
+            "Remove these rows, or set scenario.corrections.drop=[frozen]",
+            {"corrections": {"drop": ["frozen"]}},
+            picture=Picture("t [s]", "fix North [m]", (thin_curve(log.names[1], time, position[:, 0]),), (float(time[i]),)),
+        )  # fmt: skip
+    return frozen
 
 
 def _check_joint(log: RawLog, errors: FixErrors, outliers: _Mask, facts: dict[str, Any]) -> Iterator[Finding]:  # fmt: skip
@@ -436,12 +408,13 @@ def _check_joint(log: RawLog, errors: FixErrors, outliers: _Mask, facts: dict[st
         return
     effects = _make_design(log, at)
     fit = _fit_jointly(error[used], effects[used])
-    offset, error_of_offset = errors.offset + fit.offset, fit.offset_error
+    lever, lever_error = fit.solution[:3], fit.sd[:3]
+    offset, error_of_offset = errors.offset + float(fit.solution[3]), float(fit.sd[3])
     middle = np.median(error[used], 0)
     facts.update(
         {
             "fix offset [s]": [round(offset, 4), round(error_of_offset, 4)],
-            "lever arm [m]": [fit.lever.round(3).tolist(), fit.lever_error.round(3).tolist()],
+            "lever arm [m]": [lever.round(3).tolist(), lever_error.round(3).tolist()],
             "fix shift [m]": middle.round(3).tolist(),
             "fix deviation [m]": fit.deviation.round(3).tolist(),
         }
@@ -449,13 +422,12 @@ def _check_joint(log: RawLog, errors: FixErrors, outliers: _Mask, facts: dict[st
     is_late = abs(offset) > max(limit_of("gnss clock"), STANDARD_ERRORS * error_of_offset)
     if is_late:
         yield _describe_late(log, errors, offset, error_of_offset)
-    large = np.abs(fit.lever) > np.maximum(limit_of("lever arm"), STANDARD_ERRORS * fit.lever_error)
+    large = np.abs(lever) > np.maximum(limit_of("lever arm"), STANDARD_ERRORS * lever_error)
     if large[:2].any():
         yield _describe_lever(log, fit, error, at)
-    if np.abs(middle).max() > limit_of("fix shift"):
-        yield _describe_shift(log, error, middle)
+    yield from check_shift(log, error, used)
     lasting = errors.inside & ~outliers  # the fit leaves out fixes that are far off for a while
-    rest = error - effects @ np.r_[fit.lever, fit.offset, fit.shift]
+    rest = error - effects @ fit.solution
     yield from _check_slow(log, at[lasting], rest[lasting], facts)
 
 
@@ -471,11 +443,11 @@ def _make_design(log: RawLog, at: Array) -> Array:
 
 
 def _fit_jointly(error: Array, a: Array) -> JointFit:
-    """Fit lever arm, offset and shift by their effects [m, 3, 7] to differences [m, 3]."""
+    """Fit lever arm, offset, shift and other effects, [m, 3, 7 or more], to differences, [m, 3]."""
     deviation = 1.4826 * np.median(np.abs(error - np.median(error, 0)), 0) + 0.01
-    regular = np.diag([1e-4] * 4 + [1e-6] * 3)
+    regular = np.diag([1e-4] * 4 + [1e-6] * (a.shape[-1] - 4))
     for _ in range(4):
-        scaled = (a / deviation[:, None]).reshape(-1, 7)
+        scaled = (a / deviation[:, None]).reshape(-1, a.shape[-1])
         information = scaled.T @ scaled + regular
         solution: Array = np.linalg.solve(
             information, scaled.T @ (error / deviation).reshape(-1)
@@ -484,22 +456,14 @@ def _fit_jointly(error: Array, a: Array) -> JointFit:
         deviation = rest.std(0) + 0.005
     memory = correlate_neighbours(rest)  # errors of receivers last longer than a fix
     variance = np.diag(np.linalg.inv(information)) * (1.0 + memory) / (1.0 - memory)
-    sd = np.sqrt(variance)
-    return JointFit(
-        solution[:3],
-        sd[:3],
-        float(solution[3]),
-        float(sd[3]),
-        solution[4:],
-        np.asarray(deviation),
-    )
+    return JointFit(solution, np.sqrt(variance), np.asarray(deviation))
 
 
 def _describe_late(log: RawLog, errors: FixErrors, offset: float, error: float) -> Finding:
     late = "late" if offset > 0.0 else "early"
     name, time = log.names[1], log.fixes.time
     leap = " (leap seconds between UTC and GPS time)" if abs(abs(offset) - 18.0) < 0.1 else ""
-    plain = _compare(log, 0.0)
+    plain = compare_at(log, 0.0)
     return Finding(
         "gnss clock", REFUSE if abs(offset) > REFUSED_OFFSET else WARN, offset, limit_of("gnss clock"), "s",
         f"{name}: t is {abs(offset):.3f} s {late} against {log.names[2]}, within {2.0 * error:.3f} s{leap}",
@@ -514,20 +478,21 @@ def _describe_late(log: RawLog, errors: FixErrors, offset: float, error: float) 
 
 
 def _describe_lever(log: RawLog, fit: JointFit, error: Array, at: Array) -> Finding:
-    lever = [float(v) for v in fit.lever.round(3)]
-    if fit.lever_error[2] > 0.3 * max(abs(lever[2]), limit_of("lever arm")):
-        lever[2] = 0.0  # a vehicle that does not tilt does not show it
+    lever, lever_error = fit.solution[:3], fit.sd[:3]
+    arm = [float(v) for v in lever.round(3)]
+    if lever_error[2] > 0.3 * max(abs(arm[2]), limit_of("lever arm")):
+        arm[2] = 0.0  # a vehicle that does not tilt does not show it
     dcm = dcm_of(log.reference.angles).reshape(-1, 9)
     body = np.einsum(
         "nji,nj->ni",
         interpolate_columns(at, log.reference.time, dcm).reshape(-1, 3, 3),
-        error - fit.shift,
+        error - fit.solution[4:],
     )
     return Finding(
-        "lever arm", TELL, float(np.abs(fit.lever[:2]).max()), limit_of("lever arm"), "m",
-        f"{log.names[1]}: the antenna is {fit.lever.round(2).tolist()} m forward, right, down of the position of "
-        f"{log.names[2]}, within {(2.0 * fit.lever_error).round(2).tolist()}",
-        f"Set scenario.corrections.lever_arm={lever}", {"corrections": {"lever_arm": lever}},
+        "lever arm", TELL, float(np.abs(lever[:2]).max()), limit_of("lever arm"), "m",
+        f"{log.names[1]}: the antenna is {lever.round(2).tolist()} m forward, right, down of the position of "
+        f"{log.names[2]}, within {(2.0 * lever_error).round(2).tolist()}",
+        f"Set scenario.corrections.lever_arm={arm}", {"corrections": {"lever_arm": arm}},
         ("a lever arm of the antenna", "an offset of the point to which the reference refers"),
         Picture("t [s]", "fix minus reference in body axes [m]", (
             thin_curve("forward", log.fixes.time, body[:, 0]), thin_curve("right", log.fixes.time, body[:, 1]),
@@ -535,14 +500,18 @@ def _describe_lever(log: RawLog, fit: JointFit, error: Array, at: Array) -> Find
     )  # fmt: skip
 
 
-def _describe_shift(log: RawLog, error: Array, middle: Array) -> Finding:
-    axis = int(np.argmax(np.abs(middle)))
-    shift = [float(v) for v in middle.round(3)]
+def check_shift(log: RawLog, error: Array, used: _Mask) -> Iterator[Finding]:
+    """Check for a constant shift of the fixes against the reference, by their differences [m, 3]."""
+    middle = np.median(error[used], 0)
+    scatter = np.median(np.abs(error[used] - middle), 0)
+    clear = np.where(np.abs(middle) > _CLEAR * scatter, np.abs(middle), 0.0)
+    axis, shift = int(np.argmax(clear)), [float(v) for v in middle.round(3)]
     causes = ("heights above the geoid", "another datum", "a wrong position of the base station")
-    return Finding(
-        "fix shift", WARN, float(middle[axis]), limit_of("fix shift"), "m",
-        f"{log.names[1]}: the fixes are shifted by {middle[axis]:+.1f} m {_AXES[axis]} against {log.names[2]}",
-        f"Set scenario.corrections.offset_m={shift}", {"corrections": {"offset_m": shift}},
-        causes if axis == 2 else causes[1:],
-        Picture("t [s]", f"fix minus reference {_AXES[axis]} [m]", (thin_curve(log.names[1], log.fixes.time, error[:, axis]),)),
-    )  # fmt: skip
+    if clear[axis] > limit_of("fix shift"):
+        yield Finding(
+            "fix shift", WARN, float(middle[axis]), limit_of("fix shift"), "m",
+            f"{log.names[1]}: the fixes are shifted by {middle[axis]:+.1f} m {_AXES[axis]} against {log.names[2]}",
+            f"Set scenario.corrections.offset_m={shift}", {"corrections": {"offset_m": shift}},
+            causes if axis == 2 else causes[1:],
+            Picture("t [s]", f"fix minus reference {_AXES[axis]} [m]", (thin_curve(log.names[1], log.fixes.time, error[:, axis]),)),
+        )  # fmt: skip

@@ -48,7 +48,7 @@ class ForceFit(NamedTuple):
     Attributes:
         cost: Mean squared residual with the penalty of the bias, (m/s^2)^2.
         bias: Addition to the force in body axes that fits best, m/s^2, [3].
-        residual: Residuals of the windows that count, m/s^2, [r, 3].
+        residual: Residuals, m/s^2, [p, 3].
         keep: Windows that count, [p].
     """
 
@@ -127,6 +127,6 @@ def fit_force(windows: ForceWindows, body: Array | None = None, level: Array | N
     keep = size < _GROSS * np.median(size) + 0.5
     a, z = windows.rotation[keep].reshape(-1, 3), residual[keep].reshape(-1)
     bias = np.linalg.solve(a.T @ a + _PENALTY * keep.sum() * np.eye(3), a.T @ z)
-    rest = (z - a @ bias).reshape(-1, 3)
-    cost = float(np.square(rest).sum()) / float(keep.sum()) + _PENALTY * float(bias @ bias)
+    rest = residual - windows.rotation @ bias
+    cost = float(np.square(rest[keep]).sum()) / float(keep.sum()) + _PENALTY * float(bias @ bias)
     return ForceFit(cost, bias, rest, keep)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +10,15 @@ from pfbench.files.reader_notes import announce_notes
 from pfbench.logs.doctor.checks import WITHOUT_REFERENCE, run_checks
 from pfbench.logs.doctor.finding import REFUSE, TELL, Finding, LogDiagnosis, merge_settings
 from pfbench.logs.doctor.sensor_grade import measure_noise
+from pfbench.logs.doctor.thresholds import limit_of
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
 from pfbench.logs.worlds.corrections import LogTables
 from pfbench.logs.worlds.log_reader import LogSource
 from pfbench.logs.worlds.log_tables import LogFiles, list_tables
 
 _ROUNDS = 3  # of checks with the settings found so far
-_SPOILS = {"slow errors", "dead axis"}  # what no setting mends, and what others are measured with
+_SPOILS = {"slow errors", "dead axis", "saturated axis", "gyro bias drift", "accelerometer bias drift", "attitude jump"}  # fmt: skip  # what no setting mends, and what others are measured with
+_RESTS = ("rest of the force", "rest of the rate")  # what a mended log may leave
 READER_CHECK = "reading"  # check of what the reader refuses itself
 
 
@@ -50,19 +52,23 @@ def inspect_log(
     settings = merge_settings(finding.settings for finding in findings)
     checks = [finding.check for finding in findings if not finding.settings]
     for _ in range(_ROUNDS if settings else 0):
-        remaining, _ = _inspect(source.with_settings(settings), tables)
+        remaining, rests = _inspect(source.with_settings(settings), tables)
         checks = [finding.check for finding in remaining]
         more = merge_settings([settings, *(finding.settings for finding in remaining)])
         if more == settings:
             break
         settings = more
-    if settings and not _is_mended(findings, remaining):
+    if settings and not _is_mended(findings, remaining, rests):
         findings, settings = withhold_remedies(findings), {}
     return LogDiagnosis(tuple(findings), facts, settings, tuple(checks))
 
 
-def _is_mended(findings: Sequence[Finding], remaining: Sequence[Finding]) -> bool:
+def _is_mended(
+    findings: Sequence[Finding], remaining: Sequence[Finding], rests: Mapping[str, Any]
+) -> bool:
     """Return whether a log with all settings is refused no more, and is as good as a clean one."""
+    if any(rests.get(name, 0.0) > limit_of(name) for name in _RESTS):
+        return False
     unmended = {finding.check for finding in findings if not finding.settings} - _SPOILS
     return all(f.level == TELL or (f.level != REFUSE and f.check in unmended) for f in remaining)
 

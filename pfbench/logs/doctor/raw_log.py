@@ -87,6 +87,7 @@ def take_rows(table: Table, rows: Any) -> Table:
 
 
 _NO_ROWS = np.empty((0, 3))
+NO_IMU = RawImu(np.empty(0), _NO_ROWS, _NO_ROWS, np.empty(0, np.intp))
 NO_REFERENCE = RawReference(np.empty(0), _NO_ROWS, _NO_ROWS, _NO_ROWS, np.empty(0, np.intp))
 
 

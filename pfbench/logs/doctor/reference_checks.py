@@ -8,8 +8,8 @@ import numpy as np
 
 from pfbench.files.table_file import Array
 from pfbench.logs.doctor.axis_orders import BODY_ORDERS, name_axes
-from pfbench.logs.doctor.finding import REFUSE, Finding, Picture, thin_curve
-from pfbench.logs.doctor.raw_log import RawReference, dcm_of, take_rows
+from pfbench.logs.doctor.finding import REFUSE, WARN, Finding, Picture, thin_curve
+from pfbench.logs.doctor.raw_log import RawLog, RawReference, dcm_of, take_rows
 from pfbench.logs.doctor.thresholds import limit_of
 from pfbench.logs.doctor.turn_search import integrate, select_nodes, turns_between
 from pfbench.logs.units import find_units
@@ -21,26 +21,56 @@ _SLOPES, _CORRELATION = (0.8, 1.25), 0.8
 _SLOW_SLOPES, _CLEAR_CORRELATION = (0.7, 1.4), 0.95  # of an axis with less motion
 _EXPLAINED = 0.3  # part of the residual that other axes may leave
 _UNIT_ERROR = 0.03  # relative
-_LEAST_JUMP, _LEAST_TURN = 2.0, 0.25  # m and rad of a wrong row
+_LEAST_JUMP, _LEAST_TURN, _LEAST_KICK = 2.0, 0.25, 3.0  # m, rad and m/s of a wrong row
+_IMPOSSIBLE = 1.5  # rad, of a row
 _RETURN = 0.5  # part of a jump that remains after the next row
 _MOST_WRONG = 0.01  # share of rows: more are another fault
 
 
-def drop_wrong_rows(reference: RawReference) -> RawReference:
-    """Leave out single rows whose position or attitude jumps there and back, which spoil sums over all rows.
+def drop_wrong_rows(
+    reference: RawReference,
+) -> tuple[RawReference, list[tuple[tuple[str, str], float, int]]]:
+    """Leave out single rows that jump there and back, which spoil sums over all rows.
 
-    Readers name these rows, with their limits.
+    Returns the reference, and quantity, size and row of the largest jump of attitude and velocity; readers name those of
+    positions, with their limits.
     """
     time, velocity = reference.time, reference.velocity
     difference = np.diff(reference.position, axis=0) - np.diff(integrate(time, velocity), axis=0)
     turned = turns_between(dcm_of(reference.angles), np.arange(len(time)))
-    wrong = np.zeros(len(time), bool)
-    for change, least in ((difference, _LEAST_JUMP), (turned, _LEAST_TURN)):
+    changes = {
+        ("position", "m"): (difference, _LEAST_JUMP),
+        ("attitude", "rad"): (turned, _LEAST_TURN),
+        ("velocity", "m/s"): (np.diff(velocity, axis=0), _LEAST_KICK),
+    }
+    wrong, largest = np.zeros(len(time), bool), []
+    for quantity, (change, least) in changes.items():
         size = np.linalg.norm(change, axis=1)
         jump = np.minimum(size[1:], size[:-1])
         rest = np.linalg.norm(change[1:] + change[:-1], axis=1)
-        wrong[1:-1] |= (jump > least) & (rest < _RETURN * jump)
-    return take_rows(reference, ~wrong if wrong.mean() < _MOST_WRONG else slice(None))
+        jump[(jump <= least) | (rest >= _RETURN * jump)] = 0.0
+        wrong[1:-1] |= jump > 0.0
+        if jump.any() and quantity[-1] != "m":
+            largest.append((quantity, float(jump.max()), int(jump.argmax()) + 1))
+    if wrong.mean() >= _MOST_WRONG:
+        return reference, []
+    return take_rows(reference, ~wrong), largest
+
+
+def check_rows(log: RawLog) -> tuple[RawLog, list[Finding]]:
+    """Name single rows of the reference whose attitude or velocity jumps there and back, and leave them out."""
+    reference, largest = (
+        drop_wrong_rows(log.reference) if len(log.reference.time) > 2 else (log.reference, [])
+    )
+    findings = []
+    for (name, unit), size, row in largest:
+        level = REFUSE if (name, size > _IMPOSSIBLE) == ("attitude", True) else WARN
+        findings.append(Finding(
+            "reference rows", level, size, 0.0, unit,
+            f"{log.names[2]}: the {name} jumps by {size:.3g} {unit} there and back in {log.row(2, row)}",
+            "Correct or remove this row",
+        ))  # fmt: skip
+    return log._replace(reference=reference), findings
 
 
 def check_reference(
@@ -94,7 +124,9 @@ def _explain(
         text = f"the velocities North, East, Down are the columns {', '.join(names)}"
         corrections = {"level_axes": {"reference_velocity": names}}
         return text, corrections, reference.velocity @ best.T
-    for unit, factor in find_units("velocity", 1.0 / float(np.median(slope)), _UNIT_ERROR).items():
+    for unit, factor in find_units(
+        "velocity", 1.0 / (float(np.median(slope)) or np.inf), _UNIT_ERROR
+    ).items():
         if (np.abs(slope / factor - 1.0) < _UNIT_ERROR).all():
             scale = {"reference": dict.fromkeys(("vn", "ve", "vd"), factor)}
             return f"velocities are in {unit}", {"scale": scale}, reference.velocity * factor

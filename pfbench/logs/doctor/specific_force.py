@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -17,9 +17,11 @@ from pfbench.logs.doctor.axis_orders import (
     BODY_ORDERS,
     CONVENTIONS,
     LEVEL_ORDERS,
+    axes_matrix,
     convert_angles,
     name_axes,
 )
+from pfbench.logs.doctor.changes import find_change
 from pfbench.logs.doctor.finding import REFUSE, WARN, Finding, Picture, thin_curve
 from pfbench.logs.doctor.force_windows import (
     ForceFit,
@@ -49,29 +51,24 @@ _LEAST_SPEED, _AHEAD = (
     2.0,
     0.9,
 )  # m/s, and mean cosine between yaw and course of a vehicle that drives forward
-_BLOCKS = 10  # of windows, whose differences give a standard error
 _DOWN = np.array([0.0, 0.0, 1.0])
 _FEWEST = 20  # windows for scales
+_FEWEST_FORCE, _FEWEST_RATE = 8, 16  # windows of a block
 _LEAST_RATE, _SCALE_ERROR = 0.05, 0.02  # rad/s and 1: motion and accuracy that show a scale
 _SCALE_ERRORS = 6.0
+_ALONE = 3.0  # times the next largest turn
 _DELAYS, _DELAY_S = (
     np.linspace(-0.2, 0.2, 5),
     600.0,
 )  # s of the force, and of the log that is compared
 
 
-class Cause(NamedTuple):
-    """Explanation of axes that disagree.
-
-    Attributes:
-        text: What is wrong.
-        corrections: Settings that mend it.
-        log: The log as mended.
-    """
-
-    text: str
-    corrections: dict[str, Any]
-    log: RawLog
+Cause = tuple[str, dict[str, Any]]  # what is wrong, and the corrections that mend it
+_LEVEL = ["e", "n", "-d"]
+_ROS: dict[str, Any] = {
+    "mounting": {"imu": ["x", "-y", "-z"]}, "level_axes": {"reference": _LEVEL, "gnss": _LEVEL},
+    "attitude": "forward_left_up",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -108,25 +105,22 @@ def check_force_and_rate(aligned: Alignment, facts: dict[str, Any]) -> tuple[Raw
     windows = integrate_force(aligned.log, aligned.dcm, aligned.offset)
     if windows is None:
         return aligned.log, []
-    turned = _find_rotation(aligned, windows, facts)
+    turned = _find_rotation(aligned, windows, facts) or _find_heading(aligned, windows, facts)
     if turned:
         finding, log = turned
         return log, [finding]
     state = _try_axes(aligned, windows)
     horizontal = float(np.sqrt(np.square(windows.change[:, :2]).mean()))
     ratio = state.fit.cost / max(state.least, 1e-12)
-    errors = _compare_blocks(state)
     facts.update(
         {
             "rate axes": aligned.rate_ratio,
             "force axes": ratio,
-            "force axes [standard errors]": errors,
             "horizontal acceleration [m/s^2]": horizontal,
         }
     )
     is_rate = aligned.rate_ratio > limit_of("axes")
-    is_clear = errors > STANDARD_ERRORS or ratio > CLEAR_AXES
-    is_force = ratio > limit_of("axes") and horizontal > LEAST_ACCELERATION and is_clear
+    is_force = ratio > CLEAR_AXES and horizontal > LEAST_ACCELERATION
     if is_rate or is_force:
         finding, log = _describe_axes(state, is_rate, max(ratio, aligned.rate_ratio))
         return log, [finding]
@@ -168,11 +162,13 @@ def _find_rotation(aligned: Alignment, windows: ForceWindows, facts: dict[str, A
         least / max(float(np.square(measured @ matrix.T - true).sum()), 1e-300),
         min(forces) / max(fit_force(windows, matrix).cost, 1e-12),
     )
-    if angle < limit_of("mounting") or max(gains) < limit_of("axes") or min(gains) < 1.0 / _EQUAL:
+    if (
+        angle < limit_of("mounting") or max(gains) < limit_of("axes") or min(gains) < 1.0 / _EQUAL
+        or _find_force_change(windows, fit_force(windows, matrix))  # which no turn explains
+    ):  # fmt: skip
         return None
     log, names = aligned.log, aligned.log.names
     angles = [round(float(a), 2) for a in Rotation.from_matrix(matrix).as_euler("ZYX", degrees=True)[::-1]]  # fmt: skip
-    mended = log.imu._replace(force=log.imu.force @ matrix.T, rate=log.imu.rate @ matrix.T)
     finding = Finding(
         "mounting", REFUSE, angle, limit_of("mounting"), "deg",
         f"{names[0]}: the sensor is turned by roll, pitch, yaw {angles} deg against the attitude of {names[2]}, {angle:.1f} deg "
@@ -181,7 +177,32 @@ def _find_rotation(aligned: Alignment, windows: ForceWindows, facts: dict[str, A
         ("a sensor that is tilted or turned", f"an attitude of {names[2]} in another frame, as a magnetic yaw"),
         _force_picture(windows),
     )  # fmt: skip
-    return finding, log._replace(imu=mended)
+    return finding, _mend(log, finding.settings["corrections"])
+
+
+def _find_heading(aligned: Alignment, windows: ForceWindows, facts: dict[str, Any]) -> tuple[Finding, RawLog] | None:  # fmt: skip
+    """Find a yaw of the reference that is off by a constant: turns agree, and the force moves in another direction.
+
+    Returns the finding, and the log with the yaw corrected.
+    """
+    plain, log = fit_force(windows), aligned.log
+    predicted, expected = (a[plain.keep, :2] @ [1.0, 1j] for a in (windows.change - plain.residual, windows.change))  # fmt: skip
+    angle = float(np.angle(np.vdot(predicted, expected)))
+    turn = Rotation.from_euler("z", angle).as_matrix()
+    turned = windows._replace(products=np.einsum("ij,njkl->nikl", turn, windows.products), rotation=turn @ windows.rotation)  # fmt: skip
+    ratio, degrees = plain.cost / max(fit_force(turned).cost, 1e-12), np.rad2deg(angle)
+    facts["turn of the heading [deg]"] = round(degrees, 2)
+    is_near_axes = abs((degrees + 45.0) % 90.0 - 45.0) < limit_of("mounting")
+    if ratio < CLEAR_AXES or is_near_axes or aligned.rate_ratio > limit_of("axes"):
+        return None
+    finding = Finding(
+        "heading", REFUSE, degrees, limit_of("mounting"), "deg",
+        f"{log.names[2]}: yaw is {-degrees:.1f} deg off: it turns as the gyroscope does, and the force moves in another direction",
+        f"Set +scenario.corrections.bias.reference.yaw={-angle:.5f}",
+        {"corrections": {"bias": {"reference": {"yaw": round(-angle, 5)}}}},
+        ("magnetic or grid North", "a velocity in another frame than the attitude"), _force_picture(windows),
+    )  # fmt: skip
+    return finding, log._replace(reference=log.reference._replace(angles=np.add(log.reference.angles, [0.0, 0.0, angle])))  # fmt: skip
 
 
 def _drives_forward(log: RawLog) -> bool:
@@ -215,38 +236,13 @@ def _try_axes(aligned: Alignment, windows: ForceWindows) -> ForceState:
     return replace(state, conventions=tuple(sorted(conventions, key=lambda c: c[1])))
 
 
-def _compare_blocks(state: ForceState) -> float:
-    """Return by how many standard errors the recorded axes fit worse than the best orders, by blocks of time."""
-    if state.body[0] <= state.level[0]:
-        best = fit_force(state.windows, state.body[1])
-    else:
-        best = fit_force(state.windows, level=state.level[1])
-    both = state.fit.keep & best.keep
-    if both.sum() < 4:
-        return np.inf
-    count = min(_BLOCKS, int(both.sum()) // 2)
-    plain, least = (
-        [
-            block.mean()
-            for block in np.array_split(np.square(f.residual[both[f.keep]]).sum(1), count)
-        ]
-        for f in (state.fit, best)
-    )
-    ratio = np.log(np.maximum(plain, 1e-12) / np.maximum(least, 1e-12))
-    return float(ratio.mean()) / max(float(ratio.std(ddof=1)) / np.sqrt(count), 1e-12)
-
-
-# --------------------------------------------------------------------------------------------------
-# Explanations of axes that disagree.
-
-
 def _describe_axes(state: ForceState, is_rate: bool, ratio: float) -> tuple[Finding, RawLog]:
     """Describe axes that disagree, with all explanations that fit as well as the best."""
     aligned = state.aligned
     causes = list(_list_causes(state, is_rate))
     best = f"the best axes of the rate are {_join(aligned.rate_axes.T)}, of the force {_join(state.body[1])}"
     remedy = (
-        f"Set scenario.corrections: {causes[0].corrections}"
+        f"Set scenario.corrections: {causes[0][1]}"
         if causes
         else f"No single change explains both: {best}. Check the axes of both tables"
     )
@@ -254,72 +250,61 @@ def _describe_axes(state: ForceState, is_rate: bool, ratio: float) -> tuple[Find
         "axes", REFUSE, ratio, limit_of("axes"), "times the least residual",
         f"{aligned.log.names[0]} and {aligned.log.names[2]}: axes disagree, residuals of the rate are "
         f"{aligned.rate_ratio:.1f} and of the force {state.fit.cost / max(state.least, 1e-12):.1f} times those of the best axes",
-        remedy, {"corrections": causes[0].corrections} if causes else {},
-        tuple(cause.text for cause in causes), _force_picture(state.windows),
+        remedy, {"corrections": causes[0][1]} if causes else {},
+        tuple(text for text, _ in causes), _force_picture(state.windows),
     )  # fmt: skip
-    return finding, causes[0].log if causes else aligned.log
+    return finding, _mend(aligned.log, causes[0][1] if causes else {})
 
 
 def _list_causes(state: ForceState, is_rate: bool) -> Iterator[Cause]:
     """Yield the explanations, simple ones first."""
     log, limit = state.aligned.log, _EQUAL * state.least
-    ros = _ros_cause(state)
-    if not is_rate and ros:
-        yield ros
+    (imu, _, reference), identity = log.names, np.eye(3)
+    if not is_rate and _fits_ros(state):
+        yield "all tables: East, North, Up and forward, left, up, as in ROS", _ROS
     for rest, cost, name in state.conventions:
         if rest < _EQUAL and cost < limit and not ("yaw" in name and _drives_forward(log)):
-            yield _convention_cause(log, name)
+            yield f"{reference}: {CONVENTIONS[name][0]}", {"attitude": name}
     axes = _find_mounting(state)
     if is_rate and fit_force(state.windows, axes).cost < limit:
-        yield _axes_cause(log, "imu", "forward, right, down are the axes", axes)
+        yield f"{imu}: forward, right, down are the axes {_join(axes)}", {"mounting": {"imu": name_axes(axes)}}  # fmt: skip
     if is_rate and state.fit.cost < limit:
         axes = state.aligned.rate_axes.T
-        yield _axes_cause(log, "gyroscope", "wx, wy, wz alone have other axes,", axes)
-    if is_rate:
-        return
-    if state.level[0] < limit and not np.array_equal(state.level[1], np.eye(3)):
-        yield _level_cause(log, state.level[1])
-    if state.body[0] < limit and not np.array_equal(state.body[1], np.eye(3)):
-        yield _axes_cause(log, "accelerometer", "fx, fy, fz alone have other axes,", state.body[1])
+        yield f"{imu}: wx, wy, wz alone have other axes, {_join(axes)}", {"mounting": {"gyroscope": name_axes(axes)}}  # fmt: skip
+    if not is_rate and state.level[0] < limit and not np.array_equal(state.level[1], identity):
+        names = name_axes(state.level[1], is_level=True)
+        enu = " (East, North, Up under the names of North, East, Down)" if names == _ROS["level_axes"]["gnss"] else ""  # fmt: skip
+        yield f"{reference}: North, East, Down are the axes {', '.join(names)}{enu}", {"level_axes": {"reference": names}}  # fmt: skip
+    if not is_rate and state.body[0] < limit and not np.array_equal(state.body[1], identity):
+        axes = state.body[1]
+        yield f"{imu}: fx, fy, fz alone have other axes, {_join(axes)}", {"mounting": {"accelerometer": name_axes(axes)}}  # fmt: skip
 
 
-def _axes_cause(log: RawLog, sensor: str, text: str, axes: Array) -> Cause:
-    """Explain by the axes of the whole IMU, or of one of its sensors."""
-    force = log.imu.force if sensor == "gyroscope" else log.imu.force @ axes.T
-    rate = log.imu.rate if sensor == "accelerometer" else log.imu.rate @ axes.T
-    mended = log._replace(imu=log.imu._replace(force=force, rate=rate))
-    text = f"{log.names[0]}: {text} {_join(axes)}"
-    return Cause(text, {"mounting": {sensor: name_axes(axes)}}, mended)
+def _mend(log: RawLog, corrections: Mapping[str, Any]) -> RawLog:
+    """Apply axes and conventions of corrections to a log."""
+    imu, reference, fixes = log.imu, log.reference, log.fixes
+    for sensor, axes in corrections.get("mounting", {}).items():
+        matrix = axes_matrix(sensor, axes)
+        force = imu.force if sensor == "gyroscope" else imu.force @ matrix.T
+        imu = imu._replace(force=force, rate=imu.rate if sensor == "accelerometer" else imu.rate @ matrix.T)  # fmt: skip
+    if "attitude" in corrections:
+        reference = reference._replace(angles=convert_angles(corrections["attitude"], reference.angles))  # fmt: skip
+    level = corrections.get("level_axes", {})
+    if "reference" in level:
+        turn = axes_matrix("reference", level["reference"], is_level=True).T
+        reference = reference._replace(velocity=reference.velocity @ turn, position=reference.position @ turn)  # fmt: skip
+    if "gnss" in level:
+        fixes = fixes._replace(
+            position=fixes.position @ axes_matrix("gnss", level["gnss"], is_level=True).T
+        )
+    return log._replace(imu=imu, reference=reference, fixes=fixes)
 
 
-def _convention_cause(log: RawLog, name: str) -> Cause:
-    """Explain by the convention of the attitude."""
-    angles = convert_angles(name, log.reference.angles)
-    mended = log._replace(reference=log.reference._replace(angles=angles))
-    return Cause(f"{log.names[2]}: {CONVENTIONS[name][0]}", {"attitude": name}, mended)
-
-
-def _ros_cause(state: ForceState) -> Cause | None:
-    """Explain by axes of ROS in all tables: these agree with each other, and gravity alone points the other way."""
-    log, flip = state.aligned.log, np.array([1.0, -1.0, -1.0])
-    imu, swap = log.imu, np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    angles = convert_angles("forward_left_up", log.reference.angles)
-    reference = log.reference._replace(
-        velocity=log.reference.velocity @ swap, position=log.reference.position @ swap, angles=angles
-    )  # fmt: skip
-    mended = log._replace(
-        imu=imu._replace(force=imu.force * flip, rate=imu.rate * flip), reference=reference,
-        fixes=log.fixes._replace(position=log.fixes.position @ swap),
-    )  # fmt: skip
-    windows = integrate_force(mended, dcm_of(angles), state.aligned.offset)
-    if windows is None or fit_force(windows).cost >= _EQUAL * state.least:
-        return None
-    level = ["e", "n", "-d"]
-    settings = {
-        "mounting": {"imu": ["x", "-y", "-z"]}, "level_axes": {"reference": level, "gnss": level},
-        "attitude": "forward_left_up",
-    }  # fmt: skip
-    return Cause("all tables: East, North, Up and forward, left, up, as in ROS", settings, mended)
+def _fits_ros(state: ForceState) -> bool:
+    """Return whether axes of ROS in all tables fit: these agree with each other, and gravity alone points the other way."""
+    mended = _mend(state.aligned.log, _ROS)
+    windows = integrate_force(mended, dcm_of(mended.reference.angles), state.aligned.offset)
+    return windows is not None and fit_force(windows).cost < _EQUAL * state.least
 
 
 def _find_mounting(state: ForceState) -> Array:
@@ -329,21 +314,6 @@ def _find_mounting(state: ForceState) -> Array:
     accepted = np.flatnonzero(residuals < _EQUAL * residuals.min())
     axes = (BODY_ORDERS[i].T for i in accepted)
     return min(axes, key=lambda matrix: fit_force(state.windows, matrix).cost)
-
-
-def _level_cause(log: RawLog, level: Array) -> Cause:
-    """Explain by the level frame of the reference."""
-    names = name_axes(level, is_level=True)
-    enu = " (East, North, Up under the names of North, East, Down)" if names == ["e", "n", "-d"] else ""  # fmt: skip
-    reference = log.reference
-    mended = reference._replace(
-        velocity=reference.velocity @ level.T, position=reference.position @ level.T
-    )
-    return Cause(
-        f"{log.names[2]}: North, East, Down are the axes {', '.join(names)}{enu}",
-        {"level_axes": {"reference": names}},
-        log._replace(reference=mended),
-    )
 
 
 def _join(axes: Array) -> str:
@@ -360,10 +330,6 @@ def _force_picture(windows: ForceWindows) -> Picture:
         f"acceleration {('North', 'East')[axis]} [m/s^2]",
         tuple(thin_curve(label, windows.time, values[:, axis]) for label, values in curves),
     )
-
-
-# --------------------------------------------------------------------------------------------------
-# Biases and scales.
 
 
 def _check_force_delay(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Finding]:
@@ -388,14 +354,25 @@ def _check_force_delay(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Fi
 
 
 def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Finding]:
-    """Check scale and bias of the force."""
+    """Check scale and bias of the force, which are not judged where the bias changes."""
     windows, fit, name = state.windows, state.fit, state.aligned.log.names[0]
+    facts["rest of the force"] = float(np.sqrt(np.square(fit.residual[fit.keep]).sum(1).mean()))
+    change = _find_force_change(windows, fit)
+    if change:
+        yield Finding(
+            "accelerometer bias drift", WARN, change[1], limit_of("accelerometer bias drift"), "m/s^2",
+            f"{name}: the bias of f{'xyz'[change[0]]} {change[2]} m/s^2",
+            "Record again, or use the part without the change: a correction is one number for the whole log",
+            explanations=("a sensor that warms up or was hit", "a saturated axis", "an attitude that changes"),
+            picture=_force_picture(windows),
+        )  # fmt: skip
+        return
     measured = np.linalg.norm(np.einsum("nijj->ni", windows.products), axis=1)
     needed = np.linalg.norm(windows.change - windows.gravity * _DOWN, axis=1)
     scale = float(np.median(measured / np.maximum(needed, 1e-9)))
-    bias, memory = -fit.bias, correlate_neighbours(fit.residual)
+    bias, memory = -fit.bias, correlate_neighbours(fit.residual[fit.keep])
     a = windows.rotation[fit.keep].reshape(-1, 3)
-    variance = np.diag(np.linalg.inv(a.T @ a + 1e-9 * np.eye(3))) * fit.residual.var()
+    variance = np.diag(np.linalg.inv(a.T @ a + 1e-9 * np.eye(3))) * fit.residual[fit.keep].var()
     error = np.sqrt(variance * (1.0 + memory) / (1.0 - memory))
     facts.update({"force scale": scale, "accelerometer bias [m/s^2]": bias.round(3).tolist()})
     if abs(scale - 1.0) > limit_of("force scale") and windows.gravity:
@@ -422,6 +399,13 @@ def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Fi
         )  # fmt: skip
 
 
+def _find_force_change(windows: ForceWindows, fit: ForceFit) -> tuple[int, float, str] | None:
+    """Find a change of the bias of the force that clean logs do not show."""
+    body = np.einsum("nji,nj->ni", windows.rotation, fit.residual)
+    change = find_change(windows.time, -body, _FEWEST_FORCE)
+    return change if change and change[1] > limit_of("accelerometer bias drift") else None
+
+
 def _by_column(letter: str, values: Array) -> dict[str, float]:
     return {f"{letter}{axis}": round(float(v), 5) for axis, v in zip("xyz", values, strict=True)}
 
@@ -434,20 +418,32 @@ def _check_rate_errors(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Fi
     name = aligned.log.names[0]
     rates = np.rad2deg((measured - true) / window)
     bias = np.median(rates, 0)
+    facts["rest of the rate"] = float(np.sqrt(np.square(rates - bias).sum(1).mean()))
     facts["gyro bias [deg/s]"] = bias.round(4).tolist()
     axis = int(np.argmax(np.abs(bias)))
     picture = Picture(
         "t [s]", f"rate of imu minus reference about {'xyz'[axis]} [deg/s]",
         (thin_curve("difference", time, rates[:, axis]),),
     )  # fmt: skip
-    if abs(bias[axis]) > limit_of("gyro bias"):
+    change = find_change(time, rates, _FEWEST_RATE)
+    facts["change of the gyro bias [deg/s]"] = round(change[1], 3) if change else 0.0
+    if change and change[1] > limit_of("gyro bias drift"):
+        yield Finding(
+            "gyro bias drift", WARN, change[1], limit_of("gyro bias drift"), "deg/s",
+            f"{name}: the bias of w{'xyz'[change[0]]} {change[2]} deg/s",
+            "Let the sensor warm up, or record in shorter parts: a correction of the bias is one number for the whole log",
+            explanations=("a sensor that warms up", "a reference whose attitude drifts"),
+            picture=picture._replace(ylabel=f"rate of imu minus reference about {'xyz'[change[0]]} [deg/s]",
+                                     curves=(thin_curve("difference", time, rates[:, change[0]]),)),
+        )  # fmt: skip
+    elif abs(bias[axis]) > limit_of("gyro bias"):
         yield Finding(
             "gyro bias", WARN, float(bias[axis]), limit_of("gyro bias"), "deg/s",
             f"{name}: gyro bias {bias.round(2).tolist()} deg/s, forward, right, down",
             "Set scenario.corrections.bias, or the nominal bias scenario.tuning.gyro_bias_deg_s",
             {"corrections": {"bias": {"imu": _by_column("w", np.deg2rad(bias))}}}, picture=picture,
         )  # fmt: skip
-    yield from _check_bias_drift(name, rates, time, facts)
+    yield from _check_attitude_jump(aligned.log.names[2], rates - bias, time, window)
     scales = list(_find_rate_scales(measured, true, window))
     facts["gyro scale"] = {f"w{axis}": round(scale, 4) for axis, scale, _ in scales}
     wrong = [
@@ -469,21 +465,18 @@ def _check_rate_errors(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Fi
         )  # fmt: skip
 
 
-def _check_bias_drift(
-    name: str, rates: Array, time: Array, facts: dict[str, Any]
-) -> Iterator[Finding]:
-    """Check that the bias of the rate in the last third of the log is that in the first."""
-    change = np.subtract(*(np.median(third, 0) for third in np.array_split(rates, 3)[::-2]))
-    axis = int(np.argmax(np.abs(change)))
-    facts["change of the gyro bias [deg/s]"] = change.round(3).tolist()
-    if abs(change[axis]) > limit_of("gyro bias drift"):
+def _check_attitude_jump(name: str, rates: Array, time: Array, window: float) -> Iterator[Finding]:
+    """Check for one window in which the attitude turns and the gyro does not."""
+    sizes = window * np.linalg.norm(rates, axis=1)
+    i, second = int(sizes.argmax()), float(np.partition(sizes, -2)[-2])
+    if sizes[i] > max(limit_of("attitude jump"), _ALONE * second):
         yield Finding(
-            "gyro bias drift", WARN, float(change[axis]), limit_of("gyro bias drift"), "deg/s",
-            f"{name}: the bias of w{'xyz'[axis]} changes by {change[axis]:+.1f} deg/s from the first third of the log to the last",
-            "Let the sensor warm up, or record in shorter parts: a correction of the bias is one number for the whole log",
-            explanations=("a sensor that warms up", "a reference whose attitude drifts"),
-            picture=Picture("t [s]", f"rate of imu minus reference about {'xyz'[axis]} [deg/s]",
-                            (thin_curve("difference", time, rates[:, axis]),)),
+            "attitude jump", WARN, float(sizes[i]), limit_of("attitude jump"), "deg",
+            f"{name}: roll, pitch, yaw jump by {np.round(-window * rates[i], 1).tolist()} deg, forward, right, down, near "
+            f"t = {time[i]:.1f}, and the gyroscope does not turn",
+            "Use the part before or after it: no correction has two frames",
+            explanations=("a filter that starts anew", "a heading that is set"),
+            picture=Picture("t [s]", "turn of imu minus reference [deg]", (thin_curve("windows", time, sizes),), (float(time[i]),)),
         )  # fmt: skip
 
 
@@ -492,6 +485,8 @@ def _compare_turns(aligned: Alignment) -> tuple[Array, Array, float, Array]:
     search: TurnSearch = aligned.search
     at = search.nodes + aligned.offset
     used = (at[:-1] >= search.time[0]) & (at[1:] <= search.time[-1]) & search.usable
+    gaps = search.time[:-1][np.diff(search.time) > 0.5 * np.median(np.diff(at))]
+    used &= ~np.isin(np.arange(len(used)), np.searchsorted(at, gaps, side="right") - 1)
     middle = 0.5 * (search.angle[1:] + search.angle[:-1])
     cone = np.vstack([np.zeros(3), np.cumsum(np.cross(middle, np.diff(search.angle, axis=0)), 0)])
     angle, sums = (interpolate_columns(at, search.time, a) for a in (search.angle, cone))

@@ -97,18 +97,19 @@ class TurnSearch:
             return 0.0
         return float(np.linalg.svd(true.T @ measured, compute_uv=False).sum()) / size
 
-    def find(self, turns: Array, around: float | None = None, stretch: _Mask | None = None) -> tuple[float, float]:  # fmt: skip
+    def find(self, turns: Array, around: float | None = None, stretch: _Mask | None = None, reach: float = 0.6) -> tuple[float, float]:  # fmt: skip
         """Find the offset of the largest score.
 
         Args:
             turns: Rotation vectors of the reference, rad, [m, 3].
-            around: Centre of a search of 0.6 s. None for 25 s about 0.
+            around: Centre of a search. None for 25 s about 0.
             stretch: Windows to compare, [m]. None for all.
+            reach: Half of the search about a centre, s.
 
         Returns:
             Offset, s, and score.
         """
-        grid = _COARSE if around is None else around + np.arange(-0.6, 0.601, 0.1)
+        grid = _COARSE if around is None else around + np.arange(-reach, reach + 0.01, 0.1)
         start = float(grid[int(np.argmax([self.score(turns, float(a), stretch) for a in grid]))])
         fine = start + _FINE
         scores = np.array([self.score(turns, float(a), stretch) for a in fine])

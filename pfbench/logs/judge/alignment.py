@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pfbench.logs.doctor.turn_search import select_nodes
 from pfbench.logs.judge.judge_options import JudgeOptions
 from pfbench.logs.judge.reference_track import (
     ReferenceTrack,
@@ -80,7 +81,7 @@ def find_common_epochs(
     common = np.logical_and.reduce([everywhere, *(has_row[k] | in_hole[k] for k in valid)])
     share = float(shared.sum() / max((~is_hole).sum(), 1))
     needed = _tolerance_needed([times[k] for k in valid], grid[~is_hole])
-    common &= _thinned(instants, common, options.every)
+    common = _thin(instants, common, options.every)
     sizes = ", ".join(f"{len(times[k])} ({tables[k].file})" for k in valid) or "none"
     remedy = "a smaller every" if options.every and share > 0.5 else f"tolerance={needed:g}"
     counts = int((common & shared).sum()), int((common & is_hole).sum())
@@ -92,6 +93,13 @@ def find_common_epochs(
     holes = tuple(~has_row[k][common] if k in times else None for k in range(len(tables)))
     unused = _count_unused(masks, rows, holes)
     return CommonEpochs(instants[common], rows, holes, coverage, unused, share, needed, is_weighted)
+
+
+def _thin(grid: Array, common: np.ndarray, every: float) -> np.ndarray:
+    """Return a mask of common epochs that are at least `every` seconds after the last one."""
+    rows = np.flatnonzero(common)
+    keep = rows[select_nodes(grid[rows], every)] if every > 0 and len(rows) else rows
+    return np.isin(np.arange(len(grid)), keep)
 
 
 def _weigh(grid: Array) -> tuple[Array, Array, bool]:
@@ -155,15 +163,6 @@ def _nearest(time: Array, grid: Array) -> np.ndarray:
         time[np.minimum(right, len(time) - 1)] - grid
     )
     return np.asarray(np.where(is_left, right - 1, np.minimum(right, len(time) - 1)))
-
-
-def _thinned(grid: Array, common: np.ndarray, every: float) -> np.ndarray:
-    """Return a mask of common epochs that are at least `every` seconds after the last one."""
-    mask, last = common.copy(), -np.inf
-    for k in np.flatnonzero(common) if every > 0 else ():
-        mask[k] = grid[k] >= last + every * (1 - 1e-9)
-        last = grid[k] if mask[k] else last
-    return mask
 
 
 def position_errors(

@@ -10,8 +10,19 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from pfbench.logs.doctor.axis_orders import BODY_ORDERS, ENU_TO_NED, FLU_TO_FRD, name_axes
 from pfbench.logs.doctor.finding import REFUSE, TELL, Finding
+from pfbench.logs.doctor.fix_checks import check_frame, check_shift, compare_at
+from pfbench.logs.doctor.motion_search import MotionSearch, extent_of
+from pfbench.logs.doctor.raw_log import (  # fmt: skip
+    NO_IMU,
+    RawFixes,
+    RawLog,
+    RawReference,
+    dcm_of,
+)
 from pfbench.logs.judge.reference_track import ReferenceTrack
 from pfbench.logs.judge.trajectory_table import (
     ATTITUDE_COLUMNS,
@@ -38,7 +49,6 @@ _NEAR_S, _FAR = (
     25.0,
     0.05,
 )  # s, half of the first search; share of the extent of the reference above which it is widened
-_OFFSET_WEIGHT = 0.02  # weight of the median difference among shifts at which the motion agrees
 _PLACE = 1000.0  # m, smallest distance of a trajectory of the same place
 _CLOSE, _SIGN = 0.045, 0.25  # relative differences of a slope from a factor, and from -1
 _AGREES, _HALF, _WORSE = (
@@ -46,6 +56,7 @@ _AGREES, _HALF, _WORSE = (
     0.5,
     5.0,
 )  # shares of explained variance; ratio of the variances that two columns leave
+_TURN = 0.1  # rad, of body axes
 _USUAL = 0.97  # share of the increments of an angle that are compared
 _AXES = ((*LOCAL, *VELOCITY_COLUMNS), ("roll", "pitch"), ("yaw",))
 _COMPARED = (*LOCAL, GEODETIC[2], *GEODETIC[:2], *VELOCITY_COLUMNS, *ATTITUDE_COLUMNS)
@@ -64,48 +75,14 @@ def check_run(
 # Clock: overlap with the reference, and the offset that the motion shows.
 
 
-class _Motion:
-    """Positions of a trajectory that are moved in time against the reference."""
-
-    def __init__(self, table: TrajectoryTable, reference: ReferenceTrack, rows: np.ndarray | slice) -> None:  # fmt: skip
-        time, position = table.time[rows], reference.locate(table)[rows]
-        every = max(1, len(time) // 1500)
-        self.time, self.position, self.reference = time[::every], position[::every], reference
-        self.clock, self.extent = reference.table.time, _median_distance(reference.position)
-
-    def spread(self, shift: float, every: int = 1, offset_weight: float = 0.0) -> float:
-        """Return the median distance from the reference after removal of the median difference, m.
-
-        A motion with a period agrees at several shifts. The weight of the median difference
-        selects among them.
-        """
-        time = self.time[::every] + shift
-        inside = (time >= self.clock[0]) & (time <= self.clock[-1])
-        if inside.sum() < max(_LEAST_ROWS, len(time) // 2):
-            return np.inf
-        difference = self.position[::every][inside] - self.reference.interpolate_position(time[inside])  # fmt: skip
-        move = float(np.linalg.norm(np.median(difference, axis=0)))
-        return _median_distance(difference) + offset_weight * move
-
-    def search(self, first: float, last: float) -> tuple[float, float]:
-        """Return spread, m, and shift of the best one from first to last, s, to 1 ms."""
-        step, every = max(0.25, (last - first) / 4000), max(1, len(self.time) // 300)
-        grid = np.arange(first, last + step / 2, step)
-        shift = float(grid[np.argmin([self.spread(s, every, _OFFSET_WEIGHT) for s in grid])])
-        for half, finer in ((2 * step, step / 5), (0.5, 0.02), (0.03, 0.001)):
-            grid = shift + np.arange(-half, half + finer / 2, finer)
-            shift = float(grid[np.argmin([self.spread(s) for s in grid])])
-        return self.spread(shift), shift
-
-    def search_all(self) -> tuple[float, float]:
-        """Search all shifts that leave half of the trajectory in the reference."""
-        middle = float(np.median(self.time))
-        return self.search(self.clock[0] - middle, self.clock[-1] - middle)
-
-
-def _median_distance(points: Array) -> float:
-    """Return the median distance of points [K, 3] from their median."""
-    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+def _follow(
+    table: TrajectoryTable, reference: ReferenceTrack, rows: np.ndarray | slice
+) -> MotionSearch:
+    """Return positions of a trajectory that are moved in time against the reference."""
+    position = reference.locate(table)[rows]
+    return MotionSearch(
+        table.time[rows], position, reference.table.time, reference.interpolate_position
+    )
 
 
 def _round_whole(shift: float) -> float:
@@ -120,9 +97,9 @@ def _check_common_time(table: TrajectoryTable, reference: ReferenceTrack, applie
     if last > clock[0] and first < clock[-1] and not remedy:
         return
     if not remedy:
-        motion = _Motion(table, reference, slice(None))
+        motion = _follow(table, reference, slice(None))
         spread, shift = motion.search_all()
-        is_found = spread < _EXPLAINED * motion.extent
+        is_found = spread < _EXPLAINED * extent_of(reference.position)
         size = applied + (_round_whole(shift) if is_found else clock[0] - first)
         remedy = f"{'The motion agrees at' if is_found else 'If both start together, set'} NAME.shift={size:.10g}"
     evidence = (
@@ -144,9 +121,13 @@ def _find_time_unit(table: TrajectoryTable, reference: ReferenceTrack) -> str:
     factor, remedy = next(((f, text) for f, text in choices if 0.5 < ratio * f < 2), (1.0, ""))
     inside = (table.time >= clock[0]) & (table.time <= clock[-1])
     if remedy and (factor > 1 or inside.sum() >= _LEAST_ROWS):
-        motion = _Motion(table.scale_columns({"t": factor}), reference, slice(None))
+        motion = _follow(table.scale_columns({"t": factor}), reference, slice(None))
         best = min(motion.spread(0.0), motion.search_all()[0])
-        return remedy if motion.extent and best <= _EXPLAINED * motion.extent else ""
+        return (
+            remedy
+            if extent_of(reference.position) and best <= _EXPLAINED * extent_of(reference.position)
+            else ""
+        )
     return remedy
 
 
@@ -163,10 +144,10 @@ def check_clock(table: TrajectoryTable, reference: ReferenceTrack, applied: floa
     rows = np.flatnonzero((table.time >= clock[0]) & (table.time <= clock[-1]))
     if len(rows) < _LEAST_ROWS:
         return np.nan
-    motion = _Motion(table, reference, rows)
+    motion = _follow(table, reference, rows)
     at_zero, (spread, shift) = motion.spread(0.0), motion.search(-_NEAR_S, _NEAR_S)
-    if spread >= _EXPLAINED * at_zero and at_zero > _FAR * motion.extent:
-        spread, shift = min((spread, shift), _Motion(table, reference, slice(None)).search_all())
+    if spread >= _EXPLAINED * at_zero and at_zero > _FAR * extent_of(reference.position):
+        spread, shift = min((spread, shift), _follow(table, reference, slice(None)).search_all())
     if abs(shift) > CLOCK_LIMIT and spread < _EXPLAINED * at_zero:
         if spread > _CLEAR * at_zero:  # other axes may explain more
             check_axes(table, reference)
@@ -315,15 +296,18 @@ def regress_column(mine: Array, theirs: Array, is_angle: bool = False) -> tuple[
     return float(x @ y / (x @ x)), float((x @ y) ** 2 / ((x @ x) * (y @ y)))
 
 
-def check_axes(table: TrajectoryTable, reference: ReferenceTrack) -> None:
+def check_axes(table: TrajectoryTable, reference: ReferenceTrack) -> TrajectoryTable:
     """Compare each column with all columns of the reference, and refuse other signs and names.
+
+    Returns the trajectory, with a note on a body that is turned as a whole, whose angles are then not compared.
 
     A column has the opposite sign if its slope on that of the reference is -1 and explains half of its
     variance. It has another name if another column explains 90 % with slope 1 or -1, and its own one
     leaves 5 times the variance.
     """
     pairs = _pair_columns(table, reference, _LEAST_ROWS)
-    for group in _AXES:
+    body = list(_check_body(table, reference))
+    for group in _AXES[:1] if body else _AXES:
         of_group = [pair for pair in pairs if pair.name in group]
         fault = next(_list_axis_faults(of_group), None)
         if fault:
@@ -332,6 +316,7 @@ def check_axes(table: TrajectoryTable, reference: ReferenceTrack) -> None:
                 remedy = _frame_remedy(table.frame, of_group)
             evidence = f"{table.file}: column {column} must be that of axes North, East, Down, got {problem} in {reference.file}"
             settle(table, [Finding("axes", REFUSE, 1.0, 0.0, "1", evidence, remedy)])
+    return settle(table, body)
 
 
 def _list_axis_faults(pairs: Iterable[_Pair]) -> Iterator[tuple[str, str, str]]:
@@ -365,3 +350,60 @@ def _frame_remedy(frame: str, pairs: Sequence[_Pair]) -> str:
         if not next(_list_axis_faults(turned), None):
             return f"Set NAME.frame={'ned' if frame == 'enu' else 'enu'}"
     return "Check NAME.frame, enu or ned, and the order t x y z qx qy qz qw"
+
+
+def check_frame_of(table: TrajectoryTable, reference: ReferenceTrack) -> TrajectoryTable:
+    """Compare the frame of the positions with the reference, as an inspection compares fixes.
+
+    Returns the trajectory, with a note on a turn, a scale or a shift.
+    """
+    position, time = reference.locate(table), reference.table.time
+    velocity = np.gradient(reference.position, time, axis=0)
+    motion = RawReference(time, np.zeros_like(velocity), velocity, reference.position, np.arange(len(time)))  # fmt: skip
+    fixes = RawFixes(table.time, position, np.arange(len(position)))
+    log = RawLog(NO_IMU, fixes, motion, 0.0, ("", table.file, reference.file), ())
+    notes = {
+        "fix turn": "set align=yaw, which removes it from all programs",
+        "fix scale": "correct the scale, or set NAME.scale for pn, pe, pd",
+        "fix shift": "check heights (ellipsoid or geoid), datum and origin",
+    }
+    findings = [f._replace(level=TELL, remedy=f"If it is no error, {notes[f.check]}") for f in (*check_frame(log, {}), *check_shift(log, *compare_at(log, 0.0)[1:]))]  # fmt: skip
+    return settle(table, [f._replace(evidence=f.evidence.replace("fixes", "positions"), explanations=()) for f in findings])  # fmt: skip
+
+
+def _check_body(table: TrajectoryTable, reference: ReferenceTrack) -> Iterator[Finding]:
+    """Compare the attitude with that of the reference: a quaternion in another order, or other body axes."""
+    pairs = {pair.name: pair for pair in _pair_columns(table, reference, _LEAST_ROWS)}
+    if not set(ATTITUDE_COLUMNS) <= pairs.keys():
+        return
+    mine, theirs = (
+        Rotation.from_matrix(dcm_of(np.stack([getattr(pairs[name], side) for name in ATTITUDE_COLUMNS], -1)))
+        for side in ("mine", "theirs")
+    )  # fmt: skip
+    turn, rest = _find_constant_turn(theirs.inv() * mine)
+    level, body = (ENU_TO_NED, FLU_TO_FRD) if table.frame == "enu" else (np.eye(3), np.eye(3))
+    read = Rotation.from_matrix(level.T @ mine.as_matrix() @ body.T).as_quat()
+    reordered = level @ Rotation.from_quat(read[:, [1, 2, 3, 0]]).as_matrix() @ body
+    _, reordered_rest = _find_constant_turn(theirs.inv() * Rotation.from_matrix(reordered))
+    if table.frame and rest > _TURN and reordered_rest < _EXPLAINED * rest:
+        evidence = f"{table.file}: columns qx qy qz qw must have this order, got an attitude that turns as that of {reference.file} with qw first"
+        remedy = "Set the line of names # t x y z qw qx qy qz above the first row"
+        yield Finding("axes", REFUSE, rest, _TURN, "rad", evidence, remedy)
+    size = turn.magnitude()
+    if size > _TURN and rest < _EXPLAINED * size:
+        near = min(BODY_ORDERS, key=lambda m: float(np.abs(m - turn.as_matrix()).sum()))
+        is_near = float(np.abs(near - turn.as_matrix()).max()) < np.sin(_TURN)
+        names = f": forward, right, down of the reference are its [{', '.join(name_axes(near))}]" if is_near else ""  # fmt: skip
+        evidence = (
+            f"{table.file}: the body axes are turned by a constant {np.rad2deg(size):.1f} deg against those of "
+            f"{reference.file}, within {np.rad2deg(rest):.1f} deg{names}"
+        )
+        causes = ("axes of a camera or of the sensor", "another frame of the attitude")
+        remedy = "Convert the attitude: all its errors contain this turn"
+        yield Finding("mounting", TELL, size, _TURN, "rad", evidence, remedy, explanations=causes)
+
+
+def _find_constant_turn(turns: Rotation) -> tuple[Rotation, float]:
+    """Return the mean of rotations, and the median distance from it, rad."""
+    mean = turns.mean()
+    return mean, float(np.median((mean.inv() * turns).magnitude()))

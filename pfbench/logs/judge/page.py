@@ -119,10 +119,7 @@ _ALIGNED = {
     "yaw": "A shift and a turn about the vertical are removed from each run (align=yaw): errors are relative.",
 }
 _CLOCK_SHOWN = 0.05  # s
-_OFFSET_SHOWN = 5.0  # m
-_TREND_SHOWN = 0.5  # share of the squared error
 _INTERPOLATION_SHOWN = 0.2  # share of the smallest RMSE
-_AXES = ("North", "East", "Down")
 
 
 def describe_notes(judgement: Judgement, options: JudgeOptions) -> Iterator[str]:
@@ -135,8 +132,6 @@ def describe_notes(judgement: Judgement, options: JudgeOptions) -> Iterator[str]
         yield from _describe_missing(sequence, programs)
         yield from _describe_epochs(sequence)
         yield from _describe_reference(sequence)
-        yield from _describe_offsets(sequence)
-        yield from _describe_trends(sequence)
         yield from _describe_runs(sequence, options)
 
 
@@ -224,38 +219,6 @@ def _valid_errors(sequence: SequenceResults, program: str) -> Array:
     """Return the position errors of the runs that are not lost, [R, T, 3], m."""
     data = sequence.results[program].data
     return np.asarray(data["error"][~data["lost"]][..., :3])
-
-
-def _describe_offsets(sequence: SequenceResults) -> Iterator[str]:
-    """Yield a note on each constant position error, as of heights above the geoid."""
-    for program in sequence.results:
-        error = _valid_errors(sequence, program).reshape(-1, 3)
-        if not len(error):
-            continue
-        median = np.median(error, axis=0)
-        spread = np.median(np.abs(error - median), axis=0)
-        for axis in np.flatnonzero(np.abs(median) > np.maximum(_OFFSET_SHOWN, 3 * spread)):
-            hint = "heights (ellipsoid or geoid)" if axis == 2 else "datum"
-            yield (
-                f"Offset: {program} in {sequence.name} has a median error of {median[axis]:.4g} m "
-                f"{_AXES[axis]}. It is not removed. Check {hint} and origin."
-            )
-
-
-def _describe_trends(sequence: SequenceResults) -> Iterator[str]:
-    """Yield a note on each program whose errors are mostly a constant and a drift of the run."""
-    time = sequence.epochs.time - sequence.epochs.time.mean()
-    basis = np.linalg.qr(np.stack([np.ones_like(time), time], axis=-1))[0]
-    for program in sequence.results:
-        error = _valid_errors(sequence, program)
-        total = float((error**2).sum())
-        share = float((np.einsum("tb,rtc->rbc", basis, error) ** 2).sum()) / total if total else 0.0
-        if share > _TREND_SHOWN:
-            yield (
-                f"Trend: {100 * share:.3g} % of the squared position error of {program} in {sequence.name} "
-                "is a constant and a drift of the run. One record cannot tell how these differ between runs. "
-                "Judge several runs."
-            )
 
 
 # --------------------------------------------------------------------------------------------------

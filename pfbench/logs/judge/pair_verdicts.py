@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pfbench.logs.judge.judge_options import JudgeOptions
+from pfbench.logs.judge.nuisance import remove_nuisance
 from pfbench.logs.judge.sequence_results import SequenceResults
 from pfbench.results.status import keeps_track
 from pfbench.stats.comparison import (
@@ -28,10 +29,10 @@ from pfbench.stats.time_blocks import (
     bound_losses,
     compare_blocks,
     count_blocks,
-    remove_drift,
     withhold,
 )
 
+_ONE_DRAW = "offset, drift, slow oscillations, heading or scale"  # of a run
 _LEAST_CAP = 100.0  # m, error of a lost run where the reference does not move [ours]
 
 
@@ -79,7 +80,7 @@ class _Common(NamedTuple):
 
 
 class _Sample(NamedTuple):
-    """Effects of a pair: of the errors, and without the mean error and the drift of each run."""
+    """Effects of a pair: of the errors, and without what is one draw of each run."""
 
     effect: Effect
     steady: Effect
@@ -124,7 +125,11 @@ def _withhold(sample: _Sample, verdict: Verdict, steady: Verdict) -> Verdict:
     """Return the verdict, undecided where the sample cannot carry its word."""
     if sample.reason:
         return verdict._replace(word=NO_DECISION, reason=sample.reason)
-    return withhold(verdict, steady, sample.effective)
+    decided = withhold(verdict, steady, sample.effective, _ONE_DRAW)
+    more = MIN_RUNS - len(sample.common)
+    if decided.reason and sample.effect.unit == "block":
+        return decided._replace(reason=f"{decided.reason}; {more} further sequences would decide")
+    return decided
 
 
 def _draw_sample(
@@ -161,14 +166,14 @@ def _of_blocks(common: list[_Common], a: str, b: str, options: JudgeOptions) -> 
     seconds = [_seconds(c.sequence) for c in common]
     counts = count_blocks(seconds, options.block)
 
-    def losses(program: str, change: Callable[[Array], Array]) -> tuple[str, Array]:
+    def losses(program: str, change: Callable[[Array, Array], Array]) -> tuple[str, Array]:
         of_sequences = zip(common, counts, strict=True)
-        parts = [block_losses(change(_errors(c, program)), n, c.cap) for c, n in of_sequences]
+        parts = [block_losses(change(_errors(c, program), _path(c)), n, c.cap) for c, n in of_sequences]  # fmt: skip
         return program, np.concatenate(parts)
 
     full, steady = (
         compare_blocks(losses(a, change), losses(b, change))
-        for change in (np.asarray, remove_drift)
+        for change in (lambda error, _: error, remove_nuisance)
     )
     length = sum(seconds) / len(full.effect.differences)
     effective = min(full.effective, steady.effective)
@@ -187,6 +192,11 @@ def _errors(common: _Common, program: str) -> Array:
     result = common.sequence.results[program]
     places = list(result.meta["state"]["groups"]["position"])
     return np.asarray(result.data["error"][_rows(common, program)][..., places])
+
+
+def _path(common: _Common) -> Array:
+    """Return the positions of the reference at the epochs, m, [T, 3]."""
+    return common.sequence.reference.interpolate_position(common.sequence.epochs.time)
 
 
 def _lost(common: _Common, program: str) -> Flags:

@@ -19,7 +19,7 @@ from pfbench.logs.judge.alignment import (
     find_common_epochs,
     position_errors,
 )
-from pfbench.logs.judge.checks import check_axes, check_clock, check_run
+from pfbench.logs.judge.checks import check_axes, check_clock, check_frame_of, check_run
 from pfbench.logs.judge.formats import TrajectoryFile, read_trajectories
 from pfbench.logs.judge.judge_options import JudgeOptions, SourceOptions, name_program
 from pfbench.logs.judge.reference_track import ReferenceTrack
@@ -125,8 +125,7 @@ def _check_run(
     if align == "yaw":
         return table, math.nan
     offset = check_clock(table, reference, source.shift)
-    check_axes(table, reference)
-    return table, offset
+    return check_frame_of(check_axes(table, reference), reference), offset
 
 
 def score_sequence(

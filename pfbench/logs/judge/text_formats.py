@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from pfbench.core.parameter_checks import require
 from pfbench.files.limits import check_columns, read_text
 from pfbench.files.table_file import describe_cut, is_number_text, split_lines
+from pfbench.logs.doctor.axis_orders import ENU_TO_NED, FLU_TO_FRD
 from pfbench.logs.judge.judge_options import SourceOptions
 from pfbench.logs.judge.trajectory_table import (
     ATTITUDE_COLUMNS,
@@ -36,8 +37,6 @@ _EUROC_COLUMNS = ("t", "p_x", "p_y", "p_z", "q_w", "q_x", "q_y", "q_z", "v_x", "
 KF_GINS_SD = 22  # columns of the file of standard deviations: time, 9 of navigation, 12 of sensors
 KF_GINS_IMU, KF_GINS_FIXES = 7, (7, 10, 13)  # columns; fixes with deviations, and with velocities
 _EUROC_WITH_BIASES, _KITTI_PACKET = 17, 30  # columns
-_TO_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # from East, North, Up
-_TO_FRD = np.diag([1.0, -1.0, -1.0])  # a body with forward, left, up
 _COMMENTS, _BOM = ("#", "%"), "\ufeff"
 _HEAD_BYTES = 2**20  # with all comments before the first row
 _UNIT = re.compile(r"[\[(][^\[(\])]*[\])]")  # as in time [s]
@@ -74,7 +73,7 @@ def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
         notes = (*notes, f"columns {used} of {width} are read as {' '.join(_TUM_COLUMNS)}")
     position, rotation = numbers[:, 1:4], Rotation.from_quat(numbers[:, 4:]).as_matrix()
     if options.frame == "enu":
-        position, rotation = position @ _TO_NED.T, _TO_NED @ rotation @ _TO_FRD
+        position, rotation = position @ ENU_TO_NED.T, ENU_TO_NED @ rotation @ FLU_TO_FRD
     values = _by_name(LOCAL, position) | _by_name(ATTITUDE_COLUMNS, euler_angles(rotation))
     return [TrajectoryTable(file.name, numbers[:, 0], values, lines, notes, frame=options.frame)]
 
@@ -200,10 +199,10 @@ def read_euroc_reference(file: Path, options: SourceOptions) -> list[TrajectoryT
     """Read position, quaternion (w, x, y, z) and velocity in a frame with z up, and a body as recorded."""
     widths = (len(_EUROC_COLUMNS), _EUROC_WITH_BIASES)
     numbers, lines, notes = _read_numbers(file, _EUROC_COLUMNS, widths)
-    rotation = _TO_NED @ Rotation.from_quat(numbers[:, [5, 6, 7, 4]]).as_matrix()
+    rotation = ENU_TO_NED @ Rotation.from_quat(numbers[:, [5, 6, 7, 4]]).as_matrix()
     values = (
-        _by_name(LOCAL, numbers[:, 1:4] @ _TO_NED.T)
-        | _by_name(VELOCITY_COLUMNS, numbers[:, 8:11] @ _TO_NED.T)
+        _by_name(LOCAL, numbers[:, 1:4] @ ENU_TO_NED.T)
+        | _by_name(VELOCITY_COLUMNS, numbers[:, 8:11] @ ENU_TO_NED.T)
         | _by_name(ATTITUDE_COLUMNS, euler_angles(rotation))
     )
     notes = (*notes, "x, y, z of the frame are taken as East, North, Up")
@@ -244,7 +243,9 @@ def read_kitti(path: Path, options: SourceOptions) -> list[TrajectoryTable]:
     angles = np.stack([packets[:, 3], -packets[:, 4], np.pi / 2 - packets[:, 5]], -1)
     down = -np.gradient(packets[:, 2], time)
     values = (
-        _by_name(IMU_COLUMNS, np.hstack([packets[:, 11:14] @ _TO_FRD, packets[:, 17:20] @ _TO_FRD]))
+        _by_name(
+            IMU_COLUMNS, np.hstack([packets[:, 11:14] @ FLU_TO_FRD, packets[:, 17:20] @ FLU_TO_FRD])
+        )
         | _by_name(GEODETIC, packets[:, :3])
         | _by_name(VELOCITY_COLUMNS, np.column_stack([packets[:, 6:8], down]))
         | _by_name(ATTITUDE_COLUMNS, angles)

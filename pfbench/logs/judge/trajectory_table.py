@@ -8,7 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pfbench.core.parameter_checks import require
+from pfbench.logs.doctor.axis_orders import ENU_TO_NED
 from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, QUANTITIES, Quantity
+from pfbench.logs.units import DEGREE
 from pfbench.logs.worlds.time_order import find_order_remedy
 from pfbench.stats.error_measures import Array
 
@@ -219,37 +221,17 @@ def covariance_matrices(entries: Array) -> Array:
     return upper.reshape(-1, 3, 3)
 
 
-# --------------------------------------------------------------------------------------------------
-# Positions on the WGS-84 ellipsoid in a local frame, and Euler angles, with numpy alone.
-
-SEMI_MAJOR = 6378137.0  # m
-ECCENTRICITY_2 = (2 - 1 / 298.257223563) / 298.257223563
-
-
 def to_north_east_down(geodetic: Array, origin: Array) -> Array:
     """Convert geodetic positions to the tangent frame of an origin.
 
     Returns north, East, Down, [T, 3], m. Shapes: geodetic [T, 3].
     """
-    lat, lon = np.radians(origin[:2])
-    sin_lat, cos_lat, sin_lon, cos_lon = np.sin(lat), np.cos(lat), np.sin(lon), np.cos(lon)
-    turn = np.array(
-        [
-            [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
-            [-sin_lon, cos_lon, 0.0],
-            [-cos_lat * cos_lon, -cos_lat * sin_lon, -sin_lat],
-        ]
-    )
-    return (_earth_fixed(geodetic) - _earth_fixed(origin)) @ turn.T
+    import torch
 
+    from pfbench.nav import earth
 
-def _earth_fixed(geodetic: Array) -> Array:
-    """Convert latitude, longitude (deg) and height (m) to Earth-centred coordinates, m."""
-    lat, lon = np.radians(geodetic[..., 0]), np.radians(geodetic[..., 1])
-    h = geodetic[..., 2]
-    normal = SEMI_MAJOR / np.sqrt(1 - ECCENTRICITY_2 * np.sin(lat) ** 2)
-    x, y = (normal + h) * np.cos(lat) * np.cos(lon), (normal + h) * np.cos(lat) * np.sin(lon)
-    return np.stack([x, y, (normal * (1 - ECCENTRICITY_2) + h) * np.sin(lat)], axis=-1)
+    places = (torch.from_numpy(np.asarray(a, float) * [DEGREE, DEGREE, 1.0]) for a in (geodetic, origin))  # fmt: skip
+    return np.asarray(earth.local_enu(*places).numpy() @ ENU_TO_NED)
 
 
 def euler_angles(rotation: Array) -> Array:

@@ -202,7 +202,6 @@ def _list_doubts(table: TrajectoryTable, position: Array) -> Iterator[Finding]:
     lag = max(1, len(position) // _WINDOWS)
     move = np.linalg.norm(position[lag:] - position[:-lag], axis=1)
     speed = float((move / (table.time[lag:] - table.time[:-lag])).max())
-    text = ""
     if table.has(GEODETIC) and not table.has(LOCAL):
         lat, lon = np.abs(table.select(GEODETIC[:2])).max(0)
         if _EQUATOR < lat <= math.pi / 2 and _EQUATOR < lon <= math.pi:

@@ -10,11 +10,10 @@ import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from pfbench.core.parameter_checks import require
 from pfbench.files.table_file import Array
-from pfbench.logs.doctor.axis_orders import CONVENTIONS, convert_angles, parse_axes
+from pfbench.logs.doctor.axis_orders import CONVENTIONS, axes_matrix, convert_angles
 from pfbench.logs.doctor.bad_samples import find_bad_samples, find_stuck
 from pfbench.logs.doctor.fix_checks import find_frozen, find_jumps
 from pfbench.logs.worlds.imu_gaps import CUT, cut_longest
@@ -95,9 +94,9 @@ class LogCorrections:
         ):  # fmt: skip
             _check_names(key, names, allowed)
         for sensor, axes in (self.mounting or {}).items():
-            _mounting_matrix(sensor, axes)
+            axes_matrix(sensor, axes)
         for frame, axes in (self.level_axes or {}).items():
-            _level_matrix(frame, axes)
+            axes_matrix(frame, axes, is_level=True)
         for key in ("offset_m", "lever_arm"):
             _check_vector(key, getattr(self, key))
         for key in ("scale", "bias"):
@@ -141,7 +140,7 @@ class LogCorrections:
             )
             notes.append(f"{tables[name].name}: columns multiplied by {dict(factors)}")
         for sensor, axes in (self.mounting or {}).items():
-            matrix = _mounting_matrix(sensor, axes)
+            matrix = axes_matrix(sensor, axes)
             for columns in _SENSORS[sensor]:
                 tables["imu"] = _apply(tables["imu"], columns, lambda v, a=matrix: v @ a.T)
             notes.append(
@@ -149,7 +148,10 @@ class LogCorrections:
             )
         for frame, axes in (self.level_axes or {}).items():
             name, groups = _LEVEL[frame]
-            matrix, tables[name] = _level_matrix(frame, axes), _require_local(tables[name], frame)
+            matrix, tables[name] = (
+                axes_matrix(frame, axes, is_level=True),
+                _require_local(tables[name], frame),
+            )
             for columns in groups:
                 if tables[name].has(columns):
                     tables[name] = _apply(tables[name], columns, lambda v, a=matrix: v @ a.T)
@@ -210,7 +212,7 @@ def _wrong_fixes(fixes: GnssLog, reference: ReferenceLog, kind: str) -> NDArray[
     true = np.stack([np.interp(time, reference.time, p) for p in reference.position.T], -1)
     if kind == "outliers":
         inside = (time >= reference.time[0]) & (time <= reference.time[-1])
-        wrong = find_jumps(position - true, inside).mask
+        wrong = find_jumps(position - true, inside)[2]
     else:
         wrong = find_frozen(position, np.linalg.norm(np.diff(true, axis=0), axis=1))
     mask = np.zeros(len(fixes.time), bool)
@@ -359,39 +361,6 @@ def _check_columns(key: str, values: Mapping[str, float]) -> None:
             value,
             "Set a number.",
         )
-
-
-def _numbers(values: Sequence[Any]) -> Array | None:
-    """Return three numbers, or None."""
-    is_numeric = len(values) == 3 and all(isinstance(v, int | float) for v in values)
-    return np.array(values, float) if is_numeric else None
-
-
-def _mounting_matrix(sensor: str, axes: Sequence[str | float]) -> Array:
-    """Return the matrix from the recorded to the body axes, [3, 3]."""
-    angles = _numbers(axes)
-    if angles is not None:
-        return np.asarray(Rotation.from_euler("ZYX", angles[::-1], degrees=True).as_matrix())
-    matrix = parse_axes([str(name) for name in axes])
-    if matrix is None:
-        raise ValueError(
-            f"scenario.corrections.mounting.{sensor} must be three different axes such as [x, -y, -z], or roll, "
-            f"pitch, yaw in deg, got {list(axes)}. Name the recorded axes that are forward, right, down."
-        )
-    return matrix
-
-
-def _level_matrix(frame: str, axes: Sequence[str | float]) -> Array:
-    """Return the matrix from the recorded to North, East, Down, [3, 3]."""
-    if len(axes) == 1 and isinstance(axes[0], int | float):
-        return np.asarray(Rotation.from_euler("z", -axes[0], degrees=True).as_matrix())
-    matrix = parse_axes([str(name) for name in axes], is_level=True)
-    if matrix is None:
-        raise ValueError(
-            f"scenario.corrections.level_axes.{frame} must be three different axes such as [e, n, -d], or a turn in deg, got "
-            f"{list(axes)}. Name the recorded axes that are North, East, Down."
-        )
-    return matrix
 
 
 def _nodes_of(table: str, shift: float | Sequence[Sequence[float]]) -> tuple[Array, Array]:

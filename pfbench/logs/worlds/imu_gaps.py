@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from pfbench.files.table_file import Array
@@ -57,21 +55,16 @@ def _bridge(samples: Array, i: int, share: Array) -> Array:
     return np.asarray(line + noise[np.arange(len(share)) % len(noise)])
 
 
-class LongestPart(NamedTuple):
-    """First and last row of the part between gaps that covers the longest time, and the number of parts."""
+def find_longest(time: Array) -> tuple[int, int, int]:
+    """Find the part between gaps that are too long to bridge that covers the longest time. Shapes: time [n].
 
-    first: int
-    last: int
-    parts: int
-
-
-def find_longest(time: Array) -> LongestPart:
-    """Find the longest part between gaps that are too long to bridge. Shapes: time [n]."""
+    Returns its first and last row, and the number of parts.
+    """
     is_gap = np.diff(time) > longest_bridge(time)
     borders = np.concatenate([[0], np.flatnonzero(is_gap) + 1, [len(time)]])
     first, last = borders[:-1], borders[1:] - 1
     i = int(np.argmax(time[last] - time[first]))
-    return LongestPart(int(first[i]), int(last[i]), len(first))
+    return int(first[i]), int(last[i]), len(first)
 
 
 def longest_bridge(time: Array) -> float:

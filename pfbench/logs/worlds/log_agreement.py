@@ -15,30 +15,25 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pfbench.core import chart
 from pfbench.core.parameter_checks import require
 from pfbench.logs.doctor.raw_log import RawReference
 from pfbench.logs.doctor.reference_checks import check_reference, drop_wrong_rows
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
 from pfbench.logs.units import DEGREE
-from pfbench.logs.worlds.dead_reckoning import integrate_windows
 from pfbench.logs.worlds.log_frames import GEODETIC_COLUMNS
 from pfbench.logs.worlds.log_tables import (
     Array,
     GnssLog,
-    ImuLog,
     LogTable,
     ReferenceLog,
     parse_numbers,
     swap_frd_rfu,
 )
 from pfbench.logs.worlds.time_grid import interpolate
-from pfbench.nav import attitude, earth
+from pfbench.nav import earth
 
 _FIX_LIMITS = (2e3, 5e3, 1e4, 2e4, 5e4, 1e5)  # m; offered limits of the error of a fix
-_WINDOW = 1.0  # s; IMU and reference are compared over windows of about this length
 _STEADY = 2.0  # m/s; least speed at which the track turns as the car
-_FEWEST = 5  # fixes with a median
 _GEOCENTRIC = ("x", "y", "z")
 _BRAKING, _SLOW = 10.0, 1.0  # m/s^2, hard braking on a road; m/s, noise of the wheels about zero
 _LONGEST = 5.0  # s between compared epochs of satellites
@@ -64,10 +59,6 @@ class Agreement(NamedTuple):
 
 
 MOTION = Agreement("position change and integrated velocity of the reference", "m", 2.0, 200.0)
-VELOCITY = Agreement("velocity change of the reference and integrated force of the IMU", "m/s", 3.0, 30.0)  # fmt: skip
-ATTITUDE = Agreement("rotation of the reference and integrated rate of the IMU", "rad", 0.25, 1.5)
-FIX = Agreement("position of a fix and of the reference", "m", 20.0, math.inf)
-FIX_OFFSET = Agreement("median of the fixes and of the reference along an axis", "m", 3.0, math.inf)
 FIX_VELOCITY = Agreement("velocity of a fix and of the reference", "m/s", 5.0, math.inf)
 WHEELS = Agreement("wheel speed and speed of the reference", "m/s", 3.0, 50.0)
 YAW_RATE = Agreement("yaw rate and turn of the track", "rad/s", 1.0, 10.0)
@@ -115,7 +106,7 @@ def compare_reference(table: LogTable, reference: ReferenceLog) -> tuple[str, ..
     angles = parse_numbers(table, ("roll", "pitch", "yaw"))
     velocity, position = swap_frd_rfu(reference.velocity), swap_frd_rfu(reference.position)
     raw = RawReference(reference.time, angles, velocity, position, np.arange(len(angles)))
-    _, findings = check_reference(table.name, drop_wrong_rows(raw), {})
+    _, findings = check_reference(table.name, drop_wrong_rows(raw)[0], {})
     evidence = next((finding.evidence for finding in findings), "")
     require(
         not evidence,
@@ -138,46 +129,6 @@ def compare_velocities(table: LogTable, reference: ReferenceLog) -> tuple[str, .
     return _judge_rows(MOTION, difference, table, np.arange(1, len(reference.time)))
 
 
-def compare_inertial(table: LogTable, imu: ImuLog, reference: ReferenceLog, gravity: float) -> tuple[str, ...]:  # fmt: skip
-    """Compare dead reckoning of the IMU with the reference between rows, and over about a second.
-
-    Returns notes.
-    """
-    inside = np.flatnonzero((reference.time >= imu.time[0]) & (reference.time <= imu.time[-1]))
-    stride = max(1, round(_WINDOW / float(np.median(np.diff(reference.time)))))
-    notes = [
-        note
-        for nodes in (inside, inside[::stride])
-        if len(nodes) > 1
-        for note in _compare_windows(table, imu, reference, gravity, nodes)
-    ]
-    return tuple(dict.fromkeys(notes))
-
-
-def _compare_windows(
-    table: LogTable, imu: ImuLog, reference: ReferenceLog, gravity: float, nodes: NDArray[np.intp]
-) -> tuple[str, ...]:
-    """Compare dead reckoning between the rows `nodes` of the reference."""
-    time = reference.time[nodes]
-    rotation, velocity = integrate_windows(imu, time)
-    q = torch.from_numpy(reference.attitude[nodes])
-    inverse = q[1:] * q.new_tensor([1.0, -1.0, -1.0, -1.0])
-    turned = chart.quaternion_multiply(q[:-1], rotation)
-    angle = chart.rotation_vector_from_quaternion(chart.quaternion_multiply(inverse, turned)).norm(
-        dim=-1
-    )
-    level = (attitude.dcm_from_quaternion(q[:-1]) @ velocity[..., None])[..., 0].numpy()
-    dt = np.diff(time)
-    level[:, 2] -= gravity * dt
-    change = np.diff(reference.velocity[nodes], axis=0)
-    # errors of an unaided IMU grow with the window, which a gap of the reference extends
-    scale = np.maximum(1.0, dt / _WINDOW)
-    return (
-        *_judge_rows(VELOCITY, np.linalg.norm(change - level, axis=1) / scale, table, nodes[1:]),
-        *_judge_rows(ATTITUDE, angle.numpy() / scale, table, nodes[1:]),
-    )
-
-
 def drop_fixes(
     table: LogTable, fixes: GnssLog, reference: ReferenceLog, limits: PlausibleLimits
 ) -> tuple[GnssLog, tuple[str, ...]]:
@@ -186,7 +137,7 @@ def drop_fixes(
     Returns the fixes, and notes.
     """
     wrong = _find_wrong(fixes, reference, limits.speed_m_s)(limits.fix_error_m)
-    if not (limits.drop_fixes and wrong.any() and _usable(fixes, wrong)):
+    if not (limits.drop_fixes and wrong.any() and np.isfinite(fixes.position[~wrong, 0]).any()):
         return fixes, ()
     position, velocity = fixes.position.copy(), fixes.velocity.copy()
     position[wrong] = velocity[wrong] = np.nan
@@ -208,15 +159,8 @@ def compare_fixes(
         _fix_remedy(fixes, wrong, is_wrong),
     )
     true, rows = interpolate(reference, fixes.time), np.arange(len(fixes.time))
-    position_error, velocity_error = (
-        np.nan_to_num(np.linalg.norm(measured - expected, axis=1))
-        for measured, expected in ((fixes.position, true[:, 7:]), (fixes.velocity, true[:, 4:7]))
-    )
-    return (
-        *_note_offset(table, fixes.position - true[:, 7:]),
-        *_judge_rows(FIX, position_error, table, rows),
-        *_judge_rows(FIX_VELOCITY, velocity_error, table, rows),
-    )
+    off = np.nan_to_num(np.linalg.norm(fixes.velocity - true[:, 4:7], axis=1))
+    return _judge_rows(FIX_VELOCITY, off, table, rows)
 
 
 def _find_wrong(
@@ -244,39 +188,18 @@ def _describe_first(
     return f"{np.linalg.norm(change):.0f} m in {table.row(i)}"
 
 
-def _usable(fixes: GnssLog, wrong_mask: NDArray[np.bool_]) -> int:
-    return int((np.isfinite(fixes.position[:, 0]) & ~wrong_mask).sum())
-
-
 def _fix_remedy(
     fixes: GnssLog, wrong_mask: NDArray[np.bool_], is_wrong: Callable[[float], NDArray[np.bool_]]
 ) -> str:
     """Advise to drop wrong fixes if others remain, and to widen the limit if that accepts all."""
-    largest = next((limit for limit in _FIX_LIMITS if not is_wrong(limit).any()), None)
-    remedies = []
-    if _usable(fixes, wrong_mask) > int(wrong_mask.sum()):
-        remedies.append("Correct or remove these rows, or set scenario.limits.drop_fixes=true.")
-    else:
-        remedies.append(
-            "Check the origin, axes and clock of the fixes, which are wrong in most rows."
-        )
-    if largest is not None:
-        remedies.append(f"If fixes can be so wrong, set scenario.limits.fix_error_m={largest:g}.")
-    return " ".join(remedies)
-
-
-def _note_offset(table: LogTable, difference: Array) -> tuple[str, ...]:
-    """Note the largest median over time of fixes minus reference [n, 3]."""
-    difference = difference[np.isfinite(difference).all(1)]
-    if len(difference) < _FEWEST:
-        return ()
-    offset = np.median(difference, axis=0)
-    axis = int(np.argmax(np.abs(offset)))
-    if abs(offset[axis]) <= FIX_OFFSET.noted:
-        return ()
+    remedy = "Check the origin, axes and clock of the fixes, which are wrong in most rows."
+    if int(np.isfinite(fixes.position[~wrong_mask, 0]).sum()) > int(wrong_mask.sum()):
+        remedy = "Correct or remove these rows, or set scenario.limits.drop_fixes=true."
+    largest = next((f"{limit:g}" for limit in _FIX_LIMITS if not is_wrong(limit).any()), "")
     return (
-        f"{table.name}: {FIX_OFFSET.quantity} differ by more than {FIX_OFFSET.noted:g} {FIX_OFFSET.unit}, "
-        f"{offset[axis]:.3g} {FIX_OFFSET.unit} {('East', 'North', 'Up')[axis]}",
+        f"{remedy} If fixes can be so wrong, set scenario.limits.fix_error_m={largest}."
+        if largest
+        else remedy
     )
 
 
@@ -297,20 +220,6 @@ def compare_wheels(
     return (
         *_judge_rows(WHEELS, np.abs(np.abs(speed) - true_speed), table, rows),
         *_judge_rows(YAW_RATE, off, table, rows[1:]),
-    )
-
-
-def compare_times(tables: tuple[tuple[str, Array], ...]) -> tuple[str, ...]:
-    """Name tables that begin later or end earlier than the others.
-
-    Returns notes. Shapes: tables [n].
-    """
-    first = min(time[0] for _, time in tables)
-    last = max(time[-1] for _, time in tables)
-    return tuple(
-        f"{name} covers t = {time[0]:.3f} to {time[-1]:.3f} s of {first:.3f} to {last:.3f} s"
-        for name, time in tables
-        if max(time[0] - first, last - time[-1]) > COMMON_TIME + 2 * np.median(np.diff(time))
     )
 
 

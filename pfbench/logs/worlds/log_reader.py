@@ -42,8 +42,6 @@ from pfbench.logs.worlds.fix_codes import FixCodes, select_usable
 from pfbench.logs.worlds.imu_gaps import GAP_SAMPLES, bridge_gaps, find_longest
 from pfbench.logs.worlds.log_agreement import (
     compare_fixes,
-    compare_inertial,
-    compare_times,
     compare_velocities,
     drop_fixes,
 )
@@ -191,9 +189,7 @@ class LogSource:
         for name, time in spans[1:]:
             check_overlap(inertial.name, sensors.time, name, time)
         gravity, gravity_notes = gravity_at(centre)
-        fixes, rows = self._compare_tables(tables, (sensors, fixes, motion), gravity, findings)
-        if motion:
-            rows += compare_times(tuple(spans))
+        fixes, rows = self._compare_tables(tables, fixes, motion, findings)
         dropped = dict.fromkeys(note for table in tables if table for note in table.notes)
         notes = (*dropped, *mended, *mended_fixes, *usable_notes, *notes, *gravity_notes, *rows)
         reference = motion or (read_track(truth, centre) if truth else _join_fixes(fixes))
@@ -202,12 +198,12 @@ class LogSource:
     def _compare_tables(
         self,
         tables: LogTables,
-        read: tuple[ImuLog, GnssLog, ReferenceLog | None],
-        gravity: float,
+        fixes: GnssLog,
+        motion: ReferenceLog | None,
         findings: Sequence[Finding] | None,
     ) -> tuple[GnssLog, tuple[str, ...]]:
         """Return the fixes to use, and notes of what disagrees: in a whole table first, since it spoils single rows, too."""
-        (_, gnss, truth), (sensors, fixes, motion) = tables, read
+        _, gnss, truth = tables
         limits = self.limits or PlausibleLimits()
         rows: tuple[str, ...] = ()
         left_out: tuple[str, ...] = ()
@@ -220,7 +216,6 @@ class LogSource:
             findings, _, _ = run_checks(raw._replace(fixes=take_rows(raw.fixes, keep)))
         diagnosed = judge_findings(findings, has_own_fixes=truth is None or gnss.name != truth.name)
         if truth and motion:
-            rows += compare_inertial(truth, sensors, motion, gravity)
             rows += compare_fixes(gnss, fixes, motion, limits)
         return fixes, (*left_out, *rows, *diagnosed)
 
@@ -293,15 +288,15 @@ def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
         )
     check_increasing(table, time)
     check_seconds(table, time, longest=0.5)
-    longest, i = find_longest(time), int(np.diff(time).argmax())
+    (first, last, parts), i = find_longest(time), int(np.diff(time).argmax())
     require(
-        longest.parts == 1,
+        parts == 1,
         table.name,
         "not have gaps",
         f"a gap of {time[i + 1] - time[i]:.3f} s after {table.row(i)} (t = {time[i]}), with samples every {typical:.4f} s",
         (
-            f"Keep the longest part without a gap, {table.row(longest.first)} to {table.row(longest.last)} "
-            f"(t = {time[longest.first]:.3f} to {time[longest.last]:.3f})."
+            f"Keep the longest part without a gap, {table.row(first)} to {table.row(last)} "
+            f"(t = {time[first]:.3f} to {time[last]:.3f})."
         ),
     )
     return time, notes

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+from drawn_faults import COUNT, SPOILT, Drawn, cut, draw_faults, draw_pairs, judge, ratio_of
 from log_faults import (  # fmt: skip
     CLEAN,
     FAULTS,
@@ -23,12 +22,9 @@ from log_faults import (  # fmt: skip
 from recorded_data import recorded
 from synthetic_log import write
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.filter.loop import run_filter
-from pfbench.job import build_plan, compose
-from pfbench.scenario import LogCorrections, inspect_log
+from pfbench.scenario import inspect_log
 
-# what a short or noisy log does not show; 57 of 65 faults must be named on all six logs
+# what a short or noisy log does not show; 57 of 65 faults are named on all six logs
 HIDDEN = {
     "imu clock +0.03 s": {"wing"},  # whose own offset is -0.011 s
     "imu clock 1000 ppm fast": {"quad 2", "quad 17"},  # of 18 s
@@ -43,19 +39,6 @@ HIDDEN = {
         "quad 17",
     },  # whose force does not show a delay
 }
-FEWEST_ON_ALL = 57
-PAIRS = [
-    ("car", "forward-left-up", "gnss clock +1 s"),
-    ("car", "gyro in deg/s", "imu clock +0.1 s"),
-    ("car", "gyro bias 4 deg/s", "lever arm 3.4 m"),
-    ("walk", "gyro z sign", "heights above the geoid"),
-    ("walk", "attitude in degrees", "gnss clock +18 s"),
-    ("wing", "reference velocity km/h", "one fix off 18.6 km"),
-    ("wing", "force in g", "gyro scale 8 %"),
-    ("quad 13", "fixes North/East exchanged", "accelerometer bias 1.2 m/s^2"),
-    ("quad 13", "imu clock +18 s", "yaw + 90 deg"),
-    ("quad 17", "imu gap 0.5 s", "lever arm 1.6 m"),
-]
 LOGS = tuple(SHARED)
 # What is said beside the fault that is named. After a jump of the clock, a log whose turns repeat agrees with the reference
 # at the offset of another turn, too.
@@ -123,26 +106,11 @@ def test_each_fault_is_named_on_six_logs_and_mended(log: str, fault: str) -> Non
     check_remedies(log, fault)
 
 
-def test_enough_faults_are_named_on_all_logs_and_have_a_remedy() -> None:
-    assert len(FAULTS) == 65
-    assert sum(not hidden for hidden in HIDDEN.values()) + len(FAULTS) - len(HIDDEN) >= FEWEST_ON_ALL  # fmt: skip
-
-
 @recorded
 @pytest.mark.parametrize("log", CLEAN)
 def test_a_clean_log_is_neither_refused_nor_warned_of(log: str) -> None:
     findings = findings_of(shared_tables(log))
     assert {f.check for f in findings if f.level in ("refuse", "warn")} == own(log)
-
-
-@recorded
-@pytest.mark.parametrize(("log", "first", "second"), PAIRS)
-def test_two_faults_at_once_are_not_misnamed(log: str, first: str, second: str) -> None:
-    spoken = checks_of(planted(tables(log), first, second))
-    wanted = {FAULTS[first].named, FAULTS[second].named}
-    assert spoken & wanted
-    allowed = {check for fault in (first, second) for check in FAULTS[fault].also}
-    assert spoken <= wanted | allowed | own(log)
 
 
 @recorded
@@ -156,23 +124,11 @@ def test_offsets_and_lever_arms_are_measured() -> None:
     ):
         found = next(f for f in findings_of(planted(log, fault)) if f.check == check)
         assert found.statistic == pytest.approx(value, abs=0.01)
+    magnetic = {**log, "reference": log["reference"].assign(yaw=log["reference"]["yaw"] + 0.21)}
+    assert next(f for f in findings_of(magnetic) if f.check == "heading").settings["corrections"]["bias"]["reference"]["yaw"] == pytest.approx(0.21, abs=0.02)  # fmt: skip
     arm = next(f for f in findings_of(planted(log, "lever arm 3.4 m")) if f.check == "lever arm")
     forward, right, _ = arm.settings["corrections"]["lever_arm"]
     assert np.hypot(forward - 3.0, right - 0.8) < 0.15
-
-
-def error_of(folder: Path, settings: dict[str, object]) -> float:
-    """Root mean square of the position error of an EKF behind the first ten seconds, m."""
-    words = [f"data.root={folder.parent}", f"scenario.folder={folder.name}"]
-    plan = build_plan(compose(["scenario=user_log", "filter=ekf", *words]))
-    keys = {**settings, "corrections": LogCorrections(**settings.get("corrections", {}))}  # type: ignore[arg-type]
-    episode = replace(plan, scenario=replace(plan.scenario, **keys)).draw_episode(torch.arange(4))
-    with torch.no_grad():
-        draws = PhiloxStream(1, torch.arange(4))
-        result = run_filter(plan.method, plan.model, episode.record, draws)
-    error = result.mean[..., 7:10] - episode.truth["position"]
-    late = episode.time > episode.time[0] + 10.0
-    return float(error[:, late].square().sum(-1).nanmean().sqrt())
 
 
 @recorded
@@ -185,5 +141,22 @@ def test_printed_settings_leave_the_filter_as_good_as_on_the_clean_log(
     """All settings of an inspection together; an inspection may withhold them, which says that nothing mends the log."""
     found = inspect_log(write(tmp_path / "spoilt", planted(tables(log), fault)))
     if found.settings:
-        clean = error_of(write(tmp_path / "clean", tables(log)), {})
-        assert error_of(tmp_path / "spoilt", dict(found.settings)) < 1.2 * clean
+        fault_of = Drawn(fault, FAULTS[fault].plant, frozenset())
+        assert ratio_of(tmp_path / "spoilt", dict(found.settings), tables(log), fault_of) < SPOILT
+
+
+@recorded
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["single", "pair"])
+def test_no_remedy_of_a_drawn_fault_spoils_the_log(tmp_path: Path, kind: str) -> None:
+    """Nine of ten are named, and none has a remedy that leaves the filter worse than 1.2 times that of the clean log."""
+    faults = draw_faults() if kind == "single" else list(draw_pairs())
+    found = {}
+    for k, drawn in enumerate(faults):
+        log = LOGS[k % len(LOGS)]
+        found[drawn.name] = judge(drawn, log, cut(log), tmp_path / str(k))
+    spoilt = {
+        name: out for name, out in found.items() if out.settings and not (out.ratio <= SPOILT)
+    }
+    assert not spoilt
+    assert sum(out.word in ("right", "harmless", "mended") for out in found.values()) >= 0.9 * COUNT

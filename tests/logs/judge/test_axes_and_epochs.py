@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import judge_cases as cases
@@ -10,6 +11,7 @@ import pandas as pd
 import pytest
 from refusals import check_refused
 from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 from pfbench.logs.judge.alignment import is_in_hole
 from pfbench.logs.judge.checks import check_axes
@@ -64,6 +66,50 @@ def test_true_axes_are_accepted(tmp_path: Path, sd: float) -> None:
         reference = read_reference(file, JudgeOptions(), SourceOptions())
         (read,) = read_trajectories(cases.write(table, tmp_path / "m.csv"), SourceOptions())
         check_axes(read, reference)
+
+
+FRAMES = {
+    "camera": "turned by a constant 120.0 deg .* forward, right, down of the reference are its [z, x, y]",
+    "tilted": "turned by a constant 12.0 deg",
+    "turned": "positions are turned by 8.0. deg .* set align=yaw",
+    "scaled": "positions move 0.4.* times as far",
+    "shifted": r"positions are shifted by +20.0 m Down .* check heights",
+}
+
+
+@pytest.mark.parametrize("case", FRAMES)
+def test_another_frame_of_a_program_is_named_as_by_an_inspection(tmp_path: Path, case: str) -> None:
+    """Body axes as of a camera, a tilt, a turned frame, a scale and a shift; the file without them has no note."""
+    truth = cases.drive(300.0).assign(roll=lambda rows: 0.02 * np.cos(0.2 * rows.t))
+    table, position = cases.full(truth), ["pn", "pe", "pd"]
+    angles = ["yaw", "pitch", "roll"]
+    body = {"camera": np.roll(np.eye(3), 1, axis=0), "tilted": Rotation.from_euler("y", 12.0, degrees=True).as_matrix()}.get(case, np.eye(3))  # fmt: skip
+    table[angles] = (
+        Rotation.from_euler("ZYX", truth[angles]) * Rotation.from_matrix(body)
+    ).as_euler("ZYX")
+    turn = Rotation.from_euler("z", 8.0 * (case == "turned"), degrees=True)
+    table[position] = turn.apply(table[position]) * (0.4 if case == "scaled" else 1.0) + [0.0, 0.0, 20.0 * (case == "shifted")]  # fmt: skip
+    files = {"mine": str(cases.write(table, tmp_path / "mine.csv")), "plain": str(cases.write(cases.full(truth), tmp_path / "plain.csv"))}  # fmt: skip
+    judged = judge_programs(str(cases.write(truth, tmp_path / "truth.csv")), files)
+    mine, plain = (run.table.notes for run in judged.sequences[0].runs)
+    assert re.search(FRAMES[case].replace("[z", r"\[z").replace("+", r"\+"), " ".join(mine))
+    assert plain == ()
+
+
+def test_a_quaternion_with_the_real_part_first_is_refused_and_its_remedy_reads_it(
+    tmp_path: Path,
+) -> None:
+    truth = cases.drive(120.0)
+    q = Rotation.from_euler("ZYX", truth[["yaw", "pitch", "roll"]]).as_quat()[:, [3, 0, 1, 2]]
+    rows = np.column_stack([truth[["t", "pn", "pe", "pd"]] + [0.0, 0.1, 0.0, 0.0], q])
+    reference = str(cases.write(truth, tmp_path / "truth.csv"))
+    source, file = {"mine": SourceOptions(frame="ned")}, tmp_path / "mine.tum"
+    np.savetxt(file, rows)
+    with pytest.raises(ValueError, match=r"with qw first\. Set the line of names") as error:
+        judge_programs(reference, {"mine": str(file)}, sources=source)
+    names = re.search(r"# (t x y z qw qx qy qz)", str(error.value))[1]  # type: ignore[index]
+    np.savetxt(file, rows, header=names)
+    judge_programs(reference, {"mine": str(file)}, sources=source)
 
 
 def test_the_end_of_a_program_within_its_step_is_no_hole() -> None:

@@ -92,35 +92,6 @@ def test_a_fast_stretch_has_the_weight_of_its_time(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "is_noted"), [("none", False), ("constant", True), ("drift", True)]
-)
-def test_a_constant_and_a_drift_are_stated(tmp_path: Path, kind: str, is_noted: bool) -> None:
-    """They are one draw of a run: equal programs are not called different, and the reason names it."""
-    truth = cases.drive(300.0)
-    verdicts = []
-    for seed in range(6):
-        rng = np.random.default_rng(100 + seed)
-        tables = {}
-        for name in ("mine", "theirs"):
-            table = cases.estimate(truth, 0.3, int(rng.integers(1000)))
-            growth = {
-                "none": 0.0 * truth.t,
-                "constant": 1.0 + 0.0 * truth.t,
-                "drift": truth.t / 100,
-            }
-            table[POSITION] += np.outer(growth[kind], rng.normal(size=3))
-            tables[name] = table
-        judged = judge_tables(tmp_path, truth, **tables)
-        verdicts.append(judged.pairs[0].verdict)
-        assert ("Trend:" in notes(judged)) == is_noted
-    assert {v.word for v in verdicts} == {"not decided"}
-    named = sum("rests on the mean error and the drift of the run" in v.reason for v in verdicts)
-    assert (named >= 3) == (kind == "constant")
-    slow = sum("errors vary slowly" in v.reason for v in verdicts)
-    assert (named + slow >= 3) == is_noted
-
-
-@pytest.mark.parametrize(
     ("step", "with_velocity", "outcome"),
     [(2, False, "exact"), (10, False, "noted"), (40, False, "refused"), (300, False, "refused"), (20, True, "exact")],
 )  # fmt: skip

@@ -2,58 +2,12 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
 from log_faults import findings_of
-from synthetic_log import tables, write
-
-from pfbench.logs.worlds.log_reader import read_log
 
 Log = dict[str, pd.DataFrame]
-LATE = re.compile(
-    r"(\w+)\.csv: t is ([\d.]+) s (late|early) against reference.*?(Add|Subtract) ([\d.]+)"
-)
-
-
-def noisy(seconds: float = 60.0) -> Log:
-    """A log with the errors of a MEMS IMU and of a receiver."""
-    log, rng = tables(seconds), np.random.default_rng(1)
-    log["imu"][["wx", "wy", "wz"]] += rng.normal(size=(len(log["imu"]), 3)) * 5e-3 + 1e-3
-    log["imu"][["fx", "fy", "fz"]] += rng.normal(size=(len(log["imu"]), 3)) * 0.1
-    log["gnss"][["pn", "pe", "pd"]] += rng.normal([2.0, -1.0, 3.0], 1.0, (len(log["gnss"]), 3))
-    return log
-
-
-def said_of(folder: Path, log: Log) -> str:
-    """Notes of a log, or its error."""
-    try:
-        return "\n".join(read_log(write(folder, log)).notes)
-    except ValueError as error:
-        return str(error)
-
-
-# 5 standard errors: of fixes 1 m at 10 m/s, 200 fixes
-LATE_BY = [("gnss", late_s, 0.06) for late_s in (0.3, 1.0, 5.0, -18.0)] + [("imu", late_s, 0.02) for late_s in (0.1, 0.5, -1.0, 5.0)]  # fmt: skip
-
-
-@pytest.mark.parametrize(("table", "delay", "accuracy"), LATE_BY)
-def test_a_late_table_is_named_and_the_named_change_removes_it(
-    tmp_path: Path, table: str, delay: float, accuracy: float
-) -> None:
-    log = noisy()
-    log[table]["t"] += delay
-    log["gnss"] = log["gnss"][log["gnss"]["t"] >= 0.0]
-    said = said_of(tmp_path, log)
-    name, size, side, change, amount = LATE.search(said).groups()  # type: ignore[union-attr]
-    assert (name, side) == (table, "late" if delay > 0.0 else "early")
-    assert float(size) == pytest.approx(abs(delay), abs=accuracy)
-    assert ("leap seconds" in said) == (delay == -18.0)
-    log[table]["t"] += float(amount) if change == "Add" else -float(amount)
-    assert not LATE.search(said_of(tmp_path, log))
 
 
 def turning(yaw: np.ndarray, speed: np.ndarray, arm: float, delay: float) -> Log:

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
-from synthetic_log import drive, tables, write
+from synthetic_log import tables, write
 
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
-from pfbench.logs.worlds.corrections import LogCorrections
 from pfbench.logs.worlds.log_reader import read_log
-from pfbench.logs.worlds.log_tables import LogTable
-from pfbench.scenario import inspect_log
 
 Log = dict[str, pd.DataFrame]
 
@@ -139,111 +135,7 @@ def test_the_longest_part_between_gaps_is_kept(tmp_path: Path) -> None:
     assert (read.imu.time[0], read.imu.time[-1]) == (3.4, 14.99)
 
 
-FORCE, RATE, ANGLES = ["fx", "fy", "fz"], ["wx", "wy", "wz"], ["roll", "pitch", "yaw"]
-GROUPS = (FORCE, RATE, ["vn", "ve", "vd"], ["pn", "pe", "pd"])
-
-
-def fast() -> Log:
-    """A log that turns at up to 57 deg/s and tilts, so that units show."""
-    log = tables()
-    t = log["imu"]["t"].to_numpy()
-    turn = np.cos(2.0 * t)
-    log["imu"]["wz"] = turn
-    log["imu"]["fy"] = drive(t)["fy"] / drive(t)["wz"] * turn
-    at = log["reference"]["t"].to_numpy()
-    log["reference"]["yaw"] = 0.5 + 0.5 * np.sin(2.0 * at)
-    speed, yaw = 10 + 2 * np.sin(0.5 * at), log["reference"]["yaw"].to_numpy()
-    for where, column, v in (("pn", "vn", speed * np.cos(yaw)), ("pe", "ve", speed * np.sin(yaw))):
-        log["reference"][column] = v
-        log["reference"][where] = np.r_[0.0, np.cumsum(0.5 * (v[1:] + v[:-1]) * 0.05)]
-    log["gnss"] = log["reference"].iloc[::4].drop(columns=ANGLES)
-    return log
-
-
-def obey(log: Log, said: str, unit: str = "") -> None:
-    """Does to a log what a message about units tells, where two fit for the true unit."""
-    name, _, rest = said.removeprefix("the log must agree in itself, got ").partition(".csv")
-    columns = re.findall(r"\b(f[xyz]|w[xyz]|v[ned]|p[ned])\b", rest)
-    group = next((g for g in GROUPS if columns and columns[0] in g), [])
-    said = said.partition(f"in {unit},")[2] or said if unit else said
-    if factor := re.search(r"multiply by (-?[\d.e-]+\d)", said):
-        log[name][group] *= float(factor[1])
-    if "gravity is missing" in said:
-        near = np.searchsorted(log["reference"]["t"], log["imu"]["t"]).clip(
-            max=len(log["reference"]) - 1
-        )
-        roll, pitch, _ = log["reference"][ANGLES].to_numpy()[near].T
-        log["imu"]["fx"] += 9.80665 * np.sin(pitch)
-        log["imu"]["fy"] -= 9.80665 * np.cos(pitch) * np.sin(roll)
-        log["imu"]["fz"] -= 9.80665 * np.cos(pitch) * np.cos(roll)
-
-
-def set_keys(log: Log, settings: Mapping[str, Any]) -> None:
-    """Does to a log what keys of `scenario.corrections` do."""
-    read = (LogTable(table, name, True, {}) for name, table in log.items())
-    corrected, _ = LogCorrections(**settings).correct_tables(*read)
-    log.update(zip(log, (table.rows for table in corrected), strict=True))
-
-
-def add_gravity(log: Log) -> None:
-    log["imu"]["fz"] += 9.80665
-
-
-def multiply(name: str, columns: list[str], factor: float) -> Callable[[Log], None]:
-    def spoil(log: Log) -> None:
-        log[name][columns] = log[name][columns] * factor
-
-    return spoil
-
-
-def several(*spoils: Callable[[Log], None]) -> Callable[[Log], None]:
-    def spoil(log: Log) -> None:
-        for part in spoils:
-            part(log)
-
-    return spoil
-
-
-UNITS = {
-    "force in g": multiply("imu", FORCE, 1 / 9.80665),
-    "force in cm/s^2": multiply("imu", FORCE, 100.0),
-    "force of the other sign": multiply("imu", FORCE, -1.0),
-    "forward-left-up": multiply("imu", ["fy", "fz", "wy", "wz"], -1.0),
-    "forward-left-up in g": several(
-        multiply("imu", ["fy", "fz", "wy", "wz"], -1.0), multiply("imu", FORCE, 1 / 9.80665)
-    ),
-    "without gravity": add_gravity,
-    "without gravity in g": several(add_gravity, multiply("imu", FORCE, 1 / 9.80665)),
-    "rates in deg/s": multiply("imu", RATE, 180 / np.pi),
-    "rates of the other sign": multiply("imu", RATE, -1.0),
-    "yaw in degrees": multiply("reference", ["yaw"], 180 / np.pi),
-    "angles in degrees": multiply("reference", ANGLES, 180 / np.pi),
-    "velocity in mm/s": multiply("reference", ["vn", "ve", "vd"], 1e3),
-    "anticlockwise": multiply("reference", ["yaw"], -1.0),
-}
-
-
-@pytest.mark.parametrize("name", UNITS)
-@pytest.mark.parametrize("clean", [tables, fast])
-def test_another_unit_or_sign_is_named_and_corrected(
-    tmp_path: Path, clean: Callable[[], Log], name: str
-) -> None:
-    log = clean()
-    UNITS[name](log)
-    for _ in range(3):  # a remedy may uncover the next fault of the same table
-        said = said_or_none(tmp_path, log)
-        if said is None:
-            break
-        keys = inspect_log(tmp_path).settings
-        if keys:
-            set_keys(log, keys["corrections"])
-        else:
-            obey(log, said, name.partition(" in ")[2])
-    expected, read = read_log(write(tmp_path / "clean", clean())), read_log(write(tmp_path, log))
-    assert np.allclose(read.imu.force, expected.imu.force, atol=1e-6)
-    assert np.allclose(read.imu.rate, expected.imu.rate, atol=1e-6)
-    assert np.allclose(read.reference.attitude, expected.reference.attitude, atol=1e-6)
-    assert np.allclose(read.reference.velocity, expected.reference.velocity, atol=1e-6)
+FORCE = ["fx", "fy", "fz"]
 
 
 def said_or_none(folder: Path, log: Log) -> str | None:
