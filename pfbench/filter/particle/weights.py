@@ -264,9 +264,14 @@ class PowerLikelihoodUpdate(WeightUpdate):
         return self.is_exact
 
     def temper(self, model: StateSpaceModel) -> StateSpaceModel:
-        """Return the model with the likelihood of the weights, by which moves accept."""
+        """Return the model with the likelihood of the weights, by which the flow accepts.
+
+        It is not linear, since a linear model has a shorter way that does not ask for the likelihood.
+        """
         tempered, plain = copy.copy(model), model.log_likelihood
-        tempered.__dict__["log_likelihood"] = lambda y, x, u: plain(y, x, u) / self.r_factor
+        tempered.__dict__.update(
+            log_likelihood=lambda y, x, u: plain(y, x, u) / self.r_factor, linear=False
+        )
         return tempered
 
     @override

@@ -101,6 +101,7 @@ def render_overview(
             for m in overview.methods
         ],
         "tuned": describe_tuned(overview, overviews[TUNED]) if TUNED in overviews else "",
+        "forms": list_forms(overview, overviews[TUNED]) if TUNED in overviews else [],
         "price": describe_price(overview) if TUNED in overviews else "",
         "count": spell_number(len(overview.methods)),
         "pictures": {
@@ -134,6 +135,7 @@ def list_overview_blocks(page: Mapping[str, Any]) -> list[Block]:
         Block("text", Markup("![Ratio of the error of each method to that of the best Kalman filter, in each world](heat_map.svg)")),
         Block("text", Markup("![Worlds in which each method is better and worse than each other](matrices.svg)")),
         Block("text", f"The {page['count']} tuned as the baselines are. {page['tuned']} {page['price']}" if page["tuned"] else ""),
+        make_rows(["ratio, and that of the tuned form", *(overview.names[m] for m in overview.methods)], page["forms"]),
         *with_heading(
             Block("text", "Before you quote a number of these worlds:"), Block("list", [f"{name}: {text}." for name, text in page["notes"]])
         ),
@@ -222,17 +224,29 @@ def describe_tuned(overview: Overview, tuned: Overview) -> str:
     """Say how the words of the methods change if they are tuned as the baselines are."""
     worlds = {world.key: world.part_name.name for world in tuned.worlds}
     pairs = pair_forms(overview, tuned)
-    words = Counter(name_word(cell) for _, cell in pairs)
-    changed = [(a, b) for a, b in pairs if name_word(a) != name_word(b)]
-    turned = [(a, b) for a, b in changed if {name_word(a), name_word(b)} == {"better", "worse"}]
-    texts = [
-        f"{overview.names[a.filter]} in {worlds[a.world]}: {name_word(a)} ({name_size(a)}), tuned {name_word(b)} ({name_size(b)})"
-        for a, b in (*turned, *(pair for pair in changed if pair not in turned))
-    ]
+    changed = [a for a, b in pairs if name_word(a) != name_word(b)]
+    turned = [a for a, b in pairs if {name_word(a), name_word(b)} == {"better", "worse"}]
+    names = "; ".join(f"{overview.names[a.filter]} in {worlds[a.world]}" for a in turned)
     return (
-        f"Each has 16 candidates, runs and seed as the baselines. Tuned, they are {', '.join(f'{word} in {n}' for word, n in words.items())} "
-        f"of {len(pairs)} cells. {len(turned) or 'None'} turn{'s' * (len(turned) < 2)} from blue to orange or back; {len(changed)} have another word. {'; '.join(texts)}."
+        f"Each has 16 candidates, and the runs and the seed of the baselines. Tuned, they are {', '.join(f'{word} in {n}' for word, n in Counter(name_word(b) for _, b in pairs).items())} "
+        f"of {len(pairs)} cells. {f'Blue turns orange or back: {names}' if turned else 'None turns from blue to orange or back'}; "
+        f"{len(changed)} have another word (‡)."
     )
+
+
+def list_forms(overview: Overview, tuned: Overview) -> list[list[str]]:
+    """List the ratios of the methods, and tuned ones behind them, by world."""
+    cells = {
+        (
+            a.world,
+            a.filter,
+        ): f"{name_size(a)} → {name_size(b)}{'‡' * (name_word(a) != name_word(b))}"
+        for a, b in pair_forms(overview, tuned)
+    }
+    return [
+        [world.part_name.name, *(cells.get((world.key, m), "–") for m in overview.methods)]
+        for world in tuned.worlds
+    ]
 
 
 def describe_price(overview: Overview) -> str:
@@ -240,10 +254,10 @@ def describe_price(overview: Overview) -> str:
     names = {parse_label(label)[0]: overview.names[label] for label in overview.methods}
     tunings = {w.part_name.name: w.facts.tuning for w in overview.worlds}
     seconds = sum(t[n]["seconds"] for t in tunings.values() for n in names if n in t)
-    lacking = {w: t["not_tuned_hours"] for w, t in tunings.items() if "not_tuned_hours" in t}
     texts = [
         f"{world}, {'all' if len(hours) == len(names) else ' and '.join(names[n] for n in hours)}: {sum(hours.values()):.2g} CPU hours"
-        for world, hours in lacking.items()
+        for world, tuning in tunings.items()
+        if (hours := tuning.get("not_tuned_hours"))
     ]
     return f"The tuning took {seconds / 60:.0f} CPU minutes. Not tuned in this world: {'; '.join(texts) or 'none'}."
 

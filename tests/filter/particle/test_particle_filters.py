@@ -501,13 +501,19 @@ def test_a_look_ahead_that_finds_nothing_possible_falls_back_on_the_weights() ->
     assert abs(z.mean() - truth) < 4 * z.std() / math.sqrt(len(z))
 
 
-def test_a_likelihood_to_a_power_is_that_of_larger_normal_errors() -> None:
-    """The oracle is the filter of a model whose covariance of the errors is multiplied: equal weights."""
+@pytest.mark.parametrize("moves", [(), (MetropolisHastings(NoiseFlowKernel(5), 3),)], ids=len)
+def test_a_likelihood_to_a_power_is_that_of_larger_normal_errors(
+    moves: tuple[MetropolisHastings, ...],
+) -> None:
+    """The oracle is the filter of a model whose covariance of the errors is multiplied: equal weights and moves."""
     steps = torch.randn(30, 1, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     y = steps.cumsum(0)
     power, plain = (
         filter_record(
-            ParticleFilter(300, weight_update=update), linear_walk(1.0, 0.5, sd), y, runs=3
+            ParticleFilter(300, weight_update=update, moves=moves),
+            linear_walk(1.0, 0.5, sd),
+            y,
+            runs=3,
         )
         for update, sd in ((PowerLikelihoodUpdate(4.0), 1.0), (BayesWeightUpdate(), 2.0))
     )
