@@ -702,7 +702,7 @@ def test_the_price_of_a_tuning_is_named_where_it_was_not_paid(tabs: dict[TabKey,
     ]
     text = describe_price(overview._replace(worlds=worlds))
     assert text.startswith("The tuning took 2 CPU minutes. Not tuned in this world: ")
-    assert f"{worlds[1].part_name.name}, MCMC-RPF and CPSO-Escape: 2.5 CPU hours." in text
+    assert f"{worlds[1].part_name.name} (MCMC-RPF, CPSO-Escape: 2.5 CPU hours)." in text
 
 
 def test_filters_that_take_longer_than_the_equal_time_are_named(tabs: dict[TabKey, Overview]) -> None:  # fmt: skip

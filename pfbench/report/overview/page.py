@@ -255,11 +255,11 @@ def describe_price(overview: Overview) -> str:
     tunings = {w.part_name.name: w.facts.tuning for w in overview.worlds}
     seconds = sum(t[n]["seconds"] for t in tunings.values() for n in names if n in t)
     texts = [
-        f"{world}, {'all' if len(hours) == len(names) else ' and '.join(names[n] for n in hours)}: {sum(hours.values()):.2g} CPU hours"
+        f"{world} ({'all' if len(hours) == len(names) else ', '.join(names[n] for n in hours)}: {sum(hours.values()):.2g} CPU hours)"
         for world, tuning in tunings.items()
         if (hours := tuning.get("not_tuned_hours"))
     ]
-    return f"The tuning took {seconds / 60:.0f} CPU minutes. Not tuned in this world: {'; '.join(texts) or 'none'}."
+    return f"The tuning took {seconds / 60:.0f} CPU minutes. Not tuned in this world: {'; '.join(texts) or 'none'}. These are estimates."
 
 
 def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> str:

@@ -175,18 +175,18 @@ class Overview(NamedTuple):
 
 
 def read_world_facts(scenario: str, model: str) -> WorldFacts | None:
-    """Read the facts of a world from the files of tunings, the nominal regime first; None without one.
+    """Read the facts of a world from the files of tunings, the nominal regime and the scenario as it is first; None without one.
 
     They are those of pfbench, and those that `pfbench tune` wrote into `conf` of the current folder.
     """
-    candidates: list[tuple[bool, WorldFacts]] = []
+    candidates: list[tuple[tuple[bool, bool], WorldFacts]] = []
     for content in (*_read_shipped_tunings(), *_read_own_tunings()):
         world = content.get("world") or {}
         is_of = (world.get("scenario"), world.get("model")) == (scenario, model)
         if is_of and content.get("best"):
             candidates.append(
                 (
-                    world.get("regimes") != [CENTRAL],
+                    (world.get("regimes") != [CENTRAL], bool(world.get("settings"))),
                     WorldFacts(
                         str(content["best"]),
                         content.get("kalman_fits"),
