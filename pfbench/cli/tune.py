@@ -110,14 +110,14 @@ def _search(
         _check_same_world(present, world)
     fixed = [*settings, f"seed={world['seed']}", "pcrb=false", "score_steps=0"]
     fixed += ["budget=particles", "engine=kernels"]  # whatever an experiment sets
-    place = world["regimes"], print, world["start_time_s"]
-    search = CandidateSearch([*fixed, f"runs={world['runs']}"], *place)
+    searched = world["regimes"], print, world["start_time_s"]
+    search = CandidateSearch([*fixed, f"runs={world['runs']}"], *searched)
     results, unsupported = _tune_each(search, grids)
     if adds:
         add_to_tuned_file(results, present, unsupported)
         return present
     others = [f"runs={fit_runs}", f"first_run={world['runs']}"]  # that have chosen no knobs
-    fit = measure_fit(CandidateSearch([*fixed, *others], *place), results, fit_particles)
+    fit = measure_fit(CandidateSearch([*fixed, *others], *searched), results, fit_particles)
     print(f"best: {fit.best}\nkalman_fits: {str(fit.kalman_fits).lower()}")
     return write_tuned_file(results, folder, name, world, fit, unsupported)
 

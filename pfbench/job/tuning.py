@@ -449,22 +449,22 @@ class Knob(NamedTuple):
     """Knob of a method, as its file states it.
 
     Attributes:
-        place: Place of the parameter in the settings of the filter.
+        key: Key of the parameter in the settings of the filter.
         values: Values to try.
     """
 
-    place: str
+    key: str
     values: tuple[float, ...]
 
     @property
     def name(self) -> str:
         """Name of the parameter."""
-        return self.place.rpartition(".")[2]
+        return self.key.rpartition(".")[2]
 
 
 # Each method has the same number of values, so that each has the same number of candidates.
 KNOBS: Mapping[str, Knob] = {
-    method: Knob(block["knob"]["place"], tuple(block["knob"]["values"]))
+    method: Knob(block["knob"]["key"], tuple(block["knob"]["values"]))
     for method in list_named_parts("filter")
     if "knob" in (block := read_paper_block("filter", method))
 }
@@ -495,9 +495,9 @@ def apply_candidate(node: Mapping[str, Any], values: Mapping[str, float]) -> dic
     Returns the settings.
     """
     changed: Any = copy.deepcopy(dict(node))
-    *path, name = changed[PAPER]["knob"]["place"].split(".")
-    part = reduce(lambda node, key: node[int(key) if key.isdigit() else key], path, changed)
-    part[name] = values[name]
+    *path, name = changed[PAPER]["knob"]["key"].split(".")
+    settings = reduce(lambda node, key: node[int(key) if key.isdigit() else key], path, changed)
+    settings[name] = values[name]
     guided = changed.get("proposal", {}).get("guide_filter", changed)
     if "noise_adaptations" not in guided:
         return changed | {"weight_update": {"_target_": _POWER, "r_factor": values["r_factor"]}}

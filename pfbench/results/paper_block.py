@@ -122,7 +122,7 @@ def _requirement(group: str, key: str, value: Any) -> str:
         (key == "colour" and not _is_colour_pair(value), "two colours such as '#0b4f8a', for white and for dark ground"),
         (key == "form" and value not in METHOD_FORMS, f"one of {', '.join(METHOD_FORMS)}"),
         (not is_list, f"a list of entries with {entries}: keys a list of names, all others texts"),
-        (key == "knob" and not (isinstance(value, Mapping) and set(value) == {"place", "values"}), "the place of a parameter, and the values to try"),
+        (key == "knob" and not (isinstance(value, Mapping) and set(value) == {"key", "values"}), "the key of a parameter, and the values to try"),
         (key == "baselines" and not _is_list_of_names(value), "a list of filters"),
     )  # fmt: skip
     return next((requirement for is_fault, requirement in faults if is_fault), "")

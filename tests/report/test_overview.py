@@ -38,7 +38,7 @@ from pfbench.report.overview.page import (
 from pfbench.report.overview.tables import (
     EQUAL_TIME,
     PRINTED,
-    TUNED,
+    WITH_KNOBS,
     Overview,
     TabKey,
     World,
@@ -638,7 +638,7 @@ def test_filters_at_equal_time_and_as_printed_have_tables_of_their_own(
     overview: Overview, tabs: dict[TabKey, Overview]
 ) -> None:
     """In each table all filters have one setting, so that none is compared with another setting of itself."""
-    assert list(tabs) == [100, 1000, EQUAL_TIME, PRINTED, TUNED]
+    assert list(tabs) == [100, 1000, EQUAL_TIME, PRINTED, WITH_KNOBS]
     plain = {(c.world, c.filter): c.verdict.ratio for c in overview.cells}
     for key in (100, 1000):
         found = {(c.world, c.filter): c.verdict.ratio for c in tabs[key].cells}
@@ -661,7 +661,7 @@ def test_filters_at_equal_time_and_as_printed_have_tables_of_their_own(
 
 def test_a_word_that_tuning_turns_is_named_with_both_ratios(tabs: dict[TabKey, Overview]) -> None:
     """A ninth of the errors of one method turns its words; methods with the same errors keep theirs."""
-    plain, tuned = tabs[1000], tabs[TUNED]
+    plain, tuned = tabs[1000], tabs[WITH_KNOBS]
     pairs = pair_forms(plain, tuned)
     assert {(a.world, f"{a.filter}_tuned") for a, _ in pairs} == {
         (b.world, b.filter) for _, b in pairs
@@ -799,7 +799,7 @@ def test_the_page_shows_all_tables(tabs: dict[TabKey, Overview]) -> None:
     assert "<summary>The methods as printed, 100 particles</summary>" in page
     assert len(files["error_by_time.svg"]) < 60_000
     cells = pd.read_csv(io.StringIO(files["cells.csv"]))
-    assert set(cells["table"]) == {"100", "1000", EQUAL_TIME, PRINTED, TUNED}
+    assert set(cells["table"]) == {"100", "1000", EQUAL_TIME, PRINTED, WITH_KNOBS}
     assert {"heat_map_equal_time.svg", "matrices_as_printed.svg"} <= set(files)
 
 

@@ -246,8 +246,8 @@ class ParticleFilter(Filter):
             Weighted particles at t, and a summary of the step.
         """
         update = self.weight_update
-        moved = update.temper(model) if isinstance(update, PowerLikelihoodUpdate) else model
-        parents, trace = self._resample_and_move(model, moved, belief, record, draws)
+        target = update.temper(model) if isinstance(update, PowerLikelihoodUpdate) else model
+        parents, trace = self._resample_and_move(model, target, belief, record, draws)
         x, log_ratio, memory, w, proposal_trace = self.proposal(model, parents, record, draws)
         log_w, carried, counts = compute_updated_weights(
             update, model, parents.log_w, x, log_ratio, record, parents.memory
@@ -276,7 +276,7 @@ class ParticleFilter(Filter):
             ancestors=None,
         )
         if (history := self.history) is not None:
-            children = history.append(moved, parents, children, w, record)
+            children = history.append(target, parents, children, w, record)
         if not fused:
             mean, variance = weighted_mean_variance(model, children, normalised_w)
         return children, StepSummary(
@@ -286,7 +286,7 @@ class ParticleFilter(Filter):
     def _resample_and_move(
         self,
         model: StateSpaceModel,
-        moved: StateSpaceModel,
+        target: StateSpaceModel,
         belief: ParticleBelief,
         record: Record,
         draws: RandomStream,
@@ -303,7 +303,7 @@ class ParticleFilter(Filter):
             trace["ancestors"] = count_distinct_ancestors(belief.ancestors, belief.log_w)
         for i, move in enumerate(self.moves):
             belief, trace[f"accepted_{i}"] = move(
-                moved, belief, trace["resampled"], relabel(draws, f"move_{i}.")
+                target, belief, trace["resampled"], relabel(draws, f"move_{i}.")
             )
         if self.moves and belief.ancestors is not None:
             trace["unique"] = count_distinct_ancestors(belief.ancestors, belief.log_w)

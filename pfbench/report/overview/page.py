@@ -16,7 +16,7 @@ from pfbench.report.overview.tables import (
     EQUAL_TIME,
     PRINTED,
     SIR,
-    TUNED,
+    WITH_KNOBS,
     Overview,
     TabKey,
     World,
@@ -78,7 +78,7 @@ def render_overview(
         "others": [
             (_name_tab(key, item), _suffix(key))
             for key, item in overviews.items()
-            if key not in (level, TUNED)
+            if key not in (level, WITH_KNOBS)
         ],
         "headline": word_headline(overview, overviews.get(EQUAL_TIME)),
         "setting": describe_setting(overview, level),
@@ -94,15 +94,10 @@ def render_overview(
         "format_error": figures.format_reference_error,
         "format_reference": figures.format_reference,
         "filters": [overview.names[label] for label in overview.columns],
-        "stories": [
-            tell_story(
-                overview, m, str(read_paper_block("filter", parse_label(m)[0]).get("summary", ""))
-            )
-            for m in overview.methods
-        ],
-        "tuned": describe_tuned(overview, overviews[TUNED]) if TUNED in overviews else "",
-        "forms": list_forms(overview, overviews[TUNED]) if TUNED in overviews else [],
-        "price": describe_price(overview) if TUNED in overviews else "",
+        "stories": [tell_story(overview, m, str(read_paper_block("filter", parse_label(m)[0]).get("summary", ""))) for m in overview.methods],
+        "tuned": describe_tuned(overview, overviews[WITH_KNOBS]) if WITH_KNOBS in overviews else "",
+        "forms": list_forms(overview, overviews[WITH_KNOBS]) if WITH_KNOBS in overviews else [],
+        "price": describe_price(overview) if WITH_KNOBS in overviews else "",
         "count": spell_number(len(overview.methods)),
         "pictures": {
             name: Markup(format_data_address("svg", text.encode()))
@@ -199,7 +194,7 @@ def draw_pictures(overviews: Mapping[TabKey, Overview]) -> dict[str, str]:
         suffix = "" if key == first else _suffix(key)
         for size in figures.HEAT_FORMATS:
             pictures[f"heat_map{suffix}{size.name}"] = figures.draw_heat_map(overview, size)
-        for size in figures.MATRIX_FORMATS if key != TUNED else ():
+        for size in figures.MATRIX_FORMATS if key != WITH_KNOBS else ():
             pictures[f"matrices{suffix}{size.name}"] = figures.draw_matrices(overview, size)
     if len(levels) > 1:
         worlds = order_dose_worlds(overviews[first])

@@ -35,7 +35,7 @@ CONVENTIONAL = (SIR, "rpf", "rpf_tuned", "ekf_bank")  # that stand next to the m
 METRIC = "rmse"  # of all words of the page
 DEAD_RECKONING, PLAIN = "dead_reckoning", "ukf"
 TabKey = int | str  # a number of particles, 0 for a study of one number, or one of those below
-EQUAL_TIME, PRINTED, TUNED = "equal time", "as printed", "tuned"
+EQUAL_TIME, PRINTED, WITH_KNOBS = "equal time", "as printed", "tuned"
 _TUNING_BYTES = 1_000_000
 _WORDS = ("better", "worse", *EQUAL_WORDS, "not decided")
 _FAMILIES = ("particle", "guided", "swarm", "gaussian", "learned", "kalman", "")
@@ -371,10 +371,10 @@ def build_overviews(
         names = {name_without_level(label) for label in timed}
         fixed = [label for label in looks if _level(label) is None and label not in names]
         tabs[EQUAL_TIME] = _Tab([*timed, *fixed])
-    for form, is_shown in ((PRINTED, is_printed), (TUNED, is_tuned)):
-        shown = [label for label, look in looks.items() if is_shown(look)]
-        if len(shown) >= FEWEST_METHODS:
-            number = table.loc[table["filter"].isin(shown), "particles"].dropna().median()
+    for form, is_shown in ((PRINTED, is_printed), (WITH_KNOBS, is_tuned)):
+        forms = [label for label, look in looks.items() if is_shown(look)]
+        if len(forms) >= FEWEST_METHODS:
+            number = table.loc[table["filter"].isin(forms), "particles"].dropna().median()
             others = [v for v in rest if _level(v) in (None, number) and not is_method(looks[v])]
             tabs[form] = _Tab(others, 0, is_shown)
     central = {

@@ -110,19 +110,17 @@ def test_the_knobs_reach_the_filter(method: str) -> None:
     values = list_candidates(method)[-1]
     changed = apply_candidate(node, values)
     built = job.instantiate({k: v for k, v in changed.items() if k != "paper"})
-    assert stated_values(built, KNOBS[method].place) == values
+    assert stated_values(built, KNOBS[method].key) == values
 
 
-def stated_values(built: Any, place: str) -> dict[str, float]:
+def stated_values(built: Any, key: str) -> dict[str, float]:
     """Read the factor on R and the knob from a built filter; the factor stands before other adaptations."""
-    *path, name = place.split(".")
+    *path, name = key.split(".")
     guided = getattr(getattr(built, "proposal", None), "guide_filter", built)
     stages = getattr(guided, "noise_adaptations", ())
     if path[0] == "noise_adaptations" and name != "q_factor":
         path[1] = str(int(path[1]) + 1)
-    part = reduce(
-        lambda node, key: node[int(key)] if key.isdigit() else getattr(node, key), path, built
-    )
+    part = reduce(lambda node, k: node[int(k)] if k.isdigit() else getattr(node, k), path, built)
     scaled = stages[0] if stages else built.weight_update
     return {"r_factor": scaled.r_factor, name: getattr(part, name)}
 
@@ -350,6 +348,7 @@ def test_a_filter_is_added_to_the_file_of_its_world(
     tune_filters([*world, "runs=4", "filter=ekf_scaled"])
     path = tmp_path / "lab/tuned/walk.yaml"
     first = path.read_text()
+    assert "\n  first_run: 4\n" in first  # the best filter is chosen by other runs
     for _ in range(2):
         tune_filters([*world, "runs=4", "filter=rpf"])
         assert path.read_text().startswith(first)
