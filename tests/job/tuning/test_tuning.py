@@ -575,7 +575,9 @@ def test_candidates_side_by_side_have_the_numbers_of_each_alone(method: str) -> 
     for values, joint in zip(grid[::5], result.candidates[::5], strict=True):
         (scores,) = search._score([with_candidate(config, values)])
         assert joint.errors == {regime: score.error for regime, score in scores.items()}
-    assert len({c.log_ratio for c in result.candidates}) >= 4  # equal weights have no entropy to add
+    assert (
+        len({c.log_ratio for c in result.candidates}) >= 4
+    )  # equal weights have no entropy to add
 
 
 def test_kalman_filters_that_fit_are_not_called_unfit_beyond_the_level() -> None:
