@@ -94,7 +94,12 @@ def render_overview(
         "format_error": figures.format_reference_error,
         "format_reference": figures.format_reference,
         "filters": [overview.names[label] for label in overview.columns],
-        "stories": [tell_story(overview, m, str(read_paper_block("filter", parse_label(m)[0]).get("summary", ""))) for m in overview.methods],
+        "stories": [
+            tell_story(
+                overview, m, str(read_paper_block("filter", parse_label(m)[0]).get("summary", ""))
+            )
+            for m in overview.methods
+        ],
         "tuned": describe_tuned(overview, overviews[WITH_KNOBS]) if WITH_KNOBS in overviews else "",
         "forms": list_forms(overview, overviews[WITH_KNOBS]) if WITH_KNOBS in overviews else [],
         "price": describe_price(overview) if WITH_KNOBS in overviews else "",
