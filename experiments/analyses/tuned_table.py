@@ -1,12 +1,15 @@
 """Files of tunings to one table: `python experiments/analyses/tuned_table.py` after `pfbench tune ... folder=conf` in the checkout.
 
 Each file conf/tuned/NAME.yaml becomes an entry of conf/tuned/families/worlds.yaml, which a run finds as it finds the file, and its
-candidates become rows of tuned_candidates.parquet. To add a filter to an entry, tune all filters of the world again.
+candidates become rows of tuned_candidates.parquet. To add a filter to an entry, `python experiments/analyses/tuned_table.py NAME` makes it a
+file again, to which `pfbench tune` adds.
 """
 
 from __future__ import annotations
 
+import json
 import re
+import sys
 from collections.abc import Mapping
 from io import StringIO
 from pathlib import Path
@@ -76,10 +79,11 @@ def add_files() -> None:
         if path.stem in _REFERS:
             continue
         content = yaml.safe_load(path.read_text())
-        if content["objective"] == _OBJECTIVE:
+        if content.get("objective") == _OBJECTIVE:
             del content["objective"]
         table[path.stem], frames = split_file(path.stem, content)
-        rows = [frame[frame["file"] != path.stem] for frame in rows] + frames
+        new = {frame["filter"].iloc[0] for frame in frames}
+        rows = [f[(f["file"] != path.stem) | ~f["filter"].isin(new)] for f in rows] + frames
         path.unlink()
     all_rows = pd.concat(rows, ignore_index=True).sort_values(KEY, kind="stable")
     columns = [*KEY, "r_factor", "knob", "value", *SCORES]
@@ -89,5 +93,17 @@ def add_files() -> None:
     TABLE.write_text(_HEAD + "".join(entry for _, entry in sorted(table.items())))
 
 
+def take_entry(name: str) -> None:
+    """Make an entry of the table a file, without the candidates, which stay in their table."""
+    table = yaml.safe_load(TABLE.read_text())
+    lines = [f"{key}: {json.dumps(node)}" for key, node in table.pop(name).items()]
+    (TUNED / f"{name}.yaml").write_text("\n".join(lines) + "\n")
+    entries = re.split(r"^(?=\w)", TABLE.read_text(), flags=re.M)[1:]
+    TABLE.write_text(_HEAD + "".join(e for e in entries if e.partition(":")[0] != name))
+
+
 if __name__ == "__main__":
-    add_files()
+    for entry in sys.argv[1:]:
+        take_entry(entry)
+    if not sys.argv[1:]:
+        add_files()

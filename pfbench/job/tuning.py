@@ -30,7 +30,12 @@ from pfbench.job.filter_pass import TimedFilterPass, pass_filter
 from pfbench.job.plan import JobPlan, build_plan, describe_state
 from pfbench.model.base import StateSpaceModel
 from pfbench.results.conditions import main_component_group
-from pfbench.results.paper_block import experiments_dir
+from pfbench.results.paper_block import (
+    PAPER,
+    experiments_dir,
+    list_named_parts,
+    read_paper_block,
+)
 from pfbench.results.status import is_diverged
 from pfbench.results.store import DamagedResultError, read_metadata
 from pfbench.stats.error_measures import Array, Flags, mean_per_run, rmse_per_run
@@ -138,7 +143,8 @@ class CandidateSearch:
         candidates, self.seconds = [], 0.0
         config = self.compose(method, self.regimes[0])
         at_once = max(1, _RUNS_AT_ONCE // max(len(batch.runs) for batch in self.batches))
-        at_once = 1 if method == "rpf" else at_once  # only Gaussian filters share a pass
+        stages = config.values["filter"].get("noise_adaptations", ())
+        at_once = at_once if len(stages) == 1 else 1  # only one adaptation can be joined
         for first in range(0, len(grid), at_once):
             some = grid[first : first + at_once]
             self.progress(f"{method}, candidates {first + 1} to {first + len(some)} of {len(grid)}")
@@ -432,30 +438,28 @@ R_FACTORS = (1.0, 2.0, 4.0, 8.0)
 _SCALED, _POWER = "pfbench.filter.ScaledNoise", "pfbench.filter.PowerLikelihoodUpdate"
 
 
-@dataclass(frozen=True)
-class Knob:
-    """Knob of a method.
+class Knob(NamedTuple):
+    """Knob of a method, as its file states it.
 
     Attributes:
-        name: Key of the robust update, `q_factor` of the scaled noise, or `scale` of the bandwidth.
+        place: Place of the parameter in the settings of the filter.
         values: Values to try.
     """
 
-    name: str
+    place: str
     values: tuple[float, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the parameter."""
+        return self.place.rpartition(".")[2]
 
 
 # Each method has the same number of values, so that each has the same number of candidates.
 KNOBS: Mapping[str, Knob] = {
-    "ekf_scaled": Knob("q_factor", (0.25, 0.5, 1.0, 2.0)),
-    "gate": Knob("probability", (0.99, 0.999, 0.9999, 1.0)),
-    "huber": Knob("threshold", (1.0, 1.345, 2.0, 3.0)),
-    "student": Knob("dof", (3.0, 4.0, 6.0, 10.0)),
-    "correntropy": Knob("threshold", (1.5, 2.0, 3.0, 5.0)),
-    "wolf": Knob("threshold", (2.0, 3.0, 4.0, 6.0)),
-    "sage_husa": Knob("forgetting_factor", (0.95, 0.98, 0.99, 0.998)),
-    "vb_r": Knob("forgetting_factor", (0.95, 0.98, 0.99, 0.998)),
-    "rpf": Knob("scale", (0.25, 0.5, 1.0, 2.0)),
+    method: Knob(block["knob"]["place"], tuple(block["knob"]["values"]))
+    for method in list_named_parts("filter")
+    if "knob" in (block := read_paper_block("filter", method))
 }
 
 
@@ -469,7 +473,7 @@ def list_candidates(method: str, r_factors: Sequence[float] = R_FACTORS) -> list
         "filter",
         f"be of {', '.join(KNOBS)}",
         method,
-        "Only these have knobs that are tuned alike.",
+        "Only these state a knob in their file.",
     )
     knob = KNOBS[method]
     return [{"r_factor": r, knob.name: v} for r, v in product(r_factors, knob.values)]
@@ -478,20 +482,25 @@ def list_candidates(method: str, r_factors: Sequence[float] = R_FACTORS) -> list
 def apply_candidate(node: Mapping[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
     """Set the knobs in the settings of a filter.
 
-    Returns the settings that change: the noise adaptations, with the scaled noise first, or bandwidth and
-    weights of a particle filter.
+    The factor on R is a scaled noise before the other adaptations of a Gaussian filter, or of the filter that guides
+    particles. Other particle filters have a power of the likelihood.
+
+    Returns the settings.
     """
-    if "scale" in values:
-        return {
-            "resampler": {**node["resampler"], "scale": values["scale"]},
-            "weight_update": {"_target_": _POWER, "r_factor": values["r_factor"]},
-        }
-    scaled = {"_target_": _SCALED, "r_factor": values["r_factor"], "q_factor": 1.0}
-    if "q_factor" in values:
-        return {"noise_adaptations": [scaled | {"q_factor": values["q_factor"]}]}
-    (name,) = (key for key in values if key != "r_factor")
-    update = {**node["noise_adaptations"][-1], name: values[name]}
-    return {"noise_adaptations": [scaled, update]}
+    changed: Any = copy.deepcopy(dict(node))
+    *path, name = changed[PAPER]["knob"]["place"].split(".")
+    part = changed
+    for key in path:
+        part = part[int(key) if key.isdigit() else key]
+    part[name] = values[name]
+    guided = changed.get("proposal", {}).get("guide_filter", changed)
+    if "noise_adaptations" not in guided:
+        return changed | {"weight_update": {"_target_": _POWER, "r_factor": values["r_factor"]}}
+    scaled = {"q_factor": 1.0, **values, "_target_": _SCALED}
+    scaled = {key: scaled[key] for key in ("_target_", "r_factor", "q_factor")}
+    others = [stage for stage in guided["noise_adaptations"] if stage["_target_"] != _SCALED]
+    guided["noise_adaptations"] = [scaled, *others]
+    return changed
 
 
 # --------------------------------------------------------------------------------------------------

@@ -28,8 +28,8 @@ PAPER = "paper"
 
 FAMILIES = ("kalman", "particle", "gaussian", "guided", "swarm", "learned")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">", "p", "h")  # of matplotlib
-# form of a method: to the letter of its paper, as printed with named completions, repaired, or another
-METHOD_FORMS = ("literal", "printed", "repaired", "variant")
+# form of a method: to the letter of its paper, as printed with named completions, repaired, another, or with tuned knobs
+METHOD_FORMS = ("literal", "printed", "repaired", "variant", "tuned")
 _COLOUR = re.compile(r"#[0-9a-f]{6}")
 # entries of `cites`, keys that the paper states, and of `completions`, keys that it does not state or that are read
 # otherwise than `printed`: each with keys of the filter and a text
@@ -42,7 +42,7 @@ _KEYS = {
     "noise": ("name", "words", "family"),
     "filter": (
         "name", "long_name", "summary", "family", "proposed", "form", "form_of", "colour", "marker", "cite",
-        "baselines", "tuning", "cites", "completions",
+        "baselines", "knob", "tuning", "cites", "completions",
     ),
 }  # fmt: skip
 
@@ -125,6 +125,7 @@ def _requirement(group: str, key: str, value: Any) -> str:
         (key == "colour" and not _is_colour_pair(value), "two colours such as '#0b4f8a', for white and for dark ground"),
         (key == "form" and value not in METHOD_FORMS, f"one of {', '.join(METHOD_FORMS)}"),
         (not is_list, f"a list of entries with {entries}: keys a list of names, all others texts"),
+        (key == "knob" and not _is_knob(value), "the place of a parameter and the values to try: {place: TEXT, values: [NUMBER, ...]}"),
         (key == "baselines" and not _is_list_of_names(value), "a list of filters"),
     )  # fmt: skip
     return next((requirement for is_fault, requirement in faults if is_fault), "")
@@ -150,6 +151,12 @@ def _is_list_of_entries(value: Any, required: set[str], optional: set[str]) -> b
 def _is_list_of_names(value: Any) -> bool:
     """Return whether a value is a list of texts."""
     return isinstance(value, list | tuple) and all(isinstance(item, str) for item in value)
+
+
+def _is_knob(value: Any) -> bool:
+    """Return whether a value is the place of a parameter with distinct numbers."""
+    is_pair = isinstance(value, Mapping) and set(value) == {"place", "values"}
+    return is_pair and isinstance(value["place"], str) and len({*map(float, value["values"])}) > 1
 
 
 def _is_positive(value: Any) -> bool:
@@ -230,7 +237,7 @@ def plan_installed_pairs(labels: Collection[str]) -> list[tuple[str, str]]:
 
     methods = {parse_label(label)[0] for label in labels}
     blocks = {method: read_paper_block("filter", method) for method in methods}
-    tuned = sorted(method for method, block in blocks.items() if block.get("tuning"))
+    tuned = sorted(m for m, b in blocks.items() if b.get("tuning") and not b["proposed"])
     return list_planned_pairs(
         labels, {method: block.get("baselines", ()) for method, block in blocks.items()}, tuned
     )

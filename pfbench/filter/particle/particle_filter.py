@@ -53,6 +53,7 @@ from pfbench.filter.particle.stages import (
     count_particles,
     deactivate_invalid_particles,
 )
+from pfbench.filter.particle.weights import PowerLikelihoodUpdate
 from pfbench.kernels import dispatch
 from pfbench.model.base import StateSpaceModel, initial_law
 
@@ -244,10 +245,12 @@ class ParticleFilter(Filter):
         Returns:
             Weighted particles at t, and a summary of the step.
         """
-        parents, trace = self._resample_and_move(model, belief, record, draws)
+        update = self.weight_update
+        moved = update.temper(model) if isinstance(update, PowerLikelihoodUpdate) else model
+        parents, trace = self._resample_and_move(model, moved, belief, record, draws)
         x, log_ratio, memory, w, proposal_trace = self.proposal(model, parents, record, draws)
         log_w, carried, counts = compute_updated_weights(
-            self.weight_update, model, parents.log_w, x, log_ratio, record, parents.memory
+            update, model, parents.log_w, x, log_ratio, record, parents.memory
         )
         fused = model.chart.flat and dispatch.runs_operators(x, log_w)
         if fused:
@@ -273,7 +276,7 @@ class ParticleFilter(Filter):
             ancestors=None,
         )
         if (history := self.history) is not None:
-            children = history.append(model, parents, children, w, record)
+            children = history.append(moved, parents, children, w, record)
         if not fused:
             mean, variance = weighted_mean_variance(model, children, normalised_w)
         return children, StepSummary(
@@ -281,7 +284,12 @@ class ParticleFilter(Filter):
         )
 
     def _resample_and_move(
-        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
+        self,
+        model: StateSpaceModel,
+        moved: StateSpaceModel,
+        belief: ParticleBelief,
+        record: Record,
+        draws: RandomStream,
     ) -> tuple[ParticleBelief, dict[str, Tensor]]:
         """Return the parents of the particles at t, and diagnostics."""
         trace: dict[str, Tensor] = {}
@@ -295,7 +303,7 @@ class ParticleFilter(Filter):
             trace["ancestors"] = count_distinct_ancestors(belief.ancestors, belief.log_w)
         for i, move in enumerate(self.moves):
             belief, trace[f"accepted_{i}"] = move(
-                model, belief, trace["resampled"], relabel(draws, f"move_{i}.")
+                moved, belief, trace["resampled"], relabel(draws, f"move_{i}.")
             )
         if self.moves and belief.ancestors is not None:
             trace["unique"] = count_distinct_ancestors(belief.ancestors, belief.log_w)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -234,7 +235,8 @@ class TemperedPosterior(WeightUpdate):
 class PowerLikelihoodUpdate(WeightUpdate):
     """Bayes' rule with the likelihood to the power 1 / r_factor.
 
-    For normal errors this is their likelihood with `r_factor` times the covariance, up to a constant.
+    For normal errors this is their likelihood with `r_factor` times the covariance, up to a constant. Moves of
+    particles accept by the same likelihood.
 
     Attributes:
         r_factor: Factor on the measurement noise covariance.
@@ -260,6 +262,12 @@ class PowerLikelihoodUpdate(WeightUpdate):
     def has_evidence(self) -> bool:
         """True if the weights are densities of y given x."""
         return self.is_exact
+
+    def temper(self, model: StateSpaceModel) -> StateSpaceModel:
+        """Return the model with the likelihood of the weights, by which moves accept."""
+        tempered, plain = copy.copy(model), model.log_likelihood
+        tempered.__dict__["log_likelihood"] = lambda y, x, u: plain(y, x, u) / self.r_factor
+        return tempered
 
     @override
     def __call__(
