@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 HELP = """\
 pfbench tune scenario=NAME [model=NAME] [filter=NAME,NAME] [key=value ...]
 
-Tune the conventional filters of a world, a scenario with a model: a factor on R and one knob of the
-method, 16 candidates each, in three noise regimes, with the seed of the study plus 1000. Write the
+Tune the filters of a world, a scenario with a model: a factor on R and one knob of the method, which
+its file states, 16 candidates each, in three noise regimes, with the seed of the study plus 1000. Write the
 chosen knobs and the record of all candidates into one file, FOLDER/tuned/NAME.yaml, which a study
 finds by its scenario and model and gives to the filters that end in _tuned. The file states the best
 of these filters, ekf and ukf (`best`), and whether Kalman filters fit the world (`kalman_fits`).
@@ -33,7 +33,8 @@ of these filters, ekf and ukf (`best`), and whether Kalman filters fit the world
   noise=...          noise regimes, default nominal,outliers,student. noise=nominal for a study of
                      nominal noise alone, whose choice is tuned=nominal
   r_factors=1,2,4,8  factors on R of the candidates, for all filters alike
-  fit_runs=RUNS      runs of sir and rpf in the first noise regime, which decide on kalman_fits
+  fit_runs=RUNS      further runs, which decide on best, and by sir and rpf in the first noise regime on
+                     kalman_fits
   fit_particles=10000     their particles
   report.start_time_s=0   time before which errors do not count, as in the report of the study
   name=...           name of the file, default SCENARIO, SCENARIO_with_MODEL, and _nominal behind it;
@@ -68,7 +69,7 @@ def tune_filters(words: Sequence[str]) -> None:
     name = options["name"] or _name_file(study.choices, lists["noise"], others)
     runs = study.values["runs"]
     _check_choices(name, runs)
-    fit_runs = _count("fit_runs", options["fit_runs"] or str(runs), runs)
+    fit_runs = _count("fit_runs", options["fit_runs"] or str(runs))
     particles = _count("fit_particles", options["fit_particles"])
     check_seed(study, study.values["seed"] + SEED_SHIFT)
     settings = [word for word in others if word.partition("=")[0] not in _OWN]
@@ -86,7 +87,7 @@ def tune_filters(words: Sequence[str]) -> None:
     }
     folder = Path(options["folder"] or _own_folder(words))
     _check_new_name(name, folder)
-    path = _search(settings, grids, world, (fit_runs, particles), folder, name)
+    path = _search(settings, grids, world, fit_runs, particles, folder, name)
     print(f"tuned={name}: {path.resolve()}{_describe_use(folder, words)}")
 
 
@@ -94,7 +95,8 @@ def _search(
     settings: Sequence[str],
     grids: Mapping[str, Sequence[dict[str, float]]],
     world: Mapping[str, Any],
-    fit_size: tuple[int, int],
+    fit_runs: int,
+    fit_particles: int,
     folder: Path,
     name: str,
 ) -> Path:
@@ -106,14 +108,16 @@ def _search(
     adds = CONTROL not in grids and present.is_file()
     if adds:
         _check_same_world(present, world)
-    fixed = [f"seed={world['seed']}", f"runs={world['runs']}", "pcrb=false", "score_steps=0"]
+    fixed = [*settings, f"seed={world['seed']}", "pcrb=false", "score_steps=0"]
     fixed += ["budget=particles", "engine=kernels"]  # whatever an experiment sets
-    search = CandidateSearch([*settings, *fixed], world["regimes"], print, world["start_time_s"])
+    place = world["regimes"], print, world["start_time_s"]
+    search = CandidateSearch([*fixed, f"runs={world['runs']}"], *place)
     results, unsupported = _tune_each(search, grids)
     if adds:
         add_to_tuned_file(results, present, unsupported)
         return present
-    fit = measure_fit(search, results, *fit_size)
+    others = [f"runs={fit_runs}", f"first_run={world['runs']}"]  # that have chosen no knobs
+    fit = measure_fit(CandidateSearch([*fixed, *others], *place), results, fit_particles)
     print(f"best: {fit.best}\nkalman_fits: {str(fit.kalman_fits).lower()}")
     return write_tuned_file(results, folder, name, world, fit, unsupported)
 
@@ -200,13 +204,15 @@ def _check_choices(name: str, runs: int) -> None:
     _count("runs", str(runs))
 
 
-def _count(key: str, text: str, most: int | None = None) -> int:
+def _count(key: str, text: str) -> int:
     """Return a number of runs or particles, at least two."""
-    upper = "" if most is None else f" and at most runs={most}"
-    if not text.isdecimal() or int(text) < _FEWEST_RUNS or (most is not None and int(text) > most):
-        raise ValueError(
-            f"{key} must be at least {_FEWEST_RUNS}{upper} for a tuning, got {text}. Default: {_DEFAULTS[key]}."
-        )
+    require(
+        text.isdecimal() and int(text) >= _FEWEST_RUNS,
+        key,
+        f"be at least {_FEWEST_RUNS} for a tuning",
+        text,
+        f"Default: {_DEFAULTS[key]}.",
+    )
     return int(text)
 
 

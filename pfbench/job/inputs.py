@@ -110,11 +110,13 @@ def _list_files(node: Any, trusted: Sequence[str]) -> Iterator[Path]:
             continue
         for entry in built.input_files():
             path = Path(entry)
-            if path.exists() and not path.is_file():
-                raise ValueError(
-                    f"input_files of {reader['_target_']} must return files, got {path}. "
-                    "Return the path of each file that is read."
-                )
+            require(
+                not path.exists() or path.is_file(),
+                f"input_files of {reader['_target_']}",
+                "return files",
+                path,
+                "Return the path of each file that is read.",
+            )
             yield path
 
 

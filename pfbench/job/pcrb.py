@@ -76,16 +76,15 @@ def _states(model: StateSpaceModel, truth: Tensor, record: Record) -> Tensor:
     """Return the true states [R, T + 1, D], with the initial states first."""
     runs, steps = record.y.shape[:2]
     start = model.origin.expand(runs, -1) if record.start is None else record.start
-    if (
-        truth.dim() != 3
-        or truth.shape[1] not in (steps, steps + 1)
-        or truth[:, 0].shape != start.shape
-    ):
-        raise ValueError(
-            f"truth must have shape {[runs, steps, model.chart.size]} for this record and "
-            f"{type(model).__name__}, or one more step with the initial states first, got "
-            f"{list(truth.shape)}. Give the true states of the record."
-        )
+    require(
+        truth.dim() == 3
+        and truth.shape[1] in (steps, steps + 1)
+        and (truth[:, 0].shape == start.shape),
+        "truth",
+        f"have shape {[runs, steps, model.chart.size]} for this record and {type(model).__name__}, or one more step with the initial states first",
+        list(truth.shape),
+        "Give the true states of the record.",
+    )
     if model.linear:
         return start[:, None].expand(-1, steps + 1, -1)
     require(

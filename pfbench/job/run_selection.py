@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pfbench.core.parameter_checks import require
 from pfbench.results import store
 from pfbench.results.conditions import (
     Condition,
@@ -59,11 +60,13 @@ def find_run(
     condition, job = matches[0]
     result = job.load()
     numbers = _run_numbers(result)
-    if run not in numbers:
-        raise ValueError(
-            f"run must be a run of {job.label}, {numbers.min()} to {numbers.max()}, got {run}. "
-            f"Set run={numbers.min()}."
-        )
+    require(
+        run in numbers,
+        "run",
+        f"be a run of {job.label}, {numbers.min()} to {numbers.max()}",
+        run,
+        f"Set run={numbers.min()}.",
+    )
     return StoredRun(condition, job, run, select_run(result, int(np.argmax(numbers == run))))
 
 
@@ -73,10 +76,13 @@ def _select_data(
     """Select the conditions of settings of scenario and noise such as "flight[gps_sd=2.0]"."""
     for group, value in choices.items():
         names = {str(getattr(condition, group)) for condition in conditions}
-        if "[" in value and value not in names:
-            raise ValueError(
-                f"{group} must be one of the study, got {value}. Choose from {_list_names(names)}."
-            )
+        require(
+            "[" not in value or value in names,
+            group,
+            "be one of the study",
+            value,
+            f"Choose from {_list_names(names)}.",
+        )
         conditions = [c for c in conditions if "[" not in value or getattr(c, group) == value]
     return conditions
 
@@ -88,11 +94,13 @@ def _matching_keys(folder: Path, choices: Mapping[str, str]) -> list[str] | None
     names = {path.stem: _read_choices(path) for path in folder.glob("*.npz")}
     for group, value in choices.items():
         values = {job.get(group, "") for job in names.values()}
-        if names and value not in values:
-            raise ValueError(
-                f"{group} must be one of the study {folder.name}, got {value}. "
-                f"Choose from {_list_names(values)}."
-            )
+        require(
+            not names or value in values,
+            group,
+            f"be one of the study {folder.name}",
+            value,
+            f"Choose from {_list_names(values)}.",
+        )
     keys = [
         key
         for key, job in names.items()
@@ -126,11 +134,13 @@ def _check_single(matches: Sequence[tuple[Condition, JobFile]], label: str) -> N
         group: {str(getattr(condition, group)) for condition in conditions} for group in _GROUPS
     }
     several = [group for group in _GROUPS if len(names[group]) > 1]
-    if len({condition.name for condition in conditions}) == 1:
-        raise ValueError(
-            f"filter must name one job, got {label} with {len(labels)} settings. "
-            f"Choose from {_list_names(labels)}."
-        )
+    require(
+        len({condition.name for condition in conditions}) != 1,
+        "filter",
+        "name one job",
+        f"{label} with {len(labels)} settings",
+        f"Choose from {_list_names(labels)}.",
+    )
     advice = ", ".join(f"{group}=... ({_list_names(names[group])})" for group in several)
     raise ValueError(
         f"{' and '.join(several)} must be set, since {label} has results in "

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import stats
 
 from pfbench.files.atomic_write import write_atomically
-from pfbench.job.config import SUFFIX
+from pfbench.job.config import SUFFIX, TUNED_METHODS
 from pfbench.job.tuning import OBJECTIVE, Candidate, CandidateSearch, TuningResult, with_candidate
 from pfbench.results.paper_block import PAPER
 from pfbench.stats.error_measures import Array
@@ -85,8 +85,9 @@ def _list_fit(fit: WorldFit) -> Iterator[str]:
     yield f"kalman_fits: {json.dumps(fit.kalman_fits)}"
     yield "fit:"
     yield f"  rule: {json.dumps(FIT_RULE)}"
-    for key, value in (("noise", fit.regime), ("runs", fit.runs), ("particles", fit.particles)):
-        yield f"  {key}: {value}"
+    yield from (
+        f"  {key}: {getattr(fit, key)}" for key in ("noise", "runs", "first_run", "particles")
+    )
     yield "  objectives:"
     yield from (f"    {name}: {score:.{_DIGITS}g}" for name, score in fit.objectives.items())
     yield "  ratios:  # with both ends of the interval"
@@ -162,17 +163,19 @@ class WorldFit:
     Attributes:
         best: Name of the filter with the smallest objective.
         objectives: Objective by filter, with capped errors.
-        regime: Noise regime of the ratios.
+        noise: Noise regime of the ratios.
         particles: Number of particles.
-        runs: Number of runs of the ratios.
+        runs: Number of runs, which are others than those that chose the knobs.
+        first_run: Number of the first of them.
         ratios: Ratios by particle filter.
     """
 
     best: str
     objectives: dict[str, float]
-    regime: str
+    noise: str
     particles: int
     runs: int
+    first_run: int
     ratios: dict[str, Ratio] = field(default_factory=dict)
 
     @property
@@ -212,16 +215,17 @@ def find_best(
     return min(objectives, key=lambda name: objectives[name]), objectives
 
 
-def measure_fit(
-    search: CandidateSearch, results: list[TuningResult], runs: int, particles: int
-) -> WorldFit:
-    """Find the best conventional filter, and compare SIR and RPF with it in the first noise regime."""
-    regime = search.regimes[0]
-    first = [f"runs={runs}", f"particles={particles}"]
-    tuned = {f"{r.method}_{SUFFIX}": r.choice for r in results if r.particles is None}
+def measure_fit(search: CandidateSearch, results: list[TuningResult], particles: int) -> WorldFit:
+    """Find the best conventional filter, and compare SIR and RPF with it in the first noise regime.
+
+    The search has other runs than that which chose the knobs: a filter may be the best of 16 candidates by chance.
+    """
+    first, runs = [f"particles={particles}"], search.batches[0].plan.runs
+    tuned = {f"{r.method}_{SUFFIX}": r.choice for r in results if r.method in TUNED_METHODS}
     errors = {name: _errors_of(search, name) for name in _UNTUNED}
     errors = {name: e for name, e in errors.items() if e}
-    errors |= {name: choice.errors for name, choice in tuned.items()}
+    for name, choice in tuned.items():
+        errors[name] = search.score_method(name.removesuffix(f"_{SUFFIX}"), choice.values).errors
     cap, threshold = _find_cap(search, first)
     best, objectives = find_best(errors, cap)
     reference = _run(search, best, first, tuned.get(best), threshold)
@@ -230,7 +234,7 @@ def measure_fit(
         search.progress(f"{name} particles={particles}")
         errors_of_runs = _run(search, name, first, threshold=threshold)
         ratios[name] = compare_errors(errors_of_runs, reference, cap, len(_PARTICLE_FILTERS))
-    return WorldFit(best, objectives, regime, particles, runs, ratios)
+    return WorldFit(best, objectives, search.regimes[0], particles, len(runs), int(runs[0]), ratios)
 
 
 def _errors_of(search: CandidateSearch, name: str) -> dict[str, float]:

@@ -6,8 +6,10 @@ import copy
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from itertools import chain, product
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -142,16 +144,16 @@ class CandidateSearch:
         """
         candidates, self.seconds = [], 0.0
         config = self.compose(method, self.regimes[0])
-        at_once = max(1, _RUNS_AT_ONCE // max(len(batch.runs) for batch in self.batches))
-        stages = config.values["filter"].get("noise_adaptations", ())
-        at_once = at_once if len(stages) == 1 else 1  # only one adaptation can be joined
+        is_joint = len(config.values["filter"].get("noise_adaptations", ())) == 1  # one adaptation
+        size = max(len(batch.runs) for batch in self.batches)
+        at_once = max(1, _RUNS_AT_ONCE // size) if is_joint else 1
         for first in range(0, len(grid), at_once):
             some = grid[first : first + at_once]
             self.progress(f"{method}, candidates {first + 1} to {first + len(some)} of {len(grid)}")
             scores = self._score([with_candidate(config, values) for values in some])
             candidates += [self._rate(*pair) for pair in zip(some, scores, strict=True)]
         choice, seconds = choose_candidate(candidates), self.seconds
-        untuned = self._rate({}, *self._score([config]))
+        untuned = self.score_method(method)
         particles = config.values["filter"].get("particles")
         return TuningResult(method, choice, untuned, tuple(candidates), seconds, particles)
 
@@ -166,9 +168,12 @@ class CandidateSearch:
             {regime: s.error for regime, s in scores.items()},
         )
 
-    def score_method(self, method: str) -> Candidate:
-        """Run a filter without knobs in all regimes."""
-        return self._rate({}, *self._score([self.compose(method, self.regimes[0])]))
+    def score_method(
+        self, method: str, values: Mapping[str, float] = MappingProxyType({})
+    ) -> Candidate:
+        """Run a filter in all regimes, without knobs or with those of a candidate."""
+        config = self.compose(method, self.regimes[0])
+        return self._rate(dict(values), *self._score([with_candidate(config, values)]))
 
     def pass_alone(self, config: JobConfig, threshold: float = math.inf) -> Array:
         """Run a filter in one regime and return the RMSE of each run [R], infinite for a lost or diverged run."""
@@ -200,11 +205,13 @@ class CandidateSearch:
 
 def _check_start(time: Tensor, start_time_s: float) -> None:
     """Check that a step remains after the start time."""
-    if not bool((time >= start_time_s).any()):
-        raise ValueError(
-            f"report.start_time_s must be at most {float(time[-1]):g} s, the end of the episode, "
-            f"got {start_time_s:g} s. Use a smaller value."
-        )
+    require(
+        bool((time >= start_time_s).any()),
+        "report.start_time_s",
+        f"be at most {float(time[-1]):g} s, the end of the episode",
+        f"{start_time_s:g} s",
+        "Use a smaller value.",
+    )
 
 
 def with_candidate(config: JobConfig, values: Mapping[str, float]) -> JobConfig:
@@ -489,17 +496,19 @@ def apply_candidate(node: Mapping[str, Any], values: Mapping[str, float]) -> dic
     """
     changed: Any = copy.deepcopy(dict(node))
     *path, name = changed[PAPER]["knob"]["place"].split(".")
-    part = changed
-    for key in path:
-        part = part[int(key) if key.isdigit() else key]
+    part = reduce(lambda node, key: node[int(key) if key.isdigit() else key], path, changed)
     part[name] = values[name]
     guided = changed.get("proposal", {}).get("guide_filter", changed)
     if "noise_adaptations" not in guided:
         return changed | {"weight_update": {"_target_": _POWER, "r_factor": values["r_factor"]}}
-    scaled = {"q_factor": 1.0, **values, "_target_": _SCALED}
-    scaled = {key: scaled[key] for key in ("_target_", "r_factor", "q_factor")}
-    others = [stage for stage in guided["noise_adaptations"] if stage["_target_"] != _SCALED]
-    guided["noise_adaptations"] = [scaled, *others]
+    guided["noise_adaptations"] = [
+        {
+            "_target_": _SCALED,
+            "r_factor": values["r_factor"],
+            "q_factor": values.get("q_factor", 1.0),
+        },
+        *(stage for stage in guided["noise_adaptations"] if stage["_target_"] != _SCALED),
+    ]
     return changed
 
 
@@ -517,8 +526,7 @@ def check_seed(world: JobConfig, seed: int) -> None:
     Runs of another window of a recording have other data, so that settings of the scenario are compared
     where they are stored.
     """
-    if seed < 0:
-        raise ValueError(f"seed must be at least -1000, got {seed - 1000}. Set seed to that of the study.")  # fmt: skip
+    require(seed >= 0, "seed", "be at least -1000", seed - 1000, "Set seed to that of the study.")
     scenario = world.choices["scenario"]
     scored = (*_list_experiments(scenario, seed), *_list_results(world, seed))
     for study in scored:

@@ -125,7 +125,7 @@ def _requirement(group: str, key: str, value: Any) -> str:
         (key == "colour" and not _is_colour_pair(value), "two colours such as '#0b4f8a', for white and for dark ground"),
         (key == "form" and value not in METHOD_FORMS, f"one of {', '.join(METHOD_FORMS)}"),
         (not is_list, f"a list of entries with {entries}: keys a list of names, all others texts"),
-        (key == "knob" and not _is_knob(value), "the place of a parameter and the values to try: {place: TEXT, values: [NUMBER, ...]}"),
+        (key == "knob" and not (isinstance(value, Mapping) and set(value) == {"place", "values"}), "the place of a parameter, and the values to try"),
         (key == "baselines" and not _is_list_of_names(value), "a list of filters"),
     )  # fmt: skip
     return next((requirement for is_fault, requirement in faults if is_fault), "")
@@ -151,12 +151,6 @@ def _is_list_of_entries(value: Any, required: set[str], optional: set[str]) -> b
 def _is_list_of_names(value: Any) -> bool:
     """Return whether a value is a list of texts."""
     return isinstance(value, list | tuple) and all(isinstance(item, str) for item in value)
-
-
-def _is_knob(value: Any) -> bool:
-    """Return whether a value is the place of a parameter with distinct numbers."""
-    is_pair = isinstance(value, Mapping) and set(value) == {"place", "values"}
-    return is_pair and isinstance(value["place"], str) and len({*map(float, value["values"])}) > 1
 
 
 def _is_positive(value: Any) -> bool:

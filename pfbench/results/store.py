@@ -312,11 +312,13 @@ def check_metadata(path: Path, meta: Any) -> None:
     must = f"contain {', '.join(missing)}"
     require(not missing, f"{path}: metadata", must, "none of them", "Run the job again.")
     for name, (kind, is_valid) in _KINDS.items():
-        if name in meta and not is_valid(meta[name]):
-            raise ValueError(
-                f"{path}: {name} must be {kind}, got {shorten(repr(meta[name]), 60)}. "
-                "Run the job again."
-            )
+        require(
+            name not in meta or is_valid(meta[name]),
+            f"{path}: {name}",
+            f"be {kind}",
+            shorten(repr(meta.get(name)), 60),
+            "Run the job again.",
+        )
     if fault := _find_state_fault(meta["state"]):
         raise ValueError(f"{path}: state must {fault}. Run the job again.")
 

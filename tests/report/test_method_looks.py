@@ -70,7 +70,7 @@ def test_the_measures_of_colour_know_known_values() -> None:
     )  # fmt: skip
 
 
-OPTIONAL = {"tuning", "summary", "form", "form_of", "cites", "completions"}
+OPTIONAL = {"knob", "tuning", "summary", "form", "form_of", "cites", "completions"}
 
 
 def test_every_method_states_its_own_name_and_look() -> None:
@@ -171,7 +171,8 @@ def test_baselines_exist_and_give_the_planned_pairs() -> None:
     ) == [(f"mcmc_rpf[particles={n}]", f"sir[particles={n}]") for n in (9, 99)]
     tuned = {pair for pair in pairs if "tuning" in read_paper_block("filter", pair[1])}
     assert len(pairs) - len(tuned) == 17
-    controls = {m for m in METHODS if "tuning" in read_paper_block("filter", m)}
+    blocks = {m: read_paper_block("filter", m) for m in METHODS}
+    controls = {m for m, block in blocks.items() if "tuning" in block and not block["proposed"]}
     assert len(controls) >= 4
     assert tuned == {(m, control) for m in {method for method, _ in pairs} for control in controls}
     assert plan_installed_pairs(["mcmc_rpf", "sir"]) == [("mcmc_rpf", "sir")]  # rpf did not run

@@ -306,12 +306,13 @@ def check_adaptations(
         "Set filter.iterations=1.",
     )
     judges = [type(a).__name__ for a in noise_adaptations if not states_evidence(a)]
-    if len(judges) > 1:
-        raise ValueError(
-            "filter.noise_adaptations must contain at most one that uses the measurement of the "
-            f"step, got {' and '.join(judges)}. Remove all but one: the same innovation would count "
-            "twice."
-        )
+    require(
+        len(judges) <= 1,
+        "filter.noise_adaptations",
+        "contain at most one that uses the measurement of the step",
+        " and ".join(judges),
+        "Remove all but one: the same innovation would count twice.",
+    )
 
 
 # --------------------------------------------------------------------------------------------------

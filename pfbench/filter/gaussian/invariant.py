@@ -50,12 +50,13 @@ class InvariantFilter:
             self.chart,
             "Use left for position fixes.",
         )
-        if not isinstance(self.filter, (GaussianFilter, ParticleFilter)):
-            raise ValueError(
-                "filter.filter must be GaussianFilter or ParticleFilter, got "
-                f"{self.filter if isinstance(self.filter, str) else type(self.filter).__name__}. "
-                "Select it by name as filter@filter.filter=ukf."
-            )
+        require(
+            isinstance(self.filter, (GaussianFilter, ParticleFilter)),
+            "filter.filter",
+            "be GaussianFilter or ParticleFilter",
+            self.filter if isinstance(self.filter, str) else type(self.filter).__name__,
+            "Select it by name as filter@filter.filter=ukf.",
+        )
 
     @property
     def is_exact(self) -> bool:

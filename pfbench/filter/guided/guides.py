@@ -430,8 +430,10 @@ FACTOR_RULE = "(0, inf] Use 1 for no change."
 def check_normal_guide(guide_filter: object) -> None:
     """Check that a guide filter takes the measurement errors as normal."""
     update = getattr(guide_filter, "measurement_update", None)
-    if update is not None:
-        raise ValueError(
-            "proposal.guide_filter.measurement_update must be null in a proposal, got "
-            f"{type(update).__name__}. Remove it: the weights contain the distribution."
-        )
+    require(
+        update is None,
+        "proposal.guide_filter.measurement_update",
+        "be null in a proposal",
+        type(update).__name__,
+        "Remove it: the weights contain the distribution.",
+    )

@@ -270,11 +270,13 @@ def _check_sizes(
             f"{' '.join(options) or 'the scenario and the model of the training'}."
         )
     frame = content.get("frames", {}).get(key, learnable.frame)  # missing in older files
-    if frame != learnable.frame:
-        raise ValueError(
-            f"checkpoint must correct {learnable.frame}, got {frame} in {path}. Set "
-            f"filter={choices.get('filter', 'NAME')} as in the training, or train this filter."
-        )
+    require(
+        frame == learnable.frame,
+        "checkpoint",
+        f"correct {learnable.frame}",
+        f"{frame} in {path}",
+        f"Set filter={choices.get('filter', 'NAME')} as in the training, or train this filter.",
+    )
     for (name, label), size, stored in zip(
         SIZES.items(), sizes, content["sizes"][key], strict=True
     ):

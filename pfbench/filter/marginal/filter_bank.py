@@ -110,11 +110,13 @@ class FilterBank(HypothesisFilter):
         """Return the name of the group that is split."""
         if self.group is None:
             return "position" if "position" in model.groups else next(iter(model.groups))
-        if self.group not in model.groups:
-            raise ValueError(
-                f"filter.group must be of {', '.join(model.groups)}, got {self.group}. "
-                "Choose a component group of the model."
-            )
+        require(
+            self.group in model.groups,
+            "filter.group",
+            f"be of {', '.join(model.groups)}",
+            self.group,
+            "Choose a component group of the model.",
+        )
         return self.group
 
     @override

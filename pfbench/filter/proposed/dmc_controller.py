@@ -151,10 +151,13 @@ def state_indices(model: StateSpaceModel, key: str, names: Sequence[str]) -> lis
 def _expand(name: str, value: float | Sequence[float], template: Tensor, n: int) -> Tensor:
     """Expand one number to n, or check the number of several."""
     numbers = torch.as_tensor(value).to(template)
-    if numbers.numel() not in (1, n):
-        raise ValueError(
-            f"controller.{name} must have 1 or {n} numbers, got {numbers.numel()}. Set one or {n}."
-        )
+    require(
+        numbers.numel() in (1, n),
+        f"controller.{name}",
+        f"have 1 or {n} numbers",
+        numbers.numel(),
+        f"Set one or {n}.",
+    )
     return numbers.expand(n)
 
 

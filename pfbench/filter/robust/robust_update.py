@@ -52,16 +52,20 @@ class ComponentGrouping:
     groups: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
-        if self.kind not in GROUPINGS:
-            raise ValueError(
-                f"grouping must be {', '.join(GROUPINGS[:-1])} or {GROUPINGS[-1]}, got "
-                f"{self.kind}. Choose one of them."
-            )
-        if not all(isinstance(number, int) for number in self.groups or ()):
-            raise ValueError(
-                f"groups must be a whole number for each component, got {list(self.groups or ())}. "
-                "Give components of one group the same number."
-            )
+        require(
+            self.kind in GROUPINGS,
+            "grouping",
+            f"be {', '.join(GROUPINGS[:-1])} or {GROUPINGS[-1]}",
+            self.kind,
+            "Choose one of them.",
+        )
+        require(
+            all(isinstance(number, int) for number in self.groups or ()),
+            "groups",
+            "be a whole number for each component",
+            list(self.groups or ()),
+            "Give components of one group the same number.",
+        )
 
     def numbers(self, components: int) -> Sequence[int] | None:
         """Return the group number of each component, None for groups of equal variance."""

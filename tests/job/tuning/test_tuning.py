@@ -8,6 +8,7 @@ import shlex
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import reduce
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -116,16 +117,17 @@ def test_the_knobs_reach_the_filter(method: str) -> None:
 
 
 def stated_values(built: Any, place: str) -> dict[str, float]:
-    """Read the factor on R and the knob from a built filter; the factor stands in front of other adaptations."""
-    name = place.rpartition(".")[2]
+    """Read the factor on R and the knob from a built filter; the factor stands before other adaptations."""
+    *path, name = place.split(".")
     guided = getattr(getattr(built, "proposal", None), "guide_filter", built)
-    stages = getattr(guided, "noise_adaptations", None)
-    r_factor = (stages[0] if stages else built.weight_update).r_factor
-    shift = sum(place.startswith("noise_adaptations") and len(stages) > 1 for _ in "1")
-    part = built
-    for key in place.split("."):
-        part = part[int(key) + shift] if key.isdigit() and part is stages else part[int(key)] if key.isdigit() else getattr(part, key)
-    return {"r_factor": r_factor, name: part}
+    stages = getattr(guided, "noise_adaptations", ())
+    if path[0] == "noise_adaptations" and name != "q_factor":
+        path[1] = str(int(path[1]) + 1)
+    part = reduce(
+        lambda node, key: node[int(key)] if key.isdigit() else getattr(node, key), path, built
+    )
+    scaled = stages[0] if stages else built.weight_update
+    return {"r_factor": scaled.r_factor, name: getattr(part, name)}
 
 
 def test_named_sets_are_lists_of_installed_filters() -> None:
@@ -197,8 +199,11 @@ def test_a_file_states_the_best_filter_of_its_world_and_whether_kalman_filters_f
             errors[f"{method}_tuned"] = choose_candidate(candidates)
     scenario = job.compose([f"scenario={content['world']['scenario']}"]).values["scenario"]
     limit = scenario["paper"].get("divergence_threshold") or 0.0
-    for method, choice in errors.items():  # unless the limit is below an error
-        if max(choice.errors.values()) < limit:
+    for (
+        method,
+        choice,
+    ) in errors.items():  # unless the limit is below an error, or other runs decide
+        if "first_run" not in fit and max(choice.errors.values()) < limit:
             assert fit["objectives"][method] == pytest.approx(choice.log_ratio, abs=1e-5)
     assert {"ekf", *errors} <= set(fit["objectives"]) <= {"ekf", "ukf", *errors}
     assert fit["objectives"][content["best"]] == min(fit["objectives"].values())
@@ -286,7 +291,9 @@ def test_a_search_finds_that_errors_are_larger_than_the_model_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Outliers of 10 sd in 5 % of the epochs have six times the variance: R x 4 is better than R."""
-    monkeypatch.setattr(tuning, "KNOBS", {"ekf_scaled": Knob("noise_adaptations.0.q_factor", (1.0,))})
+    monkeypatch.setattr(
+        tuning, "KNOBS", {"ekf_scaled": Knob("noise_adaptations.0.q_factor", (1.0,))}
+    )
     monkeypatch.chdir(tmp_path)
     tune_filters([
         "scenario=linear_walk", "scenario.steps=60", "runs=20", "filter=ekf_scaled",
@@ -399,7 +406,7 @@ def test_a_filter_is_added_to_the_file_of_its_world(
         (["scenario=linear_walk", "r_factors=1,many"], r"r_factors must be positive numbers, got 1,many"),
         (["scenario=linear_walk", "name=../x"], r"name must consist of letters.*got '../x'\. It"),
         (["scenario=linear_walk", "name=auto"], r"name must.*not be auto or nominal, got 'auto'\. It"),
-        (["scenario=linear_walk", "fit_runs=21"], r"fit_runs must be at least 2 and at most runs=20.*got 21\. Default"),
+        (["scenario=linear_walk", "fit_runs=1"], r"fit_runs must be at least 2.*got 1\. Default"),
         (["scenario=linear_walk", "fit_particles=1"], r"fit_particles must be at least 2.*got 1\. Default"),
         (["scenario=linear_walk", "runs=1"], r"runs must be at least 2 for a tuning, got 1\. Default"),
         (["scenario=passiv_1"], r"scenario=passiv_1 does not exist. Similar: passive_1"),
