@@ -16,14 +16,15 @@ from pfbench.report.overview.tables import (
     EQUAL_TIME,
     PRINTED,
     SIR,
+    TUNED,
     Overview,
     TabKey,
     World,
     find_outdone,
-    is_worse,
-    list_plain_losses,
-    list_rivals,
     list_world_notes,
+    name_size,
+    name_word,
+    pair_forms,
     tell_story,
 )
 from pfbench.report.page_kit import (
@@ -75,7 +76,9 @@ def render_overview(
         "level": level,
         "has_doses": len(_select_levels(overviews)) > 1,
         "others": [
-            (_name_tab(key, item), _suffix(key)) for key, item in overviews.items() if key != level
+            (_name_tab(key, item), _suffix(key))
+            for key, item in overviews.items()
+            if key not in (level, TUNED)
         ],
         "headline": word_headline(overview, overviews.get(EQUAL_TIME)),
         "setting": describe_setting(overview, level),
@@ -92,7 +95,8 @@ def render_overview(
         "format_reference": figures.format_reference,
         "filters": [overview.names[label] for label in overview.columns],
         "stories": [tell_story(overview, m, _summary(m)) for m in overview.methods],
-        "rivals": list_rivals(overview),
+        "tuned": describe_tuned(overview, overviews[TUNED]) if TUNED in overviews else "",
+        "price": describe_price(overview) if TUNED in overviews else "",
         "count": spell_number(len(overview.methods)),
         "pictures": {
             name: Markup(format_data_address("svg", text.encode()))
@@ -124,6 +128,7 @@ def list_overview_blocks(page: Mapping[str, Any]) -> list[Block]:
         Block("text", page["foreign_knobs"]),
         Block("text", Markup("![Ratio of the error of each method to that of the best Kalman filter, in each world](heat_map.svg)")),
         Block("text", Markup("![Worlds in which each method is better and worse than each other](matrices.svg)")),
+        Block("text", f"The {page['count']} tuned as the baselines are. {page['tuned']} {page['price']}" if page["tuned"] else ""),
         *with_heading(
             Block("text", "Before you quote a number of these worlds:"), Block("list", [f"{name}: {text}." for name, text in page["notes"]])
         ),
@@ -187,7 +192,7 @@ def draw_pictures(overviews: Mapping[TabKey, Overview]) -> dict[str, str]:
         suffix = "" if key == first else _suffix(key)
         for size in figures.HEAT_FORMATS:
             pictures[f"heat_map{suffix}{size.name}"] = figures.draw_heat_map(overview, size)
-        for size in figures.MATRIX_FORMATS:
+        for size in figures.MATRIX_FORMATS if key != TUNED else ():
             pictures[f"matrices{suffix}{size.name}"] = figures.draw_matrices(overview, size)
     if len(levels) > 1:
         worlds = order_dose_worlds(overviews[first])
@@ -206,6 +211,36 @@ def order_dose_worlds(overview: Overview) -> list[World]:
         (w for w in overview.worlds if any(c.verdict.ratio > 0 for c in overview.cells if c.world == w.key)),
         key=lambda w: (w.facts.kalman_fits is not False, -wins[w.key]),
     )  # fmt: skip
+
+
+def describe_tuned(overview: Overview, tuned: Overview) -> str:
+    """Say how the words of the methods change if they are tuned as the baselines are."""
+    worlds = {world.key: world.part_name.name for world in tuned.worlds}
+    pairs = pair_forms(overview, tuned)
+    words = Counter(name_word(cell) for _, cell in pairs)
+    changed = [(a, b) for a, b in pairs if name_word(a) != name_word(b)]
+    turned = [(a, b) for a, b in changed if {name_word(a), name_word(b)} == {"better", "worse"}]
+    texts = [
+        f"{overview.names[a.filter]} in {worlds[a.world]}: {name_word(a)} ({name_size(a)}), tuned {name_word(b)} ({name_size(b)})"
+        for a, b in (*turned, *(pair for pair in changed if pair not in turned))
+    ]
+    return (
+        f"Each has 16 candidates, runs and seed as the baselines. Tuned, they are {', '.join(f'{word} in {n}' for word, n in words.items())} "
+        f"of {len(pairs)} cells. {len(turned) or 'None'} turn{'s' * (len(turned) < 2)} from blue to orange or back; {len(changed)} have another word. {'; '.join(texts)}."
+    )
+
+
+def describe_price(overview: Overview) -> str:
+    """Say what the tuning of the methods took, and what it would take where they are not tuned."""
+    names = {parse_label(label)[0]: overview.names[label] for label in overview.methods}
+    tunings = {w.part_name.name: w.facts.tuning for w in overview.worlds}
+    seconds = sum(t[n]["seconds"] for t in tunings.values() for n in names if n in t)
+    lacking = {w: t["not_tuned_hours"] for w, t in tunings.items() if "not_tuned_hours" in t}
+    texts = [
+        f"{world}, {'all' if len(hours) == len(names) else ' and '.join(names[n] for n in hours)}: {sum(hours.values()):.2g} CPU hours"
+        for world, hours in lacking.items()
+    ]
+    return f"The tuning took {seconds / 60:.0f} CPU minutes. Not tuned in this world: {'; '.join(texts) or 'none'}."
 
 
 def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> str:
@@ -287,23 +322,8 @@ def _describe_reference(overview: Overview) -> str:
         for world, v in outdone
         if v
     ]
-    text = "The best Kalman filter of a world was chosen on another seed, tuned ones among the candidates"
-    blocks = [read_paper_block("filter", parse_label(method)[0]) for method in overview.methods]
-    if any(block.get("tuning") for block in blocks):
-        text += "."
-    else:
-        text += f"; the methods are not tuned{_count_plain_losses(overview)}."
-    if better:
-        text += f" In these runs another one is better: {', '.join(better)}."
-    return text
-
-
-def _count_plain_losses(overview: Overview) -> str:
-    """Say how many of the worse cells remain against a Kalman filter that is not tuned either; empty without it."""
-    worse, plain = sum(map(is_worse, overview.of_methods)), list_plain_losses(overview)
-    if not worse or plain is None:
-        return ""
-    return f". Of the {worse} worse cells, {len(plain)} are worse also than the UKF, which is not tuned either"
+    text = "The best Kalman filter of a world was chosen on another seed, tuned ones among the candidates; the methods are not tuned."
+    return text + (f" In these runs another one is better: {', '.join(better)}." if better else "")
 
 
 def list_notes(overview: Overview) -> list[tuple[str, str]]:

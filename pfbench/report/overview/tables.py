@@ -33,9 +33,9 @@ CENTRAL = "nominal"  # regime of the page, if a world has several
 SIR = "sir"
 CONVENTIONAL = (SIR, "rpf", "rpf_tuned", "ekf_bank")  # that stand next to the methods
 METRIC = "rmse"  # of all words of the page
-DEAD_RECKONING, PLAIN = "dead_reckoning", "ukf"  # the second is as little tuned as the methods
-TabKey = int | str  # a number of particles, 0 for a study of one number, or one of the two below
-EQUAL_TIME, PRINTED = "equal time", "as printed"
+DEAD_RECKONING, PLAIN = "dead_reckoning", "ukf"
+TabKey = int | str  # a number of particles, 0 for a study of one number, or one of those below
+EQUAL_TIME, PRINTED, TUNED = "equal time", "as printed", "tuned"
 _TUNING_BYTES = 1_000_000
 _WORDS = ("better", "worse", *EQUAL_WORDS, "not decided")
 _FAMILIES = ("particle", "guided", "swarm", "gaussian", "learned", "kalman", "")
@@ -48,11 +48,13 @@ class WorldFacts(NamedTuple):
         reference: Best conventional filter.
         kalman_fits: Whether Kalman filters fit the world; None if it is not known.
         has_part: Whether the tuning had settings of the scenario of its own, such as a part of a recording.
+        tuning: All that the file states, such as the computing time of each filter.
     """
 
     reference: str
     kalman_fits: bool | None
     has_part: bool = False
+    tuning: Mapping[str, Any] = MappingProxyType({})
 
 
 class World(NamedTuple):
@@ -189,6 +191,7 @@ def read_world_facts(scenario: str, model: str) -> WorldFacts | None:
                         str(content["best"]),
                         content.get("kalman_fits"),
                         bool(world.get("settings")),
+                        content,
                     ),
                 )
             )
@@ -226,6 +229,11 @@ def is_printed(look: MethodLook) -> bool:
     return look.proposed and _read_form(look).get("form") == "printed"
 
 
+def is_tuned(look: MethodLook) -> bool:
+    """Return whether a filter is a proposed method with knobs that a tuning chose."""
+    return look.proposed and _read_form(look).get("form") == "tuned"
+
+
 def _read_form(look: MethodLook) -> Mapping[str, Any]:
     """Return the statements of the file of a filter on its form."""
     return read_paper_block("filter", parse_label(look.key)[0])
@@ -253,11 +261,6 @@ def plan_world_pairs(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> di
         references = [label for label in looks if parse_label(label)[0] in bases]
         pairs[str(name)] = [*methods, *((a, b) for b in references for a in looks if a != b)]
     return pairs
-
-
-def is_worse(cell: WorldCell) -> bool:
-    """Return whether a filter is worse than the reference of its world, and does not lose track."""
-    return cell.verdict.word == "worse" and not cell.loses_track
 
 
 def decide_cells(worlds: Sequence[World], filters: Sequence[str]) -> list[WorldCell]:
@@ -303,19 +306,6 @@ def find_outdone(world: World, single: Sequence[str]) -> Verdict | None:
     verdicts = [world.find(world.reference, name) for name in others]
     worse = [verdict for verdict in verdicts if verdict.word == "worse"]
     return max(worse, key=lambda v: v.ratio if v.ratio > 0 else math.inf, default=None)
-
-
-def list_plain_losses(overview: Overview) -> list[WorldCell] | None:
-    """List the cells of methods that are worse than the reference and than the plain UKF; None without a UKF in a world."""
-    worlds = {world.key: world for world in overview.worlds}
-    if any(PLAIN not in world.labels for world in overview.worlds):
-        return None
-    return [
-        cell
-        for cell in filter(is_worse, overview.of_methods)
-        for world in [worlds[cell.world]]
-        if world.reference == PLAIN or world.find(cell.filter, PLAIN).word == "worse"
-    ]
 
 
 def list_world_notes(world: World) -> list[str]:
@@ -373,7 +363,6 @@ def build_overviews(
     """
     levels, timed = list_levels(looks), [label for label in looks if _has_equal_time(label)]
     rest = [label for label in looks if label not in timed]
-    printed = [label for label, look in looks.items() if is_printed(look)]
     tabs: dict[TabKey, _Tab] = {
         key: _Tab([label for label in rest if _level(label) in (None, key)], key) for key in levels
     }
@@ -382,10 +371,12 @@ def build_overviews(
         names = {name_without_level(label) for label in timed}
         fixed = [label for label in looks if _level(label) is None and label not in names]
         tabs[EQUAL_TIME] = _Tab([*timed, *fixed])
-    if len(printed) >= FEWEST_METHODS:
-        number = table.loc[table["filter"].isin(printed), "particles"].dropna().median()
-        others = [v for v in rest if _level(v) in (None, number) and not is_method(looks[v])]
-        tabs[PRINTED] = _Tab(others, 0, is_printed)
+    for form, is_shown in ((PRINTED, is_printed), (TUNED, is_tuned)):
+        shown = [label for label, look in looks.items() if is_shown(look)]
+        if len(shown) >= FEWEST_METHODS:
+            number = table.loc[table["filter"].isin(shown), "particles"].dropna().median()
+            others = [v for v in rest if _level(v) in (None, number) and not is_method(looks[v])]
+            tabs[form] = _Tab(others, 0, is_shown)
     central = {
         str(key): central_rows(rows).iloc[0]
         for key, rows in table.groupby("scenario", observed=True, sort=False)
@@ -434,7 +425,7 @@ def _build_tab(
         court.runs.conditions["scenario"],
     )
     where = {v: set(scenarios[present[court.runs.filters.index(v)]]) for v in tab.labels}
-    swept = [v for v in tab.labels if tab.is_shown is is_printed or name_without_level(v) != v]
+    swept = [v for v in tab.labels if tab.is_shown is not is_method or name_without_level(v) != v]
     swept = [v for v in swept if tab.is_shown(looks[v])] or list(tab.labels)
     keys = [key for key in central if any(key in where[v] for v in swept)]
     labels = {name_without_level(v): v for v in tab.labels if where[v] & set(keys)}
@@ -599,7 +590,7 @@ def tell_story(overview: Overview, method: str, summary: str) -> dict[str, str]:
         return "; ".join(
             names[cell.world]
             + (
-                f" ({_size(cell)}{'†' if cell.world in dagger else ''})"
+                f" ({name_size(cell)}{'†' if cell.world in dagger else ''})"
                 * (word in ("better", "worse"))
             )
             for word in words
@@ -623,25 +614,26 @@ def _distance(cell: WorldCell) -> float:
     return abs(math.log(cell.verdict.ratio)) if cell.verdict.ratio > 0 else math.inf
 
 
-def _size(cell: WorldCell) -> str:
+def name_size(cell: WorldCell) -> str:
     """Format the ratio of a cell; the share of runs that keep track where lost runs leave none."""
     if cell.verdict.ratio > 0:
         return f"{cell.verdict.ratio:.2f}"
     return f"{100 * cell.track_share:.0f} % keep track"
 
 
-def list_rivals(overview: Overview) -> list[tuple[str, str, str, str]]:
-    """List each pair of methods with the worlds in which the first is better, and those in which the second is."""
-    names = {world.key: world.part_name.name for world in overview.worlds}
-    rows: dict[tuple[str, str], dict[str, list[str]]] = {}
-    for pair in overview.pairs:
-        worlds = rows.setdefault((pair.verdict.a, pair.verdict.b), {"better": [], "worse": []})
-        if pair.verdict.word in worlds:
-            worlds[pair.verdict.word].append(names[pair.world])
-    return [
-        (overview.names[a], overview.names[b], "; ".join(w["better"]), "; ".join(w["worse"]))
-        for (a, b), w in rows.items()
-    ]
+def pair_forms(overview: Overview, tuned: Overview) -> list[tuple[WorldCell, WorldCell]]:
+    """Pair the cells of methods with those of their tuned forms."""
+    cells = {
+        (cell.world, f"{parse_label(cell.filter)[0]}_tuned"): cell for cell in overview.of_methods
+    }
+    keys = [((cell.world, parse_label(cell.filter)[0]), cell) for cell in tuned.of_methods]
+    return [(cells[key], cell) for key, cell in keys if key in cells]
+
+
+def name_word(cell: WorldCell) -> str:
+    """Name the word of a cell for a reader."""
+    plain = "equal" if cell.verdict.word in EQUAL_WORDS else cell.verdict.word
+    return "loses track" if cell.loses_track else plain
 
 
 def format_times(overview: Overview, method: str) -> str:
