@@ -32,6 +32,7 @@ _HEAD = f"""\
 # Worlds in which pfbench has tuned filters: knobs that `pfbench tune` chose, what they were chosen by, and whether Kalman filters fit.
 # Objective, unless an entry states another: {_OBJECTIVE}.
 # The rule of `fit` is `FIT_RULE` of pfbench/job/tuned_files.py, and its ratios have both ends of their interval. All candidates are in experiments/analyses/tuned_candidates.parquet.
+# `not_tuned_hours`: computing time that the tuning of a method would take, estimated from the times per step of the study all_seven.
 """
 
 

@@ -166,22 +166,17 @@ def test_stored_knobs_are_the_choice_among_the_stored_candidates(name: str) -> N
     content = read_tuned(name)
     methods = [method for method in TUNED_METHODS if "unsupported" not in content[method]]
     assert "ekf_scaled" in methods  # the control
-    has_particles = "scale" in content.get("rpf", {})
-    for method in [*methods, *["rpf"] * has_particles]:
+    for method in [m for m in KNOBS if "r_factor" in content.get(m, {})]:
         candidates, untuned = to_candidates(tuned_table.read_candidates(name, method))
         choice = choose_candidate(candidates)
         assert choice.values == {key: content[method][key] for key in choice.values}
         assert [c.values for c in candidates] == list_candidates(method)
         assert untuned.values == {}
         assert set(untuned.errors) == set(content["world"]["regimes"])
-        words = [f"tuned={name}", f"filter={method}_tuned"]
-        if method == "rpf":
-            node = job.compose(words).values["filter"]
-            stated = {**node["resampler"], **node["weight_update"]}
-        else:
-            stated = stated_knobs(words)
-        assert {key: stated[key] for key in choice.values} == choice.values
-        config = job.compose(words).values
+        config = job.compose([f"tuned={name}", f"filter={method}_tuned"]).values
+        plain = job.compose([f"filter={method}"]).values["filter"]
+        stated = {**apply_candidate(plain, choice.values), "paper": config["filter"]["paper"]}
+        assert config["filter"] == stated  # the filter with the chosen candidate, and nothing else
         assert config["filter"]["paper"]["tuning"] == content["data"]
         assert "tuned" not in config  # else the key of every job would change with the record
 
