@@ -398,7 +398,7 @@ def tie() -> str:
     size = format_with_interval(row["ratio"], row["ratio_low"], row["ratio_high"])
     return (
         f"At 200 m/s in place of 20 m/s, in nominal noise, RPF has {size} times the error of the same tuned EKF in [50 paired runs](reports/robust_simulated/report.md): "
-        f"{row['words']}."
+        f"{row['words']}. `pfbench open study=robust_simulated` shows its view."
     )
 
 

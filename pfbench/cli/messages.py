@@ -351,7 +351,11 @@ def describe_unknown(error: BaseException) -> str:
     calls = traceback.extract_tb(error.__traceback__)
     if own_frames := [call for call in calls if Path(call.filename).parent.match(WRITTEN)]:
         return f"{own_frames[-1].name} of your class must succeed, got {reason}. Correct the line: {own_frames[-1].line}"
-    subject = str(path) if path else "the words of the command and the files that they name"
+    subject = (
+        str(path)
+        if path
+        else "the words of the command, the files that they name, and a class of your own by pfbench check"
+    )
     return f"{name} must succeed, got {reason}. Check {subject}."
 
 

@@ -113,7 +113,7 @@ def test_only_what_pfbench_raises_itself_counts_as_a_sentence() -> None:
         assert not is_named(error_of(call, argument))
     text = describe_unknown(error_of(natural_sort_key, 3))
     assert text.startswith("comparing the filters must succeed, got TypeError: expected string or")
-    assert text.endswith(". Check the words of the command and the files that they name.")
+    assert text.endswith(" and a class of your own by pfbench check.")
 
 
 def test_the_trace_of_an_unforeseen_error_is_kept_in_a_file(

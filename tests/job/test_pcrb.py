@@ -320,18 +320,10 @@ def test_differing_initial_laws_are_averaged_as_information() -> None:
 
 
 BELIEVED = StrapdownTuning(
-    1e-2,
-    0.1,
-    1e-4,
-    1e-3,
-    [1.0, 2.0, 3.0],
-    None,
-    [1.0, 2.0, 3.0],
-    [0.1, 0.2, 0.3],
-    [1.0, 2.0, 3.0],
-    0.1,
-    0.2,
-)
+    gyro_density=1e-2, accelerometer_density=0.1, gyro_bias_walk=1e-4, accelerometer_bias_walk=1e-3,
+    position_sd=[1.0, 2.0, 3.0], velocity_sd=None, attitude_sd_deg=[1.0, 2.0, 3.0], initial_velocity_sd=[0.1, 0.2, 0.3],
+    initial_position_sd=[1.0, 2.0, 3.0], gyro_bias_sd_deg_s=0.1, accelerometer_bias_sd=0.2,
+)  # fmt: skip
 
 
 def test_in_a_curved_chart_it_is_the_kalman_filter_linearised_along_the_truth() -> None:

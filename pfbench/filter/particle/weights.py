@@ -264,7 +264,7 @@ class PowerLikelihoodUpdate(WeightUpdate):
         return self.is_exact
 
     def temper(self, model: StateSpaceModel) -> StateSpaceModel:
-        """Return the model with the likelihood of the weights, by which the flow accepts.
+        """Return the model with the likelihood of the weights, for the flow to accept by.
 
         It is not linear, since a linear model has a shorter way that does not ask for the likelihood.
         """

@@ -190,8 +190,8 @@ def _find_unit(
 ) -> tuple[tuple[str, str], float, float]:
     """Return columns in another unit and its name, '' for none, with the offset and the score of their turns.
 
-    A yaw within a turn is in radians: a short log without turns can agree with any unit. Units that agree as well are
-    told apart by the size of the turns, of a gyroscope in rad/s or in deg/s.
+    A yaw within a turn is in radians: a short log without turns can agree with any unit. Units that agree equally are
+    distinguished by the size of the turns, of a gyroscope in rad/s or in deg/s.
     """
     results = []
     is_within_a_turn = float(np.abs(log.reference.angles[:, 2]).max()) <= 2.0 * np.pi

@@ -1,4 +1,4 @@
-"""Errors of a run without those of which one record shows a single draw."""
+"""Errors of a run without parts that a record shows one draw of, such as an offset or a slow oscillation."""
 
 from __future__ import annotations
 

@@ -175,7 +175,7 @@ class Overview(NamedTuple):
 
 
 def read_world_facts(scenario: str, model: str) -> WorldFacts | None:
-    """Read the facts of a world from the files of tunings, the nominal regime and the scenario as it is first; None without one.
+    """Read the facts of a world from the files of tunings, the nominal regime and the scenario without changes first; None without one.
 
     They are those of pfbench, and those that `pfbench tune` wrote into `conf` of the current folder.
     """
