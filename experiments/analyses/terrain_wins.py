@@ -157,8 +157,7 @@ def terrain_table(
         label: np.mean([table.fillna(LOST).median().rank()[label] for table in errors.values()])
         for label in families
     }
-    times = runs.groupby("filter")["ms"].median()
-    lines = markdown_head("filter", *(f"{dose:g} m" for dose in errors), "ms/step")
+    lines = markdown_head("filter", *(f"{dose:g} m" for dose in errors))
     for label in sorted(ranks, key=lambda key: ranks[key]):
         cells = []
         for dose, table in errors.items():
@@ -167,7 +166,7 @@ def terrain_table(
                 pairs[dose][label].word if label in kalman else "", ""
             )
             cells.append(f"{format_median(table[label].to_numpy())}, {share}{mark}")
-        lines.append(markdown_row(f"`{label}`", *cells, f"{times[label]:.3g}"))
+        lines.append(markdown_row(f"`{label}`", *cells))
     single = [label for label in kalman if label not in BANKS]
     ends = [describe_wins(pairs, single), *(describe_wins(pairs, [bank]) for bank in BANKS)]
     return "\n".join(

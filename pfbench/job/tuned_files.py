@@ -71,7 +71,10 @@ def _list_methods(results: Sequence[TuningResult], unsupported: Mapping[str, str
     for result in results:
         yield f"{result.method}:"
         yield from (f"  {key}: {json.dumps(value)}" for key, value in result.choice.values.items())
-        if _has_no_effect(result):
+        if (
+            len({(c.log_ratio, *c.errors.values()) for c in (*result.candidates, result.untuned)})
+            == 1
+        ):
             yield f"  note: {json.dumps(_NO_EFFECT)}"
         if result.particles is not None:
             yield f"  particles: {result.particles}"
@@ -93,13 +96,6 @@ def _list_fit(fit: WorldFit) -> Iterator[str]:
     yield "  ratios:  # with both ends of the interval"
     for name, ratio in fit.ratios.items():
         yield f"    {name}: [{', '.join(f'{number:.{_DIGITS}g}' for number in ratio)}]"
-
-
-def _has_no_effect(result: TuningResult) -> bool:
-    """Return whether all candidates have the score of the filter without tuned knobs."""
-    return (
-        len({(c.log_ratio, *c.errors.values()) for c in (*result.candidates, result.untuned)}) == 1
-    )
 
 
 def _list_rows(result: TuningResult) -> Iterator[list[str]]:

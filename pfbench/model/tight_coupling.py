@@ -396,7 +396,17 @@ class SinsGnssTightNl(_TightModel):
         dv_end = dv + span * (u.f.unsqueeze(1) - force + level.free_acceleration(dv_middle, middle))
         end = start + span * level.drift(0.5 * (dv + dv_end), middle)
         clock = torch.cat([clock[..., :1] + span * clock[..., 1:], clock[..., 1:]], -1)
-        return torch.cat([q, dv_end, _metres(end, u.pos_end), gyro, accelerometer, clock], -1)
+        return torch.cat(
+            [
+                q,
+                dv_end,
+                end * earth.metre_scale(u.pos_end.unsqueeze(1) - end),
+                gyro,
+                accelerometer,
+                clock,
+            ],
+            -1,
+        )
 
 
 class _Level(NamedTuple):
@@ -447,11 +457,6 @@ def _scale_true(dp: Tensor, pos: Tensor) -> Tensor:
     for _ in range(2):
         lat = pos[:, :1] - dp[..., 0] / (earth.radii(lat)[0] + height)
     return earth.metre_scale(torch.stack([lat, lat, height], -1))
-
-
-def _metres(offset: Tensor, pos: Tensor) -> Tensor:
-    """Convert offsets (rad, rad, m) from pos [R, 3] to metres at the truth [R, N, 3]."""
-    return offset * earth.metre_scale(pos.unsqueeze(1) - offset)
 
 
 def _conjugate(q: Tensor) -> Tensor:

@@ -386,7 +386,9 @@ def _decide_one(
         low, high = min(low, 0.0), max(high, 0.0)
     word, reason = _choose_word(effect, (p, evidence), (location, low, high), (margin, alpha))
     if effect.has_ratio:
-        decided = decided._replace(low=math.exp(low), high=_exp(high))
+        decided = decided._replace(
+            low=math.exp(low), high=math.exp(high) if high < 700.0 else math.inf
+        )
     else:
         decided = decided._replace(low=math.nan, high=math.nan)
         reason = describe_lost(effect)
@@ -456,11 +458,6 @@ def flip(verdict: Verdict) -> Verdict:
         a=verdict.b, b=verdict.a, word=words.get(verdict.word, verdict.word), ratio=ratio, low=low, high=high,
         lost=LostRuns(b, a, both, losses.get(loses, "")), evidence=evidence,
     )  # fmt: skip
-
-
-def _exp(log_ratio: float) -> float:
-    """Return a ratio of any size."""
-    return math.exp(log_ratio) if log_ratio < 700.0 else math.inf
 
 
 def _select_means(d: Array, ranks: Sequence[int]) -> list[float]:

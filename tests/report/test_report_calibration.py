@@ -13,7 +13,9 @@ from scipy import stats
 
 from pfbench.results import conditions, frame, metrics, status, store
 from pfbench.results.conditions import component_groups
-from pfbench.stats.consistency_bands import assess_consistency
+from pfbench.stats.consistency_bands import assess_consistency, compare_share
+
+RNG = np.random.default_rng(3)
 
 ARCMIN = 180 * 60 / np.pi
 METHODS = (
@@ -169,3 +171,31 @@ def test_lost_runs_are_left_out_and_counted_and_few_runs_decide_nothing() -> Non
     (row,) = assess_consistency(table({"a": 9.0}, 1, runs=9)).to_dict("records")
     assert (row["word"], row["reason"]) == ("no deviation shown", "9 valid runs, 10 are required")
     assert (row["low"], row["high"], row["p"]) == (0.0, math.inf, pytest.approx(1.0))
+
+
+def shares(correlation: float, studies: int, runs: int, sd: float = 1.0) -> np.ndarray:
+    """Share of 100 steps in which a normal error lies within its 90 % interval, [studies, runs]."""
+    error, covered = RNG.standard_normal((studies, runs)), np.zeros((studies, runs))
+    for _ in range(100):
+        error = correlation * error + np.sqrt(1 - correlation**2) * RNG.standard_normal((studies, runs))  # fmt: skip
+        covered += np.abs(sd * error) < stats.norm.isf(0.05)
+    return covered / 100
+
+
+@pytest.mark.parametrize("correlation", [0.5, 0.95, 0.995, 1.0])
+def test_a_word_on_coverage_holds_its_level_for_slow_errors(correlation: float) -> None:
+    """Level of both sides 0.05; Student's test, the row that must fail, exceeds it three times for constant errors."""
+    x = shares(correlation, 300, 12)
+    student = 2 * stats.t.sf(np.abs(x.mean(1) - 0.9) / (x.std(1, ddof=1) / np.sqrt(12) + 1e-9), 11)
+    assert np.mean([compare_share(row, 0.9) < 0.05 for row in x]) <= 0.05 + 3 * math.sqrt(0.05 * 0.95 / 300)  # fmt: skip
+    assert correlation < 1.0 or np.mean(student < 0.05) > 0.15
+
+
+def test_a_coverage_that_is_too_low_is_shown() -> None:
+    assert np.mean([compare_share(row, 0.9) < 0.05 for row in shares(0.95, 100, 30, sd=1.4)]) > 0.9
+
+
+@pytest.mark.parametrize("k", range(13))
+def test_shares_of_0_and_1_have_the_binomial_test(k: int) -> None:
+    tails = stats.binom.sf(k - 1, 12, 0.9), stats.binom.cdf(k, 12, 0.9)
+    assert compare_share(np.arange(12.0) < k, 0.9) == pytest.approx(min(1.0, 2 * min(tails)), abs=1e-12)  # fmt: skip

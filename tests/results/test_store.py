@@ -190,26 +190,18 @@ def test_a_kill_in_the_middle_leaves_no_result_and_the_next_save_sweeps_up(tmp_p
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "b.npz"]
 
 
-def _cut(raw):
-    return raw[: len(raw) // 2]
+DAMAGES = {
+    "cut": lambda raw: raw[: len(raw) // 2],
+    "flip": lambda raw: raw[:200] + bytes(255 - byte for byte in raw[200:400]) + raw[400:],
+    "empty": lambda raw: b"",
+    "prose": lambda raw: b"these are not the results",
+}
 
 
-def _flip(raw):
-    return raw[:200] + bytes(255 - byte for byte in raw[200:400]) + raw[400:]
-
-
-def _empty(raw):
-    return b""
-
-
-def _prose(raw):
-    return b"these are not the results"
-
-
-@pytest.mark.parametrize("damage", [_cut, _flip, _empty, _prose])
+@pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_file_is_named(tmp_path, damage):
     path = store.write_result(tmp_path / "a.npz", meta(), arrays())
-    path.write_bytes(damage(path.read_bytes()))
+    path.write_bytes(DAMAGES[damage](path.read_bytes()))
     check_refused([(r"a\.npz is damaged", lambda: store.read_result(path))], remedy=False)
 
 

@@ -168,7 +168,7 @@ def _of_blocks(common: list[_Common], a: str, b: str, options: JudgeOptions) -> 
 
     def losses(program: str, change: Callable[[Array, Array], Array]) -> tuple[str, Array]:
         of_sequences = zip(common, counts, strict=True)
-        parts = [block_losses(change(_errors(c, program), _path(c)), n, c.cap) for c, n in of_sequences]  # fmt: skip
+        parts = [block_losses(change(_errors(c, program), c.sequence.reference.interpolate_position(c.sequence.epochs.time)), n, c.cap) for c, n in of_sequences]  # fmt: skip
         return program, np.concatenate(parts)
 
     full, steady = (
@@ -192,11 +192,6 @@ def _errors(common: _Common, program: str) -> Array:
     result = common.sequence.results[program]
     places = list(result.meta["state"]["groups"]["position"])
     return np.asarray(result.data["error"][_rows(common, program)][..., places])
-
-
-def _path(common: _Common) -> Array:
-    """Return the positions of the reference at the epochs, m, [T, 3]."""
-    return common.sequence.reference.interpolate_position(common.sequence.epochs.time)
 
 
 def _lost(common: _Common, program: str) -> Flags:

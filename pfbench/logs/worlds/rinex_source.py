@@ -181,8 +181,15 @@ class RinexSource:
         if not files and kind == "O":
             for file in sorted(folder.iterdir()):  # says how to unpack it
                 head = _read_head(file)
-                if "CRINEX VERS" in head or (
-                    head.startswith("\x1f\x8b") and _looks_like_rinex(file)
+                if (
+                    "CRINEX VERS" in head
+                    or (
+                        head.startswith("\x1f\x8b")  # compressed, with the name of observations
+                        and any(
+                            s.lower().endswith(("o", "obs", "rnx", "crx", "d"))
+                            for s in file.suffixes[:-1]
+                        )
+                    )
                 ):
                     check_version(file.name, head)
         label = {"O": "RINEX 3 observation", "N": "RINEX navigation"}[kind]
@@ -213,13 +220,6 @@ def _read_head(file: Path) -> str:
         return ""
     with file.open("rb") as stream:
         return stream.read(_HEAD).removeprefix(b"\xef\xbb\xbf").decode("latin-1")
-
-
-def _looks_like_rinex(file: Path) -> bool:
-    """Return whether the name of a compressed file is that of observations."""
-    return any(
-        suffix.lower().endswith(("o", "obs", "rnx", "crx", "d")) for suffix in file.suffixes[:-1]
-    )
 
 
 def _describe_missing(

@@ -20,8 +20,8 @@ from pfbench.stats.comparison import (
     EQUALITY_MARGIN,
     MIN_RUNS,
     Verdict,
-    estimate_mean,
 )
+from pfbench.stats.consistency_bands import compare_share
 from pfbench.stats.court import Court, find_lost_conditions
 from pfbench.stats.error_measures import Array, Flags
 from pfbench.stats.rank_tests import holm
@@ -218,12 +218,11 @@ def describe_filters(runs: StudyRuns, alpha: float = 0.05) -> dict[str, BoardRow
 
 def word_calibration(coverage: Array, alpha: float) -> list[str]:
     """Return "too low" or "too high" where the mean coverage [F, N] of 90 % intervals is shown to differ; else empty."""
-    estimates = [estimate_mean(row[~np.isnan(row)] - _INTERVAL_LEVEL) for row in coverage]
-    tested = [np.isfinite(e.p) and e.df >= MIN_RUNS - 1 for e in estimates]
-    p = holm([float(e.p) if yes else 1.0 for e, yes in zip(estimates, tested, strict=True)])
+    by_run = [row[~np.isnan(row)] for row in coverage]
+    p = holm([compare_share(a, _INTERVAL_LEVEL) if a.size >= MIN_RUNS else 1.0 for a in by_run])
     return [
-        "" if value >= alpha else "too low" if e.value < 0 else "too high"
-        for e, value in zip(estimates, p, strict=True)
+        "" if value >= alpha else "too low" if a.mean() < _INTERVAL_LEVEL else "too high"
+        for a, value in zip(by_run, p, strict=True)
     ]
 
 

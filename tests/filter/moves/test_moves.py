@@ -471,7 +471,10 @@ def geweke(
         )
         window = cloud.window | {"states": states, "log_like": log_like}
         cloud, rate = MetropolisHastings(kernel, 3)(
-            model, cloud._replace(window=window, past=tuple(records)), rate_of(chains), draws
+            model,
+            cloud._replace(window=window, past=tuple(records)),
+            torch.ones(chains, dtype=torch.bool),
+            draws,
         )
     assert 0.1 < float(rate.mean()) < 0.95
     xi = model.chart.subtract(cloud.window["states"][:, 0, 0], model.origin) / law.stddev
@@ -484,10 +487,6 @@ def geweke(
         + m * (np.triu(covariance, 1) ** 2).sum()
     )
     return float(stats.chi2(2 * d + d * (d - 1) / 2).sf(statistic))
-
-
-def rate_of(chains: int) -> Tensor:
-    return torch.ones(chains, dtype=torch.bool)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -103,10 +103,6 @@ def refreshed(
     return resampler(model, belief, belief.log_w if log_a is None else log_a, n, draws)[0]
 
 
-def inverse(root: Tensor, x: Tensor) -> Tensor:
-    return torch.linalg.solve_triangular(root, x, upper=False)
-
-
 def kept_moments(
     resampler: Any, sharpness: float = 1.0, turn: Tensor | None = None, runs: int = 500
 ) -> tuple[Tensor, Tensor]:
@@ -118,7 +114,7 @@ def kept_moments(
     mean, covariance = weighted_mean_cov(MODEL.chart, before)
     root = torch.linalg.cholesky(covariance[0])
     after = refreshed(resampler, before, n)
-    z = inverse(root, (after.x - mean.unsqueeze(1)).mT).mT
+    z = torch.linalg.solve_triangular(root, (after.x - mean.unsqueeze(1)).mT, upper=False).mT
     w = after.log_w.exp().unsqueeze(-1)
     first, second = (w * z).sum(1), (w * z).mT @ z - torch.eye(4, dtype=torch.float64)
 

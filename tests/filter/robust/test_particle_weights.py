@@ -68,16 +68,15 @@ def huber_factor(e: np.ndarray, r: float, s: float) -> np.ndarray:
     return -loss - math.log(constant)
 
 
-def wolf_factor(e: np.ndarray, r: float, s: float) -> np.ndarray:
-    return stats.norm.logpdf(e) / (1.0 + r * r / 4.0)
-
-
 LAWS: dict[str, tuple[Any, Factor]] = {
     "gate": (InnovationGate(0.99, patience=0), gate_factor),
     "huber": (HuberUpdate(1.5), huber_factor),
     "student": (StudentUpdate(DOF), lambda e, r, s: stats.t.logpdf(e, DOF)),
     "correntropy": (CorrentropyUpdate(2.0), lambda e, r, s: -4.0 * (1 - np.exp(-e * e / 8))),
-    "wolf": (WeightedLikelihoodUpdate(threshold=2.0), wolf_factor),
+    "wolf": (
+        WeightedLikelihoodUpdate(threshold=2.0),
+        lambda e, r, s: stats.norm.logpdf(e) / (1.0 + r * r / 4.0),
+    ),
 }
 
 

@@ -182,10 +182,6 @@ def filtered(model: StrapdownTotal, record: Record) -> FilterResult:
     )
 
 
-def horizontal(error: torch.Tensor) -> float:
-    return float(error[..., 6:8].square().sum(-1).nanmean().sqrt())
-
-
 @recorded
 @pytest.mark.slow
 def test_the_filter_is_as_good_as_the_data_sheet_says() -> None:
@@ -212,7 +208,7 @@ def test_the_filter_is_as_good_as_the_data_sheet_says() -> None:
         found, estimate.mean.split(runs), figures.values(), strict=True
     ):
         error = model.error(mean, model.assemble(episode.truth))
-        assert 0.5 < horizontal(error) < figure
+        assert 0.5 < float(error[..., 6:8].square().sum(-1).nanmean().sqrt()) < figure
         pitch, roll, yaw = torch.rad2deg(error[..., :3].square().mean((0, 1)).sqrt()).tolist()
         assert (
             max(pitch, roll) < 1.5

@@ -114,15 +114,10 @@ def test_scenes_without_a_law_are_recorded_ones() -> None:
         assert scenario in RECORDED
 
 
-def varied(scenario: str) -> bool:
-    """Whether it is another scene with other numbers."""
-    return bool(list_bases("scenario", scenario))
-
-
 @pytest.mark.parametrize(
     "scenario",
     [
-        pytest.param(name, marks=[pytest.mark.slow] if varied(name) else [])
+        pytest.param(name, marks=[pytest.mark.slow] if list_bases("scenario", name) else [])
         for name in SCENES
         if not name.startswith("user_")
     ],
