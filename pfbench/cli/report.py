@@ -63,14 +63,14 @@ def report_study(words: Sequence[str]) -> None:
 
 def check_has_results(study: str, results: Path) -> None:
     """Check that a study has files of results."""
+    from pfbench.report.stored_study import RUNS_FILE
     from pfbench.results.conditions import list_stored_studies
     from pfbench.results.store import list_failures
 
     if any((results / study).glob("*.npz")):
         return
     experiments = {path.stem for path in experiments_dir().glob("*.yaml")}
-    available, failures = list_stored_studies(results), list_failures(results / study)
-    failed, similar = "", ""
+    available, failures, failed, similar = list_stored_studies(results), list_failures(results / study), "", ""  # fmt: skip
     if failures:
         failed = f" {len(failures)} of its jobs failed, the first with {failures[0]['message']}"
     elif study not in experiments:
@@ -79,6 +79,7 @@ def check_has_results(study: str, results: Path) -> None:
         f"study must be a study with results, got {study}.{similar}{failed} "
         f"Studies with results in {results}: {', '.join(available) or 'none'}. "
         f"Run its jobs first: {name_run_command(study)}{describe_missing_runs().rstrip()}"
+        f"{f'. Its published page: pfbench open study={study}' if find_published_file(f'{study}/{RUNS_FILE}') else ''}"
     )
 
 

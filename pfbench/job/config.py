@@ -73,8 +73,8 @@ class JobConfig:
             not missing,
             "choices",
             f"name {', '.join(CHOICES)}",
-            sorted(self.choices),
-            f"Add {', '.join(missing)}, or build the configuration with job.compose([...]).",
+            [name for name in sorted(self.choices) if name in CHOICES],
+            f"Write {'=NAME, '.join(missing)}=NAME. Several names need -m and no brackets, as in filter=A,B.",
         )
         check_groups(self.values, CHOICES)
         check_configuration(self.values, self.trusted)
