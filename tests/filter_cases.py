@@ -60,7 +60,15 @@ EACH = (
 )  # a guide filter for each particle
 
 REMEMBERING = (
-    *("cofm_amssrcpf", "cofm_amssrcpf_printed", "cpf", "fmcpf", "dmc_reconstructed_literal", *EACH),
+    *(
+        "cofm_amssrcpf",
+        "cofm_amssrcpf_printed",
+        "cofm_amssrcpf_tuned",
+        "cpf",
+        "fmcpf",
+        "dmc_reconstructed_literal",
+        *EACH,
+    ),
 )
 
 # no step determines the state; that of Benes is known at the start
