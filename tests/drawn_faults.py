@@ -1,7 +1,7 @@
 """Faults drawn by a stored seed from a grammar: unit, axes, frame, clock, jump, ramp, drop-out, duplication, saturation, column.
 
 `PYTHONPATH=.:tests python tests/drawn_faults.py [LOG ...]` prints what the inspection says of each fault, and the error of
-an EKF with the printed settings over that of the clean log; docs/use_your_data.md has the table.
+an EKF with the printed settings over that of the clean log.
 """
 
 from __future__ import annotations
