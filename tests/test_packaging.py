@@ -329,7 +329,7 @@ def test_a_new_user_runs_a_first_study_from_the_wheel(wheel: Path, tmp_path: Pat
     for file in (home / "results" / "first").glob("*.npz"):
         with np.load(file, allow_pickle=False) as stored:
             engines.add(json.loads(str(stored["meta"]))["engine"])
-    assert engines == ({"eager"} if COMPILER is None else {"kernels"})
+    assert engines == ({"eager"} if COMPILER is None else {"kernels", "tape"})
 
 
 ASK = """

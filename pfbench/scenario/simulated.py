@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -19,7 +20,6 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-import pfbench
 from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record, take_groups
@@ -157,7 +157,7 @@ def load_or_build(folder: str | Path | None, recipe: object, build: Callable[[],
     if folder is None:
         return build()
     # one folder for all environments of a user: another version may simulate otherwise
-    head = f"episodes 2 generator {GENERATOR_VERSION} pfbench {pfbench.__version__}"
+    head = f"episodes 2 generator {GENERATOR_VERSION} pfbench {sys.modules['pfbench'].__version__}"
     key = hashlib.sha256(f"{head} {recipe!r}".encode()).hexdigest()[:16]
     path = Path(folder) / f"{key}.npz"
     if path.exists():

@@ -123,7 +123,10 @@ def test_a_proposal_of_a_notebook_runs_in_workers_and_is_computed_again(notebook
     result = stored("own")["defensive"]
     target = result.meta["config"]["filter"]["proposal"]["_target_"]
     assert re.fullmatch(r"own_defensive_[0-9a-f]{10}\.Defensive", target)
-    assert result.meta["inputs"]["filter"].keys() == {"code of own_defensive"}
+    assert result.meta["inputs"]["filter"].keys() == {
+        "code of own_defensive",
+        "values of own_defensive.Defensive",
+    }
     assert result.meta["config"]["filter"]["particles"] == SMALL["particles"]  # that of the study
     assert not np.array_equal(result.data["error"], stored("own")["sir"].data["error"])
     traces = study.replay("defensive", 2)

@@ -10,7 +10,6 @@ import numpy as np
 from pfbench.core.parameter_checks import require
 from pfbench.logs.doctor.axis_orders import ENU_TO_NED
 from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, QUANTITIES, Quantity
-from pfbench.logs.units import DEGREE
 from pfbench.logs.worlds.time_order import find_order_remedy
 from pfbench.stats.error_measures import Array
 
@@ -226,12 +225,9 @@ def to_north_east_down(geodetic: Array, origin: Array) -> Array:
 
     Returns north, East, Down, [T, 3], m. Shapes: geodetic [T, 3].
     """
-    import torch
+    from pfbench.logs.worlds.log_frames import to_east_north_up  # imports torch
 
-    from pfbench.nav import earth
-
-    places = (torch.from_numpy(np.asarray(a, float) * [DEGREE, DEGREE, 1.0]) for a in (geodetic, origin))  # fmt: skip
-    return np.asarray(earth.local_enu(*places).numpy() @ ENU_TO_NED)
+    return to_east_north_up(geodetic, origin) @ ENU_TO_NED
 
 
 def euler_angles(rotation: Array) -> Array:

@@ -15,6 +15,12 @@ from pfbench.nav import attitude, earth
 GEODETIC_COLUMNS, LOCAL_COLUMNS = ("lat_deg", "lon_deg", "h_m"), ("pn", "pe", "pd")
 
 
+def to_east_north_up(geodetic: Array, origin: Array) -> Array:
+    """Convert geodetic positions, deg, deg, m, to the tangent frame of an origin, [T, 3], m."""
+    places = (torch.from_numpy(np.asarray(a, float) * [DEGREE, DEGREE, 1.0]) for a in (geodetic, origin))  # fmt: skip
+    return np.asarray(earth.local_enu(*places).numpy())
+
+
 def find_origin(
     origin: Sequence[float] | None, gnss: LogTable, truth: LogTable
 ) -> tuple[float, ...] | None:
