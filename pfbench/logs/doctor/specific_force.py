@@ -105,10 +105,6 @@ def check_force_and_rate(aligned: Alignment, facts: dict[str, Any]) -> tuple[Raw
     windows = integrate_force(aligned.log, aligned.dcm, aligned.offset)
     if windows is None:
         return aligned.log, []
-    turned = _find_rotation(aligned, windows, facts) or _find_heading(aligned, windows, facts)
-    if turned:
-        finding, log = turned
-        return log, [finding]
     state = _try_axes(aligned, windows)
     horizontal = float(np.sqrt(np.square(windows.change[:, :2]).mean()))
     ratio = state.fit.cost / max(state.least, 1e-12)
@@ -121,6 +117,12 @@ def check_force_and_rate(aligned: Alignment, facts: dict[str, Any]) -> tuple[Raw
     )
     is_rate = aligned.rate_ratio > limit_of("axes")
     is_force = ratio > CLEAR_AXES and horizontal > LEAST_ACCELERATION
+    # exchanged axes are looked for before a heading, since part of them is a turn about the vertical
+    if turned := _find_rotation(aligned, windows, facts) or (
+        None if is_rate or is_force else _find_heading(aligned, windows, facts)
+    ):
+        finding, log = turned
+        return log, [finding]
     if is_rate or is_force:
         finding, log = _describe_axes(state, is_rate, max(ratio, aligned.rate_ratio))
         return log, [finding]
