@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import copy_context
+from contextvars import ContextVar, copy_context
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -217,6 +217,20 @@ def prepare_record(model: StateSpaceModel, record: Record) -> Record:
     return prepared.to(model.anchor)._replace(start=start, spread=spread)
 
 
+# what a filter may remember of a model during a pass over a record: between two passes its constants may change
+MEMORY_OF_PASS: ContextVar[dict[Any, Any] | None] = ContextVar("memory of a pass", default=None)
+
+
+@contextmanager
+def _remember() -> Iterator[None]:
+    token = MEMORY_OF_PASS.set({})
+    try:
+        yield
+    finally:
+        MEMORY_OF_PASS.reset(token)
+
+
+@_remember()
 def run_filter(
     method: Filter,
     model: StateSpaceModel,

@@ -56,6 +56,7 @@ class LikelihoodCounter:
     def __init__(self, model: StateSpaceModel) -> None:
         self.count = 0
         self._is_paused = False
+        model.__dict__["likelihood_counter"] = self  # for what evaluates the model without a call
         observation = model.observation
         # a function that can be pickled: another process may compile the step of the model
         model.observation = partial(self._observe, observation)  # type: ignore[method-assign]

@@ -297,6 +297,7 @@ for _operator in read_operators().values():
     _operators.define(_operator.name + _operator.schema)
 cuda.register(_operators)
 _operators.define("run_tape(Tensor[] given) -> Tensor[]")
+_operators.define("run_paths(Tensor[] given) -> Tensor[]")
 
 philox_normals = _make_function("philox_normals")
 philox_normals_float64 = _make_function("philox_normals_float64")
@@ -334,4 +335,14 @@ def run_tape(arguments: list[Tensor]) -> list[Tensor]:
     """
     load_library()
     results: list[Tensor] = torch.ops.pfbench.run_tape.default(arguments)
+    return results
+
+
+def run_paths(arguments: list[Tensor]) -> list[Tensor]:
+    """Propagate paths from their starts under given noise, with the model as a tape.
+
+    Returns states [K + 1, D, R, N] and log likelihoods [K + 1, R, N]. The arguments are those of `run_paths` in src/tape.cpp.
+    """
+    load_library()
+    results: list[Tensor] = torch.ops.pfbench.run_paths.default(arguments)
     return results

@@ -38,6 +38,7 @@ from pfbench.filter.moves.path_proposals import (
     measurement_log_density,
     transition_log_density,
 )
+from pfbench.filter.moves.taped_paths import find_taped_paths
 from pfbench.filter.particle.regularised_resampling import GaussianSmoothing, SmoothingKernel
 from pfbench.filter.whitening import compute_half_square, whiten
 from pfbench.model.base import StateSpaceModel
@@ -286,16 +287,13 @@ class NoiseFlowKernel(McmcKernel):
         """Return moved particles with the paths that follow from their starts."""
         if "score" not in short.window:
             return short
-        window, states, values = before.window, [], []
-        x = short.window["states"][:, :, 0]
-        for j, record in enumerate(before.past):
-            if j > 0:
-                x = model.propagate(x, record.u, window["noise"][:, :, j - 1])
-            value = model.log_likelihood(record.y, x, record.u)
-            states.append(torch.where(accepted.unsqueeze(2), x, window["states"][:, :, j]))
-            values.append(torch.where(accepted, value, window["log_like"][:, :, j]))
-        additions = {"states": stack_history(states), "log_like": stack_history(values)}
-        return short._replace(x=states[-1], window=window | additions)
+        window, start = before.window, short.window["states"][:, :, 0]
+        states, values = propagate_path(model, start, window["noise"], before.past)
+        additions = {
+            "states": torch.where(accepted[..., None, None], states, window["states"]),
+            "log_like": torch.where(accepted.unsqueeze(2), values, window["log_like"]),
+        }
+        return short._replace(x=additions["states"][:, :, -1], window=window | additions)
 
     def _refresh_noise(self, model: StateSpaceModel, w: Tensor, draws: RandomStream) -> Tensor:
         """Mix the noises [R, N, K, W] with new ones."""
@@ -326,15 +324,21 @@ def propagate_path(
     Returns states [R, N, K+1, D] and log p(y_j | x_j) [R, N, K+1]. Shapes: start [R, N, D], noise
     [R, N, K, W].
     """
-    x, states = start, [start]
-    values = [model.log_likelihood(record.y, x, record.u) for record in past[:1]] or [
+    paths = find_taped_paths(model, start) if len(past) > 1 else None
+    first = [model.log_likelihood(record.y, start, record.u) for record in past[:1]] or [
         torch.zeros_like(start[..., 0])
     ]
+    if paths and paths.tape:
+        return paths.run(start, first[0], noise, past)
+    x, states, values = start, [start], first
     for j, record in enumerate(past[1:]):
         x = model.propagate(x, record.u, noise[:, :, j])
         states.append(x)
         values.append(model.log_likelihood(record.y, x, record.u))
-    return stack_history(states), stack_history(values)
+    results = stack_history(states), stack_history(values)
+    if paths:
+        paths.record(start, noise, past, *results)
+    return results
 
 
 def _measure_start(

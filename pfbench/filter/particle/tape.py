@@ -28,7 +28,7 @@ OPERATIONS = (
     "remainder", "eq", "ne", "lt", "le", "abs", "round", "floor", "tan", "tanh", "log1p", "expm1", "special_ndtr", "where", "affine",
 )  # fmt: skip
 FEW = 2  # runs and particles of a recording
-_MOST_INSTRUCTIONS = 400  # per particle: longer ones are products of matrices of each particle
+_MOST_INSTRUCTIONS = 2000  # per particle: longer ones are products of matrices of each particle
 _MOST_NODES = 4 * _MOST_INSTRUCTIONS  # with constants, inputs and what nothing needs in the end
 # Names of torch functions that are one, without underscores. Functions that move the numbers of a tensor, or of several, that change
 # their type alone, that sum them, that fill a tensor, and those whose results depend on shapes.
@@ -135,6 +135,7 @@ def _make_table(graph: _Graph) -> dict[str, Callable[..., int]]:
         "add": lambda a, b, alpha=unit: e("add", a, e("mul", alpha, b)),
         "sub": lambda a, b, alpha=unit: e("sub", a, e("mul", alpha, b)),
         "rsub": lambda a, b: e("sub", b, a),
+        "lerp": lambda a, b, weight: e("add", a, e("mul", weight, e("sub", b, a))),
         "rdiv": lambda a, b: e("div", b, a),
         "rpow": lambda a, b: e("pow", b, a),
         "gt": lambda a, b: e("lt", b, a),
@@ -209,11 +210,10 @@ class _Recorder(TorchFunctionMode):
             return self._reduce(name, *args, **options).reshape(result.shape)
         if name == "linear":  # with a bias or without one
             bias = [self.read(a) for a in (*args[2:], *options.values()) if a is not None]
-            return self._combine(
-                lambda *atoms: reduce(partial(self.graph.emit, "add"), atoms),
-                [self._multiply(self.read(args[0]), self.read(args[1]).mT), *bias],
-                {},
-            )
+            return self._add(self._multiply(self.read(args[0]), self.read(args[1]).mT), *bias)
+        if name == "baddbmm" and not options:
+            first, *factors = map(self.read, args)
+            return self._add(first, self._multiply(*factors))
         if name in ("matmul", "rmatmul", "mm", "mv", "bmm"):
             return self._multiply(
                 *map(self.read, args[::-1] if name == "rmatmul" else args)
@@ -248,6 +248,12 @@ class _Recorder(TorchFunctionMode):
         )
         atoms = (build(*row[:count], **dict(zip(options, row[count:], strict=True))) for row in rows)  # fmt: skip
         return _stack(atoms, operand_atoms[0].shape)
+
+    def _add(self, *terms: Tensor) -> Tensor:
+        """Return the atoms of a sum of tensors."""
+        return self._combine(
+            lambda *atoms: reduce(partial(self.graph.emit, "add"), atoms), terms, {}
+        )
 
     def _reduce(self, name: str, a: Tensor, *args: Any, **options: Any) -> Tensor:
         """Return the atoms of a sum or a product over axes."""

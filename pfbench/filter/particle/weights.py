@@ -270,7 +270,9 @@ class PowerLikelihoodUpdate(WeightUpdate):
         """
         tempered, plain = copy.copy(model), model.log_likelihood
         tempered.__dict__.update(
-            log_likelihood=lambda y, x, u: plain(y, x, u) / self.r_factor, linear=False
+            log_likelihood=lambda y, x, u: plain(y, x, u) / self.r_factor,
+            linear=False,
+            tape_key=(id(model), self.r_factor),
         )
         return tempered
 

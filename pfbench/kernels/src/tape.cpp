@@ -126,7 +126,8 @@ struct Tape {
 struct Workspace {
     std::vector<double> copies, noise, scratch, number, log_w, updated;
     const double* parents = nullptr;  // [states] rows `apart` apart: copies of the chosen ones, or the states before
-    int64_t apart = 0;
+    const double* drawn = nullptr;    // [noises] rows `drawn_apart` apart
+    int64_t apart = 0, drawn_apart = 0;
     std::vector<int64_t> ancestors;
     std::vector<const double*> place;
     std::vector<Product<double>> terms;  // of sums that are computed together
@@ -151,14 +152,14 @@ const int64_t* add_terms(const Tape& tape, Workspace& work, const int64_t* row, 
     return row;
 }
 
-// New states [states] rows `plane` apart, and the log weights `updated` of one run, from its parents and its noise.
+// New states [states] rows `plane` apart, and their log likelihoods `updated`, of one run, from its parents and its noise.
 void propagate(const Tape& tape, Workspace& work, double* x, int64_t plane, int64_t slots) {
-    const int64_t given = tape.states + tape.noises, stride = 4 * ((slots + 3) / 4);
+    const int64_t given = tape.states + tape.noises;
     const auto read = [&](int64_t a) { return a < 0 ? Operand{&work.number[~a], 0} : Operand{work.place[a], 1}; };
     for (int64_t first = 0; first < slots; first += BLOCK) {
         const int64_t n = std::min(BLOCK, slots - first);
         for (int64_t d = 0; d < tape.states; ++d) work.place[d] = work.parents + d * work.apart + first;
-        for (int64_t d = 0; d < tape.noises; ++d) work.place[tape.states + d] = work.noise.data() + d * stride + first;
+        for (int64_t d = 0; d < tape.noises; ++d) work.place[tape.states + d] = work.drawn + d * work.drawn_apart + first;
         for (int64_t k = given; k < tape.registers; ++k) work.place[k] = work.scratch.data() + (k - given) * BLOCK;
         for (const int64_t *row = tape.code, *next; row < tape.code + 5 * tape.rows; row = next) {
             next = row[0] == AFFINE ? add_terms(tape, work, row, n) : row + 5;
@@ -167,12 +168,7 @@ void propagate(const Tape& tape, Workspace& work, double* x, int64_t plane, int6
             execute(row[0], out, read(row[2]), read(row[3]), read(row[4]), row[1] < 0 ? 1 : n);
         }
         for (int64_t d = 0; d < tape.states; ++d) execute(0, x + d * plane + first, read(tape.outputs[d]), {}, {}, n);
-        double* const updated = work.updated.data() + first;
-        execute(0, updated, read(tape.outputs[tape.states]), {}, {}, n);
-        for (int64_t i = 0; i < n; ++i) {
-            const double sum = updated[i] + work.log_w[first + i];
-            updated[i] = sum == sum ? sum : NONE;
-        }
+        execute(0, work.updated.data() + first, read(tape.outputs[tape.states]), {}, {}, n);
     }
 }
 
@@ -224,6 +220,7 @@ std::vector<Tensor> run_tape(std::vector<Tensor> given) {
     Workspace work(tape, slots);
     std::vector<double> spare[2] = {std::vector<double>(tape.states * slots), std::vector<double>(tape.states * slots)}, spare_log_w(slots), spare_w(slots);
     std::copy_n(constants.data, tape.constants, work.number.data());
+    work.drawn = work.noise.data(), work.drawn_apart = 4 * ((slots + 3) / 4);
     for (int64_t r = 0; r < runs; ++r) {  // all steps of a run, whose particles stay in the cache
         const int64_t from = r * slots;
         const double *x = x0.data + from, *log_w = log_w0.data + from, *w = w0.data + from;
@@ -245,6 +242,10 @@ std::vector<Tensor> run_tape(std::vector<Tensor> given) {
             normals_double(work.noise.data(), run.data + r, 1, 0, tape.noises, (slots + 3) / 4, first + t, seed, size.data[6]);
             std::copy_n(own.data + at * each, each, std::copy_n(shared.data + t * common, common, work.number.data() + tape.constants));
             propagate(tape, work, new_x, new_apart, slots);
+            for (int64_t i = 0; i < slots; ++i) {
+                const double sum = work.updated[i] + work.log_w[i];
+                work.updated[i] = sum == sum ? sum : NONE;
+            }
             if (keep) std::copy_n(work.log_w.data(), slots, numbers<double>(out.prior) + row * plane + from);
             double *const mean = numbers<double>(out.mean) + at * tape.states, *const variance = numbers<double>(out.variance) + at * tape.states;
             const auto weigh = [&] {
@@ -262,5 +263,37 @@ std::vector<Tensor> run_tape(std::vector<Tensor> given) {
     return out.list();
 }
 
-const pfbench::Registration registration(pfbench::entry<&run_tape>("run_tape"));
+// Paths of K steps from their starts under given noise: states [K + 1, D, R, N] and their log likelihoods [K + 1, R, N]. Tensors: code,
+// outputs and constants as above, inputs float64 [K, R, U], starts float64 [D, R, N] and their log likelihoods float64 [R, N], noise
+// float64 [K W, R, N], sizes int64 [3]: noises, registers, numbers.
+std::vector<Tensor> run_paths(std::vector<Tensor> given) {
+    require(given.size() == 8, "run_paths: must have 8 tensors");
+    constexpr int AXES[] = {2, 1, 1, 3, 3, 2, 3, 1};
+    for (int k = 0; k < 8; ++k) require(given[k].dim() == AXES[k] && given[k].numel() < MAX_SIZE, "run_paths: a tensor has another shape");
+    const Packed<int64_t> code(given[0]), outputs(given[1]), size(given[7]);
+    const Packed<double> constants(given[2]), inputs(given[3]), starts(given[4]), values(given[5]), noise(given[6]);
+    const int64_t steps = given[3].size(0), states = given[4].size(0), runs = given[4].size(1), slots = given[4].size(2), plane = runs * slots;
+    require(given[7].size(0) == 3 && given[0].size(1) == 5 && given[1].size(0) == states + 1 && given[3].size(1) == runs && slots > 0 &&
+                given[5].size(0) == runs && given[5].size(1) == slots && given[6].size(1) == runs && given[6].size(2) == slots &&
+                given[6].size(0) == steps * size.data[0],
+            "run_paths: its tensors must have common sizes");
+    const Tape tape{states, size.data[0], given[2].size(0), given[3].size(2), size.data[1], size.data[2], code.data, given[0].size(0), outputs.data};
+    tape.check();
+    const Tensor x = fresh<double>({steps + 1, states, runs, slots}), value = fresh<double>({steps + 1, runs, slots});
+    std::copy_n(starts.data, states * plane, numbers<double>(x)), std::copy_n(values.data, plane, numbers<double>(value));
+    Workspace work(tape, slots);
+    std::copy_n(constants.data, tape.constants, work.number.data());
+    work.apart = work.drawn_apart = plane;
+    for (int64_t r = 0; r < runs; ++r)
+        for (int64_t t = 0; t < steps; ++t) {
+            double* const before = numbers<double>(x) + t * states * plane + r * slots;
+            work.parents = before, work.drawn = noise.data + t * tape.noises * plane + r * slots;
+            std::copy_n(inputs.data + (t * runs + r) * tape.inputs, tape.inputs, work.number.data() + tape.constants);
+            propagate(tape, work, before + states * plane, plane, slots);
+            std::copy_n(work.updated.data(), slots, numbers<double>(value) + ((t + 1) * runs + r) * slots);
+        }
+    return {x, value};
+}
+
+const pfbench::Registration registration(pfbench::entry<&run_tape>("run_tape"), pfbench::entry<&run_paths>("run_paths"));
 }  // namespace

@@ -1,0 +1,176 @@
+"""Paths under fixed noise by a tape are those of the model's own operations."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from compiled_cases import compiler
+from model_cases import tracker
+from move_cases import moving
+
+from pfbench.core.random_stream import PhiloxStream
+from pfbench.core.record import Record
+from pfbench.filter import (
+    FilterResult,
+    MetropolisHastings,
+    NoiseFlowKernel,
+    PowerLikelihoodUpdate,
+    run_filter,
+)
+from pfbench.filter.moves import path_kernels, taped_paths
+from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.job.scoring import LikelihoodCounter
+from pfbench.kernels import dispatch
+from pfbench.model import LinearGaussian, Lorenz63, Pendulum, StateSpaceModel, UnivariateGrowth
+from pfbench.noise.base import NominalNoise
+from pfbench.scenario.simulated import ModelSimulation
+
+pytestmark = compiler
+RUNS = torch.tensor([7, 0, 12])
+MODELS: dict[str, Callable[[], StateSpaceModel]] = {
+    "growth": UnivariateGrowth,  # with an input that runs share
+    "lorenz": Lorenz63,
+    "pendulum": Pendulum,  # states with an angle
+    "tracker": tracker,
+    "linear": lambda: LinearGaussian([[1.0, 0.1], [0.0, 0.9]], [[0.1], [0.3]], [[1.0, 0.0]], [0.4], [0.0] * 2, [1.0] * 2),
+}  # fmt: skip
+
+
+def make_filter(refresh: float = 0.1, threshold: float = 0.7, **stages: Any) -> ParticleFilter:
+    """A filter whose particles move in runs with few effective ones alone."""
+    flow = MetropolisHastings(NoiseFlowKernel(lag=4, noise_refresh=refresh), 2)
+    filter_ = moving(flow, n=300, threshold=threshold)
+    return copy.replace(filter_, **stages) if hasattr(copy, "replace") else type(filter_)(**{**vars(filter_), **stages})  # fmt: skip
+
+
+def simulate(model: StateSpaceModel) -> Record:
+    """A record with a component missing at times, in some runs."""
+    record = ModelSimulation(model, 12).draw(NominalNoise(), RUNS, 1).record
+    record.y[1, 4] = record.y[2, 7:9, 0] = torch.nan
+    return record
+
+
+def run(method: ParticleFilter, model: StateSpaceModel, record: Record) -> FilterResult:
+    with dispatch.use_kernels(), torch.no_grad():
+        return run_filter(method, model, record, PhiloxStream(3, RUNS))
+
+
+def run_by_torch(method: ParticleFilter, model: StateSpaceModel, record: Record) -> FilterResult:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(path_kernels, "find_taped_paths", lambda *_: None)
+        return run(method, model, record)
+
+
+@pytest.fixture
+def taken(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """The arguments of each call of C++."""
+    calls: list[Any] = []
+    call = dispatch.run_paths
+    monkeypatch.setattr(dispatch, "run_paths", lambda given: calls.append(given) or call(given))
+    return calls
+
+
+def assert_close(one: FilterResult, other: FilterResult) -> None:
+    for name in ("mean", "variance", "log_evidence"):
+        torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-9, atol=1e-9)
+    assert torch.equal(one.trace["accepted_0"], other.trace["accepted_0"])
+
+
+@pytest.mark.parametrize("refresh", [0.0, 0.1])
+@pytest.mark.parametrize("name", MODELS)
+def test_paths_by_a_tape_are_those_of_the_model(
+    name: str, refresh: float, taken: list[Any]
+) -> None:
+    """Moments, evidence, accepted moves and counts of evaluations, also where few runs move."""
+    counts, results = [], []
+    record, method = simulate(MODELS[name]()), make_filter(refresh)
+    for call in (run, run_by_torch):
+        model = MODELS[name]()
+        counter = LikelihoodCounter(model)
+        results.append(call(method, model, record))
+        counts.append(counter.count)
+    assert_close(*results)
+    assert counts[0] == counts[1]
+    assert len(taken) >= 10  # once to check the tape, and then each time
+    moves = results[0].trace["accepted_0"]
+    assert 0.0 < float(moves.mean()) < 1.0
+    assert bool((moves == 0.0).any())  # not all runs move in each step
+
+
+def test_tempered_likelihoods_have_a_tape_of_their_own(taken: list[Any]) -> None:
+    model = UnivariateGrowth()
+    record = simulate(model)
+    results = []
+    for factor in (1.0, 4.0):
+        method = make_filter(weight_update=PowerLikelihoodUpdate(factor))
+        results.append(run(method, model, record))
+        assert_close(results[-1], run_by_torch(method, model, record))
+    assert len(taken) > 20
+    assert not torch.allclose(results[0].mean, results[1].mean)
+
+
+def test_a_tape_has_the_constants_of_its_pass() -> None:
+    """A buffer that changes in place, or a number of Python: the next pass of the same objects has the new one."""
+    model, method = Lorenz63(), make_filter()
+    record, found = simulate(model), []
+    for change in (lambda: None, lambda: model.q.mul_(3.0), lambda: setattr(model, "step", 0.03)):
+        change()
+        found.append(run(method, model, record))
+        assert_close(found[-1], run_by_torch(method, model, record))
+    assert not torch.allclose(found[0].mean, found[1].mean)
+    assert not torch.allclose(found[1].mean, found[2].mean)
+
+
+class Branching(UnivariateGrowth):
+    """Its measurement depends on a value that a tape cannot ask for."""
+
+    def observation(self, x: torch.Tensor, u: Any) -> Any:
+        return super().observation(x if bool((x > -1e9).all()) else -x, u)
+
+
+def test_without_a_tape_and_outside_of_a_pass_the_model_is_asked(taken: list[Any]) -> None:
+    model = Branching()
+    record, method = simulate(model), make_filter()
+    assert_close(run(method, model, record), run(method, UnivariateGrowth(), record))
+    calls = len(taken)
+    assert calls > 10  # of the second model
+    assert taped_paths.find_taped_paths(UnivariateGrowth(), record.y) is None
+    with torch.enable_grad():
+        run_filter(method, UnivariateGrowth(), record, PhiloxStream(3, RUNS))
+    assert len(taken) == calls  # a derivative needs the model
+
+
+def test_a_tape_of_other_numbers_is_not_used(
+    taken: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first path of a pass is computed in both ways."""
+    record_tape = taped_paths.record_tape
+
+    def record_wrong(*given: Any) -> Any:
+        tape, *rest = record_tape(*given)
+        return tape._replace(constants=tape.constants * 1.001), *rest
+
+    monkeypatch.setattr(taped_paths, "record_tape", record_wrong)
+    model, method = UnivariateGrowth(), make_filter()
+    record = simulate(model)
+    assert_close(run(method, model, record), run_by_torch(method, model, record))
+    assert len(taken) == 1
+
+
+def test_wrong_instructions_are_refused(taken: list[Any]) -> None:
+    """Nothing is read or written outside of the tape's own numbers."""
+    model, call = UnivariateGrowth(), dispatch.run_paths
+    run(make_filter(), model, simulate(model))
+    given = taken[-1]
+    wrong = [(1, given[1] + 1000), (3, given[3][:, 1:]), (4, given[4][0]), (5, given[5][:, :1])]
+    wrong += [(6, given[6][1:]), (6, given[6].float()), (7, given[7] * 0), (7, given[7][:2])]
+    for column, value in ((0, 31), (1, 0), (2, 10**6), (4, -(10**6))):
+        wrong.append((0, given[0].clone()))
+        wrong[-1][1][-1, column] = value
+    for place, tensor in wrong:
+        with pytest.raises(RuntimeError, match=r"run_paths|run_tape|different types"):
+            call([*given[:place], tensor, *given[place + 1 :]])
