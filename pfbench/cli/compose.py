@@ -13,6 +13,7 @@ from typing import Any, NoReturn
 from pfbench.cli.messages import format_flag, suggest_similar
 from pfbench.core.parameter_checks import require
 from pfbench.job.config import CHOICES, JobConfig, compose, compose_tree, expand_filter_sets
+from pfbench.job.settings import check_settings
 from pfbench.job.trust import UntrustedConfigError, check_study, trusted_packages
 from pfbench.results.paper_block import PAPER, experiments_dir, list_named_parts
 
@@ -235,9 +236,18 @@ def _check_sweep(overrides: list[str]) -> JobConfig | None:
             if key == "study":
                 check_study(value.strip("'\""))
             is_plain = key in values and not isinstance(values[key], Mapping)
-            if not is_plain and value not in list_named_parts(key):
+            if is_plain:  # a setting, whose values are known before a job starts
+                check_settings({**values, key: _parse_value(option)})
+            elif value not in list_named_parts(key):
                 _check_composition([*first[:index], option, *first[index + 1 :]])
     return config
+
+
+def _parse_value(override: str) -> Any:
+    """Return the value of an override."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    return OverridesParser.create().parse_override(override).value()
 
 
 # --------------------------------------------------------------------------------------------------

@@ -182,6 +182,7 @@ def try_own_parts(configs: Iterable[JobConfig]) -> None:
         ValueError: If parts break their contracts.
     """
     from pfbench.job.run_job import list_used_packages
+    from pfbench.job.trust import list_user_targets
 
     episodes: dict[str, Episode] = {}
     errors: dict[str, Exception] = {}
@@ -191,7 +192,10 @@ def try_own_parts(configs: Iterable[JobConfig]) -> None:
             if packages:
                 _try_job(config, episodes)
         except AssertionError as error:
-            errors[f"the part must keep its contract: {error}."] = error
+            own = dict.fromkeys(t.rpartition(".")[2] for t in list_user_targets(config.values))
+            errors[
+                f"{' and '.join(own)} must keep {'its' if len(own) == 1 else 'their'} contract: {error}."
+            ] = error
         except Exception as error:
             if _is_of_user(error, packages):
                 errors[format_error(error, config.words)] = error

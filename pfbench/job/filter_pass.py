@@ -237,11 +237,9 @@ def choose_engine(
     if engine in ("kernels", "compiled"):
         return cast(Literal["kernels", "compiled"], engine)
     obstacle = "the device is a GPU" if model.anchor.is_cuda else find_obstacle(method, model)
-    if obstacle:
-        _say_once(f"engine={engine}: C++ operators, step by step ({obstacle})")
-        return "kernels"
-    _say_once(f"engine={engine}: all steps in C++, if the model has a tape")
-    return "tape"
+    if obstacle and engine == "tape":  # what was asked for
+        _say_once(f"engine=tape: C++ operators, step by step ({obstacle})")
+    return "kernels" if obstacle else "tape"
 
 
 @cache

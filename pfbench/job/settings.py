@@ -13,6 +13,7 @@ from typing import Any
 
 from pfbench.core.parameter_checks import RUN_NUMBERS, require
 from pfbench.job.inputs import find_inputs, names_checkpoint
+from pfbench.job.trust import list_user_targets
 from pfbench.results import store
 from pfbench.results.paper_block import PAPER, PARTS
 from pfbench.results.store import PLACE_SETTINGS, Inputs, compute_config_key, extend_key
@@ -45,6 +46,11 @@ def job_key(values: Mapping[str, Any], inputs: Inputs | None = None) -> str:
         from pfbench.filter.learned.checkpoint import replace_checkpoint_by_hash
 
         values = {**values, "filter": replace_checkpoint_by_hash(values["filter"])}
+    node = values.get("filter") or {}
+    own = {target.rpartition(".")[2].lower() for target in list_user_targets(node)}
+    name = str(node.get(PAPER, {}).get("name", ""))
+    if own and re.sub(r"[\W_]", "", name).lower() not in own:
+        inputs = inputs | {"name": {name: ""}}  # of a class of the user: a new name is a new row
     defaults = (k for k, default in DEFAULTS_NOT_IN_KEY.items() if values.get(k) == default)
     return extend_key(compute_config_key(values, (*IGNORED_IN_KEY, *defaults)), inputs)
 
@@ -72,7 +78,8 @@ def check_settings(values: Mapping[str, Any]) -> None:
     for key, (requirement, example) in _REQUIREMENTS.items():
         if not valid[key]:
             remedy = _advise_integer(key, values[key]) or f"Set {key}={example}."
-            raise ValueError(f"{key} must be {requirement}, got {values.get(key)}. {remedy}")
+            got = values.get(key)  # a text in quotes: "10" is none of the numbers
+            raise ValueError(f"{key} must be {requirement}, got {got!r}. {remedy}")
     require(
         not values["first_run"] + values["runs"] > RUN_NUMBERS,
         "first_run + runs",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import random
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -75,8 +76,7 @@ def time_condition(
 ) -> dict[str, Any]:
     """Time the filters of a condition in turn.
 
-    Each filter runs once before, so that nothing is compiled or loaded in a round. The first filter of
-    a round is another one each time.
+    Each filter runs once before, so that nothing is compiled or loaded in a round. Each round has an order of its own.
 
     Returns measurement for `step_times.write_step_times`.
     """
@@ -86,9 +86,9 @@ def time_condition(
     for task in tasks:
         task.measure()
     times: list[list[tuple[float, float]]] = [[] for _ in tasks]
-    for round_number in range(rounds):
-        for k in range(len(tasks)):
-            i = (k + round_number) % len(tasks)
+    for number in range(rounds):
+        # by chance, so that none follows the same filter each time, whose data it finds in the cache
+        for i in random.Random(number).sample(range(len(tasks)), len(tasks)):
             times[i].append(tasks[i].measure())
     first = tasks[0].plan.values
     is_single = first["device"] == "cpu" and first["threads"] == 1

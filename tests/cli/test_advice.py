@@ -252,11 +252,18 @@ def test_refused_input_exits_with_two_and_prints_no_plan(
 
 def test_a_sweep_without_a_result_has_no_next_report(tmp_path: Path) -> None:
     words = ("run", "-m", *WALK, "filter=ekf", "study=mine")
-    said = pfbench(*words, "dtype=one,two", home=tmp_path)
+    said = pfbench(*words, "memory_limit_gib=1e-6,1e-7", home=tmp_path)
     assert said.code == 1
     assert "2 failed" in said.out
     assert "Next:" not in said.out
-    assert "plan:" not in said.out
-    said = pfbench(*words, "dtype=one,float64", home=tmp_path)
+    said = pfbench(*words, "memory_limit_gib=1e-6,null", home=tmp_path)
     assert "1 finished, 0 skipped, 1 failed" in said.out
     assert "Next: pfbench report study=mine" in said.out
+
+
+@pytest.mark.parametrize("setting", ["particles=10,abc", "seed=1,1e3", "threads=choice(1,0)"])
+def test_a_bad_value_of_a_sweep_is_told_before_a_job_starts(tmp_path: Path, setting: str) -> None:
+    said = pfbench("run", "-m", *WALK, "filter=sir,ekf", setting, home=tmp_path)
+    assert said.code == 2
+    assert f"error run: {setting.partition('=')[0]} must be a whole number" in said.err
+    assert not (tmp_path / "results").exists()

@@ -436,7 +436,7 @@ def test_a_failed_job_leaves_a_note_and_its_success_takes_it_away(tmp_path: Path
 
 
 REFUSED = {
-    "dtype=double": "dtype must be float64 (default) or float32, got double. Set dtype=float64.",
+    "dtype=double": "dtype must be float64 (default) or float32, got 'double'. Set dtype=float64.",
     "runs=ten": "runs must be a whole number of at least 1, got ten. Set runs=100.",
     "runs=0": "runs must be a whole number of at least 1, got 0. Set runs=100.",
     "runs=1e9": "runs must be a whole number of at least 1, got 1000000000.0. Write it without exponent and "

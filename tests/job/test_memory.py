@@ -326,7 +326,7 @@ def test_what_does_not_fit_at_all_is_refused_before_it_starts(tmp_path: Path) ->
     assert not list((tmp_path / "results").rglob("*.npz"))
 
 
-@pytest.mark.parametrize("value", ["-1", "0", "much"])
+@pytest.mark.parametrize("value", ["-1", "0", "'much'"])
 def test_a_limit_that_is_none_is_told(tmp_path: Path, value: str) -> None:
     said = pfbench("run", *WALK, f"memory_limit_gib={value}", home=tmp_path)
     assert (
