@@ -261,7 +261,10 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
         "calibration": list_calibration(table),
         "runs": list_runs(table),
         "sweeps": list_sweeps(views, looks, options.metric),
-        "failures": list(facts.failures),
+        # what failed, without a traceback, which has paths of the machine and is in the note of the job
+        "failures": [
+            {name: f[name] for name in ("key", "choices", "message")} for f in facts.failures
+        ],
     }
 
 
