@@ -20,6 +20,7 @@ from matplotlib.patches import Rectangle
 from pfbench.report.overview.tables import Overview, World, count_wins
 from pfbench.results.plotting import RC, line_styles, set_plain_ticks
 from pfbench.stats.comparison import EQUAL_WORDS, Verdict
+from pfbench.stats.court import Pair
 
 BLUE, ORANGE, GREY, INK = "#2166ac", "#c4561a", "#d4d4d4", "#1b1b1b"
 _SCALE = math.log(3.0)  # log ratio of the strongest colour
@@ -99,9 +100,7 @@ def draw_heat_map(overview: Overview, size: Format) -> Figure:
         figure, panels = _lay_out(size, [(title, len(rows)) for title, rows in groups], foot)
         for axes, (_, worlds) in zip(panels, groups, strict=True):
             cells = [[describe_cell(overview, w, label) for label in columns] for w in worlds]
-            values = np.array([[cell.value for cell in row] for row in cells])
-            _draw_grid(axes, values, _SCALE, palette(), np.isnan(values))
-            _fill_cells(axes, cells, size)
+            _draw_cells(axes, cells, (palette(), _SCALE), size)
             axes.set_yticks(
                 np.arange(len(worlds)) + 0.5, [_short(w.part_name.name, size) for w in worlds]
             )
@@ -123,13 +122,8 @@ def draw_matrices(overview: Overview, size: Format) -> Figure:
         figure, panels = _lay_out(size, rows, 8)
         for axes, (_, worlds) in zip(panels, groups, strict=True):
             wins = count_wins(overview.pairs, [world.key for world in worlds])
-            balance = np.array([[wins[a, b] - wins[b, a] for b in methods] for a in methods])
-            texts = [
-                [_count_text(wins[a, b], wins[b, a], a == b) for b in methods] for a in methods
-            ]
-            colours = palette().reversed()
-            _draw_grid(axes, balance, len(worlds), colours, np.eye(len(methods), dtype=bool))
-            _fill_counts(axes, texts, colours(Normalize(-len(worlds), len(worlds))(balance)), size)
+            counts = [[_describe_wins(wins, a, b) for b in methods] for a in methods]
+            _draw_cells(axes, counts, (palette().reversed(), len(worlds)), size)
             axes.set_yticks(np.arange(len(methods)) + 0.5, names)
         if panels:
             _name_columns(panels[0], names, len(methods), size)
@@ -143,6 +137,7 @@ def draw_doses(
 
     A panel is a world, at most three in a row. Points have the simultaneous intervals of the heat map; those of neighbours are moved apart.
     """
+    first = next(iter(overviews.values()))
     columns = 1 if size.name else max(1, min(len(worlds), 3))
     rows = -(-len(worlds) // columns)
     shape = (size.width / _DPI, rows * (250 if size.name else 300) / _DPI)
@@ -152,8 +147,8 @@ def draw_doses(
         for empty in panels[len(worlds) :]:
             empty.remove()
         for axes, world in zip(panels, worlds, strict=False):
-            for label in _first(overviews).columns:
-                _draw_dose(axes, dose_points(overviews, world, label, axis), label, overviews)
+            for label in first.columns:
+                _draw_dose(axes, dose_points(overviews, world, label, axis), label, first)
             axes.set(xscale="log", yscale="log", title=world.part_name.name)
             axes.set_xlabel(
                 "number of particles" if axis == "particles" else "time of a step of a run [ms]"
@@ -187,15 +182,11 @@ def dose_points(
 
 
 def _draw_dose(
-    axes: Axes,
-    points: Sequence[tuple[float, Verdict]],
-    label: str,
-    overviews: Mapping[int, Overview],
+    axes: Axes, points: Sequence[tuple[float, Verdict]], label: str, first: Overview
 ) -> None:
     """Draw the line of one filter, a proposed one solid."""
     if not points:
         return
-    first = _first(overviews)
     style = line_styles([label])[label]
     offset = first.columns.index(label) - len(first.methods) / 2
     x = np.array([x for x, _ in points]) * (1 + 0.03 * offset)
@@ -203,11 +194,6 @@ def _draw_dose(
     ends = np.clip([[v.low, v.high] for _, v in points], y.min() / 10, y.max() * 10)
     axes.plot(x, y, **style.line(first.names[label]), **style.mark(), ms=4)
     axes.vlines(x, ends[:, 0], ends[:, 1], color=style.colour, alpha=0.35, lw=1)
-
-
-def _first(overviews: Mapping[int, Overview]) -> Overview:
-    """Return the overview of the fewest particles."""
-    return next(iter(overviews.values()))
 
 
 def group_worlds(overview: Overview) -> list[tuple[str, list[World]]]:
@@ -243,19 +229,29 @@ def _gap(size: Format) -> int:
     return round(0.85 * size.row)
 
 
-def _draw_grid(
-    axes: Axes, values: np.ndarray, scale: float, colours: Colormap, mask: np.ndarray
+def _draw_cells(
+    axes: Axes,
+    cells: Sequence[Sequence[CellLook]],
+    colours: tuple[Colormap, float],
+    size: Format,
 ) -> None:
-    """Draw coloured cells without axes."""
+    """Draw cells without axes: colours of their values up to a scale, and their texts; one without a text stays empty."""
     import seaborn
 
+    palette, scale = colours
+    values = np.array([[cell.value for cell in row] for row in cells])
     seaborn.heatmap(
-        values, ax=axes, cmap=colours, vmin=-scale, vmax=scale, cbar=False, linewidths=1.2, linecolor="white",
-        mask=mask, xticklabels=False, yticklabels=False,
+        values, ax=axes, cmap=palette, vmin=-scale, vmax=scale, cbar=False, linewidths=1.2, linecolor="white",
+        mask=np.isnan(values), xticklabels=False, yticklabels=False,
     )  # fmt: skip
     axes.set_facecolor("#ececec")
     axes.set(xlabel="", ylabel="")
     axes.tick_params(length=0, pad=3)
+    grounds = palette(Normalize(-scale, scale)(values))
+    for i, row in enumerate(cells):
+        for j, cell in enumerate(row):
+            if cell.text:
+                _write_cell(axes, cell, (i, j), grounds[i, j], size)
 
 
 def to_svg(figure: Figure) -> str:
@@ -301,48 +297,34 @@ def format_ratio(value: float) -> str:
     return f"{value:.2f}" if value < 1.995 else f"{value:.1f}"
 
 
-def _fill_cells(axes: Axes, cells: Sequence[Sequence[CellLook]], size: Format) -> None:
-    """Write the text of each cell, and draw those without a colour."""
-    colours, norm = palette(), Normalize(-_SCALE, _SCALE)
-    for i, row in enumerate(cells):
-        for j, cell in enumerate(row):
-            is_decided = not math.isnan(cell.value)
-            ground = colours(norm(cell.value)) if is_decided else (1.0, 1.0, 1.0)
-            if not is_decided:
-                face = GREY if cell.is_grey else "white"
-                axes.add_patch(
-                    Rectangle((j + 0.03, i + 0.04), 0.94, 0.92, fc=face, ec="#dcdcdc", lw=0.6)
-                )
-            ink = choose_ink(ground) if is_decided else "#444444" if cell.is_grey else "#6a6a6a"
-            axes.text(
-                j + 0.5, i + 0.5, cell.text, ha="center", va="center", color=ink, fontsize=size.font,
-                weight="bold" if cell.is_strong else "normal", style="italic" if cell.is_grey else "normal",
-            )  # fmt: skip
+def _write_cell(
+    axes: Axes, cell: CellLook, index: tuple[int, int], ground: np.ndarray, size: Format
+) -> None:
+    """Write the text of a cell in a row and a column, and draw one without a colour."""
+    i, j = index
+    ink = choose_ink(ground)
+    if math.isnan(cell.value):
+        ink, face = ("#444444", GREY) if cell.is_grey else ("#6a6a6a", "white")
+        axes.add_patch(Rectangle((j + 0.03, i + 0.04), 0.94, 0.92, fc=face, ec="#dcdcdc", lw=0.6))
+    axes.text(
+        j + 0.5, i + 0.5, cell.text, ha="center", va="center", color=ink, fontsize=size.font,
+        weight="bold" if cell.is_strong else "normal", style="italic" if cell.is_grey else "normal",
+    )  # fmt: skip
 
 
-def choose_ink(ground: Sequence[float]) -> str:
+def choose_ink(ground: Sequence[float] | np.ndarray) -> str:
     """Return white or black, whichever has the larger contrast on a ground: at least 4.5 (WCAG)."""
     linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in ground[:3]]
     luminance = float(np.dot((0.2126, 0.7152, 0.0722), linear))
     return "white" if 1.05 / (luminance + 0.05) > (luminance + 0.05) / 0.05 else "#000000"
 
 
-def _count_text(wins: int, losses: int, is_same: bool) -> str:
-    """Return the text of a cell of a matrix."""
-    if is_same:
-        return ""
-    return f"{wins}–{losses}" if wins or losses else "·"
-
-
-def _fill_counts(
-    axes: Axes, texts: Sequence[Sequence[str]], grounds: np.ndarray, size: Format
-) -> None:
-    """Write the counts of wins into the cells of a matrix."""
-    for i, row in enumerate(texts):
-        for j, text in enumerate(row):
-            axes.text(
-                j + 0.5, i + 0.5, text, ha="center", va="center", color=choose_ink(grounds[i, j]), fontsize=size.font
-            )  # fmt: skip
+def _describe_wins(wins: Mapping[Pair, int], a: str, b: str) -> CellLook:
+    """Return how a cell of a matrix is drawn, with wins and losses of a method."""
+    if a == b:
+        return CellLook("")
+    some = (wins[a, b], wins[b, a])
+    return CellLook("{}–{}".format(*some) if any(some) else "·", some[0] - some[1])
 
 
 def _name_columns(axes: Axes, names: Sequence[str], methods: int, size: Format) -> None:

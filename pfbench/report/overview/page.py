@@ -20,6 +20,7 @@ from pfbench.report.overview.tables import (
     Overview,
     TabKey,
     World,
+    WorldCell,
     find_outdone,
     list_world_notes,
     name_size,
@@ -222,14 +223,17 @@ def order_dose_worlds(overview: Overview) -> list[World]:
 
 def describe_tuned(overview: Overview, tuned: Overview) -> str:
     """Say how the words of the methods change if they are tuned as the baselines are."""
-    worlds = {world.key: world.part_name.name for world in tuned.worlds}
     pairs = pair_forms(overview, tuned)
-    changed = [a for a, b in pairs if name_word(a) != name_word(b)]
-    turned = [a for a, b in pairs if {name_word(a), name_word(b)} == {"better", "worse"}]
-    names = "; ".join(f"{overview.names[a.filter]} in {worlds[a.world]}" for a in turned)
+    changed = [(a, {name_word(a), name_word(b)}) for a, b in pairs if name_word(a) != name_word(b)]
+    turned = "; ".join(
+        f"{overview.names[a.filter]} in {tuned.world_names[a.world]}"
+        for a, words in changed
+        if words == {"better", "worse"}
+    )
+    counts = Counter(name_word(b) for _, b in pairs)
     return (
-        f"Each has 16 candidates, and the runs and the seed of the baselines. Tuned, they are {', '.join(f'{word} in {n}' for word, n in Counter(name_word(b) for _, b in pairs).items())} "
-        f"of {len(pairs)} cells. {f'Blue turns orange or back: {names}' if turned else 'None turns from blue to orange or back'}; "
+        f"Each has 16 candidates, and the runs and the seed of the baselines. Tuned, they are {', '.join(f'{word} in {n}' for word, n in counts.items())} "
+        f"of {len(pairs)} cells. {f'Blue turns orange or back: {turned}' if turned else 'None turns from blue to orange or back'}; "
         f"{len(changed)} have another word (‡)."
     )
 
@@ -264,18 +268,14 @@ def describe_price(overview: Overview) -> str:
 
 def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> str:
     """Word the two sentences that open the page, at most 55 words."""
-    count, number = spell_number(len(overview.methods)), len(overview.worlds)
-    winners, better = _name_winners(overview), "better than every conventional filter"
-    timed = _name_winners(at_equal_time) if at_equal_time else ""
-    if winners:
-        first = f"{better.capitalize()} with as many particles: {winners}."
-    else:
-        first = f"None of the {count} is shown to be {better} in any of {number} worlds"
-        first += (
-            f", nor at equal time in {len(at_equal_time.worlds)}."
-            if at_equal_time and not timed
-            else "."
-        )
+    count, better = spell_number(len(overview.methods)), "better than every conventional filter"
+    winners, timed = (_name_winners(some) if some else "" for some in (overview, at_equal_time))
+    first = f"{better.capitalize()} with as many particles: {winners}."
+    nor = (
+        f", nor at equal time in {len(at_equal_time.worlds)}" if at_equal_time and not timed else ""
+    )
+    if not winners:
+        first = f"None of the {count} is shown to be {better} in any of {len(overview.worlds)} worlds{nor}."
     if timed:
         first += f" {'Also at' if winners else 'At'} equal time: {timed}."
     elif winners and at_equal_time:
@@ -296,11 +296,9 @@ def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> 
 
 def _name_winners(overview: Overview, most: int = 2) -> str:
     """Name the methods that are better than every conventional filter of a world; empty without one."""
-    worlds = {world.key: world.part_name.name for world in overview.worlds}
-    winners = [cell for cell in overview.cells if cell.wins]
-    wins = [f"{overview.names[w.filter]} ({worlds[w.world]})" for w in winners[:most]]
-    more = f" and {len(winners) - most} more" if len(winners) > most else ""
-    return f"{', '.join(wins)}{more}"
+    wins = [f"{overview.names[c.filter]} ({overview.world_names[c.world]})" for c in overview.cells if c.wins]  # fmt: skip
+    more = f" and {len(wins) - most} more" if len(wins) > most else ""
+    return f"{', '.join(wins[:most])}{more}"
 
 
 def describe_setting(overview: Overview, level: TabKey = 0) -> str:
@@ -315,20 +313,14 @@ def describe_setting(overview: Overview, level: TabKey = 0) -> str:
 
 def _name_numbers(overview: Overview) -> str:
     """Name the methods that set their number of particles themselves."""
-    labels = [label for label in overview.methods if label in overview.numbers]
-    some = [f"{overview.names[label]} {overview.numbers[label]:.0f}" for label in labels]
+    some = [f"{overview.names[m]} {overview.numbers[m]:.0f}" for m in overview.methods if m in overview.numbers]  # fmt: skip
     return f" (its own number: {', '.join(some)})" if some else ""
 
 
 def _name_absent(overview: Overview) -> str:
     """Name the methods that lack more than one world, with the number of those in which they ran."""
-    counts = Counter(cell.filter for cell in overview.cells)
-    worlds = len(overview.worlds)
-    some = [
-        f"{overview.names[method]} ran in {counts[method]} of them"
-        for method in overview.methods
-        if counts[method] < worlds - 1
-    ]
+    counts, worlds = Counter(cell.filter for cell in overview.cells), len(overview.worlds)
+    some = [f"{overview.names[m]} ran in {counts[m]} of them" for m in overview.methods if counts[m] < worlds - 1]  # fmt: skip
     return f" {'; '.join(some)}." if some else ""
 
 
@@ -347,10 +339,11 @@ def _describe_reference(overview: Overview) -> str:
 
 def list_notes(overview: Overview) -> list[tuple[str, str]]:
     """List the worlds with what must be known before their numbers are quoted."""
-    notes = [
-        (world.part_name.name, "; ".join(list_world_notes(world))) for world in overview.worlds
+    return [
+        (world.part_name.name, "; ".join(notes))
+        for world in overview.worlds
+        if (notes := list_world_notes(world))
     ]
-    return [(name, text) for name, text in notes if text]
 
 
 def describe_times(overview: Overview, most: float = 1.5) -> str:
@@ -375,12 +368,11 @@ def spell_number(number: int) -> str:
 
 def describe_failures(pack: Mapping[str, Any], overview: Overview) -> list[str]:
     """Describe the jobs that failed, those of a filter with one reason in a sentence."""
-    worlds = {world.key: world.part_name.name for world in overview.worlds}
     places: dict[tuple[str, str], dict[str, None]] = {}
     for failure in pack.get("failures", ()):
         world, label = (str(failure["choices"][key]) for key in ("scenario", "filter"))
         reason = str(failure["message"]).partition(": ")[2].partition(", got ")[0]
-        places.setdefault((label, reason), {})[worlds.get(world, world)] = None
+        places.setdefault((label, reason), {})[overview.world_names.get(world, world)] = None
     looks = find_looks([label for label, _ in places])
     return [
         f"{looks[label].name} in {'; '.join(some)}{f', since {reason}' if reason else ''}"
@@ -390,18 +382,20 @@ def describe_failures(pack: Mapping[str, Any], overview: Overview) -> list[str]:
 
 def list_ratios(overview: Overview) -> list[tuple[World, list[str]]]:
     """List the ratios of a world with their simultaneous intervals, in the order of the columns of the heat map."""
-    rows = []
-    for world in overview.worlds:
-        texts = []
-        for label in overview.columns:
-            cell = overview.find(world, label)
-            has_ratio = cell is not None and cell.verdict.ratio > 0
-            text = format_with_interval(*cell.verdict[3:6]) if cell and has_ratio else "–"
-            is_lost = cell is not None and (cell.loses_track or not has_ratio)
-            share = f"; {100 * cell.track_share:.0f} % keep track" if cell and is_lost else ""
-            texts.append(text + share)
-        rows.append((world, texts))
-    return rows
+    return [
+        (world, [_format_ratio(overview.find(world, label)) for label in overview.columns])
+        for world in overview.worlds
+    ]
+
+
+def _format_ratio(cell: WorldCell | None) -> str:
+    """Format the ratio of a cell with its interval, and the share of runs that keep track where some are lost."""
+    if cell is None:
+        return "–"
+    has_ratio = cell.verdict.ratio > 0
+    text = format_with_interval(*cell.verdict[3:6]) if has_ratio else "–"
+    is_lost = cell.loses_track or not has_ratio
+    return text + f"; {100 * cell.track_share:.0f} % keep track" * is_lost
 
 
 def tabulate_heat_map(overviews: Mapping[TabKey, Overview]) -> tuple[list[str], list[list[str]]]:
@@ -451,16 +445,16 @@ def _format_cell(overview: Overview, world: World, label: str) -> str:
 def list_verdicts(overview: Overview) -> pd.DataFrame:
     """List the filters against the reference of each world."""
     worlds = {world.key: world for world in overview.worlds}
-    rows: list[dict[str, Any]] = []
-    for cell in overview.cells:
-        world = worlds[cell.world]
-        verdict = {k: v for k, v in cell.verdict.to_row().items() if k not in ("a", "b")}
-        rows.append({
-            "world": cell.world, "filter": cell.filter, "reference": overview.names[world.reference], "limit": world.part_name.limit, **verdict,
+    rows = [
+        {
+            "world": cell.world, "filter": cell.filter, "reference": overview.names[worlds[cell.world].reference],
+            "limit": worlds[cell.world].part_name.limit, **cell.verdict.to_row(),
             "track_share": cell.track_share, "loses_track": cell.loses_track,
             "p_every_baseline": cell.p_every, "is_winner": cell.wins, "ms_per_step": overview.times.get((cell.world, cell.filter), ""),
-        })  # fmt: skip
-    return pd.DataFrame(rows)
+        }
+        for cell in overview.cells
+    ]  # fmt: skip
+    return pd.DataFrame(rows).drop(columns=["a", "b"], errors="ignore")
 
 
 def list_comparisons(overview: Overview) -> pd.DataFrame:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import combinations
 from pathlib import Path
 from types import MappingProxyType
@@ -37,7 +37,6 @@ DEAD_RECKONING, PLAIN = "dead_reckoning", "ukf"
 TabKey = int | str  # a number of particles, 0 for a study of one number, or one of those below
 EQUAL_TIME, PRINTED, WITH_KNOBS = "equal time", "as printed", "tuned"
 _TUNING_BYTES = 1_000_000
-_WORDS = ("better", "worse", *EQUAL_WORDS, "not decided")
 _FAMILIES = ("particle", "guided", "swarm", "gaussian", "learned", "kalman", "")
 
 
@@ -164,6 +163,11 @@ class Overview(NamedTuple):
         return [*self.methods, *self.conventional]
 
     @property
+    def world_names(self) -> dict[str, str]:
+        """Names of the worlds for a reader, by key."""
+        return {world.key: world.part_name.name for world in self.worlds}
+
+    @property
     def of_methods(self) -> list[WorldCell]:
         """Methods against the reference of each world."""
         return [cell for cell in self.cells if cell.filter in self.methods]
@@ -179,23 +183,17 @@ def read_world_facts(scenario: str, model: str) -> WorldFacts | None:
 
     They are those of pfbench, and those that `pfbench tune` wrote into `conf` of the current folder.
     """
-    candidates: list[tuple[tuple[bool, bool], WorldFacts]] = []
-    for content in (*_read_shipped_tunings(), *_read_own_tunings()):
-        world = content.get("world") or {}
-        is_of = (world.get("scenario"), world.get("model")) == (scenario, model)
-        if is_of and content.get("best"):
-            candidates.append(
-                (
-                    (world.get("regimes") != [CENTRAL], bool(world.get("settings"))),
-                    WorldFacts(
-                        str(content["best"]),
-                        content.get("kalman_fits"),
-                        bool(world.get("settings")),
-                        content,
-                    ),
-                )
-            )
-    return min(candidates, key=lambda item: item[0])[1] if candidates else None
+    stated = {"scenario": scenario, "model": model}
+    tunings = [
+        tuning for tuning in (*_read_shipped_tunings(), *_read_own_tunings())
+        if tuning.get("best") and stated.items() <= (tuning.get("world") or {}).items()
+    ]  # fmt: skip
+    if not tunings:
+        return None
+    by_settings = sorted(tunings, key=lambda tuning: bool(tuning["world"].get("settings")))
+    first = min(by_settings, key=lambda tuning: tuning["world"].get("regimes") != [CENTRAL])
+    has_part = bool(first["world"].get("settings"))
+    return WorldFacts(str(first["best"]), first.get("kalman_fits"), has_part, first)
 
 
 @cache
@@ -221,22 +219,14 @@ def has_overview(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> bool:
 
 def is_method(look: MethodLook) -> bool:
     """Return whether a filter is a proposed method, and not another form of one, such as that as printed."""
-    return look.proposed and not _read_form(look).get("form_of")
+    return look.proposed and not read_paper_block("filter", parse_label(look.key)[0]).get("form_of")
 
 
-def is_printed(look: MethodLook) -> bool:
-    """Return whether a filter is a proposed method as printed, with the completions that it names."""
-    return look.proposed and _read_form(look).get("form") == "printed"
-
-
-def is_tuned(look: MethodLook) -> bool:
-    """Return whether a filter is a proposed method with knobs that a tuning chose."""
-    return look.proposed and _read_form(look).get("form") == "tuned"
-
-
-def _read_form(look: MethodLook) -> Mapping[str, Any]:
-    """Return the statements of the file of a filter on its form."""
-    return read_paper_block("filter", parse_label(look.key)[0])
+def has_form(form: str, look: MethodLook) -> bool:
+    """Return whether a filter is a proposed method as printed, with the completions that it names, or with knobs that a tuning chose."""
+    return (
+        look.proposed and read_paper_block("filter", parse_label(look.key)[0]).get("form") == form
+    )
 
 
 def plan_world_pairs(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> dict[str, list[Pair]]:
@@ -247,8 +237,8 @@ def plan_world_pairs(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> di
     if not has_overview(table, looks):
         return {}
     keys = {
-        label: PRINTED if is_printed(look) else EQUAL_TIME if _has_equal_time(label) else _level(label)
-        for label, look in looks.items() if is_method(look) or is_printed(look)
+        label: PRINTED if has_form("printed", look) else EQUAL_TIME if _has_equal_time(label) else _level(label)
+        for label, look in looks.items() if is_method(look) or has_form("printed", look)
     }  # fmt: skip
     methods = [
         (a, b) for a, b in combinations(keys, 2)
@@ -256,7 +246,7 @@ def plan_world_pairs(table: pd.DataFrame, looks: Mapping[str, MethodLook]) -> di
     ]  # fmt: skip
     pairs = {}
     for name, rows in table.groupby("scenario", observed=True, sort=False):
-        facts = _find_facts(central_rows(rows).iloc[0], str(name))
+        facts = read_world_facts(str(name), _name_model(central_rows(rows).iloc[0]))
         bases = {PLAIN, facts.reference if facts else PLAIN}
         references = [label for label in looks if parse_label(label)[0] in bases]
         pairs[str(name)] = [*methods, *((a, b) for b in references for a in looks if a != b)]
@@ -371,16 +361,14 @@ def build_overviews(
         names = {name_without_level(label) for label in timed}
         fixed = [label for label in looks if _level(label) is None and label not in names]
         tabs[EQUAL_TIME] = _Tab([*timed, *fixed])
-    for form, is_shown in ((PRINTED, is_printed), (WITH_KNOBS, is_tuned)):
-        forms = [label for label, look in looks.items() if is_shown(look)]
+    for key, form in ((PRINTED, "printed"), (WITH_KNOBS, "tuned")):
+        forms = [label for label, look in looks.items() if has_form(form, look)]
         if len(forms) >= FEWEST_METHODS:
             number = table.loc[table["filter"].isin(forms), "particles"].dropna().median()
             others = [v for v in rest if _level(v) in (None, number) and not is_method(looks[v])]
-            tabs[form] = _Tab(others, 0, is_shown)
-    central = {
-        str(key): central_rows(rows).iloc[0]
-        for key, rows in table.groupby("scenario", observed=True, sort=False)
-    }
+            tabs[key] = _Tab(others, 0, partial(has_form, form))
+    by_world = table.groupby("scenario", observed=True, sort=False)
+    central = {str(key): central_rows(rows).iloc[0] for key, rows in by_world}
     return {key: _build_tab(tab, central, looks, parts, court) for key, tab in tabs.items()}
 
 
@@ -420,10 +408,7 @@ def _build_tab(
 
     A world without a stated reference, or without runs of it, is left out with the reason.
     """
-    present, scenarios = (
-        np.asarray(court.runs.present.any(axis=2)),
-        court.runs.conditions["scenario"],
-    )
+    present, scenarios = np.any(court.runs.present, axis=2), court.runs.conditions["scenario"]
     where = {v: set(scenarios[present[court.runs.filters.index(v)]]) for v in tab.labels}
     swept = [v for v in tab.labels if tab.is_shown is not is_method or name_without_level(v) != v]
     swept = [v for v in swept if tab.is_shown(looks[v])] or list(tab.labels)
@@ -434,7 +419,7 @@ def _build_tab(
     worlds, left_out = [], {}
     for key in keys:
         try:
-            facts = _read_facts(central[key], key)
+            facts = _read_facts(key, _name_model(central[key]))
             worlds.append(build_world(parts[key], facts, court, str(central[key]["regime"]), labels))  # fmt: skip
         except ValueError as error:
             left_out[parts[key].name] = str(error)
@@ -450,15 +435,9 @@ def _decide_tab(
     methods = [label for label, look in looks.items() if is_shown(look)]
     methods.sort(key=lambda label: _FAMILIES.index(looks[label].family))  # one Gaussian last
     by_name = {parse_label(label)[0]: label for label in looks}
-    conventional = [
-        by_name[name] for name in CONVENTIONAL if name in by_name and name not in methods
-    ]
+    conventional = [by_name[name] for name in CONVENTIONAL if name in by_name and name not in methods]  # fmt: skip
     baselines = [label for label, look in looks.items() if not look.proposed]
-    single = [
-        v
-        for v in baselines
-        if looks[v].family == "kalman" and parse_label(v)[0] not in CONVENTIONAL
-    ]
+    single = [v for v in baselines if looks[v].family == "kalman" and parse_label(v)[0] not in CONVENTIONAL]  # fmt: skip
     every, kalman = (find_winners(worlds, methods, some) for some in (baselines, single))
     cells = [
         c._replace(p_every=every[key][0], wins=every[key][1], beats_kalman=kalman[key][1])
@@ -524,18 +503,18 @@ def central_rows(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[rows["regime"] == (CENTRAL if CENTRAL in regimes else next(iter(regimes)))]
 
 
-def _find_facts(row: pd.Series[Any], scenario: str) -> WorldFacts | None:
-    """Find the facts that the tuning of a world states, by a row of its runs; None without one."""
-    return read_world_facts(scenario, str(row.get("model", "")))
+def _name_model(row: pd.Series[Any]) -> str:
+    """Name the model of a run; empty if its table does not state it."""
+    return str(row.get("model", ""))
 
 
-def _read_facts(row: pd.Series[Any], scenario: str) -> WorldFacts:
+def _read_facts(scenario: str, model: str) -> WorldFacts:
     """Read the facts that the tuning of a world states."""
-    facts = _find_facts(row, scenario)
+    facts = read_world_facts(scenario, model)
     if facts is None:
         raise ValueError(
             f"{scenario} must have a tuning that states its best conventional filter, got none. "
-            f"Run pfbench tune scenario={scenario} model={row.get('model', '')}."
+            f"Run pfbench tune scenario={scenario} model={model}."
         )
     return facts
 
@@ -555,11 +534,9 @@ def build_world(
     Raises:
         ValueError: If runs of the reference are missing.
     """
-    conditions, present = court.runs.conditions, np.asarray(court.runs.present.any(axis=2))
+    runs, conditions = court.runs, court.runs.conditions
     mask = ((conditions["scenario"] == part_name.key) & (conditions["regime"] == regime)).to_numpy()
-    present_labels = {
-        k: v for k, v in labels.items() if present[court.runs.filters.index(v), mask].any()
-    }
+    present_labels = {k: v for k, v in labels.items() if runs.present[runs.filters.index(v), mask].any()}  # fmt: skip
     by_name = {parse_label(name)[0]: name for name in present_labels}
     require(
         facts.reference in by_name,
@@ -579,34 +556,26 @@ def tell_story(overview: Overview, method: str, summary: str) -> dict[str, str]:
     A win that is not shown against every single Kalman filter has a dagger.
     """
     cells = [cell for cell in overview.cells if cell.filter == method]
-    names = {world.key: world.part_name.name for world in overview.worlds}
-    over_all = {cell.world for cell in cells if cell.beats_kalman}
-    by_word: dict[str, list[WorldCell]] = {word: [] for word in (*_WORDS, "lost")}
-    for cell in sorted(cells, key=_distance, reverse=True):
-        by_word["lost" if cell.loses_track else cell.verdict.word].append(cell)
+    cells.sort(key=_distance, reverse=True)
 
-    def join(*words: str, dagger: Collection[str] = ()) -> str:
-        """Join the worlds of some words, with the ratios of those that are not near 1."""
+    def join(word: str, mark: str = "") -> str:
+        """Join the worlds of a word, with the ratios of those that are not near 1."""
         return "; ".join(
-            names[cell.world]
-            + (
-                f" ({name_size(cell)}{'†' if cell.world in dagger else ''})"
-                * (word in ("better", "worse"))
-            )
-            for word in words
-            for cell in by_word[word]
-        )
+            overview.world_names[cell.world]
+            + f" ({name_size(cell)}{mark * (not cell.beats_kalman)})" * (word in ("better", "worse"))
+            for cell in cells if name_word(cell) == word
+        )  # fmt: skip
 
-    losses = [join("worse"), f"Loses track: {join('lost')}" if by_word["lost"] else ""]
+    lost = join("loses track")
     return {
         "name": overview.names[method],
         "is": summary,
-        "wins": join("better", dagger=names.keys() - over_all) or "None shown.",
-        "equal": join(*EQUAL_WORDS) or "–",
+        "wins": join("better", "†") or "None shown.",
+        "equal": join("equal") or "–",
         "open": join("not decided") or "–",
-        "loses": ". ".join(filter(None, losses)) or "None shown.",
+        "loses": ". ".join(filter(None, (join("worse"), f"Loses track: {lost}" * bool(lost)))) or "None shown.",
         "time": format_times(overview, method),
-    }
+    }  # fmt: skip
 
 
 def _distance(cell: WorldCell) -> float:
