@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -60,44 +59,38 @@ def name_build(builds: str) -> str:
 
 def list_shared_settings(conditions: Sequence[Condition]) -> list[tuple[str, str]]:
     """List the settings of all jobs; a mixed report has several values."""
-    rows = []
-    for name, path in _SHARED:
-        values = [_value_at(job.meta, path) for cell in conditions for job in cell.jobs]
-        rows.append(
-            (
-                name,
-                ", ".join(distinct_values(str(value) for value in values if value is not None))
-                or "not recorded",
-            )
-        )
-    return rows
-
-
-def compute_cost(conditions: Sequence[Condition], planned: int | None) -> list[tuple[str, str]]:
-    """Count the jobs and sum their time by phase."""
-    parts: Counter[str] = Counter()
     jobs = [job for cell in conditions for job in cell.jobs]
-    for job in jobs:
-        parts.update({name: job.meta["seconds"].get(name, 0.0) for name in _PHASES})
-    shares = ", ".join(
-        f"{phase} {100 * parts[name] / parts.total():.0f} %"
+    values = {
+        name: [str(value) for job in jobs if (value := _value_at(job.meta, path)) is not None]
+        for name, path in _SHARED
+    }
+    return [(name, ", ".join(distinct_values(v)) or "not recorded") for name, v in values.items()]
+
+
+def compute_cost(
+    metadata: Sequence[Mapping[str, Any]], planned: int | None
+) -> list[tuple[str, str]]:
+    """Count the jobs and sum their time by phase."""
+    times = {
+        phase: sum(meta["seconds"].get(name, 0.0) for meta in metadata)
         for name, phase in _PHASES.items()
-        if parts[name]
-    )
+    }
+    total = sum(times.values())
+    shares = ", ".join(f"{phase} {100 * t / total:.0f} %" for phase, t in times.items() if t)
     target = f" of {planned} in the experiment" if planned else ""
-    elapsed = f"{_format_duration(parts.total())} ({shares})" if shares else "not recorded"
-    return [("jobs", f"{len(jobs)}{target}"), ("time of all jobs", elapsed)]
+    elapsed = f"{_format_duration(total)} ({shares})" if shares else "not recorded"
+    return [("jobs", f"{len(metadata)}{target}"), ("time of all jobs", elapsed)]
 
 
 def training_cost(conditions: Sequence[Condition]) -> list[tuple[str, str]]:
     """List the training data and the training cost of each learned filter."""
-    rows = []
+    rows: dict[tuple[str, str], None] = {}
     for job in (job for cell in conditions for job in cell.jobs if job.meta.get("trained")):
         split, cost = job.meta["trained"]["split"], job.meta["trained"]["cost"]
         data = f"{split['train']['runs']} episodes of {split['scenario']}, " if split else ""
         effort = f"{cost['updates']} updates, {cost['seconds']:.0f} s on {cost['device']} ({cost['threads']} threads)"
-        rows.append((f"training of {job.label}", data + effort))
-    return list(dict.fromkeys(rows))
+        rows[f"training of {job.label}", data + effort] = None
+    return list(rows)
 
 
 def format_bibtex(conditions: Sequence[Condition]) -> str:
@@ -151,21 +144,20 @@ def list_cited_keys(pack: Pack) -> list[str]:
     return [key for key in keys if key in _entries()]
 
 
-def find_entries(keys: Iterable[str]) -> str:
-    """Return the BibTeX entries of keys; keys without an entry are left out."""
-    entries = _entries()
-    return "\n".join(entries[key] for key in dict.fromkeys(keys) if key in entries)
-
-
 def format_bibliography(pack: Pack, conditions: Sequence[Condition]) -> str:
     """Format the BibTeX file of a study: pfbench itself, then the references of its filters."""
-    return f"{format_bibtex(conditions)}\n{find_entries(list_cited_keys(pack))}"
+    return f"{format_bibtex(conditions)}\n{_find_entries(pack)}"
 
 
 def renew_bibliography(pack: Pack) -> str:
     """Format the BibTeX file of stored data: its entry of pfbench, then the present references of the filters."""
     entry, end, _ = str(pack["bibtex"]).partition("\n}\n")
-    return f"{entry}{end}\n{find_entries(list_cited_keys(pack))}"
+    return f"{entry}{end}\n{_find_entries(pack)}"
+
+
+def _find_entries(pack: Pack) -> str:
+    """Return the BibTeX entries of the references of all filters."""
+    return "\n".join(_entries()[key] for key in list_cited_keys(pack))
 
 
 def cite(keys: Sequence[str]) -> str:

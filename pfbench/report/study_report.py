@@ -11,10 +11,15 @@ import numpy as np
 import pandas as pd
 
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.report import provenance, provenance as cost, writers
+from pfbench.report import provenance, writers
 from pfbench.report.board.entries import StudyFacts, ViewKey
-from pfbench.report.board.pack import StudyData, build_pack, open_court, read_study
-from pfbench.report.board.study_views import DECISION_COLUMNS
+from pfbench.report.board.pack import (
+    DECISION_COLUMNS,
+    StudyData,
+    build_pack,
+    open_court,
+    read_study,
+)
 from pfbench.report.journal.ratio_figures import HEADLINE, render_headline
 from pfbench.report.options import ReportOptions
 from pfbench.report.overview.page import BOARD_PAGE, render_overview
@@ -133,12 +138,7 @@ def rebuild_page(folder: Path) -> Path:
     pack["bibtex"] = renew_bibliography(pack)
     pack["replay_first"] = name_run_command(str(pack["study"]))
     pack["paper_figures"] = [
-        {
-            **entry,
-            "source": writers.format_data_address(
-                Path(entry["file"]).suffix, (folder / entry["file"]).read_bytes()
-            ),
-        }
+        {**entry, "source": _embed(entry, (folder / entry["file"]).read_bytes())}
         for entry in pack["paper_figures"]
     ]
     others = {name: (folder / name).read_bytes() for name in _TITLES if (folder / name).is_file()}
@@ -214,10 +214,9 @@ def format_verdicts(pack: Mapping[str, Any]) -> str:
 
 def list_downloads(files: Mapping[str, str | bytes]) -> list[dict[str, Any]]:
     """List files as downloads of the page, whatever the order in which they were made."""
-    entries, order = [], {name: k for k, name in enumerate(_TITLES)}
-    for name in sorted(files, key=lambda name: (order.get(name, len(order)), name)):
-        content = files[name]
-        path = Path(name)
+    entries = []
+    for name in (*(n for n in _TITLES if n in files), *sorted(files.keys() - _TITLES.keys())):
+        content, path = files[name], Path(name)
         figure = f"{path.stem.removeprefix('paper_').replace('_', ' ')} ({path.suffix[1:].upper()})"
         group, title = _TITLES.get(name, ("Figures", figure))
         size = len(content.encode() if isinstance(content, str) else content)
@@ -230,12 +229,14 @@ def list_job_settings(conditions: Sequence[Condition], planned: int | None) -> l
 
     Returns names and values, for the settings of the page.
     """
-    budget = cost.format_budget([job.meta for condition in conditions for job in condition.jobs])
-    rows = [("budget", budget.removeprefix("Budget: "))]
-    bounds = [job.meta["pcrb"] for c in conditions for job in c.jobs if "pcrb" in job.meta]
-    rows += [("PCRB", text) for text in provenance.distinct_values(bounds)]
-    rows += provenance.compute_cost(conditions, planned)
-    rows += provenance.training_cost(conditions)
+    metadata = [job.meta for condition in conditions for job in condition.jobs]
+    bounds = [meta["pcrb"] for meta in metadata if "pcrb" in meta]
+    rows = [
+        ("budget", provenance.format_budget(metadata).removeprefix("Budget: ")),
+        *(("PCRB", text) for text in provenance.distinct_values(bounds)),
+        *provenance.compute_cost(metadata, planned),
+        *provenance.training_cost(conditions),
+    ]
     return [list(row) for row in rows]
 
 
@@ -263,15 +264,16 @@ def _draw_paper_figures(
     study: str, conditions: Sequence[Condition], options: ReportOptions, formats: Sequence[str]
 ) -> tuple[list[dict[str, Any]], Files]:
     """Draw the figures of the paper of a study; return template variables and files."""
-    names, start = options.paper_figures, options.start_time_s
-    pairs = figures.paper_figures(study, conditions, names, start)
-    drawings = [drawing for _, drawing in pairs]
-    entries, files = writers.render_figures(drawings, "paper", formats)
+    pairs = figures.paper_figures(study, conditions, options.paper_figures, options.start_time_s)
+    entries, files = writers.render_figures([drawing for _, drawing in pairs], "paper", formats)
     for (name, _), entry in zip(pairs, entries, strict=True):
-        path = Path(entry["file"])  # the page shows the file that is stored
-        source = writers.format_data_address(path.suffix, files[entry["file"]])
-        entry |= {"entry": name, "source": source}
+        entry |= {"entry": name, "source": _embed(entry, files[entry["file"]])}
     return entries, dict(files)
+
+
+def _embed(entry: Mapping[str, Any], content: bytes) -> str:
+    """Return the figure that a page shows: the file that is stored."""
+    return writers.format_data_address(Path(entry["file"]).suffix, content)
 
 
 def _write_all(folder: RecordedFolder, files: Files) -> Path:

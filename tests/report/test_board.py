@@ -17,18 +17,27 @@ from scipy import stats
 from pfbench.report import RUNS_FILE, provenance, read_stored_study
 from pfbench.report.board.curves import select_telling_runs
 from pfbench.report.board.entries import StudyFacts, describe_uncommitted, metric_entries
-from pfbench.report.board.pack import build_pack, join_notes, note_job, select_baselines
-from pfbench.report.board.study_views import (
-    build_views,
+from pfbench.report.board.pack import (
+    build_pack,
+    join_notes,
+    note_job,
     planned_entries,
     round_ratio,
+    select_baselines,
+)
+from pfbench.report.board.view import (
+    BoardRow,
+    View,
+    build_rows,
+    build_views,
+    describe_filters,
+    describe_view,
     select_everywhere,
 )
-from pfbench.report.board.view import BoardRow, View, build_rows, describe_filters, describe_view
 from pfbench.report.methods_text import write_methods
 from pfbench.report.options import ReportOptions
 from pfbench.report.study_page.page_writer import describe_pairs
-from pfbench.results.conditions import Condition, JobFile, load_conditions
+from pfbench.results.conditions import load_conditions
 from pfbench.results.looks import PartName, find_looks, plan_look_pairs
 from pfbench.results.store import JobResult
 from pfbench.stats.court import Court, fix_pairs
@@ -524,7 +533,5 @@ def test_a_page_says_that_jobs_are_of_uncommitted_code() -> None:
     assert builds == ["0123abc", "0123abc with uncommitted changes", "sources 89ef"]
     assert provenance.name_build(builds[0]) == "commit 0123abc"
     assert provenance.name_build(builds[2]) == "sources 89ef"
-    jobs = tuple(JobFile(Path("a"), "a", meta) for meta in metadata)
-    condition = Condition("s", "n", "m", jobs)
-    assert describe_uncommitted([condition]) == "1 of 3 jobs are of uncommitted code."
-    assert describe_uncommitted([condition._replace(jobs=jobs[:1])]) == ""
+    assert describe_uncommitted(metadata) == "1 of 3 jobs are of uncommitted code."
+    assert describe_uncommitted(metadata[:1]) == ""

@@ -16,7 +16,7 @@ from pfbench import job
 from pfbench.report import study_report, writers
 from pfbench.report.board.curves import make_curves
 from pfbench.report.board.entries import round_values
-from pfbench.report.board.study_views import DECISION_COLUMNS
+from pfbench.report.board.pack import DECISION_COLUMNS
 from pfbench.report.study_page import page_writer
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import zip_longest
+from itertools import product, zip_longest
 from typing import Any
 
 import numpy as np
@@ -29,28 +29,27 @@ def make_curves(results: Mapping[str, JobResult], conditions: int = 1) -> dict[s
     most = CURVE_INSTANTS if len(results) * conditions <= _MANY else FEW_CURVE_INSTANTS
     norms = compute_error_norms(results)
     steps = select_truth_steps(norms.values(), most)
-    filters = {}
-    for label, norm in norms.items():
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # instants without a run
-            low, median, high = np.nanquantile(norm[:, steps], [0.1, 0.5, 0.9], axis=0)
-        filters[label] = {
-            "median": round_values(median.tolist()), "q10": round_values(low.tolist()), "q90": round_values(high.tolist()),
-        }  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # instants without a run
+        levels = {k: np.nanquantile(v[:, steps], [0.5, 0.1, 0.9], axis=0) for k, v in norms.items()}
+    filters = {
+        label: dict(zip(("median", "q10", "q90"), round_values(values.tolist()), strict=True))
+        for label, values in levels.items()
+    }
     time = round_values(first.data["time"][steps].tolist())
     return {"t": time, "filters": filters, "unit": group.unit, "group": group.group}
 
 
 def compute_error_norms(results: Mapping[str, JobResult]) -> dict[str, Array]:
     """Compute the norm of the error of the main group in displayed units, [R, T] by label; NaN in lost runs."""
-    norms = {}
-    for label, result in results.items():
-        group = main_component_group(result.meta["state"])
-        error = result.data["error"][..., group.places].astype(np.float64)
-        norm = np.sqrt((error**2).sum(axis=-1)) * group.scale
-        norm[np.asarray(result.data["lost"], dtype=bool)] = np.nan
-        norms[label] = norm
-    return norms
+    return {label: np.sqrt((scale_errors(r) ** 2).sum(axis=-1)) for label, r in results.items()}
+
+
+def scale_errors(result: JobResult) -> Array:
+    """Return the errors of the main group in displayed units, [R, T, K]; NaN in lost runs."""
+    group = main_component_group(result.meta["state"])
+    error = group.scale * result.data["error"][..., group.places].astype(np.float64)
+    return np.where(np.asarray(result.data["lost"], dtype=bool)[:, None, None], np.nan, error)
 
 
 def select_truth_steps(norms: Iterable[Array], most: int) -> np.ndarray:
@@ -66,22 +65,22 @@ def select_truth_steps(norms: Iterable[Array], most: int) -> np.ndarray:
 def list_calibration(table: pd.DataFrame) -> dict[CellKey, Any]:
     """List coverage and NEES ratio of each filter, by cell and by scope."""
     columns = {"coverage_50": "c50", "coverage_90": "c90", "nees_ratio": "nees_ratio"}
-    cells = table.groupby(["scenario", "regime", "filter"], sort=False)[list(columns)].mean()
-    cells = cells.rename(columns=columns)
-    scopes = {(ALL, ALL): cells.groupby("filter").mean()}
-    for world, rows in cells.groupby("scenario"):
-        scopes[str(world), ALL] = rows.groupby("filter").mean()
-    for noise, rows in cells.groupby("regime"):
-        scopes[ALL, str(noise)] = rows.groupby("filter").mean()
-    for (scenario, regime), rows in cells.groupby(["scenario", "regime"]):
-        scopes[str(scenario), str(regime)] = rows.droplevel([0, 1])
-    return {
-        key: {
-            str(label): {name: round_values(value) for name, value in row.items()}
-            for label, row in rows.to_dict("index").items()
-        }
-        for key, rows in scopes.items()
-    }
+    by_cell = table.groupby(["scenario", "regime", "filter"], sort=False)[list(columns)].mean()
+    cells = by_cell.rename(columns=columns).reset_index(["scenario", "regime"])
+    calibration: dict[CellKey, Any] = {}
+    for world, regime in product(
+        *((ALL, *sorted(cells[k].unique())) for k in ("scenario", "regime"))
+    ):
+        rows = cells[cells["scenario"].isin([world]) | (world == ALL)]
+        rows = rows[rows["regime"].isin([regime]) | (regime == ALL)].drop(
+            columns=["scenario", "regime"]
+        )
+        means = rows.groupby("filter", sort=ALL in (world, regime)).mean().to_dict("index")
+        if means:
+            calibration[str(world), str(regime)] = {
+                str(k): round_values(v) for k, v in means.items()
+            }
+    return calibration
 
 
 def list_runs(table: pd.DataFrame) -> dict[CellKey, Any]:
@@ -147,18 +146,16 @@ def make_tracks(
     runs = select_telling_runs(errors, most)
     norms = compute_error_norms(results)
     steps = select_truth_steps(norms.values(), TRACK_INSTANTS)
-    names = [str(numbers[k]) for k in runs]
+    time = first.data["time"]
 
     def by_run(values: Array) -> dict[str, Array]:
-        return dict(zip(names, values, strict=True))
+        return {str(numbers[k]): value for k, value in zip(runs, values, strict=True)}
 
-    time, total = first.data["time"], len(first.data["time"])
-    note = f"{len(steps)} of {total} instants." if len(steps) < total else ""
     entry: dict[str, Any] = {
         "t": [float(f"{t:.4g}") for t in time[steps]],
         "unit": group.unit,
-        "numbers": [int(name) for name in names],
-        "note": note,
+        "numbers": [int(numbers[k]) for k in runs],
+        "note": f"{len(steps)} of {len(time)} instants." * (len(steps) < len(time)),
         "error": {label: by_run(norm[runs][:, steps]) for label, norm in norms.items()},
         "traces": _list_traces(results, runs, steps, by_run),
     }
@@ -169,25 +166,17 @@ def _list_traces(
     results: Mapping[str, JobResult], runs: Sequence[int], steps: np.ndarray, by_run: Any
 ) -> list[dict[str, Any]]:
     """List effective sample size and normalised innovations, where results have them."""
+    counted, scored = ({k: r for k, r in results.items() if name in r.data} for name in ("ess", "nis"))  # fmt: skip
     traces: list[dict[str, Any]] = []
-    sizes = {
-        label: by_run(result.data["ess"][runs][:, steps])
-        for label, result in results.items()
-        if "ess" in result.data
-    }
-    if sizes:
+    if counted:
+        sizes = {k: by_run(r.data["ess"][runs][:, steps]) for k, r in counted.items()}
         traces.append({"name": "effective sample size", "unit": "", "log": True, "filters": sizes})
-    innovations = {
-        label: by_run(_nis_ratio(result)[runs])
-        for label, result in results.items()
-        if "nis" in result.data
-    }
-    if innovations:
-        first = next(result for result in results.values() if "nis" in result.data)
-        time = first.data["time"][first.data["score_steps"]]
+    if scored:
+        data = next(iter(scored.values())).data
         traces.append({
-            "name": "squared innovation divided by its expectation", "unit": "", "log": True, "filters": innovations,
-            "t": [float(f"{t:.4g}") for t in time],
+            "name": "squared innovation divided by its expectation", "unit": "", "log": True,
+            "filters": {k: by_run(_nis_ratio(r)[runs]) for k, r in scored.items()},
+            "t": [float(f"{t:.4g}") for t in data["time"][data["score_steps"]]],
         })  # fmt: skip
     return traces
 
@@ -211,16 +200,10 @@ def _describe_plane(
     truth = np.asarray(first.data["track"], dtype=np.float64)[runs][:, steps, :2]
     is_common = np.allclose(truth, truth[:1], rtol=0, atol=0.05, equal_nan=True)
     errors = {
-        label: by_run(_mask_lost(result)[runs][:, steps][..., places])
-        for label, result in results.items()
-    }
+        label: by_run(np.where(data["lost"][:, None, None], np.nan, data["error"])[runs][:, steps][..., places])
+        for label, (_, data) in results.items()
+    }  # fmt: skip
     return {"truth": {"all": truth[0]} if is_common else by_run(truth), "plane": errors}
-
-
-def _mask_lost(result: JobResult) -> Array:
-    """Return the errors with NaN in lost runs, [R, T, D]."""
-    lost = np.asarray(result.data["lost"], dtype=bool)
-    return np.where(lost[:, None, None], np.nan, result.data["error"])
 
 
 # --------------------------------------------------------------------------------------------------
@@ -271,21 +254,15 @@ def _list_lines(
         return []
     lines: list[dict[str, Any]] = []
     for line, items in present.groupby("line", sort=False):
-        look = looks[items["filter"].iloc[0]]
+        look, (_, bracket, others) = looks[items["filter"].iloc[0]], str(line).partition("[")
         ordered = items.sort_values("x", kind="stable")
         points = [_point(x, rows[v]) for x, v in zip(ordered["x"], ordered["filter"], strict=True)]
-        lines.append({"filter": look.key, "name": _name_line(str(line), look), "points": points})
+        name = look.name.partition(" [")[0] + f" {bracket}{others}" * bool(bracket)
+        lines.append({"filter": look.key, "name": name, "points": points})
     for label in [label for label in rows if label not in set(members["filter"])]:
         ends = [_point(x, rows[label]) for x in (members["x"].min(), members["x"].max())]
         lines.append({"filter": label, "name": looks[label].name, "points": ends})
     return lines
-
-
-def _name_line(line: str, look: MethodLook) -> str:
-    """Return the name of a method with its other settings."""
-    _, _, others = line.partition("[")
-    name = look.name.partition(" [")[0]
-    return f"{name} [{others}" if others else name
 
 
 def _point(x: float, row: Mapping[str, Any]) -> dict[str, Any]:

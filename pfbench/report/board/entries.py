@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from pfbench.report import provenance
 from pfbench.report.options import ReportOptions
-from pfbench.results import metrics, status, store
-from pfbench.results.conditions import ComponentGroup, Condition, main_component_group, parse_label
+from pfbench.results import status, store
+from pfbench.results.conditions import Condition, main_component_group, parse_label
 from pfbench.results.frame import drop_before
 from pfbench.results.looks import MethodLook, PartName, add_tuning, find_looks
-from pfbench.results.metrics import MetricInput, page_metrics
+from pfbench.results.metrics import MetricInput, compute_metric, page_metrics
 from pfbench.results.paper_block import list_named_parts
 from pfbench.results.step_times import STEP_TIME, WARM_UP, StepTimes
 from pfbench.results.store import SAME_LIKELIHOODS, SAME_N
@@ -94,15 +93,13 @@ class StudyFacts(NamedTuple):
             pack: Data of a page.
         """
         facts = pack["facts"]
-        stored = [MethodLook(**{**v, "baselines": tuple(v["baselines"])}) for v in facts["looks"]]
-        labels = [look.key for look in stored]
-        methods = {parse_label(label)[0] for label in labels}
+        stored = {v["key"]: MethodLook(**{**v, "baselines": tuple(v["baselines"])}) for v in facts["looks"]}  # fmt: skip
+        methods = {parse_label(label)[0] for label in stored}
         is_installed = methods <= set(list_named_parts("filter"))
-        looks = {look.key: look for look in stored}
-        present = find_looks(labels) if is_installed else looks
+        present = find_looks(list(stored)) if is_installed else stored
         return cls(
             {
-                key: add_tuning(look, looks[key].tuning, looks[key].tuned_on)
+                key: add_tuning(look, stored[key].tuning, stored[key].tuned_on)
                 for key, look in present.items()
             },
             {entry["key"]: PartName(**entry) for entry in pack["worlds"]},
@@ -146,32 +143,11 @@ def round_values(values: Any, digits: int = 4) -> Any:
     return None if values == "" else values
 
 
-def describe_versions(conditions: Sequence[Condition]) -> dict[str, str]:
-    """Return builds, date and version of the results. The build of uncommitted code is not its commit."""
-    metadata = [job.meta for c in conditions for job in c.jobs]
-    versions = metadata[0].get("versions", {})
-    return {
-        "commit": ", ".join(provenance.list_builds(metadata)),
-        "date": max(str(meta.get("created", ""))[:10] for meta in metadata),
-        "version": str(versions.get("pfbench", "")),
-    }
-
-
-def describe_uncommitted(conditions: Sequence[Condition]) -> str:
+def describe_uncommitted(metadata: Sequence[Mapping[str, Any]]) -> str:
     """State how many jobs were computed by code that no commit has; empty if none was."""
-    metadata = [job.meta for c in conditions for job in c.jobs]
     commits = [str(meta.get("versions", {}).get("commit") or "") for meta in metadata]
     number = sum(commit.endswith("-dirty") for commit in commits)
     return f"{number} of {len(metadata)} jobs are of uncommitted code." if number else ""
-
-
-def filter_entry(look: MethodLook) -> dict[str, Any]:
-    """Return the entry of a filter."""
-    return {
-        "key": look.key, "name": look.name, "long": look.long_name, "family": look.family,
-        "proposed": look.proposed, "colour": look.colour, "dark": look.dark_colour,
-        "marker": look.marker, "cite": look.cite,
-    }  # fmt: skip
 
 
 def regime_entries(table: pd.DataFrame, regimes: Mapping[str, PartName]) -> list[dict[str, Any]]:
@@ -203,10 +179,9 @@ def cell_entries(table: pd.DataFrame) -> list[dict[str, Any]]:
     return cells
 
 
-def budget_entries(conditions: Sequence[Condition]) -> list[dict[str, Any]]:
+def budget_entries(metadata: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """List the entries of the budgets, each with the reason why the study lacks it."""
-    jobs = [job.meta for condition in conditions for job in condition.jobs]
-    kinds = {str(meta["config"].get("budget", SAME_N)) for meta in jobs}
+    kinds = {str(meta["config"].get("budget", SAME_N)) for meta in metadata}
     return [
         {"key": key, "name": name,
          "reason_missing": None if key in kinds else f"The study has no jobs with budget={key}."}
@@ -271,11 +246,13 @@ def job_rows(
     meta, lost = result.meta, np.asarray(result.data["lost"], dtype=bool)
     group = main_component_group(meta["state"])
     particles, rounds, seconds = meta.get("particles"), meta.get(STEP_TIME), meta["seconds"]
+    data, missing = MetricInput(result, group, group.state_group), np.full(lost.size, np.nan)
     components = {
         name: entry.component
         for name, entry in page_metrics().items()
         if name == metric or not entry.only_decides
-    }
+    } | {"coverage_50": "mean", "coverage_90": "mean", "nees_ratio": "norm"}
+    values = {name: compute_metric(name, data).get(k, missing) for name, k in components.items()}
     columns = {
         "filter": label,
         "scenario": condition.scenario,
@@ -289,31 +266,8 @@ def job_rows(
         "keeps_track": status.keeps_track(result.data, meta),
         "unit": group.unit,
         "group": group.group,
-        **dict(_metric_columns(result, group, lost, components)),
+        **{name: np.where(lost, np.nan, np.asarray(v, dtype=np.float64)) for name, v in values.items()},
         # NaN for a time that holds the first steps of a process
-        "ms": 1e3
-        * float(
-            rounds["median"] if rounds else seconds["per_step"] if WARM_UP in seconds else math.nan
-        ),
-    }
+        "ms": 1e3 * float(rounds["median"] if rounds else seconds["per_step"] if WARM_UP in seconds else math.nan),
+    }  # fmt: skip
     return pd.DataFrame(columns)
-
-
-def _metric_columns(
-    result: store.JobResult,
-    group: ComponentGroup,
-    lost: np.ndarray,
-    components: Mapping[str, str],
-) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the values of the main group by metric."""
-    data = MetricInput(result, group, group.state_group)
-    missing = np.full(lost.size, np.nan)
-    for name, component in components.items():
-        values = metrics.compute_metric(name, data).get(component, missing)
-        yield name, np.where(lost, np.nan, np.asarray(values, dtype=np.float64))
-    for name in ("coverage_50", "coverage_90"):
-        values = metrics.compute_metric(name, data).get("mean", missing)
-        yield name, np.where(lost, np.nan, np.asarray(values, dtype=np.float64))
-    dof = len(result.meta["state"]["groups"][group.state_group])
-    nees = metrics.compute_metric("nees", data).get("norm", missing)
-    yield "nees_ratio", np.where(lost, np.nan, np.asarray(nees, dtype=np.float64) / dof)

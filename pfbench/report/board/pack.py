@@ -22,16 +22,16 @@ from pfbench.report.board.curves import (
 from pfbench.report.board.entries import (
     CellKey,
     StudyFacts,
+    ViewKey,
     budget_entries,
     cell_entries,
     describe_uncommitted,
-    describe_versions,
-    filter_entry,
     job_rows,
     join_rows,
     metric_entries,
     name_regimes,
     regime_entries,
+    round_values,
 )
 from pfbench.report.board.recorded_units import (
     RecordedCondition,
@@ -39,13 +39,14 @@ from pfbench.report.board.recorded_units import (
     decide_records,
     describe_reach,
 )
-from pfbench.report.board.study_views import (
+from pfbench.report.board.view import (
     build_views,
-    list_decisions,
-    order_worlds,
-    planned_entries,
+    select_common,
+    select_everywhere,
+    shorten_view,
+    word_verdict,
 )
-from pfbench.report.board.view import shorten_view
+from pfbench.report.journal.study_pack import ALL
 from pfbench.report.methods_text import collect_methods_facts
 from pfbench.report.options import ReportOptions
 from pfbench.report.overview.tables import plan_world_pairs
@@ -54,6 +55,7 @@ from pfbench.results.conditions import Condition, differing_settings, parse_labe
 from pfbench.results.frame import drop_before, to_long_rows
 from pfbench.results.looks import (
     MethodLook,
+    PartName,
     plan_look_pairs,
     study_looks,
     study_part_names,
@@ -63,9 +65,16 @@ from pfbench.results.paper_block import REFERENCES
 from pfbench.results.status import count_statuses
 from pfbench.results.step_times import StepTimes
 from pfbench.results.store import JobResult, list_failures
+from pfbench.stats.comparison import MIN_RUNS, NO_DECISION, Verdict, decide
 from pfbench.stats.court import Court, fix_pairs
+from pfbench.stats.error_measures import Flags
 from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
-from pfbench.stats.study_runs import arrange_runs
+from pfbench.stats.study_runs import (
+    arrange_runs,
+    compare_filters,
+    compute_losses,
+    share_conditions,
+)
 
 
 def build_pack(
@@ -80,8 +89,14 @@ def build_pack(
     regime). None is a value that does not exist.
     """
     data = data or read_study(conditions, options)
-    table = data.table
+    table, metadata = data.table, [job.meta for c in conditions for job in c.jobs]
     regimes = study_part_names(conditions, "noise")
+    differing = [
+        f"Jobs of {condition.name} differ in {', '.join(settings)}: "
+        "their runs share random numbers, but not the data."
+        for condition in conditions
+        if (settings := differing_settings(condition.jobs))
+    ]
     facts = StudyFacts(
         study_looks(conditions),
         study_part_names(conditions, "scenario"),
@@ -90,7 +105,7 @@ def build_pack(
         data.times,
         list_failures(conditions[0].jobs[0].path.parent),
         " ".join(filter(None, (conditions[0].older, data.warning))),
-        " ".join(filter(None, (describe_uncommitted(conditions), _describe_differing(conditions)))),
+        " ".join(filter(None, (describe_uncommitted(metadata), *differing))),
         data.records,
     )
     decided = decide_parts(table, facts)
@@ -99,11 +114,15 @@ def build_pack(
     pack = {
         "study": study,
         "title": options.title or study,
-        "generated": describe_versions(conditions),
+        "generated": {  # the build of uncommitted code is not its commit
+            "commit": ", ".join(provenance.list_builds(metadata)),
+            "date": max(str(meta.get("created", ""))[:10] for meta in metadata),
+            "version": str(metadata[0].get("versions", {}).get("pfbench", "")),
+        },
         **decided,
         "regimes": regime_entries(table, regimes),
         "cells": cells,
-        "budgets": budget_entries(conditions),
+        "budgets": budget_entries(metadata),
         "curves": data.curves,
         "tracks": data.tracks,
         "replay": f"pfbench replay study={study} scenario={{world}} noise={{noise}}"
@@ -120,16 +139,6 @@ def build_pack(
         "facts": facts.to_entries(),
     }
     return pack | {"bibtex": format_bibliography(pack, conditions)}
-
-
-def _describe_differing(conditions: Sequence[Condition]) -> str:
-    """Name the conditions whose jobs differ in their data."""
-    return " ".join(
-        f"Jobs of {condition.name} differ in {', '.join(settings)}: "
-        "their runs share random numbers, but not the data."
-        for condition in conditions
-        if (settings := differing_settings(condition.jobs))
-    )
 
 
 # --------------------------------------------------------------------------------------------------
@@ -220,6 +229,11 @@ def _leave_out_copies(data: StudyData) -> StudyData:
 _BASELINES = (*REFERENCES, "ukf", "ckf")  # offered first if they are in the study
 _MOST_BASELINES, _FEW_BASELINES = 3, 2
 _MANY = 300  # filters times conditions, from which a page offers few baselines
+# names of a look on a page
+_LOOKS = {
+    "key": "key", "name": "name", "long": "long_name", "family": "family", "proposed": "proposed", "colour": "colour",
+    "dark": "dark_colour", "marker": "marker", "cite": "cite",
+}  # fmt: skip
 
 
 def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
@@ -235,7 +249,11 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
     most = _MOST_BASELINES if len(looks) * conditions <= _MANY else _FEW_BASELINES
     baselines = select_baselines(looks, options.baseline)[:most]
     groups = table.groupby(["scenario", "regime"])[["unit", "group"]].first()
-    views = build_views(court, groups, facts, baselines)
+    views, failed = build_views(court, groups, facts, baselines), len(facts.failures)
+    missing = (
+        f"{failed} {'job has' if failed == 1 else 'jobs have'} no valid result and "
+        f"{'is' if failed == 1 else 'are'} missing from all tables."
+    )
     recorded = decide_records(facts.records, court, baselines)
     for key, view in views.items():
         view["sentence"] = shorten_view(
@@ -246,7 +264,10 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
     return {
         "alpha": options.alpha,
         "margin": options.equivalence_margin,
-        "filters": [filter_entry(looks[row["filter"]]) for row in first],
+        "filters": [
+            {name: getattr(looks[row["filter"]], field) for name, field in _LOOKS.items()}
+            for row in first
+        ],
         "worlds": [asdict(name) for name in worlds.values()],
         "metrics": metric_entries(table, options.metric),
         "baselines": baselines,
@@ -255,9 +276,7 @@ def decide_parts(table: pd.DataFrame, facts: StudyFacts) -> dict[str, Any]:
         "decisions": list_decisions(court, options.metric),
         "recorded": recorded,
         "world_orders": order_worlds(court, views, facts),
-        "warnings": [
-            text for text in (_count_failures(len(facts.failures)), facts.warning) if text
-        ],
+        "warnings": [text for text in (missing * bool(failed), facts.warning) if text],
         "calibration": list_calibration(table),
         "runs": list_runs(table),
         "sweeps": list_sweeps(views, looks, options.metric),
@@ -285,16 +304,6 @@ def open_court(
     return Court(runs, fixed, margin, options.alpha, in_worlds)
 
 
-def _count_failures(number: int) -> str:
-    """State how many jobs failed; empty if none did."""
-    jobs = (
-        "1 job has no valid result and is"
-        if number == 1
-        else f"{number} jobs have no valid result and are"
-    )
-    return f"{jobs} missing from all tables." if number else ""
-
-
 def select_baselines(looks: Mapping[str, MethodLook], baseline: str = "") -> list[str]:
     """Select the baselines that a reader may choose, the one of the opening view first."""
     require(
@@ -309,6 +318,131 @@ def select_baselines(looks: Mapping[str, MethodLook], baseline: str = "") -> lis
     available += [label for name in names for label in looks if parse_label(label)[0] == name]
     available += [label for label, look in looks.items() if not look.proposed][:1]
     return list(dict.fromkeys(available)) or list(looks)[:1]
+
+
+def planned_entries(court: Court, facts: StudyFacts) -> list[dict[str, Any]]:
+    """List the entries of the pairs that were compared in advance, in ratios, with each scenario and a new world."""
+    looks, options = facts.looks, facts.options
+    mask = select_everywhere(court.runs)
+    runs = court.runs.select(mask)
+    pairs = [pair for pair in plan_look_pairs(looks) if share_conditions(runs, *pair)]
+    planned = [court.find(options.metric, mask, *pair) for pair in pairs]
+    losses = compute_losses(runs, options.metric)
+    new = decide(compare_filters(runs, losses, pairs, "world"), court.margin, court.alpha)
+    return [
+        {
+            "a": v.a, "b": v.b, "kind": _find_kind(looks[v.a], looks[v.b]), "word": v.word, "reason": v.reason or None,
+            "words": word_verdict(v, court.margin), **show_ratio(v), "p": round_values(v.p),
+            "loses": v.lost.word, "cells": _list_cells(court, options.metric, (v.a, v.b), facts.worlds),
+            "new_world": {**show_ratio(w), "word": w.word, "worlds": w.n} if w.n >= MIN_RUNS else None,
+        }
+        for v, w in zip(planned, new, strict=True)
+    ]  # fmt: skip
+
+
+_NO_VERDICT = Verdict("", "", NO_DECISION, math.nan, math.nan, math.nan, math.nan, 0)
+DECISION_COLUMNS = ("world", "family", *_NO_VERDICT.to_row())  #: of the table of all pairs
+
+
+def list_decisions(court: Court, metric: str) -> list[dict[str, Any]]:
+    """List the verdicts on all pairs with their families: over all conditions, and in each of a few scenarios.
+
+    Of a scenario with pairs of its own that are fixed in advance, these pairs are listed.
+    """
+    worlds = select_each_world(court)
+    is_few = 1 < len(worlds) <= MOST_WORLDS  # whose page has the order of each world
+    scopes = {ALL: select_everywhere(court.runs)} | (worlds if is_few or court.fixed_in else {})
+    return [
+        {"world": world, "family": family, **verdict.to_row()}
+        for world, mask in scopes.items()
+        for family, verdict in court.list_verdicts(metric, mask, world == ALL or is_few)
+    ]
+
+
+def select_each_world(court: Court) -> dict[str, Flags]:
+    """Select the conditions of the view of each scenario, [C]."""
+    scenarios = court.runs.conditions["scenario"]
+    return {
+        str(name): select_common(court.runs, (scenarios == name).to_numpy())
+        for name in scenarios.unique()
+    }
+
+
+def _find_kind(method: MethodLook, baseline: MethodLook) -> str:
+    """Return whether a baseline is of the paper or a tuned one; empty for neither."""
+    if parse_label(baseline.key)[0] in method.baselines:
+        return "paper"
+    return "tuned" if method.baselines and baseline.tuning else ""
+
+
+def _list_cells(
+    court: Court, metric: str, pair: tuple[str, str], worlds: Mapping[str, PartName]
+) -> list[dict[str, Any]]:
+    """List the ratio of a pair in each scenario, of its view; none for one scenario."""
+    verdicts = {world: court.find(metric, mask, *pair) for world, mask in select_each_world(court).items()}  # fmt: skip
+    return [
+        {"world": world, "regime": ALL, "name": worlds[world].name, **show_ratio(verdict)}
+        for world, verdict in verdicts.items()
+        if verdict.n and len(verdicts) > 1
+    ]
+
+
+_NEAR = 0.1  # distance from 1 that is shown in percent with digits of its own
+
+
+def round_ratio(log_ratio: float) -> float | None:
+    """Return a ratio with four digits, and four of its distance from 1 if it is near; None without a number."""
+    if not math.isfinite(log_ratio):
+        return None
+    distance = math.expm1(min(log_ratio, 700.0))
+    if abs(distance) < _NEAR:
+        return round(1 + float(f"{distance:.4g}"), 12)
+    return float(f"{1 + distance:.4g}")
+
+
+def show_ratio(verdict: Verdict) -> dict[str, float | None]:
+    """Return the ratio of a verdict and its interval."""
+    ends = {"estimate": verdict.ratio, "low": verdict.low, "high": verdict.high}
+    rounded = {name: round_ratio(math.log(v) if v > 0 else -math.inf) for name, v in ends.items()}
+    return rounded | ({"high": math.inf} if verdict.high == math.inf and verdict.low > 0 else {})
+
+
+MOST_WORLDS = 3  # more worlds have a page of their own, or an average
+
+
+def order_worlds(
+    court: Court, views: Mapping[ViewKey, Mapping[str, Any]], facts: StudyFacts
+) -> list[dict[str, Any]]:
+    """Describe the order of each world: its sentence, its first filter, and the filters that do as well.
+
+    Empty unless the study has two or three worlds, each one scenario, in one noise regime.
+    """
+    conditions, worlds = court.runs.conditions, select_each_world(court)
+    is_few = 1 < len(worlds) <= MOST_WORLDS and conditions["family"].nunique() == len(worlds)
+    if not is_few or conditions["regime"].nunique() > 1:
+        return []
+    (metric, *_, baseline), orders = next(iter(views)), []
+    for world, mask in worlds.items():
+        view = views[ViewKey(metric, world, ALL, baseline)]
+        first, *others = [row["filter"] for row in view["rows"] if row["rank"] is not None]
+        ties = [v for v in others if court.find(metric, mask, v, first).word != "worse"]
+        is_said = not ties and first == baseline  # by the sentence of the view
+        text = "" if is_said else _describe_ties(first, ties, len(others), facts.looks)
+        orders.append({"world": world, "sentence": f"{view['sentence']} {text}".rstrip()})
+    return orders
+
+
+def _describe_ties(
+    best: str, ties: Sequence[str], others: int, looks: Mapping[str, MethodLook]
+) -> str:
+    """Say which filters are not shown to be worse than the first one of a world."""
+    first = f"[[{looks[best].name}]]"
+    if not ties:
+        return f"All others are worse than {first}." if others else ""
+    names = ", ".join(f"[[{looks[label].name}]]" for label in ties)
+    verb = "is" if len(ties) == 1 else "are"
+    end = "" if len(ties) == others else " All others are."
+    return f"{names} {verb} not shown to be worse than {first}, the first of this world.{end}"
 
 
 # --------------------------------------------------------------------------------------------------
@@ -356,16 +490,10 @@ def join_notes(notes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 def list_modelling_choices(
     notes: Sequence[Mapping[str, Any]], looks: Mapping[str, MethodLook]
 ) -> list[dict[str, str]]:
-    """List the modelling choices, with the names of the filters that make them."""
-    labels: dict[str, dict[str, None]] = {}
-    for note in notes:
-        for text in note["choices"]:
-            labels.setdefault(text, {})[note["filter"]] = None
-    return [{"text": text, "filters": _name_filters(labels[text], looks)} for text in sorted(labels)]  # fmt: skip
-
-
-def _name_filters(labels: Mapping[str, None], looks: Mapping[str, MethodLook]) -> str:
-    """Return the names of filters, "all filters" if none is missing."""
-    if set(labels) == set(looks):
-        return "all filters"
-    return ", ".join(looks[label].name for label in looks if label in labels)
+    """List the modelling choices, with the names of the filters that make them, "all filters" if none is missing."""
+    pairs = {(text, note["filter"]) for note in notes for text in note["choices"]}
+    labels = {text: [v for v in looks if (text, v) in pairs] for text, _ in sorted(pairs)}
+    return [
+        {"text": text, "filters": "all filters" if len(some) == len(looks) else ", ".join(looks[v].name for v in some)}
+        for text, some in labels.items()
+    ]  # fmt: skip

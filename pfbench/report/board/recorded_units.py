@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from pfbench.report.board.curves import scale_errors
 from pfbench.report.board.entries import round_values
+from pfbench.report.journal.study_pack import name_of
 from pfbench.report.methods_text import is_recorded
-from pfbench.results.conditions import main_component_group
 from pfbench.results.looks import PartName
 from pfbench.results.store import JobResult
 from pfbench.stats.comparison import NO_DECISION, SAME_RUNS, Effect, Verdict, compare, decide
@@ -64,7 +65,7 @@ def collect_record(
     if not is_recorded(first.meta):
         return None
     config, drives = first.meta["config"], count_drives(first.meta)
-    errors = {label: _scaled_errors(result) for label, result in results.items()}
+    errors = {label: scale_errors(result) for label, result in results.items()}
     numbers = np.arange(len(first.data["lost"])) + int(first.meta.get("first_run", 0))
     world, regime, noise = origin
     return {
@@ -77,13 +78,6 @@ def collect_record(
 def count_drives(meta: Mapping[str, Any]) -> int:
     """Return the number of drives of a recorded scenario; run r uses drive r modulo this number."""
     return len(meta["config"]["scenario"].get("flights") or (1,))
-
-
-def _scaled_errors(result: JobResult) -> Array:
-    """Return the errors of the main group in displayed units, [R, T, K]; NaN in lost runs."""
-    group = main_component_group(result.meta["state"])
-    error = group.scale * result.data["error"][..., group.places].astype(np.float64)
-    return np.where(np.asarray(result.data["lost"], bool)[:, None, None], np.nan, error)
 
 
 def _describe_added(scenario: Mapping[str, Any]) -> str:
@@ -113,8 +107,8 @@ def _list_losses(errors: Mapping[str, Array], time: Array, drive: np.ndarray) ->
     steps = []
     for number in np.unique(drive):
         finite = [np.isfinite(e[drive == number]).all(-1).any(0) for e in errors.values()]
-        steps.append((drive == number, np.flatnonzero(np.logical_or.reduce(finite))))
-    steps = [(runs, where) for runs, where in steps if len(where) > 1]
+        where = np.flatnonzero(np.logical_or.reduce(finite))
+        steps += [(drive == number, where)] * (len(where) > 1)
     seconds = [float(time[where[-1]] - time[where[0]]) for _, where in steps]
     counts = count_blocks(seconds) if sum(seconds) > 0.0 else []
 
@@ -174,21 +168,19 @@ def decide_records(
     Returns:
         The conditions with a row per filter: verdict, ratio, interval and p-value by unit.
     """
-    runs, decided = court.runs, []
+    decided, conditions = [], court.runs.conditions
     for record in records:
-        labels = [label for label in record["filters"] if label in runs.filters]
-        base = next((label for label in baselines if label in labels), labels[0] if labels else "")
+        labels = [label for label in record["filters"] if label in court.runs.filters]
+        base = next((label for label in (*baselines, *labels) if label in labels), "")
         pairs = [(label, base) for label in labels if label != base]
-        conditions = runs.conditions
         mask = ((conditions["scenario"] == record["world"]) & (conditions["regime"] == record["regime"])).to_numpy()  # fmt: skip
-        if not mask.any():
-            continue
-        verdicts = _decide_units(record, court, mask, pairs)
-        decided.append({
-            **{key: record[key] for key in ("world", "regime", "noise", "added", "simulated", "seconds", "drives", "runs")},
-            "baseline": base,
-            "rows": [{"filter": label, **{unit: v[k] for unit, v in verdicts.items()}} for k, (label, _) in enumerate(pairs)],
-        })  # fmt: skip
+        if mask.any():
+            verdicts = _decide_units(record, court, mask, pairs)
+            decided.append({
+                **{key: record[key] for key in ("world", "regime", "noise", "added", "simulated", "seconds", "drives", "runs")},
+                "baseline": base,
+                "rows": [{"filter": label, **{unit: v[k] for unit, v in verdicts.items()}} for k, (label, _) in enumerate(pairs)],
+            })  # fmt: skip
     return decided
 
 
@@ -282,14 +274,13 @@ def describe_reach(
         ]  # fmt: skip
         if not records:
             continue
-        name, drives = worlds[world].name if world in worlds else world, records[0]["drives"]
+        drives, kind = records[0]["drives"], _count_recorded(records[0]["drives"])
         unit, by = ("blocks", "blocks of time") if drives == 1 else ("drives", "drives")
         words = Counter(row[unit]["word"] for record in records for row in record["rows"])
-        texts = [f"{n} {word}" for word, n in words.items()]
-        kind = _count_recorded(drives)
+        texts = ", ".join(f"{n} {word}" for word, n in words.items())
+        name = worlds[world].name if world in worlds else world
         where = f"On {kind}" if len(worlds) == 1 else f"{name}, {kind}"
-        decided_by = f"; by {by} {', '.join(texts)}" if texts else ""
-        sentences.append(f"{where}{decided_by}.")
+        sentences.append(f"{where}; by {by} {texts}." if texts else f"{where}.")
     return " ".join(sentences)
 
 
@@ -307,11 +298,10 @@ def _count_recorded(drives: int) -> str:
 def describe_records(pack: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the recorded conditions of a page as texts: source, questions, and a row per filter."""
     names = {look["key"]: look["name"] for look in pack["filters"]}
-    worlds = {entry["key"]: entry["name"] for entry in pack["worlds"]}
     regimes = {entry["key"]: entry for entry in pack["regimes"]}
     return [
         {
-            "title": f"{worlds.get(record['world'], record['world'])}, {regimes[record['regime']]['name']}",
+            "title": f"{name_of(pack, 'worlds', record['world'])}, {regimes[record['regime']]['name']}",
             "source": _describe_source(record, str(regimes[record["regime"]]["words"])),
             "baseline": names[record["baseline"]],
             "rows": [
@@ -328,8 +318,8 @@ def describe_records(pack: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def _describe_source(record: Mapping[str, Any], words: str) -> str:
     """Say what is recorded and what is simulated."""
-    parts = [(words, record["simulated"])] if record["noise"] != "nominal" else []
-    parts += [("white errors", record["added"])] if record["added"] else []
+    is_noisy = record["noise"] != "nominal"
+    parts = [(words, record["simulated"])] * is_noisy + [("white errors", record["added"])] * bool(record["added"])  # fmt: skip
     texts = [f"{name} ({numbers})" if numbers else name for name, numbers in parts]
     source = f"Measurements: recorded, plus simulated {' and '.join(texts)}" if texts else "Measurements as recorded"  # fmt: skip
     drives = "One drive" if record["drives"] == 1 else f"{record['drives']} drives"

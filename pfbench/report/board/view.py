@@ -1,11 +1,11 @@
-"""View of a board: the filters of a selection of conditions against one baseline, with a sentence."""
+"""Views of a study: the filters of a selection of conditions against one baseline by one metric, with a sentence."""
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -13,7 +13,22 @@ import numpy as np
 import pandas as pd
 import scipy  # scipy.stats is imported at its first use
 
-from pfbench.results.looks import MethodLook
+from pfbench.report.board.entries import (
+    StudyFacts,
+    ViewKey,
+    format_interval_level,
+    list_metrics,
+    round_values,
+)
+from pfbench.report.journal.study_pack import ALL
+from pfbench.results.looks import (
+    MethodLook,
+    count_tuned,
+    describe_data_settings,
+    describe_settings,
+    describe_tuning,
+)
+from pfbench.results.metrics import page_metrics
 from pfbench.results.step_times import StepTimes, describe_costs
 from pfbench.stats.comparison import (
     EQUAL_WORDS,
@@ -25,8 +40,13 @@ from pfbench.stats.consistency_bands import compare_share
 from pfbench.stats.court import Court, find_lost_conditions
 from pfbench.stats.error_measures import Array, Flags
 from pfbench.stats.rank_tests import holm
-from pfbench.stats.sentences import format_with_interval
-from pfbench.stats.study_runs import StudyRuns, compute_losses, weigh_conditions
+from pfbench.stats.sentences import format_count, format_with_interval
+from pfbench.stats.study_runs import (
+    StudyRuns,
+    compute_losses,
+    select_conditions,
+    weigh_conditions,
+)
 
 BASE, MISSING, LOSES_TRACK = "baseline", "missing", "loses track"
 _SAME_LEVEL = 1e-6
@@ -71,6 +91,149 @@ class View:
         return self.court.runs.select(self.mask)
 
 
+def build_views(
+    court: Court, groups: pd.DataFrame, facts: StudyFacts, baselines: Sequence[str]
+) -> dict[ViewKey, dict[str, Any]]:
+    """Build all views that have runs. The first one opens the page.
+
+    Args:
+        court: Court that decides the pairs of the study.
+        groups: Unit and main group by scenario and regime.
+        facts: Names, options and times of the study.
+        baselines: Labels of the baselines.
+    """
+    scopes = [_make_view(court, scope, groups, facts) for scope in _list_scopes(court.runs.conditions)]  # fmt: skip
+    views: dict[ViewKey, dict[str, Any]] = {}
+    for metric in list_metrics(court.runs.values, facts.options.metric):
+        entry = page_metrics()[metric]
+        for scope in scopes:
+            names, units = scope.groups["group"], scope.groups["unit"]
+            has_unit = len(units) == 1 and entry.is_of_group
+            view = replace(scope, metric=metric, unit=units.iloc[0] if has_unit else "")
+            is_one = names.nunique() == 1 and entry.is_of_group
+            name = f"{names.iloc[0]} {entry.page_name}" if is_one else entry.page_name
+            for baseline in baselines:
+                rows = build_rows(view, baseline)
+                views[ViewKey(metric, *view.scope, baseline)] = {
+                    "sentence": describe_view(rows, facts.looks, baseline, view.where, name),
+                    "small_print": view.small_print,
+                    "rows": [_round_row(row, view.has_limit) for row in rows],
+                }
+    return views
+
+
+def _make_view(
+    court: Court, scope: tuple[str, str, Flags], groups: pd.DataFrame, facts: StudyFacts
+) -> View:
+    """Collect the data of a scope, and what is said of it whatever the metric."""
+    world, regime, in_scope = scope
+    mask = select_common(court.runs, in_scope)
+    runs = court.runs.select(mask)
+    keys = list(runs.conditions[["scenario", "regime"]].itertuples(index=False, name=None))
+    times = [facts.times.get(key, {}) for key in keys]
+    count, total = int(mask.sum()), format_count(int(in_scope.sum()), "condition")
+    common = "" if count == in_scope.sum() else (
+        f"{count} of {total} {'is' if count == 1 else 'are'} compared: "
+        f"not all {len(runs.filters)} filters were run in the others. "
+    )  # fmt: skip
+    notes = f"{common}{_small_print(runs, facts)} {_describe_timing(runs, times, court.alpha)}"
+    worlds = [facts.worlds.get(name) for name in runs.conditions["scenario"].unique()]
+    return View(
+        court, mask, "", "", describe_filters(runs, facts.options.alpha), times,
+        all(name is None or name.limit is not None for name in worlds), (world, regime), groups.loc[keys],
+        _describe_scope(runs.conditions, facts), notes.rstrip(),
+    )  # fmt: skip
+
+
+def _round_row(row: BoardRow, has_limit: bool) -> BoardRow:
+    """Return the values of a row for the page: no track without a divergence threshold, an open interval as infinity.
+
+    Pages print three digits. A number that was rounded to four before could have another third one than its sentence.
+    """
+    rounded: BoardRow = round_values(row if has_limit else {**row, "track": math.nan}, 8)
+    return rounded | ({"ratio_high": math.inf} if row["ratio_high"] == math.inf else {})
+
+
+def _list_scopes(conditions: pd.DataFrame) -> Iterator[tuple[str, str, Flags]]:
+    """Yield world, regime and mask of the conditions of each scope that has conditions."""
+    for world in (ALL, *conditions["scenario"].unique()):
+        for regime in (ALL, *conditions["regime"].unique()):
+            mask = ((world == ALL) | (conditions["scenario"] == world)) & (
+                (regime == ALL) | (conditions["regime"] == regime)
+            )
+            if mask.any():
+                yield world, regime, mask.to_numpy()
+
+
+def select_common(runs: StudyRuns, mask: Flags) -> Flags:
+    """Select the conditions of a scope in which its filters are compared; all if none is common."""
+    common = select_conditions(runs.present.any(axis=2) & mask)
+    return common if common.any() else mask
+
+
+def select_everywhere(runs: StudyRuns) -> Flags:
+    """Select the conditions of the view that opens a page, [C]."""
+    return select_common(runs, np.ones(len(runs.conditions), dtype=bool))
+
+
+def _describe_scope(conditions: pd.DataFrame, names: StudyFacts) -> str:
+    """Describe worlds and regimes in words."""
+    scenarios, regimes = conditions["scenario"].unique(), conditions["regime"].unique()
+    is_one = len(scenarios) == 1
+    where = names.worlds[scenarios[0]].name if is_one else _count_worlds(conditions)
+    noise = names.regimes.get(regimes[0]) if len(regimes) == 1 else None
+    return f"in {where} with {noise.words}" if noise else f"in {where}"
+
+
+def _count_worlds(conditions: pd.DataFrame) -> str:
+    """Count the scenarios, and the worlds where several scenarios share a trajectory."""
+    scenarios, worlds = conditions["scenario"].nunique(), conditions["family"].nunique()
+    text = format_count(scenarios, "scenario")
+    return text if scenarios == worlds else f"{text} of {format_count(worlds, 'world')}"
+
+
+def _describe_timing(
+    runs: StudyRuns, times: Sequence[Mapping[str, StepTimes]], alpha: float
+) -> str:
+    """Describe how the times per step of a view were measured."""
+    if not all(set(runs.filters) <= set(by_label) for by_label in times):
+        return "" if np.isnan(runs.values["ms"]).all() else "ms/step: one timing per job of all its runs, which other programs can change."  # fmt: skip
+    rounds = sorted({t.seconds.size for by_label in times for t in by_label.values()})
+    number = str(rounds[0]) if len(rounds) == 1 else f"{rounds[0]} to {rounds[-1]}"
+    return (
+        f"ms/step: of all runs of a job; median and quartiles of {number} rounds in which the filters took turns. "
+        f"Ratio of the times paired by round, {format_interval_level(alpha)} interval."
+    )
+
+
+def _small_print(runs: StudyRuns, names: StudyFacts) -> str:
+    """Describe the sample of a view, its tests, settings in names, and what was tuned."""
+    texts = (
+        describe_data_settings([*names.worlds, *names.regimes]),
+        describe_settings(list(names.looks)),
+        describe_tuning(count_tuned(names.looks), len(names.looks)),
+    )
+    sample = ", ".join((
+        format_count(int(runs.present.any(axis=(1, 2)).sum()), "filter"), _count_worlds(runs.conditions),
+        format_count(runs.conditions["regime"].nunique(), "noise regime"), _count_runs(runs, names.options.metric),
+        format_count(len(np.unique(runs.values["seed"][runs.present])), "seed"),
+    ))  # fmt: skip
+    return (
+        f"{sample}. Ratios are those of Hodges and Lehmann over paired runs, with simultaneous "
+        f"{format_interval_level(names.options.alpha)} intervals; without one where more than a fifth of the pairs has a lost run. "
+        f"Better and worse: Wilcoxon's test, the trimmed mean and the sign test agree. "
+        f"A lost run is worse than every kept one. {' '.join(filter(None, texts))}"
+    ).rstrip()
+
+
+def _count_runs(runs: StudyRuns, metric: str) -> str:
+    """Count the paired runs of a condition, as a range where conditions differ, and those without truth."""
+    counts = (~np.isnan(compute_losses(runs, metric))).any(axis=0).sum(axis=1)
+    total, few = int(runs.present.any(axis=0).sum()), "" if counts.min() == counts.max() else f"{counts.min()} to "  # fmt: skip
+    lacking = f" ({total - counts.sum()} of {total} runs have no truth)" * bool(counts.sum() < total)  # fmt: skip
+    return f"{few}{format_count(int(counts.max()), 'paired run')} per condition{lacking}"
+
+
 def build_rows(view: View, baseline: str) -> list[BoardRow]:
     """Build the rows of a view, ordered by level; filters that lack a condition come last.
 
@@ -78,40 +241,36 @@ def build_rows(view: View, baseline: str) -> list[BoardRow]:
     verdict and its words, and the description of the filter. A value that does not exist is NaN.
     """
     runs, alpha = view.runs, view.court.alpha
-    complete = np.all(runs.present.any(axis=2), axis=1)
-    verdicts = find_against(view, baseline, complete)
-    values = summarise_levels(view)
-    level = np.where(complete, values[0], np.nan)
+    is_complete = np.all(runs.present.any(axis=2), axis=1)
+    complete = dict(zip(runs.filters, map(bool, is_complete), strict=True))
+    verdicts = {
+        name: view.court.find(view.metric, view.mask, name, baseline)
+        for name, is_there in complete.items()
+        if is_there and complete.get(baseline) and name != baseline
+    }
+    levels, values = summarise_levels(view)
+    level = np.where(is_complete, levels, np.nan)
     track = np.array([view.filters[label]["track"] for label in runs.filters])
-    order = np.lexsort((np.array(runs.filters), -track, level)).tolist()
     rows = []
-    for i in order:
+    for i in np.lexsort((np.array(runs.filters), -track, level)).tolist():
         label = runs.filters[i]
-        costs = describe_costs(view.times, label, baseline, alpha)
         rows.append({
             "filter": label,
-            "rank": int((level < level[i] - _SAME_LEVEL).sum()) + 1 if complete[i] else None,
-            **_show_level(view, values[:, i]), "unit": view.unit,
-            **_show_verdict(view, label, verdicts), **view.filters[label], **costs,
+            "rank": int((level < level[i] - _SAME_LEVEL).sum()) + 1 if complete[label] else None,
+            **dict(zip(("value", "low", "high"), values[:, i].tolist(), strict=True)), "unit": view.unit,
+            **_show_verdict(view, label, {baseline: None, **verdicts}), **view.filters[label],
+            **describe_costs(view.times, label, baseline, alpha),
         })  # fmt: skip
-        if complete[i] and label not in verdicts:
+        if complete[label] and label not in (baseline, *verdicts):
             rows[-1]["words"] = "the baseline was not run in all conditions"
     return rows
 
 
-def find_against(view: View, baseline: str, complete: Flags) -> dict[str, Verdict | None]:
-    """Find the verdicts on all filters of a view against a baseline; None for the baseline."""
-    labels = [name for name, is_there in zip(view.runs.filters, complete, strict=True) if is_there]
-    others = [name for name in labels if name != baseline and baseline in labels]
-    verdicts = {name: view.court.find(view.metric, view.mask, name, baseline) for name in others}
-    return {baseline: None, **verdicts}
-
-
-def summarise_levels(view: View) -> Array:
+def summarise_levels(view: View) -> tuple[Array, Array]:
     """Summarise the losses of each filter: mean over conditions of the logs of median errors, and an interval.
 
-    Returns level and, for a single condition, the ends of the interval of its median, [3, F]. A level is infinite
-    where half of the runs are lost.
+    Returns the level, [F], and for a single condition the error with the ends of the interval of its median, [3, F].
+    A level is infinite where half of the runs are lost, and its error NaN.
     """
     losses = compute_losses(view.runs, view.metric)
     ordered, count = np.sort(losses, axis=2), (~np.isnan(losses)).sum(axis=2, keepdims=True)
@@ -120,20 +279,13 @@ def summarise_levels(view: View) -> Array:
     with np.errstate(invalid="ignore"):
         medians = np.logaddexp(*pair) - math.log(2.0)
         level = medians @ weigh_conditions(view.runs.conditions)
-    ends = np.full((2, len(level)), np.nan)
+    values = np.full((3, len(level)), np.nan)
     if losses.shape[1] == 1:
-        for i, row in enumerate(losses[:, 0]):
-            ends[:, i] = _interval_of_median(row[~np.isnan(row)], view.court.alpha)
-    return np.stack([level, *ends])
-
-
-def _interval_of_median(values: Array, alpha: float) -> tuple[float, float]:
-    """Return the order statistics that contain the median with probability 1 - alpha; NaN if none do."""
-    k = _count_below(len(values), alpha)
-    if k < 0:
-        return math.nan, math.nan
-    ordered = np.sort(values)
-    return float(ordered[k]), float(ordered[len(values) - 1 - k])
+        for i in np.flatnonzero(np.isfinite(level)):
+            n = int(count[i, 0, 0])
+            k = _count_below(n, view.court.alpha)
+            values[:, i] = [level[i], *(ordered[i, 0, [k, n - 1 - k]] if k >= 0 else [np.nan] * 2)]
+    return level, np.exp(np.where(np.isfinite(values), values, np.nan))
 
 
 @cache
@@ -141,13 +293,6 @@ def _count_below(n: int, alpha: float) -> int:
     """Return the number of values below the interval of a median of n values; -1 without an interval."""
     below = scipy.stats.binom.cdf(np.arange(n), n, 0.5) if n else np.ones(1)
     return int((below <= alpha / 2).sum()) - 1
-
-
-def _show_level(view: View, level: Array) -> BoardRow:
-    """Return the error of a filter and its interval, NaN for several conditions or a level of lost runs."""
-    is_known = len(view.runs.conditions) == 1 and math.isfinite(level[0])
-    logs = np.where(np.isfinite(level), level, np.nan) if is_known else np.full(3, np.nan)
-    return dict(zip(("value", "low", "high"), map(float, np.exp(logs)), strict=True))
 
 
 def _show_verdict(view: View, label: str, verdicts: Mapping[str, Verdict | None]) -> BoardRow:
@@ -205,7 +350,12 @@ def describe_filters(runs: StudyRuns, alpha: float = 0.05) -> dict[str, BoardRow
         by_run = np.nanmean(runs.values["coverage_90"], axis=1)
         lost = np.nansum(runs.values["lost"], axis=(1, 2))
     lost_conditions = find_lost_conditions(runs, alpha).sum(axis=1)
-    calibration = word_calibration(by_run, alpha)
+    values = [row[~np.isnan(row)] for row in by_run]
+    p = holm([compare_share(v, _INTERVAL_LEVEL) if v.size >= MIN_RUNS else 1.0 for v in values])
+    calibration = [
+        "" if p_value >= alpha else "too low" if v.mean() < _INTERVAL_LEVEL else "too high"
+        for v, p_value in zip(values, p, strict=True)
+    ]
     return {
         label: {
             "track": float(track[i]), "lost": int(lost[i]), "lost_conditions": int(lost_conditions[i]),
@@ -214,16 +364,6 @@ def describe_filters(runs: StudyRuns, alpha: float = 0.05) -> dict[str, BoardRow
         }
         for i, label in enumerate(runs.filters)
     }  # fmt: skip
-
-
-def word_calibration(coverage: Array, alpha: float) -> list[str]:
-    """Return "too low" or "too high" where the mean coverage [F, N] of 90 % intervals is shown to differ; else empty."""
-    by_run = [row[~np.isnan(row)] for row in coverage]
-    p = holm([compare_share(a, _INTERVAL_LEVEL) if a.size >= MIN_RUNS else 1.0 for a in by_run])
-    return [
-        "" if value >= alpha else "too low" if a.mean() < _INTERVAL_LEVEL else "too high"
-        for a, value in zip(by_run, p, strict=True)
-    ]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -254,20 +394,17 @@ def describe_view(
         )
         return f"{base} has a median {metric}{number} {where}; no other filter is compared with it."
     better = [row for row in others if row["verdict"] == "better"]  # in the order of the table
-    counts = [
-        (sum(r["verdict"] in EQUAL_WORDS for r in others), "equal to it"),
-        (sum(r["verdict"] == "not decided" for r in others), "not decided"),
-        (sum(r["verdict"] == "worse" for r in others), "worse"),
-        (sum(r["verdict"] == LOSES_TRACK for r in others), "without track"),
-    ]
-    rest = ", ".join(f"{n} {'is' if n == 1 else 'are'} {text}" for n, text in counts if n)
+    words = {
+        "equal to it": EQUAL_WORDS, "not decided": ["not decided"], "worse": ["worse"], "without track": [LOSES_TRACK]
+    }  # fmt: skip
+    counts = {text: sum(row["verdict"] in some for row in others) for text, some in words.items()}
+    rest = ", ".join(f"{n} {'is' if n == 1 else 'are'} {text}" for text, n in counts.items() if n)
     head = (
-        f"Of {len(others)} {'filter' if len(others) == 1 else 'filters'}, {len(better) or 'none'}"
+        f"Of {format_count(len(others), 'filter')}, {len(better) or 'none'} "
+        f"{'is' if len(better) < 2 else 'are'} better than {base} {where}"
     )
-    head += f" {'is' if len(better) < 2 else 'are'} better than {base} {where}"
     if better:
-        first = better[0]
-        size = _word_ratio(first)
+        first, size = better[0], _word_ratio(better[0])
         text = f", {size} of its {metric}" if size else ""
         position = "first in the table" if first is rows[0] else "the first of them"
         head += f" ({position}: [[{looks[first['filter']].name}]]{text})"
