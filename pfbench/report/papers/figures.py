@@ -22,12 +22,13 @@ from pfbench.report.papers.specs import (
     make_escape_figure,
     make_ess_figure,
     make_flight_figures,
-    make_flight_velocity_figures,
     make_maximum_figures,
     make_parameter_figures,
     make_relative_error_figures,
     make_time_figure,
     make_trace_figures,
+    plot_flight,
+    plot_flight_velocity,
 )
 from pfbench.results import store
 from pfbench.results.conditions import Condition, parse_label
@@ -56,7 +57,7 @@ def paper_figures(
     for name in default if selection is None else selection:
         figure = FIGURES[name]
         data = list(_read_conditions(figure, conditions, read, start_time_s))
-        drawings = figure.draw(PaperFigureInput(figure, data, _list_looks(figure, conditions)))
+        drawings = list(figure.draw(PaperFigureInput(figure, data, _list_looks(figure, conditions))))  # fmt: skip
         if selection is not None and not drawings:
             noise = f" with noise={figure.noise}" if figure.noise else ""
             raise ValueError(
@@ -225,12 +226,18 @@ _BEFORE = partial(make_error_figures, before=True)
 _SIZE = partial(make_trace_figures, "particles", "number of particles", "particles")
 _NEFF = partial(make_trace_figures, "ess", "effective number of particles", "Neff")
 _FLOWN = partial(make_trace_figures, "iterations", "iterations until the swarm stops", "iterations")
+_FLIGHT = partial(
+    make_flight_figures, "true track of the first run from above, and its height. The dot is the start.", plot_flight
+)  # fmt: skip
+_SPEED = partial(
+    make_flight_figures, "velocity of the first run, from differences of its true positions.", plot_flight_velocity
+)  # fmt: skip
 _SECOND = "section on simulation 2"
 
 
 FIGURES: Mapping[str, PaperFigure] = {
     "000-1": PaperFigure(
-        f"{_YAN}, figure 1", _MODIFIED, make_flight_figures, ("paper_000",),
+        f"{_YAN}, figure 1", _MODIFIED, _FLIGHT, ("paper_000",),
         printed=(PrintedValue("", "Up", 480.0, 3875.0), PrintedValue("", "Up", 1000.0, 748.0)),
         source="Crosses: 3875 m at most and 748 m at the end above the start, from 2000, 5875 and 2748 m in the section on performance, "
         "which prints no time of the highest point.",
@@ -283,8 +290,8 @@ FIGURES: Mapping[str, PaperFigure] = {
         ),
         source=f"Crosses: maintained between 110 and 180, {_SECOND}.",
     ),
-    "003-1": PaperFigure(f"{_DMC}, figure 1", _CORRECTED, make_flight_figures, ("paper_003",)),
-    "003-2": PaperFigure(f"{_DMC}, figure 2", _CORRECTED, make_flight_velocity_figures, ("paper_003",)),
+    "003-1": PaperFigure(f"{_DMC}, figure 1", _CORRECTED, _FLIGHT, ("paper_003",)),
+    "003-2": PaperFigure(f"{_DMC}, figure 2", _CORRECTED, _SPEED, ("paper_003",)),
     "003-3": PaperFigure(
         f"{_DMC}, figure 3", _CORRECTED, make_error_figures, ("paper_003",), titles=tuple(_FACTORS), groups=("attitude",),
         printed=tuple(PrintedValue(labels[1], "attitude_E", 110.0, 22.0) for labels in _CORRECTED),

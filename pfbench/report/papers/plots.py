@@ -94,10 +94,9 @@ def plot_errors(
         values: list[Levels] = []
         for axis, results in zip(row, columns.values(), strict=False):
             curves = {
-                label: _select_runs(result, np.abs(_component(result, block, component)))
-                for label, (result, block) in results.items()
-                if component in block.components
-            }
+                label: (result.data["time"], select_valid(result, np.abs(_component(result, block, component))))
+                for label, (result, block) in results.items() if component in block.components
+            }  # fmt: skip
             values.append(_draw_curves(axis, curves, looks, numbers, _INSTANTS // len(columns)))
             if before:
                 values.append(_draw_first(axis, *next(iter(curves.values()))))
@@ -168,10 +167,9 @@ def plot_points(
 def plot_escape(curves: Mapping[str, np.ndarray], looks: Looks) -> Figure:
     """Plot escape factors over the iterations of a step as a share of all, curves [k] by name."""
     figure, ((axis,),) = _make_grid(1, [1.0], 2.0)
-    for name, values in curves.items():
-        share = np.linspace(0.0, 1.0, len(values))
-        look = looks[name]
-        axis.plot(share, values, **look.line.line(look.name), markevery=0.1, **look.line.mark())
+    for label, values in curves.items():
+        share, (name, line) = np.linspace(0.0, 1.0, len(values)), looks[label]
+        axis.plot(share, values, **line.line(name), markevery=0.1, **line.mark())
     axis.set(xlabel="iteration / number of iterations", ylabel="c3 = c4")
     axis.set_ylim(bottom=0)
     add_legend(figure, axis, 1)
@@ -190,9 +188,8 @@ def measure_error(
     """Compute the RMSE or the maximum of the error of a component from a time on, for each valid run, [n]."""
     late = result.data["time"] >= start
     error = _component(result, block, component)[~result.data["lost"]][:, late, None]
-    no_run_lost = np.zeros(len(error), dtype=bool)
     compute = error_measures.rmse_per_run if measure == "RMSE" else error_measures.max_error
-    return compute(error, no_run_lost)
+    return compute(error, np.zeros(len(error), dtype=bool))
 
 
 def relative_error_percent(result: store.JobResult) -> np.ndarray:
@@ -225,18 +222,6 @@ def _component(result: store.JobResult, block: ComponentGroup, component: str) -
     return np.asarray(block.scale * result.data["error"][..., index].astype(np.float64))
 
 
-def _select_runs(result: store.JobResult, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return times, and values of the valid runs."""
-    return result.data["time"], select_valid(result, values)
-
-
-def _thin(time: np.ndarray, values: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times of a curve, and values there [R, T]."""
-    steps = np.flatnonzero(~np.isnan(values).all(0))
-    steps = steps[select_indices(steps.size, most)]
-    return time[steps], values[:, steps]
-
-
 def _draw_curves(
     axis: Axes,
     curves: Mapping[str, tuple[np.ndarray, np.ndarray]],
@@ -246,9 +231,12 @@ def _draw_curves(
 ) -> Levels:
     """Draw medians over runs, the band of the last filter, and crosses at printed numbers."""
     medians, others = {}, [np.empty(0)]
-    for k, (label, curve) in enumerate(curves.items()):
-        (time, values), (name, line) = _thin(*curve, instants), looks[label]
-        low, medians[name], high = compute_run_quantiles(values, BAND_QUANTILES)
+    for k, (label, (times, values)) in enumerate(curves.items()):
+        name, line = looks[label]
+        steps = np.flatnonzero(~np.isnan(values).all(0))
+        steps = steps[select_indices(steps.size, instants)]
+        time = times[steps]
+        low, medians[name], high = compute_run_quantiles(values[:, steps], BAND_QUANTILES)
         every = max(1, time.size // _MARKS)
         axis.plot(
             time, medians[name], ms=3.2, markevery=(k * every // max(1, len(curves)), every),
@@ -316,12 +304,6 @@ def _draw_cross(axis: Axes, x: Any, y: float, colour: str) -> None:
     axis.plot(x, y, color=colour, clip_on=False, label="_printed", **style)
 
 
-def _find_typical(values: np.ndarray) -> float:
-    """Return the median of the positive values, NaN without one."""
-    positive = values[np.isfinite(values) & (values > 0)]
-    return float(np.median(positive)) if positive.size else float("nan")
-
-
 def _set_scale(axes: Sequence[Axes], panels: Sequence[Levels]) -> None:
     """Use one scale in a row of panels, where good filters stay distinct whatever a bad one does.
 
@@ -333,13 +315,12 @@ def _set_scale(axes: Sequence[Axes], panels: Sequence[Levels]) -> None:
     others = [panel.others for panel in panels]
     positive = np.concatenate([*(values for _, values in medians), *others, printed])
     positive = positive[np.isfinite(positive) & (positive > 0)]
-    typical = [_find_typical(values) for _, values in medians]
-    if not positive.size or np.isnan(typical).all():
+    levels = [v[np.isfinite(v) & (v > 0)] for _, v in medians]
+    levels = [v for v in levels if v.size]
+    if not levels:
         return
-    least = float(np.nanmin(typical))
-    lowest = min(
-        float(np.quantile(v[v > 0], 0.02, method="lower")) for _, v in medians if (v > 0).any()
-    )
+    least = min(float(np.median(v)) for v in levels)
+    lowest = min(float(np.quantile(v, 0.02, method="lower")) for v in levels)
     high = min(float(positive.max()), CURVE_RANGE * least)
     is_log = high > _WIDE * least
     low = min([max(float(positive.min()), lowest / _WIDE), *printed]) if is_log else 0.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
 from typing import Any, NamedTuple, TypeVar
@@ -56,6 +56,11 @@ class PaperFigureData(NamedTuple):
         scenario, noise, model = self.condition[:3]
         return format_slug(f"{scenario}_{noise}_{model}")
 
+    @property
+    def since(self) -> str:
+        """Words on the start time of the measures; empty for that of the record."""
+        return f" after {self.start_time_s:g} s" if self.start_time_s else ""
+
     def select_group(self, group: str, labels: Sequence[str] = ()) -> ResultsWithGroup:
         """Return the results of filters, of all by default, that have a component group, with the group, by label."""
         return {
@@ -84,7 +89,7 @@ class PaperFigure(NamedTuple):
 
     title: str
     columns: tuple[tuple[str, ...], ...]
-    draw: Callable[[PaperFigureInput], list[FigureSpec]]
+    draw: Callable[[PaperFigureInput], Iterable[FigureSpec]]
     studies: tuple[str, ...] = ()
     noise: str = ""
     groups: tuple[str, ...] = ()
@@ -146,28 +151,24 @@ class PaperFigureInput(NamedTuple):
         return " ".join(filter(None, parts))
 
 
-def make_error_figures(source: PaperFigureInput, before: bool = False) -> list[FigureSpec]:
-    """Return figures of the size of the error over time, one per condition and group."""
-    figures = []
+def make_error_figures(source: PaperFigureInput, before: bool = False) -> Iterator[FigureSpec]:
+    """Yield figures of the size of the error over time, one per condition and group."""
     for data, group, results in source.list_groups():
         columns = source.arrange(partial(data.select_group, group))
         components = {name for _, block in results.values() for name in block.components}
         printed = [p for p in source.figure.printed if p.component in components]
-        since = f" after {data.start_time_s:g} s" if data.start_time_s else ""
-        text = f"{source.format_head(data)}: size of the {group.replace('_', ' ')} error over time"
         measures = dict.fromkeys(p.at for p in printed if isinstance(p.at, str))
-        text += f", and its {' and '.join(map(str, measures))}{since}" if measures else ""
-        text += f". {source.describe_runs(data)}{_FIRST if before else ''}"
+        also = f", and its {' and '.join(measures)}{data.since}" if measures else ""
+        text = f"{source.format_head(data)}: size of the {group.replace('_', ' ')} error over time{also}. "
+        text += source.describe_runs(data) + _FIRST * before
         make = partial(plots.plot_errors, columns, source.looks, printed, data.start_time_s, before)
-        figures.append(FigureSpec(f"{data.prefix}_{format_slug(group)}", text, make))
-    return figures
+        yield FigureSpec(f"{data.prefix}_{format_slug(group)}", text, make)
 
 
 def make_trace_figures(
     name: str, words: str, unit: str, source: PaperFigureInput
-) -> list[FigureSpec]:
-    """Return figures of a trace over time, one per condition."""
-    figures = []
+) -> Iterator[FigureSpec]:
+    """Yield figures of a trace over time, one per condition."""
     for data in source.data:
         results = {label: r for label, r in data.results.items() if name in r.data}
         if results:
@@ -177,8 +178,7 @@ def make_trace_figures(
             printed = [p for p in source.figure.printed if p.filter in results]
             text = f"{source.format_head(data)}: {words} over time. {source.describe_runs(data)}"
             make = partial(plots.plot_curves, rows, time, unit, source.looks, printed)
-            figures.append(FigureSpec(f"{data.prefix}_{name}", text, make))
-    return figures
+            yield FigureSpec(f"{data.prefix}_{name}", text, make)
 
 
 def make_escape_figure(source: PaperFigureInput) -> list[FigureSpec]:
@@ -210,24 +210,17 @@ def make_relative_error_figures(source: PaperFigureInput) -> list[FigureSpec]:
     if not source.data or not with_range:
         return []
     errors = [
-        {
-            label: plots.select_valid(r, plots.relative_error_percent(r))
-            for label, r in data.results.items()
-        }
+        {label: plots.select_valid(r, plots.relative_error_percent(r)) for label, r in data.results.items()}
         for data in source.data
-    ]
+    ]  # fmt: skip
     quantity = "Err, the horizontal error in % of the horizontal range (eq. 20 as repaired)"
-    rows = {
-        f"experiment {k + 1}": source.arrange(partial(_select, values))
-        for k, values in enumerate(errors)
-    }
+    rows = {f"experiment {k}": source.arrange(partial(_select, v)) for k, v in enumerate(errors, 1)}
     time = next(iter(source.data[0].results.values())).data["time"]
-    words = source.describe_runs(*source.data)
     over_time = partial(plots.plot_curves, rows, time, "Err [%]", source.looks)
-    head = f"{source.format_head(*source.data)}: {quantity}"
+    text = f"{source.format_head(*source.data)}: {quantity}, over time. {source.describe_runs(*source.data)}"  # fmt: skip
     return [
         _make_experiment_figure(source, errors, "mean Err [%]", f"{quantity}, mean over time"),
-        FigureSpec("over_time", f"{head}, over time. {words}", over_time),
+        FigureSpec("over_time", text, over_time),
     ]
 
 
@@ -258,21 +251,16 @@ def make_time_figure(source: PaperFigureInput) -> list[FigureSpec]:
             n: 1e3 * (times.seconds if (times := rounds[n]) else np.array([r.meta["seconds"]["per_step"]]))
             for n, r in data.results.items()
         })  # fmt: skip
-    columns = _arrange_experiments(source, values)
     runs = sorted({r.meta["runs"] for data in source.data for r in data.results.values()})
     text = (
         f"{source.format_head(*source.data)}: time per step of all {' or '.join(map(str, runs))} runs together. Filters "
         "took turns in rounds; bars: 80 % of rounds. Without a bar: one timing of the job."
     )
-    make = partial(
-        plots.plot_points, columns, source.looks, "time per step [ms]", xlabel="experiment"
-    )
-    return [FigureSpec("", text, make)]
+    return [_plot_experiments(source, values, "time per step [ms]", text)]
 
 
-def make_maximum_figures(source: PaperFigureInput) -> list[FigureSpec]:
-    """Return figures of RMSE and maximum error, a panel per component, with the values of the paper."""
-    figures = []
+def make_maximum_figures(source: PaperFigureInput) -> Iterator[FigureSpec]:
+    """Yield figures of RMSE and maximum error, a panel per component, with the values of the paper."""
     for data, group, results in source.list_groups():
         names = list(dict.fromkeys(n for _, block in results.values() for n in block.components))
         titles = {name: plots.name_component(name).rpartition(" ")[2] for name in names}
@@ -290,19 +278,15 @@ def make_maximum_figures(source: PaperFigureInput) -> list[FigureSpec]:
             titles[name]: [p for p in source.figure.printed if p.component == name]
             for name in names
         }
-        unit = next(block.unit for _, block in results.values())
-        since = f" after {data.start_time_s:g} s" if data.start_time_s else ""
-        text = f"{source.format_head(data)}: RMSE and maximum of the {group} error{since}. "
+        text = f"{source.format_head(data)}: RMSE and maximum of the {group} error{data.since}. "
         text += source.describe_runs(data, has_curves=False)
-        unit = format_axis_label("error", unit)
+        unit = format_axis_label("error", next(block.unit for _, block in results.values()))
         make = partial(plots.plot_points, columns, source.looks, unit, printed=printed)
-        figures.append(FigureSpec(f"{data.prefix}_{format_slug(group)}", text, make))
-    return figures
+        yield FigureSpec(f"{data.prefix}_{format_slug(group)}", text, make)
 
 
-def make_parameter_figures(name: str, source: PaperFigureInput) -> list[FigureSpec]:
-    """Return figures of the error over time for each value of a parameter, one per condition."""
-    figures = []
+def make_parameter_figures(name: str, source: PaperFigureInput) -> Iterator[FigureSpec]:
+    """Yield figures of the error over time for each value of a parameter, one per condition."""
     for data, group, results in source.list_groups():
         if len(results) < 2:
             continue
@@ -312,8 +296,7 @@ def make_parameter_figures(name: str, source: PaperFigureInput) -> list[FigureSp
         text = f"{source.format_head(data)}: size of the {group} error over time for values of the {name}. "
         make = partial(plots.plot_errors, {"": results}, plain.looks)
         text += plain.describe_runs(data)
-        figures.append(FigureSpec(f"{data.prefix}_{format_slug(group)}", text, make))
-    return figures
+        yield FigureSpec(f"{data.prefix}_{format_slug(group)}", text, make)
 
 
 _PRINTED_ITERATIONS = 150  # [Tian et al., section 5.3]
@@ -330,13 +313,15 @@ def _select(values: Mapping[str, Any], labels: Sequence[str]) -> dict[str, Any]:
     return {label: values[label] for label in labels if label in values}
 
 
-def _arrange_experiments(
-    source: PaperFigureInput, values: Sequence[Mapping[str, np.ndarray]]
-) -> dict[str, dict[str, dict[str, np.ndarray]]]:
-    """Arrange values by the title of the column, number of the experiment, and filter."""
-    return source.arrange(
-        lambda labels: {str(k + 1): _select(v, labels) for k, v in enumerate(values)}
+def _plot_experiments(
+    source: PaperFigureInput, values: Sequence[Mapping[str, np.ndarray]], label: str, text: str
+) -> FigureSpec:
+    """Return the figure of values by the title of the column, number of the experiment, and filter."""
+    columns = source.arrange(
+        lambda labels: {str(k): _select(v, labels) for k, v in enumerate(values, 1)}
     )
+    make = partial(plots.plot_points, columns, source.looks, label, xlabel="experiment")
+    return FigureSpec("", text, make)
 
 
 def _make_experiment_figure(
@@ -344,11 +329,9 @@ def _make_experiment_figure(
 ) -> FigureSpec:
     """Return the figure of a mean over time of each run, by experiment."""
     means = [{n: mean_per_run(v, np.zeros(len(v), dtype=bool)) for n, v in runs.items()} for runs in values]  # fmt: skip
-    text = f"{source.format_head(*source.data)}: {quantity}, by experiment. "
-    text += source.describe_runs(*source.data, has_curves=False)
-    columns = _arrange_experiments(source, means)
-    make = partial(plots.plot_points, columns, source.looks, label, xlabel="experiment")
-    return FigureSpec("", text, make)
+    words = source.describe_runs(*source.data, has_curves=False)
+    text = f"{source.format_head(*source.data)}: {quantity}, by experiment. {words}"
+    return _plot_experiments(source, means, label, text)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -381,7 +364,7 @@ def plot_flight(result: store.JobResult, printed: Sequence[PrintedValue] = ()) -
     return figure
 
 
-def plot_flight_velocity(result: store.JobResult) -> Figure:
+def plot_flight_velocity(result: store.JobResult, _: Sequence[PrintedValue] = ()) -> Figure:
     """Plot the velocity of the first run, from differences of its true positions."""
     time = result.data["time"]
     velocity = np.gradient(result.data["track"][0].astype(np.float64), time, axis=0)
@@ -396,37 +379,21 @@ def plot_flight_velocity(result: store.JobResult) -> Figure:
     return figure
 
 
-def make_flight_figures(source: PaperFigureInput) -> list[FigureSpec]:
-    """Return the figure of the flight of each scenario."""
-    printed = source.figure.printed
-    return [
-        FigureSpec(
-            format_slug(data.condition.scenario),
-            f"{source.format_head(data)}: true track of the first run from above, and its height. The dot is the "
-            f"start. {source.figure.source}".rstrip(),
-            partial(plot_flight, result, printed),
-        )
-        for data, result in _list_flights(source)
-    ]
-
-
-def make_flight_velocity_figures(source: PaperFigureInput) -> list[FigureSpec]:
-    """Return the figure of the velocity of each scenario."""
-    return [
-        FigureSpec(
-            format_slug(data.condition.scenario),
-            f"{source.format_head(data)}: velocity of the first run, from differences of its true positions.",
-            partial(plot_flight_velocity, result),
-        )
-        for data, result in _list_flights(source)
-    ]
-
-
-def _list_flights(source: PaperFigureInput) -> Iterator[tuple[PaperFigureData, store.JobResult]]:
-    """Yield the data of each scenario with a result that has a track."""
-    scenarios: set[str] = set()
+def make_flight_figures(
+    text: str, plot: Callable[[store.JobResult, Sequence[PrintedValue]], Figure], source: PaperFigureInput
+) -> list[FigureSpec]:  # fmt: skip
+    """Return the figure of the first result of each scenario that has a track."""
+    first: dict[str, tuple[str, store.JobResult]] = {}
     for data in source.data:
-        result = next((r for r in data.results.values() if "track" in r.data), None)
-        if result is not None and data.condition.scenario not in scenarios:
-            scenarios.add(data.condition.scenario)
-            yield data, result
+        flights = [r for r in data.results.values() if "track" in r.data]
+        if flights:
+            first.setdefault(data.condition.scenario, (source.format_head(data), flights[0]))
+    figure = source.figure
+    return [
+        FigureSpec(
+            format_slug(scenario),
+            f"{head}: {text} {figure.source}".rstrip(),
+            partial(plot, result, figure.printed),
+        )
+        for scenario, (head, result) in first.items()
+    ]
