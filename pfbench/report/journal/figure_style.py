@@ -104,22 +104,17 @@ def draw_interval(
     ends: tuple[float, float, float],
     look: LookData,
     limits: tuple[float, float],
-) -> bool:
+) -> None:
     """Draw a value with its interval; outside the limits a triangle at the edge."""
-    value, low, high = ends
-    colour = str(look["colour"])
+    value, *bounds = ends
     inner = limits[0] * 1.02, limits[1] / 1.02
-    start, stop = np.clip([low, high], *inner)
-    axis.plot(
-        [start, stop], [y, y], color=colour, lw=1.6, alpha=0.5, solid_capstyle="butt", zorder=2
-    )
-    if limits[0] <= value <= limits[1]:
-        axis.plot([value], [y], zorder=3, **{**mark_style(look), "linestyle": "none"})
-        return True
-    edge = inner[1] if value > limits[1] else inner[0]
-    style = {**mark_style(look), "marker": ">" if value > limits[1] else "<"}
-    axis.plot([edge], [y], zorder=3, clip_on=False, **{**style, "linestyle": "none"})
-    return False
+    bar: Any = {"color": str(look["colour"]), "lw": 1.6, "alpha": 0.5, "solid_capstyle": "butt"}
+    axis.plot(np.clip(bounds, *inner), [y, y], zorder=2, **bar)
+    style, is_inside = {**mark_style(look), "linestyle": "none"}, limits[0] <= value <= limits[1]
+    if not is_inside:
+        style["marker"] = ">" if value > limits[1] else "<"
+        value = np.clip(value, *inner)
+    axis.plot([value], [y], zorder=3, clip_on=is_inside, **style)
 
 
 def add_legend_below(axis: Axes, entries: LegendEntries, setting: FigureSetting) -> None:

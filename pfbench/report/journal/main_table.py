@@ -68,18 +68,15 @@ def _make_table(pack: Pack, worlds: Sequence[str], regime: str, name: str) -> La
         [[text_cell(name_with_star(pack, key)), *_error_cells(columns, key)] for key in family]
         for family in filters_by_family(pack)
     ]
-    caption = describe_columns(pack, worlds, regime)
-    return LatexTable(name, caption, specs, _make_head(pack, columns), groups)
-
-
-def _make_head(pack: Pack, columns: Sequence[ErrorColumn]) -> list[list[LatexCell]]:
-    """Build the head: the names of worlds with units, in lines of about equal width."""
-    lines = [
+    names = [  # of worlds with units, in lines of about equal width
         _break_name(f"{name_of(pack, 'worlds', c.world)}{f' ({c.unit})' if c.unit else ''}") for c in columns
     ]  # fmt: skip
-    upper = [text_cell(""), *(text_cell(line[0], span=2) for line in lines)]
-    lower = [text_cell("Method"), *(text_cell(line[1], span=2) for line in lines)]
-    return [upper, lower] if any(line[0] for line in lines) else [lower]
+    upper, lower = (
+        [text_cell(first), *(text_cell(line, span=2) for line in lines)]
+        for first, lines in zip(("", "Method"), zip(*names, strict=True), strict=True)
+    )
+    head = [upper, lower] if any(line for line, _ in names) else [lower]
+    return LatexTable(name, describe_columns(pack, worlds, regime), specs, head, groups)
 
 
 def _break_name(name: str) -> tuple[str, str]:
@@ -94,21 +91,16 @@ def _error_cells(columns: Sequence[ErrorColumn], key: str) -> list[LatexCell]:
     cells = []
     for column in columns:
         text, interval, verdict = column.entries.get(key, ("--", "", ""))
-        is_best, is_worse = key in column.best(), verdict == "worse"
-        number = rf"\num{{{text}}}" if is_printed_number(text) else text
+        is_best, is_number = key in column.best(), is_printed_number(text)
+        number = rf"\num{{{text}}}" if is_number else text
         tex = rf"\textbf{{{text}}}" if is_best else number
-        tex = rf"\textcolor{{black!62}}{{{number}{_DAGGER}}}" if is_worse else tex
-        cells.append(
-            LatexCell(tex + r"\phantom{\textsuperscript{\textdagger}}", _error_width(text, is_best))
-        )
+        if verdict == "worse":
+            tex = rf"\textcolor{{black!62}}{{{number}{_DAGGER}}}"
+        printed = text.replace("e", "×10") if is_number else text
+        width = text_width(printed, SIZE, is_bold=is_best) + text_width("†", INTERVAL_SIZE)
+        cells.append(LatexCell(tex + r"\phantom{\textsuperscript{\textdagger}}", width))
         cells.append(text_cell(interval, size=INTERVAL_SIZE))
     return cells
-
-
-def _error_width(text: str, is_best: bool) -> float:
-    """Return the width of a number and the dagger after it."""
-    printed = text.replace("e", "×10") if "e" in text and text != "lost" else text
-    return text_width(printed, SIZE, is_bold=is_best) + text_width("†", INTERVAL_SIZE)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -155,17 +147,11 @@ def make_column(pack: Pack, world: str, regime: str) -> ErrorColumn:
     scale = 1e-3 if is_kilo else 1.0
     entries = {}
     for key, row in rows.items():
-        value, low, high = (
-            scale * row[name] if is_number(row[name]) else None for name in ("value", "low", "high")
-        )
-        interval = (
-            ""
-            if low is None or high is None or row["verdict"] == "loses track"
-            else f"[{format_entry(low, 2)}, {format_entry(high, 2)}]"
-        )
-        is_lost = row["verdict"] == "loses track" or (value is None and row.get("lost"))
-        text = "lost" if is_lost else format_entry(value)
-        entries[key] = (text, interval, str(row["verdict"]))
+        value, *ends = (scale * row[name] if is_number(row[name]) else None for name in ("value", "low", "high"))  # fmt: skip
+        loses = row["verdict"] == "loses track"
+        interval = f"[{', '.join(format_entry(end, 2) for end in ends)}]"
+        text = "lost" if loses or (value is None and row.get("lost")) else format_entry(value)
+        entries[key] = (text, "" if loses or None in ends else interval, str(row["verdict"]))
     return ErrorColumn(world, _KILO.get(unit, unit) if is_kilo else unit, entries)
 
 
@@ -184,27 +170,18 @@ def describe_columns(pack: Pack, worlds: Sequence[str], regime: str) -> str:
     tables = [find_rows(pack, world, regime) for world in worlds]
     noise = f", {escape_latex(name_of(pack, 'regimes', regime).lower())}"
     where = noise if len(pack["regimes"]) > 1 else ""
+    has_dash = any(
+        key not in row or (row[key]["value"] is None and not row[key].get("lost"))
+        for row in tables
+        for key in filters_by_key(pack)
+    )
+    dash = " --: no error to compare, because the track is not kept or the filter was not run."
     return (
         rf"{metric}: median over runs and its {level}\,\% interval{where}. Bold: smallest. "
         rf"\textsuperscript{{\textdagger}}: shown to be worse than {escape_latex(name_baseline(pack))}, jointly for all filters "
         r"of the column. lost: shown to keep track in fewer than 80\,\% of runs. \textsuperscript{*}: proposed methods."
-        + _describe_absent(pack, tables)
+        + dash * has_dash
         + _describe_lost(pack, tables)
-    )
-
-
-def _describe_absent(pack: Pack, tables: Sequence[Mapping[str, Row]]) -> str:
-    """Explain the dash of filters without an error in a condition; empty if there is none."""
-    keys = [str(look["key"]) for look in pack["filters"]]
-    has_dash = any(
-        key not in row or (row[key]["value"] is None and not row[key].get("lost"))
-        for row in tables
-        for key in keys
-    )
-    return (
-        " --: no error to compare, because the track is not kept or the filter was not run."
-        if has_dash
-        else ""
     )
 
 
@@ -240,9 +217,10 @@ def make_planned_table(pack: Pack) -> LatexTable | None:
     head = ["Method and baseline", "ratio", "interval", "p", "verdict"]
     groups: dict[str, list[list[LatexCell]]] = {}
     for pair in pack["planned"]:
-        name = f"{looks[str(pair['a'])]['name']} against"
-        title = text_cell(name, span=len(head))._replace(alignment="@{}l")
-        baseline = _indent(text_cell(str(looks[str(pair["b"])]["name"])))
+        method, name = (str(looks[str(pair[side])]["name"]) for side in ("a", "b"))
+        title = text_cell(f"{method} against", span=len(head))._replace(alignment="@{}l")
+        baseline = text_cell(name)
+        baseline = baseline._replace(tex=rf"\hspace*{{{_INDENT:g}pt}}{baseline.tex}", width=baseline.width + _INDENT)  # fmt: skip
         groups.setdefault(str(pair["a"]), [[title]]).append([baseline, *_pair_cells(pair)])
     worlds = len(pack["worlds"])
     where = f"these {worlds} worlds" if worlds > 1 else "the runs of this world"
@@ -257,15 +235,16 @@ def make_planned_table(pack: Pack) -> LatexTable | None:
 
 def _pair_cells(pair: Pack) -> list[LatexCell]:
     """Return the cells of a pair after its name."""
-    word = str(pair["word"])
-    effect = (
-        _effect_cell(_ratio(pair["estimate"]), word)
-        if is_number(pair["estimate"])
-        else text_cell("--")
-    )
+    word, p = str(pair["word"]), pair.get("p")
+    effect = text_cell(_ratio(pair["estimate"]), is_bold=word == "better")
+    if not is_number(pair["estimate"]):
+        effect = text_cell("--")
+    elif word == "worse":
+        effect = effect._replace(tex=effect.tex + _DAGGER)
     ends = [_ratio(pair[name]) for name in ("low", "high")]
     interval = "--" if "--" in ends else f"[{', '.join(ends)}]"
-    return [effect, text_cell(interval), text_cell(_p_value(pair.get("p"))), text_cell(word)]
+    p_value = "--" if p is None or not is_number(p) else f"<{_LEAST_P:g}" if p < _LEAST_P else f"{p:.3f}"  # fmt: skip
+    return [effect, text_cell(interval), text_cell(p_value), text_cell(word)]
 
 
 def make_cost_table(pack: Pack, particles: Mapping[str, str]) -> LatexTable:
@@ -312,11 +291,6 @@ def _cost_cells(row: Row, particles: str, has_rounds: bool) -> list[LatexCell]:
     return [text_cell(particles or "--"), *cells]
 
 
-def _indent(cell: LatexCell) -> LatexCell:
-    """Indent a cell."""
-    return cell._replace(tex=rf"\hspace*{{{_INDENT:g}pt}}{cell.tex}", width=cell.width + _INDENT)
-
-
 def _ratio(value: Any) -> str:
     """Format a ratio with two places, three near 1, or two digits if it is large."""
     if not is_number(value):
@@ -324,18 +298,3 @@ def _ratio(value: Any) -> str:
     if f"{value:.2f}" == "1.00" and abs(value - 1) > _EQUAL:
         return f"{value:.3f}"
     return f"{value:.2f}" if 0.095 <= value < 9.995 else format_entry(value, 2)
-
-
-def _effect_cell(text: str, word: str) -> LatexCell:
-    """Return the cell of an effect: bold if better, with a dagger if worse."""
-    tex = escape_latex(text)
-    tex = rf"\textbf{{{tex}}}" if word == "better" else tex
-    tex += r"\rlap{\textsuperscript{\textdagger}}" if word == "worse" else ""
-    return LatexCell(tex, text_width(text, SIZE, is_bold=word == "better"))
-
-
-def _p_value(value: Any) -> str:
-    """Format a p-value with three places."""
-    if not is_number(value) or math.isnan(value):
-        return "--"
-    return f"<{_LEAST_P:g}" if value < _LEAST_P else f"{value:.3f}"

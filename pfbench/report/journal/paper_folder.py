@@ -106,13 +106,22 @@ def write_paper(
             "no pair compared in advance has a ratio, so that planned.pdf and table_planned.tex are left out"
         )
     widths = _write_plots(plots, pack, page, folder, remarks)
-    for name, text in tables.items():
-        folder.write(f"{name}.tex", text)
-    folder.write("methods.tex", format_methods(write_methods(pack)))
-    folder.write("pfbench.bib", renew_bibliography(pack))
+    figures = drawings or {}
+    if any(name.endswith(".svg") for name in figures):
+        remarks.append(
+            "the figures of the paper are SVG, since there are no results: convert them to PDF"
+        )
     main = sorted(tables, key=lambda name: "{table*}" in tables[name])  # wide floats hold up others
-    captions = _write_drawings(drawings or {}, folder, remarks)
-    folder.write("paper.tex", format_document(pack, page, widths, main, captions))
+    captions = {name: caption for name, (caption, _) in figures.items()}
+    files = {
+        **{f"{name}.tex": text for name, text in tables.items()},
+        "methods.tex": format_methods(write_methods(pack)),
+        "pfbench.bib": renew_bibliography(pack),
+        **{name: content for name, (_, content) in figures.items()},
+        "paper.tex": format_document(pack, page, widths, main, captions),
+    }
+    for name, content in files.items():
+        folder.write(name, content)
     return remarks
 
 
@@ -137,26 +146,10 @@ def _write_plots(
     return widths
 
 
-def _write_drawings(
-    drawings: Mapping[str, tuple[str, str | bytes]], folder: RecordedFolder, remarks: list[str]
-) -> dict[str, str]:
-    """Write the figures of the paper of a study, and a remark on SVG; return their captions by file name."""
-    for name, (_, content) in drawings.items():
-        folder.write(name, content)
-    if any(name.endswith(".svg") for name in drawings):
-        remarks.append(
-            "the figures of the paper are SVG, since there are no results: convert them to PDF"
-        )
-    return {name: caption for name, (caption, _) in drawings.items()}
-
-
 def shorten_names(pack: Pack) -> Pack:
     """Return the data of a study whose filters that were tuned on other data are named so; captions say on which."""
-    looks = [dict(look) for look in pack["filters"]]
-    data: dict[str, None] = {}
-    for look in looks:
-        data |= dict.fromkeys(_TUNED_ON.findall(look["name"]))
-        look["name"] = _TUNED_ON.sub("(tuned elsewhere)", look["name"])
+    data = dict.fromkeys(text for look in pack["filters"] for text in _TUNED_ON.findall(look["name"]))  # fmt: skip
+    looks = [{**look, "name": _TUNED_ON.sub("(tuned elsewhere)", look["name"])} for look in pack["filters"]]  # fmt: skip
     return {**pack, "filters": looks, "tuned_elsewhere": list(data)}
 
 
@@ -192,25 +185,23 @@ def _format_tables(pack: Pack, page: PageFormat) -> dict[str, str]:
     """Format all tables by file name; refuse those that do not fit."""
     planned = make_planned_table(pack)
 
-    def fits(table: LatexTable) -> bool:
-        return _find_width(table, page) is not None
-
     tables = [
-        *make_main_tables(pack, fits), *([planned] if planned else []),
+        *make_main_tables(pack, lambda table: _find_width(table, page) is not None),
+        *([planned] if planned else []),
         make_cost_table(pack, _list_particles(pack)),
-    ]  # fmt: skip
+    ]
     note = _describe_tuning(pack)
-    tables = [table._replace(caption=table.caption + note) for table in tables]
-    return {f"table_{table.name}": _format_fitting(table, page) for table in tables}
+    return {
+        f"table_{table.name}": _format_fitting(table._replace(caption=table.caption + note), page)
+        for table in tables
+    }
 
 
 def _find_width(table: LatexTable, page: PageFormat) -> tuple[float, bool] | None:
     """Return the separation of columns, and whether a table spans the text; None if it does not fit."""
-    for width, is_wide in ((page.column, False), (page.text, page.has_columns)):
-        separation = fit_table(table, width)
-        if separation is not None:
-            return separation, is_wide
-    return None
+    widths = ((page.column, False), (page.text, page.has_columns))
+    fitting = ((fit_table(table, width), is_wide) for width, is_wide in widths)
+    return next(((gap, is_wide) for gap, is_wide in fitting if gap is not None), None)
 
 
 def _format_fitting(table: LatexTable, page: PageFormat) -> str:
@@ -294,24 +285,17 @@ def format_caption(name: str, pack: Pack) -> str:
     )
     text += _describe_tuning(pack)
     if name == "over_time":
-        text += _describe_selection(pack)
+        selections = {"filters": select_curves(pack), "worlds": select_worlds(pack)}
+        return text + "".join(
+            f" Shown: {len(some)} of {len(pack[noun])} {noun}."
+            for noun, some in selections.items()
+            if len(some) < len(pack[noun])
+        )
     rows = find_rows(pack).values()
     absent = sum(not is_number(row["ratio"]) for row in rows)
-    is_ratio = name in ("leaderboard", "cost")
-    return text + (
-        f" {absent} of {len(rows)} filters have no error to compare in all conditions."
-        if is_ratio and absent
-        else ""
-    )
-
-
-def _describe_selection(pack: Pack) -> str:
-    """Say how many filters and worlds a figure of curves shows, where it does not show all; else empty."""
-    counts = (
-        (len(select_curves(pack)), len(pack["filters"]), "filters"),
-        (len(select_worlds(pack)), len(pack["worlds"]), "worlds"),
-    )
-    return "".join(f" Shown: {n} of {total} {noun}." for n, total, noun in counts if n < total)
+    if name in ("leaderboard", "cost") and absent:
+        text += f" {absent} of {len(rows)} filters have no error to compare in all conditions."
+    return text
 
 
 def format_document(

@@ -114,7 +114,11 @@ def _draw_leaderboard(
             fontsize=setting.page.tick_size, fontweight="bold" if text == min(texts, key=float) else "normal", annotation_clip=False,
         )  # fmt: skip
         if row["verdict"] == "worse":
-            _write_dagger(axis, y, text, setting)
+            size = setting.page.tick_size
+            axis.annotate(
+                setting.escape(DAGGER), (1.0, y), xycoords=("axes fraction", "data"), xytext=(3 + 0.52 * size * len(text), 1.5),
+                textcoords="offset points", va="center", fontsize=0.8 * size, annotation_clip=False,
+            )  # fmt: skip
     metric = pack["metrics"][0]
     level = f"median {metric['name']} [{'k' * is_far}{metric['unit']}]"
     axis.set_xlabel(
@@ -203,30 +207,15 @@ def list_front_corners(points: np.ndarray, top: float) -> np.ndarray:
     return np.array(corners).reshape(-1, 2)
 
 
-def _write_dagger(axis: Axes, y: int, text: str, setting: FigureSetting) -> None:
-    """Write a dagger after a number at the right of a row."""
-    size = setting.page.tick_size
-    axis.annotate(
-        setting.escape(DAGGER), (1.0, y), xycoords=("axes fraction", "data"), xytext=(3 + 0.52 * size * len(text), 1.5),
-        textcoords="offset points", va="center", fontsize=0.8 * size, annotation_clip=False,
-    )  # fmt: skip
-
-
 def _draw_diamond(axis: Axes, y: int, pair: Pack, colour: str, limits: tuple[float, float]) -> None:
     """Draw an effect as a diamond between the ends of its interval, filled if it is decided."""
     low, value, high = (
         float(np.clip(pair[name], *limits)) if is_number(pair[name]) else np.nan
         for name in ("low", "estimate", "high")
     )
-    corners = [(low, y), (value, y - _HALF_DIAMOND), (high, y), (value, y + _HALF_DIAMOND)]
-    is_decided = pair["word"] in ("better", "worse")
-    axis.fill(
-        *zip(*corners, strict=True),
-        facecolor=colour if is_decided else "white",
-        edgecolor=colour,
-        lw=0.8,
-        zorder=3,
-    )
+    across, along = [low, value, high, value], [y, y - _HALF_DIAMOND, y, y + _HALF_DIAMOND]
+    face = colour if pair["word"] in ("better", "worse") else "white"
+    axis.fill(across, along, facecolor=face, edgecolor=colour, lw=0.8, zorder=3)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -252,9 +241,8 @@ def render_headline(pack: Pack, stored: bytes = b"") -> bytes:
     if all(row["ratio"] is None for row in opening["rows"]):
         return b""
     worlds = pack.get("world_orders")
-    width = f"{_WORLD_WIDTH * len(worlds)}mm" if worlds else _WIDTH
+    plot, width = (plot_worlds, f"{_WORLD_WIDTH * len(worlds)}mm") if worlds else (plot_leaderboard, _WIDTH)  # fmt: skip
     setting, buffer = FigureSetting(find_page_format(width=width)), io.BytesIO()
-    plot = plot_worlds if worlds else plot_leaderboard
     with setting.applied(), matplotlib.rc_context(_SVG):
         plot(pack, setting).savefig(buffer, format="svg", metadata={"Date": None})
     drawing = buffer.getvalue()
@@ -270,8 +258,8 @@ def is_equal_drawing(first: bytes, second: bytes) -> bool:
         first: SVG.
         second: SVG.
     """
-    texts = [_NUMBER.sub("#", drawing.decode()) for drawing in (first, second)]
-    if texts[0] != texts[1]:
+    texts = [drawing.decode() for drawing in (first, second)]
+    if len({_NUMBER.sub("#", text) for text in texts}) > 1:
         return False
-    numbers = zip(*(_NUMBER.findall(drawing.decode()) for drawing in (first, second)), strict=True)
+    numbers = zip(*map(_NUMBER.findall, texts), strict=True)
     return all(abs(float(a) - float(b)) < _EQUAL_WITHIN for a, b in numbers)

@@ -25,7 +25,7 @@ from pfbench.report.journal.study_pack import (
     is_number,
     name_of,
 )
-from pfbench.results.plotting import CURVE_RANGE, use_log_if_wide
+from pfbench.results.plotting import CURVE_RANGE, format_axis_label, use_log_if_wide
 
 _CURVES = 9  # filters at most
 _PANELS = 6  # worlds at most
@@ -37,12 +37,10 @@ def select_curves(pack: Pack) -> list[str]:
 
     Returns keys in the order of the report, nine at most.
     """
-    looks = filters_by_key(pack)
-    rows = list(find_rows(pack))
+    looks, rows = filters_by_key(pack), list(find_rows(pack))
     proposed = [key for key in rows if looks[key]["proposed"]]
     priority = dict.fromkeys([*proposed, *rows[:1], *map(str, pack["baselines"][:2]), *rows])
-    selection = set(list(priority)[:_CURVES])
-    return [key for key in looks if key in selection]
+    return [key for key in looks if key in list(priority)[:_CURVES]]
 
 
 def select_worlds(pack: Pack) -> list[str]:
@@ -55,23 +53,21 @@ def plot_over_time(pack: Pack, setting: FigureSetting) -> Figure:
     """Plot the median error over time in each world under the first noise regime."""
     regime, looks = str(pack["regimes"][0]["key"]), filters_by_key(pack)
     worlds = select_worlds(pack)
+    curves = {world: pack["curves"][world, regime] for world in worlds}
     is_wide = setting.page.has_columns and len(worlds) > 1
     across = max(1, min(len(worlds), 3 if is_wide or setting.page.column > 320 else 1))
     down = -(-len(worlds) // across)
-    keys = select_curves(pack)
     figure = setting.make_figure(0.35 + 1.35 * down, is_wide=is_wide)
     axes = figure.subplots(down, across, squeeze=False).ravel()
     curve_keys: dict[str, None] = {}
     for axis, world in zip(axes, worlds, strict=False):
-        curves = pack["curves"][world, regime]
-        curve_keys |= dict.fromkeys(draw_curves(axis, curves, keys, looks))
+        curve_keys |= dict.fromkeys(draw_curves(axis, curves[world], select_curves(pack), looks))
         axis.set_title(setting.escape(name_of(pack, "worlds", world)))
         axis.set_xlabel("time [s]")
     for axis in axes[len(worlds) :]:
         axis.remove()
-    for axis in axes[::across]:
-        if axis.figure is not None:
-            axis.set_ylabel(setting.escape(_quantity(pack, worlds, regime)))
+    for axis in axes[: len(worlds) : across]:
+        axis.set_ylabel(setting.escape(_quantity(list(curves.values()))))
     lines = [(str(looks[key]["name"]), line_style(looks[key])) for key in curve_keys]
     add_legend_below(axes[0], lines, setting)
     return figure
@@ -86,12 +82,14 @@ def plot_calibration(pack: Pack, setting: FigureSetting) -> Figure:
     draw_coverage(coverage_axis, pack, setting)
     label_rows(axis, names, setting)
     axis.tick_params(labelleft=False)
-    ratios = {key: row["nees_ratio"] for key, row in values.items()}
-    positive = {key: float(v) for key, v in ratios.items() if is_number(v) and v > 0}
-    for key, ratio in positive.items():
-        style = {**mark_style(looks[key]), "linestyle": "none"}
-        axis.plot([ratio], [list(values).index(key)], zorder=3, **style)
-    use_log_if_wide(axis, axis.xaxis, [np.array([1.0, *positive.values()])], narrow=True)
+    positive = [1.0]
+    for y, (key, row) in enumerate(values.items()):
+        if is_number(row["nees_ratio"]) and row["nees_ratio"] > 0:
+            positive.append(float(row["nees_ratio"]))
+            axis.plot(
+                positive[-1:], [y], zorder=3, **{**mark_style(looks[key]), "linestyle": "none"}
+            )
+    use_log_if_wide(axis, axis.xaxis, [np.array(positive)], narrow=True)
     axis.axvline(1.0, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
     axis.set_xlabel("NEES / expectation")
     return figure
@@ -111,9 +109,8 @@ def draw_coverage(axis: Axes, pack: Pack, setting: FigureSetting) -> None:
     for level in (50, 90):
         axis.axvline(level, color="0.25", lw=0.6, ls=(0, (2, 1.2)), zorder=1)
     for y, (key, row) in enumerate(values.items()):
-        shares = [row[name] for name in ("c50", "c90")]
-        if all(map(is_number, shares)):
-            ends = [100 * share for share in shares]
+        if is_number(row["c50"]) and is_number(row["c90"]):
+            ends = [100 * row["c50"], 100 * row["c90"]]
             axis.plot(ends, [y, y], lw=0.8, zorder=2, **mark_style(looks[key]))
     axis.set_xlim(-2, 102)
     axis.set_xticks([0, 25, 50, 75, 90])
@@ -123,12 +120,10 @@ def draw_coverage(axis: Axes, pack: Pack, setting: FigureSetting) -> None:
 def draw_curves(axis: Axes, curves: Pack, keys: Sequence[str], looks: Pack) -> list[str]:
     """Draw the curves of one panel; return the filters that have one."""
     time, lines = np.asarray(curves["t"], dtype=np.float64), []
-    present = [key for key in keys if key in curves["filters"]]
+    present, step = [key for key in keys if key in curves["filters"]], max(1, len(time) // _MARKS)
     for i, key in enumerate(present):
         median = np.array([np.nan if v is None else v for v in curves["filters"][key]["median"]])
-        step = max(1, len(time) // _MARKS)
-        start = (i * step) // max(1, len(present))
-        order = 3 if looks[key]["proposed"] else 2
+        order, start = 3 if looks[key]["proposed"] else 2, (i * step) // len(present)
         axis.plot(time, median, zorder=order, markevery=(start, step), **line_style(looks[key]))
         lines.append(median)
     use_log_if_wide(axis, axis.yaxis, lines)
@@ -139,10 +134,8 @@ def draw_curves(axis: Axes, curves: Pack, keys: Sequence[str], looks: Pack) -> l
     return present
 
 
-def _quantity(pack: Pack, worlds: list[str], regime: str) -> str:
+def _quantity(curves: Sequence[Pack]) -> str:
     """Return the label of the y axis: quantity and unit, without a unit that differs by world."""
-    curves = [pack["curves"][world, regime] for world in worlds]
     groups, units = ({str(curve.get(name, "")) for curve in curves} for name in ("group", "unit"))
     group = f"{groups.pop()} error" if len(groups) == 1 else "error"
-    unit = units.pop() if len(units) == 1 else ""
-    return f"median {group} [{unit}]" if unit else f"median {group}"
+    return format_axis_label(f"median {group}", units.pop() if len(units) == 1 else "")
