@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -343,12 +343,11 @@ def _describe_verdict(entry: Mapping[str, Any] | None, unit: str) -> str:
     return ": ".join(filter(None, (text, entry["reason"])))
 
 
-def list_questions(pack: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what the p-values of recorded conditions answer; nothing without any."""
-    if pack.get("recorded"):
-        yield from QUESTIONS.values()
-        yield (
-            "Each column is a family of its own. Blocks depend on their neighbours: the number of independent ones with the "
-            "same variance of the mean is stated. A mean error or a drift of the whole record is one draw, which no "
-            "number of blocks shows."
-        )
+def list_questions(pack: Mapping[str, Any]) -> list[str]:
+    """List what the p-values of recorded conditions answer; nothing without any."""
+    note = (
+        "Each column is a family of its own. Blocks depend on their neighbours: the number of independent ones with the "
+        "same variance of the mean is stated. A mean error or a drift of the whole record is one draw, which no "
+        "number of blocks shows."
+    )
+    return [*QUESTIONS.values(), note] if pack.get("recorded") else []

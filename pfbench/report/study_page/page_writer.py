@@ -17,7 +17,7 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from pfbench.report.board.recorded_units import describe_records, list_questions
-from pfbench.report.journal.study_pack import name_of
+from pfbench.report.journal.study_pack import filters_by_key, name_of
 from pfbench.report.methods_text import write_methods
 from pfbench.report.page_kit import (
     Block,
@@ -32,8 +32,6 @@ from pfbench.report.papers.figures import list_page_figures
 from pfbench.report.writers import DASH, format_short
 from pfbench.results.conditions import drop_settings
 from pfbench.results.looks import describe_foreign_knobs, find_stored_world
-
-# Writer of the report page: index.html with all data, and report.md of one screen.
 
 PAGE_BYTES = 1_500_000
 _HERE = Path(__file__).parent
@@ -97,14 +95,7 @@ def render_page(pack: Mapping[str, Any], name: str = "index.html") -> dict[str, 
 def list_study_blocks(page: Mapping[str, Any]) -> list[Block]:
     """List the blocks of `describe_page` as Markdown, one screen."""
     pack, opening = page["pack"], page["opening"]
-    heads = [
-        "#",
-        "filter",
-        "ratio",
-        "verdict",
-        "track kept",
-        "coverage of 90 % intervals",
-    ]
+    heads = ["#", "filter", "ratio", "verdict", "track kept", "coverage of 90 % intervals"]
     heads += ["ms/step"] * opening["is_timed"] + ["ratio of ms/step"] * opening["has_costs"]
     of_pairs = ("pair", "ratio", f"simultaneous {page['level']} % interval", "verdict")
     pairs = [
@@ -138,18 +129,10 @@ def list_study_blocks(page: Mapping[str, Any]) -> list[Block]:
 
 def _list_cells(row: Mapping[str, Any]) -> list[str]:
     """List the cells of a row in Markdown."""
-    name = f"{row['name']}{' (proposed)' if row['proposed'] else ''}"
-    ratio, cost = f"{row['ratio']} {row['interval']}", f"{row['cost']} {row['cost_interval']}"
     return [
-        row["rank"],
-        name,
-        ratio,
-        row["words"],
-        row["track"],
-        row["calibration"],
-        row["ms"],
-        cost,
-    ]
+        row["rank"], f"{row['name']}{' (proposed)' if row['proposed'] else ''}", f"{row['ratio']} {row['interval']}",
+        row["words"], row["track"], row["calibration"], row["ms"], f"{row['cost']} {row['cost_interval']}",
+    ]  # fmt: skip
 
 
 def _list_figures(figures: Sequence[Mapping[str, Any]]) -> Iterable[Block]:
@@ -190,7 +173,7 @@ def describe_page(pack: Mapping[str, Any]) -> dict[str, Any]:
         "opening": describe_opening(pack),
         "planned": describe_pairs(pack),
         "records": describe_records(pack),
-        "questions": list(list_questions(pack)),
+        "questions": list_questions(pack),
         "level": f"{100 * (1 - pack['alpha']):g}",
         "choices": pack["choices"],
         "figures": list_page_figures(pack["study"], pack["paper_figures"]),
@@ -221,11 +204,12 @@ def _format_colours(filters: Sequence[Mapping[str, Any]]) -> str:
 
 def _group_files(downloads: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[dict[str, str]]]]:
     """Return the downloads by group, with sizes as text."""
-    groups: dict[str, list[dict[str, str]]] = {}
-    for file in downloads:
-        size = f"{max(1, round(file['bytes'] / 1000))} kB" if file.get("bytes") else ""
-        groups.setdefault(str(file["group"]), []).append({**file, "size": size})
-    return list(groups.items())
+    sized = [
+        {**file, "size": f"{max(1, round(file['bytes'] / 1000))} kB" if file.get("bytes") else ""}
+        for file in downloads
+    ]
+    groups = dict.fromkeys(str(file["group"]) for file in sized)
+    return [(group, [file for file in sized if file["group"] == group]) for group in groups]
 
 
 # Sentence, table and decisions of a page before its script runs.
@@ -271,26 +255,24 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
     key = find_opening(pack)
     view, everywhere = pack["views"][key], next(iter(pack["views"].values()))
     metric, world, regime, baseline = key
-    names = {f["key"]: f for f in pack["filters"]}
-    parts = (
-        name_of(pack, "metrics", metric),
-        _scope(pack, "worlds", world, "scenario"),
-        _scope(pack, "regimes", regime, "noise regime"),
-        f"ratio to {names[baseline]['name']}",
-    )
-    orders = pack.get("world_orders", ())
-    caption = f"{'; '.join(parts)}."
-    tables = [_table_of_world(pack, key, order["world"], names) for order in orders]
+    name, names = name_of(pack, "metrics", metric), filters_by_key(pack)
+    ratio, orders = f"ratio to {names[baseline]['name']}.", pack.get("world_orders", ())
+    scopes = _scope(pack, "worlds", world, "scenario"), _scope(pack, "regimes", regime, "noise regime")  # fmt: skip
+    caption = "; ".join((name, *scopes, ratio))
+    rows = {order["world"]: pack["views"][key._replace(world=order["world"])]["rows"] for order in orders}  # fmt: skip
+    tables = [
+        {
+            "caption": "; ".join((name, name_of(pack, "worlds", key_of_world), ratio)),
+            "rows": [_row(row, names[row["filter"]]) for row in some if row["rank"] is not None],
+        }
+        for key_of_world, some in rows.items()
+    ]
     is_timed = any(row["ms"] is not None for row in view["rows"])
+    texts = [source["sentence"].replace("[[", "").replace("]]", "") for source in orders or [view]]
     return {
         "sentence": format_sentence(view["sentence"]),
         "worlds": [format_sentence(order["sentence"]) for order in orders],
-        "texts": (
-            texts := [
-                source["sentence"].replace("[[", "").replace("]]", "")
-                for source in orders or [view]
-            ]
-        ),
+        "texts": texts,
         "text": "\n".join(texts),
         "small_print": everywhere["small_print"],
         "warnings": " ".join(pack.get("warnings", ())),
@@ -298,27 +280,10 @@ def describe_opening(pack: Mapping[str, Any]) -> dict[str, Any]:
         "overconfidence": describe_overconfidence(pack),
         "caption": caption,
         "heads": _heads(names[baseline]["name"])[: None if is_timed else -1],
-        "rows": (rows := [_row(row, names[row["filter"]]) for row in view["rows"]]),
-        "tables": tables or [{"caption": caption, "rows": rows}],
+        "rows": (opening := [_row(row, names[row["filter"]]) for row in view["rows"]]),
+        "tables": tables or [{"caption": caption, "rows": opening}],
         "is_timed": is_timed,
         "has_costs": any(row.get("cost") is not None for row in view["rows"]),
-    }
-
-
-def _table_of_world(
-    pack: Mapping[str, Any], opening: Any, world: str, names: Mapping[str, Mapping[str, Any]]
-) -> dict[str, Any]:
-    """Return caption and rows of the table of one world."""
-    rows = pack["views"][opening._replace(world=world)]["rows"]
-    parts = (
-        name_of(pack, "metrics", opening.metric),
-        name_of(pack, "worlds", world),
-        f"ratio to {names[opening.baseline]['name']}",
-    )
-    present = [row for row in rows if row["rank"] is not None]
-    return {
-        "caption": f"{'; '.join(parts)}.",
-        "rows": [_row(row, names[row["filter"]]) for row in present],
     }
 
 
@@ -438,9 +403,8 @@ def select_equal_time(pack: Mapping[str, Any]) -> tuple[float, list[str]]:
     times = {row["filter"]: float(row["ms"]) for row in rows if row["ms"] is not None}
     variants: dict[str, list[tuple[int, str]]] = {}
     for key in times:
-        name = drop_settings(key, "particles")
-        number = notes.get(key, "")
-        variants.setdefault(name, []).append((int(number) if number.isdigit() else 0, key))
+        number = int(notes[key]) if notes.get(key, "").isdigit() else 0
+        variants.setdefault(drop_settings(key, "particles"), []).append((number, key))
     swept = [sorted(group) for group in variants.values() if len({n for n, _ in group}) > 1]
     if len(swept) < _LEAST:
         return 0.0, []
@@ -505,14 +469,11 @@ def _encode(value: Any) -> Any:
     return "∞" if value == math.inf else value
 
 
-def _nest(values: Mapping[tuple[str, ...], Any]) -> dict[str, Any]:
-    """Nest values by the parts of their keys."""
+def _nest(values: Mapping[tuple[str, str], Any]) -> dict[str, Any]:
+    """Nest values of cells by world and regime."""
     nested: dict[str, Any] = {}
-    for key, value in values.items():
-        level = nested
-        for name in key[:-1]:
-            level = level.setdefault(name, {})
-        level[key[-1]] = value
+    for (world, regime), value in values.items():
+        nested.setdefault(world, {})[regime] = value
     return nested
 
 
@@ -521,8 +482,13 @@ def _select_tracks(cell: Mapping[str, Any], carried: int) -> dict[str, Any]:
     numbers = cell["numbers"][:carried]
     keys = [str(number) for number in numbers]
 
-    def select(runs: Mapping[str, Any]) -> dict[str, Any]:
-        return {key: _round_all(runs[key]) for key in keys if key in runs}
+    def select(runs: Mapping[str, Any]) -> dict[str, list[float | None]]:
+        """Return the numbers of each run with three digits in one list; None where they are not finite."""
+        flat = {k: np.asarray(runs[k], dtype=np.float64).ravel().tolist() for k in keys if k in runs}  # fmt: skip
+        return {
+            key: [float(f"{v:.{_DIGITS}g}") if math.isfinite(v) else None for v in values]
+            for key, values in flat.items()
+        }
 
     selected = {**cell, "numbers": numbers}
     if "truth" in cell:
@@ -538,9 +504,3 @@ def _select_tracks(cell: Mapping[str, Any], carried: int) -> dict[str, Any]:
         for trace in cell.get("traces", [])
     ]
     return selected
-
-
-def _round_all(values: Any) -> list[float | None]:
-    """Return numbers with three digits in one list; None where they are not finite."""
-    flat = np.asarray(values, dtype=np.float64).ravel().tolist()
-    return [float(f"{v:.{_DIGITS}g}") if math.isfinite(v) else None for v in flat]
