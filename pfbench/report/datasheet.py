@@ -39,17 +39,17 @@ def write_datasheet(
         f"the job {file}",
         "Create one with: pfbench datasheet scenario=NAME",
     )
-    choices = sheet.meta["choices"]
-    title = f"{choices['scenario']} / {choices['noise']}"
-    name = format_slug(f"{choices['scenario']}_{choices['noise']}")
+    scenario, noise = (sheet.meta["choices"][part] for part in ("scenario", "noise"))
+    title, name = f"{scenario} / {noise}", format_slug(f"{scenario}_{noise}")
     tables = {"residuals": whiteness_table(sheet), "spread": spread_table(sheet)}
     with RecordedFolder(Path(out) / "datasheets" / name) as folder:
         drawings = writers.write_figures(datasheet_figures(sheet), name, folder, formats)
         for stem, table in tables.items():
             if len(table):
                 writers.write_table(folder, stem, table)
-        blocks = list_blocks(title, sheet, drawings, tables)
-        return write_page(folder, f"{title}: datasheet", blocks)
+        return write_page(
+            folder, f"{title}: datasheet", list_blocks(title, sheet, drawings, tables)
+        )
 
 
 def list_blocks(
@@ -125,8 +125,9 @@ def list_facts(sheet: store.JobResult) -> list[str]:
     data, meta = sheet.data, sheet.meta
     time, steps, kinds = data["time"], meta["steps"], meta["kinds"]
     pace = f" of {np.median(np.diff(time)):.3g} s" if steps > 1 else ""
-    span = f"{time[0]:.4g} to {time[-1]:.5g} s"
-    texts = [f"{steps} steps{pace}, {span}. {meta['runs']} runs, seed {meta['seed']}."]
+    texts = [
+        f"{steps} steps{pace}, {time[0]:.4g} to {time[-1]:.5g} s. {meta['runs']} runs, seed {meta['seed']}."
+    ]
     if "track" in data:
         texts.append(_describe_track(data["track"][0]))
     counts = ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
@@ -138,9 +139,8 @@ def list_facts(sheet: store.JobResult) -> list[str]:
         least = visible[visible > 0].min() if is_sparse else visible.min()
         total = data["elevation"].shape[1]
         texts.append(f"Satellites above the horizon: {least} to {visible.max()} of {total}.")
-    residual = data["residual"]
-    is_equal = scenario_figures.drop_equal_runs(residual).shape[0] == 1
-    if is_equal and meta["runs"] > 1 and not np.isnan(residual).all():
+    is_equal = len(scenario_figures.drop_equal_runs(data["residual"])) == 1
+    if is_equal and meta["runs"] > 1 and not np.isnan(data["residual"]).all():
         texts.append("All runs have equal residuals, which are counted once.")
     if "raw_estimate" in meta:
         texts.append(scenario_figures.describe_raw_estimate(meta))

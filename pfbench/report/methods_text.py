@@ -98,11 +98,11 @@ def _list_numbers(values: Iterable[Any]) -> list[int]:
 
 def _list_particles(conditions: Sequence[Condition]) -> dict[str, list[int]]:
     """List the numbers of particles of each particle filter by label."""
-    numbers: dict[str, set[int]] = {}
-    for job in (job for condition in conditions for job in condition.jobs):
-        if job.meta.get("particles"):
-            numbers.setdefault(job.label, set()).add(int(job.meta["particles"]))
-    return {label: sorted(counts) for label, counts in sorted(numbers.items())}
+    pairs = {
+        (job.label, int(job.meta["particles"]))
+        for condition in conditions for job in condition.jobs if job.meta.get("particles")
+    }  # fmt: skip
+    return {label: sorted(n for name, n in pairs if name == label) for label, _ in sorted(pairs)}
 
 
 def _list_software(jobs: Sequence[Mapping[str, Any]]) -> dict[str, list[str]]:
@@ -133,32 +133,29 @@ def write_methods(pack: Pack) -> list[str]:
     """
     facts = read_facts(pack["methods"])
     names = {str(look["key"]): str(look["name"]) for look in pack["filters"]}
+    rounds = f"Times per step are medians of {facts.rounds} or more rounds in which the filters took turns."
     done = [
         *_describe_design(facts),
-        *_describe_particles(facts, names),
+        _describe_particles(facts, names),
         *_describe_decisions(facts, len(pack["planned"])),
-        *(
-            [
-                f"Times per step are medians of {facts.rounds} or more rounds in which the filters took turns."
-            ]
-            if facts.rounds
-            else ()
-        ),
-        *_describe_software(facts),
+        rounds * bool(facts.rounds),
+        _describe_software(facts),
     ]
-    return [" ".join(done), " ".join(["Not done:", *_list_limits(facts)])]
+    return [" ".join(filter(None, done)), " ".join(["Not done:", *_list_limits(facts)])]
 
 
 def _list_limits(facts: SimpleNamespace) -> list[str]:
     """List what a study did not do, as sentences."""
     worlds = "One world says" if facts.worlds == 1 else f"{facts.worlds} worlds say"
     tuning = describe_tuning(facts.tuned, facts.filters)
+    are_equal = len(set(map(tuple, facts.particles.values()))) == 1
+    kind = f": particle filters have {'equal' if are_equal else 'different'} numbers of particles"
     limits = (
         (len(facts.seeds) == 1, f"one seed ({facts.seeds[0]}) was used, so that no result was repeated with another."),
         (not facts.is_recorded, "All worlds are simulated, and no recorded data were used."),
         (facts.worlds < _FEW_WORLDS, f"{worlds} little about another world."),
         (min(facts.runs) < _FEW_RUNS, f"{min(facts.runs)} runs per condition are fewer than the {_FEW_RUNS} that tests require."),
-        (set(facts.budgets) == {store.SAME_N}, _describe_equal_particles(list(facts.particles.values()))),
+        (set(facts.budgets) == {store.SAME_N}, f"The filters were not given equal time{kind * (len(facts.particles) > 1)}."),
         (not facts.has_threshold, "No divergence threshold is stated, so only numerical failures count."),
         (not facts.is_complete, "Not every filter was run in every condition."),
         (True, f"{tuning} Parameters of the {'other ' if tuning else ''}filters were not tuned for this comparison unless the paper says so.".lstrip()),
@@ -180,35 +177,21 @@ def _describe_design(facts: SimpleNamespace) -> list[str]:
     ]
 
 
-def _describe_particles(facts: SimpleNamespace, names: Mapping[str, str]) -> list[str]:
-    """Describe the numbers of particles, with the names of filters that differ, and the budget."""
+def _describe_particles(facts: SimpleNamespace, names: Mapping[str, str]) -> str:
+    """Describe the numbers of particles, with the names of filters that differ, and the budget; empty without any."""
     if not facts.particles:
-        return []
+        return ""
     filters: dict[tuple[int, ...], list[str]] = {}
     for label, numbers in facts.particles.items():
         filters.setdefault(tuple(numbers), []).append(names[label])
     usual = max(filters, key=lambda numbers: len(filters[numbers]))
-    listed = {
-        numbers: f"{_join(numbers, 'or')} ({', '.join(sorted(filters[numbers]))})"
-        for numbers in sorted(filters)
-    }
-    if len(filters) > 1 and 2 * len(filters[usual]) <= len(facts.particles):
-        text = f"Particle filters used {_join(list(listed.values()), 'and')} particles"
-    else:
-        others = "; ".join(text for numbers, text in listed.items() if numbers != usual)
-        exceptions = f", with these exceptions: {others}" if others else ""
-        text = f"Particle filters used {_join(usual, 'or')} particles{exceptions}"
-    budgets = [budget for budget in facts.budgets if budget != store.SAME_N]
-    return [f"{text}, chosen for equal cost ({', '.join(budgets)})." if budgets else f"{text}."]
-
-
-def _describe_equal_particles(numbers: Sequence[Sequence[int]]) -> str:
-    """State that filters were not given equal time, and whether their numbers of particles are equal."""
-    text = "The filters were not given equal time"
-    if len(numbers) < 2:
-        return f"{text}."
-    kind = "equal" if len(set(map(tuple, numbers))) == 1 else "different"
-    return f"{text}: particle filters have {kind} numbers of particles."
+    listed = {n: f"{_join(n, 'or')} ({', '.join(sorted(filters[n]))})" for n in sorted(filters)}
+    others = "; ".join(text for numbers, text in listed.items() if numbers != usual)
+    text = f"{_join(usual, 'or')} particles" + f", with these exceptions: {others}" * bool(others)
+    if others and 2 * len(filters[usual]) <= len(facts.particles):
+        text = f"{_join(list(listed.values()), 'and')} particles"
+    budgets = ", ".join(budget for budget in facts.budgets if budget != store.SAME_N)
+    return f"Particle filters used {text}" + f", chosen for equal cost ({budgets})" * bool(budgets) + "."  # fmt: skip
 
 
 def _describe_decisions(facts: SimpleNamespace, pairs: int) -> list[str]:
@@ -229,14 +212,14 @@ def _describe_decisions(facts: SimpleNamespace, pairs: int) -> list[str]:
     ]
 
 
-def _describe_software(facts: SimpleNamespace) -> list[str]:
+def _describe_software(facts: SimpleNamespace) -> str:
     """Describe versions, commit, number type and device."""
     value = {name: ", ".join(values) or "unknown" for name, values in facts.software.items()}
     threads = f"{value['threads']} thread{'' if value['threads'] == '1' else 's'}"
-    return [
+    return (
         f"Software: pfbench {value['pfbench']} ({name_build(value['commit'])}), Python {value['python']}, torch "
-        f"{value['torch']}, numpy {value['numpy']}; {value['dtype']} on {value['device']} ({threads}).",
-    ]
+        f"{value['torch']}, numpy {value['numpy']}; {value['dtype']} on {value['device']} ({threads})."
+    )
 
 
 def _join(values: Sequence[object], word: str) -> str:

@@ -108,9 +108,8 @@ class PublishedComparison(NamedTuple):
     def __str__(self) -> str:
         lines = []
         for name, verdicts in self.verdicts.items():
-            lines.append(
-                f"{name}: {self.witnesses[name]} has the errors of the published study in all runs"
-            )
+            witness = self.witnesses[name]
+            lines.append(f"{name}: {witness} has the errors of the published study in all runs")
             for label in dict.fromkeys(verdict.a for verdict in verdicts):
                 lines += _word_filter(label, [v for v in verdicts if v.a == label])
         lines += [f"{name} is not compared: {reason}." for name, reason in self.left_out.items()]
@@ -121,9 +120,8 @@ def _word_filter(label: str, verdicts: Sequence[Verdict]) -> Iterator[str]:
     """Yield how an own filter compares with all published ones, and with the strongest of them."""
     words = Counter(verdict.word for verdict in verdicts)
     counts = ", ".join(f"{word} {count}" for word, count in words.items())
-    sized = [verdict for verdict in verdicts if verdict.ratio > 0]
     yield f"  {label} against {len(verdicts)} filters: {counts}"
-    if sized:
+    if sized := [verdict for verdict in verdicts if verdict.ratio > 0]:
         strongest = max(sized, key=lambda verdict: verdict.ratio)
         yield (
             f"  {label} / {strongest.b}, the strongest in these runs: {format_with_interval(*strongest[3:6])} "
@@ -165,33 +163,26 @@ def compare_with_published(conditions: Sequence[Condition], folder: Path) -> Pub
         ValueError: If no condition has a witness whose errors agree.
     """
     study = read_stored_study(folder, decides=False)
-    options = StudyFacts.from_pack(study.pack).options
-    table = build_run_table(conditions, options.start_time_s)
-    compared = compare_tables(table, study)
-    compared = compared._replace(
-        names={label: look.name for label, look in study_looks(conditions).items()}
-    )
+    start = StudyFacts.from_pack(study.pack).options.start_time_s
+    compared = compare_tables(build_run_table(conditions, start), study)
     if not compared.verdicts:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in compared.left_out.items())
-        raise ValueError(
-            f"{folder / RUNS_FILE} must share a world with the study, got none. {reasons}. Its worlds, for pfbench.run: "
-            f"{_describe_worlds(study.table)}"
+        worlds = "; ".join(
+            f"{' / '.join(map(str, key[:-1]))} with seed={key[-1]}, up to {rows['run'].nunique()} runs"
+            for key, rows in study.table.groupby([*_CONDITION, "seed"], observed=True, sort=False)
         )
-    return compared
-
-
-def _describe_worlds(table: pd.DataFrame) -> str:
-    """List the conditions of stored runs with the settings that a study next to them needs."""
-    return "; ".join(
-        f"{' / '.join(map(str, key[:-1]))} with seed={key[-1]}, up to {rows['run'].nunique()} runs"
-        for key, rows in table.groupby([*_CONDITION, "seed"], observed=True, sort=False)
-    )
+        raise ValueError(
+            f"{folder / RUNS_FILE} must share a world with the study, got none. {reasons}. Its worlds, for pfbench.run: {worlds}"
+        )
+    names = {label: look.name for label, look in study_looks(conditions).items()}
+    return compared._replace(names=names)
 
 
 def compare_tables(table: pd.DataFrame, study: StoredStudy) -> PublishedComparison:
     """Compare own runs, a row per filter, condition and run, with those of a published study."""
     facts = StudyFacts.from_pack(study.pack)
-    witnesses, left_out, members = {}, {}, []
+    witnesses, left_out, parts = {}, {}, {}
+    joined, pairs, counts = [], {}, set[int]()
     for key, rows in table.groupby(_CONDITION, observed=True, sort=False):
         name = " / ".join(map(str, key))
         stored = study.table[(study.table[_CONDITION] == list(key)).all(axis=1)]
@@ -200,20 +191,19 @@ def compare_tables(table: pd.DataFrame, study: StoredStudy) -> PublishedComparis
         except ValueError as error:
             left_out[name] = str(error)
             continue
-        members.append((name, rows, stored[stored["seed"] == rows["seed"].iloc[0]]))
-    joined, pairs = [], {}
-    for name, rows, stored in members:
+        stored = stored[stored["seed"] == rows["seed"].iloc[0]]
         both, pairs[name] = _make_pairs(rows, stored)
         joined.append(both.assign(family=name, scenario=name, regime=""))
+        counts |= set(rows["particles"].dropna().astype(int))
         others = stored[~stored["filter"].isin([b for _, b in pairs[name]])]
-        if numbers := sorted({int(n) for n in others["particles"].dropna()}):
-            left_out[f"A part of {name}"] = (
+        if numbers := sorted(set(others["particles"].dropna().astype(int))):
+            parts[f"A part of {name}"] = (
                 f"{others['filter'].nunique()} published filters have {', '.join(map(str, numbers))} particles, the own ones another "
                 "number. Set particles=NUMBER to meet them"
             )
+    left_out |= parts
     worlds = _open_worlds(joined, pairs)
     verdicts = {name: [worlds[name].find(*pair) for pair in some] for name, some in pairs.items()}
-    counts = {int(n) for _, rows, _ in members for n in rows["particles"].dropna()}
     return PublishedComparison(
         verdicts, witnesses, left_out,
         _list_cells(worlds, pairs) if has_overview(study.table, facts.looks) else (),
@@ -313,16 +303,13 @@ def _make_pairs(rows: pd.DataFrame, stored: pd.DataFrame) -> tuple[pd.DataFrame,
     labels = [
         str(v) for v in rows["filter"].unique() if parse_label(str(v))[0] not in published.values()
     ]
-    counts = {
-        str(label): group["particles"].iloc[0]
-        for frame in (rows, stored)
-        for label, group in frame.groupby("filter", observed=True)
-    }
+    both = pd.concat([rows[rows["filter"].isin(labels)], stored])
+    counts = both.groupby("filter", observed=True)["particles"].first()
     pairs = [
         (a, b)
         for a in labels
         for b in published
-        if pd.isna(counts[a]) or pd.isna(counts[b]) or counts[a] == counts[b]
+        if counts[[a, b]].isna().any() or counts[a] == counts[b]
     ]
     columns = ["filter", "seed", "run", METRIC, "keeps_track"]
-    return pd.concat([rows[rows["filter"].isin(labels)], stored])[columns], pairs
+    return both[columns], pairs

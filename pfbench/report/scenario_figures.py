@@ -46,10 +46,9 @@ def plot_scenario_track(sheet: store.JobResult) -> Figure:
     first = paths[0][~np.isnan(paths[0]).any(-1)]
     plan.plot(first[:, 0] * scale, first[:, 1] * scale, color="#0072B2", lw=1.3, label="first run")
     height.plot(time[thin], paths[0, thin, 2], color="#0072B2", lw=1.3)
-    for label, point, fill in (("start", first[0], "white"), ("end", first[-1], "#0072B2")):
-        marker = "o" if label == "start" else "s"
-        shape: Any = {"marker": marker, "ms": 5, "ls": "none", "zorder": 5}
-        plan.plot(*(point[:2] * scale), mfc=fill, color="#0072B2", label=label, **shape)
+    shape: Any = {"ms": 5, "ls": "none", "zorder": 5, "color": "#0072B2"}
+    plan.plot(*(first[0, :2] * scale), marker="o", mfc="white", label="start", **shape)
+    plan.plot(*(first[-1, :2] * scale), marker="s", mfc="#0072B2", label="end", **shape)
     plan.set(xlabel=f"east [{unit}]", ylabel=f"north [{unit}]")
     plan.set_aspect("equal", adjustable="datalim")
     plan.locator_params(axis="x", nbins=5)
@@ -69,14 +68,11 @@ def plot_distance(sheet: store.JobResult) -> Figure:
 def plot_sensors(sheet: store.JobResult) -> Figure:
     """Plot specific force and angular rate over time, a line per body axis."""
     figure, panels = stacked_axes(2, 1.7)
-    lines = list(line_styles(_AXES).values())
     time, rate = sheet.data["time"], sheet.data["rate"] * np.degrees(1)
     rows = (sheet.data["force"], "specific force [m/s²]"), (rate, "rate [deg/s]")
     for axis, (values, ylabel) in zip(panels, rows, strict=True):
-        for k, name in enumerate(_AXES):
-            axis.plot(
-                time, values[:, k], color=lines[k].colour, ls=lines[k].dash, lw=1.1, label=name
-            )
+        for (name, line), value in zip(line_styles(_AXES).items(), values.T, strict=True):
+            axis.plot(time, value, color=line.colour, ls=line.dash, lw=1.1, label=name)
         axis.set_ylabel(ylabel)
     panels[-1].set_xlabel("time [s]")
     add_legend(figure, panels[0], columns=3)
@@ -94,13 +90,10 @@ def plot_sky(sheet: store.JobResult) -> Figure:
     azimuth = sheet.data["azimuth"].astype(float)
     zenith = 90 - np.degrees(sheet.data["elevation"].astype(float))
     axis.set_rgrids([30, 60], labels=["60°", "30°"], angle=22.5, color="0.4", fontsize=6.5)
-    names = list_satellites(sheet)
-    looks = line_styles(names)
-    for k, name in enumerate(names):
+    for k, (name, style) in enumerate(line_styles(list_satellites(sheet)).items()):
         steps = np.flatnonzero(~np.isnan(azimuth[:, k]) & ~np.isnan(zenith[:, k]))
         if steps.size:
-            path = azimuth[steps, k], zenith[steps, k]
-            _plot_satellite(axis, *path, str(name), looks[name].colour)
+            _plot_satellite(axis, azimuth[steps, k], zenith[steps, k], name, style.colour)
     return figure
 
 
@@ -125,12 +118,12 @@ def plot_measurements(sheet: store.JobResult) -> Figure:
         counts = {"satellites": (visible_satellites(sheet), "#0072B2"), **counts}
     figure, panels = stacked_axes(len(counts), 1.3)
     for axis, (name, (count, colour)) in zip(panels, counts.items(), strict=True):
-        sparse = has_sparse_counts(count)
-        mask = count > 0 if sparse else np.ones_like(count, dtype=bool)
         line: Any = {"ls": "-", "lw": 1.1, "drawstyle": "steps-mid"}
-        if sparse:
+        time = a["time"]
+        if has_sparse_counts(count):
+            time, count = time[count > 0], count[count > 0]
             line = {"ls": "none", "marker": ".", "ms": 2.5}
-        axis.plot(a["time"][mask], count[mask], color=colour, **line)
+        axis.plot(time, count, color=colour, **line)
         axis.set(ylabel=name)
         axis.set_ylim(bottom=0)
     panels[-1].set_xlabel("time [s]")
@@ -163,11 +156,9 @@ def plot_residuals_over_time(sheet: store.JobResult) -> Figure:
     kinds = group_residuals(sheet)
     figure, panels = stacked_axes(len(kinds), 1.3)
     for axis, (kind, z) in zip(panels, kinds.items(), strict=True):
-        first = z[0]
-        time = np.broadcast_to(sheet.data["time"][:, None], first.shape)
-        finite_mask = ~np.isnan(first)
+        steps, _ = finite = np.nonzero(~np.isnan(z[0]))
         dots: Any = {"ls": "none", "marker": ".", "ms": 3, "alpha": 0.8, "mew": 0}
-        axis.plot(time[finite_mask], first[finite_mask], color="#0072B2", **dots)
+        axis.plot(sheet.data["time"][steps], z[0][finite], color="#0072B2", **dots)
         for edge in (-2, 2):
             axis.axhline(edge, color="black", lw=0.7, ls=(0, (4, 2)))
         axis.set(title=kind, ylabel="residual [sd]")
@@ -283,7 +274,6 @@ def describe_raw_estimate(meta: Mapping[str, Any]) -> str:
     method = {0: "dead reckoning", 1: "least squares of one step"}.get(
         raw["steps"], f"least squares of {raw['steps']} steps"
     )
-    stated = divergence_threshold(meta)
 
     def show(value: float | None) -> str:
         return "none" if value is None else f"{value * group.scale:.3g} {group.unit}".rstrip()
@@ -291,7 +281,7 @@ def describe_raw_estimate(meta: Mapping[str, Any]) -> str:
     return (
         f"Estimate from raw measurements alone ({method}): {group.group} RMSE {show(raw['rmse'])}; "
         f"dead reckoning: {show(raw['dead_reckoning'])}. Computed divergence threshold: "
-        f"{show(raw['threshold'])}. Threshold of the scenario: {show(stated)}."
+        f"{show(raw['threshold'])}. Threshold of the scenario: {show(divergence_threshold(meta))}."
     )
 
 
@@ -306,8 +296,7 @@ def write_training_figure(path: Path, losses: Losses) -> Path:
 
     Returns the path.
     """
-    spec = FigureSpec(path.stem, "", lambda: plot_training(losses))
-    content = draw_figure(spec, ("svg",))["svg"]
+    content = draw_figure(FigureSpec(path.stem, "", lambda: plot_training(losses)), ("svg",))["svg"]
     write_atomically(path, lambda file: file.write(content))
     return path
 
@@ -329,7 +318,7 @@ def plot_training(losses: Losses) -> Figure:
     for bottom in others:
         bottom.plot(epoch, losses["ess"], color=PLAIN_COLOURS[0], lw=1.3)
         bottom.set(ylabel="ESS / N", ylim=(0, 1))
-    last = [top, *others][-1]
+    last = figure.axes[-1]
     last.set_xlabel("epoch")
     last.xaxis.set_major_locator(MaxNLocator(integer=True))
     add_legend(figure, top, columns=3)
