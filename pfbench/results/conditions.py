@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Collection, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
@@ -13,8 +12,14 @@ import numpy as np
 
 from pfbench.files.atomic_write import set_aside
 from pfbench.results import store
-from pfbench.results.inputs import describe_libraries, describe_older, select_newest_inputs
+from pfbench.results.inputs import (
+    describe_libraries,
+    describe_older,
+    read_condition,
+    select_newest_inputs,
+)
 from pfbench.results.joined_runs import find_consecutive_parts, join_metadata, read_joined
+from pfbench.results.paper_block import parse_label as parse_label
 from pfbench.results.step_times import STEP_TIME, add_step_times
 from pfbench.results.store import DATA_FOLDERS
 from pfbench.stats.study_runs import natural_sort_key
@@ -101,7 +106,7 @@ def load_conditions(
         _check_equal(items, _BUILD, "the study")
     groups = {group[0][0]: group for group in find_consecutive_parts(items)}
     items = [(path, join_metadata([meta for _, meta in group])) for path, group in groups.items()]
-    items.sort(key=lambda item: (_condition_key(item[1]), *(item[1][name] for name in ("label", "seed", "key"))))  # fmt: skip
+    items.sort(key=lambda item: (read_condition(item[1]), *(item[1][name] for name in ("label", "seed", "key"))))  # fmt: skip
     items = add_step_times(items, Path(results) / study)
     separated, settings = _separate_conditions(items, same_data, allow_mixed_versions)
     conditions = []
@@ -120,23 +125,32 @@ def _separate_conditions(
     """Group jobs by the names of scenario and noise and by model, and list the settings in the labels of each filter."""
     settings: dict[str, list[str]] = {}
     separated = []
-    for key, group in groupby(items, key=lambda item: _condition_key(item[1])):
+    for key, group in groupby(items, key=lambda item: read_condition(item[1])):
         members = list(group)
         separate = list_data_settings([meta for _, meta in members]) if same_data else []
         if not allow_mixed_versions:
             _check_condition(members, separate)
         for names, items_of_data in _separate_data(members, separate):
             separated.append((names, key[2], items_of_data))
-            _add_label_settings(settings, items_of_data)
+            for label, twins in _group_by_label(items_of_data).items():
+                names_of_label = [*settings.get(label, ()), *find_label_settings(twins)]
+                settings[label] = list(
+                    dict.fromkeys(names_of_label)
+                )  # its label has them in all conditions
     return separated, settings
 
 
 def _check_condition(items: Sequence[_Described], separate: Sequence[str]) -> None:
     """Raise ValueError if jobs of a scenario, noise and model differ beyond the settings of their data."""
-    where = f"the condition {' / '.join(_condition_key(items[0][1]))}"
+    where = f"the condition {' / '.join(read_condition(items[0][1]))}"
     _check_equal(items, ("seed", "first_run", "runs", "steps"), where)
-    settings = set(unlabelled_settings(_label_jobs(items))) - set(separate)
-    _check_equal(items, [f"config.{name}" for name in sorted(settings)], where)
+    jobs = _label_jobs(items)
+    hidden = {
+        name
+        for name in differing_settings(jobs)
+        if not all(f"{name}=" in job.label for job in jobs)
+    }
+    _check_equal(items, [f"config.{name}" for name in sorted(hidden - set(separate))], where)
 
 
 def _separate_data(
@@ -173,31 +187,12 @@ def differing_settings(jobs: Sequence[JobFile]) -> list[str]:
     return list_differing(flat)
 
 
-def unlabelled_settings(jobs: Sequence[JobFile]) -> list[str]:
-    """List the differing settings that are not in every label."""
-    differing = differing_settings(jobs)
-    return [name for name in differing if not all(f"{name}=" in job.label for job in jobs)]
-
-
-def _condition_key(meta: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Return scenario, noise and model of a job."""
-    choices = meta["choices"]
-    return str(choices["scenario"]), str(choices["noise"]), str(choices.get("model", ""))
-
-
 def _group_by_label(items: Sequence[_Described]) -> dict[str, list[Mapping[str, Any]]]:
     """Group the metadata of jobs by their filter."""
     twins: dict[str, list[Mapping[str, Any]]] = {}
     for _, meta in items:
         twins.setdefault(str(meta["label"]), []).append(meta)
     return twins
-
-
-def _add_label_settings(settings: dict[str, list[str]], items: Sequence[_Described]) -> None:
-    """Add the settings in which the jobs of each filter differ in a condition: its label has them in all conditions."""
-    for label, twins in _group_by_label(items).items():
-        names = settings.setdefault(label, [])
-        names += [name for name in find_label_settings(twins) if name not in names]
 
 
 def _label_jobs(
@@ -273,16 +268,6 @@ _DATA_SETTINGS = ("scenario", "noise")  # settings that decide the data of a fil
 _NOT_DATA = "scenario.paper."  # names and thresholds
 _WORDS = "filter.paper."  # names of a filter, which differ with the world of its tuning
 _LOCATION_SETTINGS = ("scenario.cache_dir", *DATA_FOLDERS)  # settings that do not
-
-
-def parse_label(label: str) -> tuple[str, dict[str, str]]:
-    """Split a label into its name and its settings.
-
-    Returns name, and values as text by setting.
-    """
-    name, _, text = label.partition("[")
-    pairs = re.split(r",(?=[\w.]+=)", text.removesuffix("]")) if text else []
-    return name, {key: value for key, _, value in (pair.partition("=") for pair in pairs)}
 
 
 def drop_settings(label: str, *dropped: str) -> str:

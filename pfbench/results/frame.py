@@ -46,9 +46,8 @@ def load_frame(
         for condition in conditions
         for job in condition.jobs
     ]
-    independent, sentence = select_independent_runs(
-        pd.concat(rows, ignore_index=True), list_main_groups(conditions)
-    )
+    table = pd.concat(rows, ignore_index=True)
+    independent, sentence = select_independent_runs(table, list_main_groups(conditions))
     if sentence:
         log.warning("warning  study %s: %s", study, sentence)
     return independent
@@ -91,15 +90,16 @@ def select_steps(result: store.JobResult, mask: np.ndarray) -> store.JobResult:
     """
     if mask.all():
         return result
-    skipped = (*_WHOLE_RUN_ARRAYS, "score_steps", *metrics.scored_arrays())
     selected = {
-        name: array[mask] if name in _SHARED_ARRAYS else array[:, mask]
+        name: array
+        if name in _WHOLE_RUN_ARRAYS
+        else array[mask]
+        if name in _SHARED_ARRAYS
+        else array[:, mask]
         for name, array in result.data.items()
-        if name not in skipped
+        if name not in ("score_steps", *metrics.scored_arrays())
     }
-    shared = {name: result.data[name] for name in _WHOLE_RUN_ARRAYS if name in result.data}
-    scores = _select_scores(result.data, mask)
-    return store.JobResult(result.meta, {**selected, **shared, **scores})
+    return store.JobResult(result.meta, selected | _select_scores(result.data, mask))
 
 
 class MetricColumn(NamedTuple):
@@ -132,9 +132,7 @@ def to_long_rows(
     scored = drop_before(result, start_time_s)
     keeps = status.keeps_track(scored.data, scored.meta)
     columns = [*_metric_rows(scored), *_convergence(result, converged)]
-    first, runs = job.meta.get("first_run", 0), lost.size
-    repeats = len(columns)
-    size = repeats * runs
+    first, runs, repeats = job.meta.get("first_run", 0), lost.size, len(columns)
     names = {
         name: np.repeat(np.array([getattr(column, name) for column in columns], dtype=object), runs)
         for name in ("group", "component", "unit", "metric")
@@ -149,13 +147,13 @@ def to_long_rows(
         "model": condition.model,
         "filter": job.meta["choices"]["filter"],
         "label": job.label,
-        "particles": pd.array([job.meta.get("particles")] * size, dtype="Int64"),
+        "particles": pd.array([job.meta.get("particles")] * len(value), dtype="Int64"),
         "seed": job.meta["seed"],
         "run": np.tile(np.arange(first, first + runs), repeats),
         "lost": np.tile(lost, repeats),
         "keeps_track": np.tile(keeps, repeats),
     }
-    return pd.DataFrame({**head, **names, "value": value}, index=range(size))
+    return pd.DataFrame({**head, **names, "value": value}, index=range(len(value)))
 
 
 def _select_scores(data: Mapping[str, np.ndarray], mask: np.ndarray) -> dict[str, np.ndarray]:
@@ -175,8 +173,7 @@ def _metric_rows(result: store.JobResult) -> Iterator[MetricColumn]:
         for data in metrics.data_by_scope(result, scope):
             group = data.group.group if data.group else data.state_group
             for metric in entries:
-                is_group_unit = metric.unit == metrics.GROUP_UNIT and data.group
-                unit = data.group.unit if is_group_unit and data.group else metric.unit
+                unit = data.group.unit if metric.is_of_group and data.group else metric.unit
                 for component, value in metric.compute(data).items():
                     yield MetricColumn(metric.name, value, group, component, unit)
 

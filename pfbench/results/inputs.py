@@ -52,12 +52,12 @@ def select_newest_inputs(items: Sequence[Item]) -> tuple[list[Item], list[OlderR
     last: dict[str, Inputs] = {}
     for _, meta in ordered:
         inputs = meta.get("inputs", {})
-        newest.setdefault(_condition(meta), {}).update(_flatten(inputs, _OF_DATA))
+        newest.setdefault(read_condition(meta), {}).update(_flatten(inputs, _OF_DATA))
         last[_describe_data(meta)] = last[_describe_job(meta)] = inputs
     compared: list[Item] = []
     older: list[tuple[str, OlderResult]] = []
     for path, meta in ordered:
-        inputs, of_condition = meta.get("inputs", {}), newest[_condition(meta)]
+        inputs, of_condition = meta.get("inputs", {}), newest[read_condition(meta)]
         of_data = _flatten(inputs, _OF_DATA)
         changed = [_format_name(key[1]) for key in of_data if of_data[key] != of_condition[key]]
         # files that came or went with equal settings of the data, or another code of the same filter
@@ -119,15 +119,16 @@ def _computed_at(item: Item) -> tuple[str, int]:
     return str(meta.get("created", "")), path.stat().st_mtime_ns if path.exists() else 0
 
 
-def _condition(meta: Mapping[str, Any]) -> tuple[str, ...]:
+def read_condition(meta: Mapping[str, Any]) -> tuple[str, str, str]:
     """Return scenario, noise and model of a result."""
-    return tuple(str(meta["choices"].get(group, "")) for group in _OF_DATA)
+    scenario, noise, model = (str(meta["choices"].get(group, "")) for group in _OF_DATA)
+    return scenario, noise, model
 
 
 def _describe_data(meta: Mapping[str, Any]) -> str:
     """Return a key of the settings that decide the data of a result, whatever the inputs are."""
     settings = {group: meta["config"].get(group) for group in _OF_DATA[:2]}
-    return repr([*_condition(meta)[:2], compute_config_key(settings, PLACE_SETTINGS)])
+    return repr([*read_condition(meta)[:2], compute_config_key(settings, PLACE_SETTINGS)])
 
 
 def _describe_job(meta: Mapping[str, Any]) -> str:

@@ -40,8 +40,8 @@ def find_consecutive_parts(items: Sequence[StoredPart]) -> list[list[StoredPart]
     joined: list[list[StoredPart]] = []
     for members in groups.values():
         ordered = sorted(members, key=lambda item: int(item[1].get("first_run", 0)))
-        ends = [int(meta.get("first_run", 0)) + int(meta["runs"]) for _, meta in ordered]
         starts = [int(meta.get("first_run", 0)) for _, meta in ordered]
+        ends = [first + int(meta["runs"]) for first, (_, meta) in zip(starts, ordered, strict=True)]
         is_chain = starts[1:] == ends[:-1]
         joined += [ordered] if is_chain else [[item] for item in members]
     return joined
@@ -56,8 +56,7 @@ def join_metadata(metadata: Sequence[dict[str, Any]]) -> dict[str, Any]:
     if len(metadata) == 1:
         return first
     total = sum(int(meta["runs"]) for meta in metadata)
-    memory = [meta["memory"] for meta in metadata]
-    times = [meta["seconds"] for meta in metadata]
+    memory, times = ([meta[name] for meta in metadata] for name in ("memory", "seconds"))
     meta = {
         **first,
         "runs": total,

@@ -16,6 +16,7 @@ from pfbench.results.paper_block import (
     list_named_parts,
     list_planned_pairs,
     read_paper_block,
+    read_stored_block,
     read_world,
 )
 
@@ -112,22 +113,23 @@ def find_looks(
 def study_looks(conditions: Sequence[Condition]) -> dict[str, MethodLook]:
     """Return the looks of all filters of a study, also of a user's own filters."""
     blocks: dict[str, Mapping[str, Any]] = {}
-    worlds: dict[str, dict[str, None]] = {}  # distinct, in the order of the conditions
-    foreign: dict[str, dict[str, None]] = {}
+    worlds: dict[
+        str, dict[str, str]
+    ] = {}  # data and other world of tunings, in the order of the conditions
     for condition in conditions:
         for job in condition.jobs:
-            blocks[job.label] = block = _stored_block(job.meta, "filter")
-            data = str(block.get("tuning") or "")
-            worlds.setdefault(job.label, {}).update({data: None} if data else {})
-            model = str(job.meta.get("choices", {}).get("model", ""))
-            foreign_world = find_foreign_world(data, parse_label(condition.scenario)[0], model)
-            text = read_world(str(block.get("name"))) or foreign_world
-            foreign.setdefault(job.label, {}).update({text: None} if text else {})
+            blocks[job.label] = block = read_stored_block(job.meta, "filter")
+            data, model = (
+                str(block.get("tuning") or ""),
+                str(job.meta.get("choices", {}).get("model", "")),
+            )
+            foreign = find_foreign_world(data, parse_label(condition.scenario)[0], model)
+            worlds.setdefault(job.label, {})[data] = read_world(str(block.get("name"))) or foreign
     looks = find_looks(sorted(blocks), blocks)
     return {
-        label: add_tuning(look, ", ".join(worlds[label]), ", ".join(foreign[label]))
+        label: add_tuning(look, *(", ".join(filter(None, dict.fromkeys(texts))) for texts in (worlds[label], worlds[label].values())))
         for label, look in looks.items()
-    }
+    }  # fmt: skip
 
 
 def find_stored_world(look: Mapping[str, Any], scenarios: Collection[str]) -> str:
@@ -152,9 +154,8 @@ def study_part_names(conditions: Sequence[Condition], group: str) -> dict[str, P
     settings = name_settings(keys)
     for key, condition in zip(keys, conditions, strict=True):
         plain, _ = parse_label(key)
-        block = read_paper_block(group, plain) or _stored_block(condition.jobs[0].meta, group)
-        stored = _stored_block(condition.jobs[0].meta, group)  # limits that the jobs had
-        limit = stored.get("divergence_threshold")
+        stored = read_stored_block(condition.jobs[0].meta, group)  # limits that the jobs had
+        block, limit = read_paper_block(group, plain) or stored, stored.get("divergence_threshold")
         names[key] = PartName(
             key,
             _add_text(str(block.get("name", plain)), settings.get(key)),
@@ -197,31 +198,19 @@ def _parse_look(label: str, block: Mapping[str, Any]) -> MethodLook:
     )
 
 
-def _stored_block(meta: Mapping[str, Any], group: str) -> Mapping[str, Any]:
-    """Return the node `paper` that a result stores."""
-    node = meta.get("config", {}).get(group)
-    block = node.get("paper") if isinstance(node, Mapping) else None
-    return block if isinstance(block, Mapping) else {}
-
-
 def _own_block(label: str, blocks: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Any]:
     """Return the stored node of a label, empty if it has the name of another method.
 
     A file without a node inherits that of the file on which it builds.
     """
     block = blocks.get(label, {})
-    names = Counter(
-        str(node.get("name")) for node in {k.partition("[")[0]: v for k, v in blocks.items()}.values()
-    )  # fmt: skip
-    name = str(block.get("name", ""))
-    is_inherited = names[name] > 1 or name in _installed_names()
+    method = parse_label(label)[0]
+    nodes = [
+        *(node for key, node in blocks.items() if parse_label(key)[0] != method),
+        *(read_paper_block("filter", key) for key in list_named_parts("filter")),
+    ]
+    is_inherited = str(block.get("name", "")) in {str(node.get("name")) for node in nodes}
     return {} if is_inherited else block
-
-
-def _installed_names() -> Collection[str]:
-    """Return the names of the installed methods."""
-    blocks = [read_paper_block("filter", key) for key in list_named_parts("filter")]
-    return {str(block.get("name")) for block in blocks}
 
 
 def _separate_markers(looks: Mapping[str, MethodLook]) -> dict[str, MethodLook]:

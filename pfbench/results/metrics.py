@@ -75,12 +75,6 @@ class MetricInput(NamedTuple):
 ByComponent = Mapping[str, Array]  #: values by the name of a component
 
 
-def particles_in_use(result: store.JobResult) -> Array | int:
-    """Return the number of particles: [R, T] if the filter changes it."""
-    data = result.data
-    return data["particles"] if "particles" in data else int(result.meta["particles"])
-
-
 def mean_trace(result: store.JobResult, name: str) -> Array:
     """Average a trace over time, as a share of the particles if it counts particles.
 
@@ -97,16 +91,8 @@ def mean_trace(result: store.JobResult, name: str) -> Array:
         return np.full(lost.size, np.nan)
     if name in ("ancestors", "unique") and "resampled" in data:
         trace = np.where(data["resampled"], trace, np.nan)
-    return mean_per_run(trace / particles_in_use(result) if is_count else trace, lost)
-
-
-def mean_acceptance(result: store.JobResult) -> Array:
-    """Average the MCMC acceptance over resampled steps; [R], NaN without moves."""
-    data, lost = result.data, result.data["lost"]
-    if "accepted_0" not in data:
-        return np.full(lost.size, np.nan)
-    accepted = np.where(data.get("resampled", True), data["accepted_0"], np.nan)
-    return mean_per_run(accepted, lost)
+    # [R, T] if the filter changes its number of particles
+    return mean_per_run(trace / data.get("particles", particles) if is_count else trace, lost)
 
 
 def compute_rmse(data: MetricInput) -> ByComponent:
@@ -199,8 +185,10 @@ def average_trace(name: str) -> Callable[[MetricInput], ByComponent]:
 
 
 def compute_acceptance(data: MetricInput) -> ByComponent:
-    """Compute the mean MCMC acceptance."""
-    return _job_value(data, mean_acceptance)
+    """Compute the mean MCMC acceptance over resampled steps; empty without moves."""
+    traces = data.result.data
+    accepted = np.where(traces.get("resampled", True), traces.get("accepted_0", np.nan), np.nan)
+    return _job_value(data, lambda _: mean_per_run(np.atleast_2d(accepted), data.lost))
 
 
 def run_log_evidence(result: store.JobResult) -> Array:
@@ -344,14 +332,12 @@ def scored_arrays() -> tuple[str, ...]:
 def table_columns(result: store.JobResult, group: ComponentGroup) -> dict[str, float]:
     """Compute the columns that metrics of a group add to a table, averaged over valid runs."""
     data = MetricInput(result, group, group.state_group)
-    columns = {}
-    for metric in METRICS:
-        if metric.scope == "components" and metric.head:
-            values = metric.compute(data).get(metric.component)
-            if values is not None:
-                mean = float(finite_mean(np.asarray(values)[~data.lost], axis=0))
-                columns[metric.column_head(group.unit)] = metric.factor * mean
-    return columns
+    selection = [metric for metric in METRICS if metric.scope == "components" and metric.head]
+    values = {metric: metric.compute(data).get(metric.component) for metric in selection}
+    return {
+        metric.column_head(group.unit): metric.factor * float(finite_mean(np.asarray(v)[~data.lost], axis=0))
+        for metric, v in values.items() if v is not None
+    }  # fmt: skip
 
 
 def metric_definitions() -> list[str]:

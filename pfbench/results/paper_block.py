@@ -59,7 +59,15 @@ def check_paper_blocks(values: Mapping[str, Any]) -> None:
             "Remove it.",
         )
         for key, value in block.items():
-            _check_key(group, key, value)
+            require(
+                key in _KEYS[group],
+                f"{group}.paper",
+                f"have keys of {', '.join(_KEYS[group])}",
+                f"{key!r}",
+                "Remove or rename it.",
+            )
+            requirement = _requirement(group, key, value)
+            require(not requirement, f"{group}.paper.{key}", f"be {requirement}", f"{value!r}", "Change it.")  # fmt: skip
 
 
 def remove_nested_blocks(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -85,23 +93,6 @@ def remove_all_blocks(node: Any) -> Any:
     if not isinstance(node, Mapping):
         return node
     return {key: remove_all_blocks(value) for key, value in node.items() if key != PAPER}
-
-
-def _check_key(group: str, key: str, value: Any) -> None:
-    """Check one value of a node."""
-    if key not in _KEYS[group]:
-        names = ", ".join(_KEYS[group])
-        raise ValueError(
-            f"{group}.paper must have keys of {names}, got {key!r}. Remove or rename it."
-        )
-    requirement = _requirement(group, key, value)
-    require(
-        not requirement,
-        f"{group}.paper.{key}",
-        f"be {requirement}",
-        f"{value!r}",
-        "Change it.",
-    )
 
 
 def _requirement(group: str, key: str, value: Any) -> str:
@@ -152,8 +143,7 @@ def _is_list_of_names(value: Any) -> bool:
 
 def _is_positive(value: Any) -> bool:
     """Return whether a value is a finite positive number."""
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return is_number and math.isfinite(value) and value > 0.0
+    return type(value) in (int, float) and math.isfinite(value) and value > 0.0
 
 
 # --------------------------------------------------------------------------------------------------
@@ -220,12 +210,15 @@ def read_paper_block(group: str, name: str) -> Mapping[str, Any]:
     return {**block, "tuning": OWN_WORLD} if is_open else block
 
 
+def read_stored_block(meta: Mapping[str, Any], group: str) -> Mapping[str, Any]:
+    """Return the node `paper` that the metadata of a result store; empty without one."""
+    node = meta.get("config", {}).get(group)
+    block = node.get(PAPER) if isinstance(node, Mapping) else None
+    return block if isinstance(block, Mapping) else {}
+
+
 def plan_installed_pairs(labels: Collection[str]) -> list[tuple[str, str]]:
     """List the planned pairs of filters by the baselines that installed files state."""
-    from pfbench.results.conditions import (
-        parse_label,
-    )  # on use: the command line starts with this module
-
     methods = {parse_label(label)[0] for label in labels}
     blocks = {method: read_paper_block("filter", method) for method in methods}
     tuned = sorted(m for m, b in blocks.items() if b.get("tuning") and not b["proposed"])
@@ -303,6 +296,16 @@ def _find_folder(name: str, marker: str) -> Path:
     )
 
 
+def parse_label(label: str) -> tuple[str, dict[str, str]]:
+    """Split a label into its name and its settings.
+
+    Returns name, and values as text by setting.
+    """
+    name, _, text = label.partition("[")
+    pairs = re.split(r",(?=[\w.]+=)", text.removesuffix("]")) if text else []
+    return name, {key: value for key, _, value in (pair.partition("=") for pair in pairs)}
+
+
 # --------------------------------------------------------------------------------------------------
 # Planned pairs of a study: proposed methods against the baselines of their papers and tuned ones.
 
@@ -319,10 +322,9 @@ def list_planned_pairs(
     Where a study varies a setting, the filters of a pair have the same value of it. A filter without
     the setting is compared with each value.
     """
-    from pfbench.results.conditions import (
-        parse_label,
-    )  # on use: the command line starts with this module
-    from pfbench.stats.study_runs import natural_sort_key
+    from pfbench.stats.study_runs import (
+        natural_sort_key,
+    )  # on use: numpy, without which the command line starts
 
     if len(set(labels)) < 2:
         return []
@@ -350,10 +352,6 @@ def list_planned_pairs(
 
 def _same_settings(label: str, method: str, labels: Sequence[str]) -> list[str]:
     """List the labels of a method that do not differ in a setting that a label has too."""
-    from pfbench.results.conditions import (
-        parse_label,
-    )  # on use: the command line starts with this module
-
     settings = parse_label(label)[1]
     candidates = {candidate: parse_label(candidate) for candidate in labels}
     return [

@@ -27,6 +27,7 @@ import numpy as np
 import scipy  # scipy.special is imported at its first use
 
 from pfbench.results.conditions import main_component_group
+from pfbench.results.paper_block import read_stored_block
 from pfbench.stats.error_measures import Array, Flags, finite_mean, rmse_per_run
 
 DIVERGED_SHARE = 0.1  # of the steps with truth, beyond the threshold
@@ -106,20 +107,13 @@ def is_severely_overconfident(
 
 def divergence_threshold(meta: Mapping[str, Any]) -> float | None:
     """Return the divergence threshold that a job's scenario states, in the unit of the main group."""
-    value = _paper_block(meta).get("divergence_threshold")
+    value = read_stored_block(meta, "scenario").get("divergence_threshold")
     return None if value is None else float(value)
 
 
 def scenario_family(meta: Mapping[str, Any], scenario: str) -> str:
     """Return the family of a job's scenario: scenarios of one trajectory have one family."""
-    return str(_paper_block(meta).get("family") or scenario.partition("[")[0])
-
-
-def _paper_block(meta: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the node `paper` of a job's scenario."""
-    scenario = meta.get("config", {}).get("scenario")
-    block = scenario.get("paper") if isinstance(scenario, Mapping) else None
-    return block if isinstance(block, Mapping) else {}
+    return str(read_stored_block(meta, "scenario").get("family") or scenario.partition("[")[0])
 
 
 def keeps_track(data: Mapping[str, Array], meta: Mapping[str, Any]) -> Flags:
@@ -266,28 +260,25 @@ def describe_runs(outputs: Mapping[str, Array], meta: Mapping[str, Any]) -> str:
         **count.marked,
     }
     present = {name: number for name, number in kinds.items() if number}
-    value = main_rmse(outputs, meta)
-    truth = meta.get("measured_truth", "")
+    value, truth = main_rmse(outputs, meta), meta.get("measured_truth", "")
     kind = f"median RMS distance to {truth}" if truth else "median RMS error"
     rmse = f"{group.group}: {kind} {value:.4g} {group.unit}".rstrip()
     if not math.isfinite(value):
         rmse = f"{group.group}: no finite {kind}"
+    all_runs = f"{count.runs} of {count.runs} runs"
     if not present:
-        ending = (
-            "track kept in {0} of {0} runs" if threshold is not None else "{0} of {0} runs valid"
+        return (
+            f"{rmse}; {f'{all_runs} valid' if threshold is None else f'track kept in {all_runs}'}"
         )
-        return f"{rmse}; {ending.format(count.runs)}"
+    text = (
+        ", ".join(f"{number} {name}" for name, number in present.items()) + f" of {count.runs} runs"
+    )
     if len(present) == 1:
-        (name,) = present
-        text = f"{present[name]} of {count.runs} runs {name}"
-    else:
-        text = ", ".join(f"{number} {name}" for name, number in present.items())
-        text += f" of {count.runs} runs"
+        text = "".join(f"{number} of {count.runs} runs {name}" for name, number in present.items())
     if count.diverged and threshold is not None:
         limit = f"{threshold * group.scale:.3g} {group.unit}".rstrip()
         text += f" (diverged: error above {limit}, the limit of the scenario)"
-    k = _largest_k(outputs)
-    hints = [HINTS[name].format(k=k) for name in count.marked if name in present]
+    hints = [HINTS[name].format(k=_largest_k(outputs)) for name in count.marked if name in present]
     return ". ".join([f"{rmse}; {text}", *hints])
 
 
