@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -64,7 +63,7 @@ class PublishedComparison(NamedTuple):
     witnesses: Mapping[str, str]
     left_out: Mapping[str, str]
     cells: Sequence[WorldCell] = ()
-    names: Mapping[str, str] = MappingProxyType({})
+    names: Mapping[str, str] = {}
     particles: int = 0
     study: StoredStudy | None = None
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -160,11 +160,12 @@ def draw_doses(
             axes.axhline(1.0, color=INK, lw=1.2)
         if worlds:
             figure.axes[0].set_ylabel("error / best Kalman filter")
-            handles, names = figure.axes[0].get_legend_handles_labels()
-            if size.name:
-                figure.legend(handles, names, loc="outside lower center", ncols=2)
-            else:
-                figure.legend(handles, names, loc="outside right center")
+            side: Any = (
+                {"loc": "outside lower center", "ncols": 2}
+                if size.name
+                else {"loc": "outside right center"}
+            )
+            figure.legend(*figure.axes[0].get_legend_handles_labels(), **side)
     return figure
 
 
@@ -172,13 +173,11 @@ def dose_points(
     overviews: Mapping[int, Overview], world: World, label: str, axis: str
 ) -> list[tuple[float, Verdict]]:
     """List the verdicts with a ratio on a filter in a world, with their positions on the axis."""
-    points = []
-    for level, overview in overviews.items():
-        time = overview.times.get((world.key, label), math.nan)
-        cell = overview.find(world, label)
-        if cell and cell.verdict.ratio > 0:
-            points.append((float(level) if axis == "particles" else time, cell.verdict))
-    return points
+    return [
+        (float(level) if axis == "particles" else overview.times[world.key, label], cell.verdict)
+        for level, overview in overviews.items()
+        if (cell := overview.find(world, label)) and cell.verdict.ratio > 0
+    ]
 
 
 def _draw_dose(
@@ -276,14 +275,13 @@ def describe_cell(overview: Overview, world: World, label: str) -> CellLook:
     cell = overview.find(world, label)
     if cell is None:
         return CellLook("1" if world.reference == label else "–")
+    word, ratio, share = cell.verdict.word, cell.verdict.ratio, f"{100 * cell.track_share:.0f} %"
     if cell.loses_track:
-        return CellLook(f"{100 * cell.track_share:.0f} %", is_grey=True)
-    word, ratio = cell.verdict.word, cell.verdict.ratio
+        return CellLook(share, is_grey=True)
     if word in EQUAL_WORDS:
         return CellLook("=")
     has_ratio = ratio > 0  # else too many runs are lost, and the share that keeps track is drawn
-    size = format_ratio(ratio) if has_ratio else f"{100 * cell.track_share:.0f} %"
-    text = f"{size}{'☆' if cell.wins else ''}"
+    text = (format_ratio(ratio) if has_ratio else share) + "☆" * bool(cell.wins)
     if word == "not decided":
         return CellLook(text)
     value = math.log(ratio) if has_ratio else _SCALE * (1 if word == "worse" else -1)
@@ -378,7 +376,5 @@ def _draw_key(figure: Figure, size: Format, foot: int) -> None:
 def _short(name: str, size: Format) -> str:
     """Break a long name of a world into two lines where the figure is narrow."""
     limit = 34 if size.width > 600 else 17
-    if len(name) <= limit:
-        return name
-    space = name.rfind(" ", 0, limit)
+    space = name.rfind(" ", 0, limit) if len(name) > limit else 0
     return f"{name[:space]}\n{name[space + 1 :]}" if space > 0 else name

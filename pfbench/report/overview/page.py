@@ -43,11 +43,12 @@ from pfbench.report.writers import format_csv, format_data_address
 from pfbench.results.conditions import parse_label
 from pfbench.results.looks import find_looks
 from pfbench.results.paper_block import read_paper_block
-from pfbench.stats.comparison import EQUAL_WORDS, TRIM_SHARE
+from pfbench.stats.comparison import TRIM_SHARE
 from pfbench.stats.sentences import format_with_interval
 
 BOARD_PAGE = "worlds.html"  # the page of each world, which is the first page of other studies
 _HERE = Path(__file__).parent
+_MARKS = {"better": "**{}**", "worse": "{}"}  # of decided cells in a text
 _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 
 
@@ -207,8 +208,8 @@ def draw_pictures(overviews: Mapping[TabKey, Overview]) -> dict[str, str]:
         for axis, size in itertools.product(("particles", "time"), figures.DOSE_FORMATS):
             for suffix, some in (("", worlds[:2]), ("_others", worlds[2:])):
                 if some:
-                    figure = figures.draw_doses(levels, some, axis, size)
-                    pictures[f"error_by_{axis}{suffix}{size.name}"] = figure
+                    name = f"error_by_{axis}{suffix}{size.name}"
+                    pictures[name] = figures.draw_doses(levels, some, axis, size)
     return {name: figures.to_svg(figure) for name, figure in pictures.items()}
 
 
@@ -280,18 +281,13 @@ def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> 
         first += f" {'Also at' if winners else 'At'} equal time: {timed}."
     elif winners and at_equal_time:
         first += " At equal time none is."
-    cells = overview.of_methods
-    words = ["lost" if cell.loses_track else cell.verdict.word for cell in cells]
-    single = sum(cell.beats_kalman for cell in cells)
-    better_than_each = f" (in {single} than all single ones)" if single else ""
-    counts = [
-        f"better in {words.count('better')} of {len(cells)} cells{better_than_each}",
-        f"equal in {sum(word in EQUAL_WORDS for word in words)}",
-        f"not decided in {words.count('not decided')}",
-        f"worse in {words.count('worse')}",
-    ]
-    lost = f" Lost in {words.count('lost')}." if "lost" in words else ""
-    return f"{first} Against each world's best Kalman filter: {', '.join(counts)}.{lost}"
+    words, single = Counter(map(name_word, overview.of_methods)), sum(c.beats_kalman for c in overview.of_methods)  # fmt: skip
+    alone = f" (in {single} than all single ones)" if single else ""
+    lost = f" Lost in {words['loses track']}." if words["loses track"] else ""
+    return (
+        f"{first} Against each world's best Kalman filter: better in {words['better']} of {words.total()} cells{alone}, "
+        f"equal in {words['equal']}, not decided in {words['not decided']}, worse in {words['worse']}.{lost}"
+    )
 
 
 def _name_winners(overview: Overview, most: int = 2) -> str:
@@ -304,7 +300,7 @@ def _name_winners(overview: Overview, most: int = 2) -> str:
 def describe_setting(overview: Overview, level: TabKey = 0) -> str:
     """Describe worlds, runs, number of particles, reference and losses in a few sentences."""
     runs = sorted({world.runs for world in overview.worlds})
-    counts = f"{runs[0]}" if len(runs) == 1 else f"{runs[0]} to {runs[-1]}"
+    counts = " to ".join(map(str, dict.fromkeys((runs[0], runs[-1]))))
     return (
         f"{len(overview.worlds)} worlds, {counts} paired runs each{f', {level} particles' if level else ''}{_name_numbers(overview)}.{_name_absent(overview)} "
         f"{_describe_reference(overview)} A run that loses track is worse than every other one."
@@ -326,12 +322,11 @@ def _name_absent(overview: Overview) -> str:
 
 def _describe_reference(overview: Overview) -> str:
     """Say how the best Kalman filter was chosen, and where it is not the best in these runs."""
-    outdone = [(world, find_outdone(world, overview.single)) for world in overview.worlds]
     better = [
         f"{overview.names[v.b]} in {world.part_name.name} ("
         f"{f'the chosen one has {v.ratio:.2f} times its error' if v.ratio > 0 else v.reason})"
-        for world, v in outdone
-        if v
+        for world in overview.worlds
+        if (v := find_outdone(world, overview.single))
     ]
     text = "The best Kalman filter of a world was chosen on another seed, tuned ones among the candidates; the methods are not tuned."
     return text + (f" In these runs another one is better: {', '.join(better)}." if better else "")
@@ -348,16 +343,12 @@ def list_notes(overview: Overview) -> list[tuple[str, str]]:
 
 def describe_times(overview: Overview, most: float = 1.5) -> str:
     """Say which filters take longer than SIR in a table of equal time: with few particles times are hard to meet."""
-    times, slow = overview.times, []
+    slow = []
     for label in overview.columns:
-        ratios = {
-            world.part_name.name: times[world.key, label] / times[world.key, SIR]
-            for world in overview.worlds
-            if {(world.key, label), (world.key, SIR)} <= times.keys()
-        }
-        worst = max(ratios, key=lambda name: ratios[name], default="")
-        if worst and ratios[worst] > most:
-            slow.append(f"{overview.names[label]} {ratios[worst]:.1f} times ({worst})")
+        ratios = overview.compare_times(label, SIR)
+        name, worst = max(ratios.items(), key=lambda item: item[1], default=("", 0.0))
+        if worst > most:
+            slow.append(f"{overview.names[label]} {worst:.1f} times ({name})")
     return f"More than {most:g} times the step of SIR: {', '.join(slow)}." if slow else ""
 
 
@@ -437,9 +428,7 @@ def _format_cell(overview: Overview, world: World, label: str) -> str:
     look, cell = figures.describe_cell(overview, world, label), overview.find(world, label)
     if cell is None or look.is_grey or look.text == "=":
         return look.text
-    if cell.verdict.word == "better":
-        return f"**{look.text}**"
-    return look.text if cell.verdict.word == "worse" else f"({look.text})"
+    return _MARKS.get(cell.verdict.word, "({})").format(look.text)
 
 
 def list_verdicts(overview: Overview) -> pd.DataFrame:

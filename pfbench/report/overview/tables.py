@@ -10,7 +10,6 @@ from dataclasses import replace
 from functools import cache, partial
 from itertools import combinations
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -53,7 +52,7 @@ class WorldFacts(NamedTuple):
     reference: str
     kalman_fits: bool | None
     has_part: bool = False
-    tuning: Mapping[str, Any] = MappingProxyType({})
+    tuning: Mapping[str, Any] = {}
 
 
 class World(NamedTuple):
@@ -155,7 +154,7 @@ class Overview(NamedTuple):
     pairs: Sequence[WorldCell]
     times: Mapping[tuple[str, str], float]
     left_out: Mapping[str, str]
-    numbers: Mapping[str, float] = MappingProxyType({})
+    numbers: Mapping[str, float] = {}
 
     @property
     def columns(self) -> list[str]:
@@ -172,10 +171,20 @@ class Overview(NamedTuple):
         """Methods against the reference of each world."""
         return [cell for cell in self.cells if cell.filter in self.methods]
 
+    def compare_times(self, label: str, base: str = "") -> dict[str, float]:
+        """Return the time of a step relative to that of another filter, or of the reference, by the names of their worlds."""
+        pairs = {
+            w.part_name.name: ((w.key, label), (w.key, base or w.reference)) for w in self.worlds
+        }
+        return {
+            name: self.times[first] / self.times[second]
+            for name, (first, second) in pairs.items()
+            if {first, second} <= self.times.keys()
+        }
+
     def find(self, world: World, label: str) -> WorldCell | None:
         """Return a filter against the reference of a world; None where it did not run."""
-        keys = (world.key, label)
-        return next((cell for cell in self.cells if (cell.world, cell.filter) == keys), None)
+        return next((c for c in self.cells if (c.world, c.filter) == (world.key, label)), None)
 
 
 def read_world_facts(scenario: str, model: str) -> WorldFacts | None:
@@ -300,20 +309,21 @@ def find_outdone(world: World, single: Sequence[str]) -> Verdict | None:
 
 def list_world_notes(world: World) -> list[str]:
     """List what must be known before a number of a world is quoted."""
-    texts, drives = [], count_recorded_drives(parse_label(world.key)[0])
-    if drives == 1:
-        texts.append("one recording: words are about other starts and random numbers on it")
-    if drives and world.facts.has_part:
-        texts.append("the best Kalman filter was tuned on a part of it")
-    elif drives:
-        same = "it" if drives == 1 else f"the same {drives} recordings"
-        texts.append(f"the best Kalman filter was tuned on {same}, with other random numbers")
+    drives, share = (
+        count_recorded_drives(parse_label(world.key)[0]),
+        world.share_track(world.reference),
+    )
+    same = "it" if drives == 1 else f"the same {drives} recordings"
+    is_part = bool(drives and world.facts.has_part)
     idle = [name for name in world.labels if parse_label(name)[0] == DEAD_RECKONING]
-    if idle and world.find(world.reference, idle[0]).word != "better":
-        texts.append("the best Kalman filter is not shown to be better than dead reckoning")
-    if (share := world.share_track(world.reference)) < TRACK_SHARE:
-        texts.append(f"the best Kalman filter keeps track in {100 * share:.0f} % of runs")
-    return texts
+    notes = (
+        (drives == 1, "one recording: words are about other starts and random numbers on it"),
+        (is_part, "the best Kalman filter was tuned on a part of it"),
+        (drives and not is_part, f"the best Kalman filter was tuned on {same}, with other random numbers"),
+        (idle and world.find(world.reference, idle[0]).word != "better", "the best Kalman filter is not shown to be better than dead reckoning"),
+        (share < TRACK_SHARE, f"the best Kalman filter keeps track in {100 * share:.0f} % of runs"),
+    )  # fmt: skip
+    return [text for is_so, text in notes if is_so]
 
 
 def count_recorded_drives(scenario: str) -> int:
@@ -610,22 +620,13 @@ def format_times(overview: Overview, method: str) -> str:
 
     The median relative to SIR with as many particles follows, if SIR is in the study.
     """
-    ratios = [
-        overview.times[world.key, method] / overview.times[world.key, world.reference]
-        for world in overview.worlds
-        if (world.key, method) in overview.times
-    ]
-    finite = [ratio for ratio in ratios if np.isfinite(ratio)]
+    finite = [ratio for ratio in overview.compare_times(method).values() if np.isfinite(ratio)]
     if not finite:
         return "–"
     middle, low, high = (format_factor(f(finite)) for f in (np.median, min, max))
     text = middle if low == high else f"{middle} ({low} to {high})"
-    against_sir = [
-        overview.times[world.key, method] / overview.times[world.key, SIR]
-        for world in overview.worlds
-        if {(world.key, method), (world.key, SIR)} <= overview.times.keys()
-    ]
-    return f"{text}; {format_factor(float(np.median(against_sir)))} of SIR" if against_sir else text
+    sir = list(overview.compare_times(method, SIR).values())
+    return f"{text}; {format_factor(float(np.median(sir)))} of SIR" if sir else text
 
 
 def format_factor(value: float) -> str:
