@@ -39,7 +39,7 @@ def write_datasheet(
         f"the job {file}",
         "Create one with: pfbench datasheet scenario=NAME",
     )
-    scenario, noise = (sheet.meta["choices"][part] for part in ("scenario", "noise"))
+    scenario, noise = (sheet.meta["choices"][key] for key in ("scenario", "noise"))
     title, name = f"{scenario} / {noise}", format_slug(f"{scenario}_{noise}")
     tables = {"residuals": whiteness_table(sheet), "spread": spread_table(sheet)}
     with RecordedFolder(Path(out) / "datasheets" / name) as folder:
@@ -125,36 +125,37 @@ def list_facts(sheet: store.JobResult) -> list[str]:
     data, meta = sheet.data, sheet.meta
     time, steps, kinds = data["time"], meta["steps"], meta["kinds"]
     pace = f" of {np.median(np.diff(time)):.3g} s" if steps > 1 else ""
-    texts = [
-        f"{steps} steps{pace}, {time[0]:.4g} to {time[-1]:.5g} s. {meta['runs']} runs, seed {meta['seed']}."
-    ]
-    if "track" in data:
-        texts.append(_describe_track(data["track"][0]))
     counts = ", ".join(f"{kinds.count(kind)} of {kind}" for kind in dict.fromkeys(kinds))
     observed = f"{100 * data['seen'].mean():.3g}"
-    texts.append(f"Measurement of {len(kinds)} components: {counts}. Observed: {observed} %.")
-    if "azimuth" in data:
-        visible = scenario_figures.visible_satellites(sheet)
-        is_sparse = scenario_figures.has_sparse_counts(visible)
-        least = visible[visible > 0].min() if is_sparse else visible.min()
-        total = data["elevation"].shape[1]
-        texts.append(f"Satellites above the horizon: {least} to {visible.max()} of {total}.")
     is_equal = len(scenario_figures.drop_equal_runs(data["residual"])) == 1
-    if is_equal and meta["runs"] > 1 and not np.isnan(data["residual"]).all():
-        texts.append("All runs have equal residuals, which are counted once.")
-    if "raw_estimate" in meta:
-        texts.append(scenario_figures.describe_raw_estimate(meta))
-    return [*texts, f"{meta['pcrb'][0].upper()}{meta['pcrb'][1:]}."]
+    is_counted_once = is_equal and meta["runs"] > 1 and not np.isnan(data["residual"]).all()
+    texts = (
+        f"{steps} steps{pace}, {time[0]:.4g} to {time[-1]:.5g} s. {meta['runs']} runs, seed {meta['seed']}.",
+        _describe_track(data["track"][0]) if "track" in data else "",
+        f"Measurement of {len(kinds)} components: {counts}. Observed: {observed} %.",
+        _describe_satellites(sheet) if "azimuth" in data else "",
+        "All runs have equal residuals, which are counted once." if is_counted_once else "",
+        scenario_figures.describe_raw_estimate(meta) if "raw_estimate" in meta else "",
+        f"{meta['pcrb'][0].upper()}{meta['pcrb'][1:]}.",
+    )
+    return list(filter(None, texts))
+
+
+def _describe_satellites(sheet: store.JobResult) -> str:
+    """Count the satellites above the horizon; where some steps have none, the least of the others."""
+    visible = scenario_figures.visible_satellites(sheet)
+    nonzero = visible[visible > 0] if scenario_figures.has_sparse_counts(visible) else visible
+    total = sheet.data["elevation"].shape[1]
+    return f"Satellites above the horizon: {nonzero.min()} to {visible.max()} of {total}."
 
 
 def _describe_track(track: np.ndarray) -> str:
     """Describe length and height of a track [T, 3]."""
-    moves = np.diff(track.astype(np.float64), axis=0)
+    moves, height = np.diff(track.astype(np.float64), axis=0), track[:, 2]
     length = np.linalg.norm(moves[~np.isnan(moves).any(-1)], axis=-1).sum()
-    low, high = np.nanmin(track[:, 2]), np.nanmax(track[:, 2])
     return (
         f"Track of the first run: {length / 1e3:.4g} km, "
-        f"height {low:.4g} to {high:.4g} m above its start."
+        f"height {np.nanmin(height):.4g} to {np.nanmax(height):.4g} m above its start."
     )
 
 
@@ -186,19 +187,18 @@ def list_missing_figures(sheet: store.JobResult) -> list[str]:
 
 def whiteness_table(sheet: store.JobResult) -> pd.DataFrame:
     """Tabulate mean, variance and lag-1 autocorrelation of residuals with 95 % intervals."""
-    rows = []
-    for kind, z in scenario_figures.group_residuals(sheet).items():
-        moments = status.compute_whiteness(z)
-        rows.append({
-            "measurement": kind,
-            "components": z.shape[-1],
-            "residuals": moments.numbers,
-            "mean": moments.mean, "95 % interval of 0": f"± {format_number(moments.mean_band)}",
-            "variance": moments.variance, "95 % interval of 1": f"± {format_number(moments.variance_band)}",
-            "lag-1 autocorrelation": moments.lag, "95 % interval of no correlation": f"± {format_number(moments.lag_band)}",
-            "outside 3 sd [%]": 100 * moments.outside_share,
-        })  # fmt: skip
-    return pd.DataFrame(rows)
+    groups = scenario_figures.group_residuals(sheet)
+    moments = {kind: status.compute_whiteness(z) for kind, z in groups.items()}
+    return pd.DataFrame([
+        {
+            "measurement": kind, "components": groups[kind].shape[-1], "residuals": m.numbers,
+            "mean": m.mean, "95 % interval of 0": f"± {format_number(m.mean_band)}",
+            "variance": m.variance, "95 % interval of 1": f"± {format_number(m.variance_band)}",
+            "lag-1 autocorrelation": m.lag, "95 % interval of no correlation": f"± {format_number(m.lag_band)}",
+            "outside 3 sd [%]": 100 * m.outside_share,
+        }
+        for kind, m in moments.items()
+    ])  # fmt: skip
 
 
 def spread_table(sheet: store.JobResult) -> pd.DataFrame:

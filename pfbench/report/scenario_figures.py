@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -67,15 +68,31 @@ def plot_distance(sheet: store.JobResult) -> Figure:
 
 def plot_sensors(sheet: store.JobResult) -> Figure:
     """Plot specific force and angular rate over time, a line per body axis."""
-    figure, panels = stacked_axes(2, 1.7)
-    time, rate = sheet.data["time"], sheet.data["rate"] * np.degrees(1)
-    rows = (sheet.data["force"], "specific force [m/s²]"), (rate, "rate [deg/s]")
-    for axis, (values, ylabel) in zip(panels, rows, strict=True):
+    data = sheet.data
+    rows = {"specific force [m/s²]": data["force"], "rate [deg/s]": data["rate"] * np.degrees(1)}
+
+    def draw(axis: Axes, ylabel: str, values: np.ndarray) -> None:
         for (name, line), value in zip(line_styles(_AXES).items(), values.T, strict=True):
-            axis.plot(time, value, color=line.colour, ls=line.dash, lw=1.1, label=name)
+            axis.plot(data["time"], value, color=line.colour, ls=line.dash, lw=1.1, label=name)
         axis.set_ylabel(ylabel)
-    panels[-1].set_xlabel("time [s]")
-    add_legend(figure, panels[0], columns=3)
+
+    return _stack(draw, rows.items(), 1.7, legend=3)
+
+
+def _stack(
+    draw: Callable[..., None],
+    rows: Collection[tuple[Any, ...]],
+    height: float,
+    xlabel: str = "time [s]",
+    legend: int = 0,
+) -> Figure:
+    """Draw a panel for each row, one below the other, with a legend of some columns."""
+    figure, panels = stacked_axes(len(rows), height)
+    for axis, row in zip(panels, rows, strict=True):
+        draw(axis, *row)
+    panels[-1].set_xlabel(xlabel)
+    if legend:
+        add_legend(figure, panels[0], legend)
     return figure
 
 
@@ -112,32 +129,31 @@ def _plot_satellite(axis: Any, theta: np.ndarray, r: np.ndarray, name: str, colo
 
 def plot_measurements(sheet: store.JobResult) -> Figure:
     """Plot the number of satellites and of observed components over time."""
-    a = sheet.data
-    counts = {"components": (a["seen"].astype(float).sum(1), "#D55E00")}
-    if "azimuth" in a:
-        counts = {"satellites": (visible_satellites(sheet), "#0072B2"), **counts}
-    figure, panels = stacked_axes(len(counts), 1.3)
-    for axis, (name, (count, colour)) in zip(panels, counts.items(), strict=True):
-        line: Any = {"ls": "-", "lw": 1.1, "drawstyle": "steps-mid"}
-        time = a["time"]
+    time = sheet.data["time"]
+    rows = [("components", sheet.data["seen"].astype(float).sum(1), "#D55E00")]
+    if "azimuth" in sheet.data:
+        rows.insert(0, ("satellites", visible_satellites(sheet), "#0072B2"))
+
+    def draw(axis: Axes, name: str, count: np.ndarray, colour: str) -> None:
         if has_sparse_counts(count):
-            time, count = time[count > 0], count[count > 0]
-            line = {"ls": "none", "marker": ".", "ms": 2.5}
-        axis.plot(time, count, color=colour, **line)
+            axis.plot(
+                time[count > 0], count[count > 0], color=colour, ls="none", marker=".", ms=2.5
+            )
+        else:
+            axis.plot(time, count, color=colour, ls="-", lw=1.1, drawstyle="steps-mid")
         axis.set(ylabel=name)
         axis.set_ylim(bottom=0)
-    panels[-1].set_xlabel("time [s]")
-    return figure
+
+    return _stack(draw, rows, 1.3)
 
 
 def plot_residuals(sheet: store.JobResult) -> Figure:
     """Plot residual histograms with the standard normal density, a panel per measurement kind."""
-    kinds = group_residuals(sheet)
-    figure, panels = stacked_axes(len(kinds), 1.5)
     x = np.linspace(-_LIMIT, _LIMIT, 201)
     density = np.exp(-0.5 * x * x) / np.sqrt(2 * np.pi)
     bars: Any = {"density": True, "color": "#56B4E9", "alpha": 0.75, "label": "residuals"}
-    for axis, (kind, z) in zip(panels, kinds.items(), strict=True):
+
+    def draw(axis: Axes, kind: str, z: np.ndarray) -> None:
         moments = status.compute_whiteness(z)
         values = np.clip(z[~np.isnan(z)], -_LIMIT, _LIMIT)
         bins = int(np.clip(2 * np.sqrt(values.size), 11, 61))
@@ -146,31 +162,28 @@ def plot_residuals(sheet: store.JobResult) -> Figure:
         title = f"{kind}: variance {moments.variance:.3g} (1 ± {moments.variance_band:.2g}), "
         axis.set_title(f"{title}lag-1 {moments.lag:+.2g} (± {moments.lag_band:.2g})", fontsize=7)
         axis.set_ylabel("density")
-    panels[-1].set_xlabel("residual [sd]")
-    add_legend(figure, panels[0])
-    return figure
+
+    return _stack(draw, group_residuals(sheet).items(), 1.5, "residual [sd]", legend=2)
 
 
 def plot_residuals_over_time(sheet: store.JobResult) -> Figure:
     """Plot the residuals of the first run over time."""
-    kinds = group_residuals(sheet)
-    figure, panels = stacked_axes(len(kinds), 1.3)
-    for axis, (kind, z) in zip(panels, kinds.items(), strict=True):
-        steps, _ = finite = np.nonzero(~np.isnan(z[0]))
-        dots: Any = {"ls": "none", "marker": ".", "ms": 3, "alpha": 0.8, "mew": 0}
-        axis.plot(sheet.data["time"][steps], z[0][finite], color="#0072B2", **dots)
+    dots: Any = {"ls": "none", "marker": ".", "ms": 3, "alpha": 0.8, "mew": 0}
+
+    def draw(axis: Axes, kind: str, z: np.ndarray) -> None:
+        steps, parts = np.nonzero(~np.isnan(z[0]))
+        axis.plot(sheet.data["time"][steps], z[0, steps, parts], color="#0072B2", **dots)
         for edge in (-2, 2):
             axis.axhline(edge, color="black", lw=0.7, ls=(0, (4, 2)))
         axis.set(title=kind, ylabel="residual [sd]")
-    panels[-1].set_xlabel("time [s]")
-    return figure
+
+    return _stack(draw, group_residuals(sheet).items(), 1.3)
 
 
 def plot_error_spread(sheet: store.JobResult) -> Figure:
     """Plot the standard deviation over runs of each group, and the PCRB."""
-    rows = compute_spreads(sheet)
-    figure, panels = stacked_axes(len(rows), 1.15)
-    for axis, (block, time, value, bound) in zip(panels, rows, strict=True):
+
+    def draw(axis: Axes, block: Any, time: np.ndarray, value: np.ndarray, bound: Any) -> None:
         thin = select_indices(time.size)
         mark = "." if time.size == 1 else ""
         axis.plot(time[thin], value[thin], color="#0072B2", label="spread of the runs", marker=mark)
@@ -178,9 +191,8 @@ def plot_error_spread(sheet: store.JobResult) -> Figure:
             axis.plot(time[thin], bound[thin], label="PCRB", marker=mark, **_BOUND)
         axis.set(title=block.group, ylabel=format_axis_label("spread", block.unit))
         use_log_if_wide(axis, axis.yaxis, [np.asarray(line.get_ydata()) for line in axis.lines])
-    panels[-1].set_xlabel("time [s]")
-    add_legend(figure, panels[0])
-    return figure
+
+    return _stack(draw, compute_spreads(sheet), 1.15, legend=2)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -243,12 +255,12 @@ def compute_deviation(data: dict[str, np.ndarray], indices: list[int]) -> np.nda
 def group_residuals(sheet: store.JobResult) -> dict[str, np.ndarray]:
     """Group the residuals [R or 1, T, k] by kind of measurement, without missing components."""
     z = drop_equal_runs(sheet.data["residual"].astype(np.float64))
-    finite_mask = ~np.isnan(z).all((0, 1))
-    kinds = np.array(sheet.meta["kinds"])
-    groups = {
-        kind: z[..., (kinds == kind) & finite_mask] for kind in dict.fromkeys(sheet.meta["kinds"])
+    kinds, is_finite = np.array(sheet.meta["kinds"]), ~np.isnan(z).all((0, 1))
+    return {
+        str(kind): z[..., mask]
+        for kind in dict.fromkeys(sheet.meta["kinds"])
+        if (mask := (kinds == kind) & is_finite).any()
     }
-    return {str(kind): values for kind, values in groups.items() if values.shape[-1]}
 
 
 def drop_equal_runs(z: np.ndarray) -> np.ndarray:
@@ -258,11 +270,8 @@ def drop_equal_runs(z: np.ndarray) -> np.ndarray:
 
 def select_tracks(track: np.ndarray) -> np.ndarray:
     """Return a single track [1, T, 3] if all runs have equal tracks, else all tracks."""
-    return (
-        track[:1]
-        if np.array_equal(track, np.broadcast_to(track[:1], track.shape), equal_nan=True)
-        else track
-    )
+    is_common = np.array_equal(track, np.broadcast_to(track[:1], track.shape), equal_nan=True)
+    return track[:1] if is_common else track
 
 
 def describe_raw_estimate(meta: Mapping[str, Any]) -> str:
