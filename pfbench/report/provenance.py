@@ -191,27 +191,26 @@ def format_budget(metadata: Sequence[Mapping[str, Any]]) -> str:
     The target of a job is its price, which differs between conditions, or else the median of all jobs. Filters that miss it
     are named.
     """
-    kinds = list(dict.fromkeys(map(_budget_kind, metadata)))
+    kind, *others = dict.fromkeys(map(_budget_kind, metadata))
     jobs = [meta for meta in metadata if meta.get("particles")]
-    if len(kinds) > 1:
-        return f"Budget: differs between jobs ({', '.join(kinds)})."
+    if others:
+        return f"Budget: differs between jobs ({', '.join([kind, *others])})."
     if not jobs:
-        return f"Budget: {kinds[0]} (without particle filters)."
-    measure, scale, unit = _MEASURES[kinds[0]]
+        return f"Budget: {kind} (without particle filters)."
+    measure, scale, unit = _MEASURES[kind]
     measured = list(map(measure, jobs))
     if None in measured:
-        return f"Budget: {kinds[0]} (as configured; the jobs do not count them)."
+        return f"Budget: {kind} (as configured; the jobs do not count them)."
     costs = np.array(measured, dtype=np.float64)
     prices = [(meta.get("budget_allocation") or {}).get("price") for meta in jobs]
-    targets = np.array([price or np.median(costs) for price in prices])
-    close = 1.0 if kinds[0] == SAME_N else _CLOSE
-    missed: dict[str, list[float]] = {}
-    for meta, ratio in zip(jobs, costs / targets, strict=True):
+    ratios = costs / np.array([price or np.median(costs) for price in prices])
+    close, missed = 1.0 if kind == SAME_N else _CLOSE, dict[str, list[float]]()
+    for meta, ratio in zip(jobs, ratios, strict=True):
         if not 1 / close <= ratio <= close:
             missed.setdefault(str(meta.get("label", "")), []).append(ratio)
     far = ", ".join(f"{k} ({_format_range(v, 2)} times the target)" for k, v in missed.items())
     size = f"{_format_range(scale * costs, 3)} {unit} in each particle filter"
-    return f"Budget: {kinds[0]}{f' not met by {far}' if far else ''} ({size})."
+    return f"Budget: {kind}{f' not met by {far}' if far else ''} ({size})."
 
 
 def _count_particles(meta: Mapping[str, Any]) -> float:
@@ -228,9 +227,7 @@ _MEASURES: Mapping[str, tuple[Callable[[Mapping[str, Any]], float | None], float
 
 def _budget_kind(meta: Mapping[str, Any]) -> str:
     """Return the budget of a job."""
-    config = meta.get("config")
-    stated = config.get("budget") if isinstance(config, Mapping) else None
-    kind = str(meta.get("budget") or stated or SAME_N)
+    kind = str(meta.get("budget") or _value_at(meta, "config.budget") or SAME_N)
     require(
         kind in BUDGETS,
         f"budget of job {meta.get('key')}",

@@ -29,7 +29,7 @@ from pfbench.report.methods_text import read_facts
 RUNS_FILE = "runs.parquet"  #: name of the file with the values of all runs of a study
 _KEY = b"pfbench"  # of the metadata of the file
 _FIGURE = re.compile(r"figures/paper_[\w.+-]+\.(svg|png)")
-_KEYED = ("curves",)  # parts with a tuple as key
+
 _OMITTED = ("tracks", "downloads", "definitions")  # large, or made again with the page
 _DECIDED = (
     "alpha", "margin", "filters", "metrics", "baselines", "views", "planned", "decisions", "recorded", "warnings", "calibration", "runs", "sweeps",
@@ -60,8 +60,7 @@ def format_runs(table: pd.DataFrame, pack: Mapping[str, Any]) -> bytes:
         Content of the Parquet file.
     """
     parts = {key: value for key, value in pack.items() if key not in (*_DECIDED, *_OMITTED)}
-    for name in _KEYED:
-        parts[name] = [[list(key), value] for key, value in pack[name].items()]
+    parts["curves"] = [[list(key), value] for key, value in pack["curves"].items()]
     parts["paper_figures"] = [{k: v for k, v in f.items() if k != "source"} for f in pack.get("paper_figures", ())]  # fmt: skip
     text = json.dumps(parts, separators=(",", ":"), allow_nan=False)
     packed = base64.b64encode(gzip.compress(text.encode(), mtime=0))
@@ -88,8 +87,7 @@ def read_stored_study(folder: Path, decides: bool = True) -> StoredStudy:
         arrow = parquet.read_table(path)
         packed = base64.b64decode((arrow.schema.metadata or {})[_KEY])
         pack: dict[str, Any] = json.loads(limits.inflate(path, packed))
-        for name in _KEYED:
-            pack[name] = {tuple(key): value for key, value in pack[name]}
+        pack["curves"] = {tuple(key): value for key, value in pack["curves"]}
         table = arrow.to_pandas()
         missing = {look["key"] for look in pack["facts"]["looks"]} - set(table["filter"])
         facts = StudyFacts.from_pack(pack)
@@ -109,10 +107,10 @@ def read_stored_study(folder: Path, decides: bool = True) -> StoredStudy:
         "Run the study and write its report again.",
     )
     read_facts(pack.get("methods"), str(path))
-    foreign = [f["file"] for f in pack["paper_figures"] if not _FIGURE.fullmatch(f["file"])]
-    if foreign:  # the file may come from a stranger, and the page shows what it names
-        raise ValueError(
-            f"paper_figures of {path} must name figures/paper_NAME.svg or .png, got {foreign[0]!r}. Write its report again."
-        )
+    for figure in pack[
+        "paper_figures"
+    ]:  # the file may come from a stranger, and the page shows what it names
+        is_own, file = bool(_FIGURE.fullmatch(figure["file"])), repr(figure["file"])
+        require(is_own, f"paper_figures of {path}", "name figures/paper_NAME.svg or .png", file, "Write its report again.")  # fmt: skip
     figures = [figure for figure in pack["paper_figures"] if (folder / figure["file"]).is_file()]
     return StoredStudy({**pack, "tracks": {}, "paper_figures": figures, **decided}, table)

@@ -169,17 +169,16 @@ def draw_error_against_cost(
     limits = (
         ratio_limits(list(values), most=2.6) if is_ratio else (min(values) / 2, max(values) * 2)
     )
-    errors = np.clip(values, *limits)
-    axis.set(xscale="log", yscale="log", ylim=limits)
-    axis.set_xlim(cost.min() / 1.6, cost.max() * 1.6)
+    errors, marks = np.clip(values, *limits), []
+    axis.set(xscale="log", yscale="log", ylim=limits, xlim=(cost.min() / 1.6, cost.max() * 1.6))
     set_plain_ticks(axis.xaxis, cost)
     set_plain_ticks(axis.yaxis, np.array(limits))
-    marks = []
     for key, x, value, y in zip(rows, cost, values, errors, strict=True):
-        style = mark_style(looks[key]) | ({} if value == y else {"marker": "^"})
-        mark = {**style, "linestyle": "none"}
+        mark, name = {**mark_style(looks[key]), "linestyle": "none"}, str(looks[key]["name"])
+        if value != y:
+            mark, name = {**mark, "marker": "^"}, f"{name} {value:.3g}"
         axis.plot([x], [y], clip_on=False, zorder=3, **mark)
-        marks.append((f"{looks[key]['name']}{'' if value == y else f' {value:.3g}'}", mark))
+        marks.append((name, mark))
     path = list_front_corners(np.column_stack([cost, errors]), limits[1])
     axis.plot(*path.T, color="0.6", lw=0.7, zorder=1.2)
     axis.set_xlabel("time per step of a batch of runs [ms]")
@@ -197,13 +196,12 @@ def list_front_corners(points: np.ndarray, top: float) -> np.ndarray:
 
     Shapes: points [n, 2].
     """
-    corners, least = [], top
+    corners: list[tuple[float, float]] = []
     for x, y in points[np.lexsort((points[:, 1], points[:, 0]))]:
+        least = corners[-1][1] if corners else top
         if y < least:
             corners += [(x, least), (x, y)]
-            least = y
-    if corners:
-        corners.append((points[:, 0].max(), least))
+    corners += [(points[:, 0].max(), y) for _, y in corners[-1:]]
     return np.array(corners).reshape(-1, 2)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import unicodedata
 from collections.abc import Sequence
 from functools import cache
+from itertools import accumulate, chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -82,20 +83,18 @@ def text_cell(text: str, *, size: float = SIZE, is_bold: bool = False, span: int
 def measure_table(table: LatexTable, separation: float) -> float:
     r"""Compute the width of a table."""
     widths = [0.0] * len(table.columns)
-    gaps = [_gap(column, separation) if i else 0.0 for i, column in enumerate(table.columns)]
-    rows = [*table.head, *(row for group in table.groups for row in group)]
-    for spanning in (False, True):
-        for row in rows:
-            start = 0
-            for cell in row:
-                end = start + cell.span
-                if spanning and cell.span > 1:
-                    inside = sum(widths[start:end]) + sum(gaps[start + 1 : end])
-                    widths[end - 1] += max(0.0, cell.width - inside)
-                elif not spanning and cell.span == 1:
-                    widths[start] = max(widths[start], cell.width)
-                start = end
-    return sum(widths) + sum(gaps)
+    gaps = [THIN_SPACE if column.is_close else 2 * separation for column in table.columns]
+    placed = [
+        (start, cell)
+        for row in (*table.head, *chain.from_iterable(table.groups))
+        for start, cell in zip(accumulate((c.span for c in row), initial=0), row, strict=False)
+    ]
+    for start, cell in sorted(
+        placed, key=lambda item: item[1].span > 1
+    ):  # those of one column first
+        inside = sum(widths[start : start + cell.span]) + sum(gaps[start + 1 : start + cell.span])
+        widths[start + cell.span - 1] += max(0.0, cell.width - inside)
+    return sum(widths) + sum(gaps[1:])
 
 
 def fit_table(table: LatexTable, width: float) -> float | None:
@@ -131,11 +130,6 @@ def format_table(table: LatexTable, separation: float, *, is_wide: bool) -> str:
         rf"\end{{table{star}}}",
     ]
     return "\n".join(lines) + "\n"
-
-
-def _gap(column: Column, separation: float) -> float:
-    """Return the space before a column."""
-    return THIN_SPACE if column.is_close else 2 * separation
 
 
 def _format_row(row: Sequence[LatexCell]) -> str:

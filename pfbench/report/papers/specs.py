@@ -134,20 +134,19 @@ class PaperFigureInput(NamedTuple):
     def describe_runs(self, *data: PaperFigureData, has_curves: bool = True) -> str:
         """Describe medians, bands, runs and absent filters, and the place of printed numbers, as the end of a caption."""
         results = [(label, r) for d in data for label, r in d.results.items()]
-        runs = sorted({int(r.meta["runs"]) for _, r in results})
-        present = {label for label, _ in results}
-        columns = [[n for n in column if n in present] for column in self.figure.columns]
-        names = dict.fromkeys(self.looks[column[-1]].name for column in columns if column)
+        runs, present = sorted({int(r.meta["runs"]) for _, r in results}), dict(results)
+        last = ([n for n in column if n in present][-1:] for column in self.figure.columns)
+        names = dict.fromkeys(self.looks[n].name for some in last for n in some)
         band = f"band: 80 % of runs of {' and of '.join(names)}" if has_curves else "bars: 80 % of runs"  # fmt: skip
-        parts = [f"Medians of {' or '.join(map(str, runs))} runs; {band}.", self.figure.source]
         lost: Counter[str] = Counter()
         for label, result in results:
             lost[self.looks[label].name] += int(result.data["lost"].sum())
-        if counts := [f"{name} {number}" for name, number in lost.items() if number]:
-            parts.append(f"Without lost runs: {', '.join(counts)}.")
-        absent = [self.looks[n].name for n in self.figure.filters if n not in present]
-        if absent:
-            parts.append(f"No results of {', '.join(dict.fromkeys(absent))}.")
+        counts = ", ".join(f"{name} {number}" for name, number in lost.items() if number)
+        absent = dict.fromkeys(self.looks[n].name for n in self.figure.filters if n not in present)
+        parts = (
+            f"Medians of {' or '.join(map(str, runs))} runs; {band}.", self.figure.source,
+            f"Without lost runs: {counts}." * bool(counts), f"No results of {', '.join(absent)}." * bool(absent),
+        )  # fmt: skip
         return " ".join(filter(None, parts))
 
 
@@ -192,10 +191,11 @@ def make_escape_figure(source: PaperFigureInput) -> list[FigureSpec]:
         return []
     (size,) = set(ran.values())
     share = np.linspace(0.0, 1.0, _PRINTED_ITERATIONS + 1)
-    curves = {"as repaired": size * (1 - np.cos(np.pi * share))}
-    for most in (_PRINTED_ITERATIONS, *sorted(ran, reverse=True)):
-        k = np.arange(most + 1)
-        curves[f"eq. 35 as printed, {most} iterations"] = size * (1 - np.cos(np.pi * k) / most)
+    curves = {"as repaired": size * (1 - np.cos(np.pi * share))} | {
+        f"eq. 35 as printed, {most} iterations": size
+        * (1 - np.cos(np.pi * np.arange(most + 1)) / most)
+        for most in (_PRINTED_ITERATIONS, *sorted(ran, reverse=True))
+    }
     text = (
         f"{source.figure.title}: escape factor c3 = c4 over the iterations of a step, for the {_PRINTED_ITERATIONS} "
         f"iterations that the paper draws and the {' and '.join(map(str, sorted(ran)))} of the filters. {source.figure.source}"
