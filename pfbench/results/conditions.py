@@ -326,13 +326,12 @@ def list_data_settings(metadata: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def name_data(meta: Mapping[str, Any], settings: Sequence[str]) -> tuple[str, str]:
     """Return the names of scenario and noise regime of a job, with settings of its data."""
-    names = []
-    for group in _DATA_SETTINGS:
+    names = {group: str(meta["choices"][group]) for group in _DATA_SETTINGS}
+    for group in names:
         of_group = [name for name in settings if name.partition(".")[0] == group]
-        text = _format_settings(meta, of_group, f"{group}.")
-        name = str(meta["choices"][group])
-        names.append(f"{name}[{text}]" if text else name)
-    return names[0], names[1]
+        if text := _format_settings(meta, of_group, f"{group}."):
+            names[group] += f"[{text}]"
+    return names["scenario"], names["noise"]
 
 
 def list_differing(configs: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -357,14 +356,11 @@ def flatten_settings(config: Any, path: str = "") -> dict[str, Any]:
 def _format_settings(meta: Mapping[str, Any], names: Sequence[str], prefix: str) -> str:
     """Format settings of a job; a class is written without its module."""
     config = flatten_settings(meta["config"]) if names else {}
-    texts = []
-    for name in names:
-        value, key = config.get(name, "-"), name.removeprefix(prefix)
-        if key.endswith("_target_"):
-            key = key.removesuffix("._target_")
-            value = str(value).rpartition(".")[2]
-        texts.append(f"{key}={value}")
-    return ",".join(texts)
+    values = {name.removeprefix(prefix): str(config.get(name, "-")) for name in names}
+    return ",".join(
+        f"{key.removesuffix('._target_')}={value.rpartition('.')[2] if key.endswith('_target_') else value}"
+        for key, value in values.items()
+    )
 
 
 # --------------------------------------------------------------------------------------------------

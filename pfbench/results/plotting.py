@@ -111,10 +111,8 @@ def line_styles(
     """
     names = list(dict.fromkeys(labels))
     first = min(len(names), 8)
-    widths = [1.3]
-    if first > 1:
-        thick = np.linspace(1.0 + min(0.25 * first, 1.0), 1.0, first)
-        widths = [*thick, *[1.0] * (len(names) - first)]
+    thick = np.linspace(1.0 + min(0.25 * first, 1.0), 1.0, first) if first > 1 else [1.3]
+    widths = [*thick, *[1.0] * (len(names) - first)]
     rows = zip(names, cycle(PLAIN_COLOURS), cycle(_DASHES), cycle(_MARKERS), widths, strict=False)
     styles = {
         name: LineStyle(colour, dash, mark, float(width))
@@ -131,15 +129,8 @@ def line_styles(
 
 def _style_of_look(look: MethodLook, width: float) -> LineStyle:
     """Return the line style of a look; the dash of a baseline follows its marker."""
-    dashes = _DASHES[1:]
-    dash = dashes[MARKERS.index(look.marker) % len(dashes)]
-    return LineStyle(
-        look.colour,
-        "-" if look.proposed else dash,
-        look.marker,
-        width,
-        filled=look.proposed,
-    )
+    dash = _DASHES[1:][MARKERS.index(look.marker) % (len(_DASHES) - 1)]
+    return LineStyle(look.colour, "-" if look.proposed else dash, look.marker, width, look.proposed)
 
 
 def stacked_axes(n: int, height: float, sharex: bool = True) -> tuple[Figure, list[Axes]]:
@@ -315,12 +306,9 @@ def _render(figure: Figure, suffix: str) -> bytes:
     """Render a figure in one format."""
     if suffix == "png":
         return render_palette_png(figure)
-    buffer = io.BytesIO()
-    if suffix == "pdf":
-        figure.savefig(buffer, format="pdf", metadata={"CreationDate": None, "ModDate": None})
-        return buffer.getvalue()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})  # equal bytes
-    return slim_svg(buffer.getvalue())
+    buffer, dates = io.BytesIO(), ("CreationDate", "ModDate") if suffix == "pdf" else ("Date",)
+    figure.savefig(buffer, format=suffix, metadata=dict.fromkeys(dates))  # equal bytes
+    return slim_svg(buffer.getvalue()) if suffix == "svg" else buffer.getvalue()
 
 
 def slim_svg(drawing: bytes) -> bytes:
