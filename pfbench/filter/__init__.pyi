@@ -258,6 +258,7 @@ from pfbench.filter.smoothing.backward_sampling import (
     MetropolisBackwardSampler as MetropolisBackwardSampler,
     RejectionBackwardSampler as RejectionBackwardSampler,
     sample_trajectories as sample_trajectories,
+    smooth_particles as smooth_particles,
 )
 from pfbench.filter.smoothing.gaussian_smoother import (
     smooth as smooth,

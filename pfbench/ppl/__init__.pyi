@@ -6,7 +6,6 @@ from pfbench.ppl.likelihood import (
     FilterLikelihood as FilterLikelihood,
     GaussianHmmLikelihood as GaussianHmmLikelihood,
     MarginalLikelihood as MarginalLikelihood,
-    SortedResampler as SortedResampler,
     repeat_runs as repeat_runs,
 )
 from pfbench.ppl.nuts_svi import (
@@ -24,7 +23,9 @@ from pfbench.ppl.parameter_posterior import (
 )
 from pfbench.ppl.parameterised_model import ParameterisedModel as ParameterisedModel
 from pfbench.ppl.particle_mcmc import (
+    GibbsSample as GibbsSample,
     PmmhSettings as PmmhSettings,
+    particle_gibbs as particle_gibbs,
     pmmh as pmmh,
 )
 from pfbench.ppl.pyro_program import (

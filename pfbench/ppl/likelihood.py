@@ -1,9 +1,9 @@
-"""Marginal likelihoods and posterior densities of parameters by a filter, with correlated random numbers."""
+"""Marginal likelihoods and posterior densities of parameters by a filter."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeAlias
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import torch
 from pyro.distributions import GaussianHMM, MultivariateNormal
@@ -11,12 +11,11 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import distribution_covariance
-from pfbench.core.random_stream import BatchRandomStream, PhiloxStream, RandomStream, relabel
+from pfbench.core.random_stream import PhiloxStream, relabel
 from pfbench.core.record import Record, map_inputs
-from pfbench.filter.belief import Filter, ParticleBelief, gather_ancestors
-from pfbench.filter.exactness import check_has_evidence, is_every_part_exact
+from pfbench.filter.belief import Filter
+from pfbench.filter.exactness import check_has_evidence
 from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.stages import Resampler
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.ppl.model_batch import ModelBatch
 from pfbench.ppl.parameterised_model import ParameterisedModel
@@ -141,41 +140,29 @@ class PosteriorEstimator:
         chains: int,
         seed: int,
         separate_parameters: bool,
-        rho: float,
     ) -> None:
         check_has_evidence(method, "pmmh")
         self.unknown, self.method = unknown, method
-        self.seed, self.separate_parameters, self.rho = seed, separate_parameters, rho
+        self.seed, self.separate_parameters = seed, separate_parameters
         runs = len(record.y)
         self.shape = (chains, runs if separate_parameters else 1)
         self.runs_per_model = 1 if separate_parameters else runs
         self.record = repeat_runs(record, chains)
-        self._stored: StoredNumbers = {}
 
-    def __call__(self, z: Tensor, iteration: int) -> tuple[Tensor, CorrelatedStream | None]:
-        """Estimate the log density, and return the random numbers if they are correlated.
+    def __call__(self, z: Tensor, iteration: int) -> Tensor:
+        """Estimate the log density with the random numbers of an iteration.
 
-        Returns log density [C, Q], and the correlated stream or None. Shapes: z [C, Q, P].
+        Returns log density [C, Q]. Shapes: z [C, Q, P].
         """
         values, log_prior = self.unknown.constrained(z.flatten(0, 1))
         model, is_possible = self.unknown.models_per_run(values, self.runs_per_model)
         is_valid = is_possible & torch.isfinite(log_prior)
         runs = torch.arange(is_valid.numel() * self.runs_per_model)
-        source = relabel(PhiloxStream(self.seed, runs), f"pmmh_{iteration}.")
-        correlated = CorrelatedStream(source, self.rho, self._stored) if self.rho else None
-        stream: Any = correlated or source
+        stream = relabel(PhiloxStream(self.seed, runs), f"pmmh_{iteration}.")
         log_z = run_filter(self.method, model, self.record, stream).log_evidence
         log_z = log_z.view(-1, self.runs_per_model).sum(1)
         total = torch.where(is_valid & torch.isfinite(log_z), log_prior + log_z, -torch.inf)
-        return total.view(self.shape), correlated
-
-    def store_numbers(self, numbers: CorrelatedStream | None, is_accepted: Tensor) -> None:
-        """Store the correlated random numbers of accepted chains.
-
-        Shapes: is_accepted [C, Q].
-        """
-        if numbers is not None:
-            numbers.accept(is_accepted.flatten().repeat_interleave(self.runs_per_model))
+        return total.view(self.shape)
 
     def draw_start(self, start: ParameterisedModel) -> tuple[Tensor, Tensor]:
         """Draw the starts of the chains, repeated while the filter is lost.
@@ -187,9 +174,7 @@ class PosteriorEstimator:
         for attempt in range(_START_ATTEMPTS):
             is_lost = ~torch.isfinite(log_p)
             z = torch.where(is_lost.unsqueeze(-1), self._sample(start, attempt), z)
-            new_log_p, numbers = self(z, -attempt - 1)
-            self.store_numbers(numbers, is_lost)
-            log_p = torch.where(is_lost, new_log_p, log_p)
+            log_p = torch.where(is_lost, self(z, -attempt - 1), log_p)
             if bool(torch.isfinite(log_p).all()):
                 return z, log_p
         lost = int((~torch.isfinite(log_p)).sum())
@@ -197,12 +182,6 @@ class PosteriorEstimator:
             f"pmmh needs a start at which the filter is not lost, got {lost} chains lost at "
             f"{_START_ATTEMPTS} draws. Narrow the prior, or use more particles."
         )
-
-    def start_covariance(self, start: ParameterisedModel) -> Tensor:
-        """Return the covariance of the starts, [Q, P, P]."""
-        z = self.unknown.unconstrained(start.draw(1000, self.seed))
-        p = z.shape[-1]
-        return torch.cov(z.T).view(1, p, p).repeat(self.shape[1], 1, 1)
 
     def _sample(self, start: ParameterisedModel, attempt: int) -> Tensor:
         values = start.draw(self.shape[0] * self.shape[1], self.seed + 7919 * (attempt + 1))
@@ -226,106 +205,3 @@ def repeat_runs(record: Record, copies: int) -> Record:
     start, spread = (None if a is None else repeat(a) for a in (record.start, record.spread))
     u = map_inputs(lambda a: a if len(a) == 1 else repeat(a), record.u)
     return Record(repeat(record.y), u, start, spread, record.feedback)
-
-
-# --------------------------------------------------------------------------------------------------
-# Random numbers that are correlated between iterations.
-
-StoredNumbers: TypeAlias = dict[tuple[int, str, int, int], Tensor]
-"""Numbers [R, n, w] by (step, purpose, n, w)."""
-
-
-@dataclass(frozen=True, eq=False)
-class CorrelatedStream(BatchRandomStream):
-    """A random stream correlated with the one of the last accepted iteration.
-
-    A proposed normal number is rho u + sqrt(1 - rho^2) e, which leaves N(0, I) invariant. The two
-    estimates of the likelihood are then correlated, and their ratio is less noisy [Deligiannidis,
-    Doucet and Pitt 2018]. A uniform number is Phi of a normal one.
-
-    Attributes:
-        independent_stream: Random stream e of this iteration.
-        correlation: Correlation rho, 0 for the plain algorithm.
-        stored: Numbers u of the last accepted iteration of each chain.
-        proposed: Numbers of this iteration, filled as they are drawn.
-        step: Time step.
-    """
-
-    independent_stream: RandomStream
-    correlation: float
-    stored: StoredNumbers
-    proposed: StoredNumbers = field(default_factory=dict)
-    step: int = 0
-
-    @property
-    @override
-    def dtype(self) -> torch.dtype:
-        return self.independent_stream.dtype
-
-    @override
-    def at_step(self, step: int) -> CorrelatedStream:
-        return replace(self, independent_stream=self.independent_stream.at_step(step), step=step)
-
-    @override
-    def select_runs(self, runs: slice) -> RandomStream:
-        raise ValueError(
-            "pmmh.rho must be 0 for a filter that splits the runs, got a correlated stream, whose "
-            "numbers belong to all of them. Set rho=0."
-        )
-
-    @override
-    def normal(self, purpose: str, n: int, w: int) -> Tensor:
-        key, e = (self.step, purpose, n, w), self.independent_stream.normal(purpose, n, w)
-        u = self.stored.get(key)
-        self.proposed[key] = (
-            e if u is None else self.correlation * u + (1.0 - self.correlation**2) ** 0.5 * e
-        )
-        return self.proposed[key]
-
-    @override
-    def uniform(self, purpose: str, n: int, w: int) -> Tensor:
-        z = self.normal("uniform." + purpose, n, w).double()
-        return torch.special.ndtr(z).clamp(1e-12, 1.0 - 1e-12)
-
-    def accept(self, is_accepted: Tensor) -> None:
-        """Store the proposed numbers of accepted runs, bool [R]."""
-        mask = is_accepted[:, None, None]
-        for key, new in self.proposed.items():
-            old = self.stored.get(key)
-            self.stored[key] = new if old is None else torch.where(mask, new, old)
-
-
-@dataclass(frozen=True)
-class SortedResampler(Resampler):
-    """A resampler that sorts the particles by one component first.
-
-    With correlated random numbers neighbours then stay neighbours. Without sorting the first
-    resampling removes the correlation. The distribution of the filter does not change.
-
-    Attributes:
-        resampler: Resampler of the filter.
-        component: Component of the state.
-    """
-
-    resampler: Resampler
-    component: int = 0
-
-    @property
-    @override
-    def is_exact(self) -> bool:
-        return is_every_part_exact(**{"resampler.resampler": self.resampler})
-
-    @override
-    def __call__(
-        self,
-        model: StateSpaceModel,
-        belief: ParticleBelief,
-        log_a: Tensor,
-        n: Tensor,
-        draws: RandomStream,
-    ) -> tuple[ParticleBelief, Tensor]:
-        active_mask = torch.isfinite(belief.log_w)
-        order = torch.where(active_mask, belief.x[..., self.component], torch.inf).argsort(1)
-        sorted_belief = gather_ancestors(belief, order)
-        log_a = sorted_belief.log_w if log_a is belief.log_w else log_a.gather(1, order)
-        return self.resampler(model, sorted_belief, log_a, n, draws)

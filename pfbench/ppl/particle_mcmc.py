@@ -1,4 +1,4 @@
-"""Particle marginal Metropolis-Hastings: chains of parameters with a filter each.
+"""Particle Markov chain Monte Carlo: chains of parameters with a filter each, or with a path of the states each.
 
 All chains move at once, as runs of one batch. `ModelBatch` maps the model of each chain over them.
 """
@@ -12,11 +12,12 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from pfbench.core.parameter_checks import require, require_range
-from pfbench.core.random_stream import PhiloxStream, RandomStream
+from pfbench.core.parameter_checks import require
+from pfbench.core.random_stream import PhiloxStream, RandomStream, relabel
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
-from pfbench.ppl.likelihood import PosteriorEstimator
+from pfbench.filter.smoothing.noise_space import ConditionalSmcKernel, NoiseSpace, PathKernel
+from pfbench.ppl.likelihood import PosteriorEstimator, repeat_runs
 from pfbench.ppl.parameter_posterior import ParameterPosterior
 from pfbench.ppl.parameterised_model import (
     ParameterisedModel,
@@ -35,8 +36,6 @@ class PmmhSettings:
     Attributes:
         separate_parameters: Whether each run has its own parameters, R posteriors. Otherwise the
             runs share them.
-        rho: Correlation of the filter's random numbers between iterations; they are all stored.
-            It needs a resampler `SortedResampler` and helps little for more than a few states.
         thin: Iterations for each draw.
         start: Distributions of the chains' starts and of the walk's first covariance, by parameter,
             with the supports of the prior. They should be wider than the posterior, so that r-hat
@@ -50,7 +49,6 @@ class PmmhSettings:
     """
 
     separate_parameters: bool = False
-    rho: float = 0.0
     thin: int = 1
     start: Mapping[str, Prior] | None = None
     leaps: int = 0
@@ -58,7 +56,6 @@ class PmmhSettings:
 
     def __post_init__(self) -> None:
         check_counts("pmmh", {"thin": (self.thin, 1), "leaps": (self.leaps, 0)})
-        require_range("pmmh.rho", self.rho, "[0, 1)")
 
 
 def pmmh(
@@ -116,9 +113,7 @@ def pmmh(
         )
         distributions = {name: settings.start[name] for name in unknown.names}
         start = ParameterisedModel(unknown.make, distributions)
-    target = PosteriorEstimator(
-        unknown, method, record, chains, seed, settings.separate_parameters, settings.rho
-    )
+    target = PosteriorEstimator(unknown, method, record, chains, seed, settings.separate_parameters)
     with torch.no_grad():
         return _run_chains(target, start, draws, warmup, settings)
 
@@ -132,8 +127,7 @@ def _run_chains(
 ) -> ParameterPosterior:
     """Run all chains of a posterior."""
     z, log_p = target.draw_start(start)
-    log_size = torch.full((z.shape[1],), -0.5, dtype=z.dtype)
-    walk = ParameterWalk(z.mean(0), target.start_covariance(start), log_size)
+    walk = ParameterWalk.start(start, z, target.seed)
     samples, accepted_count = [], torch.zeros_like(log_p)
     for i in range(1, warmup + draws * settings.thin + 1):
         is_step = i % (settings.leaps + 1) == 0
@@ -160,12 +154,144 @@ def _metropolis_step(
     """Return states, log densities, acceptance probabilities and outcomes."""
     stream = PhiloxStream(target.seed, torch.arange(log_p.numel())).at_step(iteration)
     proposed_z, log_back = proposal(z, stream)
-    proposed_log_p, numbers = target(proposed_z, iteration)
+    proposed_log_p = target(proposed_z, iteration)
     probability = torch.exp(proposed_log_p - log_p + log_back).clamp(max=1.0)
     is_accepted = stream.uniform("pmmh.accept", 1, 1).view_as(probability) < probability
-    target.store_numbers(numbers, is_accepted)
     z = torch.where(is_accepted.unsqueeze(-1), proposed_z, z)
     return z, torch.where(is_accepted, proposed_log_p, log_p), probability, is_accepted
+
+
+# --------------------------------------------------------------------------------------------------
+# Particle Gibbs: parameters given a path of the states, and a path given parameters, in turn.
+
+
+class GibbsSample(NamedTuple):
+    """Draws of parameters and states.
+
+    Attributes:
+        posterior: Draws of the parameters, and the acceptance rates of their moves.
+        states: Paths that belong to them, [chains, S, R, T, D].
+    """
+
+    posterior: ParameterPosterior
+    states: Tensor
+
+
+def particle_gibbs(
+    unknown: ParameterisedModel,
+    record: Record,
+    draws: int,
+    warmup: int,
+    chains: int = 4,
+    seed: int = 0,
+    kernel: PathKernel | None = None,
+) -> GibbsSample:
+    """Draw from p(parameters, x_1:T | y_1:T) by particle Gibbs with ancestor sampling.
+
+    A sweep draws a path by conditional SMC, and moves the parameters twice by a random walk: given the states and given the
+    noises of the path, where the states determine the noises, else given the noises twice. Both targets are
+    exact, and which of them mixes well depends on the parameter [Papaspiliopoulos, Roberts and Skold 2007].
+    The filter needs few particles, and the path of the states is part of the answer. Its time grows with the length of the
+    record, squared where the model has fewer noises than states.
+
+    Args:
+        unknown: Model and prior; initial state and noise of the model are normal.
+        record: Measurements [R, T, Dy] and inputs. All runs share the parameters.
+        draws: Sweeps of each chain that are stored.
+        warmup: Sweeps before, in which the walks are learned.
+        chains: Number of chains.
+        seed: Seed of all random numbers.
+        kernel: Step of a path, `ConditionalSmcKernel(20)` by default.
+
+    Returns:
+        Draws of parameters and states.
+
+    Raises:
+        ValueError: If a count is too small, a distribution is not normal, or the record has feedback.
+
+    References:
+        Andrieu, Doucet and Holenstein 2010. Lindsten, Jordan and Schon 2014.
+    """
+    kinds = {"unknown": (unknown, ParameterisedModel), "record": (record, Record)}
+    check_kinds("particle_gibbs", kinds)
+    counts = {"draws": (draws, 1), "warmup": (warmup, 0), "chains": (chains, 1), "seed": (seed, 0)}
+    check_counts("particle_gibbs", counts)
+    with torch.no_grad():
+        target = _PathPosterior(unknown, record, chains)
+        return _run_sweeps(target, draws, warmup, seed, kernel or ConditionalSmcKernel(20))
+
+
+@dataclass(frozen=True)
+class _PathPosterior:
+    """Density of the parameters of each chain, given a path of it."""
+
+    unknown: ParameterisedModel
+    record: Record
+    chains: int
+
+    def make_space(self, z: Tensor) -> tuple[NoiseSpace, Tensor]:
+        """Return the noise space of the models of z [C, 1, P], and the log prior [C, 1], -inf where a model is impossible."""
+        values, log_prior = self.unknown.constrained(z[:, 0])
+        model, is_possible = self.unknown.models_per_run(values, len(self.record.y))
+        space = NoiseSpace(model, repeat_runs(self.record, self.chains))
+        return space, torch.where(is_possible, log_prior, -torch.inf).unsqueeze(1)
+
+    def evaluate(
+        self, space: NoiseSpace, log_prior: Tensor, theta: Tensor, states: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return log p(z, path, y) [C, 1] and the vectors of the paths, which keep the states, or the noises without these."""
+        found = None if states is None else _find_vectors(space, theta, states)
+        theta, log_p = found or (theta, space.roll_out(theta)[1])
+        total = log_prior + log_p.view(self.chains, -1).sum(1, keepdim=True)
+        return total.nan_to_num(nan=-torch.inf), theta
+
+
+def _find_vectors(space: NoiseSpace, theta: Tensor, states: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Return the vectors of given states after the initial state of theta, and their log density with y; None where they are not determined."""
+    d = space.model.chart.dimension
+    x, parts, total = space.start(theta[..., :d]), [theta[..., :d]], torch.zeros_like(theta[..., 0])
+    for t, (model, record) in enumerate(space.steps):
+        found = space.find_noise(t, x, states[:, :, t])
+        if found is None:
+            return None
+        x, (w, log_det) = states[:, :, t], found
+        parts.append(w)
+        log_p = model.log_likelihood(record.y, x, record.u) - log_det
+        total = total + log_p - 0.5 * w.square().sum(-1)
+    return torch.cat(parts, -1), total
+
+
+def _run_sweeps(
+    target: _PathPosterior, draws: int, warmup: int, seed: int, kernel: PathKernel
+) -> GibbsSample:
+    """Run all chains of paths and parameters."""
+    unknown, runs = target.unknown, len(target.record.y)
+    z = unknown.unconstrained(unknown.sample(target.chains, seed)).unsqueeze(1)
+    walks, samples, accepted = [ParameterWalk.start(unknown, z, seed)] * 2, [], []
+    source = PhiloxStream(seed, torch.arange(target.chains * runs))
+    place = target.make_space(z)
+    theta = source.normal("gibbs.start", 1, place[0].size).to(z)
+    for i in range(warmup + draws):
+        theta, _ = kernel(place[0], theta, relabel(source, f"gibbs_{i}."))
+        for j, states in enumerate((place[0].roll_out(theta)[0], None)):
+            stream = relabel(PhiloxStream(seed, torch.arange(target.chains)), f"gibbs_{i}_{j}.")
+            before, _ = target.evaluate(*place, theta, states)
+            proposed, _ = walks[j].step(z, stream)
+            after, new_theta = target.evaluate(*target.make_space(proposed), theta, states)
+            probability = torch.exp(after - before).nan_to_num(nan=1.0).clamp(max=1.0)
+            is_accepted = stream.uniform("gibbs.accept", 1, 1) < probability.unsqueeze(-1)
+            z = torch.where(is_accepted, proposed, z)
+            theta = torch.where(is_accepted.repeat_interleave(runs, 0), new_theta, theta)
+            place = target.make_space(z)
+            if i < warmup:
+                walks[j] = walks[j].adapt(z, probability.mean(0), (i + 2.0) ** -0.6)
+            accepted.append(probability[:, 0])
+        if i >= warmup:
+            samples.append((z[:, 0], place[0].roll_out(theta)[0][:, 0]))
+    parameters, paths = (torch.stack(parts, 1) for parts in zip(*samples, strict=True))
+    rates = torch.stack(accepted[2 * warmup :], 1).mean(1)
+    posterior = ParameterPosterior(unknown.constrained(parameters)[0], rates, "particle Gibbs")
+    return GibbsSample(posterior, paths.unflatten(0, (target.chains, runs)).transpose(1, 2))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -187,6 +313,13 @@ class ParameterWalk(NamedTuple):
     mean: Tensor
     covariance: Tensor
     log_size: Tensor
+
+    @classmethod
+    def start(cls, unknown: ParameterisedModel, z: Tensor, seed: int) -> ParameterWalk:
+        """Return the walk of chains at z [C, Q, P], with the covariance of draws of the prior."""
+        covariance = torch.cov(unknown.unconstrained(unknown.draw(1000, seed)).T)
+        covariance = covariance.view(1, *2 * z.shape[-1:]).repeat(z.shape[1], 1, 1)
+        return cls(z.mean(0), covariance, torch.full_like(z[0, :, 0], -0.5))
 
     def step(self, z: Tensor, stream: RandomStream) -> tuple[Tensor, Tensor]:
         """Propose a step of the random walk.

@@ -29,7 +29,6 @@ from pfbench.filter.gaussian.linearisation_rules import (
 )
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.model.base import ModelWrapper, StateSpaceModel
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
 from pfbench.model.passive_location import PassiveLocation, PlatformInputs, compute_level_attitude
@@ -37,10 +36,8 @@ from pfbench.model.textbook import Pendulum, StochasticVolatility, UnivariateGro
 from pfbench.model.urban_gnss import NormalExponentialMixture
 from pfbench.ppl.ibis_smc2 import smc2
 from pfbench.ppl.likelihood import (
-    CorrelatedStream,
     FilterLikelihood,
     GaussianHmmLikelihood,
-    SortedResampler,
     repeat_runs,
 )
 from pfbench.ppl.model_batch import ModelBatch
@@ -212,7 +209,6 @@ REFUSED: dict[str, list[Refusal]] = {
     "pmmh": [
         (r"leaps must .* got -1", lambda: leaping(leaps=-1)),
         (r"a distribution for each of \['a', 'b'\], got \['a'\]", lambda: leaping(start={"a": LOG})),
-        (r"rho must be in \[0, 1\), got 1", lambda: leaping(rho=1.0)),
         (r"draws must .* got 0", lambda: pmmh(LEVELS, EKF, Record(ZEROS), 0, 1)),
         ("lost at 20 draws", lambda: pmmh(LEVELS, ParticleFilter(5), Record(ZEROS + 1e200), 1, 1, chains=2)),
     ],
@@ -419,46 +415,6 @@ def test_the_density_on_the_whole_line_integrates_to_one() -> None:
     assert abs(float(log_prior.exp().sum()) * float(at[1] - at[0]) ** 2 - 1.0) < 1e-6
     back = unknown.unconstrained({name: v[:: 801 * 50 + 50] for name, v in values.items()})
     torch.testing.assert_close(back, z[:: 801 * 50 + 50])
-
-
-def test_held_draws_are_correlated_normals_that_only_accepted_runs_replace() -> None:
-    kept: dict[Any, Tensor] = {}
-    runs, rho = torch.arange(400), 0.9
-    first, second = (CorrelatedStream(PhiloxStream(seed, runs), rho, kept) for seed in (1, 2))
-    one = first.at_step(3).normal("noise", 25, 2)
-    first.accept(torch.ones(400, dtype=torch.bool))
-    two = second.at_step(3).normal("noise", 25, 2)
-    both = torch.corrcoef(torch.stack([one.flatten(), two.flatten()]))[0, 1]
-    assert abs(float(both) - rho) < 4.5 * (1 - rho**2) / 2e4**0.5
-    assert abs(float(two.std()) - 1.0) < 4.5 / 4e4**0.5
-    hit = runs < 100
-    second.accept(hit)
-    torch.testing.assert_close(kept[(3, "noise", 25, 2)], torch.where(hit[:, None, None], two, one))
-    u = second.uniform("resample", 10, 1)
-    assert 0.0 < float(u.min()) < 0.01 < 0.99 < float(u.max()) < 1.0
-
-
-def test_correlated_draws_make_the_likelihood_s_ratio_less_noisy_if_particles_are_in_order() -> (
-    None
-):
-    model, runs = local_level(0.5, 0.7, 0.0, 1.0), torch.arange(60)
-    record = repeat_runs(Record(record_for(model, 1).y), 60)
-    always = EssResampler(Systematic(), ess_threshold=1.0)
-
-    def spread(rho: float, resampler: Any) -> float:
-        kept: dict[Any, Tensor] = {}
-        found = []
-        for seed in (1, 2):
-            held = CorrelatedStream(PhiloxStream(seed, runs), rho, kept)
-            found.append(
-                run_filter(ParticleFilter(40, resampler), model, record, held).log_evidence
-            )
-            held.accept(torch.ones(60, dtype=torch.bool))
-        return float((found[1] - found[0]).std())
-
-    ordered = spread(0.99, SortedResampler(always))
-    assert ordered < 0.5 * spread(0.0, SortedResampler(always))
-    assert ordered < 0.7 * spread(0.99, always)
 
 
 def test_leaps_are_of_a_t_law_and_know_its_density() -> None:

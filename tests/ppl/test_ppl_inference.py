@@ -30,8 +30,9 @@ from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.smoothing.noise_space import ConditionalSmcKernel
 from pfbench.job import compose
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.base import ModelWrapper, StateSpaceModel
 from pfbench.model.linear_gaussian import local_level
 from pfbench.model.textbook import StochasticVolatility
 from pfbench.ppl.ibis_smc2 import Smc2Result, smc2
@@ -46,7 +47,7 @@ from pfbench.ppl.parameter_posterior import (
     simulation_based_calibration,
 )
 from pfbench.ppl.parameterised_model import ParameterisedModel
-from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
+from pfbench.ppl.particle_mcmc import PmmhSettings, particle_gibbs, pmmh
 from pfbench.ppl.priors import prior_by_name
 from pfbench.ppl.pyro_program import latent_program, program
 
@@ -156,6 +157,17 @@ def test_metropolis_on_a_kalman_likelihood_finds_it_too(leaps: int) -> None:
     agrees(posterior.table(), YEARS)
     assert posterior.accepted is not None
     assert 0.1 < float(posterior.accepted.mean()) < 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrap", [None, ModelWrapper], ids=["of_states", "of_noises"])
+def test_chains_of_particle_gibbs_find_it_as_well(wrap: Any) -> None:
+    """The wrapped model does not tell how its noise enters: then noises are kept, and ancestors see the whole future."""
+    make: Any = (lambda **values: wrap(NILE.make(**values))) if wrap else NILE.make
+    unknown, kernel = ParameterisedModel(make, NILE.prior), ConditionalSmcKernel(8)
+    found = particle_gibbs(unknown, nile(YEARS), 20, 30, chains=48, seed=1, kernel=kernel)
+    assert found.states.shape == (48, 20, 1, YEARS, 1)
+    agrees(found.posterior.table(), YEARS, ess=48)
 
 
 @pytest.mark.slow

@@ -49,7 +49,6 @@ from pfbench.filter.particle.stages import (
 from pfbench.filter.particle.weights import LookAheadWeights, TemperedPosterior, TemperedWeights
 from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import linear_walk
-from pfbench.ppl.likelihood import SortedResampler
 from pfbench.testing import (
     check_causality,
     check_convergence,
@@ -184,7 +183,7 @@ def peek(method: Any, model: StateSpaceModel, y: Tensor) -> FilterResult:
     "stage",
     [
         Systematic(), Residual(), EssResampler(Residual(), 0.5), EssResampler(Multinomial(), 0.0), SoftResampler(0.5), StopGradientResampler(),
-        HilbertSortedResampler(EssResampler(SqmcScheme(), 1.0)), SortedResampler(EssResampler(Systematic(), 1.0)),
+        HilbertSortedResampler(EssResampler(SqmcScheme(), 1.0)),
     ],
     ids=lambda s: type(s).__name__,
 )  # fmt: skip

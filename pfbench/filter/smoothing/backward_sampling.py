@@ -15,11 +15,11 @@ from typing_extensions import override
 from pfbench.core.parameter_checks import require_range, require_ranges
 from pfbench.core.random_stream import BatchRandomStream, RandomStream, relabel
 from pfbench.core.record import Record
-from pfbench.filter.belief import Filter, ParticleBelief, StepInfo
-from pfbench.filter.loop import prepare_record, run_filter
+from pfbench.filter.belief import Filter, ParticleBelief, StepInfo, weighted_mean_cov
+from pfbench.filter.loop import FilterResult, prepare_record, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.stages import EssResampler, Resampler
-from pfbench.filter.smoothing.gaussian_smoother import check_no_feedback
+from pfbench.filter.smoothing.gaussian_smoother import SmoothedStates, check_no_feedback
 from pfbench.model.base import StateSpaceModel
 
 
@@ -63,7 +63,7 @@ def sample_trajectories(
     sampler = sampler or ExactBackwardSampler()
     inputs = prepare_record(model, record)
     _check_dense(model, inputs, record)
-    clouds, parents, lost = _filter_forward(method, model, record, draws, sampler)
+    clouds, parents, filtered = _filter_forward(method, model, record, draws, sampler)
     x, log_w = clouds[-1]
     last = relabel(draws.at_step(len(clouds)), "path.").uniform("state", paths, 1)
     slots = draw_by_weight(log_w, last.squeeze(-1))
@@ -75,7 +75,53 @@ def sample_trajectories(
         step = BackwardStep(x, log_w, transition, path[-1], before)
         slots = sampler(step, relabel(draws.at_step(t + 1), "path."))
         path.append(gather_states(x, slots))
-    return torch.where(lost[:, None, None, None], torch.nan, torch.stack(path[::-1], 2))
+    return torch.where(filtered.lost[:, None, None, None], torch.nan, torch.stack(path[::-1], 2))
+
+
+def smooth_particles(
+    method: ParticleFilter,
+    model: StateSpaceModel,
+    record: Record,
+    draws: BatchRandomStream,
+    lag: int,
+) -> SmoothedStates:
+    """Compute means and covariances of p(x_t | y_1:t+lag) by the particles of step t + lag and their ancestors.
+
+    The estimate of a step is ready `lag` steps later and needs no transition density. With a long lag few distinct
+    ancestors remain, and with a short one later measurements are missing: choose the time in which the model forgets its state.
+
+    Args:
+        method: Particle filter that copies particles and makes no moves.
+        model: State-space model.
+        record: Measurements [R, T, Dy] and inputs.
+        draws: Random stream of the filter.
+        lag: Number of later measurements that a state may use.
+
+    Returns:
+        Smoothed means and covariances in the chart, and the result of the filter.
+
+    Raises:
+        ValueError: If lag is negative, the record has feedback, or the filter does not know the parents of its particles.
+
+    References:
+        G. Kitagawa and S. Sato (2001), Monte Carlo smoothing and self-organising state-space model.
+    """
+    require_range("smooth_particles: lag", lag, "whole [0, inf)")
+    check_no_feedback(record)
+    clouds, parents, filtered = _filter_forward(
+        method, model, record, draws, MetropolisBackwardSampler()
+    )
+    moments = []
+    for t, (x, _) in enumerate(clouds):
+        end = min(t + lag, len(clouds) - 1)
+        log_w = clouds[end][1]
+        slots = torch.arange(log_w.shape[1], device=x.device).expand_as(log_w)
+        for s in range(end, t, -1):
+            slots = parents[s].gather(1, slots)
+        belief = ParticleBelief(gather_states(x, slots), log_w, log_w[:, 0])
+        moments.append(weighted_mean_cov(model.chart, belief))
+    means, covariances = zip(*moments, strict=True)
+    return SmoothedStates(torch.stack(means, 1), torch.stack(covariances, 1), filtered)
 
 
 @dataclass(frozen=True)
@@ -111,8 +157,8 @@ def _filter_forward(
     record: Record,
     draws: BatchRandomStream,
     sampler: BackwardSampler,
-) -> tuple[list[tuple[Tensor, Tensor]], list[Tensor], Tensor]:
-    """Return particles and log weights of each step, their parents if needed, and lost runs [R]."""
+) -> tuple[list[tuple[Tensor, Tensor]], list[Tensor], FilterResult]:
+    """Return particles and log weights of each step, their parents if needed, and the result of the filter."""
     clouds: list[tuple[Tensor, Tensor]] = []
 
     def store(t: int, info: StepInfo) -> dict[str, Tensor]:
@@ -138,8 +184,7 @@ def _filter_forward(
                 f"EssResampler and without moves, got {method}. Use RejectionBackwardSampler."
             )
         method = replace(method, resampler=_AncestorRecorder(resampler, parents))
-    estimate = run_filter(method, model, record, draws, store)
-    return clouds, parents, estimate.lost
+    return clouds, parents, run_filter(method, model, record, draws, store)
 
 
 def _check_dense(model: StateSpaceModel, inputs: Record, record: Record) -> None:

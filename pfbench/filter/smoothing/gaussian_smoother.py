@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import reduce
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
@@ -34,7 +36,11 @@ class SmoothedStates(NamedTuple):
 
 
 def smooth(
-    method: GaussianFilter, model: StateSpaceModel, record: Record, watch: Watch | None = None
+    method: GaussianFilter,
+    model: StateSpaceModel,
+    record: Record,
+    watch: Watch | None = None,
+    lag: int | None = None,
 ) -> SmoothedStates:
     """Compute smoothed means and covariances (Rauch-Tung-Striebel).
 
@@ -47,12 +53,13 @@ def smooth(
         model: State-space model of the filter.
         record: Measurements [R, T, Dy] and inputs.
         watch: Function of each step of the filter, see `run_filter`.
+        lag: Number of later measurements that a state may use, for estimates with a fixed delay. None uses all.
 
     Returns:
         Smoothed means and covariances, and the result of the filter.
 
     Raises:
-        ValueError: If the filter adapts noise or gain, or if the record has feedback.
+        ValueError: If the filter adapts noise or gain, the record has feedback, or lag is negative.
 
     References:
         H. Rauch, F. Tung and C. Striebel (1965). S. Sarkka (2008), Unscented
@@ -65,6 +72,7 @@ def smooth(
         "a filter that adapts them",
         "Choose a filter without adaptations.",
     )
+    require_range("smooth: lag", lag, "null or whole [0, inf)")
     check_no_feedback(record)
     filtered_moments: list[tuple[Tensor, Tensor]] = []
 
@@ -75,18 +83,26 @@ def smooth(
     runs = torch.arange(len(record.y))
     filtered = run_filter(method, model, record, PhiloxStream(0, runs), store)
     inputs, chart = prepare_record(model, record), model.chart
-    mean, covariance = filtered_moments[-1]
-    means, covariances = [mean], [covariance]
-    for t in reversed(range(len(filtered_moments) - 1)):
-        before, spread = filtered_moments[t]
+    last, gains = len(filtered_moments) - 1, []
+    for t, (before, spread) in enumerate(filtered_moments[:-1]):
         belief = GaussianBelief(before, spread, torch.zeros_like(before[:, 0]))
         predicted, rooted = method.predict(model, belief, inputs.at_step(t + 1).u)
-        gain, remainder = _backward_gain(predicted, factor(spread)[0], rooted)
-        shift = (gain @ chart.subtract(mean, predicted.y).unsqueeze(-1)).squeeze(-1)
-        mean, covariance = chart.add(before, shift), remainder + gain @ covariance @ gain.mT
-        means.append(mean)
-        covariances.append(covariance)
-    return SmoothedStates(torch.stack(means[::-1], 1), torch.stack(covariances[::-1], 1), filtered)
+        gains.append((predicted.y, *_backward_gain(predicted, factor(spread)[0], rooted)))
+
+    def step_back(later: tuple[Tensor, Tensor], t: int) -> tuple[Tensor, Tensor]:
+        y, gain, remainder = gains[t]
+        shift = (gain @ chart.subtract(later[0], y).unsqueeze(-1)).squeeze(-1)
+        return chart.add(filtered_moments[t][0], shift), remainder + gain @ later[1] @ gain.mT
+
+    laws = [*accumulate(reversed(range(last)), step_back, initial=filtered_moments[-1])][::-1]
+    if lag is not None:
+        ends = [min(t + lag, last) for t in range(last + 1)]
+        laws = [
+            reduce(step_back, reversed(range(t, end)), filtered_moments[end])
+            for t, end in enumerate(ends)
+        ]
+    means, covariances = zip(*laws, strict=True)
+    return SmoothedStates(torch.stack(means, 1), torch.stack(covariances, 1), filtered)
 
 
 def _backward_gain(

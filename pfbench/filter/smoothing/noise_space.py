@@ -94,6 +94,27 @@ class NoiseSpace:
         x = model.propagate(x, record.u, self._noise_mean + self._noise_sd * w)
         return x, model.log_likelihood(record.y, x, record.u)
 
+    def find_noise(self, t: int, x: Tensor, later: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Find the noise of a step between given states.
+
+        Args:
+            t: Step from 0.
+            x: States before the step, [R, M, D].
+            later: States after the step, [R, M, D].
+
+        Returns:
+            Whitened noise [R, M, W], and log |det| of the noise in the state, [R or 1, 1]. None if the model does not add as
+            many noises as there are states, on a flat chart.
+        """
+        model, record = self.steps[t]
+        gain = model.noise_gain(record.u) if model.chart.flat else None
+        if gain is None or gain.shape[-1] != gain.shape[-2]:
+            return None
+        still = model.propagate(x, record.u, x.new_zeros(*x.shape[:2], gain.shape[-1]))
+        w = torch.linalg.solve(gain, (later - still).mT).mT
+        log_det = torch.linalg.slogdet(gain).logabsdet + self._noise_sd.log().sum()
+        return (w - self._noise_mean) / self._noise_sd, log_det.unsqueeze(-1)
+
     def roll_out(self, theta: Tensor) -> tuple[Tensor, Tensor]:
         """Return the paths of vectors and their log likelihoods.
 
@@ -339,10 +360,10 @@ def sample_smoothed_paths(
 class ConditionalSmcKernel(PathKernel):
     """Conditional particle filter: the present path is one of its particles.
 
-    With ancestor sampling the parent of the present path's future is drawn at each step. Its
-    probability is the weight of the parent times the likelihood of all later measurements
-    along the path that starts there with the noises of the future. The densities of these noises
-    cancel. A kernel then takes T^2 N / 2 propagations, and T N without ancestor sampling.
+    With ancestor sampling the parent of the present path's future is drawn at each step. Where a model adds as many noises as
+    it has states, the probability is the weight of the parent times the transition density to the next state of the path.
+    Elsewhere it is the weight times the likelihood of all later measurements along the path that starts there with the noises of
+    the future, whose densities cancel. A kernel then takes T^2 N / 2 propagations in place of T N.
 
     Attributes:
         particles: Number of particles N.
@@ -370,18 +391,19 @@ class ConditionalSmcKernel(PathKernel):
         noises = [self._draw(theta[..., :d], draws.at_step(0))]
         x = space.start(noises[0].flatten(1, 2))
         log_w, parents = torch.zeros_like(noises[0][..., 0]), []
+        path, _ = space.roll_out(theta)
         for t, _ in enumerate(space.steps):
             stream = draws.at_step(t + 1)
             u = stream.uniform("parent", theta.shape[1], self.particles)
             slots = draw_by_weight(log_w.flatten(0, 1), u.flatten(0, 1)).view(log_w.shape)
-            slots[..., -1] = self._draw_parent(space, theta, t, x, log_w, stream)
+            later = path[:, :, t].repeat_interleave(self.particles, 1)
+            slots[..., -1], reference = self._draw_parent(space, theta, t, x, log_w, later, stream)
             parents.append(slots)
-            noises.append(self._draw(space.noise(theta, t), stream))
+            noises.append(self._draw(reference, stream))
             x = _take(x.unflatten(1, log_w.shape[1:]), slots).flatten(1, 2)
             x, log_likelihood = space.advance(t, x, noises[-1].flatten(1, 2))
             log_w = log_likelihood.view(log_w.shape)
-        u = draws.at_step(len(space.steps) + 1).uniform("path", theta.shape[1], 1)
-        slot = draw_by_weight(log_w.flatten(0, 1), u.flatten(0, 1)).view(*log_w.shape[:2], 1)
+        slot = _draw_slot(log_w, draws.at_step(len(space.steps) + 1), "path").unsqueeze(-1)
         parts = []
         for noise, before in zip(noises[:0:-1], parents[::-1], strict=True):
             parts.append(_take(noise, slot))
@@ -403,17 +425,30 @@ class ConditionalSmcKernel(PathKernel):
         t: int,
         x: Tensor,
         log_w: Tensor,
+        later: Tensor,
         draws: RandomStream,
-    ) -> Tensor:
-        """Draw the slot [R, M] of the parent of the present path's future."""
+    ) -> tuple[Tensor, Tensor]:
+        """Draw the slot [R, M] of the parent of the present path's future, and return the noise [R, M, W] that leads from there to `later`."""
+        reference = space.noise(theta, t)
         if not self.sample_ancestors:
-            return torch.full(log_w.shape[:2], self.particles - 1, device=log_w.device)
+            slots = torch.full(log_w.shape[:2], self.particles - 1, device=log_w.device)
+            return slots, reference
+        found = space.find_noise(t, x, later)
+        if found is not None:
+            noise = found[0].unflatten(1, log_w.shape[1:])
+            slots = _draw_slot(log_w - 0.5 * noise.square().sum(-1), draws, "ancestor")
+            return slots, _take(noise, slots.unsqueeze(-1)).squeeze(2)
         future = theta.repeat_interleave(self.particles, 1)
         for s in range(t, len(space.steps)):
             x, log_likelihood = space.advance(s, x, space.noise(future, s))
             log_w = log_w + log_likelihood.view(log_w.shape)
-        u = draws.uniform("ancestor", log_w.shape[1], 1).flatten(0, 1)
-        return draw_by_weight(log_w.flatten(0, 1), u).view(log_w.shape[:2])
+        return _draw_slot(log_w, draws, "ancestor"), reference
+
+
+def _draw_slot(log_w: Tensor, draws: RandomStream, purpose: str) -> Tensor:
+    """Draw a slot [R, M] of each chain by log weights [R, M, N]."""
+    u = draws.uniform(purpose, log_w.shape[1], 1).flatten(0, 1)
+    return draw_by_weight(log_w.flatten(0, 1), u).view(log_w.shape[:2])
 
 
 def _take(values: Tensor, slots: Tensor) -> Tensor:

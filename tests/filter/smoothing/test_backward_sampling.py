@@ -30,6 +30,7 @@ from pfbench.filter.smoothing.backward_sampling import (
     MetropolisBackwardSampler,
     RejectionBackwardSampler,
     sample_trajectories,
+    smooth_particles,
 )
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.model.textbook import UnivariateGrowth
@@ -144,6 +145,20 @@ def test_backward_sampling_agrees_with_the_smoother(name: str) -> None:
     assert (
         steps_of.std() < 0.5 / 3**0.5 * 1.3
     )  # paths of unrelated states would scatter by the posterior spread, 0.6 and more
+
+
+def test_particles_with_a_lag_have_the_moments_of_the_dense_law_of_so_many_measurements() -> None:
+    """Of a singular model, whose paths cannot be sampled backwards; as many clouds as runs, whose scatter is the standard error."""
+    steps, clouds, lag = 8, 60, 2
+    record = record_of(SINGULAR, 1, steps)
+    many = record._replace(y=record.y.expand(clouds, -1, -1))
+    draws = PhiloxStream(1, torch.arange(clouds))
+    found = smooth_particles(ParticleFilter(800), SINGULAR, many, draws, lag)
+    for t in range(steps):
+        mean, covariance = dense(SINGULAR, record.y[0, : t + lag + 1].numpy())
+        for value, truth in ((found.mean[:, t], mean[t]), (found.covariance[:, t], covariance[t])):
+            off = (value.mean(0) - torch.from_numpy(truth)) / (value.std(0) / clouds**0.5)
+            assert off.abs().max() < 4.5, (t, off)
 
 
 @pytest.mark.parametrize("name", SAMPLERS)

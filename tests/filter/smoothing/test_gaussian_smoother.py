@@ -1,5 +1,6 @@
 """Smoothing of Gaussian filters against one dense solve of the joint normal law."""
 
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,6 +58,16 @@ def test_smoothed_laws_are_those_of_the_dense_joint_law(model: StateSpaceModel, 
         mean, covariance = dense(plain, record.y[run].numpy())
         np.testing.assert_allclose(found.mean[run], mean, rtol=0, atol=1e-9)
         np.testing.assert_allclose(found.covariance[run], covariance, rtol=0, atol=1e-9)
+
+
+def test_states_with_a_lag_are_those_of_the_dense_law_of_so_many_measurements() -> None:
+    record = record_of(SINGULAR, 3, 9)
+    for lag in (0, 2, 20):
+        found = smooth(GaussianFilter(TaylorLinearisation()), SINGULAR, record, lag=lag)
+        for run, t in itertools.product(range(3), range(9)):
+            mean, covariance = dense(SINGULAR, record.y[run, : t + lag + 1].numpy())
+            np.testing.assert_allclose(found.mean[run, t], mean[t], rtol=0, atol=1e-9)
+            np.testing.assert_allclose(found.covariance[run, t], covariance[t], rtol=0, atol=1e-9)
 
 
 class Push(NamedTuple):

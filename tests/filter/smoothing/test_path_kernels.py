@@ -24,35 +24,40 @@ from pfbench.filter import (
     sample_smoothed_paths,
     smooth_iteratively,
 )
+from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.simulated import ModelSimulation
 
 CHAINS, STEPS = 4000, 7
 RECORD = record_of(SINGULAR, 1, STEPS)
 SPACE = NoiseSpace(SINGULAR, RECORD)
+FULL = LinearGaussian(
+    [[1.0, 0.7], [0.0, 0.9]], [[0.4, 0.0], [0.3, 0.5]], [[1.0, 0.0]], [0.8], [1.0, -1.0], [2.0, 1.0]
+)
 
 
-def exact_vectors(chains: int, seed: int) -> Tensor:
+def exact_vectors(chains: int, seed: int, model: LinearGaussian = SINGULAR) -> Tensor:
     """Draws of theta given y from the dense normal law of a linear model, in NumPy."""
-    f, g, h, r, m0, l0 = (getattr(SINGULAR, n).numpy() for n in ("f", "g", "h", "r", "m0", "l0"))
-    row, centre, rows, means = np.concatenate([l0, np.zeros((2, STEPS))], 1), m0, [], []
+    f, g, h, r, m0, l0 = (getattr(model, n).numpy() for n in ("f", "g", "h", "r", "m0", "l0"))
+    w = g.shape[1]
+    row, centre, rows, means = np.concatenate([l0, np.zeros((2, STEPS * w))], 1), m0, [], []
     for t in range(STEPS):
         row, centre = f @ row, f @ centre
-        row[:, 2 + t] += g[:, 0]
+        row[:, 2 + t * w : 2 + (t + 1) * w] += g
         rows.append(h @ row)
         means.append(h @ centre)
     y = RECORD.y[0].numpy().ravel()
     seen = ~np.isnan(y)
     j = (np.concatenate(rows) / r)[seen]
-    covariance = np.linalg.inv(np.eye(2 + STEPS) + j.T @ j)
+    covariance = np.linalg.inv(np.eye(len(j.T)) + j.T @ j)
     mean = covariance @ j.T @ ((y - np.concatenate(means)) / r)[seen]
-    z = np.random.default_rng(seed).normal(size=(chains, 2 + STEPS))
+    z = np.random.default_rng(seed).normal(size=(chains, len(mean)))
     return torch.from_numpy(mean + z @ np.linalg.cholesky(covariance).T).unsqueeze(0)
 
 
-def largest_deviation(states: Tensor) -> float:
-    """Return the largest |z| of means, variances and neighbours' sums of states [1, M, T, 2] against the dense solve."""
-    mean, covariance = dense(SINGULAR, RECORD.y[0].numpy())
+def largest_deviation(states: Tensor, model: LinearGaussian = SINGULAR) -> float:
+    """Return the largest |z| of means and variances of states [1, M, T, 2] against the dense solve."""
+    mean, covariance = dense(model, RECORD.y[0].numpy())
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     z = (states[0].numpy() - mean) / sd
     m = len(z)
@@ -65,10 +70,10 @@ def largest_deviation(states: Tensor) -> float:
 class Truncated(ConditionalSmcKernel):
     """Looks one step ahead in place of the whole future: another law."""
 
-    def _draw_parent(self, space, theta, t, x, log_w, draws):  # type: ignore[no-untyped-def]
+    def _draw_parent(self, space, theta, t, x, log_w, later, draws):  # type: ignore[no-untyped-def]
         short = NoiseSpace.__new__(NoiseSpace)
         vars(short).update(vars(space), steps=space.steps[: t + 1])
-        return super()._draw_parent(short, theta, t, x, log_w, draws)
+        return super()._draw_parent(short, theta, t, x, log_w, later, draws)
 
 
 class Careless(CrankNicolsonKernel):
@@ -100,6 +105,15 @@ def test_kernels_leave_the_smoothed_law_of_a_singular_model(name: str) -> None:
         theta, changed = kernel(SPACE, theta, PhiloxStream(k, torch.arange(1)))
     assert changed.double().mean() > least
     assert largest_deviation(SPACE.roll_out(theta)[0]) < 4.0
+
+
+def test_a_kernel_leaves_the_smoothed_law_of_a_model_with_as_many_noises_as_states() -> None:
+    """There the parent of a future is drawn by the transition density, and its noise changes with it."""
+    space, theta = NoiseSpace(FULL, RECORD), exact_vectors(CHAINS, 1, FULL)
+    assert largest_deviation(space.roll_out(theta)[0], FULL) < 4.0
+    new, _ = ConditionalSmcKernel(5)(space, theta, PhiloxStream(1, torch.arange(1)))
+    assert (new != theta).double().mean() > 0.5  # so many of the numbers of a path are new
+    assert largest_deviation(space.roll_out(new)[0], FULL) < 4.0
 
 
 @pytest.mark.parametrize(
