@@ -173,7 +173,7 @@ def estimate(stretch: str, best: LosNlosRangeError, draws: int, warmup: int) -> 
     ) as bar:
         return pmmh(
             ParameterisedModel(make, PRIOR), ParticleFilter(PARTICLES), record, draws, warmup, chains=CHAINS, seed=4,
-            settings=PmmhSettings(start=start, leaps=LEAPS, tick=bar.update),
+            settings=PmmhSettings(start=start, leaps=LEAPS, tick=lambda *_: bar.update()),
         )  # fmt: skip
 
 

@@ -105,7 +105,7 @@ def estimate(draws: int, warmup: int, step: float) -> ParameterPosterior:
     ) as bar:
         return pmmh(
             parameterised, GaussianFilter(TaylorLinearisation()), record, draws, warmup, chains=CHAINS, seed=2,
-            settings=PmmhSettings(leaps=LEAPS, tick=bar.update),
+            settings=PmmhSettings(leaps=LEAPS, tick=lambda *_: bar.update()),
         )  # fmt: skip
 
 

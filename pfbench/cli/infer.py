@@ -23,7 +23,8 @@ pfbench infer model=NAME method=nuts|svi|pmmh|smc2 'parameters={KEY:[LOW,HIGH]}'
 pfbench infer scenario=NAME [key=value ...]
 
 Infer numbers of a model from measurements of a scenario, by the likelihood of a filter. LOW and HIGH are the 5 % and the
-95 % quantile of a prior on the values that the model accepts. A prior can have a name instead. The result has the posterior table and all draws; a finished one is not computed again.
+95 % quantile of a prior on the values that the model accepts. A prior can have a name instead. The result has the posterior table and all draws; a finished one is not computed again,
+and an interrupted one goes on: from the chains of nuts that are finished, and from a state of pmmh that is stored each 20 s.
 
 Without a method and parameters: all noise numbers of an inertial log (IMU, bias walks, fixes), lever arm and delay, with priors
 from data sheets (method=noise). The numbers become a scenario that run, tune and estimate know by its name.
@@ -37,6 +38,7 @@ from data sheets (method=noise). The numbers become a scenario that run, tune an
   runs=1 seed=1 noise=NAME   runs that share the parameters
   filter=NAME                filter of the likelihood: ekf, and sir for pmmh
   infer.draws=500            settings of the method: pfbench list infer
+  cores=2                    processes of the chains of nuts and pmmh
   overwrite=true             infer again
   name=SCENARIO_noise        of the scenario of method=noise, a file of folder=conf
 
@@ -52,7 +54,7 @@ def infer_parameters(words: Sequence[str]) -> None:
     from pfbench.job.inputs import find_inputs
     from pfbench.ppl.inference_job import infer
 
-    options = {"name": "", "folder": "conf"}
+    options = {"name": "", "folder": "conf", "cores": "1"}
     options |= {k: v for k, _, v in (word.partition("=") for word in words) if k in options}
     method, composed = _read_words([w for w in words if w.partition("=")[0] not in options])
     config = compose(composed)
@@ -65,7 +67,11 @@ def infer_parameters(words: Sequence[str]) -> None:
     if method == NOISE:
         name = options["name"] or f"{choices['scenario']}_noise"
         scenario_file = check_scenario_name(name, options["folder"])
-    path, content = infer(method, values, choices, _build, about, truth)
+    is_count = options["cores"].isdigit() and int(options["cores"]) > 0
+    require(
+        is_count, "cores", "be a number of processes from 1 on", options["cores"], "Use cores=2."
+    )
+    path, content = infer(method, values, choices, _build, about, truth, int(options["cores"]))
     print(format_noise(content) if scenario_file else format_posterior(content))
     print(f"inference: {path.resolve()}")
     if scenario_file:

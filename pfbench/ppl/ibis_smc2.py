@@ -60,6 +60,7 @@ def smc2(
     seed: int = 0,
     moves: int = 2,
     threshold: float = 0.5,
+    tick: Callable[[int], object] | None = None,
 ) -> Smc2Result:
     """Infer the parameters of a model after each measurement.
 
@@ -79,6 +80,7 @@ def smc2(
         seed: Seed of all random numbers.
         moves: Number of Metropolis-Hastings steps after each resampling.
         threshold: Effective sample size below which particles are resampled, as a fraction of M.
+        tick: Function that is called after each measurement with its number, for a progress bar.
 
     Returns:
         Parameter particles and moments of the posterior after each step.
@@ -96,7 +98,7 @@ def smc2(
     require_range("smc2.threshold", threshold, "[0, 1]")
     with torch.no_grad():
         sampler = _ParameterSampler(unknown, method, record, particles, seed)
-        return sampler.run(moves, threshold)
+        return sampler.run(moves, threshold, tick)
 
 
 class _ParameterSampler:
@@ -112,7 +114,7 @@ class _ParameterSampler:
         self.z = unknown.unconstrained(unknown.sample(particles, seed))
         self.log_w = torch.full((particles,), -math.log(particles), dtype=torch.float64)
 
-    def run(self, moves: int, threshold: float) -> Smc2Result:
+    def run(self, moves: int, threshold: float, tick: Callable[[int], object] | None) -> Smc2Result:
         """Process the record."""
         log_evidence, rows, resamplings = torch.zeros((), dtype=torch.float64), [], 0
         filters = self._start_filters(self._models(), self._stream(""))
@@ -140,6 +142,8 @@ class _ParameterSampler:
                 filters.model = self._models()
             before = self._log_likelihood(filters.belief)
             rows.append((mean, sd, log_evidence, ess, accepted))
+            if tick:
+                tick(t + 1)
         means, sds, *columns = zip(*rows, strict=True)
         mean, sd = (
             {name: torch.stack([row[name] for row in moment]) for name in self.unknown.names}

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import shutil
+import sys
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
 
-from pfbench.core.parameter_checks import require
+from pfbench.core.parameter_checks import require, require_range
 from pfbench.core.record import Record
 from pfbench.files.atomic_write import write_atomically
 from pfbench.files.command_start import start_work
@@ -25,13 +29,14 @@ from pfbench.ppl.noise_job import infer_noise
 from pfbench.ppl.nuts_svi import normal_guide, nuts, svi
 from pfbench.ppl.parameter_posterior import ParameterPosterior
 from pfbench.ppl.parameterised_model import ParameterisedModel, Prior
-from pfbench.ppl.particle_mcmc import pmmh
+from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
 from pfbench.ppl.priors import find_range, prior_by_name, prior_by_quantiles
 from pfbench.ppl.pyro_program import program
 from pfbench.results.plotting import FigureSpec, draw_figure
 from pfbench.results.store import compute_config_key, extend_key
 
 _BY_GRADIENT = ("nuts", "svi")
+_SILENCE, _RECENT = 10.0, 200  # s between two lines of progress; steps of their acceptance rate
 _KEYS = ("model", "scenario", "noise", "filter", "infer", "seed", "runs", "first_run")
 
 
@@ -95,10 +100,12 @@ def infer(
     build: Callable[..., Any],
     about: Mapping[str, Any],
     truth: Mapping[str, float],
+    cores: int = 1,
 ) -> tuple[Path, dict[str, Any]]:
     """Infer the parameters of a configuration by a method, unless the result exists; return its file and content.
 
-    `build` makes the object of a node, with other arguments as keywords. `truth` has the true values, where they are known.
+    `build` makes the object of a node, with other arguments as keywords. `truth` has the true values, where they are known. Chains
+    are divided among `cores` processes. What they have done is stored on the way, so that the same call goes on after a kill.
     """
     settings = {key: values[key] for key in _KEYS} | {"method": name}
     ignored = ("scenario.root", "scenario.cache_dir")
@@ -115,7 +122,8 @@ def infer(
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path.with_suffix(".svg"), lambda file: file.write(picture))
     else:
-        posterior, extra = _draw(name, values, choices, build)
+        folder = path.with_suffix(".parts")
+        posterior, extra = _draw(name, values, choices, build, folder, cores)
     content = {
         "format": 1,
         "method": name,
@@ -132,18 +140,89 @@ def infer(
     text = json.dumps(content, default=str)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda file: file.write(text.encode()))
+    shutil.rmtree(path.with_suffix(".parts"), ignore_errors=True)
     return path, json.loads(text)
 
 
 def _draw(
-    name: str, values: Mapping[str, Any], choices: Mapping[str, str], build: Callable[..., Any]
+    name: str,
+    values: Mapping[str, Any],
+    choices: Mapping[str, str],
+    build: Callable[..., Any],
+    folder: Path,
+    cores: int,
 ) -> tuple[ParameterPosterior, dict[str, Any]]:
-    """Draw by a method from the posterior of the parameters that the configuration names."""
-    task = _make_task(values, build)
+    """Draw by a method from the posterior of the parameters that the configuration names, in parts that are stored in a folder."""
+    task, chains = _make_task(values, build), int(values["infer"].get("chains", 1))
+    require_range("infer.chains", chains, "whole [1, inf)")
     if name in _BY_GRADIENT:
         _check_gradient(name, task, choices["model"])
     start_work()
-    return _METHODS[name](task, values["infer"], int(values["seed"]))
+    size = 1 if name == "nuts" else -(-chains // cores)
+    parts = [(first, min(size, chains - first)) for first in range(0, chains, size)]
+    draw = partial(_draw_part, name, values, build, folder)
+    if min(cores, len(parts)) == 1:
+        found = list(map(draw, parts))
+    else:
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(min(cores, len(parts)), context) as pool:
+            found = list(pool.map(draw, parts))
+    posteriors, extras = zip(*found, strict=True)
+    posterior = ParameterPosterior.join([ParameterPosterior.from_dict(p) for p in posteriors])
+    rate = posterior.accepted
+    return posterior, extras[0] | ({} if rate is None else {"acceptance": float(rate.mean())})
+
+
+def _draw_part(
+    name: str,
+    values: Mapping[str, Any],
+    build: Callable[..., Any],
+    folder: Path,
+    part: tuple[int, int],
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Draw some chains, from the first of `part` on, unless they are stored; return the posterior as a dictionary, and other results."""
+    torch.set_num_threads(int(values["threads"]))
+    path = folder / "chains_{}_{}.json".format(*part)
+    if not path.is_file():
+        settings = {**values["infer"], "first_chain": part[0], "chains": part[1]}
+        label = f"{name}, {part[1]} chains from {part[0] + 1} on"
+        steps = Steps(label, path.with_suffix(".pt"))
+        posterior, extra = _METHODS[name](
+            _make_task(values, build), settings, int(values["seed"]), steps
+        )
+        text = json.dumps([posterior.to_dict(), extra])
+        write_atomically(path, lambda file: file.write(text.encode()))
+    found: tuple[dict[str, Any], dict[str, Any]] = tuple(json.loads(path.read_text()))
+    return found
+
+
+class Steps:
+    """Steps of a part of an inference: lines on standard error, at most one in ten seconds, and the file of their state."""
+
+    def __init__(self, label: str, file: Path) -> None:
+        self.label, self.file, self.total = label, file, 0
+        self.rates: list[float] = []
+        self.first, self.said = (-1, 0.0), time.monotonic()
+
+    def of(self, total: int) -> Steps:
+        """Note how many steps there are."""
+        self.total = total
+        return self
+
+    def __call__(self, done: int, rate: float | None = None) -> None:
+        """Note that steps are done, with an acceptance rate, and say so after a while."""
+        now = time.monotonic()
+        self.rates += [] if rate is None else [rate]
+        if self.first[0] < 0:
+            self.first = done, now
+        if now - self.said > _SILENCE:
+            self.said = now
+            minutes = (
+                (now - self.first[1]) / max(done - self.first[0], 1) * (self.total - done) / 60.0
+            )
+            recent = self.rates[-_RECENT:]
+            words = f", {sum(recent) / len(recent):.0%} accepted" if recent else ""
+            print(f"{self.label}: {done} of {self.total} steps{words}, {minutes:.1f} min left", file=sys.stderr, flush=True)  # fmt: skip
 
 
 def _make_task(values: Mapping[str, Any], build: Callable[..., Any]) -> InferenceTask:
@@ -184,41 +263,39 @@ def choose_likelihood(task: InferenceTask) -> MarginalLikelihood:
     return GaussianHmmLikelihood() if is_plain else FilterLikelihood(task.method)
 
 
-def _infer_by_nuts(
-    task: InferenceTask, settings: Mapping[str, Any], seed: int
-) -> tuple[ParameterPosterior, dict[str, Any]]:
+_Found: TypeAlias = tuple[ParameterPosterior, dict[str, Any]]
+
+
+def _infer_by_nuts(task: InferenceTask, settings: Mapping[str, Any], seed: int, steps: Steps) -> _Found:  # fmt: skip
     """Draw by the no-U-turn sampler."""
     model = program(task.unknown, choose_likelihood(task))
-    counts = {key: settings[key] for key in ("draws", "warmup", "chains")}
-    return nuts(model, task.record, seed=seed, **counts), {}
+    counts = {key: settings[key] for key in ("draws", "warmup", "chains", "first_chain")}
+    tick = steps.of(settings["draws"] + settings["warmup"])
+    return nuts(model, task.record, seed=seed, tick=tick, **counts), {}
 
 
-def _infer_by_svi(
-    task: InferenceTask, settings: Mapping[str, Any], seed: int
-) -> tuple[ParameterPosterior, dict[str, Any]]:
+def _infer_by_svi(task: InferenceTask, settings: Mapping[str, Any], seed: int, _: Steps) -> _Found:  # fmt: skip
     """Draw from a fitted guide."""
-    model = program(task.unknown, choose_likelihood(task))
+    model, guide = program(task.unknown, choose_likelihood(task)), normal_guide(task.unknown)
     options = {key: settings[key] for key in ("steps", "draws", "rate")}
-    result = svi(model, task.record, normal_guide(task.unknown), seed=seed, **options)
+    result = svi(model, task.record, guide, seed=seed, **options)
     return result.posterior, {"losses": result.losses}
 
 
-def _infer_by_pmmh(
-    task: InferenceTask, settings: Mapping[str, Any], seed: int
-) -> tuple[ParameterPosterior, dict[str, Any]]:
+def _infer_by_pmmh(task: InferenceTask, settings: Mapping[str, Any], seed: int, steps: Steps) -> _Found:  # fmt: skip
     """Draw by chains of Metropolis-Hastings."""
     counts = {key: settings[key] for key in ("draws", "warmup", "chains")}
-    posterior = pmmh(task.unknown, task.method, task.record, seed=seed, **counts)
-    assert posterior.accepted is not None
-    return posterior, {"acceptance": float(posterior.accepted.mean())}
+    tick = steps.of(settings["draws"] + settings["warmup"])
+    options = PmmhSettings(tick=tick, checkpoint=steps.file)
+    first = seed + 100_003 * settings["first_chain"]
+    return pmmh(task.unknown, task.method, task.record, seed=first, settings=options, **counts), {}
 
 
-def _infer_by_smc2(
-    task: InferenceTask, settings: Mapping[str, Any], seed: int
-) -> tuple[ParameterPosterior, dict[str, Any]]:
+def _infer_by_smc2(task: InferenceTask, settings: Mapping[str, Any], seed: int, steps: Steps) -> _Found:  # fmt: skip
     """Draw from the weighted values after the last measurement."""
     counts = {"particles": settings["values"], "moves": settings["moves"]}
-    result = smc2(task.unknown, task.method, task.record, seed=seed, **counts)
+    tick = steps.of(task.record.y.shape[1])
+    result = smc2(task.unknown, task.method, task.record, seed=seed, tick=tick, **counts)
     extra = {"log_evidence": float(result.log_evidence[-1]), "ess": float(result.ess[-1])}
     return draw_equally(result.values, result.weights, "SMC2"), extra
 

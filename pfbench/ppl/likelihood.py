@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -15,7 +16,7 @@ from pfbench.core.random_stream import PhiloxStream, relabel
 from pfbench.core.record import Record, map_inputs
 from pfbench.filter.belief import Filter
 from pfbench.filter.exactness import check_has_evidence
-from pfbench.filter.loop import run_filter
+from pfbench.filter.loop import FilterPass, prepare_record, run_filter
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.ppl.model_batch import ModelBatch
 from pfbench.ppl.parameterised_model import ParameterisedModel
@@ -120,6 +121,30 @@ def gaussian_hmm(model: StateSpaceModel, record: Record) -> GaussianHMM:
     )
 
 
+_BATCH = 200  # values of the parameters in a batch
+
+
+def evaluate_fixes(
+    unknown: ParameterisedModel, method: Filter, record: Record, values: Mapping[str, Tensor]
+) -> Tensor:
+    """Compute the log density of each measurement given those before it, for values [S] of the parameters.
+
+    Returns log densities, [S, F] for the F steps of all runs that have a measurement, run after run.
+    """
+    count, runs = len(next(iter(values.values()))), len(record.y)
+    is_fix = (~torch.isnan(record.y)).any(-1).flatten()
+    rows = []
+    for first in range(0, count, _BATCH):
+        some = {name: a[first : first + _BATCH] for name, a in values.items()}
+        model, _ = unknown.models_per_run(some, runs)
+        size = len(next(iter(some.values())))
+        prepared = prepare_record(model, repeat_runs(record, size))
+        filters = FilterPass(method, model, prepared, PhiloxStream(0, torch.arange(size * runs)))
+        totals = [filters.belief.log_evidence, *(filters.belief.log_evidence for _ in filters)]
+        rows.append(torch.stack(totals, 1).diff(dim=1).view(size, -1)[:, is_fix])
+    return torch.cat(rows)
+
+
 # --------------------------------------------------------------------------------------------------
 # Estimates of the posterior density of parameters by a filter.
 
@@ -158,7 +183,7 @@ class PosteriorEstimator:
         model, is_possible = self.unknown.models_per_run(values, self.runs_per_model)
         is_valid = is_possible & torch.isfinite(log_prior)
         runs = torch.arange(is_valid.numel() * self.runs_per_model)
-        stream = relabel(PhiloxStream(self.seed, runs), f"pmmh_{iteration}.")
+        stream: Any = relabel(PhiloxStream(self.seed, runs), f"pmmh_{iteration}.")
         log_z = run_filter(self.method, model, self.record, stream).log_evidence
         log_z = log_z.view(-1, self.runs_per_model).sum(1)
         total = torch.where(is_valid & torch.isfinite(log_z), log_prior + log_z, -torch.inf)

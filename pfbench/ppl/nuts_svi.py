@@ -48,7 +48,8 @@ def nuts(
     warmup: int,
     chains: int = 2,
     seed: int = 0,
-    progress: bool = False,
+    tick: Callable[[int, float], object] | None = None,
+    first_chain: int = 0,
 ) -> ParameterPosterior:
     """Draw from a posterior with the no-U-turn sampler, chain after chain.
 
@@ -61,10 +62,11 @@ def nuts(
         warmup: Warm-up steps of each chain.
         chains: Number of chains.
         seed: Seed of all random numbers.
-        progress: Whether to show a progress bar.
+        tick: Function that is called after each step of a chain with its number and the acceptance rate, for a progress bar.
+        first_chain: Number of the first chain. With the seed it determines the random numbers of a chain.
 
     Returns:
-        Draws and acceptance rates.
+        Draws and acceptance rates, and which draws end a divergent path.
 
     Raises:
         ValueError: If a count is too small, or an argument is of another class.
@@ -73,21 +75,30 @@ def nuts(
     counts = {"draws": (draws, 1), "warmup": (warmup, 0), "chains": (chains, 1), "seed": (seed, 0)}
     check_counts("nuts", counts)
     samples: list[dict[str, Tensor]] = []
-    accepted = []
-    for chain in range(chains):
+    accepted, diverging = [], torch.zeros(chains, draws)
+
+    def count(kernel: Any, _: Any, stage: str, i: int) -> None:
+        if tick:
+            done = i + 1 + (0 if stage.lower().startswith("warmup") else warmup)
+            tick(done, float(kernel._mean_accept_prob))
+
+    for row, chain in enumerate(range(first_chain, first_chain + chains)):
         with torch.random.fork_rng():
             torch.manual_seed(1000 * seed + chain)
             sampler = MCMC(
                 NUTS(program),
                 num_samples=draws,
                 warmup_steps=warmup,
-                disable_progbar=not progress,
+                disable_progbar=True,
+                hook_fn=count,
             )
             sampler.run(record)
         samples.append({name: a for name, a in sampler.get_samples().items() if a.dim() == 1})
-        accepted.append(sampler.diagnostics()["acceptance rate"]["chain 0"])
+        found = sampler.diagnostics()
+        accepted.append(found["acceptance rate"]["chain 0"])
+        diverging[row, found["divergences"]["chain 0"]] = 1.0
     stacked = {name: torch.stack([a[name] for a in samples]) for name in samples[0]}
-    return ParameterPosterior(stacked, torch.tensor(accepted), "NUTS")
+    return ParameterPosterior(stacked, torch.tensor(accepted), "NUTS", {"diverging": diverging})
 
 
 def svi(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import matplotlib
@@ -17,6 +17,8 @@ from torch import Tensor
 
 from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record
+from pfbench.filter.belief import Filter
+from pfbench.ppl.likelihood import evaluate_fixes
 from pfbench.ppl.parameterised_model import ParameterisedModel, check_counts, check_kinds
 from pfbench.ppl.pyro_program import simulate
 from pfbench.results.plotting import COLUMN, RC, add_legend, line_styles
@@ -32,26 +34,44 @@ class ParameterPosterior:
         draws: Draws by parameter, [chains, S], or [chains, S, R] if runs have their own parameters.
         accepted: Acceptance rate, [chains] or [chains, R]; None without proposals.
         method: Algorithm, for captions.
+        stats: Numbers of each draw, such as its log density `lp` or `diverging`, shaped as the draws.
     """
 
     draws: Mapping[str, Tensor]
     accepted: Tensor | None = None
     method: str = ""
+    stats: Mapping[str, Tensor] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dictionary that JSON can store and `from_dict` reads."""
         accepted = None if self.accepted is None else self.accepted.tolist()
-        draws = {name: a.tolist() for name, a in self.draws.items()}
-        return {"draws": draws, "accepted": accepted, "how": self.method}
+        draws, stats = (
+            {k: a.tolist() for k, a in group.items()} for group in (self.draws, self.stats)
+        )
+        return {"draws": draws, "accepted": accepted, "how": self.method, "stats": stats}
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> ParameterPosterior:
         """Build a posterior from the dictionary of `to_dict`."""
-        draws = {name: torch.tensor(a, dtype=torch.float64) for name, a in content["draws"].items()}
+        groups = (content["draws"], content.get("stats", {}))
+        draws, stats = ({k: torch.tensor(a).double() for k, a in group.items()} for group in groups)
         accepted = content["accepted"]
         if accepted is not None:
             accepted = torch.tensor(accepted, dtype=torch.float64)
-        return ParameterPosterior(draws, accepted, content["how"])
+        return ParameterPosterior(draws, accepted, content["how"], stats)
+
+    @staticmethod
+    def join(parts: Sequence[ParameterPosterior]) -> ParameterPosterior:
+        """Join the chains of several posteriors of one method."""
+        first = parts[0]
+        if len(parts) == 1:
+            return first
+        draws, stats = (
+            {k: torch.cat([group[k] for group in groups]) for k in groups[0]}
+            for groups in ([part.draws for part in parts], [part.stats for part in parts])
+        )
+        rates = [part.accepted for part in parts if part.accepted is not None]
+        return ParameterPosterior(draws, torch.cat(rates), first.method, stats)
 
     def run(self, r: int) -> ParameterPosterior:
         """Return the posterior of run r, if runs have their own parameters."""
@@ -101,11 +121,26 @@ class ParameterPosterior:
             }
         return pd.DataFrame.from_dict(rows, orient="index")
 
-    def to_arviz(self) -> Any:
+    def to_arviz(
+        self,
+        unknown: ParameterisedModel | None = None,
+        method: Filter | None = None,
+        record: Record | None = None,
+    ) -> Any:
         """Return the draws as ArviZ reads them, with the axes chain, draw and, if runs have their own parameters, run.
 
+        With all arguments there are also the measurements, as many draws of the prior as the posterior has, and the log density
+        of each fix given those before it. This is what `loo` compares models by, which leaves out one of these terms at a
+        time, not a fix of the record with what later ones say of it.
+
+        Args:
+            unknown: Model and prior of the draws.
+            method: Filter of the likelihood.
+            record: Measurements that were used.
+
         Returns:
-            Inference data of ArviZ with the group `posterior`.
+            Inference data of ArviZ with the groups `posterior` and `sample_stats`, and with all arguments `log_likelihood`,
+            `prior` and `observed_data`.
 
         Raises:
             ModuleNotFoundError: If ArviZ is not installed.
@@ -116,11 +151,22 @@ class ParameterPosterior:
             raise ModuleNotFoundError(
                 "to_arviz must have arviz-base, got no such package. Install it: pip install pfbench[arviz]"
             ) from error
-        draws = {name: a.double().numpy() for name, a in self.draws.items()}
-        dims = {name: ["run"] for name, a in draws.items() if a.ndim == 3}
-        return from_dict(
-            {"posterior": draws}, dims=dims, attrs={"posterior": {"method": self.method}}
-        )
+        groups = {"posterior": self.draws}
+        stats, first = dict(self.stats), next(iter(self.draws.values()))
+        if self.accepted is not None:
+            rate = self.accepted.unsqueeze(1)
+            stats["acceptance_rate"] = rate.expand(first.shape)
+        groups |= {"sample_stats": stats} if stats else {}
+        if unknown is not None and method is not None and record is not None:
+            values = {name: a.flatten(0, 1) for name, a in self.draws.items()}
+            terms = evaluate_fixes(unknown, method, record, values)
+            prior = unknown.sample(first[..., 0].numel() if first.dim() == 3 else first.numel(), 0)
+            groups["log_likelihood"] = {"y": terms.unflatten(0, first.shape[:2])}
+            groups["prior"] = {name: a.view(first.shape[:2]) for name, a in prior.items()}
+            groups["observed_data"] = {"y": record.y}
+        arrays = {k: {name: a.double().numpy() for name, a in g.items()} for k, g in groups.items()}
+        dims = {name: ["run"] for name, a in arrays["posterior"].items() if a.ndim == 3}
+        return from_dict(arrays, dims=dims, attrs={"posterior": {"method": self.method}})
 
     @property
     def has_converged(self) -> bool:

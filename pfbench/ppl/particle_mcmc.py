@@ -5,9 +5,12 @@ All chains move at once, as runs of one batch. `ModelBatch` maps the model of ea
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
 
 import torch
 from torch import Tensor
@@ -15,6 +18,7 @@ from torch import Tensor
 from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import PhiloxStream, RandomStream, relabel
 from pfbench.core.record import Record
+from pfbench.files.atomic_write import write_atomically
 from pfbench.filter.belief import Filter
 from pfbench.filter.smoothing.noise_space import ConditionalSmcKernel, NoiseSpace, PathKernel
 from pfbench.ppl.likelihood import PosteriorEstimator, repeat_runs
@@ -26,6 +30,7 @@ from pfbench.ppl.parameterised_model import (
     check_kinds,
 )
 
+_STORE_EVERY = 20.0  # s between two stored states of the chains
 _Proposal: TypeAlias = Callable[[Tensor, RandomStream], tuple[Tensor, Tensor]]
 
 
@@ -42,7 +47,8 @@ class PmmhSettings:
             detects chains that disagree. None is the prior.
         leaps: Leaps after each step of the walk. They improve mixing if the posterior is nearly
             normal.
-        tick: Function that is called after each iteration, for a progress bar.
+        tick: Function that is called after each iteration with its number and the acceptance rate, for a progress bar.
+        checkpoint: File in which the chains are stored each 20 s. The same call goes on from it, with the same result.
 
     Raises:
         ValueError: If a value is out of range.
@@ -52,7 +58,8 @@ class PmmhSettings:
     thin: int = 1
     start: Mapping[str, Prior] | None = None
     leaps: int = 0
-    tick: Callable[[], object] | None = None
+    tick: Callable[[int, float], object] | None = None
+    checkpoint: Path | None = None
 
     def __post_init__(self) -> None:
         check_counts("pmmh", {"thin": (self.thin, 1), "leaps": (self.leaps, 0)})
@@ -126,10 +133,12 @@ def _run_chains(
     settings: PmmhSettings,
 ) -> ParameterPosterior:
     """Run all chains of a posterior."""
-    z, log_p = target.draw_start(start)
-    walk = ParameterWalk.start(start, z, target.seed)
-    samples, accepted_count = [], torch.zeros_like(log_p)
-    for i in range(1, warmup + draws * settings.thin + 1):
+    call = repr(
+        (target.shape, target.seed, draws, warmup, settings.thin, settings.leaps, start.names)
+    )
+    z, log_p, moments, samples, accepted_count, done = _find_chains(target, start, settings, call)
+    walk, stored = ParameterWalk(*moments), time.monotonic()
+    for i in range(done + 1, warmup + draws * settings.thin + 1):
         is_step = i % (settings.leaps + 1) == 0
         proposal = walk.step if is_step else walk.leap
         z, log_p, probability, is_accepted = _metropolis_step(target, proposal, z, log_p, i)
@@ -138,14 +147,34 @@ def _run_chains(
         else:
             accepted_count += is_accepted
             if (i - warmup) % settings.thin == 0:
-                samples.append(z)
+                samples.append((z, log_p))
         if settings.tick:
-            settings.tick()
-    values, _ = target.unknown.constrained(torch.stack(samples, 1))  # {name: [C, S, Q]}
-    acceptance = accepted_count / (draws * settings.thin)
+            settings.tick(i, float(probability.mean()))
+        if settings.checkpoint and time.monotonic() - stored > _STORE_EVERY:
+            state = (z, log_p, tuple(walk), samples, accepted_count, i)
+            write_atomically(settings.checkpoint, partial(torch.save, (call, state)))
+            stored = time.monotonic()
+    paths, densities = (torch.stack(parts, 1) for parts in zip(*samples, strict=True))
+    values, _ = target.unknown.constrained(paths)  # {name: [C, S, Q]}
+    rate = accepted_count / (draws * settings.thin)
+    stats = {"lp": densities}
     if not settings.separate_parameters:
-        values, acceptance = {name: a[..., 0] for name, a in values.items()}, acceptance[:, 0]
-    return ParameterPosterior(values, acceptance, "PMMH")
+        values, rate = {name: a[..., 0] for name, a in values.items()}, rate[:, 0]
+        stats = {"lp": densities[..., 0]}
+    return ParameterPosterior(values, rate, "PMMH", stats)
+
+
+def _find_chains(
+    target: PosteriorEstimator, start: ParameterisedModel, settings: PmmhSettings, call: str
+) -> tuple[Any, ...]:
+    """Return states, log densities, moments of the walk, samples, counts and the number of iterations done: stored ones, or new ones."""
+    if settings.checkpoint and settings.checkpoint.is_file():
+        stored_call, state = torch.load(settings.checkpoint, weights_only=True)
+        remedy = "Remove the file, or repeat that call."
+        require(stored_call == call, "pmmh.checkpoint", f"be of the same call, {call}", stored_call, remedy)  # fmt: skip
+        return tuple(state)
+    z, log_p = target.draw_start(start)
+    return z, log_p, ParameterWalk.start(start, z, target.seed), [], torch.zeros_like(log_p), 0
 
 
 def _metropolis_step(

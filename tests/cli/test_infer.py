@@ -19,7 +19,9 @@ from scipy.stats import beta, halfcauchy
 
 from pfbench.job import compose, instantiate
 from pfbench.model.textbook import StochasticVolatility
+from pfbench.ppl import inference_job
 from pfbench.ppl.inference_job import make_priors
+from pfbench.ppl.nuts_svi import nuts
 from pfbench.ppl.parameterised_model import ParameterisedModel
 from pfbench.ppl.priors import find_range
 
@@ -29,7 +31,7 @@ SETTINGS = {
     "svi": ("infer.steps=200", "infer.draws=500"),
     "smc2": ("infer.values=150",),
     "pmmh": ("infer.draws=60", "infer.warmup=60", "infer.chains=6", "particles=60"),
-    "nuts": ("infer.draws=80", "infer.warmup=40", "infer.chains=1"),
+    "nuts": ("infer.draws=40", "infer.warmup=40", "infer.chains=2", "cores=2"),
 }
 
 
@@ -96,9 +98,38 @@ def test_a_finished_inference_is_not_computed_again_and_another_prior_is_another
     assert len(list(folder.glob("*.json"))) == 2
 
 
+def test_finished_chains_of_an_interrupted_inference_are_not_drawn_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second of three chains is interrupted once; what it says of its progress is on standard error."""
+    drawn: list[int] = []
+    monkeypatch.setattr(inference_job, "_SILENCE", -1.0)
+
+    def draw(*args: Any, first_chain: int, **settings: Any) -> Any:
+        drawn.append(first_chain)
+        if drawn == [0, 1]:
+            raise OSError("killed")
+        return nuts(*args, first_chain=first_chain, **settings)
+
+    monkeypatch.setattr(inference_job, "nuts", draw)
+    words = ("infer", *WORLD, "method=nuts", "infer.draws=4", "infer.warmup=2", "infer.chains=3")
+    assert command(*words, home=tmp_path).code != 0
+    said = command(*words, home=tmp_path)
+    assert said.code == 0, said.err
+    assert drawn == [0, 1, 1, 2]
+    assert re.search(
+        r"nuts, 1 chains from 3 on: 6 of 6 steps, \d+% accepted, 0.0 min left", said.err
+    )
+    (path,) = (tmp_path / "results" / "s" / "inference").iterdir()
+    draws = np.array(json.loads(path.read_text())["posterior"]["draws"]["level_sd"])
+    assert draws.shape == (3, 4)
+    assert len(np.unique(draws[:, -1])) == 3
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
+        (("model=local_level", "method=nuts", PARAMETERS, "cores=0"), "cores must be a number of processes from 1 on, got 0"),
         (("method=nuts", PARAMETERS), "model must be set. Use: pfbench infer model=NAME"),
         (("model=local_level", PARAMETERS), "method must be set"),
         (("model=local_level", "method=nut", PARAMETERS), "method must be one of noise, nuts, pmmh, smc2, svi, got nut. Similar: nuts."),

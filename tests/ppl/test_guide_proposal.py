@@ -10,20 +10,24 @@ import numpy as np
 import pyro
 import pytest
 import torch
-from pyro.distributions import Gamma, Laplace, MultivariateNormal, Normal
+from pyro.distributions import Gamma, Laplace, LogNormal, MultivariateNormal, Normal
 from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
+from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.linear_gaussian import local_level
 from pfbench.ppl.guide_proposal import GuideProposal
-from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood
+from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood, repeat_runs
 from pfbench.ppl.parameter_posterior import ParameterPosterior
+from pfbench.ppl.parameterised_model import ParameterisedModel
+from pfbench.ppl.particle_mcmc import pmmh
 
 Q, S = 0.6, 1.0  # standard deviations of a step and of a measurement
-MODEL = local_level(Q, S, 0.0, 2.0)
+MODEL, EKF = local_level(Q, S, 0.0, 2.0), GaussianFilter(TaylorLinearisation())
 
 
 def optimal(model: Any, x: Tensor, record: Record) -> None:
@@ -105,3 +109,26 @@ def test_draws_pass_to_arviz_with_chains_draws_and_runs() -> None:
     assert posterior["a"].dims == ("chain", "draw")
     assert posterior["b"].dims == ("chain", "draw", "run")
     np.testing.assert_array_equal(posterior["b"].values, own.double().numpy())
+
+
+def test_arviz_gets_the_log_density_of_each_fix_and_finds_the_one_that_is_off() -> None:
+    """Two runs with a gap: the terms of a draw sum to its likelihood, and only the outlier has a large Pareto k."""
+    pytest.importorskip("arviz_base")
+    record = Record(torch.linspace(-1.0, 1.0, 24, dtype=torch.float64).view(2, 12, 1).sin())
+    record.y[0, 3], record.y[1, 5] = torch.nan, 9.0
+    unknown = ParameterisedModel(
+        lambda sd: local_level(0.5, sd, 0.0, 1.0), {"sd": LogNormal(0.0, 0.7)}
+    )
+    posterior = pmmh(unknown, EKF, record, 60, 20, chains=4, seed=1)
+    data = posterior.to_arviz(unknown, EKF, record)
+    terms = data.log_likelihood["y"]
+    assert terms.shape == (4, 60, 23)
+    model, _ = unknown.models_per_run({"sd": posterior.draws["sd"][:, -1]}, 2)
+    exact = FilterLikelihood(EKF)(model, repeat_runs(record, 4)).view(4, 2).sum(1)
+    np.testing.assert_allclose(terms.sum(terms.dims[-1])[:, -1], exact)
+    assert {"lp", "acceptance_rate"} == set(data.sample_stats.data_vars)
+    assert data.prior["sd"].shape == (4, 60)
+    stats = pytest.importorskip("arviz_stats.loo")
+    with pytest.warns(UserWarning, match="Pareto"):
+        k = stats.loo(data, pointwise=True).pareto_k.values.ravel()
+    assert k.argmax() == 11 + 5

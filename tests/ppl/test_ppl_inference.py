@@ -4,6 +4,7 @@ import csv
 import math
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from pfbench.job import compose
 from pfbench.model.base import ModelWrapper, StateSpaceModel
 from pfbench.model.linear_gaussian import local_level
 from pfbench.model.textbook import StochasticVolatility
+from pfbench.ppl import particle_mcmc
 from pfbench.ppl.ibis_smc2 import Smc2Result, smc2
 from pfbench.ppl.inference_job import draw_equally, list_numbers
 from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood, repeat_runs
@@ -145,6 +147,33 @@ def test_particle_marginal_chains_find_the_grid_s_posterior() -> None:
     assert posterior.accepted is not None
     assert 0.1 < float(posterior.accepted.mean()) < 0.6
     agrees(posterior.table(), YEARS)
+
+
+def test_interrupted_chains_go_on_to_the_same_draws(tmp_path: Path, monkeypatch: Any) -> None:
+    """Stopped in the warm-up and among the draws; another call does not take the file."""
+    monkeypatch.setattr(particle_mcmc, "_STORE_EVERY", 0.0)
+
+    def run(stop: int | None, file: Path | None = None, draws: int = 8) -> ParameterPosterior:
+        def tick(i: int, rate: float) -> None:
+            assert 0.0 <= rate <= 1.0
+            if i == stop:
+                raise KeyboardInterrupt
+
+        settings = PmmhSettings(leaps=1, thin=2, tick=tick, checkpoint=file)
+        return pmmh(NILE, EKF, nile(3), draws, 6, chains=3, seed=1, settings=settings)
+
+    for stop in (4, 13):
+        with pytest.raises(KeyboardInterrupt):
+            run(stop, tmp_path / "chains.pt")
+    with pytest.raises(ValueError, match="checkpoint must be of the same call"):
+        run(None, tmp_path / "chains.pt", draws=9)
+    whole, again = run(None), run(None, tmp_path / "chains.pt")
+    for one, other in (
+        (whole.draws, again.draws),
+        (whole.stats, again.stats),
+        ({"": whole.accepted}, {"": again.accepted}),
+    ):
+        torch.testing.assert_close(dict(one), dict(other), rtol=0, atol=0)
 
 
 @pytest.mark.slow
