@@ -22,6 +22,7 @@ from pfbench.files.atomic_write import write_atomically
 from pfbench.files.command_start import start_work
 from pfbench.filter.belief import Filter
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.filter.guided.twisted import TwistedParticleFilter
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.ppl.ibis_smc2 import smc2
 from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood, MarginalLikelihood
@@ -233,7 +234,13 @@ def _make_task(values: Mapping[str, Any], build: Callable[..., Any]) -> Inferenc
     numbers = torch.arange(values["first_run"], values["first_run"] + values["runs"])
     episode = build(values["scenario"]).draw(build(values["noise"]), numbers, int(values["seed"]))
     record = episode.record._replace(y=episode.record.y.double())
-    return InferenceTask(unknown, build(values["filter"]), record)
+    passes = values["infer"].get("look_ahead")
+    require_range(
+        "infer.look_ahead", passes, "null or whole [0, inf) Use 10, or 1 for a nearly linear model."
+    )
+    if passes is None:
+        return InferenceTask(unknown, build(values["filter"]), record)
+    return InferenceTask(unknown, TwistedParticleFilter(values["particles"], passes=passes), record)
 
 
 def _check_gradient(name: str, task: InferenceTask, model: str) -> None:

@@ -93,7 +93,8 @@ def nuts(
                 hook_fn=count,
             )
             sampler.run(record)
-        samples.append({name: a for name, a in sampler.get_samples().items() if a.dim() == 1})
+        found_draws = sampler.get_samples().items()
+        samples.append({name: a for name, a in found_draws if a.dim() <= 2})
         found = sampler.diagnostics()
         accepted.append(found["acceptance rate"]["chain 0"])
         diverging[row, found["divergences"]["chain 0"]] = 1.0

@@ -96,13 +96,14 @@ class ParameterisedModel:
             runs_per_model: Number of consecutive runs that share a model.
 
         Returns:
-            Model of G `runs_per_model` runs, and a mask of the values that are possible, [G].
+            Model of G `runs_per_model` runs, the model itself of one value, and a mask of the values that are possible, [G].
             The runs of the others have any model.
         """
         models = [self.find_model(row) for row in self._rows(values)]
         spare = next((model for model in models if model is not None), None) or self.some_model()
         is_possible = torch.tensor([model is not None for model in models])
-        return ModelBatch([model or spare for model in models], runs_per_model), is_possible
+        chosen = [model or spare for model in models]
+        return chosen[0] if len(chosen) == 1 else ModelBatch(chosen, runs_per_model), is_possible
 
     def draw(self, count: int, seed: int, attempt: int = 0) -> Values:
         """Draw parameters from the prior by counters, whether the model accepts them or not.

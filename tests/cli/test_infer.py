@@ -30,7 +30,13 @@ WORLD = ("model=local_level", PARAMETERS, "scenario.steps=25", "study=s")
 SETTINGS = {
     "svi": ("infer.steps=200", "infer.draws=500"),
     "smc2": ("infer.values=150",),
-    "pmmh": ("infer.draws=60", "infer.warmup=60", "infer.chains=6", "particles=60"),
+    "pmmh": (
+        "infer.draws=60",
+        "infer.warmup=60",
+        "infer.chains=6",
+        "particles=5",
+        "infer.look_ahead=1",
+    ),
     "nuts": ("infer.draws=40", "infer.warmup=40", "infer.chains=2", "cores=2"),
 }
 

@@ -417,6 +417,14 @@ def test_the_density_on_the_whole_line_integrates_to_one() -> None:
     torch.testing.assert_close(back, z[:: 801 * 50 + 50])
 
 
+def test_a_chain_alone_is_what_it_is_among_others() -> None:
+    """Its batch of one model also passes the health check, which takes the steps of a run as runs."""
+    record = Record(torch.linspace(0.0, 1.0, 40, dtype=torch.float64).view(1, 40, 1))
+    alone, among = (pmmh(LEVELS, EKF, record, 3, 0, chains=chains) for chains in (1, 3))
+    for name, draws in alone.draws.items():
+        torch.testing.assert_close(draws, among.draws[name][:1])
+
+
 def test_leaps_are_of_a_t_law_and_know_its_density() -> None:
     """Squared lengths under a law of t with 5 degrees of freedom are 3 F(3, 5) in three dimensions; SciPy has its density."""
     root = torch.tensor([[1.0, 0.0, 0.0], [0.4, 0.7, 0.0], [-0.3, 0.2, 2.0]], dtype=torch.float64)

@@ -142,13 +142,12 @@ def _curvature(model: StateSpaceModel, record: Record, x: Tensor) -> tuple[Tenso
         c = torch.zeros(len(x), 1, model.chart.dimension).to(x).requires_grad_()
         value = model.log_likelihood(record.y, model.chart.add(x, c), record.u).sum()
         (score,) = torch.autograd.grad(value, c, create_graph=True)
-        rows = [
-            torch.autograd.grad(slope, c, retain_graph=True)[0]
-            for slope in score.sum((0, 1))
-            if slope.requires_grad
-        ]
+        hessian = torch.zeros_like(score).mT @ torch.zeros_like(score)
+        if score.requires_grad:
+            total, eye = score.sum((0, 1)), torch.eye(score.shape[-1]).to(score)
+            (rows,) = torch.autograd.grad(total, c, eye, is_grads_batched=True)
+            hessian = rows.squeeze(2).transpose(0, 1)
     score = score.detach().squeeze(1)
-    hessian = torch.cat(rows, 1) if rows else torch.zeros_like(score).diag_embed()
     values, vectors = torch.linalg.eigh(-hessian)
     return score, vectors @ (values.clamp(min=0.0).unsqueeze(-1) * vectors.mT)
 

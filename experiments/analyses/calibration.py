@@ -1,0 +1,197 @@
+"""Simulation-based calibration of each method of inference: the table of docs/parameter_inference.md.
+
+    python experiments/analyses/calibration.py [data sets]
+
+Parameters come from their prior, measurements from the model with them. The rank of a parameter among 19 draws of a method must be
+uniform. A method whose runs share their parameters gets 40 of 100 data
+sets. Finished cases are kept in results/calibration.json.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from pfbench.experiments.study_parts import ResumableResults
+from pyro.distributions import LogNormal, Normal, Uniform
+from scipy.stats import chisquare
+
+from pfbench.core import Record
+from pfbench.files import markdown_head, markdown_row
+from pfbench.filter import (
+    ConditionalSmcKernel,
+    GaussianFilter,
+    ParticleFilter,
+    TaylorLinearisation,
+    TwistedParticleFilter,
+)
+from pfbench.model import StochasticVolatility, StrapdownTotal, StrapdownTuning, local_level
+from pfbench.nav.strapdown import PreintegratedImu, preintegrate
+from pfbench.ppl import (
+    FilterLikelihood,
+    GaussianHmmLikelihood,
+    ParameterisedModel,
+    ParameterPosterior,
+    PmmhSettings,
+    normal_guide,
+    nuts,
+    particle_gibbs,
+    pmmh,
+    program,
+    simulation_based_calibration,
+    smc2,
+    svi,
+)
+from pfbench.results import holm
+
+BINS, DRAWS, LEVEL = 5, 19, 0.05
+EKF = GaussianFilter(TaylorLinearisation())
+SEPARATE = PmmhSettings(separate_parameters=True)
+Infer = Callable[[Record], ParameterPosterior]
+
+
+def level(level_sd: Any, measurement_sd: Any) -> Any:
+    return local_level(level_sd, measurement_sd, 0.0, 2.0)
+
+
+def strapdown(gyro_density: Any, position_sd: Any) -> Any:
+    one = torch.ones(3, dtype=torch.float64)
+    return StrapdownTotal(
+        StrapdownTuning(
+            gyro_density=gyro_density, accelerometer_density=0.02, gyro_bias_walk=1e-6, accelerometer_bias_walk=1e-5,
+            position_sd=position_sd * one, velocity_sd=None, attitude_sd_deg=[1.0, 1.0, 5.0], initial_velocity_sd=[0.1] * 3,
+            initial_position_sd=[1.0] * 3, gyro_bias_sd_deg_s=0.1, accelerometer_bias_sd=0.05, gyro_bias_deg_s=[0.0] * 3,
+            accelerometer_bias=[0.0] * 3,
+        )
+    )  # fmt: skip
+
+
+LEVELS = ParameterisedModel(
+    level, {"level_sd": LogNormal(0.0, 0.7), "measurement_sd": LogNormal(0.0, 0.7)}
+)
+VOLATILITY = ParameterisedModel(
+    StochasticVolatility,
+    {"mu": Normal(-1.0, 1.0), "rho": Uniform(0.5, 0.99), "sigma": LogNormal(-0.7, 0.5)},
+)
+INS = ParameterisedModel(
+    strapdown, {"gyro_density": LogNormal(-4.6, 0.7), "position_sd": LogNormal(-1.2, 0.5)}
+)
+
+
+def turn(runs: int, seconds: int) -> Record:
+    """A vehicle on a circle of 17 m at 5 m/s, with a fix each second."""
+    rate, force = torch.zeros(2, seconds, 10, 3, dtype=torch.float64)
+    rate[..., 2], force[..., 0], force[..., 2] = 0.3, -1.5, 9.8
+    force[0, :, 1] = 5.0  # starts to move in the first second
+    spans, bias = torch.full((seconds, 10), 0.1).double(), torch.zeros(seconds, 6).double()
+    parts = preintegrate(force, rate, spans, bias)
+    imu = (*parts, bias, torch.full((seconds,), 9.8).double(), spans.sum(-1))
+    y = torch.zeros(runs, seconds, 3, dtype=torch.float64)
+    return Record(y, PreintegratedImu(*(a.unsqueeze(0) for a in imu)))
+
+
+def by_pmmh(unknown: ParameterisedModel, method: Any, draws: int, warmup: int) -> Infer:
+    return lambda record: pmmh(unknown, method, record, draws, warmup, 1, 3, SEPARATE)
+
+
+def by_svi(unknown: ParameterisedModel, likelihood: Any, steps: int) -> Infer:
+    model, guide = program(unknown, likelihood, True), normal_guide(unknown, True)
+    return lambda record: svi(model, record, guide, steps, 100, rate=0.1, seed=3).posterior
+
+
+def by_nuts(unknown: ParameterisedModel, likelihood: Any, draws: int, warmup: int) -> Infer:
+    """All data sets in one chain, since their parameters are independent."""
+    return lambda record: nuts(program(unknown, likelihood, True), record, draws, warmup, 1, 3)
+
+
+def one_by_one(infer: Callable[[Record, int], dict[str, Any]]) -> Infer:
+    """Infer each data set alone, by a method whose runs share their parameters; draws [S] by name."""
+
+    def run(record: Record) -> ParameterPosterior:
+        found = [infer(record.select_runs(slice(r, r + 1)), r) for r in range(len(record.y))]
+        return ParameterPosterior({k: torch.stack([f[k] for f in found], -1)[None] for k in found[0]})  # fmt: skip
+
+    return run
+
+
+def by_smc2(unknown: ParameterisedModel, method: Any, values: int) -> Infer:
+    def infer(record: Record, seed: int) -> dict[str, Any]:
+        result = smc2(unknown, method, record, values, seed)
+        chosen = torch.multinomial(result.weights, 100, True, generator=torch.Generator().manual_seed(seed))  # fmt: skip
+        return {name: a[chosen] for name, a in result.values.items()}
+
+    return one_by_one(infer)
+
+
+def by_gibbs(unknown: ParameterisedModel, chains: int, draws: int, warmup: int) -> Infer:
+    def infer(record: Record, seed: int) -> dict[str, Any]:
+        kernel = ConditionalSmcKernel(8)
+        found = particle_gibbs(unknown, record, draws, warmup, chains, seed, kernel).posterior
+        return {name: found.pooled_draws(name) for name in unknown.prior}
+
+    return one_by_one(infer)
+
+
+def list_cases(runs: int) -> dict[str, tuple[ParameterisedModel, Record, Infer]]:
+    """Cases by name `model, method`."""
+    short = Record(torch.zeros(runs, 8, 1, dtype=torch.float64))
+    returns, log = Record(torch.zeros(runs, 20, 1, dtype=torch.float64)), turn(runs, 15)
+    some, few = (
+        r._replace(y=r.y[: runs * 2 // 5]) for r in (short, returns)
+    )  # for methods without a batch of data sets
+    hmm, ahead = GaussianHmmLikelihood(), TwistedParticleFilter(20, passes=3)
+    return {
+        "local level, PMMH": (LEVELS, short, by_pmmh(LEVELS, ParticleFilter(60), 150, 80)),
+        "local level, SVI": (LEVELS, short, by_svi(LEVELS, hmm, 200)),
+        "local level, NUTS": (LEVELS, short, by_nuts(LEVELS, hmm, 100, 60)),
+        "local level, SMC2": (LEVELS, some, by_smc2(LEVELS, EKF, 100)),
+        "local level, particle Gibbs": (LEVELS, some, by_gibbs(LEVELS, 16, 15, 15)),
+        "volatility, PMMH": (VOLATILITY, returns, by_pmmh(VOLATILITY, ParticleFilter(100), 150, 80)),
+        "volatility, PMMH that looks ahead": (VOLATILITY, returns, by_pmmh(VOLATILITY, ahead, 100, 60)),
+        "volatility, SMC2": (VOLATILITY, few, by_smc2(VOLATILITY, ParticleFilter(50), 100)),
+        "INS, PMMH by EKF": (INS, log, by_pmmh(INS, EKF, 120, 60)),
+        "INS, SVI by EKF": (INS, log, by_svi(INS, FilterLikelihood(EKF), 80)),
+    }  # fmt: skip
+
+
+def compute_case(case: tuple[ParameterisedModel, Record, Infer]) -> dict[str, Any]:
+    """Counts of ranks by parameter, and the time."""
+    start = time.process_time()
+    ranks = simulation_based_calibration(*case, draws=DRAWS, seed=7)
+    counts = {name: ranks.counts(name, BINS).tolist() for name in case[0].names}
+    return {"counts": counts, "seconds": time.process_time() - start}
+
+
+def write_table(done: dict[str, Any]) -> str:
+    """Return the table and what it says."""
+    lines = markdown_head("model", "method", "parameter", "data sets in each fifth of the ranks", "p", "CPU [s]")  # fmt: skip
+    p_values = {}
+    for case, result in done.items():
+        model, method = case.split(", ")
+        for name, counts in result["counts"].items():
+            p_values[f"{name} by {method}"] = p = float(chisquare(counts).pvalue)
+            counted, seconds = " ".join(map(str, counts)), f"{result['seconds']:.0f}"
+            lines.append(markdown_row(model, method, f"`{name}`", counted, f"{p:.2g}", seconds))
+    corrected = dict(zip(p_values, holm(list(p_values.values())), strict=True))
+    off = [name for name, p in corrected.items() if p < LEVEL]
+    words = f"{len(p_values)} tests, Holm's correction at {LEVEL:.0%}. Not uniform: {', '.join(off) or 'none'}."
+    return "\n".join([*lines, "", words])
+
+
+def main(runs: int) -> None:
+    torch.set_num_threads(1)
+    folder = Path(os.environ.get("PFBENCH_RESULTS", "results"))
+    results = ResumableResults(folder / "calibration.json", {"runs": runs})
+    for name, case in list_cases(runs).items():
+        results(name, lambda case=case: compute_case(case))
+        print(name, flush=True)
+    print(write_table(results.state["done"]))
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 100)
