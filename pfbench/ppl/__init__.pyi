@@ -34,3 +34,4 @@ from pfbench.ppl.pyro_program import (
     program as program,
     simulate as simulate,
 )
+from pfbench.ppl.step_program import PyroModel as PyroModel

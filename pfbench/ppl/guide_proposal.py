@@ -9,7 +9,6 @@ from typing import Any, TypeAlias
 import torch
 from pyro.poutine.messenger import Messenger
 from torch import Tensor
-from torch.distributions import Independent, MultivariateNormal, Normal
 from typing_extensions import override
 
 from pfbench.core.random_stream import RandomStream
@@ -17,6 +16,7 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.particle.stages import Proposal, ProposalSample
 from pfbench.model.base import StateSpaceModel
+from pfbench.ppl.step_program import value_at
 
 Guide: TypeAlias = Callable[[StateSpaceModel, Tensor, Record], Any]
 SITE = "noise"
@@ -88,24 +88,7 @@ class _CountedSite(Messenger):
                 f"{list(distribution.event_shape)}. Use .to_event(1)."
             )
         expanded = distribution.expand(self.batch)
-        value = self._draw(expanded).expand(shape)
+        z = self.draws.normal("guide", self.batch[1], self.width)
+        value = value_at("proposal.guide", expanded, z).expand(shape)
         message["value"], message["done"] = value, True
         self._drawn = value, expanded.log_prob(value)
-
-    def _draw(self, distribution: Any) -> Tensor:
-        """Draw [R, N, W] from a distribution of batch [R, N]."""
-        n = self.batch[1]
-        base = distribution.base_dist if isinstance(distribution, Independent) else distribution
-        if isinstance(base, Normal):
-            return base.loc + base.scale * self.draws.normal("guide", n, self.width)
-        if isinstance(base, MultivariateNormal):
-            z = self.draws.normal("guide", n, self.width).unsqueeze(-1)
-            return base.loc + (base.scale_tril @ z).squeeze(-1)
-        try:
-            value: Tensor = base.icdf(self.draws.uniform("guide", n, self.width))
-        except NotImplementedError as error:
-            raise ValueError(
-                f"proposal.guide must have a normal site or one with an inverse distribution function, got "
-                f"{type(base).__name__}. Use Normal, MultivariateNormal, Laplace or Cauchy."
-            ) from error
-        return value

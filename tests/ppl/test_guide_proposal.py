@@ -10,7 +10,8 @@ import numpy as np
 import pyro
 import pytest
 import torch
-from pyro.distributions import Gamma, Laplace, LogNormal, MultivariateNormal, Normal
+from pyro.distributions import Gamma, Laplace, LogNormal, MultivariateNormal, Normal, Poisson
+from smoothing_cases import SINGULAR, record_of
 from torch import Tensor
 
 from pfbench.core.random_stream import PhiloxStream
@@ -18,6 +19,7 @@ from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
+from pfbench.filter.guided.twisted import TwistedParticleFilter
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.linear_gaussian import local_level
 from pfbench.ppl.guide_proposal import GuideProposal
@@ -25,6 +27,8 @@ from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood, repe
 from pfbench.ppl.parameter_posterior import ParameterPosterior
 from pfbench.ppl.parameterised_model import ParameterisedModel
 from pfbench.ppl.particle_mcmc import pmmh
+from pfbench.ppl.pyro_program import simulate
+from pfbench.ppl.step_program import PyroModel
 
 Q, S = 0.6, 1.0  # standard deviations of a step and of a measurement
 MODEL, EKF = local_level(Q, S, 0.0, 2.0), GaussianFilter(TaylorLinearisation())
@@ -132,3 +136,78 @@ def test_arviz_gets_the_log_density_of_each_fix_and_finds_the_one_that_is_off() 
     with pytest.warns(UserWarning, match="Pareto"):
         k = stats.loo(data, pointwise=True).pareto_k.values.ravel()
     assert k.argmax() == 11 + 5
+
+
+def begin(q: Any = 0.0, r: Any = 0.0) -> None:
+    pyro.sample("x", Normal(torch.zeros(1).double(), 2.0).to_event(1))
+
+
+def walk(x: Tensor, u: Any, q: Any, r: Any) -> None:
+    x = pyro.sample("x", Normal(x, q).to_event(1))
+    pyro.sample("y", Normal(x, r).to_event(1))
+
+
+def test_a_program_of_a_step_is_the_model_that_it_describes() -> None:
+    """The same evidence by Kalman and particle filters with the same numbers, and the same gradient, of a batch of parameters."""
+    record, _ = simulate(MODEL, Record(torch.zeros(2, 12, 1).double()), 1)
+    values = {"q": torch.tensor([0.3, 0.9], requires_grad=True), "r": torch.tensor([1.0, 0.7])}
+    prior = {name: LogNormal(0.0, 1.0) for name in values}
+    program = ParameterisedModel(lambda q, r: PyroModel(begin, walk, q=q, r=r), prior)
+    library = ParameterisedModel(lambda q, r: local_level(q, r, 0.0, 2.0), prior)
+    for method in (EKF, ParticleFilter(50), TwistedParticleFilter(10)):
+        found, expected = (
+            FilterLikelihood(method)(u.models_per_run(values)[0], record)
+            for u in (program, library)
+        )
+        torch.testing.assert_close(found, expected)
+        if method is EKF:
+            slopes = [torch.autograd.grad(a.sum(), values["q"])[0] for a in (found, expected)]
+            torch.testing.assert_close(*slopes)
+    x = torch.randn(2, 5, 1).double()
+    torch.testing.assert_close(
+        program.some_model().transition(x, ()).log_prob(x + 1.0),
+        library.some_model().transition(x, ()).log_prob(x + 1.0),
+    )
+
+
+def test_a_program_may_have_fewer_noises_than_states() -> None:
+    record, f, g = record_of(SINGULAR, 2, 9), SINGULAR.f, SINGULAR.g
+
+    def step(x: Tensor, u: Any) -> None:
+        w = pyro.sample("w", Normal(torch.zeros(1).double(), 1.0).to_event(1))
+        x = pyro.deterministic("x", x @ f.mT + w @ g.mT)
+        pyro.sample("y", Normal(x[..., :1], 0.8).to_event(1))
+
+    start = Normal(SINGULAR.m0, SINGULAR.l0.diagonal()).to_event(1)
+    model = PyroModel(lambda: pyro.sample("x", start), step)
+    for method in (EKF, ParticleFilter(50)):
+        found, expected = (FilterLikelihood(method)(m, record) for m in (model, SINGULAR))
+        torch.testing.assert_close(found, expected)
+    assert model.transition(torch.zeros(2, 1, 2).double(), ()) is None
+
+
+def looks_back(x: Tensor, u: Any) -> None:
+    pyro.sample("x", Normal(x, 1.0).to_event(1))
+    pyro.sample("y", Normal(x, 1.0).to_event(1))
+
+
+def branches(x: Tensor, u: Any) -> None:
+    pyro.sample("x", Normal(x if x.sum() > 0 else -x, 1.0).to_event(1))
+    pyro.sample("y" if x.mean() > 0 else "z", Normal(x, 1.0).to_event(1))
+
+
+@pytest.mark.parametrize(
+    ("step", "sentence"),
+    [
+        (looks_back, "site 'y' must depend on the new state 'x' alone"),
+        (branches, "step must have the same sites at each state"),
+        (lambda x, u: pyro.sample("x", Normal(x, 1.0 if x > 0 else 2.0)), "step must be a program of states [R, N, D] without branches"),
+        (lambda x, u: pyro.sample("x", Poisson(x.exp()).to_event(1)), "got Poisson. Use Normal"),
+        (lambda x, u: pyro.sample("x", Normal(x, 1.0)), "site 'x' must have one event dimension"),
+        (lambda x, u: pyro.sample("x", Normal(x, 1.0).to_event(1)), "step must sample the site 'y', the measurement"),
+        (lambda x, u: pyro.sample("y", Normal(x, 1.0).to_event(1)), "step must have the site 'x', a new state of 1 components"),
+    ],
+)  # fmt: skip
+def test_programs_that_are_no_models_are_refused_in_a_sentence(step: Any, sentence: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        PyroModel(begin, step)
