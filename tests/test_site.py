@@ -135,7 +135,7 @@ def test_links_lead_to_the_places_of_the_site() -> None:
 
 
 def test_notebooks_are_short() -> None:
-    assert len([page for page in NOTEBOOKS if page.parent.name == "tutorials"]) == 7
+    assert len([page for page in NOTEBOOKS if page.parent.name == "tutorials"]) == 8
     for page in NOTEBOOKS:
         shown = re.sub(
             r"```\{code-cell\} ipython3\n:tags: \[remove-cell\].*?```",

@@ -79,6 +79,7 @@ def make_priors(
             priors[name] = prior_by_name(name, words)
         else:
             ends = find_range(partial(_is_accepted, build, node, name), float(numbers[name]))
+            require(ends[0] < ends[1], f"parameters.{name}", "be a number that the model accepts near its value, too", numbers[name], "Choose another: it is a count or a seed.")  # fmt: skip
             priors[name] = prior_by_quantiles(name, words, numbers[name], ends)
     return priors
 
