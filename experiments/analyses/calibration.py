@@ -148,14 +148,14 @@ def list_cases(runs: int) -> dict[str, tuple[ParameterisedModel, Record, Infer]]
     return {
         "local level, PMMH": (LEVELS, short, by_pmmh(LEVELS, ParticleFilter(60), 150, 80)),
         "local level, SVI": (LEVELS, short, by_svi(LEVELS, hmm, 200)),
-        "local level, NUTS": (LEVELS, short, by_nuts(LEVELS, hmm, 100, 60)),
-        "local level, SMC2": (LEVELS, some, by_smc2(LEVELS, EKF, 100)),
-        "local level, particle Gibbs": (LEVELS, some, by_gibbs(LEVELS, 16, 15, 15)),
         "volatility, PMMH": (VOLATILITY, returns, by_pmmh(VOLATILITY, ParticleFilter(100), 150, 80)),
-        "volatility, PMMH that looks ahead": (VOLATILITY, returns, by_pmmh(VOLATILITY, ahead, 100, 60)),
-        "volatility, SMC2": (VOLATILITY, few, by_smc2(VOLATILITY, ParticleFilter(50), 100)),
         "INS, PMMH by EKF": (INS, log, by_pmmh(INS, EKF, 120, 60)),
         "INS, SVI by EKF": (INS, log, by_svi(INS, FilterLikelihood(EKF), 80)),
+        "local level, SMC2": (LEVELS, some, by_smc2(LEVELS, EKF, 100)),
+        "local level, particle Gibbs": (LEVELS, some, by_gibbs(LEVELS, 16, 15, 15)),
+        "volatility, PMMH that looks ahead": (VOLATILITY, returns, by_pmmh(VOLATILITY, ahead, 100, 60)),
+        "volatility, SMC2": (VOLATILITY, few, by_smc2(VOLATILITY, ParticleFilter(50), 100)),
+        "local level, NUTS": (LEVELS, short, by_nuts(LEVELS, hmm, 100, 60)),
     }  # fmt: skip
 
 

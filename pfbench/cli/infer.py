@@ -107,7 +107,8 @@ def _read_words(words: Sequence[str]) -> tuple[str, list[str]]:
             f"method must be one of {', '.join(methods)}, got {method}.{suggest_similar(method, methods)} {_USAGE}"
         )
     remedy = "Leave it out, or use method=pmmh."
-    require(method != NOISE or "particles" not in keys, "particles", "be left out for method=noise, a Kalman filter", words_by_key.get("particles"), remedy)  # fmt: skip
+    by_kalman = method in (NOISE, "nuts", "svi")
+    require(not by_kalman or "particles" not in keys, "particles", f"be left out for method={method}, a Kalman filter", words_by_key.get("particles"), remedy)  # fmt: skip
     others = [
         f"++infer.{word}" if word.startswith("parameters") else word
         for word in words

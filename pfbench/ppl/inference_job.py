@@ -37,6 +37,10 @@ from pfbench.results.plotting import FigureSpec, draw_figure
 from pfbench.results.store import compute_config_key, extend_key
 
 _BY_GRADIENT = ("nuts", "svi")
+_RULES = {
+    "draws": "whole [1, inf)", "warmup": "whole [0, inf)", "chains": "whole [1, inf)", "values": "whole [2, inf)", "moves": "whole [0, inf)",
+    "steps": "whole [1, inf)", "rate": "(0, inf)", "look_ahead": "null or whole [0, inf) Use 10, or 1 for a nearly linear model.",
+}  # fmt: skip
 _SILENCE, _RECENT = 10.0, 200  # s between two lines of progress; steps of their acceptance rate
 _KEYS = ("model", "scenario", "noise", "filter", "infer", "seed", "runs", "first_run")
 
@@ -155,8 +159,9 @@ def _draw(
     cores: int,
 ) -> tuple[ParameterPosterior, dict[str, Any]]:
     """Draw by a method from the posterior of the parameters that the configuration names, in parts that are stored in a folder."""
-    task, chains = _make_task(values, build), int(values["infer"].get("chains", 1))
-    require_range("infer.chains", chains, "whole [1, inf)")
+    for key in _RULES.keys() & values["infer"].keys():
+        require_range(f"infer.{key}", values["infer"][key], _RULES[key])
+    task, chains = _make_task(values, build), values["infer"].get("chains", 1)
     if name in _BY_GRADIENT:
         _check_gradient(name, task, choices["model"])
     start_work()
@@ -236,16 +241,16 @@ def _make_task(values: Mapping[str, Any], build: Callable[..., Any]) -> Inferenc
     episode = build(values["scenario"]).draw(build(values["noise"]), numbers, int(values["seed"]))
     record = episode.record._replace(y=episode.record.y.double())
     passes = values["infer"].get("look_ahead")
-    require_range(
-        "infer.look_ahead", passes, "null or whole [0, inf) Use 10, or 1 for a nearly linear model."
-    )
     if passes is None:
         return InferenceTask(unknown, build(values["filter"]), record)
     return InferenceTask(unknown, TwistedParticleFilter(values["particles"], passes=passes), record)
 
 
 def _check_gradient(name: str, task: InferenceTask, model: str) -> None:
-    """Check that the likelihood has a gradient for each parameter; the first steps of one run show it."""
+    """Check that the likelihood has a gradient for each parameter; that of particles is not the gradient of the likelihood."""
+    remedy = "Use filter=ekf, or method=pmmh, which needs no gradient."
+    by_particles = hasattr(task.method, "particles")
+    require(not by_particles, f"method={name}", "have a likelihood with a gradient", f"a filter of particles, {type(task.method).__name__}", remedy)  # fmt: skip
     values = {
         key: value[0].detach().requires_grad_() for key, value in task.unknown.sample(1, 0).items()
     }

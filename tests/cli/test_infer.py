@@ -135,6 +135,11 @@ def test_finished_chains_of_an_interrupted_inference_are_not_drawn_again(
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
+        (("model=local_level", "method=nuts", PARAMETERS, "filter=sir"), "method=nuts must have a likelihood with a gradient, got a filter of particles, ParticleFilter"),
+        (("model=local_level", "method=svi", PARAMETERS, "particles=50"), "particles must be left out for method=svi, a Kalman filter, got 50"),
+        (("model=local_level", "method=pmmh", PARAMETERS, "infer.look_ahead=-1"), "infer.look_ahead must be"),
+        (("model=local_level", "method=pmmh", PARAMETERS, "infer.draws=2.5"), "infer.draws must be a whole number of at least 1, got 2.5"),
+        (("model=terrain", "method=pmmh", "parameters={terrain.seed:[1,3]}"), "parameters.terrain.seed must be a number that the model accepts near its value"),
         (("model=local_level", "method=nuts", PARAMETERS, "cores=0"), "cores must be a number of processes from 1 on, got 0"),
         (("method=nuts", PARAMETERS), "model must be set. Use: pfbench infer model=NAME"),
         (("model=local_level", PARAMETERS), "method must be set"),
