@@ -1,14 +1,15 @@
-"""Simulation-based calibration of each method of inference: the table of docs/parameter_inference.md.
+"""Simulation-based calibration of each method of inference on a local level, volatility and a short strapdown record.
 
     python experiments/analyses/calibration.py [data sets]
 
 Parameters come from their prior, measurements from the model with them. The rank of a parameter among 19 draws of a method must be
 uniform. A method whose runs share their parameters gets 40 of 100 data
-sets. Finished cases are kept in results/calibration.json.
+sets. It prints a table with a chi-square test of each parameter. Finished cases are kept in results/calibration.json.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import time
@@ -31,7 +32,6 @@ from pfbench.filter import (
     TwistedParticleFilter,
 )
 from pfbench.model import StochasticVolatility, StrapdownTotal, StrapdownTuning, local_level
-from pfbench.nav.strapdown import PreintegratedImu, preintegrate
 from pfbench.ppl import (
     FilterLikelihood,
     GaussianHmmLikelihood,
@@ -84,15 +84,18 @@ INS = ParameterisedModel(
 
 
 def turn(runs: int, seconds: int) -> Record:
-    """A vehicle on a circle of 17 m at 5 m/s, with a fix each second."""
-    rate, force = torch.zeros(2, seconds, 10, 3, dtype=torch.float64)
-    rate[..., 2], force[..., 0], force[..., 2] = 0.3, -1.5, 9.8
-    force[0, :, 1] = 5.0  # starts to move in the first second
-    spans, bias = torch.full((seconds, 10), 0.1).double(), torch.zeros(seconds, 6).double()
-    parts = preintegrate(force, rate, spans, bias)
-    imu = (*parts, bias, torch.full((seconds,), 9.8).double(), spans.sum(-1))
+    """A vehicle that accelerates for a second and then turns by 0.3 rad/s at 5 m/s, with a fix each second."""
+    still = torch.zeros(seconds, 3, dtype=torch.float64)
+    force = still + torch.tensor([-1.5, 0.0, 9.8]).double()
+    force[0, 1] = 5.0
+    half = still.new_tensor([math.cos(0.15), 0.0, 0.0, math.sin(0.15)]).expand(seconds, -1)
+    eye, zero = torch.eye(3).double(), torch.zeros(3, 3).double()
+    slope = torch.cat([torch.cat(row, 1) for row in ([-eye, zero], [zero, -eye], [zero, -eye / 2])])
+    bias, one = torch.zeros(seconds, 6).double(), torch.ones(seconds).double()
+    imu = (half, force, force / 2, slope.expand(seconds, -1, -1), bias, 9.8 * one, one)
+    inputs: Any = StrapdownTotal.input_type
     y = torch.zeros(runs, seconds, 3, dtype=torch.float64)
-    return Record(y, PreintegratedImu(*(a.unsqueeze(0) for a in imu)))
+    return Record(y, inputs(*(a.unsqueeze(0) for a in imu)))
 
 
 def by_pmmh(unknown: ParameterisedModel, method: Any, draws: int, warmup: int) -> Infer:
@@ -146,14 +149,14 @@ def list_cases(runs: int) -> dict[str, tuple[ParameterisedModel, Record, Infer]]
     )  # for methods without a batch of data sets
     hmm, ahead = GaussianHmmLikelihood(), TwistedParticleFilter(20, passes=3)
     return {
-        "local level, PMMH": (LEVELS, short, by_pmmh(LEVELS, ParticleFilter(60), 150, 80)),
+        "local level, PMMH": (LEVELS, short, by_pmmh(LEVELS, ParticleFilter(60), 600, 150)),
         "local level, SVI": (LEVELS, short, by_svi(LEVELS, hmm, 200)),
-        "volatility, PMMH": (VOLATILITY, returns, by_pmmh(VOLATILITY, ParticleFilter(100), 150, 80)),
-        "INS, PMMH by EKF": (INS, log, by_pmmh(INS, EKF, 120, 60)),
+        "volatility, PMMH": (VOLATILITY, returns, by_pmmh(VOLATILITY, ParticleFilter(100), 800, 200)),
+        "INS, PMMH by EKF": (INS, log, by_pmmh(INS, EKF, 600, 150)),
         "INS, SVI by EKF": (INS, log, by_svi(INS, FilterLikelihood(EKF), 80)),
         "local level, SMC2": (LEVELS, some, by_smc2(LEVELS, EKF, 100)),
-        "local level, particle Gibbs": (LEVELS, some, by_gibbs(LEVELS, 16, 15, 15)),
-        "volatility, PMMH that looks ahead": (VOLATILITY, returns, by_pmmh(VOLATILITY, ahead, 100, 60)),
+        "local level, particle Gibbs": (LEVELS, some, by_gibbs(LEVELS, 16, 25, 25)),
+        "volatility, PMMH that looks ahead": (VOLATILITY, returns, by_pmmh(VOLATILITY, ahead, 600, 150)),
         "volatility, SMC2": (VOLATILITY, few, by_smc2(VOLATILITY, ParticleFilter(50), 100)),
         "local level, NUTS": (LEVELS, short, by_nuts(LEVELS, hmm, 100, 60)),
     }  # fmt: skip

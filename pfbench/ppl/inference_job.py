@@ -169,12 +169,12 @@ def _draw(
     parts = [(first, min(size, chains - first)) for first in range(0, chains, size)]
     draw = partial(_draw_part, name, values, build, folder)
     if min(cores, len(parts)) == 1:
-        found = list(map(draw, parts))
+        results = list(map(draw, parts))
     else:
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(min(cores, len(parts)), context) as pool:
-            found = list(pool.map(draw, parts))
-    posteriors, extras = zip(*found, strict=True)
+            results = list(pool.map(draw, parts))
+    posteriors, extras = zip(*results, strict=True)
     posterior = ParameterPosterior.join([ParameterPosterior.from_dict(p) for p in posteriors])
     rate = posterior.accepted
     return posterior, extras[0] | ({} if rate is None else {"acceptance": float(rate.mean())})
@@ -185,22 +185,22 @@ def _draw_part(
     values: Mapping[str, Any],
     build: Callable[..., Any],
     folder: Path,
-    part: tuple[int, int],
+    group: tuple[int, int],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Draw some chains, from the first of `part` on, unless they are stored; return the posterior as a dictionary, and other results."""
+    """Draw some chains, from the first of `group` on, unless they are stored; return the posterior as a dictionary, and other results."""
     torch.set_num_threads(int(values["threads"]))
-    path = folder / "chains_{}_{}.json".format(*part)
+    path = folder / "chains_{}_{}.json".format(*group)
     if not path.is_file():
-        settings = {**values["infer"], "first_chain": part[0], "chains": part[1]}
-        label = f"{name}, {part[1]} chains from {part[0] + 1} on"
+        settings = {**values["infer"], "first_chain": group[0], "chains": group[1]}
+        label = f"{name}, {group[1]} chains from {group[0] + 1} on"
         steps = Steps(label, path.with_suffix(".pt"))
         posterior, extra = _METHODS[name](
             _make_task(values, build), settings, int(values["seed"]), steps
         )
         text = json.dumps([posterior.to_dict(), extra])
         write_atomically(path, lambda file: file.write(text.encode()))
-    found: tuple[dict[str, Any], dict[str, Any]] = tuple(json.loads(path.read_text()))
-    return found
+    result: tuple[dict[str, Any], dict[str, Any]] = tuple(json.loads(path.read_text()))
+    return result
 
 
 class Steps:
@@ -209,7 +209,7 @@ class Steps:
     def __init__(self, label: str, file: Path) -> None:
         self.label, self.file, self.total = label, file, 0
         self.rates: list[float] = []
-        self.first, self.said = (-1, 0.0), time.monotonic()
+        self.first, self.reported = (-1, 0.0), time.monotonic()
 
     def of(self, total: int) -> Steps:
         """Note how many steps there are."""
@@ -222,8 +222,8 @@ class Steps:
         self.rates += [] if rate is None else [rate]
         if self.first[0] < 0:
             self.first = done, now
-        if now - self.said > _SILENCE:
-            self.said = now
+        if now - self.reported > _SILENCE:
+            self.reported = now
             minutes = (
                 (now - self.first[1]) / max(done - self.first[0], 1) * (self.total - done) / 60.0
             )

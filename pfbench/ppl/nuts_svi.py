@@ -93,11 +93,11 @@ def nuts(
                 hook_fn=count,
             )
             sampler.run(record)
-        found_draws = sampler.get_samples().items()
-        samples.append({name: a for name, a in found_draws if a.dim() <= 2})
-        found = sampler.diagnostics()
-        accepted.append(found["acceptance rate"]["chain 0"])
-        diverging[row, found["divergences"]["chain 0"]] = 1.0
+        all_draws = sampler.get_samples().items()
+        samples.append({name: a for name, a in all_draws if a.dim() <= 2})
+        diagnostics = sampler.diagnostics()
+        accepted.append(diagnostics["acceptance rate"]["chain 0"])
+        diverging[row, diagnostics["divergences"]["chain 0"]] = 1.0
     stacked = {name: torch.stack([a[name] for a in samples]) for name in samples[0]}
     return ParameterPosterior(stacked, torch.tensor(accepted), "NUTS", {"diverging": diverging})
 

@@ -61,16 +61,16 @@ class ParameterPosterior:
         return ParameterPosterior(draws, accepted, content["how"], stats)
 
     @staticmethod
-    def join(parts: Sequence[ParameterPosterior]) -> ParameterPosterior:
+    def join(posteriors: Sequence[ParameterPosterior]) -> ParameterPosterior:
         """Join the chains of several posteriors of one method."""
-        first = parts[0]
-        if len(parts) == 1:
+        first = posteriors[0]
+        if len(posteriors) == 1:
             return first
         draws, stats = (
             {k: torch.cat([group[k] for group in groups]) for k in groups[0]}
-            for groups in ([part.draws for part in parts], [part.stats for part in parts])
+            for groups in ([p.draws for p in posteriors], [p.stats for p in posteriors])
         )
-        rates = [part.accepted for part in parts if part.accepted is not None]
+        rates = [p.accepted for p in posteriors if p.accepted is not None]
         return ParameterPosterior(draws, torch.cat(rates), first.method, stats)
 
     def run(self, r: int) -> ParameterPosterior:
@@ -164,9 +164,11 @@ class ParameterPosterior:
             groups["log_likelihood"] = {"y": terms.unflatten(0, first.shape[:2])}
             groups["prior"] = {name: a.view(first.shape[:2]) for name, a in prior.items()}
             groups["observed_data"] = {"y": record.y}
-        arrays = {k: {name: a.double().numpy() for name, a in g.items()} for k, g in groups.items()}
-        dims = {name: ["run"] for name, a in arrays["posterior"].items() if a.ndim == 3}
-        return from_dict(arrays, dims=dims, attrs={"posterior": {"method": self.method}})
+        by_group = {
+            k: {name: a.double().numpy() for name, a in g.items()} for k, g in groups.items()
+        }
+        dims = {name: ["run"] for name, a in by_group["posterior"].items() if a.ndim == 3}
+        return from_dict(by_group, dims=dims, attrs={"posterior": {"method": self.method}})
 
     @property
     def has_converged(self) -> bool:

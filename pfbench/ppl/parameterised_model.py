@@ -102,8 +102,10 @@ class ParameterisedModel:
         models = [self.find_model(row) for row in self._rows(values)]
         spare = next((model for model in models if model is not None), None) or self.some_model()
         is_possible = torch.tensor([model is not None for model in models])
-        chosen = [model or spare for model in models]
-        return chosen[0] if len(chosen) == 1 else ModelBatch(chosen, runs_per_model), is_possible
+        possible = [model or spare for model in models]
+        return possible[0] if len(possible) == 1 else ModelBatch(
+            possible, runs_per_model
+        ), is_possible
 
     def draw(self, count: int, seed: int, attempt: int = 0) -> Values:
         """Draw parameters from the prior by counters, whether the model accepts them or not.

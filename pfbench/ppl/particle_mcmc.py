@@ -156,12 +156,10 @@ def _run_chains(
             stored = time.monotonic()
     paths, densities = (torch.stack(parts, 1) for parts in zip(*samples, strict=True))
     values, _ = target.unknown.constrained(paths)  # {name: [C, S, Q]}
-    rate = accepted_count / (draws * settings.thin)
-    stats = {"lp": densities}
-    if not settings.separate_parameters:
-        values, rate = {name: a[..., 0] for name, a in values.items()}, rate[:, 0]
-        stats = {"lp": densities[..., 0]}
-    return ParameterPosterior(values, rate, "PMMH", stats)
+    of_runs = slice(None) if settings.separate_parameters else 0
+    values = {name: a[..., of_runs] for name, a in values.items()}
+    rate = accepted_count[:, of_runs] / (draws * settings.thin)
+    return ParameterPosterior(values, rate, "PMMH", {"lp": densities[..., of_runs]})
 
 
 def _find_chains(
@@ -217,11 +215,10 @@ def particle_gibbs(
 ) -> GibbsSample:
     """Draw from p(parameters, x_1:T | y_1:T) by particle Gibbs with ancestor sampling.
 
-    A sweep draws a path by conditional SMC, and moves the parameters twice by a random walk: given the states and given the
-    noises of the path, where the states determine the noises, else given the noises twice. Both targets are
-    exact, and which of them mixes well depends on the parameter [Papaspiliopoulos, Roberts and Skold 2007].
-    The filter needs few particles, and the path of the states is part of the answer. Its time grows with the length of the
-    record, squared where the model has fewer noises than states.
+    A sweep draws a path by conditional SMC, and moves the parameters twice by a random walk. One move keeps the states, the other
+    the noises of the path. Where the states do not determine the noises, both keep the noises. Which of them mixes well
+    depends on the parameter [Papaspiliopoulos, Roberts and Skold 2007]. The filter needs few particles, and the path of the states is part
+    of the answer. The time grows with the length of the record, squared where the model has fewer noises than states.
 
     Args:
         unknown: Model and prior; initial state and noise of the model are normal.
@@ -269,8 +266,8 @@ class _PathPosterior:
         self, space: NoiseSpace, log_prior: Tensor, theta: Tensor, states: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Return log p(z, path, y) [C, 1] and the vectors of the paths, which keep the states, or the noises without these."""
-        found = None if states is None else _find_vectors(space, theta, states)
-        theta, log_p = found or (theta, space.roll_out(theta)[1])
+        solution = None if states is None else _find_vectors(space, theta, states)
+        theta, log_p = solution or (theta, space.roll_out(theta)[1])
         total = log_prior + log_p.view(self.chains, -1).sum(1, keepdim=True)
         return total.nan_to_num(nan=-torch.inf), theta
 
@@ -280,10 +277,10 @@ def _find_vectors(space: NoiseSpace, theta: Tensor, states: Tensor) -> tuple[Ten
     d = space.model.chart.dimension
     x, parts, total = space.start(theta[..., :d]), [theta[..., :d]], torch.zeros_like(theta[..., 0])
     for t, (model, record) in enumerate(space.steps):
-        found = space.find_noise(t, x, states[:, :, t])
-        if found is None:
+        solution = space.find_noise(t, x, states[:, :, t])
+        if solution is None:
             return None
-        x, (w, log_det) = states[:, :, t], found
+        x, (w, log_det) = states[:, :, t], solution
         parts.append(w)
         log_p = model.log_likelihood(record.y, x, record.u) - log_det
         total = total + log_p - 0.5 * w.square().sum(-1)
@@ -298,28 +295,31 @@ def _run_sweeps(
     z = unknown.unconstrained(unknown.sample(target.chains, seed)).unsqueeze(1)
     walks, samples, accepted = [ParameterWalk.start(unknown, z, seed)] * 2, [], []
     source = PhiloxStream(seed, torch.arange(target.chains * runs))
-    place = target.make_space(z)
-    theta = source.normal("gibbs.start", 1, place[0].size).to(z)
+    current = target.make_space(z)
+    theta = source.normal("gibbs.start", 1, current[0].size).to(z)
     for i in range(warmup + draws):
-        theta, _ = kernel(place[0], theta, relabel(source, f"gibbs_{i}."))
-        for j, states in enumerate((place[0].roll_out(theta)[0], None)):
+        theta, _ = kernel(current[0], theta, relabel(source, f"gibbs_{i}."))
+        for j, states in enumerate((current[0].roll_out(theta)[0], None)):
             stream = relabel(PhiloxStream(seed, torch.arange(target.chains)), f"gibbs_{i}_{j}.")
-            before, _ = target.evaluate(*place, theta, states)
             proposed, _ = walks[j].step(z, stream)
             after, new_theta = target.evaluate(*target.make_space(proposed), theta, states)
-            probability = torch.exp(after - before).nan_to_num(nan=1.0).clamp(max=1.0)
+            after -= target.evaluate(*current, theta, states)[0]
+            probability = torch.exp(after).nan_to_num(nan=1.0).clamp(max=1.0)
             is_accepted = stream.uniform("gibbs.accept", 1, 1) < probability.unsqueeze(-1)
             z = torch.where(is_accepted, proposed, z)
             theta = torch.where(is_accepted.repeat_interleave(runs, 0), new_theta, theta)
-            place = target.make_space(z)
+            current = target.make_space(z)
             if i < warmup:
                 walks[j] = walks[j].adapt(z, probability.mean(0), (i + 2.0) ** -0.6)
             accepted.append(probability[:, 0])
         if i >= warmup:
-            samples.append((z[:, 0], place[0].roll_out(theta)[0][:, 0]))
+            samples.append((z[:, 0], current[0].roll_out(theta)[0][:, 0]))
     parameters, paths = (torch.stack(parts, 1) for parts in zip(*samples, strict=True))
-    rates = torch.stack(accepted[2 * warmup :], 1).mean(1)
-    posterior = ParameterPosterior(unknown.constrained(parameters)[0], rates, "particle Gibbs")
+    posterior = ParameterPosterior(
+        unknown.constrained(parameters)[0],
+        torch.stack(accepted[2 * warmup :], 1).mean(1),
+        "particle Gibbs",
+    )
     return GibbsSample(posterior, paths.unflatten(0, (target.chains, runs)).transpose(1, 2))
 
 

@@ -86,8 +86,10 @@ class PyroModel(StateSpaceModel):
         require(first.state is not None and first.state.shape == some.shape, "step", f"have the site {STATE!r}, a new state of {d} components", "none or another size", f"Write pyro.sample({STATE!r}, ...) or pyro.deterministic({STATE!r}, ...).")  # fmt: skip
         require(MEASUREMENT in first.laws, "step", f"sample the site {MEASUREMENT!r}, the measurement", list(first.laws), f"Write pyro.sample({MEASUREMENT!r}, ...).")  # fmt: skip
         self.noise_dim, self.has_density = first.used, set(first.laws) == {STATE, MEASUREMENT}
-        law: Any = self.observation(some, inputs)
-        is_given = not bool(law.log_prob(torch.zeros_like(law.sample())).isnan().any())
+        distribution: Any = self.observation(some, inputs)
+        is_given = not bool(
+            distribution.log_prob(torch.zeros_like(distribution.sample())).isnan().any()
+        )
         require(is_given, f"step: site {MEASUREMENT!r}", f"depend on the new state {STATE!r} alone", "one that depends on the state before or on noise", f"Use the value of the site {STATE!r}.")  # fmt: skip
 
     def _call(self, program: Callable[..., Any], sites: _Sites, *args: Any) -> _Sites:
@@ -134,14 +136,14 @@ class _Sites(Messenger):
 
     def _pyro_sample(self, message: Any) -> None:
         """Set the value of a site."""
-        name, law = message["name"], message["fn"]
+        name, distribution = message["name"], message["fn"]
         if message["infer"].get("_deterministic"):
             message["value"] = value = self._find_state(name, lambda: message["value"])
         else:
-            event, free = tuple(law.event_shape), name not in self.laws
+            event, free = tuple(distribution.event_shape), name not in self.laws
             require(len(event) == 1 and free, f"site {name!r}", "have one event dimension, and occur once", list(event), "Use .to_event(1).")  # fmt: skip
-            self.laws[name] = law = law.expand(self.batch)
-            value = self._find_state(name, lambda: self._draw(name, law))
+            self.laws[name] = distribution = distribution.expand(self.batch)
+            value = self._find_state(name, lambda: self._draw(name, distribution))
         message["value"], message["done"], message["stop"] = value, True, True
 
     def _find_state(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
@@ -151,12 +153,14 @@ class _Sites(Messenger):
             self.state = value
         return value
 
-    def _draw(self, name: str, law: Any) -> Tensor:
+    def _draw(self, name: str, distribution: Any) -> Tensor:
         """Return the value of a site at the next numbers of the noise; zeros for a measurement, which nothing may read."""
-        (width,) = law.event_shape
+        (width,) = distribution.event_shape
         if name == MEASUREMENT:
             return torch.zeros(*self.batch, width, dtype=torch.float64)
         zero = torch.zeros(*self.batch, width, dtype=torch.float64)
         z = zero if self.z is None else self.z[..., self.used : self.used + width]
         self.used += width
-        return value_at(f"site {name!r}", law, z if z.shape[-1] == width else zero * torch.nan)
+        return value_at(
+            f"site {name!r}", distribution, z if z.shape[-1] == width else zero * torch.nan
+        )

@@ -433,9 +433,9 @@ class ConditionalSmcKernel(PathKernel):
         if not self.sample_ancestors:
             slots = torch.full(log_w.shape[:2], self.particles - 1, device=log_w.device)
             return slots, reference
-        found = space.find_noise(t, x, later)
-        if found is not None:
-            noise = found[0].unflatten(1, log_w.shape[1:])
+        solution = space.find_noise(t, x, later)
+        if solution is not None:
+            noise = solution[0].unflatten(1, log_w.shape[1:])
             slots = _draw_slot(log_w - 0.5 * noise.square().sum(-1), draws, "ancestor")
             return slots, _take(noise, slots.unsqueeze(-1)).squeeze(2)
         future = theta.repeat_interleave(self.particles, 1)
