@@ -111,7 +111,7 @@ def infer(
     """Infer the parameters of a configuration by a method, unless the result exists; return its file and content.
 
     `build` makes the object of a node, with other arguments as keywords. `truth` has the true values, where they are known. Chains
-    are divided among `cores` processes. What they have done is stored on the way, so that the same call goes on after a kill.
+    are divided among `cores` processes. What they have done is stored on the way, so that the same call continues after a kill.
     """
     settings = {key: values[key] for key in _KEYS} | {"method": name}
     ignored = ("scenario.root", "scenario.cache_dir")

@@ -48,7 +48,7 @@ class PmmhSettings:
         leaps: Leaps after each step of the walk. They improve mixing if the posterior is nearly
             normal.
         tick: Function that is called after each iteration with its number and the acceptance rate, for a progress bar.
-        checkpoint: File in which the chains are stored each 20 s. The same call goes on from it, with the same result.
+        checkpoint: File in which the chains are stored each 20 s. The same call continues from it, with the same result.
 
     Raises:
         ValueError: If a value is out of range.

@@ -52,7 +52,7 @@ class PyroModel(StateSpaceModel):
         **parameters: Numbers that the programs take as keywords. They are buffers, so that each can be inferred.
 
     Raises:
-        ValueError: If a site is missing, has no density or is discrete, if the sites depend on the state, or if the measurement depends on
+        ValueError: If a site is missing, lacks a density or is discrete, if the sites depend on the state, or if the measurement depends on
             more than the new state.
     """
 
