@@ -72,7 +72,7 @@ GROUPS = {
     "rate": ("imu", RATE, "unit of rate", "axes, mounting, common motion", "gyro bias drift"),
     "fixes": ("gnss", POSITION, "fix scale", "fix axes, fix shift", "slow errors, fix shift, fix turn, fix scale"),
     "velocity": ("reference", VELOCITY, "reference velocity", "reference velocity", "slow errors, fix shift, reference velocity"),
-    "attitude": ("reference", ANGLES, "unit of attitude", "axes, mounting, common motion, unit of attitude", "attitude jump, mounting, gyro bias, gyro bias drift"),
+    "attitude": ("reference", ANGLES, "unit of attitude", "axes, mounting, common motion, unit of attitude", "attitude jump, heading, mounting, gyro bias, gyro bias drift"),
 }  # fmt: skip
 UNITS = {
     "force": {"g": 1 / 9.80665, "mg": 1e3 / 9.80665, "ft/s^2": 3.28084},
@@ -174,7 +174,7 @@ def draw_column(rng: Rng) -> Drawn:
     what, (i, j) = pick(rng, GROUPS), rng.permutation(3)[:2]
     table, columns, _, right, _ = GROUPS[what]
     order = [columns[j] if k == i else column for k, column in enumerate(columns)]
-    return fault(f"column: {columns[j]} under {columns[i]}", mixed(table, columns, order), right)
+    return fault(f"column: {columns[j]} under {columns[i]}", mixed(table, columns, order), f"repeated column, {right}")
 
 
 KINDS = (

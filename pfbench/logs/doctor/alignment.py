@@ -33,6 +33,7 @@ from pfbench.logs.doctor.turn_search import (
 from pfbench.logs.units import DEGREE, UNIT_FACTORS
 
 _GAIN = 0.15  # of the score by another unit
+_EQUAL = 0.05  # of the score less the miss of the size
 _CERTAIN = 0.9  # score at which no other unit is tried, and that of a piece of the log
 _PIECE, _FEWEST_PIECES, _MOST_PIECES = 15.0, 3, 8  # s, and number of pieces for the drift
 _NO_TURN = 1e-5  # rad; RMS turn of a window of an attitude that does not change
@@ -191,7 +192,7 @@ def _find_unit(
     """Return columns in another unit and its name, '' for none, with the offset and the score of their turns.
 
     A yaw within a turn is in radians: a short log without turns can agree with any unit. Units that agree equally are
-    distinguished by the size of the turns, of a gyroscope in rad/s or in deg/s.
+    distinguished by the size of the turns, of a gyroscope in rad/s or in deg/s, and then by the force.
     """
     results = []
     is_within_a_turn = float(np.abs(log.reference.angles[:, 2]).max()) <= 2.0 * np.pi
@@ -204,7 +205,12 @@ def _find_unit(
         results.append((unit, offset, score, score - miss))
         if unit == _RADIANS and (score > _CERTAIN or is_within_a_turn):
             break
-    best = max(results, key=lambda result: result[3])
+    equal = [r for r in results if r[3] > max(result[3] for result in results) - _EQUAL]
+    best = (
+        min(equal, key=lambda r: _find_force_cost(_convert_attitude(log, r[0], r[2])[0], r[1]))
+        if len(equal) > 1
+        else equal[0]
+    )
     return best[:3] if best[2] > results[0][2] + _GAIN else results[0][:3]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,7 @@ from pfbench.logs.doctor.raw_log import RawLog
 from pfbench.logs.doctor.thresholds import SPIKE_DEVIATIONS, limit_of
 
 _COLUMNS = ("fx", "fy", "fz", "wx", "wy", "wz")
+_POSITION = ("pn", "pe", "pd")
 _BLOCK = 50  # differences of a local level
 _FEWEST = 50  # differences
 _LARGEST = (320.0, 70.0)  # m/s^2 and rad/s: absurd, ten times what platforms reach
@@ -111,6 +113,23 @@ def check_samples(log: RawLog, facts: dict[str, Any]) -> tuple[RawLog, list[Find
     return log._replace(imu=imu._replace(force=samples[:, :3], rate=samples[:, 3:])), findings
 
 
+def check_columns(log: RawLog) -> Iterator[Finding]:
+    """Check that no table has one column under two names."""
+    imu, reference = log.imu, log.reference
+    for table, names, values in (
+        (0, _COLUMNS, np.hstack([imu.force, imu.rate])), (1, _POSITION, log.fixes.position), (2, _POSITION, reference.position),
+        (2, ("vn", "ve", "vd"), reference.velocity), (2, ("roll", "pitch", "yaw"), reference.angles),
+    ):  # fmt: skip
+        for (a, first), (b, second) in combinations(zip(names, np.abs(values.T), strict=True), 2):
+            if len(first) > _FEWEST and (first == second).all() and np.ptp(first) > 0.0:
+                yield Finding(
+                    "repeated column", WARN, float(len(first)), limit_of("repeated column"), "rows",
+                    f"{log.names[table]}: {a} and {b} are equal in all rows: one column stands in the place of another",
+                    "Write the right column: no correction gives it back",
+                    picture=Picture("row", f"{a}, {b}", (thin_curve(a, np.arange(len(first)), first),)),
+                )  # fmt: skip
+
+
 def _check_stuck(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
     """Check for samples that do not change."""
     imu, samples = log.imu, np.hstack([log.imu.force, log.imu.rate])
@@ -136,7 +155,15 @@ def _check_stuck(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
 def _check_dead(log: RawLog, samples: Array, stuck: float) -> Iterator[Finding]:
     """Check for a column that does not change while the others do."""
     time, rows = log.imu.time, [find_stuck(column[:, None]) for column in samples.T]
-    durations = [float(time[last] - time[first]) for first, last in rows]
+    # a value that is held at the end of the range is cut off, not dead
+    is_cut = [
+        c[f] in (c.min(), c.max()) and c[f] != 0.0 and c.min() < c.max()
+        for c, (f, _) in zip(samples.T, rows, strict=True)
+    ]
+    durations = [
+        0.0 if cut else float(time[last] - time[first])
+        for cut, (first, last) in zip(is_cut, rows, strict=True)
+    ]
     k = int(np.argmax(durations))
     # three constant columns are a motion without errors of sensors
     if durations[k] > max(limit_of("dead axis"), 2.0 * stuck, sorted(durations)[3]):
@@ -159,7 +186,8 @@ def _check_saturated(log: RawLog, samples: Array) -> Iterator[Finding]:
             continue
         # rounded values repeat, too, and those nearer to the usual one more often
         excess = np.where(
-            np.abs(levels[[0, -1]] - np.median(values)) > _AWAY * (levels[-1] - levels[0]),
+            (np.abs(levels[[0, -1]] - np.median(values)) > _AWAY * (levels[-1] - levels[0]))
+            & (levels[[0, -1]] != 0.0),  # a broken axis: no range ends there
             counts[[0, -1]] / counts[[1, -2]], 0.0,
         )  # fmt: skip
         end = -int(excess.argmax())

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from pfbench.logs.doctor.alignment import align_clocks
-from pfbench.logs.doctor.bad_samples import check_samples
+from pfbench.logs.doctor.bad_samples import check_columns, check_samples
 from pfbench.logs.doctor.clock_checks import check_clocks, sort_tables
 from pfbench.logs.doctor.course_checks import check_course
 from pfbench.logs.doctor.finding import Finding
@@ -20,7 +20,7 @@ from pfbench.logs.doctor.specific_force import check_force_and_rate
 FEWEST_ROWS = 10  # of a table
 # checks that need no reference; the others compare IMU or fixes with it
 WITHOUT_REFERENCE = (
-    "time order", "repeated times", "imu gap", "imu jitter", "imu rate", "fix hole", "absurd samples", "stuck samples",
+    "time order", "repeated times", "repeated column", "imu gap", "imu jitter", "imu rate", "fix hole", "absurd samples", "stuck samples",
     "dead axis", "saturated axis", "spikes", "unit of force", "fix codes", "turn of the course",
 )  # fmt: skip
 
@@ -31,7 +31,7 @@ def run_checks(log: RawLog) -> tuple[list[Finding], dict[str, Any], RawLog]:
     Returns findings, facts and the log with what the checks mended for each other.
     """
     facts: dict[str, Any] = {}
-    findings = list(check_clocks(log, facts))
+    findings = [*check_clocks(log, facts), *check_columns(log)]
     log = sort_tables(log)
     log, more = check_rows(log)
     findings += more

@@ -19,7 +19,7 @@ from pfbench.logs.doctor.finding import (
     describe_change,
     thin_curve,
 )
-from pfbench.logs.doctor.motion_search import MotionSearch
+from pfbench.logs.doctor.motion_search import MotionSearch, extent_of
 from pfbench.logs.doctor.raw_log import (
     RawLog,
     correlate_neighbours,
@@ -33,6 +33,7 @@ from pfbench.logs.doctor.thresholds import (
     STANDARD_ERRORS,
     limit_of,
 )
+from pfbench.logs.doctor.turn_search import remove_line
 from pfbench.logs.units import find_units
 
 _Mask = NDArray[np.bool_]
@@ -161,7 +162,10 @@ def _fit_frame(log: RawLog, plain: FixErrors) -> tuple[complex, Array, Array, bo
         after, used = float(np.sqrt(np.square(rest[keep]).mean())), used[keep]
     recorded, true = (a - a.mean(0) for a in (log.fixes.position[used], (log.fixes.position - plain.error)[used]))  # fmt: skip
     ordered = min(float(np.sqrt(np.square((recorded - true @ m.T)[:, :2]).sum(1).mean())) for m in BODY_ORDERS)  # fmt: skip
-    is_explained = after <= min(_FRAME * before, 2.0 * ordered) and before > _LEAST_FRAME
+    drifted = float(np.linalg.norm(remove_line(plain.error[used, :2]).std(0)))
+    is_explained = after <= min(_FRAME * before, 2.0 * ordered, drifted) and before > _LEAST_FRAME
+    if is_explained and (late := _find_coarse_offset(log)).offset:  # a clock can look like a frame
+        is_explained = after <= extent_of(late.error[late.inside, :2])
     return factor, measured, expected, is_explained and bool(factor)
 
 

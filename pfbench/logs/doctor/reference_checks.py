@@ -23,6 +23,7 @@ _EXPLAINED = 0.3  # part of the residual that other axes may leave
 _UNIT_ERROR = 0.03  # relative
 _LEAST_JUMP, _LEAST_TURN, _LEAST_KICK = 2.0, 0.25, 3.0  # m, rad and m/s of a wrong row
 _IMPOSSIBLE = 1.5  # rad, of a row
+_ALONE, _USUAL = 4.0, 98.0  # times the jump that so many percent of the rows do not reach
 _RETURN = 0.5  # part of a jump that remains after the next row
 _MOST_WRONG = 0.01  # share of rows: more are another fault
 
@@ -48,6 +49,7 @@ def drop_wrong_rows(
         size = np.linalg.norm(change, axis=1)
         jump = np.minimum(size[1:], size[:-1])
         rest = np.linalg.norm(change[1:] + change[:-1], axis=1)
+        least = max(least, _ALONE * float(np.percentile(jump, _USUAL)))  # also in another unit
         jump[(jump <= least) | (rest >= _RETURN * jump)] = 0.0
         wrong[1:-1] |= jump > 0.0
         if jump.any() and quantity[-1] != "m":

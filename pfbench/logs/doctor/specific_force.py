@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.signal import detrend
 from scipy.spatial.transform import Rotation
 
 from pfbench.files.table_file import Array
@@ -30,6 +30,7 @@ from pfbench.logs.doctor.force_windows import (
     integrate_force,
 )
 from pfbench.logs.doctor.raw_log import (
+    RawImu,
     RawLog,
     RawReference,
     correlate_neighbours,
@@ -43,10 +44,10 @@ from pfbench.logs.doctor.thresholds import (
     STANDARD_ERRORS,
     limit_of,
 )
-from pfbench.logs.doctor.turn_search import TurnSearch, turns_between
+from pfbench.logs.doctor.turn_search import TurnSearch, remove_line, turns_between
 
 _EQUAL = 1.3  # times the least residual: explanations that fit as well
-_FORCE_SPREAD = 0.3  # m/s^2, of a window
+_FORCE_SPREAD, _CLEAR_FORCE = 0.3, 0.5  # m/s^2, of a window, and one that shows a direction
 _LEAST_SPEED, _AHEAD = (
     2.0,
     0.9,
@@ -192,19 +193,32 @@ def _find_heading(aligned: Alignment, windows: ForceWindows, facts: dict[str, An
     angle = float(np.angle(np.vdot(predicted, expected)))
     turn = Rotation.from_euler("z", angle).as_matrix()
     turned = windows._replace(products=np.einsum("ij,njkl->nikl", turn, windows.products), rotation=turn @ windows.rotation)  # fmt: skip
-    ratio, degrees = plain.cost / max(fit_force(turned).cost, 1e-12), np.rad2deg(angle)
+    fit = fit_force(turned)
+    ratio, degrees = plain.cost / max(fit.cost, 1e-12), np.rad2deg(angle)
     facts["turn of the heading [deg]"] = round(degrees, 2)
     is_near_axes = abs((degrees + 45.0) % 90.0 - 45.0) < limit_of("mounting")
     if ratio < CLEAR_AXES or is_near_axes or aligned.rate_ratio > limit_of("axes"):
         return None
+    change = _find_heading_change(turned, fit)
+    moves = f", and {change[2]} deg" if change else ""
     finding = Finding(
-        "heading", REFUSE, degrees, limit_of("mounting"), "deg",
-        f"{log.names[2]}: yaw is {-degrees:.1f} deg off: it turns as the gyroscope does, and the force moves in another direction",
-        f"Set +scenario.corrections.bias.reference.yaw={-angle:.5f}",
-        {"corrections": {"bias": {"reference": {"yaw": round(-angle, 5)}}}},
+        "heading", WARN if change else REFUSE, degrees, limit_of("mounting"), "deg",
+        f"{log.names[2]}: yaw is {-degrees:.1f} deg off{moves}: it turns as the gyroscope does, and the force moves in another direction",
+        "Use the part without the change: a correction is one number for the whole log" if change
+        else f"Set +scenario.corrections.bias.reference.yaw={-angle:.5f}",
+        {} if change else {"corrections": {"bias": {"reference": {"yaw": round(-angle, 5)}}}},
         ("magnetic or grid North", "a velocity in another frame than the attitude"), _force_picture(windows),
     )  # fmt: skip
     return finding, log._replace(reference=log.reference._replace(angles=np.add(log.reference.angles, [0.0, 0.0, angle])))  # fmt: skip
+
+
+def _find_heading_change(windows: ForceWindows, fit: ForceFit) -> tuple[int, float, str] | None:
+    """Find a change of the direction in which the force moves, deg, that no constant yaw explains."""
+    expected, predicted = (a[:, :2] @ [1.0, 1j] for a in (windows.change, windows.change - fit.residual))  # fmt: skip
+    used = fit.keep & (np.abs(predicted) > _CLEAR_FORCE)
+    angles = np.rad2deg(np.angle(predicted * expected.conj()))[used, None]
+    change = find_change(windows.time[used], angles, _FEWEST_FORCE)
+    return change if change and change[1] > limit_of("heading") else None
 
 
 def _drives_forward(log: RawLog) -> bool:
@@ -231,7 +245,7 @@ def _try_axes(aligned: Alignment, windows: ForceWindows) -> ForceState:
     for name in CONVENTIONS:
         dcm = dcm_of(convert_angles(name, aligned.log.reference.angles))
         turns = turns_between(dcm, aligned.nodes)[aligned.used]
-        rest = float(((measured - detrend(turns, axis=0)) ** 2).sum()) / least
+        rest = float(((measured - remove_line(turns)) ** 2).sum()) / least
         fitted = integrate_force(aligned.log, dcm, aligned.offset)
         if fitted is not None:
             conventions.append((rest, fit_force(fitted).cost, name))
@@ -359,7 +373,8 @@ def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Fi
     """Check scale and bias of the force, which are not judged where the bias changes."""
     windows, fit, name = state.windows, state.fit, state.aligned.log.names[0]
     facts["rest of the force"] = float(np.sqrt(np.square(fit.residual[fit.keep]).sum(1).mean()))
-    change = _find_force_change(windows, fit)
+    is_slow = facts.get("imu rate", np.inf) < limit_of("imu rate")  # motion between samples is lost
+    change = None if is_slow else _find_force_change(windows, fit)
     if change:
         yield Finding(
             "accelerometer bias drift", WARN, change[1], limit_of("accelerometer bias drift"), "m/s^2",
@@ -417,8 +432,15 @@ def _check_rate_errors(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Fi
     measured, true, window, time = _compare_turns(aligned)
     if len(measured) <= _FEWEST:
         return
-    name = aligned.log.names[0]
-    rates = np.rad2deg((measured - true) / window)
+    name, scales = aligned.log.names[0], list(_find_rate_scales(measured, true, window))
+    facts["gyro scale"] = {f"w{axis}": round(scale, 4) for axis, scale, _ in scales}
+    wrong = [
+        (axis, scale, error)
+        for axis, scale, error in scales
+        if abs(scale - 1.0) > max(limit_of("gyro scale"), _SCALE_ERRORS * error)
+    ]
+    factors = {axis: scale for axis, scale, _ in wrong}  # whose part of the turns is no bias
+    rates = np.rad2deg((measured / [factors.get(axis, 1.0) for axis in "xyz"] - true) / window)
     bias = np.median(rates, 0)
     facts["rest of the rate"] = float(np.sqrt(np.square(rates - bias).sum(1).mean()))
     facts["gyro bias [deg/s]"] = bias.round(4).tolist()
@@ -446,13 +468,6 @@ def _check_rate_errors(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Fi
             {"corrections": {"bias": {"imu": _by_column("w", np.deg2rad(bias))}}}, picture=picture,
         )  # fmt: skip
     yield from _check_attitude_jump(aligned.log.names[2], rates - bias, time, window)
-    scales = list(_find_rate_scales(measured, true, window))
-    facts["gyro scale"] = {f"w{axis}": round(scale, 4) for axis, scale, _ in scales}
-    wrong = [
-        (axis, scale, error)
-        for axis, scale, error in scales
-        if abs(scale - 1.0) > max(limit_of("gyro scale"), _SCALE_ERRORS * error)
-    ]
     if wrong:
         axis_name, scale, error = max(wrong, key=lambda entry: abs(entry[1] - 1.0))
         texts = ", ".join(f"w{a} {s:.3f}" for a, s, _ in wrong)
@@ -487,8 +502,7 @@ def _compare_turns(aligned: Alignment) -> tuple[Array, Array, float, Array]:
     search: TurnSearch = aligned.search
     at = search.nodes + aligned.offset
     used = (at[:-1] >= search.time[0]) & (at[1:] <= search.time[-1]) & search.usable
-    gaps = search.time[:-1][np.diff(search.time) > 0.5 * np.median(np.diff(at))]
-    used &= ~np.isin(np.arange(len(used)), np.searchsorted(at, gaps, side="right") - 1)
+    used &= ~_find_holes(aligned.log.imu, at)
     middle = 0.5 * (search.angle[1:] + search.angle[:-1])
     cone = np.vstack([np.zeros(3), np.cumsum(np.cross(middle, np.diff(search.angle, axis=0)), 0)])
     angle, sums = (interpolate_columns(at, search.time, a) for a in (search.angle, cone))
@@ -496,6 +510,16 @@ def _compare_turns(aligned: Alignment) -> tuple[Array, Array, float, Array]:
     measured = step + 0.5 * (np.diff(sums, axis=0) - np.cross(angle[:-1], step))
     true = turns_between(aligned.dcm, aligned.nodes)
     return measured[used], true[used], float(np.median(np.diff(at))), search.nodes[:-1][used]
+
+
+def _find_holes(imu: RawImu, at: Array) -> NDArray[np.bool_]:
+    """Find the windows between times [m + 1] in which no new sample came for a while: gaps and held values, [m]."""
+    samples = np.hstack([imu.force, imu.rate])
+    is_new = np.r_[True, (np.diff(samples, axis=0) != 0.0).any(1)]
+    time = np.append(imu.time[is_new], imu.time[-1])
+    step = np.diff(time)
+    holes = np.flatnonzero(step > max(limit_of("imu gap"), 3.0 * float(np.median(step))))
+    return ((at[1:, None] > time[holes]) & (at[:-1, None] < time[holes + 1])).any(1)
 
 
 def _find_rate_scales(measured: Array, true: Array, window: float) -> Iterator[tuple[str, float, float]]:  # fmt: skip

@@ -28,6 +28,7 @@ class Threshold(NamedTuple):
 THRESHOLDS = {
     "time order": Threshold(0, "rows", 0, 0),
     "repeated times": Threshold(3, "rows", 0, 2),
+    "repeated column": Threshold(0, "rows", 0, 0),
     "imu gap": Threshold(0.1, "s", 0.01, 0.1),
     "imu jitter": Threshold(1.0, "samples", 0.0, 0.5),
     "imu rate": Threshold(15.0, "Hz", 100.0, 50.0),

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import detrend
 from scipy.spatial.transform import Rotation
 
 from pfbench.files.table_file import Array
@@ -75,7 +74,7 @@ class TurnSearch:
             return None
         measured = np.diff(interpolate_columns(at, self.time, self.angle), axis=0)[used]
         # a bias does not turn, nor does one that moves evenly
-        return detrend(turns[used], axis=0), detrend(measured, axis=0), used
+        return remove_line(turns[used]), remove_line(measured), used
 
     def score(self, turns: Array, offset: float, stretch: _Mask | None = None) -> float:
         """Return the common part of the turns after the best rotation or reflection of the axes, 0 to 1.
@@ -117,6 +116,12 @@ class TurnSearch:
         bend = scores[i - 1] - 2.0 * scores[i] + scores[i + 1]
         shift = 0.5 * (scores[i - 1] - scores[i + 1]) / bend * 0.02 if bend < 0.0 else 0.0
         return float(fine[i] + np.clip(shift, -0.02, 0.02)), float(scores[i])
+
+
+def remove_line(values: Array) -> Array:
+    """Remove the mean and the line over the row number from columns, [n, k]."""
+    row, values = np.arange(len(values)) - 0.5 * (len(values) - 1), values - values.mean(0)
+    return np.asarray(values - np.outer(row, row @ values / (row @ row)))
 
 
 def integrate(time: Array, values: Array) -> Array:

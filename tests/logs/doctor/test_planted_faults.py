@@ -154,7 +154,7 @@ def test_no_remedy_of_a_drawn_fault_spoils_the_log(tmp_path: Path, kind: str) ->
     found = {}
     for k, drawn in enumerate(faults):
         log = LOGS[k % len(LOGS)]
-        found[drawn.name] = judge(drawn, log, cut(log), tmp_path / str(k))
+        found[drawn.name] = judge(drawn, log, cut(log), tmp_path / f"log_{k}")
     spoilt = {
         name: out for name, out in found.items() if out.settings and not (out.ratio <= SPOILT)
     }
