@@ -174,7 +174,11 @@ def draw_column(rng: Rng) -> Drawn:
     what, (i, j) = pick(rng, GROUPS), rng.permutation(3)[:2]
     table, columns, _, right, _ = GROUPS[what]
     order = [columns[j] if k == i else column for k, column in enumerate(columns)]
-    return fault(f"column: {columns[j]} under {columns[i]}", mixed(table, columns, order), f"repeated column, {right}")
+    return fault(
+        f"column: {columns[j]} under {columns[i]}",
+        mixed(table, columns, order),
+        f"repeated column, {right}",
+    )
 
 
 KINDS = (

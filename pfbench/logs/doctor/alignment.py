@@ -32,12 +32,16 @@ from pfbench.logs.doctor.turn_search import (
 )
 from pfbench.logs.units import DEGREE, UNIT_FACTORS
 
-_GAIN = 0.15  # of the score by another unit
-_EQUAL = 0.05  # of the score less the miss of the size
+_GAIN, _EQUAL = (
+    0.15,
+    0.05,
+)  # of the score by another unit, and of the score less the miss of the size
 _CERTAIN = 0.9  # score at which no other unit is tried, and that of a piece of the log
 _PIECE, _FEWEST_PIECES, _MOST_PIECES = 15.0, 3, 8  # s, and number of pieces for the drift
-_NO_TURN = 1e-5  # rad; RMS turn of a window of an attitude that does not change
-_LEAST_TURN = 0.03  # rad; RMS turn of a piece that shows an offset
+_NO_TURN, _LEAST_TURN = (
+    1e-5,
+    0.03,
+)  # rad; RMS turn of a window of an attitude that does not change, of a piece with an offset
 _LEAST_COST, _CLEAR_COST = (
     0.01,
     0.5,

@@ -16,11 +16,12 @@ from pfbench.logs.doctor.thresholds import SPIKE_DEVIATIONS, limit_of
 
 _COLUMNS = ("fx", "fy", "fz", "wx", "wy", "wz")
 _POSITION = ("pn", "pe", "pd")
-_BLOCK = 50  # differences of a local level
-_FEWEST = 50  # differences
+_BLOCK, _FEWEST = 50, 50  # differences of a local level, and at least
 _LARGEST = (320.0, 70.0)  # m/s^2 and rad/s: absurd, ten times what platforms reach
-_AWAY = 0.2  # of the range: distance of a saturated value from the median
-_OF_USUAL = 10.0  # times the value that 99 % of the samples do not reach
+_AWAY, _OF_USUAL = (
+    0.2,
+    10.0,
+)  # of the range, from the median to a saturated value; times the value that 99 % do not reach
 
 
 class BadSamples(NamedTuple):

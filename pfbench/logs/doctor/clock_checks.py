@@ -14,8 +14,10 @@ from pfbench.logs.doctor.thresholds import limit_of
 from pfbench.logs.worlds.imu_gaps import LONGEST_BRIDGE
 
 KEYS = ("imu", "gnss", "reference")  # tables in settings
-_MOST_REPEATS = 0.2  # share of rows that repeat a time
-_SPREAD = 99.0  # percent of the intervals within the jitter
+_MOST_REPEATS, _SPREAD = (
+    0.2,
+    99.0,
+)  # share of rows that repeat a time, and percent of the intervals within the jitter
 
 
 def check_clocks(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:

@@ -37,22 +37,27 @@ from pfbench.logs.doctor.turn_search import remove_line
 from pfbench.logs.units import find_units
 
 _Mask = NDArray[np.bool_]
-_FEWEST = 12  # compared fixes
-_LATEST = 25.0  # s; more than the leap seconds
+_FEWEST, _NEIGHBOURS = 12, 10  # compared fixes, and those on each side of a local level
+_LATEST, _GAIN = (
+    25.0,
+    0.8,
+)  # s, more than the leap seconds, and the part of the spread that an offset must leave at most
 _GROUND = np.array([1.0, 1.0, 0.0])
-_GAIN = 0.8  # of the spread that an offset must leave at most
 _CLIP, _MARGIN = 30.0, 12.0  # m of an increment, and variances of the noise
-_NEIGHBOURS = 10  # fixes on each side of a local level
-_MOST_OUTLIERS = 0.05  # share of fixes
+_MOST_OUTLIERS, _HELD = (
+    0.05,
+    0.1,
+)  # share of fixes, and of the limit: motion during other fixes of a receiver that freezes
 _AXES = ("North", "East", "Down")
 _FRAME, _LEAST_FRAME = (
     0.3,
     0.5,
 )  # part of the distances that a turn or a unit may leave, and m of them
 _BLOCK_S, _FEWEST_OF_BLOCK = 10.0, 5  # s and fixes of a block
-_CLEAR = 3.0  # median deviations of a shift
-_HELD = 0.1  # of the limit: motion during other fixes of a receiver that freezes
-_REACH = 2.5  # median steps of the reference: longer ones are gaps
+_CLEAR, _REACH = (
+    3.0,
+    2.5,
+)  # median deviations of a shift, and median steps of the reference: longer ones are gaps
 
 
 class FixErrors(NamedTuple):

@@ -15,8 +15,10 @@ from pfbench.logs.doctor.raw_log import RawLog
 from pfbench.logs.doctor.thresholds import LEAST_ACCELERATION, limit_of
 from pfbench.logs.units import STANDARD_GRAVITY, find_units
 
-_UNIT_ERROR = 0.25  # relative
-_LEFT = 0.25  # part of the squared force that a true unit may leave
+_UNIT_ERROR, _LEFT = (
+    0.25,
+    0.25,
+)  # relative, and part of the squared force that a true unit may leave
 _MISSING = (
     "gravity is missing, as in a linear acceleration",
     "Record the specific force, or {unit}add 9.80665 sin(pitch) to fx, and subtract 9.80665 cos(pitch) sin(roll) "

@@ -13,15 +13,11 @@ from pfbench.files.table_file import Array
 from pfbench.logs.doctor.raw_log import RawLog, interpolate_columns
 from pfbench.logs.doctor.turn_search import integrate, select_nodes
 
-_WINDOW = 1.0  # s
-_LONGEST = 1.6  # s
-_FEWEST = 8
+_WINDOW, _LONGEST, _FEWEST = 1.0, 1.6, 8  # s of a window, s at most, and number
 _BLOCK = 120  # windows that are integrated at once
-_PENALTY = (
-    0.03  # of the residual's weight per (m/s^2)^2 of bias: else gravity is explained by a bias
-)
-_GROSS = 6.0  # median residuals: windows beyond do not count
-_DOWN = np.array([0.0, 0.0, 1.0])
+# Of the residual's weight per (m/s^2)^2 of bias, else gravity is explained by a bias; median residuals of windows that count.
+_PENALTY, _GROSS = 0.03, 6.0
+DOWN = np.array([0.0, 0.0, 1.0])
 
 
 class ForceWindows(NamedTuple):
@@ -120,7 +116,7 @@ def fit_force(windows: ForceWindows, body: Array | None = None, level: Array | N
         The fit.
     """
     body = np.eye(3) if body is None else body
-    predicted = np.einsum("nijk,jk->ni", windows.products, body) + windows.gravity * _DOWN
+    predicted = np.einsum("nijk,jk->ni", windows.products, body) + windows.gravity * DOWN
     change = windows.change if level is None else windows.change @ level.T
     residual = change - predicted
     size = np.linalg.norm(residual, axis=1)

@@ -8,9 +8,9 @@ import numpy as np
 
 from pfbench.files.table_file import Array
 
-_LEAST_ROWS = 12  # within the reference
+# Rows within the reference, and the weight of the median difference among shifts at which the motion agrees.
+_LEAST_ROWS, _OFFSET_WEIGHT = 12, 0.02
 _MOST, _MOST_COARSE = 1500, 300  # positions that are compared, and in the coarse search
-_OFFSET_WEIGHT = 0.02  # weight of the median difference among shifts at which the motion agrees
 
 
 class MotionSearch:

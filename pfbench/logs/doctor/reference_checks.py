@@ -14,18 +14,28 @@ from pfbench.logs.doctor.thresholds import limit_of
 from pfbench.logs.doctor.turn_search import integrate, select_nodes, turns_between
 from pfbench.logs.units import find_units
 
-_LONGEST = 1.8  # s of a window
-_FEWEST = 5  # windows
-_LEAST_MOTION = 0.3  # m per window on an axis that is judged
+_LONGEST, _FEWEST, _LEAST_MOTION = (
+    1.8,
+    5,
+    0.3,
+)  # s of a window, windows, and m in one on an axis that is judged
 _SLOPES, _CORRELATION = (0.8, 1.25), 0.8
 _SLOW_SLOPES, _CLEAR_CORRELATION = (0.7, 1.4), 0.95  # of an axis with less motion
-_EXPLAINED = 0.3  # part of the residual that other axes may leave
-_UNIT_ERROR = 0.03  # relative
-_LEAST_JUMP, _LEAST_TURN, _LEAST_KICK = 2.0, 0.25, 3.0  # m, rad and m/s of a wrong row
-_IMPOSSIBLE = 1.5  # rad, of a row
+_EXPLAINED, _UNIT_ERROR = (
+    0.3,
+    0.03,
+)  # part of the residual that other axes may leave, and relative error of a unit
+_LEAST_JUMP, _LEAST_TURN, _LEAST_KICK, _IMPOSSIBLE = (
+    2.0,
+    0.25,
+    3.0,
+    1.5,
+)  # m, rad and m/s of a wrong row, rad of an impossible one
 _ALONE, _USUAL = 4.0, 98.0  # times the jump that so many percent of the rows do not reach
-_RETURN = 0.5  # part of a jump that remains after the next row
-_MOST_WRONG = 0.01  # share of rows: more are another fault
+_RETURN, _MOST_WRONG = (
+    0.5,
+    0.01,
+)  # part of a jump that remains after the next row, and share of rows: more are another fault
 
 
 def drop_wrong_rows(

@@ -11,8 +11,7 @@ from pfbench.logs.doctor.raw_log import RawImu, RawLog, RawReference
 from pfbench.logs.worlds.log_tables import ImuLog, ReferenceLog
 
 _BLOCK = 0.5  # s; mean values that show rest
-_QUIET_SPEED, _QUIET_RATE = 0.15, 0.03  # m/s, rad/s
-_LEAST_STANDING = 8.0  # s
+_QUIET_SPEED, _QUIET_RATE, _LEAST_STANDING = 0.15, 0.03, 8.0  # m/s, rad/s, s
 # grade by the density of the gyroscope, rad/s/sqrt(Hz), the best first
 _GRADES = ((1e-5, "navigation or fibre-optic"), (1e-4, "tactical"), (1e-3, "industrial MEMS"), (np.inf, "consumer MEMS"))  # fmt: skip
 

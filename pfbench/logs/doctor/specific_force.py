@@ -24,6 +24,7 @@ from pfbench.logs.doctor.axis_orders import (
 from pfbench.logs.doctor.changes import find_change
 from pfbench.logs.doctor.finding import REFUSE, WARN, Finding, Picture, thin_curve
 from pfbench.logs.doctor.force_windows import (
+    DOWN,
     ForceFit,
     ForceWindows,
     fit_force,
@@ -46,18 +47,25 @@ from pfbench.logs.doctor.thresholds import (
 )
 from pfbench.logs.doctor.turn_search import TurnSearch, remove_line, turns_between
 
-_EQUAL = 1.3  # times the least residual: explanations that fit as well
+_EQUAL, _ALONE = (
+    1.3,
+    3.0,
+)  # times the least residual, of explanations that fit as well, and the next largest turn
 _FORCE_SPREAD, _CLEAR_FORCE = 0.3, 0.5  # m/s^2, of a window, and one that shows a direction
 _LEAST_SPEED, _AHEAD = (
     2.0,
     0.9,
 )  # m/s, and mean cosine between yaw and course of a vehicle that drives forward
-_DOWN = np.array([0.0, 0.0, 1.0])
-_FEWEST = 20  # windows for scales
-_FEWEST_FORCE, _FEWEST_RATE = 8, 16  # windows of a block
-_LEAST_RATE, _SCALE_ERROR = 0.05, 0.02  # rad/s and 1: motion and accuracy that show a scale
-_SCALE_ERRORS = 6.0
-_ALONE = 3.0  # times the next largest turn
+_FEWEST, _FEWEST_FORCE, _FEWEST_RATE = (
+    20,
+    8,
+    16,
+)  # windows for scales, and of a block of the force and of the rate
+_LEAST_RATE, _SCALE_ERROR, _SCALE_ERRORS = (
+    0.05,
+    0.02,
+    6.0,
+)  # rad/s, 1, standard errors: motion and accuracy that show a scale
 _DELAYS, _DELAY_S = (
     np.linspace(-0.2, 0.2, 5),
     600.0,
@@ -118,10 +126,8 @@ def check_force_and_rate(aligned: Alignment, facts: dict[str, Any]) -> tuple[Raw
     )
     is_rate = aligned.rate_ratio > limit_of("axes")
     is_force = ratio > CLEAR_AXES and horizontal > LEAST_ACCELERATION
-    # exchanged axes are looked for before a heading, since part of them is a turn about the vertical
-    if turned := _find_rotation(aligned, windows, facts) or (
-        None if is_rate or is_force else _find_heading(aligned, windows, facts)
-    ):
+    # a part of exchanged axes is a turn about the vertical, and a motion along a line allows exchanged axes for a heading
+    if turned := _find_rotation(aligned, windows, facts) or _find_heading(state, facts):
         finding, log = turned
         return log, [finding]
     if is_rate or is_force:
@@ -149,7 +155,7 @@ def _find_rotation(aligned: Alignment, windows: ForceWindows, facts: dict[str, A
 
     def residuals(vector: Array, start: Array) -> Array:
         matrix = Rotation.from_rotvec(vector).as_matrix() @ start
-        force = windows.change - np.einsum("nijk,jk->ni", windows.products, matrix) - windows.gravity * _DOWN  # fmt: skip
+        force = windows.change - np.einsum("nijk,jk->ni", windows.products, matrix) - windows.gravity * DOWN  # fmt: skip
         return np.concatenate([((measured @ matrix.T - true) / spread).ravel(), force.ravel() / _FORCE_SPREAD])  # fmt: skip
 
     starts = [orders[0], orders[int(np.argmin(rates))], orders[int(np.argmin(forces))]]
@@ -183,21 +189,22 @@ def _find_rotation(aligned: Alignment, windows: ForceWindows, facts: dict[str, A
     return finding, _mend(log, finding.settings["corrections"])
 
 
-def _find_heading(aligned: Alignment, windows: ForceWindows, facts: dict[str, Any]) -> tuple[Finding, RawLog] | None:  # fmt: skip
+def _find_heading(state: ForceState, facts: dict[str, Any]) -> tuple[Finding, RawLog] | None:
     """Find a yaw of the reference that is off by a constant: turns agree, and the force moves in another direction.
 
     Returns the finding, and the log with the yaw corrected.
     """
-    plain, log = fit_force(windows), aligned.log
+    plain, windows, log = state.fit, state.windows, state.aligned.log
     predicted, expected = (a[plain.keep, :2] @ [1.0, 1j] for a in (windows.change - plain.residual, windows.change))  # fmt: skip
     angle = float(np.angle(np.vdot(predicted, expected)))
     turn = Rotation.from_euler("z", angle).as_matrix()
     turned = windows._replace(products=np.einsum("ij,njkl->nikl", turn, windows.products), rotation=turn @ windows.rotation)  # fmt: skip
     fit = fit_force(turned)
-    ratio, degrees = plain.cost / max(fit.cost, 1e-12), np.rad2deg(angle)
+    degrees = np.rad2deg(angle)
     facts["turn of the heading [deg]"] = round(degrees, 2)
     is_near_axes = abs((degrees + 45.0) % 90.0 - 45.0) < limit_of("mounting")
-    if ratio < CLEAR_AXES or is_near_axes or aligned.rate_ratio > limit_of("axes"):
+    is_better = fit.cost < min(plain.cost / CLEAR_AXES, state.least)
+    if not is_better or is_near_axes or state.aligned.rate_ratio > limit_of("axes"):
         return None
     change = _find_heading_change(turned, fit)
     moves = f", and {change[2]} deg" if change else ""
@@ -385,7 +392,7 @@ def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Fi
         )  # fmt: skip
         return
     measured = np.linalg.norm(np.einsum("nijj->ni", windows.products), axis=1)
-    needed = np.linalg.norm(windows.change - windows.gravity * _DOWN, axis=1)
+    needed = np.linalg.norm(windows.change - windows.gravity * DOWN, axis=1)
     scale = float(np.median(measured / np.maximum(needed, 1e-9)))
     bias, memory = -fit.bias, correlate_neighbours(fit.residual[fit.keep])
     a = windows.rotation[fit.keep].reshape(-1, 3)
@@ -439,8 +446,8 @@ def _check_rate_errors(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Fi
         for axis, scale, error in scales
         if abs(scale - 1.0) > max(limit_of("gyro scale"), _SCALE_ERRORS * error)
     ]
-    factors = {axis: scale for axis, scale, _ in wrong}  # whose part of the turns is no bias
-    rates = np.rad2deg((measured / [factors.get(axis, 1.0) for axis in "xyz"] - true) / window)
+    factors = _scale_all(scales, {axis: scale for axis, scale, _ in wrong})
+    rates = np.rad2deg((measured / [*factors.values()] - true) / window)  # a scale is no bias
     bias = np.median(rates, 0)
     facts["rest of the rate"] = float(np.sqrt(np.square(rates - bias).sum(1).mean()))
     facts["gyro bias [deg/s]"] = bias.round(4).tolist()
@@ -475,11 +482,21 @@ def _check_rate_errors(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Fi
             "gyro scale", WARN, scale - 1.0, limit_of("gyro scale"), "1",
             f"{name}: scale factors against {aligned.log.names[2]}: {texts}, within {2.0 * error:.3f}",
             "Set scenario.corrections.scale, or correct the scale factors",
-            {"corrections": {"scale": {"imu": {f"w{a}": round(1.0 / s, 5) for a, s, _ in wrong}}}},
+            {"corrections": {"scale": {"imu": {f"w{a}": round(1.0 / s, 5) for a, s in factors.items() if s != 1.0}}}},
             ("scale factors of the gyroscope", "a reference that smooths its turns"),
             Picture(f"turn of the reference about {axis_name} [rad]", "turn of the imu [rad]",
                     (thin_curve("windows", true[:, "xyz".index(axis_name)], measured[:, "xyz".index(axis_name)]),)),
         )  # fmt: skip
+
+
+def _scale_all(scales: list[tuple[str, float, float]], wrong: dict[str, float]) -> dict[str, float]:
+    """Return the scale of each axis, 1 for a right one; one that is not clear has that of two which agree, if it is nearer."""
+    values, found = [*wrong.values()], {axis: scale for axis, scale, _ in scales}
+    common = float(np.mean(values)) if len(values) > 1 and np.ptp(values) < _SCALE_ERROR else 1.0
+    return {
+        axis: wrong.get(axis, min(1.0, common, key=lambda s: abs(s - found.get(axis, common))))
+        for axis in "xyz"
+    }
 
 
 def _check_attitude_jump(name: str, rates: Array, time: Array, window: float) -> Iterator[Finding]:

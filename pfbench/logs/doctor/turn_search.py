@@ -12,10 +12,11 @@ from pfbench.files.table_file import Array
 from pfbench.logs.doctor.raw_log import RawImu, interpolate_columns
 
 _Mask = NDArray[np.bool_]
-TURN_WINDOW = 0.5  # s; turns are compared over windows of this length
-FEWEST_TURNS = 12
-_LEAST_SHARE = 0.4  # of the windows
-_LARGEST = 25.0  # s; more than the leap seconds
+TURN_WINDOW, FEWEST_TURNS = (
+    0.5,
+    12,
+)  # s: turns are compared over windows of this length; and their number
+_LEAST_SHARE, _LARGEST = 0.4, 25.0  # of the windows, and s: more than the leap seconds
 _COARSE = np.unique(np.round(np.r_[np.arange(-_LARGEST, _LARGEST, 0.25), np.arange(-1.5, 1.5, 0.1)], 3))  # fmt: skip
 _FINE = np.arange(-0.3, 0.301, 0.02)
 
