@@ -179,8 +179,9 @@ def _fit_rate_axes(aligned: Alignment) -> Alignment:
     true, measured = aligned.pair
     residuals = [float(((measured - true @ m.T) ** 2).sum()) for m in BODY_ORDERS]
     best = int(np.argmin(residuals))
-    ratio = residuals[0] / max(residuals[best], 1e-300)
-    return replace(aligned, rate_axes=BODY_ORDERS[best], rate_ratio=ratio)
+    return replace(
+        aligned, rate_axes=BODY_ORDERS[best], rate_ratio=residuals[0] / max(residuals[best], 1e-300)
+    )
 
 
 def _has_turns(search: TurnSearch, turns: Array) -> bool:

@@ -157,13 +157,11 @@ def _check_dead(log: RawLog, samples: Array, stuck: float) -> Iterator[Finding]:
     """Check for a column that does not change while the others do."""
     time, rows = log.imu.time, [find_stuck(column[:, None]) for column in samples.T]
     # a value that is held at the end of the range is cut off, not dead
-    is_cut = [
-        c[f] in (c.min(), c.max()) and c[f] != 0.0 and c.min() < c.max()
-        for c, (f, _) in zip(samples.T, rows, strict=True)
-    ]
     durations = [
-        0.0 if cut else float(time[last] - time[first])
-        for cut, (first, last) in zip(is_cut, rows, strict=True)
+        0.0
+        if c[first] in (c.min(), c.max()) and c[first] != 0.0 and c.min() < c.max()
+        else float(time[last] - time[first])
+        for c, (first, last) in zip(samples.T, rows, strict=True)
     ]
     k = int(np.argmax(durations))
     # three constant columns are a motion without errors of sensors

@@ -288,8 +288,7 @@ def _prefer_axes(log: RawLog, late: FixErrors) -> FixErrors:
     with_offset = with_offset or without
     other_axes = float(without[3].min()) / len(without[2])
     same_axes = float(with_offset[3][0]) / len(with_offset[2])
-    is_better = limit_of("fix axes") * other_axes < same_axes
-    return plain if is_better else late
+    return plain if limit_of("fix axes") * other_axes < same_axes else late
 
 
 def _check_axes(log: RawLog, errors: FixErrors, facts: dict[str, Any]) -> Iterator[Finding]:
@@ -469,10 +468,11 @@ def _fit_jointly(error: Array, a: Array) -> JointFit:
 
 
 def _describe_late(log: RawLog, errors: FixErrors, offset: float, error: float) -> Finding:
-    late = "late" if offset > 0.0 else "early"
-    name, time = log.names[1], log.fixes.time
-    leap = " (leap seconds between UTC and GPS time)" if abs(abs(offset) - 18.0) < 0.1 else ""
-    plain = compare_at(log, 0.0)
+    late, name, time = "late" if offset > 0.0 else "early", log.names[1], log.fixes.time
+    leap, plain = (
+        " (leap seconds between UTC and GPS time)" if abs(abs(offset) - 18.0) < 0.1 else "",
+        compare_at(log, 0.0),
+    )
     return Finding(
         "gnss clock", REFUSE if abs(offset) > REFUSED_OFFSET else WARN, offset, limit_of("gnss clock"), "s",
         f"{name}: t is {abs(offset):.3f} s {late} against {log.names[2]}, within {2.0 * error:.3f} s{leap}",

@@ -88,5 +88,6 @@ def _find_cost(
     windows: ForceWindows, factor: float, gravity: float, axes: Array | None = None
 ) -> float:
     """Return what the force leaves of the acceleration, (m/s^2)^2, with another unit, gravity and axes."""
-    scaled = windows._replace(products=factor * windows.products, gravity=gravity)
-    return fit_force(scaled, axes).cost
+    return fit_force(
+        windows._replace(products=factor * windows.products, gravity=gravity), axes
+    ).cost

@@ -203,7 +203,9 @@ def _find_heading(state: ForceState, facts: dict[str, Any]) -> tuple[Finding, Ra
     degrees = np.rad2deg(angle)
     facts["turn of the heading [deg]"] = round(degrees, 2)
     is_near_axes = abs((degrees + 45.0) % 90.0 - 45.0) < limit_of("mounting")
-    is_better = fit.cost < min(plain.cost / CLEAR_AXES, state.least)
+    is_better = fit.cost < min(
+        plain.cost / CLEAR_AXES, state.least, limit_of("rest of the force") ** 2
+    )
     if not is_better or is_near_axes or state.aligned.rate_ratio > limit_of("axes"):
         return None
     change = _find_heading_change(turned, fit)
@@ -223,8 +225,11 @@ def _find_heading_change(windows: ForceWindows, fit: ForceFit) -> tuple[int, flo
     """Find a change of the direction in which the force moves, deg, that no constant yaw explains."""
     expected, predicted = (a[:, :2] @ [1.0, 1j] for a in (windows.change, windows.change - fit.residual))  # fmt: skip
     used = fit.keep & (np.abs(predicted) > _CLEAR_FORCE)
-    angles = np.rad2deg(np.angle(predicted * expected.conj()))[used, None]
-    change = find_change(windows.time[used], angles, _FEWEST_FORCE)
+    change = find_change(
+        windows.time[used],
+        np.rad2deg(np.angle(predicted * expected.conj()))[used, None],
+        _FEWEST_FORCE,
+    )
     return change if change and change[1] > limit_of("heading") else None
 
 
@@ -531,8 +536,7 @@ def _compare_turns(aligned: Alignment) -> tuple[Array, Array, float, Array]:
 
 def _find_holes(imu: RawImu, at: Array) -> NDArray[np.bool_]:
     """Find the windows between times [m + 1] in which no new sample came for a while: gaps and held values, [m]."""
-    samples = np.hstack([imu.force, imu.rate])
-    is_new = np.r_[True, (np.diff(samples, axis=0) != 0.0).any(1)]
+    is_new = np.r_[True, (np.diff(np.hstack([imu.force, imu.rate]), axis=0) != 0.0).any(1)]
     time = np.append(imu.time[is_new], imu.time[-1])
     step = np.diff(time)
     holes = np.flatnonzero(step > max(limit_of("imu gap"), 3.0 * float(np.median(step))))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -270,7 +270,8 @@ def _find_text_format(file: Path, has_names: bool) -> str:
     names, rows = read_head(file)
     by_suffix = _SUFFIXES.get(file.suffix.lower(), "")
     numbers = to_numbers(rows)
-    if names and (has_names or _is_table(names)):
+    is_table = "t" in names and any(set(columns) <= set(names) for columns in (LOCAL, GEODETIC))
+    if names and (has_names or is_table):
         return "table"
     if find_pose_columns(names, rows):
         return "tum"
@@ -300,11 +301,6 @@ def _describe_unknown(file: Path, width: int) -> ValueError:
         f"quaternion), a result of KF-GINS (11 numbers from week and second on) or NMEA, got {width} fields in "
         f"the first row. {remedy}"
     )
-
-
-def _is_table(names: Sequence[str]) -> bool:
-    """Return whether names of columns are those of a table of pfbench."""
-    return "t" in names and (set(LOCAL) <= set(names) or set(GEODETIC) <= set(names))
 
 
 def _is_kf_gins(numbers: Array) -> bool:

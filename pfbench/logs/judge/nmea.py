@@ -255,11 +255,6 @@ def _read_gga(fields: list[str]) -> _Epoch:
     return _read_fix(fields)
 
 
-def _read_gns(fields: list[str]) -> _Epoch:
-    """Return the position of GNS, whose geoid separation lies one field nearer, without units."""
-    return _read_fix([*fields[:10], "M", *fields[10:]])
-
-
 def _read_minimum(fields: list[str]) -> _Epoch:
     if fields[2] != "A" or not fields[7]:
         return {}
@@ -293,7 +288,8 @@ def _read_deviations(fields: list[str]) -> _Epoch:
 
 _READERS: dict[str, Callable[[list[str]], _Epoch]] = {
     "GGA": _read_gga,
-    "GNS": _read_gns,
+    # whose geoid separation lies one field nearer, without units
+    "GNS": lambda fields: _read_fix([*fields[:10], "M", *fields[10:]]),
     "RMC": _read_minimum,
     "VTG": _read_ground_velocity,
     "GST": _read_deviations,

@@ -177,8 +177,7 @@ def _draw_intervals(estimate: TrackEstimate) -> Figure:
         for ending, motion, line in kinds:
             if motion is not None:
                 axis.plot(estimate.time, _NORMAL * motion.sd[:, 6 + k], line, color=_COLOURS[k], linewidth=0.8, label=name + ending)  # fmt: skip
-    axis.set(xlabel="t [s]", ylabel="half-width [m]")
-    axis.set_ylim(bottom=0.0)
+    axis.set(xlabel="t [s]", ylabel="half-width [m]", ylim=(0.0, None))
     axis.legend(fontsize="x-small", ncols=3)
     return figure
 
@@ -190,8 +189,7 @@ def _draw_held_out(estimate: TrackEstimate) -> Figure:
     for name, motion in estimate.tracks().items():
         distance = np.linalg.norm(motion.held_out[:, :2], axis=1)
         axis.plot(estimate.held_out_time[order], distance[order], ".", markersize=4, label=name)
-    axis.set(xlabel="t [s]", ylabel="distance [m]")
-    axis.set_ylim(bottom=0.0)
+    axis.set(xlabel="t [s]", ylabel="distance [m]", ylim=(0.0, None))
     axis.legend(fontsize="x-small")
     return figure
 
@@ -214,7 +212,6 @@ def _draw_agreement(estimate: TrackEstimate) -> Figure:
     first, *others = estimate.answers
     for k, answer in enumerate(others, 1):
         axis.plot(estimate.time, _distances(first, answer), color=_COLOURS[k % len(_COLOURS)], linewidth=0.8, label=answer.name)  # fmt: skip
-    axis.set(xlabel="t [s]", ylabel="distance [m]")
-    axis.set_ylim(bottom=0.0)
+    axis.set(xlabel="t [s]", ylabel="distance [m]", ylim=(0.0, None))
     axis.legend(fontsize="x-small")
     return figure
