@@ -114,7 +114,7 @@ def check_samples(log: RawLog, facts: dict[str, Any]) -> tuple[RawLog, list[Find
     return log._replace(imu=imu._replace(force=samples[:, :3], rate=samples[:, 3:])), findings
 
 
-def check_columns(log: RawLog) -> Iterator[Finding]:
+def check_repeated_columns(log: RawLog) -> Iterator[Finding]:
     """Check that no table has one column under two names."""
     imu, reference = log.imu, log.reference
     for table, names, values in (

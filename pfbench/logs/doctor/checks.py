@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from pfbench.logs.doctor.alignment import align_clocks
-from pfbench.logs.doctor.bad_samples import check_columns, check_samples
+from pfbench.logs.doctor.bad_samples import check_repeated_columns, check_samples
 from pfbench.logs.doctor.clock_checks import check_clocks, sort_tables
 from pfbench.logs.doctor.course_checks import check_course
 from pfbench.logs.doctor.finding import Finding
@@ -31,7 +31,7 @@ def run_checks(log: RawLog) -> tuple[list[Finding], dict[str, Any], RawLog]:
     Returns findings, facts and the log with what the checks mended for each other.
     """
     facts: dict[str, Any] = {}
-    findings = [*check_clocks(log, facts), *check_columns(log)]
+    findings = [*check_clocks(log, facts), *check_repeated_columns(log)]
     log = sort_tables(log)
     log, more = check_rows(log)
     findings += more

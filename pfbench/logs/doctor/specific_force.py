@@ -90,6 +90,7 @@ class ForceState:
         fit: Fit of the recorded axes.
         body: Cost and matrix of the best body axes of the force.
         level: Cost and matrix of the best level axes.
+        ros: Cost of axes of ROS in all tables.
         conventions: Rate residual, force cost and name of each convention of the attitude.
     """
 
@@ -98,12 +99,15 @@ class ForceState:
     fit: ForceFit
     body: tuple[float, Array]
     level: tuple[float, Array]
+    ros: float
     conventions: tuple[tuple[float, float, str], ...] = ()
 
     @property
     def least(self) -> float:
         """Least cost of any explanation."""
-        return min(self.body[0], self.level[0], *(cost for _, cost, _ in self.conventions))
+        return min(
+            self.body[0], self.level[0], self.ros, *(cost for _, cost, _ in self.conventions)
+        )
 
 
 def check_force_and_rate(aligned: Alignment, facts: dict[str, Any]) -> tuple[RawLog, list[Finding]]:
@@ -202,11 +206,12 @@ def _find_heading(state: ForceState, facts: dict[str, Any]) -> tuple[Finding, Ra
     fit = fit_force(turned)
     degrees = np.rad2deg(angle)
     facts["turn of the heading [deg]"] = round(degrees, 2)
-    is_near_axes = abs((degrees + 45.0) % 90.0 - 45.0) < limit_of("mounting")
-    is_better = fit.cost < min(
-        plain.cost / CLEAR_AXES, state.least, limit_of("rest of the force") ** 2
-    )
-    if not is_better or is_near_axes or state.aligned.rate_ratio > limit_of("axes"):
+    if (
+        fit.cost >= min(plain.cost / CLEAR_AXES, state.least, limit_of("rest of the force") ** 2)
+        or state.aligned.rate_ratio > limit_of("axes")
+        or abs((degrees + 45.0) % 90.0 - 45.0)
+        < limit_of("mounting")  # orders of axes have their own check
+    ):
         return None
     change = _find_heading_change(turned, fit)
     moves = f", and {change[2]} deg" if change else ""
@@ -248,7 +253,9 @@ def _try_axes(aligned: Alignment, windows: ForceWindows) -> ForceState:
     level = min(
         ((fit_force(windows, level=m).cost, m) for m in LEVEL_ORDERS), key=lambda pair: pair[0]
     )
-    state = ForceState(aligned, windows, fit, body, level)
+    # with these, turns agree, and only gravity points the other way: a bias can hide it
+    ros = fit.cost if fit.cost < limit_of("rest of the force") ** 2 else _find_ros_cost(aligned)
+    state = ForceState(aligned, windows, fit, body, level, ros)
     if max(fit.cost / max(state.least, 1e-12), aligned.rate_ratio) <= limit_of("axes"):
         return state
     conventions = []
@@ -288,7 +295,7 @@ def _list_causes(state: ForceState, is_rate: bool) -> Iterator[Cause]:
     """Yield the explanations, simple ones first."""
     log, limit = state.aligned.log, _EQUAL * state.least
     (imu, _, reference), identity = log.names, np.eye(3)
-    if not is_rate and _fits_ros(state):
+    if not is_rate and state.ros < limit:
         yield "all tables: East, North, Up and forward, left, up, as in ROS", _ROS
     for rest, cost, name in state.conventions:
         if rest < _EQUAL and cost < limit and not ("yaw" in name and _drives_forward(log)):
@@ -328,11 +335,11 @@ def _mend(log: RawLog, corrections: Mapping[str, Any]) -> RawLog:
     return log._replace(imu=imu, reference=reference, fixes=fixes)
 
 
-def _fits_ros(state: ForceState) -> bool:
-    """Return whether axes of ROS in all tables fit: these agree with each other, and gravity alone points the other way."""
-    mended = _mend(state.aligned.log, _ROS)
-    windows = integrate_force(mended, dcm_of(mended.reference.angles), state.aligned.offset)
-    return windows is not None and fit_force(windows).cost < _EQUAL * state.least
+def _find_ros_cost(aligned: Alignment) -> float:
+    """Return what the force leaves if all tables have axes of ROS."""
+    mended = _mend(aligned.log, _ROS)
+    windows = integrate_force(mended, dcm_of(mended.reference.angles), aligned.offset)
+    return fit_force(windows).cost if windows else np.inf
 
 
 def _find_mounting(state: ForceState) -> Array:

@@ -29,7 +29,6 @@ HIDDEN = {
     "imu clock +0.03 s": {"wing"},  # whose own offset is -0.011 s
     "imu clock 1000 ppm fast": {"quad 2", "quad 17"},  # of 18 s
     "fixes turned 12 deg": {"walk"},  # of 15 m, on which it moves fixes by less than 3 m
-    "axes of ROS": {"wing"},  # with an attitude of an on-board filter
     "force sample +150": {"quad 2"},  # vibration of 100 m/s^2
     "force sample +30": {"quad 2", "quad 13", "quad 17"},
     "force late 0.2 s": {
@@ -47,7 +46,6 @@ BESIDE = {
     ("quad 17", "imu clock jump 1 s"): {"imu clock"},
     ("quad 17", "reference ENU"): {"fix axes"},
     ("wing", "fixes frozen 3 s"): {"fix outliers"},
-    ("wing", "axes of ROS"): {"accelerometer bias"},
     ("walk", "reference jumps 8 m"): {"reference velocity"},
 }
 # Its remedy exchanges North and East and leaves the vertical, so that the fixes seem to be upside down: a fault of the check.
