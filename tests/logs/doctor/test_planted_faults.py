@@ -24,7 +24,7 @@ from synthetic_log import write
 
 from pfbench.scenario import inspect_log
 
-# what a short or noisy log does not show; 57 of 65 faults are named on all six logs
+# what a short or noisy log does not show; 62 of 68 faults are named on all six logs
 HIDDEN = {
     "imu clock +0.03 s": {"wing"},  # whose own offset is -0.011 s
     "imu clock 1000 ppm fast": {"quad 2", "quad 17"},  # of 18 s
