@@ -547,7 +547,7 @@ def _find_holes(imu: RawImu, at: Array) -> NDArray[np.bool_]:
     time = np.append(imu.time[is_new], imu.time[-1])
     step = np.diff(time)
     holes = np.flatnonzero(step > max(limit_of("imu gap"), 3.0 * float(np.median(step))))
-    return ((at[1:, None] > time[holes]) & (at[:-1, None] < time[holes + 1])).any(1)
+    return np.asarray(((at[1:, None] > time[holes]) & (at[:-1, None] < time[holes + 1])).any(1))
 
 
 def _find_rate_scales(measured: Array, true: Array, window: float) -> Iterator[tuple[str, float, float]]:  # fmt: skip
