@@ -284,10 +284,9 @@ def _describe_rate_unit(log: RawLog, pair: tuple[Array, Array], ratio: float) ->
     factor, is_degrees = 1.0 / _unit_of(ratio), _unit_of(ratio) != ratio
     true, measured = pair
     axis, rows = int(np.argmax(np.square(true).sum(0))), np.arange(len(true))
-    unit = "they are in deg/s" if is_degrees else "they have another unit"
     return Finding(
         "unit of rate", REFUSE, ratio, limit_of("unit of rate"), "times the reference",
-        f"{log.names[0]}: wx, wy, wz are {ratio:.3g} times the turns of the reference: {unit}",
+        f"{log.names[0]}: wx, wy, wz are {ratio:.3g} times the turns of the reference: they {'are in deg/s' if is_degrees else 'have another unit'}",
         f"Multiply by {factor:.10g}, or set scenario.corrections.scale",
         {"corrections": {"scale": {"imu": dict.fromkeys(("wx", "wy", "wz"), factor)}}},
         picture=Picture("window", f"turn about {'xyz'[axis]}", (

@@ -258,8 +258,9 @@ def _find_coarse_offset(log: RawLog) -> FixErrors:
     fixes, reference = log.fixes, log.reference
     motion = MotionSearch(fixes.time, fixes.position * _GROUND, reference.time, lambda at: reference_at(log, at) * _GROUND)  # fmt: skip
     spread, shift = motion.search(-_LATEST, _LATEST)
-    is_late = np.isfinite(spread) and spread <= _GAIN * motion.spread(0.0)
-    late = compare_at(log, -shift if is_late else 0.0)
+    late = compare_at(
+        log, -shift if np.isfinite(spread) and spread <= _GAIN * motion.spread(0.0) else 0.0
+    )
     return _prefer_axes(log, late) if late.offset else late
 
 

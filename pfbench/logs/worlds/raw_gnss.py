@@ -31,6 +31,7 @@ from pfbench.logs.worlds.log_tables import (
     Array,
     LogFiles,
     LogTable,
+    NavigationLog,
     check_range,
     convert_column,
     find_dataset,
@@ -441,6 +442,10 @@ class RecordedWalk(RecordedScenario):
         clock = self.tuning.clock_sd * draws.at_step(0).normal("world.clock", 1, 3)[:, 0]
         return torch.cat([clock.new_zeros(len(clock), 0) if motion is None else motion, -clock], -1)
 
+    def _read_sky(self, folder: Path, log: NavigationLog, time: Array) -> RawGnssLog:
+        """Read the raw measurements at some times, s, [K]."""
+        return collect_sky(read_table(folder, SKY, {}), time, self.receiver, self.origin)
+
     def _read(self) -> tuple[ResampledLog, RawGnssLog]:
         """Read the log on filter steps and the raw measurements relative to the start."""
         folder = find_dataset(self.root, self.folder)
@@ -453,7 +458,7 @@ class RecordedWalk(RecordedScenario):
             end=self.end_s,
         )
         time = np.concatenate([[leg.start_s], leg.time])
-        gnss_log = collect_sky(read_table(folder, SKY, {}), time, self.receiver, self.origin)
+        gnss_log = self._read_sky(folder, log, time)
         motion = interpolate(log.reference, time)
         notes = check_sky(gnss_log, time, motion, self.limits or PlausibleLimits())
         leg = leg._replace(notes=(*leg.notes, *notes))
