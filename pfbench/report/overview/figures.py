@@ -176,7 +176,9 @@ def dose_points(
     return [
         (float(level) if axis == "particles" else overview.times[world.key, label], cell.verdict)
         for level, overview in overviews.items()
-        if (cell := overview.find(world, label)) and cell.verdict.ratio > 0
+        if (cell := overview.find(world, label))
+        and cell.verdict.ratio > 0
+        and (axis == "particles" or np.isfinite(overview.times[world.key, label]))
     ]
 
 

@@ -22,6 +22,7 @@ from pfbench.report.overview.tables import (
     World,
     WorldCell,
     find_outdone,
+    format_times,
     list_world_notes,
     name_size,
     name_word,
@@ -66,6 +67,9 @@ def render_overview(
     """
     level = choose_level(overviews)
     overview = overviews[level]
+    timed = next(
+        (key for key in (level, *_list_timed(overviews)) if overviews[key].has_times), level
+    )
     pictures = draw_pictures(overviews)
     files = {f"{name}.svg": text for name, text in pictures.items() if not name.endswith("_390")}
     for name, tables in (("cells", list_verdicts), ("pairs", list_comparisons)):
@@ -76,7 +80,8 @@ def render_overview(
         "overview": overview,
         "levels": [key for key in overviews if key],
         "level": level,
-        "has_doses": len(_select_levels(overviews)) > 1,
+        "doses": _choose_axes(overviews),
+        "timed": f" with {timed} particles" * (timed != level),
         "others": [
             (_name_tab(key, item), _suffix(key))
             for key, item in overviews.items()
@@ -100,6 +105,7 @@ def render_overview(
             tell_story(
                 overview, m, str(read_paper_block("filter", parse_label(m)[0]).get("summary", ""))
             )
+            | {"time": format_times(overviews[timed], m)}
             for m in overview.methods
         ],
         "tuned": describe_tuned(overview, overviews[WITH_KNOBS]) if WITH_KNOBS in overviews else "",
@@ -126,7 +132,7 @@ def list_overview_blocks(page: Mapping[str, Any]) -> list[Block]:
     printed = " The methods are repaired where a printed form fails; as printed they have a table in index.html."
     heads = (
         "method", "in one line", "better than the best Kalman filter", "equal to it", "not decided", "worse",
-        "time of a step / that of the best Kalman filter, median over worlds (range); / that of SIR",
+        f"time of a step{page['timed']} / that of the best Kalman filter, median over worlds (range); / that of SIR",
     )  # fmt: skip
     columns = ("name", "is", "wins", "equal", "open", "loses", "time")
     return [
@@ -177,6 +183,25 @@ def _select_levels(overviews: Mapping[TabKey, Overview]) -> dict[int, Overview]:
     return {key: overview for key, overview in overviews.items() if isinstance(key, int)}
 
 
+def _list_timed(overviews: Mapping[TabKey, Overview]) -> list[int]:
+    """List the numbers of particles with times of a step."""
+    return [key for key, overview in _select_levels(overviews).items() if overview.has_times]
+
+
+def _choose_axes(overviews: Mapping[TabKey, Overview]) -> dict[str, str]:
+    """Return the titles of the figures of error by their axis: the time is one where several numbers of particles have times."""
+    titles = {
+        "particles": "How many particles are enough?",
+        "time": "What does computing time bring?",
+    }
+    counts = len(_select_levels(overviews)), len(_list_timed(overviews))
+    return {
+        axis: title
+        for (axis, title), count in zip(titles.items(), counts, strict=True)
+        if count > 1
+    }
+
+
 def _name_tab(key: TabKey, overview: Overview) -> str:
     """Name tables below the first ones."""
     if key == EQUAL_TIME:
@@ -195,7 +220,11 @@ def _suffix(key: TabKey) -> str:
 
 def draw_pictures(overviews: Mapping[TabKey, Overview]) -> dict[str, str]:
     """Draw all figures of the page as SVG: those of the middle number of particles without a suffix of it."""
-    first, levels = choose_level(overviews), _select_levels(overviews)
+    first, levels, axes = (
+        choose_level(overviews),
+        _select_levels(overviews),
+        _choose_axes(overviews),
+    )
     pictures = {}
     for key, overview in overviews.items():
         suffix = "" if key == first else _suffix(key)
@@ -203,13 +232,12 @@ def draw_pictures(overviews: Mapping[TabKey, Overview]) -> dict[str, str]:
             pictures[f"heat_map{suffix}{size.name}"] = figures.draw_heat_map(overview, size)
         for size in figures.MATRIX_FORMATS if key != WITH_KNOBS else ():
             pictures[f"matrices{suffix}{size.name}"] = figures.draw_matrices(overview, size)
-    if len(levels) > 1:
-        worlds = order_dose_worlds(overviews[first])
-        for axis, size in itertools.product(("particles", "time"), figures.DOSE_FORMATS):
-            for suffix, some in (("", worlds[:2]), ("_others", worlds[2:])):
-                if some:
-                    name = f"error_by_{axis}{suffix}{size.name}"
-                    pictures[name] = figures.draw_doses(levels, some, axis, size)
+    worlds = order_dose_worlds(overviews[first])
+    for axis, size in itertools.product(axes, figures.DOSE_FORMATS):
+        for suffix, some in (("", worlds[:2]), ("_others", worlds[2:])):
+            if some:
+                name = f"error_by_{axis}{suffix}{size.name}"
+                pictures[name] = figures.draw_doses(levels, some, axis, size)
     return {name: figures.to_svg(figure) for name, figure in pictures.items()}
 
 

@@ -171,6 +171,11 @@ class Overview(NamedTuple):
         """Methods against the reference of each world."""
         return [cell for cell in self.cells if cell.filter in self.methods]
 
+    @property
+    def has_times(self) -> bool:
+        """True if all filters have times of a step."""
+        return bool(self.times) and bool(np.isfinite(list(self.times.values())).all())
+
     def compare_times(self, label: str, base: str = "") -> dict[str, float]:
         """Return the time of a step relative to that of another filter, or of the reference, by the names of their worlds."""
         pairs = {
@@ -468,7 +473,8 @@ def _find_time(world: World, label: str) -> float:
     """Return the median time of a step of a filter in all regimes of a world [ms]."""
     runs = world.court.runs
     of_world = (runs.conditions["scenario"] == world.key).to_numpy()
-    return float(np.nanmedian(runs.values["ms"][runs.filters.index(label), of_world]))
+    times = runs.values["ms"][runs.filters.index(label), of_world]
+    return float(np.median(times[np.isfinite(times)])) if np.isfinite(times).any() else math.nan
 
 
 def _count_particles(tab: _Tab, labels: Mapping[str, str], court: Court) -> dict[str, float]:
