@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.kernels import dispatch
 from pfbench.model.base import StateSpaceModel

@@ -13,8 +13,7 @@ from hydra import compose, initialize_config_dir
 
 from pfbench import job
 from pfbench.core.record import Record
-from pfbench.filter.gaussian.linearisation_rules import SigmaPointLinearisation
-from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
+from pfbench.filter import GuidedNoiseProposal, SigmaPointLinearisation
 from pfbench.model.base import StateSpaceModel
 from pfbench.results.paper_block import read_part
 

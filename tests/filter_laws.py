@@ -9,12 +9,9 @@ import torch
 from model_cases import Unrolled
 from torch import Tensor
 
-from pfbench.core.chart import wrap_angle
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record, wrap_angle
 from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.textbook import Pendulum
+from pfbench.model import Pendulum, StateSpaceModel
 from pfbench.testing import filter_record
 
 

@@ -11,12 +11,9 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
-from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, wrap_angle
+from pfbench.core import AngleBlock, Chart, EuclideanBlock, PhiloxStream, wrap_angle
 from pfbench.core.density import independent_normal, normal_batch
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian
-from pfbench.model.textbook import Pendulum
+from pfbench.model import LinearGaussian, Pendulum, StateSpaceModel
 
 
 def tracker() -> LinearGaussian:

@@ -9,10 +9,14 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.moves.metropolis import McmcKernel, Move
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.stages import EssResampler, Systematic
+from pfbench.filter import (
+    EssResampler,
+    McmcKernel,
+    Move,
+    ParticleBelief,
+    ParticleFilter,
+    Systematic,
+)
 
 
 def moving(*moves: Move, n: int = 40, threshold: float = 1.0) -> ParticleFilter:

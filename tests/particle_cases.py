@@ -14,11 +14,16 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent, Uniform
 
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.textbook import Benes, StochasticVolatility, UnivariateGrowth
+from pfbench.filter import ParticleBelief, ParticleFilter
+from pfbench.model import (
+    Benes,
+    LinearGaussian,
+    StateSpaceModel,
+    StochasticVolatility,
+    UnivariateGrowth,
+    linear_walk,
+    local_level,
+)
 from pfbench.testing import FilterMoments, reference_moments
 
 WALK = linear_walk(1.0, 0.5, 1.0)

@@ -8,11 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pfbench.core.chart import Chart, QuaternionBlock
+from pfbench.core import Chart, QuaternionBlock, Record
 from pfbench.core.density import independent_normal, normal_batch
-from pfbench.core.record import Record
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian
+from pfbench.model import LinearGaussian, StateSpaceModel
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.simulated import ModelSimulation
 

@@ -27,11 +27,9 @@ from recorded_data import DATA
 
 from pfbench import job
 from pfbench.cli.compose import read_description
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode, MeasurementChannels
+from pfbench.core import Episode, MeasurementChannels, PhiloxStream
+from pfbench.filter import FilterResult, GaussianFilter, run_filter
 from pfbench.filter.exactness import has_covariance
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.job.config import compose_tree, expand_filter_names, list_groups
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.job.tuned_knobs import select_knobs

@@ -20,9 +20,7 @@ from pyarrow import parquet
 
 from pfbench.claims import write_claims
 from pfbench.files.recorded_folder import PUBLISHED_FILES
-from pfbench.report import is_equal_drawing
-from pfbench.report.stored_study import RUNS_FILE, read_stored_study
-from pfbench.report.study_report import rebuild_page
+from pfbench.report import RUNS_FILE, is_equal_drawing, read_stored_study, rebuild_page
 
 
 def load(name: str) -> ModuleType:

@@ -10,13 +10,17 @@ from torch import Tensor
 
 from pfbench.core.record import Episode, Record
 from pfbench.model.tight_coupling import SinsGnssTight, TightStep
-from pfbench.nav import earth
-from pfbench.nav.aiding import AlignmentErrors, ProcessNoiseInflation
-from pfbench.nav.imu_errors import ImuErrors
-from pfbench.nav.manoeuvres import CycloidRamp, RampTrajectory
-from pfbench.nav.orbits import WalkerConstellation
-from pfbench.nav.ranging import RangingReceiver
-from pfbench.nav.trajectory import TrajectoryStart
+from pfbench.nav import (
+    AlignmentErrors,
+    CycloidRamp,
+    ImuErrors,
+    ProcessNoiseInflation,
+    RampTrajectory,
+    RangingReceiver,
+    TrajectoryStart,
+    WalkerConstellation,
+    earth,
+)
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.flights import SimulatedFlight
 

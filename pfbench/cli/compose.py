@@ -214,10 +214,12 @@ def _check_composition(words: list[str]) -> JobConfig | None:
 
 
 def _check_sweep(overrides: list[str]) -> JobConfig | None:
-    """Check the first job of a sweep, and all values that can choose a file that is not pfbench's.
+    """Check the first job of a sweep, all settings, and all values that can choose a file that is not pfbench's.
 
     Returns the configuration of the first job, None if it is not valid.
     """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
     try:
         tree = compose_tree([options[0] for options in expand_sweep(overrides)])
         params = tree.hydra.sweeper.params or {}
@@ -227,7 +229,7 @@ def _check_sweep(overrides: list[str]) -> JobConfig | None:
         raise
     except Exception:  # Hydra reports an invalid override
         return None
-    first = [options[0] for options in alternatives]
+    first, parser = [options[0] for options in alternatives], OverridesParser.create()
     config = _check_composition(first)
     values: Mapping[str, object] = config.values if config else {}
     for index, options in enumerate(alternatives):
@@ -237,17 +239,10 @@ def _check_sweep(overrides: list[str]) -> JobConfig | None:
                 check_study(value.strip("'\""))
             is_plain = key in values and not isinstance(values[key], Mapping)
             if is_plain:  # a setting, whose values are known before a job starts
-                check_settings({**values, key: _parse_value(option)})
+                check_settings({**values, key: parser.parse_override(option).value()})
             elif value not in list_named_parts(key):
                 _check_composition([*first[:index], option, *first[index + 1 :]])
     return config
-
-
-def _parse_value(override: str) -> Any:
-    """Return the value of an override."""
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-
-    return OverridesParser.create().parse_override(override).value()
 
 
 # --------------------------------------------------------------------------------------------------
@@ -260,9 +255,6 @@ def wants_until_decided(plan: StudyPlan) -> bool:
     """Return whether a study adds runs until it is decided."""
     return plan.first.values.get("runs") == UNTIL_DECIDED
 
-
-# --------------------------------------------------------------------------------------------------
-# Jobs, worlds and pairs of a sweep, before it runs.
 
 # keys that are equal in all jobs of a condition, and how several values are run
 _EQUAL_KEYS = {

@@ -78,8 +78,8 @@ def check_settings(values: Mapping[str, Any]) -> None:
     for key, (requirement, example) in _REQUIREMENTS.items():
         if not valid[key]:
             remedy = _advise_integer(key, values[key]) or f"Set {key}={example}."
-            got = values.get(key)  # a text in quotes: "10" is none of the numbers
-            raise ValueError(f"{key} must be {requirement}, got {got!r}. {remedy}")
+            # a text in quotes: "10" is none of the numbers
+            raise ValueError(f"{key} must be {requirement}, got {values.get(key)!r}. {remedy}")
     require(
         not values["first_run"] + values["runs"] > RUN_NUMBERS,
         "first_run + runs",

@@ -15,8 +15,7 @@ from scipy import stats
 
 from pfbench import job
 from pfbench.cli.compose import read_sweep
-from pfbench.report import StudyFacts
-from pfbench.report.options import ReportOptions
+from pfbench.report import ReportOptions, StudyFacts
 from pfbench.results.looks import find_looks
 
 sys.path.insert(0, str(ROOT / "experiments" / "analyses"))  # scripts, not a package

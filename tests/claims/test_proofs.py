@@ -13,28 +13,31 @@ from filter_cases import method_of
 from refusals import check_refused
 
 from pfbench.claims.claim_lines import read_proofs
+from pfbench.core import PhiloxStream, Record
 from pfbench.core.linear_algebra import factor
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.guided.guides import SharedGuideProposal
-from pfbench.filter.linearisation import is_normal
-from pfbench.filter.loop import run_filter
-from pfbench.filter.moves.metropolis import MetropolisHastings
-from pfbench.filter.moves.path_kernels import PathBlockKernel
-from pfbench.filter.moves.path_proposals import SmoothedSegment
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.regularised_resampling import GaussianSmoothing
-from pfbench.filter.particle.stages import EssResampler, Systematic
-from pfbench.filter.proposed.dmc_controller import DmcController
-from pfbench.filter.proposed.swarm import SwarmLimits, SwarmProposal
-from pfbench.filter.proposed.swarm_coordinates import (
+from pfbench.filter import (
     AllComponents,
+    DmcController,
+    EssResampler,
+    GaussianFilter,
+    GaussianSmoothing,
+    GaussianVelocity,
+    InertiaVelocity,
     LikelihoodFitness,
+    MetropolisHastings,
+    ParticleFilter,
+    PathBlockKernel,
     PrintedFitness,
+    PrintedWeighting,
+    PriorStart,
+    SharedGuideProposal,
+    SmoothedSegment,
+    SwarmLimits,
+    SwarmProposal,
+    Systematic,
+    run_filter,
 )
-from pfbench.filter.proposed.swarm_motion import GaussianVelocity, InertiaVelocity, PriorStart
-from pfbench.filter.proposed.swarm_weighting import PrintedWeighting
+from pfbench.filter.linearisation import is_normal
 from pfbench.model.linear_gaussian import LinearGaussian
 
 RULES = ("ckf", "hckf", "ssrckf", "ssrhckf5", "ssr53", "mssrckf")

@@ -19,10 +19,8 @@ from scipy.stats import beta, halfcauchy
 
 from pfbench.job import compose, instantiate
 from pfbench.model.textbook import StochasticVolatility
-from pfbench.ppl import inference_job
+from pfbench.ppl import ParameterisedModel, inference_job, nuts
 from pfbench.ppl.inference_job import make_priors
-from pfbench.ppl.nuts_svi import nuts
-from pfbench.ppl.parameterised_model import ParameterisedModel
 from pfbench.ppl.priors import find_range
 
 PARAMETERS = "parameters={level_sd:[10,100]}"

@@ -14,23 +14,28 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
-from pfbench.core import linear_algebra as jacobian_module
-from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock, wrap_angle
+from pfbench.core import (
+    Chart,
+    EuclideanBlock,
+    PhiloxStream,
+    QuaternionBlock,
+    Record,
+    linear_algebra as jacobian_module,
+    wrap_angle,
+)
 from pfbench.core.density import ChartNormal, has_finite_moments, normal_batch
 from pfbench.core.linear_algebra import jacobian
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.gaussian.ensemble_kalman import EnsembleKalmanFilter
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.filter import (
     CubaturePoints,
+    EnsembleKalmanFilter,
+    GaussianFilter,
+    ParticleFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
     UnscentedPoints,
+    run_filter,
 )
 from pfbench.filter.linearisation import compute_nis
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.base import StateSpaceModel, StaticModel
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.simulated import ModelSimulation

@@ -19,25 +19,17 @@ from torch import Tensor
 from torch.distributions import Distribution, Independent
 
 import pfbench
-from pfbench.core import require, require_range, require_ranges
+from pfbench.core import PhiloxStream, Record, require, require_range, require_ranges
 from pfbench.core.density import normal_batch
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
 from pfbench.core.simulate import NumberSource, draw_values
+from pfbench.filter import ParticleFilter, run_filter
 from pfbench.filter.learned.objectives import simulate_from_model
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.filter.particle.stages import draw_noise
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import linear_walk
-from pfbench.model.textbook import Pendulum
-from pfbench.noise.base import NominalNoise, OutlierNoise
-from pfbench.noise.time_windows import MeasurementOutage, VarianceSurge
+from pfbench.model import Pendulum, StateSpaceModel, linear_walk
+from pfbench.noise import MeasurementOutage, NominalNoise, OutlierNoise, VarianceSurge
+from pfbench.ppl import ParameterisedModel, latent_program, simulate
 from pfbench.ppl.model_batch import ModelBatch
-from pfbench.ppl.parameterised_model import ParameterisedModel
-from pfbench.ppl.pyro_program import latent_program, simulate
-from pfbench.scenario.base import RecordingRegime
-from pfbench.scenario.simulated import ModelSimulation
+from pfbench.scenario import ModelSimulation, RecordingRegime
 
 RUNS = 20_000
 

@@ -24,13 +24,11 @@ from faults.children import Ending, run_child
 from faults.numeric_cases import CASES, RUNS, Extreme
 from faults.sweeps import CLEAR
 from faults.tally import FINE, Tally
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
+from pfbench.filter import FilterResult, ParticleFilter, run_filter
 from pfbench.filter.exactness import has_covariance, has_evidence
 from pfbench.filter.health import HEALTH
-from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.kernels import dispatch
 from pfbench.model.linear_gaussian import LinearGaussian
 

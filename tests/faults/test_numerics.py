@@ -9,8 +9,7 @@ from filter_cases import method_of
 from faults.numeric_cases import CASES, RUNS
 from faults.numerics import try_case
 from faults.tally import FINE
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter.loop import run_filter
 
 POINTS = (("ekf_pf", "H of 1e100"), ("dmc_noise", "R of 1e-24"), ("dmc_optimal", "H of 1e100"))

@@ -17,14 +17,11 @@ from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
+from pfbench.filter import FilterResult, ParticleFilter, SwarmProposal, run_filter
 from pfbench.filter.belief import StepInfo
-from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle import compiled_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.proposed.swarm import SwarmProposal
 from pfbench.kernels import dispatch
 
 pytestmark = pytest.mark.filterwarnings("ignore:ParticleGuideProposal")  # it says that it is dear

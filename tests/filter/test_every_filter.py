@@ -20,20 +20,21 @@ from recorded_data import DATA
 from torch import Tensor
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter import loop
+from pfbench.core import PhiloxStream, Record
+from pfbench.filter import (
+    CountLimits,
+    EssStepCount,
+    LookAheadWeights,
+    ParticleFilter,
+    SwarmProposal,
+    loop,
+)
 from pfbench.filter.belief import ParticleBelief, StepInfo
 from pfbench.filter.exactness import has_bounded_weights, has_covariance
 from pfbench.filter.input_check import check_model
 from pfbench.filter.loop import prepare_record, run_filter
-from pfbench.filter.particle.particle_count import CountLimits, EssStepCount
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.weights import LookAheadWeights
-from pfbench.filter.proposed.swarm import SwarmProposal
 from pfbench.job.scoring import ScoreRecorder
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian
+from pfbench.model import LinearGaussian, StateSpaceModel
 from pfbench.noise.base import NominalNoise
 from pfbench.results.paper_block import read_paper_block, read_part
 from pfbench.scenario.simulated import ModelSimulation

@@ -12,19 +12,19 @@ from refusals import check_refused
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core import PhiloxStream, Record
 from pfbench.core.density import log_density
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter import input_check
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import CubaturePoints
-from pfbench.filter.loop import run_filter
-from pfbench.filter.moves.metropolis import MetropolisHastings
-from pfbench.filter.moves.path_kernels import NoiseFlowStatKernel
-from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter import (
+    CubaturePoints,
+    GaussianFilter,
+    MetropolisHastings,
+    NoiseFlowStatKernel,
+    ParticleFilter,
+    input_check,
+    run_filter,
+)
 from pfbench.kernels import dispatch
-from pfbench.model.base import ModelWrapper
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
+from pfbench.model import LinearGaussian, ModelWrapper, linear_walk
 from pfbench.noise import NominalNoise
 from pfbench.ppl import simulate
 from pfbench.scenario import ModelSimulation

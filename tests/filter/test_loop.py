@@ -11,19 +11,17 @@ import torch
 from checkout import ROOT
 from refusals import check_refused
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.belief import StepInfo
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.core import PhiloxStream, Record
+from pfbench.filter import (
     CubaturePoints,
+    GaussianFilter,
+    ParticleFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
 )
+from pfbench.filter.belief import StepInfo
 from pfbench.filter.loop import choose_run_batch, run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.model.linear_gaussian import linear_walk, local_level
-from pfbench.model.textbook import UnivariateGrowth
+from pfbench.model import UnivariateGrowth, linear_walk, local_level
 
 MODEL = linear_walk(1.0, 0.5, 1.0)
 METHODS = [

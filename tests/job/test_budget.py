@@ -12,9 +12,7 @@ import torch
 from command_line import pfbench
 
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.stages import EssResampler, Systematic
+from pfbench.filter import EssResampler, ParticleFilter, Systematic, run_filter
 from pfbench.job import budget
 from pfbench.job.scoring import LikelihoodCounter
 from pfbench.model.linear_gaussian import linear_walk

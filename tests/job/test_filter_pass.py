@@ -16,9 +16,7 @@ from config_cases import truncated
 
 from pfbench.filter.loop import run_filter
 from pfbench.filter.particle import compiled_filter
-from pfbench.job import compose, filter_pass
-from pfbench.job.config import resolve_config
-from pfbench.job.plan import build_plan
+from pfbench.job import build_plan, compose, filter_pass, resolve_config
 
 JOB = ["scenario=growth", "filter=sir", "runs=3", "particles=50"]
 

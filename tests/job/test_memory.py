@@ -17,10 +17,8 @@ from command_line import environment, pfbench
 from refusals import check_refused
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.core import Episode, PhiloxStream
+from pfbench.filter import ParticleFilter, run_filter
 from pfbench.job import budget, instantiate, memory, memory as system_memory, model_fit, plan
 from pfbench.job.memory import GIB, MIB, AllocationCounter
 from pfbench.model.linear_gaussian import linear_walk

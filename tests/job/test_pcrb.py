@@ -13,33 +13,46 @@ from refusals import check_refused
 from torch import Tensor
 from torch.distributions import Independent, MultivariateNormal, StudentT
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.core import PhiloxStream, Record
+from pfbench.filter import (
     CubaturePoints,
+    EssResampler,
+    GaussianFilter,
+    ParticleFilter,
     SigmaPointLinearisation,
+    Systematic,
     TaylorLinearisation,
+    run_filter,
 )
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.stages import EssResampler, Systematic
 from pfbench.job.pcrb import compute_posterior_bound
-from pfbench.model.ins_gnss import InsGnss
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk
-from pfbench.model.passive_location import PassiveLocation, PlatformInputs, compute_level_attitude
-from pfbench.model.strapdown import StrapdownTotal
-from pfbench.model.strapdown_tuning import StrapdownTuning
-from pfbench.model.textbook import Benes, Pendulum, StochasticVolatility, UnivariateGrowth
-from pfbench.nav.aiding import AlignmentErrors, GnssReceiver, ProcessNoiseInflation
-from pfbench.nav.imu_errors import ImuErrors
-from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, climb, turn
+from pfbench.model import (
+    Benes,
+    InsGnss,
+    LinearGaussian,
+    PassiveLocation,
+    Pendulum,
+    PlatformInputs,
+    StochasticVolatility,
+    StrapdownTotal,
+    StrapdownTuning,
+    UnivariateGrowth,
+    compute_level_attitude,
+    linear_walk,
+)
+from pfbench.nav import (
+    AlignmentErrors,
+    GnssReceiver,
+    ImuErrors,
+    ManoeuvreTrajectory,
+    ProcessNoiseInflation,
+    TrajectoryStart,
+    accelerate,
+    climb,
+    turn,
+)
 from pfbench.nav.strapdown import PreintegratedImu, preintegrate
-from pfbench.nav.trajectory import TrajectoryStart
-from pfbench.noise.base import NominalNoise
-from pfbench.noise.time_windows import MeasurementOutage
-from pfbench.scenario.flights import SimulatedFlight
-from pfbench.scenario.simulated import ModelSimulation
+from pfbench.noise import MeasurementOutage, NominalNoise
+from pfbench.scenario import ModelSimulation, SimulatedFlight
 
 WALK = linear_walk(0.5, 0.3, 2.0)
 

@@ -16,17 +16,18 @@ from scipy import stats
 from torch import Tensor
 
 from pfbench import job
-from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
-from pfbench.core.random_stream import PhiloxStream
+from pfbench.core import Chart, EuclideanBlock, PhiloxStream, QuaternionBlock
 from pfbench.core.record import MeasuredTruth
+from pfbench.filter import (
+    EnsembleKalmanFilter,
+    GaussianFilter,
+    GuidedNoiseProposal,
+    ParticleFilter,
+    RaoBlackwellisedFilter,
+    TaylorLinearisation,
+    run_filter,
+)
 from pfbench.filter.belief import ParticleBelief, StepInfo, make_step_info, summarise
-from pfbench.filter.gaussian.ensemble_kalman import EnsembleKalmanFilter
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
-from pfbench.filter.loop import run_filter
-from pfbench.filter.marginal.rao_blackwellised import RaoBlackwellisedFilter
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.raw_estimate import RawEstimate, compute_raw_estimate
 from pfbench.job.scoring import (
     LikelihoodCounter,

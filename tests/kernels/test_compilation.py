@@ -14,22 +14,22 @@ from command_line import pfbench
 from torch import Tensor
 from torch._subclasses import FakeTensorMode
 
-from pfbench.core import density, linear_algebra
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter import belief
-from pfbench.filter.belief import ParticleBelief, gather_ancestors
-from pfbench.filter.gaussian import gaussian_filter, kalman_update, linearisation_rules
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.core import PhiloxStream, Record, density, linear_algebra
+from pfbench.filter import (
     CubaturePoints,
+    FilterResult,
+    ParticleBelief,
+    ParticleFilter,
     RadialDegree5,
     SimplexDegree3,
     SphericalRadialPoints,
     UnscentedPoints,
+    belief,
+    gather_ancestors,
+    run_filter,
 )
-from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.filter.gaussian import gaussian_filter, kalman_update, linearisation_rules
 from pfbench.filter.particle import stages
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job import filter_pass, scoring
 from pfbench.kernels import cpp_library, dispatch
 from pfbench.model.linear_gaussian import linear_walk

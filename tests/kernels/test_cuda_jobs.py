@@ -18,28 +18,25 @@ from model_cases import tracker
 from torch import Tensor
 
 from pfbench import job
-from pfbench.core.chart import Chart
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.learned.differentiable_resampling import SoftResampler
-from pfbench.filter.learned.networks import DiagonalNormalHead
-from pfbench.filter.learned.objectives import (
+from pfbench.core import Chart, PhiloxStream, Record
+from pfbench.filter import (
+    DiagonalNormalHead,
+    EssResampler,
     EvidenceLowerBound,
+    FilterResult,
     InferenceCompilation,
+    LearnedProposal,
+    ParticleFilter,
+    SoftResampler,
     StateErrorLoss,
+    SwarmProposal,
+    Systematic,
+    run_filter,
 )
-from pfbench.filter.learned.proposal import LearnedProposal
-from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.stages import EssResampler, Systematic
-from pfbench.filter.proposed.swarm import SwarmProposal
 from pfbench.kernels import dispatch
-from pfbench.learn.trainer import Training
-from pfbench.learn.training_data import draw_training_data
-from pfbench.learn.training_job import train
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, local_level
+from pfbench.learn import Training, draw_training_data, train
+from pfbench.model import LinearGaussian, StateSpaceModel, local_level
 from pfbench.noise.base import NominalNoise
 from pfbench.results import store
 from pfbench.scenario.simulated import ModelSimulation

@@ -12,18 +12,19 @@ from particle_cases import CASES
 from torch import Tensor
 from torch.distributions import Distribution
 
+from pfbench.core import PhiloxStream, Record
 from pfbench.core.density import independent_normal, normal_batch
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.learned.differentiable_resampling import (
+from pfbench.filter import (
+    EssResampler,
+    Multinomial,
+    ParticleBelief,
+    ParticleFilter,
+    Resampler,
     SoftResampler,
     StopGradientResampler,
+    Systematic,
+    run_filter,
 )
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.resampling import Multinomial
-from pfbench.filter.particle.stages import EssResampler, Resampler, Systematic
 from pfbench.model.base import StateSpaceModel
 from pfbench.testing import check_evidence, filter_record
 

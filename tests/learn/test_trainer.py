@@ -22,18 +22,25 @@ from synthetic_results import list_results
 from torch import Tensor, nn
 from torch.distributions import Distribution, Independent, Normal
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
-from pfbench.filter.learned import checkpoint
-from pfbench.filter.learned.differentiable_resampling import (
+from pfbench.core import PhiloxStream, Record
+from pfbench.filter import (
+    BootstrapProposal,
+    DiagonalNormalHead,
+    EssResampler,
+    GaussianFilter,
+    GuidedNoiseProposal,
+    LearnedProposal,
+    LearnedRandomWalk,
+    MetropolisHastings,
+    ParticleFilter,
+    Proposal,
     SoftResampler,
     StopGradientResampler,
+    Systematic,
+    TaylorLinearisation,
+    run_filter,
 )
-from pfbench.filter.learned.mcmc_kernel import LearnedRandomWalk
-from pfbench.filter.learned.networks import DiagonalNormalHead
+from pfbench.filter.learned import checkpoint
 from pfbench.filter.learned.objectives import (
     EvidenceLowerBound,
     ExpectedSquaredJump,
@@ -41,11 +48,6 @@ from pfbench.filter.learned.objectives import (
     StateErrorLoss,
     simulate_from_model,
 )
-from pfbench.filter.learned.proposal import LearnedProposal
-from pfbench.filter.loop import run_filter
-from pfbench.filter.moves.metropolis import MetropolisHastings
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.stages import BootstrapProposal, EssResampler, Proposal, Systematic
 from pfbench.learn.trainer import Progress, Training, TrainingState
 from pfbench.learn.training_data import TrainingData, draw_training_data
 from pfbench.learn.training_job import train, write_losses

@@ -20,26 +20,35 @@ from torch import Tensor
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record, iterate_steps
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.filter import (
     CubaturePoints,
+    FilterResult,
+    GaussianFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
     UnscentedPoints,
+    run_filter,
 )
-from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.job.config import compose_tree
 from pfbench.job.scoring import ScoreRecorder
-from pfbench.model.constraints import Constraints
-from pfbench.model.earth_form import FlatEarth, RotatingEarth
+from pfbench.model import Constraints, FlatEarth, RotatingEarth, StrapdownBlocks
 from pfbench.model.ins_gnss import InsGnss, LooseStep
-from pfbench.model.strapdown_blocks import StrapdownBlocks
-from pfbench.nav import attitude, earth, error_dynamics
-from pfbench.nav.aiding import AlignmentErrors, GnssReceiver, ProcessNoiseInflation
-from pfbench.nav.imu_errors import ImuErrors
-from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, climb, cruise, turn
+from pfbench.nav import (
+    AlignmentErrors,
+    GnssReceiver,
+    ImuErrors,
+    ManoeuvreTrajectory,
+    ProcessNoiseInflation,
+    TrajectoryStart,
+    accelerate,
+    attitude,
+    climb,
+    cruise,
+    earth,
+    error_dynamics,
+    turn,
+)
 from pfbench.nav.strapdown import InsIntervals, PreintegratedImu, preintegrate
-from pfbench.nav.trajectory import TrajectoryStart
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.flights import SimulatedFlight
 

@@ -12,8 +12,7 @@ from torch import Tensor
 
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
+from pfbench.filter import GaussianFilter, ParticleFilter, TaylorLinearisation
 from pfbench.filter.linearisation import (
     find_observation_jacobian,
     find_propagation_jacobian,
@@ -21,7 +20,6 @@ from pfbench.filter.linearisation import (
     transition_jacobian,
 )
 from pfbench.filter.loop import prepare_record, run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model import Benes, Lorenz63, UnivariateGrowth
 from pfbench.noise import NominalNoise
 from pfbench.scenario import ModelSimulation

@@ -14,18 +14,25 @@ from scipy import integrate, linalg, stats
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
-from pfbench.core.chart import wrap_angle
+from pfbench.core import PhiloxStream, Record, wrap_angle
 from pfbench.core.density import dense_normal, independent_normal, normal_batch
 from pfbench.core.linear_algebra import (
     distribution_covariance,
     gaussian_log_density,
     shared_distribution_covariance,
 )
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.model.base import StateSpaceModel, StaticModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
+from pfbench.model import (
+    Benes,
+    LinearGaussian,
+    Lorenz63,
+    Pendulum,
+    StateSpaceModel,
+    StaticModel,
+    StochasticVolatility,
+    UnivariateGrowth,
+    linear_walk,
+    local_level,
+)
 
 MODELS: dict[str, Callable[[], StateSpaceModel]] = {
     "growth": UnivariateGrowth,

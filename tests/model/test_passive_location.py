@@ -12,8 +12,7 @@ from refusals import check_refused
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.model.passive_location import (
     SPEED_OF_LIGHT,
     PassiveLocation,

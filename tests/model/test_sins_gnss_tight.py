@@ -15,15 +15,15 @@ from tight_cases import IMU, INITIAL, PATH, RECEIVER, RUNS, flight, kalman, line
 from torch import Tensor
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode, Record, map_inputs
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.core import Episode, PhiloxStream, Record, map_inputs
+from pfbench.filter import (
     CubaturePoints,
+    FilterResult,
+    GaussianFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
+    run_filter,
 )
-from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.model.tight_coupling import NAMES, SinsGnssTight, SinsGnssTightNl
 from pfbench.nav import attitude, earth, strapdown
 from pfbench.nav.aiding import AlignmentErrors, FlightSolution, GnssReceiver, ProcessNoiseInflation

@@ -14,17 +14,17 @@ from scipy import stats
 from torch import Tensor
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode, Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.core import Episode, PhiloxStream, Record
+from pfbench.filter import (
     CubaturePoints,
+    FilterResult,
+    GaussianFilter,
+    ParticleFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
     UnscentedPoints,
+    run_filter,
 )
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.azimuth import (
     ErrorEquations,
@@ -37,12 +37,20 @@ from pfbench.model.azimuth import (
     compute_euler_rate,
     compute_level_coupling,
 )
-from pfbench.nav import attitude, earth, error_dynamics
-from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
-from pfbench.nav.imu_errors import ImuErrors
-from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, climb, turn
+from pfbench.nav import (
+    AlignmentErrors,
+    GnssReceiver,
+    ImuErrors,
+    ManoeuvreTrajectory,
+    TrajectoryStart,
+    accelerate,
+    attitude,
+    climb,
+    earth,
+    error_dynamics,
+    turn,
+)
 from pfbench.nav.strapdown import InsIntervals
-from pfbench.nav.trajectory import TrajectoryStart
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.flights import SimulatedFlight
 

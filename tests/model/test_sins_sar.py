@@ -14,22 +14,29 @@ from scipy import stats
 from torch import Tensor
 
 from pfbench import job
-from pfbench.core.chart import wrap_angle
+from pfbench.core import Episode, PhiloxStream, map_inputs, wrap_angle
 from pfbench.core.density import ChartNormal
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode, map_inputs
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.filter import (
     CubaturePoints,
+    FilterResult,
+    GaussianFilter,
     LinearisationRule,
+    ParticleFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
+    run_filter,
 )
-from pfbench.filter.loop import FilterResult, run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.sins_sar import SarStep, SinsSar
-from pfbench.nav import attitude, earth, error_dynamics
+from pfbench.nav import (
+    CosineRamp,
+    ImuErrors,
+    RampTrajectory,
+    TrajectoryStart,
+    attitude,
+    earth,
+    error_dynamics,
+)
 from pfbench.nav.aiding import (
     ARCMIN,
     AlignmentErrors,
@@ -38,12 +45,8 @@ from pfbench.nav.aiding import (
     compute_heading_difference,
 )
 from pfbench.nav.earth import convert_from_metres, convert_to_metres, earth_quantities
-from pfbench.nav.imu_errors import ImuErrors
-from pfbench.nav.manoeuvres import CosineRamp, RampTrajectory
 from pfbench.nav.strapdown import InsIntervals
-from pfbench.nav.trajectory import TrajectoryStart
-from pfbench.noise.base import NominalNoise
-from pfbench.noise.time_windows import MeasurementOutage
+from pfbench.noise import MeasurementOutage, NominalNoise
 from pfbench.scenario.flights import SimulatedFlight
 
 IMU = ImuErrors(

@@ -11,13 +11,9 @@ from refusals import check_refused
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.loop import run_filter
-from pfbench.model.strapdown import StrapdownAided
-from pfbench.model.strapdown_tuning import AidedTuning, StrapdownTuning
+from pfbench.core import PhiloxStream, Record
+from pfbench.filter import GaussianFilter, TaylorLinearisation, run_filter
+from pfbench.model import AidedTuning, StrapdownAided, StrapdownTuning
 from pfbench.nav.strapdown import PreintegratedImu, preintegrate
 
 MOTION = StrapdownTuning(

@@ -17,18 +17,16 @@ from torch import Tensor
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record, iterate_steps
 from pfbench.core.simulate import draw_initial_state, simulate_steps
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.filter import (
     CubaturePoints,
+    GaussianFilter,
+    ParticleFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
+    run_filter,
 )
 from pfbench.filter.linearisation import measurement_jacobian
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.model.constraints import Constraints
-from pfbench.model.strapdown import StrapdownTotal
-from pfbench.model.strapdown_blocks import StrapdownBlocks
+from pfbench.model import Constraints, StrapdownBlocks, StrapdownTotal
 from pfbench.nav.strapdown import PreintegratedImu, preintegrate
 
 TUNING = believed([1.0, 2.0, 3.0], None)

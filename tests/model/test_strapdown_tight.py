@@ -10,11 +10,8 @@ import torch
 from refusals import check_refused
 from torch import Tensor
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record, map_inputs
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.loop import run_filter
+from pfbench.core import PhiloxStream, Record, map_inputs
+from pfbench.filter import GaussianFilter, TaylorLinearisation, run_filter
 from pfbench.model.strapdown import StrapdownTight, StrapdownTotal, TightMemsInputs
 from pfbench.model.strapdown_tuning import RangeErrorModel, StrapdownTuning, TightTuning
 from pfbench.nav.ranging import ReceiverClock

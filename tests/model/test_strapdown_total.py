@@ -12,14 +12,9 @@ from refusals import check_refused
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from pfbench.core import chart
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import CubaturePoints, SigmaPointLinearisation
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.model.strapdown import StrapdownTotal
-from pfbench.model.strapdown_tuning import StrapdownTuning
+from pfbench.core import PhiloxStream, Record, chart
+from pfbench.filter import CubaturePoints, GaussianFilter, ParticleFilter, SigmaPointLinearisation
+from pfbench.model import StrapdownTotal, StrapdownTuning
 from pfbench.nav import attitude
 from pfbench.nav.strapdown import PreintegratedImu, preintegrate, rotate
 

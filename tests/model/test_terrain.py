@@ -15,10 +15,8 @@ from refusals import check_refused
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode, Record
-from pfbench.filter import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.core import Episode, PhiloxStream, Record
+from pfbench.filter import ParticleFilter, run_filter
 from pfbench.model.terrain import (
     RandomTerrain,
     TerrainAided,
@@ -26,8 +24,7 @@ from pfbench.model.terrain import (
     compute_elevation,
     compute_slope,
 )
-from pfbench.nav.manoeuvres import ManoeuvreTrajectory, cruise, turn
-from pfbench.nav.trajectory import TrajectoryStart
+from pfbench.nav import ManoeuvreTrajectory, TrajectoryStart, cruise, turn
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.flights import TerrainFlight
 

@@ -13,14 +13,11 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.nav import earth
+from pfbench.nav import ImuErrors, ManoeuvreTrajectory, TrajectoryStart, cruise, earth, turn
 from pfbench.nav.aiding import AidingData, AlignmentErrors, FlightSolution
 from pfbench.nav.atmosphere import Sight, delay_in_ionosphere, delay_in_troposphere
-from pfbench.nav.imu_errors import ImuErrors
-from pfbench.nav.manoeuvres import ManoeuvreTrajectory, cruise, turn
 from pfbench.nav.orbits import LIGHT, SatelliteGeometry, WalkerConstellation, predict_ranges
 from pfbench.nav.ranging import RangingInputs, RangingReceiver, ReceiverClock
-from pfbench.nav.trajectory import TrajectoryStart
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.flights import SimulatedFlight
 

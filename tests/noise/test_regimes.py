@@ -14,8 +14,16 @@ import torch
 from refusals import check_refused
 from scipy import stats
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import MeasurementChannels
+from pfbench.core import MeasurementChannels, PhiloxStream
+from pfbench.noise import (
+    BiasStep,
+    ErrorReplay,
+    GaussMarkovNoise,
+    MeasurementOutage,
+    NonLineOfSightNoise,
+    RandomOutage,
+    VarianceSurge,
+)
 from pfbench.noise.base import (
     AddedErrors,
     GlintNoise,
@@ -28,9 +36,6 @@ from pfbench.noise.base import (
     draw_added_errors,
     process_variance_factors,
 )
-from pfbench.noise.correlated import GaussMarkovNoise, NonLineOfSightNoise
-from pfbench.noise.error_replay import ErrorReplay
-from pfbench.noise.time_windows import BiasStep, MeasurementOutage, RandomOutage, VarianceSurge
 
 SD = torch.tensor([2.0, 0.05, 30.0], dtype=torch.float64)
 TIME = torch.arange(0.0, 300.0, dtype=torch.float64)

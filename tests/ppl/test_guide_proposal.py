@@ -14,21 +14,26 @@ from pyro.distributions import Gamma, Laplace, LogNormal, MultivariateNormal, No
 from smoothing_cases import SINGULAR, record_of
 from torch import Tensor
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.guided.twisted import TwistedParticleFilter
-from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.core import PhiloxStream, Record
+from pfbench.filter import (
+    GaussianFilter,
+    ParticleBelief,
+    ParticleFilter,
+    TaylorLinearisation,
+    TwistedParticleFilter,
+)
 from pfbench.model.linear_gaussian import local_level
-from pfbench.ppl.guide_proposal import GuideProposal
-from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood, repeat_runs
-from pfbench.ppl.parameter_posterior import ParameterPosterior
-from pfbench.ppl.parameterised_model import ParameterisedModel
-from pfbench.ppl.particle_mcmc import pmmh
-from pfbench.ppl.pyro_program import simulate
-from pfbench.ppl.step_program import PyroModel
+from pfbench.ppl import (
+    FilterLikelihood,
+    GaussianHmmLikelihood,
+    GuideProposal,
+    ParameterisedModel,
+    ParameterPosterior,
+    PyroModel,
+    pmmh,
+    repeat_runs,
+    simulate,
+)
 
 Q, S = 0.6, 1.0  # standard deviations of a step and of a measurement
 MODEL, EKF = local_level(Q, S, 0.0, 2.0), GaussianFilter(TaylorLinearisation())

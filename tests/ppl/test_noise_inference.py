@@ -14,13 +14,11 @@ from recorded_data import recorded
 from torch import Tensor
 from torch.distributions import biject_to
 
+from pfbench.core import PhiloxStream, Record
 from pfbench.core.chart import rotation_vector_from_quaternion
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
 from pfbench.filter import GaussianFilter, TaylorLinearisation
 from pfbench.job import compose, instantiate
-from pfbench.model import Constraints, StrapdownTotal, StrapdownTuning
-from pfbench.model.strapdown_blocks import StrapdownBlocks
+from pfbench.model import Constraints, StrapdownBlocks, StrapdownTotal, StrapdownTuning
 from pfbench.nav.strapdown import PreintegratedImu, rotate
 from pfbench.ppl import FilterLikelihood
 from pfbench.ppl.fix_filter import DENSITIES, LEVER, FixFilter

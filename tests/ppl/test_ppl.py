@@ -15,39 +15,46 @@ from scipy.stats import f as f_law, kstest, multivariate_t
 from torch import Tensor
 from torch.distributions import Independent
 
+from pfbench.core import PhiloxStream, Record
 from pfbench.core.density import independent_normal
 from pfbench.core.parameter_checks import check_positive
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter.belief import Filter
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.filter import (
     CubaturePoints,
+    Filter,
+    GaussianFilter,
+    ParticleFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
     UnscentedPoints,
+    run_filter,
 )
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.model.base import ModelWrapper, StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.passive_location import PassiveLocation, PlatformInputs, compute_level_attitude
-from pfbench.model.textbook import Pendulum, StochasticVolatility, UnivariateGrowth
-from pfbench.model.urban_gnss import NormalExponentialMixture
-from pfbench.ppl.ibis_smc2 import smc2
-from pfbench.ppl.likelihood import (
+from pfbench.model import (
+    LinearGaussian,
+    ModelWrapper,
+    NormalExponentialMixture,
+    PassiveLocation,
+    Pendulum,
+    PlatformInputs,
+    StateSpaceModel,
+    StochasticVolatility,
+    UnivariateGrowth,
+    compute_level_attitude,
+    linear_walk,
+    local_level,
+)
+from pfbench.ppl import (
     FilterLikelihood,
     GaussianHmmLikelihood,
+    ParameterisedModel,
+    ParameterPosterior,
+    nuts,
+    plot_posterior,
     repeat_runs,
+    simulation_based_calibration,
+    smc2,
+    svi,
 )
 from pfbench.ppl.model_batch import ModelBatch
-from pfbench.ppl.nuts_svi import nuts, svi
-from pfbench.ppl.parameter_posterior import (
-    ParameterPosterior,
-    plot_posterior,
-    simulation_based_calibration,
-)
-from pfbench.ppl.parameterised_model import ParameterisedModel
 from pfbench.ppl.particle_mcmc import ParameterWalk, PmmhSettings, pmmh
 from pfbench.ppl.pyro_program import (
     SwitchingNoise,

@@ -25,33 +25,39 @@ from pyro.distributions import Beta, LogNormal, Normal
 from pyro.infer.autoguide import AutoMultivariateNormal
 
 from pfbench.cli.infer import _build as build
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record, map_inputs
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.smoothing.noise_space import ConditionalSmcKernel
+from pfbench.core import PhiloxStream, Record, map_inputs
+from pfbench.filter import (
+    ConditionalSmcKernel,
+    GaussianFilter,
+    ParticleFilter,
+    TaylorLinearisation,
+    run_filter,
+)
 from pfbench.job import compose
-from pfbench.model.base import ModelWrapper, StateSpaceModel
-from pfbench.model.linear_gaussian import local_level
-from pfbench.model.textbook import StochasticVolatility
-from pfbench.ppl import particle_mcmc
-from pfbench.ppl.ibis_smc2 import Smc2Result, smc2
-from pfbench.ppl.inference_job import draw_equally, list_numbers
-from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood, repeat_runs
-from pfbench.ppl.model_batch import ModelBatch, list_non_buffers
-from pfbench.ppl.nuts_svi import normal_guide, nuts, svi
-from pfbench.ppl.parameter_posterior import (
+from pfbench.model import ModelWrapper, StateSpaceModel, StochasticVolatility, local_level
+from pfbench.ppl import (
+    FilterLikelihood,
+    GaussianHmmLikelihood,
+    ParameterisedModel,
     ParameterPosterior,
+    PmmhSettings,
     SbcRanks,
+    latent_program,
+    normal_guide,
+    nuts,
+    particle_gibbs,
+    particle_mcmc,
+    pmmh,
+    program,
+    repeat_runs,
     sbc_histograms,
     simulation_based_calibration,
+    svi,
 )
-from pfbench.ppl.parameterised_model import ParameterisedModel
-from pfbench.ppl.particle_mcmc import PmmhSettings, particle_gibbs, pmmh
+from pfbench.ppl.ibis_smc2 import Smc2Result, smc2
+from pfbench.ppl.inference_job import draw_equally, list_numbers
+from pfbench.ppl.model_batch import ModelBatch, list_non_buffers
 from pfbench.ppl.priors import prior_by_name
-from pfbench.ppl.pyro_program import latent_program, program
 
 EKF, YEARS = GaussianFilter(TaylorLinearisation()), 12
 NILE = ParameterisedModel(

@@ -11,10 +11,9 @@ import synthetic_results as synthetic
 from command_line import pfbench
 from page_packs import build_pack
 
-from pfbench.report import RUNS_FILE, format_runs, read_stored_study
+from pfbench.report import RUNS_FILE, format_runs, read_stored_study, rebuild_page, write_report
 from pfbench.report.journal.paper_folder import format_methods
 from pfbench.report.methods_text import FACTS, collect_methods_facts, read_facts, write_methods
-from pfbench.report.study_report import rebuild_page, write_report
 from pfbench.results.conditions import Condition, load_conditions
 
 # another value of each fact, and words that the paragraph then has

@@ -22,11 +22,10 @@ from checkout import ROOT, list_published
 from row_oracle import compare_pairs, compare_rows
 
 from pfbench.door.comparisons import Comparison
-from pfbench.report import RUNS_FILE, read_stored_study
+from pfbench.report import RUNS_FILE, read_stored_study, render_study
 from pfbench.report.board.entries import StudyFacts, ViewKey
 from pfbench.report.board.pack import open_court
 from pfbench.report.study_page.page_writer import describe_opening
-from pfbench.report.study_report import render_study
 
 FEW = ["paper_000_growth", "paper_004_alone", "paper_003_states"]
 TURNED = {"better": "worse", "worse": "better"}

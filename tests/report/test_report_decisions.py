@@ -13,10 +13,8 @@ import pandas as pd
 import pytest
 import synthetic_results as synthetic
 
-from pfbench.report import provenance, read_stored_study, study_report
-from pfbench.report.board.entries import StudyFacts
+from pfbench.report import ReportOptions, StudyFacts, provenance, read_stored_study, study_report
 from pfbench.report.board.pack import build_pack, decide_parts, read_study
-from pfbench.report.options import ReportOptions
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
 from pfbench.results.paper_block import plan_installed_pairs

@@ -9,9 +9,8 @@ import pandas as pd
 import pytest
 import synthetic_results as synthetic
 
+from pfbench.report import ReportOptions, write_report
 from pfbench.report.board.entries import build_run_table
-from pfbench.report.options import ReportOptions
-from pfbench.report.study_report import write_report
 from pfbench.results import metrics, store
 from pfbench.results.conditions import load_conditions
 from pfbench.results.frame import load_frame

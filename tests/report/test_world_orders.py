@@ -17,10 +17,8 @@ from checkout import ROOT
 from page_packs import unpack
 
 from pfbench.cli.compose import count_planned_jobs, read_sweep
-from pfbench.report.board.entries import StudyFacts
+from pfbench.report import ReportOptions, StudyFacts, render_headline
 from pfbench.report.board.pack import build_pack, decide_parts, read_study
-from pfbench.report.journal.ratio_figures import render_headline
-from pfbench.report.options import ReportOptions
 from pfbench.report.page_kit import render_markdown
 from pfbench.report.study_page.page_writer import describe_page, list_study_blocks, render_page
 from pfbench.results.conditions import load_conditions

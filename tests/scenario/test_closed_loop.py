@@ -13,35 +13,40 @@ from torch import Tensor
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, FeedbackRun, MeasurementChannels, Record
-from pfbench.filter.belief import GaussianBelief, ParticleBelief, StepInfo
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.filter import (
+    GaussianFilter,
+    ParticleFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
     UnscentedPoints,
 )
+from pfbench.filter.belief import GaussianBelief, ParticleBelief, StepInfo
 from pfbench.filter.loop import FilterResult, apply_feedback, run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.config import compose_tree
 from pfbench.job.scoring import ScoreRecorder
-from pfbench.model.azimuth import (
+from pfbench.model import (
     ExactErrorEquations,
+    InsGnss,
     PrintedErrorEquations,
     SinsGpsAzimuth,
+    StateSpaceModel,
     TrapezoidDiscretisation,
+    linear_walk,
 )
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.ins_gnss import InsGnss
-from pfbench.model.linear_gaussian import linear_walk
-from pfbench.nav import attitude, earth, strapdown
+from pfbench.nav import (
+    ImuErrors,
+    ManoeuvreTrajectory,
+    TrajectoryStart,
+    accelerate,
+    attitude,
+    cruise,
+    earth,
+    strapdown,
+    turn,
+)
 from pfbench.nav.aiding import AidingData, AlignmentErrors, FlightSolution, GnssReceiver
-from pfbench.nav.imu_errors import ImuErrors
-from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, cruise, turn
-from pfbench.nav.trajectory import TrajectoryStart
-from pfbench.noise.base import NoiseRegime, NominalNoise
-from pfbench.noise.time_windows import MeasurementOutage, VarianceSurge
-from pfbench.scenario.base import RecordingRegime
-from pfbench.scenario.flights import SimulatedFlight
+from pfbench.noise import MeasurementOutage, NoiseRegime, NominalNoise, VarianceSurge
+from pfbench.scenario import RecordingRegime, SimulatedFlight
 
 IMU = ImuErrors(
     gyro_bias_deg_h=1.0,

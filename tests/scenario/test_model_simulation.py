@@ -12,10 +12,8 @@ import torch
 from scipy import stats
 
 import pfbench
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.textbook import Pendulum, StochasticVolatility
-from pfbench.noise.base import NominalNoise, OutlierNoise
-from pfbench.noise.time_windows import MeasurementOutage, VarianceSurge
+from pfbench.model import LinearGaussian, Pendulum, StochasticVolatility, linear_walk, local_level
+from pfbench.noise import MeasurementOutage, NominalNoise, OutlierNoise, VarianceSurge
 from pfbench.scenario.simulated import ModelSimulation
 
 RUNS, STEPS = 4000, 15

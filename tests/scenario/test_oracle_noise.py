@@ -22,34 +22,44 @@ from scipy import stats
 from torch.distributions import Independent, Laplace as LaplaceLaw
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import MeasurementChannels, Record, map_inputs
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.core import MeasurementChannels, PhiloxStream, Record, map_inputs
+from pfbench.filter import (
     CubaturePoints,
+    FilterResult,
+    GaussianFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
+    run_filter,
 )
-from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.job.config import compose_tree
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
-from pfbench.model.textbook import Benes, Lorenz63, Pendulum, StochasticVolatility, UnivariateGrowth
-from pfbench.noise.base import (
+from pfbench.model import (
+    Benes,
+    LinearGaussian,
+    Lorenz63,
+    Pendulum,
+    StateSpaceModel,
+    StochasticVolatility,
+    UnivariateGrowth,
+    linear_walk,
+    local_level,
+)
+from pfbench.noise import (
+    BiasStep,
+    ErrorReplay,
+    GaussMarkovNoise,
     GlintNoise,
     LaplaceNoise,
+    MeasurementOutage,
     NoiseRegime,
     NominalNoise,
+    NonLineOfSightNoise,
     OutlierNoise,
     StudentTNoise,
+    VarianceSurge,
 )
-from pfbench.noise.correlated import GaussMarkovNoise, NonLineOfSightNoise
-from pfbench.noise.error_replay import ErrorReplay
-from pfbench.noise.time_windows import BiasStep, MeasurementOutage, VarianceSurge
 from pfbench.results.paper_block import list_named_parts
-from pfbench.scenario.base import RecordingRegime
+from pfbench.scenario import ModelSimulation, RecordingRegime
 from pfbench.scenario.oracle_noise import OracleNoiseModel
-from pfbench.scenario.simulated import ModelSimulation
 
 KALMAN = GaussianFilter(TaylorLinearisation())
 TIME = torch.arange(1.0, 61.0, dtype=torch.float64)

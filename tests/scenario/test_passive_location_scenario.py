@@ -15,15 +15,14 @@ from scipy import stats
 from torch import Tensor
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.core import Episode, PhiloxStream
+from pfbench.filter import (
     CubaturePoints,
+    GaussianFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
+    run_filter,
 )
-from pfbench.filter.loop import run_filter
 from pfbench.job.config import compose_tree
 from pfbench.job.pcrb import compute_posterior_bound
 from pfbench.job.scoring import ScoreRecorder
@@ -35,8 +34,7 @@ from pfbench.model.passive_location import (
     predict_bearing,
     relative_motion,
 )
-from pfbench.noise.base import NoiseRegime, NominalNoise, OutlierNoise, StudentTNoise
-from pfbench.noise.time_windows import MeasurementOutage
+from pfbench.noise import MeasurementOutage, NoiseRegime, NominalNoise, OutlierNoise, StudentTNoise
 from pfbench.scenario.passive_location import (
     FirstMeasurement,
     PassiveLocationScenario,

@@ -15,22 +15,32 @@ from scipy import stats
 from torch import Tensor
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import CubaturePoints, SigmaPointLinearisation
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.core import Episode, PhiloxStream
+from pfbench.filter import (
+    CubaturePoints,
+    GaussianFilter,
+    ParticleFilter,
+    SigmaPointLinearisation,
+    run_filter,
+)
 from pfbench.job.config import compose_tree
 from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.ins_gnss import InsGnss
-from pfbench.nav import attitude, earth, imu_errors
-from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
-from pfbench.nav.imu_errors import ImuErrors
-from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, climb, cruise, turn
+from pfbench.nav import (
+    AlignmentErrors,
+    GnssReceiver,
+    ImuErrors,
+    ManoeuvreTrajectory,
+    accelerate,
+    attitude,
+    climb,
+    cruise,
+    earth,
+    imu_errors,
+    turn,
+)
 from pfbench.nav.trajectory import TrajectoryData, TrajectoryStart
-from pfbench.noise.base import NoiseRegime, NominalNoise, OutlierNoise, StudentTNoise
-from pfbench.noise.time_windows import MeasurementOutage
+from pfbench.noise import MeasurementOutage, NoiseRegime, NominalNoise, OutlierNoise, StudentTNoise
 from pfbench.scenario.flights import SimulatedFlight
 
 PATH = ManoeuvreTrajectory(

@@ -9,8 +9,7 @@ from scipy import stats
 from statsmodels.stats.multitest import multipletests
 
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter import ParticleFilter, run_filter
 from pfbench.model.linear_gaussian import linear_walk
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.simulated import ModelSimulation

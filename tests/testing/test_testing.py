@@ -18,37 +18,40 @@ from torch import Tensor
 from typing_extensions import override
 
 import pfbench.testing
-from pfbench.core.random_stream import RandomStream
-from pfbench.core.record import Record
-from pfbench.filter.belief import ParticleBelief
-from pfbench.filter.exactness import has_bounded_weights
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.guided.noise_guide import GuidedNoiseProposal
-from pfbench.filter.learned.differentiable_resampling import SoftResampler, StopGradientResampler
-from pfbench.filter.loop import FilterResult
-from pfbench.filter.moves.metropolis import KernelCycle, MetropolisHastings
-from pfbench.filter.moves.path_kernels import (
-    LastStateKernel,
-    NoiseFlowKernel,
-    NoiseFlowStatKernel,
-    PathBlockKernel,
-)
-from pfbench.filter.moves.path_proposals import SmoothedSegment
-from pfbench.filter.particle.particle_filter import ParticleFilter
-from pfbench.filter.particle.regularised_resampling import RegularisedResampler
-from pfbench.filter.particle.resampling import Multinomial, Residual
-from pfbench.filter.particle.sqmc import HilbertSortedResampler, SqmcProposal, SqmcScheme
-from pfbench.filter.particle.stages import (
+from pfbench.core import RandomStream, Record
+from pfbench.filter import (
     BayesWeightUpdate,
     BootstrapProposal,
     EssResampler,
+    FilterResult,
+    GaussianFilter,
+    GuidedNoiseProposal,
+    HilbertSortedResampler,
+    KernelCycle,
+    LastStateKernel,
+    LookAheadWeights,
+    MetropolisHastings,
+    Multinomial,
+    NoiseFlowKernel,
+    NoiseFlowStatKernel,
+    ParticleBelief,
+    ParticleFilter,
+    PathBlockKernel,
     ProposalSample,
+    RegularisedResampler,
+    Residual,
+    SmoothedSegment,
+    SoftResampler,
+    SqmcProposal,
+    SqmcScheme,
+    StopGradientResampler,
     Systematic,
+    TaylorLinearisation,
+    TemperedPosterior,
+    TemperedWeights,
 )
-from pfbench.filter.particle.weights import LookAheadWeights, TemperedPosterior, TemperedWeights
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import linear_walk
+from pfbench.filter.exactness import has_bounded_weights
+from pfbench.model import StateSpaceModel, linear_walk
 from pfbench.testing import (
     check_causality,
     check_convergence,

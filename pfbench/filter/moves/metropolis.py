@@ -24,10 +24,6 @@ from pfbench.model.base import StateSpaceModel, StaticModel
 # A particle stores everything that a kernel reads. Kernels do not look up parents.
 
 
-#
-# A particle stores everything that a kernel reads. Kernels do not look up parents.
-
-
 class PathHistory(Protocol):
     """History that particles store for a kernel in the window of the belief."""
 
@@ -217,10 +213,6 @@ def stack_history(steps: Sequence[Tensor]) -> Tensor:
 def _unobserved(record: Record) -> Record:
     """Replace all measurements of a record by NaN."""
     return record._replace(y=torch.full_like(record.y, torch.nan))
-
-
-# --------------------------------------------------------------------------------------------------
-# MCMC moves of particles after resampling.
 
 
 class Move(Protocol):

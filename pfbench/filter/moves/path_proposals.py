@@ -151,10 +151,6 @@ class CopiedSegment(SegmentProposal):
         return torch.take_along_dim(old.states[:, :, 1:-1], index[:, :, None, None], 1), None
 
 
-# --------------------------------------------------------------------------------------------------
-# Path proposals between two states by forward filtering and backward sampling.
-
-
 @dataclass(frozen=True)
 class SmoothedSegment(SegmentProposal):
     """Block from p(block | fixed state, y), optionally also given x_t.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -50,15 +49,15 @@ class TapedPaths:
             first, few = past[1], min(FEW, len(start))
             u = map_inputs(lambda a: a[_FEW].expand(few, *a.shape[1:]), first.u)
             x = to_storage(start[_FEW, _FEW]).permute(1, 2, 0)
-            with keep_count(counter := _counter(self.model)) as evaluations:
+            # what is computed twice counts once
+            with keep_count(getattr(self.model, "likelihood_counter", None)) as evaluations:
                 self.tape, *_ = record_tape(
                     self.model, x.clone(), noise[_FEW, _FEW, 0], Record(first.y[_FEW], u)
                 )
                 self._evaluations = evaluations() // (few * FEW)
-            with keep_count(counter):
                 computed = self.run(start, values[..., 0], noise[:, :, :1], past[:2])
-            expected = states[:, :, :2], values[..., :2]
-            if not all(torch.allclose(*pair, rtol=1e-9, atol=1e-12, equal_nan=True) for pair in zip(computed, expected, strict=True)):  # fmt: skip
+            pairs = zip(computed, (states[:, :, :2], values[..., :2]), strict=True)
+            if not all(torch.allclose(*a, rtol=1e-9, atol=1e-12, equal_nan=True) for a in pairs):
                 raise NoTapeError("the tape does not compute the numbers of torch")
         except Exception as error:  # NoTapeError, or of a model that takes batches of one size only
             self.refused = True
@@ -80,11 +79,10 @@ class TapedPaths:
                 for row in rows
             ]
             self._inputs = past, torch.stack(flat)
-        tape, inputs = self.tape, self._inputs[1]
         draws = noise.permute(2, 3, 0, 1).reshape(steps * width, runs, n)
-        given = [inputs, to_storage(start), value, draws, torch.tensor(tape[3:])]
-        states, values = dispatch.run_paths([*tape[:3], *given])
-        if counter := _counter(self.model):
+        given = [self._inputs[1], to_storage(start), value, draws, torch.tensor(self.tape[3:])]
+        states, values = dispatch.run_paths([*self.tape[:3], *given])
+        if counter := getattr(self.model, "likelihood_counter", None):
             counter.count += steps * runs * n * self._evaluations
         return states.permute(2, 3, 0, 1), values.permute(1, 2, 0)
 
@@ -99,8 +97,3 @@ def find_taped_paths(model: StateSpaceModel, x: Tensor) -> TapedPaths | None:
         known[key] = TapedPaths(model)
     found = known.get(key)
     return None if found is None or found.refused else found
-
-
-def _counter(model: StateSpaceModel) -> Any:
-    """Return what counts the likelihood evaluations of a model; None without it."""
-    return getattr(model, "likelihood_counter", None)

@@ -16,8 +16,7 @@ from refusals import check_refused
 from scipy import optimize, stats
 from torch import Tensor, distributions as dist
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     FilterResult,
     GaussianFilter,

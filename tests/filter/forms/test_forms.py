@@ -20,8 +20,7 @@ from model_cases import tracker
 from omegaconf import OmegaConf
 from refusals import check_refused
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     CountLimits,
     EssResampler,

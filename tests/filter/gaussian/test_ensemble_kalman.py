@@ -16,8 +16,7 @@ from pyro.distributions import MultivariateNormal
 from torch import Tensor
 from torch.distributions import Distribution
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     BootstrapProposal,
     EnsembleKalmanFilter,

@@ -11,8 +11,7 @@ import torch
 from rule_cases import RULES
 from torch import Tensor
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     AxisDegree3,
     AxisDegree5,
@@ -27,8 +26,7 @@ from pfbench.filter import (
     UnscentedPoints,
     run_filter,
 )
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.textbook import Lorenz63
+from pfbench.model import Lorenz63, StateSpaceModel
 
 COUNTS = {
     "ckf3": lambda n: 2 * n,

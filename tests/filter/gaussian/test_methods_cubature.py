@@ -14,13 +14,10 @@ from tight_cases import flight, kalman, linear
 from torch import Tensor
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode, Record, map_inputs
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+from pfbench.core import Episode, PhiloxStream, Record, map_inputs
+from pfbench.filter import GaussianFilter, SigmaPointLinearisation, TaylorLinearisation
 from pfbench.filter.gaussian.kalman_update import GaussianStep
-from pfbench.filter.gaussian.linearisation_rules import SigmaPointLinearisation, TaylorLinearisation
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.tight_coupling import SinsGnssTight
+from pfbench.model import SinsGnssTight, StateSpaceModel
 
 __all__ = ["flight"]
 MSSRCKF = GaussianFilter(SigmaPointLinearisation(RULES["mssr"]))

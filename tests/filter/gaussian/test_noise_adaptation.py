@@ -44,8 +44,7 @@ from pfbench.filter.gaussian.noise_adaptation import (
     MatrixNoiseAdaptation,
     ScalarNoiseAdaptation,
 )
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian
+from pfbench.model import LinearGaussian, StateSpaceModel
 
 MIXED = SigmaPointLinearisation(SphericalRadialPoints(SimplexDegree3(), RadialDegree5()))
 RULES: dict[str, LinearisationRule] = {

@@ -15,8 +15,14 @@ from config_cases import composed
 from filter_cases import method_of
 
 from pfbench import job
-from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, LieGroupBlock, QuaternionBlock
-from pfbench.core.random_stream import PhiloxStream
+from pfbench.core import (
+    AngleBlock,
+    Chart,
+    EuclideanBlock,
+    LieGroupBlock,
+    PhiloxStream,
+    QuaternionBlock,
+)
 from pfbench.filter.gaussian.gaussian_filter import check_point_reach
 from pfbench.filter.gaussian.linearisation_rules import (
     CubaturePoints,

@@ -13,8 +13,7 @@ from refusals import check_refused
 from torch import Tensor
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import FilterResult, GaussianFilter, RawFix, TaylorLinearisation, run_filter
 from pfbench.filter.exactness import has_covariance, has_evidence
 from pfbench.model.linear_gaussian import LinearGaussian, linear_walk

@@ -15,8 +15,7 @@ from refusals import check_refused
 from torch import Tensor
 from torch.distributions import Independent, MultivariateNormal, Normal, StudentT
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     AdaptiveFactorGain,
     AdditiveTempering,
@@ -55,8 +54,7 @@ from pfbench.filter import (
     run_filter,
 )
 from pfbench.filter.belief import ParticleBelief, ess, weighted_mean_cov
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian
+from pfbench.model import LinearGaussian, StateSpaceModel
 from pfbench.model.textbook import Lorenz63, Pendulum, TimeIndexInputs, UnivariateGrowth
 from pfbench.testing import check_evidence, check_independence, filter_record, reference_moments
 

@@ -10,8 +10,7 @@ from filter_cases import method_of
 from refusals import check_refused
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     CubaturePoints,
     FadingMemory,

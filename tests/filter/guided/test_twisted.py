@@ -6,8 +6,7 @@ import pytest
 import torch
 from refusals import check_refused
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     EssResampler,
     FilterResult,
@@ -20,8 +19,7 @@ from pfbench.filter import (
     TwistedWeights,
     run_filter,
 )
-from pfbench.model.linear_gaussian import LinearGaussian
-from pfbench.model.textbook import StochasticVolatility
+from pfbench.model import LinearGaussian, StochasticVolatility
 from pfbench.testing import check_evidence
 
 WALK = LinearGaussian([[1.0, 1.0], [0.0, 1.0]], [[0.0], [0.3]], [[1.0, 0.0]], [0.5], [0.3, 0.1], [2.0, 1.0])  # fmt: skip

@@ -25,8 +25,7 @@ from torch.distributions import (
     TransformedDistribution,
 )
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     BootstrapProposal,
     CubaturePoints,
@@ -53,8 +52,7 @@ from pfbench.filter.learned.proposal import (
     make_feature_context,
 )
 from pfbench.filter.moves.metropolis import MetropolisHastings, StateHistory
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian
+from pfbench.model import LinearGaussian, StateSpaceModel
 from pfbench.testing import (
     check_evidence,
     check_independence,

@@ -18,8 +18,7 @@ from refusals import check_refused
 from torch import Tensor, nn
 from torch.distributions import Cauchy, Distribution, Independent
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     EvidenceLowerBound,
     LearnedProposal,

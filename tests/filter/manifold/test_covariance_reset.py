@@ -11,10 +11,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from pfbench.core import PhiloxStream, Record
 from pfbench.core.chart import SIDES, Chart, EuclideanBlock, LieGroupBlock
 from pfbench.core.density import independent_normal, normal_batch
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
 from pfbench.filter import (
     CubaturePoints,
     GaussianFilter,

@@ -9,10 +9,8 @@ import pytest
 import torch
 from scipy import stats
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
-from pfbench.filter import FilterBank, GaussianFilter, TaylorLinearisation, run_filter
-from pfbench.filter.loop import FilterResult
+from pfbench.core import PhiloxStream, Record
+from pfbench.filter import FilterBank, FilterResult, GaussianFilter, TaylorLinearisation, run_filter
 from pfbench.filter.marginal.filter_bank import split_normal
 from pfbench.model.linear_gaussian import LinearGaussian
 

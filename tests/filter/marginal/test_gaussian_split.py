@@ -17,22 +17,20 @@ from scipy.integrate import trapezoid
 from torch import Tensor
 from torch.distributions import Distribution
 
+from pfbench.core import PhiloxStream, Record
 from pfbench.core.density import independent_normal, normal_batch
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
 from pfbench.filter import (
     FadingMemory,
     GaussianFilter,
     GaussianSplitFilter,
+    IidPoints,
     InvariantFilter,
     ParticleFilter,
     TaylorLinearisation,
     run_filter,
 )
-from pfbench.filter.particle.stages import IidPoints
 from pfbench.filter.whitening import split_root
-from pfbench.model import LinearGaussian, StrapdownTotal
-from pfbench.model.base import StateSpaceModel
+from pfbench.model import LinearGaussian, StateSpaceModel, StrapdownTotal
 from pfbench.testing import check_causality, check_convergence, check_evidence, check_independence
 
 EKF = GaussianFilter(TaylorLinearisation())

@@ -57,10 +57,15 @@ from pfbench.model.azimuth import (
     SinsGpsAzimuth,
     TrapezoidDiscretisation,
 )
-from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
-from pfbench.nav.imu_errors import ImuErrors
-from pfbench.nav.manoeuvres import ManoeuvreTrajectory, accelerate, turn
-from pfbench.nav.trajectory import TrajectoryStart
+from pfbench.nav import (
+    AlignmentErrors,
+    GnssReceiver,
+    ImuErrors,
+    ManoeuvreTrajectory,
+    TrajectoryStart,
+    accelerate,
+    turn,
+)
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.flights import SimulatedFlight
 

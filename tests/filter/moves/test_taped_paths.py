@@ -12,17 +12,16 @@ from compiled_cases import compiler
 from model_cases import tracker
 from move_cases import moving
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     FilterResult,
     MetropolisHastings,
     NoiseFlowKernel,
+    ParticleFilter,
     PowerLikelihoodUpdate,
     run_filter,
 )
 from pfbench.filter.moves import path_kernels, taped_paths
-from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.job.scoring import LikelihoodCounter
 from pfbench.kernels import dispatch
 from pfbench.model import LinearGaussian, Lorenz63, Pendulum, StateSpaceModel, UnivariateGrowth

@@ -14,10 +14,9 @@ from compiled_cases import RUNS, STEPS, agree, compiler, record_of, run
 from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 
+from pfbench.core import PhiloxStream, Record
 from pfbench.core.density import independent_normal
 from pfbench.core.linear_algebra import affine_map
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
 from pfbench.filter import (
     CountLimits,
     EssResampler,

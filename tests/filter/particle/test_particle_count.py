@@ -13,8 +13,7 @@ from particle_cases import WALK, WALK_Y
 from scipy import optimize
 from torch import Tensor
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     AdditiveTempering,
     AuxiliaryWeights,

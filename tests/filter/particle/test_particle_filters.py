@@ -20,8 +20,7 @@ from scipy import stats
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
-from pfbench.core.random_stream import PhiloxStream, RandomStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, RandomStream, Record
 from pfbench.filter import (
     BayesWeightUpdate,
     BootstrapProposal,

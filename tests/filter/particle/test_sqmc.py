@@ -11,8 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     EssResampler,
     LookAheadWeights,

@@ -16,9 +16,8 @@ from model_cases import tracker
 from torch import Tensor
 
 from pfbench import job
+from pfbench.core import PhiloxStream, Record
 from pfbench.core.linear_algebra import affine_map
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
 from pfbench.filter import (
     EssResampler,
     FilterResult,

@@ -16,8 +16,7 @@ from refusals import check_refused
 from scipy.linalg import solve_discrete_lyapunov
 from torch import Tensor
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     BootstrapProposal,
     DmcController,
@@ -50,8 +49,7 @@ from pfbench.model import (
     TrapezoidDiscretisation,
     UnivariateGrowth,
 )
-from pfbench.nav.aiding import AlignmentErrors, GnssReceiver
-from pfbench.nav.imu_errors import ImuErrors
+from pfbench.nav import AlignmentErrors, GnssReceiver, ImuErrors
 from pfbench.testing import check_evidence, filter_record, reference_moments
 
 ALWAYS = EssResampler(Systematic(), 1.0)

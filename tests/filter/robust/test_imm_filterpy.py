@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     CubaturePoints,
     InteractingModelFilter,

@@ -12,8 +12,7 @@ import torch
 from filter_cases import method_of
 from torch import Tensor
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     FilterResult,
     GaussianFilter,

@@ -14,8 +14,7 @@ from scipy import integrate, stats
 from torch import Tensor
 from torch.distributions import Distribution, Laplace, MultivariateNormal
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     CorrentropyUpdate,
     FilterResult,

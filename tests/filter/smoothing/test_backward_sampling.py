@@ -11,8 +11,7 @@ from scipy import stats
 from smoothing_cases import SINGULAR, dense, record_of
 from torch import Tensor
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     EssResampler,
     GaussianFilter,
@@ -32,8 +31,7 @@ from pfbench.filter.smoothing.backward_sampling import (
     sample_trajectories,
     smooth_particles,
 )
-from pfbench.model.linear_gaussian import linear_walk
-from pfbench.model.textbook import UnivariateGrowth
+from pfbench.model import UnivariateGrowth, linear_walk
 from pfbench.noise.base import NominalNoise
 from pfbench.scenario.simulated import ModelSimulation
 

@@ -19,8 +19,7 @@ from pfbench.filter import (
     UnscentedPoints,
     smooth,
 )
-from pfbench.model.base import ModelWrapper, StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
+from pfbench.model import LinearGaussian, ModelWrapper, StateSpaceModel, linear_walk, local_level
 
 RULES = {
     "jacobian": TaylorLinearisation(),

@@ -23,8 +23,7 @@ from pfbench.filter import (
     smooth,
     smooth_iteratively,
 )
-from pfbench.model.base import StateSpaceModel
-from pfbench.model.linear_gaussian import LinearGaussian, linear_walk, local_level
+from pfbench.model import LinearGaussian, StateSpaceModel, linear_walk, local_level
 
 TAYLOR = GaussianFilter(TaylorLinearisation())
 CUBATURE = GaussianFilter(SigmaPointLinearisation(CubaturePoints()))

@@ -11,8 +11,7 @@ from refusals import check_refused
 from smoothing_cases import SINGULAR, Swing, Tumbler, dense, record_of
 from torch import Tensor
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Record
+from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
     ConditionalSmcKernel,
     CrankNicolsonKernel,

@@ -20,8 +20,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream, RandomStream
-from pfbench.core.record import Episode, Record, map_inputs
+from pfbench.core import Episode, PhiloxStream, RandomStream, Record, map_inputs
 from pfbench.filter import (
     ChiSquareStopping,
     EssResampler,

@@ -17,9 +17,7 @@ from synthetic_log import GRAVITY, write
 
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.loop import run_filter
+from pfbench.filter import GaussianFilter, TaylorLinearisation, run_filter
 from pfbench.job.model_fit import check_fit
 from pfbench.logs.worlds.constrained import ConstrainedDrive
 from pfbench.logs.worlds.corrections import LogCorrections
@@ -30,11 +28,8 @@ from pfbench.logs.worlds.odometer import RecordedOdometer, SimulatedOdometer
 from pfbench.logs.worlds.standing import detect_standing
 from pfbench.logs.worlds.time_grid import FixReceiver
 from pfbench.logs.worlds.user_log import UserLog
-from pfbench.model.constraints import Constraints
-from pfbench.model.strapdown_blocks import StrapdownBlocks
-from pfbench.model.strapdown_tuning import StrapdownTuning
-from pfbench.noise.base import NominalNoise
-from pfbench.noise.time_windows import MeasurementOutage
+from pfbench.model import Constraints, StrapdownBlocks, StrapdownTuning
+from pfbench.noise import MeasurementOutage, NominalNoise
 
 TUNING = believed([1.0, 1.0, 2.0], None)
 STOPS = ((0.0, 15.0), (35.0, 43.0))  # s, in a drive of a minute

@@ -13,16 +13,16 @@ from recorded_data import DATA, believed, recorded
 from refusals import check_refused
 from synthetic_log import drive, tables, write
 
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import (
+from pfbench.core import Episode, PhiloxStream
+from pfbench.filter import (
     CubaturePoints,
+    FilterResult,
+    GaussianFilter,
     LinearisationRule,
     SigmaPointLinearisation,
     TaylorLinearisation,
+    run_filter,
 )
-from pfbench.filter.loop import FilterResult, run_filter
 from pfbench.job import instantiate
 from pfbench.job.config import compose_tree
 from pfbench.logs.worlds.drive import RecordedDrive, RecordedFlights
@@ -38,8 +38,7 @@ from pfbench.logs.worlds.time_grid import (
 )
 from pfbench.model.strapdown import StrapdownTotal
 from pfbench.nav.strapdown import PreintegratedImu
-from pfbench.noise.base import NominalNoise
-from pfbench.noise.time_windows import MeasurementOutage
+from pfbench.noise import MeasurementOutage, NominalNoise
 
 BELIEVED = believed([1.0, 1.0, 2.0], None)
 

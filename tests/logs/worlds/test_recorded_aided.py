@@ -23,10 +23,8 @@ from pfbench.logs.worlds.drive import (
     pressure_height,
 )
 from pfbench.logs.worlds.time_grid import FixReceiver
-from pfbench.model.strapdown import StrapdownAided
-from pfbench.model.strapdown_tuning import AidedTuning
-from pfbench.noise.base import NominalNoise
-from pfbench.noise.time_windows import MeasurementOutage, VarianceSurge
+from pfbench.model import AidedTuning, StrapdownAided
+from pfbench.noise import MeasurementOutage, NominalNoise, VarianceSurge
 from pfbench.scenario.base import RecordingRegime
 from pfbench.scenario.oracle_noise import OracleNoiseModel
 

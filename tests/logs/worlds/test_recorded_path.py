@@ -13,12 +13,9 @@ from recorded_data import DATA, recorded
 from synthetic_log import GRAVITY, ORIGIN, drive, write
 
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.loop import run_filter
-from pfbench.job import instantiate
+from pfbench.filter import GaussianFilter, TaylorLinearisation, run_filter
+from pfbench.job import ScoreRecorder, instantiate
 from pfbench.job.config import compose_tree
-from pfbench.job.scoring import ScoreRecorder
 from pfbench.logs.worlds.trajectory_file import RecordedTrajectory, read_motion
 from pfbench.nav import attitude, earth
 from pfbench.noise.base import NominalNoise

@@ -21,12 +21,8 @@ from recorded_data import DATA, recorded
 from refusals import check_refused
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.loop import run_filter
-from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.core import Episode, PhiloxStream
+from pfbench.filter import GaussianFilter, ParticleFilter, TaylorLinearisation, run_filter
 from pfbench.job.config import compose_tree
 from pfbench.logs.worlds.urban import (
     PseudorangeReceiver,
@@ -43,8 +39,7 @@ from pfbench.model.urban_gnss import (
     UrbanGnss,
     UrbanTuning,
 )
-from pfbench.noise.base import NominalNoise
-from pfbench.noise.time_windows import MeasurementOutage, VarianceSurge
+from pfbench.noise import MeasurementOutage, NominalNoise, VarianceSurge
 
 BELIEVED = UrbanTuning(
     distance_density=0.1,

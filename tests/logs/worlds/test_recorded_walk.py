@@ -21,19 +21,15 @@ from torch import Tensor
 from pfbench import job
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.record import Episode, MeasurementChannels, map_inputs, name_inputs
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.loop import run_filter
+from pfbench.filter import GaussianFilter, TaylorLinearisation, run_filter
 from pfbench.job.config import compose_tree
 from pfbench.logs.sky.raw_gnss import RawGnss, RawGnssTuning
 from pfbench.logs.worlds.raw_gnss import RawGnssReceiver, RecordedWalk
-from pfbench.model.strapdown import StrapdownTight
-from pfbench.model.strapdown_tuning import RangeErrorModel, TightTuning
+from pfbench.model import RangeErrorModel, StrapdownTight, TightTuning
 from pfbench.nav import earth
 from pfbench.nav.orbits import WalkerConstellation, azimuth_elevation, receive_signals
 from pfbench.nav.ranging import ReceiverClock
-from pfbench.noise.base import NoiseRegime, NominalNoise
-from pfbench.noise.time_windows import MeasurementOutage
+from pfbench.noise import MeasurementOutage, NoiseRegime, NominalNoise
 
 BIAS, DRIFT, OTHER = -4.6e5, -60.0, 12.0  # of the clock, and of the other system
 

@@ -14,17 +14,13 @@ from recorded_data import DATA, believed, recorded
 from synthetic_log import tables, write
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode, Record
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.core import Episode, PhiloxStream, Record
+from pfbench.filter import FilterResult, GaussianFilter, TaylorLinearisation, run_filter
 from pfbench.job.config import compose_tree
 from pfbench.logs.worlds.drive import FixHoldout, RecordedDrive
 from pfbench.logs.worlds.time_grid import FixReceiver
 from pfbench.model.strapdown import StrapdownTotal
-from pfbench.noise.base import NominalNoise
-from pfbench.noise.time_windows import MeasurementOutage
+from pfbench.noise import MeasurementOutage, NominalNoise
 
 MISSED = np.array([0.3, -0.2, 0.1])  # m North, East, down: the errors of the synthetic fixes
 

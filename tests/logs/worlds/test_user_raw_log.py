@@ -17,11 +17,8 @@ from recorded_data import DATA, recorded
 from refusals import check_refused
 
 from pfbench import job
-from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode
-from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-from pfbench.filter.gaussian.linearisation_rules import TaylorLinearisation
-from pfbench.filter.loop import run_filter
+from pfbench.core import Episode, PhiloxStream
+from pfbench.filter import GaussianFilter, TaylorLinearisation, run_filter
 from pfbench.job.config import compose_tree
 from pfbench.logs.sky import raw_log
 from pfbench.logs.sky.ephemeris import GM_GPS, read_rinex
