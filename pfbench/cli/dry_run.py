@@ -192,9 +192,9 @@ def try_own_parts(configs: Iterable[JobConfig]) -> None:
             if packages:
                 _try_job(config, episodes)
         except AssertionError as error:
-            own = dict.fromkeys(t.rpartition(".")[2] for t in list_user_targets(config.values))
+            classes = dict.fromkeys(t.rpartition(".")[2] for t in list_user_targets(config.values))
             errors[
-                f"{' and '.join(own)} must keep {'its' if len(own) == 1 else 'their'} contract: {error}."
+                f"{' and '.join(classes)} must keep {'its' if len(classes) == 1 else 'their'} contract: {error}."
             ] = error
         except Exception as error:
             if _is_of_user(error, packages):

@@ -47,9 +47,9 @@ def job_key(values: Mapping[str, Any], inputs: Inputs | None = None) -> str:
 
         values = {**values, "filter": replace_checkpoint_by_hash(values["filter"])}
     node = values.get("filter") or {}
-    own = {target.rpartition(".")[2].lower() for target in list_user_targets(node)}
+    classes = {target.rpartition(".")[2].lower() for target in list_user_targets(node)}
     name = str(node.get(PAPER, {}).get("name", ""))
-    if own and re.sub(r"[\W_]", "", name).lower() not in own:
+    if classes and re.sub(r"[\W_]", "", name).lower() not in classes:
         inputs = inputs | {"name": {name: ""}}  # of a class of the user: a new name is a new row
     defaults = (k for k, default in DEFAULTS_NOT_IN_KEY.items() if values.get(k) == default)
     return extend_key(compute_config_key(values, (*IGNORED_IN_KEY, *defaults)), inputs)

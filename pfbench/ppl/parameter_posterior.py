@@ -54,7 +54,9 @@ class ParameterPosterior:
     def from_dict(content: Mapping[str, Any]) -> ParameterPosterior:
         """Build a posterior from the dictionary of `to_dict`."""
         groups = (content["draws"], content.get("stats", {}))
-        draws, stats = ({k: torch.tensor(a).double() for k, a in group.items()} for group in groups)
+        draws, stats = (
+            {k: torch.tensor(a, dtype=torch.float64) for k, a in group.items()} for group in groups
+        )
         accepted = content["accepted"]
         if accepted is not None:
             accepted = torch.tensor(accepted, dtype=torch.float64)
@@ -63,15 +65,14 @@ class ParameterPosterior:
     @staticmethod
     def join(posteriors: Sequence[ParameterPosterior]) -> ParameterPosterior:
         """Join the chains of several posteriors of one method."""
-        first = posteriors[0]
-        if len(posteriors) == 1:
-            return first
         draws, stats = (
             {k: torch.cat([group[k] for group in groups]) for k in groups[0]}
             for groups in ([p.draws for p in posteriors], [p.stats for p in posteriors])
         )
         rates = [p.accepted for p in posteriors if p.accepted is not None]
-        return ParameterPosterior(draws, torch.cat(rates), first.method, stats)
+        return ParameterPosterior(
+            draws, torch.cat(rates) if rates else None, posteriors[0].method, stats
+        )
 
     def run(self, r: int) -> ParameterPosterior:
         """Return the posterior of run r, if runs have their own parameters."""

@@ -294,8 +294,7 @@ def _run_sweeps(
     unknown, runs = target.unknown, len(target.record.y)
     z = unknown.unconstrained(unknown.sample(target.chains, seed)).unsqueeze(1)
     walks, samples, accepted = [ParameterWalk.start(unknown, z, seed)] * 2, [], []
-    source = PhiloxStream(seed, torch.arange(target.chains * runs))
-    current = target.make_space(z)
+    source, current = PhiloxStream(seed, torch.arange(target.chains * runs)), target.make_space(z)
     theta = source.normal("gibbs.start", 1, current[0].size).to(z)
     for i in range(warmup + draws):
         theta, _ = kernel(current[0], theta, relabel(source, f"gibbs_{i}."))

@@ -252,6 +252,7 @@ REMOVALS = {
     "files/recorded_folder.py": 1,
     "results/store.py": 2,  # a damaged result, and the note of a failure of earlier inputs
     "learn/training_job.py": 2,
+    "ppl/inference_job.py": 1,  # its own state of a run that has ended
     "cli/progress.py": 2,  # its own log, and the folder of the study if it is empty
 }
 

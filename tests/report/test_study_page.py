@@ -272,6 +272,6 @@ def test_the_usual_budget_is_no_part_of_a_jobs_name():
 def test_an_unknown_budget_is_refused_before_anything_runs():
     config = OmegaConf.create({**OmegaConf.to_container(CONFIG, resolve=False), "budget": "fair"})
     with pytest.raises(
-        ValueError, match="budget must be one of particles, time, likelihoods, got fair"
+        ValueError, match="budget must be one of particles, time, likelihoods, got 'fair'"
     ):
         job.apply_global_settings(config)

@@ -718,5 +718,5 @@ def test_the_switch_refuses_by_name(tmp_path: Path, words: tuple[str, ...]) -> N
     assert (
         "Set oracle_noise=false."
         if "oracle_noise=true" in words
-        else "oracle_noise must be true (the filter receives the true noise regime) or false, got perhaps"
+        else "oracle_noise must be true (the filter receives the true noise regime) or false, got 'perhaps'"
     ) in said.err + said.out

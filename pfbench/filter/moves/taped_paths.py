@@ -80,8 +80,8 @@ class TapedPaths:
             ]
             self._inputs = past, torch.stack(flat)
         draws = noise.permute(2, 3, 0, 1).reshape(steps * width, runs, n)
-        given = [self._inputs[1], to_storage(start), value, draws, torch.tensor(self.tape[3:])]
-        states, values = dispatch.run_paths([*self.tape[:3], *given])
+        arguments = [self._inputs[1], to_storage(start), value, draws, torch.tensor(self.tape[3:])]
+        states, values = dispatch.run_paths([*self.tape[:3], *arguments])
         if counter := getattr(self.model, "likelihood_counter", None):
             counter.count += steps * runs * n * self._evaluations
         return states.permute(2, 3, 0, 1), values.permute(1, 2, 0)
@@ -89,11 +89,11 @@ class TapedPaths:
 
 def find_taped_paths(model: StateSpaceModel, x: Tensor) -> TapedPaths | None:
     """Return the paths of a model by a tape; None where they are taken step by step."""
-    known = MEMORY_OF_PASS.get()
-    if known is None or torch.is_grad_enabled() or x.dtype != torch.float64 or not dispatch.runs_operators(x):  # fmt: skip
+    memory = MEMORY_OF_PASS.get()
+    if memory is None or torch.is_grad_enabled() or x.dtype != torch.float64 or not dispatch.runs_operators(x):  # fmt: skip
         return None
     key = getattr(model, "tape_key", id(model))
-    if key not in known and len(known) < _MOST_MODELS:
-        known[key] = TapedPaths(model)
-    found = known.get(key)
-    return None if found is None or found.refused else found
+    if key not in memory and len(memory) < _MOST_MODELS:
+        memory[key] = TapedPaths(model)
+    paths = memory.get(key)
+    return None if paths is None or paths.refused else paths

@@ -208,20 +208,8 @@ class _Recorder(TorchFunctionMode):
             return function([self.read(a) for a in args[0]], *args[1:], **options)
         if name in _SUMS:
             return self._reduce(name, *args, **options).reshape(result.shape)
-        if name == "linear":  # with a bias or without one
-            bias = [self.read(a) for a in (*args[2:], *options.values()) if a is not None]
-            return self._add(self._multiply(self.read(args[0]), self.read(args[1]).mT), *bias)
-        if name == "baddbmm" and not options:
-            first, *factors = map(self.read, args)
-            return self._add(first, self._multiply(*factors))
-        if name in ("matmul", "rmatmul", "mm", "mv", "bmm"):
-            return self._multiply(
-                *map(self.read, args[::-1] if name == "rmatmul" else args)
-            ).reshape(result.shape)
-        if name == "propagate_affine.default":
-            phi, x, gain, w = map(self.read, args)
-            both = torch.cat([a.expand(len(x), -1, -1) for a in (phi, gain)], -1)
-            return self._multiply(both, torch.cat([x, w], -1).mT).transpose(0, 1)
+        if (products := self._compute_products(name, args, options)) is not None:
+            return products.reshape(result.shape)
         if name in _CASTS and result.dtype in (torch.float64, args[0].dtype):
             return self.read(args[0])
         if name == "pow" and (short := {2: "square", 0.5: "sqrt"}.get(_plain(args[1]))):
@@ -236,6 +224,22 @@ class _Recorder(TorchFunctionMode):
             [self.read(a) for a in args],
             {key: self.read(a) for key, a in options.items() if a is not None},
         )
+
+    def _compute_products(self, name: str, args: Any, options: Any) -> Tensor | None:
+        """Return the atoms of products of matrices; None for another function."""
+        if name == "linear":  # with a bias or without one
+            bias = [self.read(a) for a in (*args[2:], *options.values()) if a is not None]
+            return self._add(self._multiply(self.read(args[0]), self.read(args[1]).mT), *bias)
+        if name == "baddbmm" and not options:
+            first, *factors = map(self.read, args)
+            return self._add(first, self._multiply(*factors))
+        if name in ("matmul", "rmatmul", "mm", "mv", "bmm"):
+            return self._multiply(*map(self.read, args[::-1] if name == "rmatmul" else args))
+        if name == "propagate_affine.default":
+            phi, x, gain, w = map(self.read, args)
+            both = torch.cat([a.expand(len(x), -1, -1) for a in (phi, gain)], -1)
+            return self._multiply(both, torch.cat([x, w], -1).mT).transpose(0, 1)
+        return None
 
     def _combine(
         self, build: Callable[..., int], operands: Sequence[Tensor], options: dict[str, Tensor]

@@ -503,10 +503,10 @@ def _check_rate_errors(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Fi
 
 def _scale_all(scales: list[tuple[str, float, float]], wrong: dict[str, float]) -> dict[str, float]:
     """Return the scale of each axis, 1 for a right one; one that is not clear has that of two which agree, if it is nearer."""
-    values, found = [*wrong.values()], {axis: scale for axis, scale, _ in scales}
+    values, clear = [*wrong.values()], {axis: scale for axis, scale, _ in scales}
     common = float(np.mean(values)) if len(values) > 1 and np.ptp(values) < _SCALE_ERROR else 1.0
     return {
-        axis: wrong.get(axis, min(1.0, common, key=lambda s: abs(s - found.get(axis, common))))
+        axis: wrong.get(axis, min(1.0, common, key=lambda s: abs(s - clear.get(axis, common))))
         for axis in "xyz"
     }
 

@@ -191,8 +191,8 @@ class LogSource:
         gravity, gravity_notes = gravity_at(centre)
         fixes, rows = self._compare_tables(tables, fixes, motion, findings)
         if "frozen" in (self.mending.drop or ()):  # steps end on fixes that are there
-            there = np.isfinite(fixes.position).all(1)
-            fixes = GnssLog(*(column[there] for column in fixes))
+            is_fix = np.isfinite(fixes.position).all(1)
+            fixes = GnssLog(*(column[is_fix] for column in fixes))
         dropped = dict.fromkeys(note for table in tables if table for note in table.notes)
         notes = (*dropped, *mended, *mended_fixes, *usable_notes, *notes, *gravity_notes, *rows)
         reference = motion or (read_track(truth, centre) if truth else _join_fixes(fixes))

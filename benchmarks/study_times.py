@@ -1,4 +1,4 @@
-"""Measure the times per step of a published study by turns: `python experiments/analyses/turn_times.py STUDY FOLDER [--write]`.
+"""Measure the times per step of a published study by turns: `python benchmarks/study_times.py STUDY FOLDER [--write]`.
 
 The filters of a world with one number of particles are built once, take their first steps uncounted, and take turns in
 five rounds, as in `pfbench cost`, without the runs of the study. A table of each world and number goes to FOLDER, so that the
