@@ -19,11 +19,11 @@ import numpy as np
 import pandas as pd
 
 from pfbench.files import RecordedFolder
+from pfbench.job import build_plan, compose
 from pfbench.job.budget import EpisodeSource, max_runs_in_memory
-from pfbench.job.config import compose
 from pfbench.job.filter_pass import choose_engine, wrap_steps
 from pfbench.job.memory import first_steps
-from pfbench.job.plan import build_plan, describe_commit
+from pfbench.job.plan import describe_commit
 from pfbench.job.step_timing import TimingTask
 from pfbench.report import RUNS_FILE, format_runs, read_stored_study, rebuild_page
 from pfbench.results.step_times import StepTimes

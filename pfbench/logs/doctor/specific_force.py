@@ -459,7 +459,7 @@ def _check_rate_errors(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Fi
         if abs(scale - 1.0) > max(limit_of("gyro scale"), _SCALE_ERRORS * error)
     ]
     factors = _scale_all(scales, {axis: scale for axis, scale, _ in wrong})
-    rates = np.rad2deg((measured / [*factors.values()] - true) / window)  # a scale is no bias
+    rates = np.rad2deg((measured / [*factors.values()] - true) / window)  # a scale, not a bias
     bias = np.median(rates, 0)
     facts["rest of the rate"] = float(np.sqrt(np.square(rates - bias).sum(1).mean()))
     facts["gyro bias [deg/s]"] = bias.round(4).tolist()

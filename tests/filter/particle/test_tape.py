@@ -318,7 +318,10 @@ REFUSED: dict[str, tuple[str, Callable[[Tensor], Tensor]]] = {
     "sort": (r"needs torch.sort", lambda x: x.sort(-1)[0]),
     "in place": ("setitem", fill_in_place),
     "single": (r"needs torch.float .* torch.float32", lambda x: x.float().double()),
-    "long": ("more than 2000 instructions", lambda x: sum((x * k for k in range(2, 2050)), x)),
+    "long": (
+        "more than 2000 instructions",
+        lambda x: (x[..., None, None] * torch.arange(2048.0).double().view(64, 32)).sum(-1).sum(-1),
+    ),
 }
 
 
