@@ -28,7 +28,7 @@ from pfbench.job.step_timing import TimingTask
 from pfbench.report import RUNS_FILE, format_runs, read_stored_study, rebuild_page
 from pfbench.results.step_times import StepTimes
 
-TOP = Path(__file__).parents[2]
+TOP = Path(__file__).parents[1]
 ROUNDS = 5
 MEAN_TIME = 0.1  # s, of a filter in a round
 FEWEST_STEPS = 10

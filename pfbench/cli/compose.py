@@ -233,14 +233,14 @@ def _check_sweep(overrides: list[str]) -> JobConfig | None:
     config = _check_composition(first)
     values: Mapping[str, object] = config.values if config else {}
     for index, options in enumerate(alternatives):
-        for option in options[1:]:
+        for option in options[not values or len(options) == 1 :]:
             key, _, value = option.lstrip("+").partition("=")
             if key == "study":
                 check_study(value.strip("'\""))
             is_plain = key in values and not isinstance(values[key], Mapping)
-            if is_plain:  # a setting, whose values are known before a job starts
-                check_settings({**values, key: parser.parse_override(option).value()})
-            elif value not in list_named_parts(key):
+            if is_plain and value != UNTIL_DECIDED:  # of which `runs` may be one, too
+                check_settings({**values, "runs": 1, key: parser.parse_override(option).value()})
+            elif not is_plain and value not in list_named_parts(key):
                 _check_composition([*first[:index], option, *first[index + 1 :]])
     return config
 

@@ -261,7 +261,9 @@ def test_a_sweep_without_a_result_has_no_next_report(tmp_path: Path) -> None:
     assert "Next: pfbench report study=mine" in said.out
 
 
-@pytest.mark.parametrize("setting", ["particles=10,abc", "seed=1,1e3", "threads=choice(1,0)"])
+@pytest.mark.parametrize(
+    "setting", ["particles=10,abc", "particles=abc,10", "seed=1,1e3", "threads=choice(1,0)"]
+)
 def test_a_bad_value_of_a_sweep_is_told_before_a_job_starts(tmp_path: Path, setting: str) -> None:
     said = pfbench("run", "-m", *WALK, "filter=sir,ekf", setting, home=tmp_path)
     assert said.code == 2
