@@ -111,6 +111,8 @@ def write(study: str, folder: Path) -> None:
     place = TOP / "reports" / study
     pack, table = read_stored_study(place)
     entries = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
+    if not entries:
+        sys.exit(f"{folder} must hold measured times, got none. Leave out --write first.")
     table["ms"] = np.nan
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for entry in entries:
