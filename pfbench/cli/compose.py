@@ -233,7 +233,7 @@ def _check_sweep(overrides: list[str]) -> JobConfig | None:
     config = _check_composition(first)
     values: Mapping[str, object] = config.values if config else {}
     for index, options in enumerate(alternatives):
-        for option in options[not values or len(options) == 1 :]:
+        for option in options if values and len(options) > 1 else options[1:]:
             key, _, value = option.lstrip("+").partition("=")
             if key == "study":
                 check_study(value.strip("'\""))

@@ -134,7 +134,16 @@ def _run_chains(
 ) -> ParameterPosterior:
     """Run all chains of a posterior."""
     call = repr(
-        (target.shape, target.seed, draws, warmup, settings.thin, settings.leaps, start.names)
+        (
+            target.shape,
+            target.seed,
+            draws,
+            warmup,
+            settings.thin,
+            settings.leaps,
+            start.names,
+            float(target.record.y.nansum()),
+        )
     )
     z, log_p, moments, samples, accepted_count, done = _find_chains(target, start, settings, call)
     walk, stored = ParameterWalk(*moments), time.monotonic()
