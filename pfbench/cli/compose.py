@@ -238,7 +238,7 @@ def _check_sweep(overrides: list[str]) -> JobConfig | None:
             if key == "study":
                 check_study(value.strip("'\""))
             is_plain = key in values and not isinstance(values[key], Mapping)
-            if is_plain and value != UNTIL_DECIDED:  # of which `runs` may be one, too
+            if is_plain and value != UNTIL_DECIDED:  # known before a job starts
                 check_settings({**values, "runs": 1, key: parser.parse_override(option).value()})
             elif not is_plain and value not in list_named_parts(key):
                 _check_composition([*first[:index], option, *first[index + 1 :]])
