@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -22,7 +22,7 @@ from pfbench.report.options import ReportOptions
 from pfbench.report.study_page.page_writer import describe_opening
 from pfbench.results.conditions import Condition
 from pfbench.results.looks import study_looks
-from pfbench.stats.comparison import Verdict
+from pfbench.stats.comparison import NO_DECISION, Verdict
 from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
 from pfbench.stats.sentences import format_with_interval
 
@@ -108,10 +108,13 @@ class Comparison:
     Attributes:
         verdicts: Verdicts by the name of the condition, one family of tests.
         reach: Of what the runs of recorded conditions are a sample; empty for simulated ones.
+        chances: Probabilities that the first filter is better, equal and worse, of the conditions in which nothing is decided. They
+            are the posterior of the signed-rank test, and no verdict.
     """
 
     verdicts: Mapping[str, Verdict]
     reach: str = ""
+    chances: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def word(self) -> str:
@@ -146,13 +149,18 @@ class Comparison:
         return next(iter(self.verdicts.values()))
 
     def __repr__(self) -> str:
-        lines = (f"{name}: {_format(v)}" for name, v in self.verdicts.items())
+        lines = (f"{name}: {self._format(name)}" for name in self.verdicts)
         return "\n".join(filter(None, (*lines, self.reach)))
 
     def _repr_html_(self) -> str:
         heads = ("condition", "verdict")
-        table = format_html_table(heads, [(name, _format(v)) for name, v in self.verdicts.items()])
+        table = format_html_table(heads, [(name, self._format(name)) for name in self.verdicts])
         return f"{table}<p>{html.escape(self.reach)}</p>" if self.reach else table
+
+    def _format(self, name: str) -> str:
+        """Format the verdict of a condition, and where it tends if nothing is decided."""
+        chances = self.chances.get(name)
+        return _format(self.verdicts[name]) + (f" Probabilities: {chances}." if chances else "")
 
 
 def _format(verdict: Verdict) -> str:
@@ -180,11 +188,14 @@ def compare_in_conditions(conditions: Sequence[Condition], a: str, b: str) -> Co
     table = drop_runs(table, assess_runs(table, "rmse", RUN).copies, RUN)
     court = open_court(table, study_looks(conditions), ReportOptions())
     present = court.runs.conditions
-    verdicts = {}
+    verdicts, chances = {}, {}
     for condition, regime in zip(conditions, name_regimes(conditions), strict=True):
         mask = (present["scenario"] == condition.scenario) & (present["regime"] == regime)
         if {a, b} <= {job.label for job in condition.jobs}:
-            verdicts[condition.name] = court.find("rmse", mask.to_numpy(), a, b)
+            where = "rmse", mask.to_numpy(), a, b
+            verdict = verdicts[condition.name] = court.find(*where)
+            if verdict.word == NO_DECISION:
+                chances[condition.name] = court.weigh(*where)
     require(
         verdicts, f"{a} and {b}", "have a condition in common", "none", "Run both in one scenario."
     )
@@ -193,4 +204,4 @@ def compare_in_conditions(conditions: Sequence[Condition], a: str, b: str) -> Co
     reach = " ".join(
         f"{text}. The page of the study has other stretches and drives." for text in drives
     )
-    return Comparison(verdicts, reach)
+    return Comparison(verdicts, reach, chances)

@@ -65,7 +65,7 @@ _ROUNDING = 1e-12  # relative spread of equal values
 _FEW_DIFFERENCES = 200  # up to which the means of all pairs are formed
 _HALVINGS = 52  # of the range of the differences: the precision of a double
 _LEAST_SUM = 1e-300  # of errors relative to the largest one
-_FAR = 1e4  # replaces an infinite log ratio in means of pairs; all finite ones are below 1500
+FAR = 1e4  # replaces an infinite log ratio in means of pairs; all finite ones are below 1500
 
 
 class LostRuns(NamedTuple):
@@ -159,10 +159,10 @@ class Effect(NamedTuple):
         n = len(self.differences)
         k, count = _count_outside(n, alpha), n * (n + 1) // 2
         ranks = [max(k, 1), (count + 1) // 2, count // 2 + 1, count + 1 - max(k, 1)]
-        low, *middle, high = _select_means(np.clip(self.differences, -_FAR, _FAR), ranks)
+        low, *middle, high = _select_means(np.clip(self.differences, -FAR, FAR), ranks)
         value = (middle[0] + middle[1]) / 2
         low, value, high = (
-            math.copysign(math.inf, x) if abs(x) > _FAR / 4 else x for x in (low, value, high)
+            math.copysign(math.inf, x) if abs(x) > FAR / 4 else x for x in (low, value, high)
         )
         return value, low if k else -math.inf, high if k else math.inf
 

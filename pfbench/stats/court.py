@@ -18,13 +18,15 @@ import scipy  # scipy.stats is imported at its first use
 from pfbench.stats.comparison import (
     ALPHA,
     EQUALITY_MARGIN,
+    FAR,
     NO_DECISION,
     Verdict,
     flip,
     open_family,
+    subtract_losses,
 )
 from pfbench.stats.error_measures import Array, Flags
-from pfbench.stats.rank_tests import holm
+from pfbench.stats.rank_tests import holm, weigh_regions
 from pfbench.stats.study_runs import (
     StudyRuns,
     compare_filters,
@@ -102,6 +104,18 @@ class Court:
         """Find the filters that lose track in each condition of a selection, by the tests of `find_lost_conditions`."""
         is_lost = find_lost_conditions(self.runs.select(mask), self.alpha)
         return {label for label, lost in zip(self.runs.filters, is_lost, strict=True) if lost.all()}
+
+    def weigh(self, metric: str, mask: Flags, a: str, b: str) -> str:
+        """Name the probabilities that the first of two filters is better, equal and worse in a condition; empty without runs.
+
+        They are no verdict: they say where an undecided pair tends. The region of equality is that of the verdict.
+        """
+        index = [self.runs.filters.index(label) for label in (a, b)]
+        first, second = self.losses(metric, mask)[index].reshape(2, -1)
+        is_common = ~(np.isnan(first) | np.isnan(second))
+        d = np.clip(subtract_losses(first[is_common], second[is_common]), -FAR, FAR)
+        words = zip(("better", "equal", "worse"), weigh_regions(d, self.margin), strict=True)
+        return ", ".join(f"{word} {share:.2f}" for word, share in words) if len(d) else ""
 
     def _decide(self, metric: str, mask: Flags) -> tuple[_Family, _Family]:
         """Decide both families of a selection, once."""

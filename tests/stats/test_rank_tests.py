@@ -102,3 +102,21 @@ def test_rounding_decides_nothing():
     # in every run the same way, but less than single precision tells
     assert rank_tests.wilcoxon_signed_rank(comparison.subtract_losses(a, a + 1e-7)).p == 1.0
     assert rank_tests.wilcoxon_signed_rank(comparison.subtract_losses(a, a + 1e-5)).p < 1e-5
+
+
+def test_the_probabilities_of_the_posterior_are_shares_of_studies() -> None:
+    """600 studies of 20 runs, whose effects are uniform: of those with a probability p a share p has the effect."""
+    rng, margin = np.random.default_rng(5), 0.05
+    effects = rng.uniform(-0.25, 0.25, 600)
+    data = effects[:, None] + 0.3 * rng.standard_normal((600, 20))
+    stated = np.array([rank_tests.weigh_regions(d, margin) for d in data])
+    is_so = np.stack([effects < -margin, np.abs(effects) <= margin, effects > margin], 1)
+    error = 4 * np.sqrt(0.25 / 600)
+    assert stated.mean(0) == pytest.approx(is_so.mean(0), abs=error)
+    sure, tends = stated[:, 0] > 0.8, (stated[:, 0] > 0.5) & (stated[:, 0] < 0.9)
+    for some in (sure, tends):
+        share = is_so[some, 0].mean()
+        assert stated[some, 0].mean() == pytest.approx(share, abs=4 * np.sqrt(0.25 / some.sum()))
+    # of equal filters: the wider the region, the more of the posterior is in it
+    widths = [rank_tests.weigh_regions(0.3 * rng.standard_normal(20), m)[1] for m in (0.0, 10.0)]
+    assert widths == [pytest.approx(0.0, abs=0.02), 1.0]

@@ -44,7 +44,7 @@ from pfbench.report.writers import format_csv, format_data_address
 from pfbench.results.conditions import parse_label
 from pfbench.results.looks import find_looks
 from pfbench.results.paper_block import read_paper_block
-from pfbench.stats.comparison import TRIM_SHARE
+from pfbench.stats.comparison import NO_DECISION, TRIM_SHARE
 from pfbench.stats.sentences import format_with_interval
 
 BOARD_PAGE = "worlds.html"  # the page of each world, which is the first page of other studies
@@ -402,17 +402,19 @@ def describe_failures(pack: Mapping[str, Any], overview: Overview) -> list[str]:
 def list_ratios(overview: Overview) -> list[tuple[World, list[str]]]:
     """List the ratios of a world with their simultaneous intervals, in the order of the columns of the heat map."""
     return [
-        (world, [_format_ratio(overview.find(world, label)) for label in overview.columns])
+        (world, [_format_ratio(world, overview.find(world, label)) for label in overview.columns])
         for world in overview.worlds
     ]
 
 
-def _format_ratio(cell: WorldCell | None) -> str:
-    """Format the ratio of a cell with its interval, and the share of runs that keep track where some are lost."""
+def _format_ratio(world: World, cell: WorldCell | None) -> str:
+    """Format the ratio of a cell with its interval, where it tends if nothing is decided, and the runs that keep track if some are lost."""
     if cell is None:
         return "–"
     has_ratio = cell.verdict.ratio > 0
     text = format_with_interval(*cell.verdict[3:6]) if has_ratio else "–"
+    if has_ratio and cell.verdict.word == NO_DECISION:
+        text += f" ({world.weigh(cell.filter)})"
     is_lost = cell.loses_track or not has_ratio
     return text + f"; {100 * cell.track_share:.0f} % keep track" * is_lost
 

@@ -97,6 +97,10 @@ class World(NamedTuple):
         losses = self.court.losses(METRIC, self.mask)[index, 0]
         return np.asarray(losses[:, ~np.isnan(losses).any(axis=0)])
 
+    def weigh(self, name: str) -> str:
+        """Name the probabilities that a filter is better than the reference, equal and worse."""
+        return self.court.weigh(METRIC, self.mask, self.labels[name], self.labels[self.reference])
+
     def share_track(self, name: str) -> float:
         """Return the share of runs in which a filter keeps track."""
         return float(np.isfinite(self.losses(name)).mean())
