@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import scipy
 from decision_cases import make_study
 from refusals import check_refused
 
@@ -20,8 +23,9 @@ from pfbench.stats.pair_states import (
     format_look,
     look_levels,
 )
+from pfbench.stats.rank_tests import wilcoxon_signed_rank_rows
 from pfbench.stats.study_runs import StudyRuns, arrange_runs, compare_filters, compute_losses
-from pfbench.stats.study_size import describe_study_size, detectable_effects
+from pfbench.stats.study_size import count_needed_runs, describe_study_size, detectable_effects
 
 PAIRS = [("A", "B"), ("A", "C"), ("B", "C")]
 EFFECTS = {"A": -0.4, "B": 0.0, "C": 0.0}
@@ -157,3 +161,21 @@ def test_the_sentence_before_a_study() -> None:
     assert f"at least {np.exp(effects.error_same_worlds):.3g} in these 3 worlds" in sentence
     assert f"at least {np.exp(effects.error_new):.3g} in a new world" in sentence
     assert "requires at least 2 worlds" in describe_study_size(50, 1, 4)
+
+
+@pytest.mark.parametrize(
+    "law", [lambda r, n: r.standard_normal(n), lambda r, n: r.standard_t(2, n)]
+)
+def test_the_needed_runs_have_the_power(law: Callable[[Any, Any], np.ndarray]) -> None:
+    """Two tests of one side on 2000 simulated studies; half of the runs lack the power."""
+    rng, ratio, alpha = np.random.default_rng(3), 0.8, 0.002
+    needed = int(count_needed_runs(0.4 * law(rng, 2000), ratio, alpha))
+
+    def power(n: int) -> float:
+        d = math.log(ratio) + 0.4 * law(rng, (2000, n))
+        ranks = wilcoxon_signed_rank_rows(d, "less")[1] < alpha
+        signs = scipy.stats.binom.cdf((d > 0).sum(1), n, 0.5) < alpha
+        return float((ranks & signs).mean())
+
+    assert 0.72 < power(needed) < 0.9  # the formula for ranks is one for large samples
+    assert power(needed // 2) < 0.6

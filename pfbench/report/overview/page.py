@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,6 +15,7 @@ from markupsafe import Markup
 from pfbench.report.overview import figures
 from pfbench.report.overview.tables import (
     EQUAL_TIME,
+    PLANNED_RATIO,
     PRINTED,
     SIR,
     WITH_KNOBS,
@@ -21,6 +23,7 @@ from pfbench.report.overview.tables import (
     TabKey,
     World,
     WorldCell,
+    count_runs_of_cells,
     find_outdone,
     format_times,
     list_world_notes,
@@ -46,6 +49,7 @@ from pfbench.results.looks import find_looks
 from pfbench.results.paper_block import read_paper_block
 from pfbench.stats.comparison import NO_DECISION, TRIM_SHARE
 from pfbench.stats.sentences import format_with_interval
+from pfbench.stats.study_size import POWER
 
 BOARD_PAGE = "worlds.html"  # the page of each world, which is the first page of other studies
 _HERE = Path(__file__).parent
@@ -93,6 +97,7 @@ def render_overview(
         "has_stars": any(cell.wins for item in overviews.values() for cell in item.cells),
         "failures": describe_failures(pack, overview),
         "notes": list_notes(overview),
+        "power": describe_power(overview),
         "times_note": describe_times(overviews[EQUAL_TIME]) if EQUAL_TIME in overviews else "",
         "conventional": ", ".join(overview.names[label] for label in overview.conventional),
         "trim": f"{100 * TRIM_SHARE:.0f} %",
@@ -148,6 +153,7 @@ def list_overview_blocks(page: Mapping[str, Any]) -> list[Block]:
             Block("text", "Before you quote a number of these worlds:"), Block("list", [f"{name}: {text}." for name, text in page["notes"]])
         ),
         make_rows(heads, [[story[name] for name in columns] for story in page["stories"]]),
+        Block("text", page["power"]),
         Block("text", "†: not shown to be better than every single Kalman filter of that world."),
         *with_heading(
             Block("text", "The figures of the papers from our runs, with the numbers that the papers print as crosses:"),
@@ -358,6 +364,23 @@ def _describe_reference(overview: Overview) -> str:
     ]
     text = "The best Kalman filter of a world was chosen on another seed, tuned ones among the candidates; the methods are not tuned."
     return text + (f" In these runs another one is better: {', '.join(better)}." if better else "")
+
+
+def describe_power(overview: Overview) -> str:
+    """Say in how many cells the runs suffice for the question of the page, and name the others."""
+    counted = count_runs_of_cells(overview)
+    texts = [
+        f"{overview.names[cell.filter]} in {overview.world_names[cell.world]} ({cell.verdict.n} runs, "
+        f"{'more than 10 000' if math.isinf(needed) else f'{needed:.0f}'} needed)"
+        for cell, needed in counted
+        if needed > cell.verdict.n
+    ]
+    return (
+        f"In {len(counted) - len(texts)} of {len(counted)} cells the runs suffice to show a method with {PLANNED_RATIO:g} of the error of the "
+        f"strongest conventional filter, with power {POWER:g} and Holm's correction over all cells."
+        + f" They are too few for {'; '.join(texts)}."
+        * bool(texts)
+    )
 
 
 def list_notes(overview: Overview) -> list[tuple[str, str]]:

@@ -22,15 +22,24 @@ from pfbench.results.conditions import drop_settings, parse_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.results.paper_block import list_named_parts, read_paper_block, read_part
 from pfbench.results.store import SAME_TIME
-from pfbench.stats.comparison import EQUAL_WORDS, Verdict, find_largest_p
+from pfbench.stats.comparison import (
+    EQUAL_WORDS,
+    FAR,
+    MOST_LOST,
+    Verdict,
+    find_largest_p,
+    subtract_losses,
+)
 from pfbench.stats.court import TRACK_SHARE, Court, Pair
 from pfbench.stats.error_measures import Array, Flags
 from pfbench.stats.rank_tests import holm
+from pfbench.stats.study_size import count_needed_runs
 
 FEWEST_METHODS, FEWEST_WORLDS = 3, 2  # from which a study has this page
 CENTRAL = "nominal"  # regime of the page, if a world has several
 SIR = "sir"
 CONVENTIONAL = (SIR, "rpf", "rpf_tuned", "ekf_bank")  # that stand next to the methods
+PLANNED_RATIO = 0.8  # for which the runs of a cell are counted
 METRIC = "rmse"  # of all words of the page
 DEAD_RECKONING, PLAIN = "dead_reckoning", "ukf"
 TabKey = int | str  # a number of particles, 0 for a study of one number, or one of those below
@@ -314,6 +323,25 @@ def find_outdone(world: World, single: Sequence[str]) -> Verdict | None:
     verdicts = [world.find(world.reference, name) for name in others]
     worse = [verdict for verdict in verdicts if verdict.word == "worse"]
     return max(worse, key=lambda v: v.ratio if v.ratio > 0 else math.inf, default=None)
+
+
+def count_runs_of_cells(overview: Overview) -> list[tuple[WorldCell, float]]:
+    """Count the runs that show 0.8 of the error of the strongest conventional filter, for each cell of a method.
+
+    The level is the first of Holm's correction over all these cells. A cell is left out if more than a fifth of its runs is lost.
+    """
+    worlds = {world.key: world for world in overview.worlds}
+    counted = []
+    for cell in overview.of_methods:
+        world = worlds[cell.world]
+        rivals = [v for v in (*overview.single, *overview.conventional) if v in world.labels]
+        strongest = min(rivals, key=lambda name: float(np.median(world.losses(name))))
+        d = subtract_losses(*world.losses(cell.filter, strongest))
+        if np.isinf(d).mean() <= MOST_LOST and d.any():
+            level = world.court.alpha / len(overview.of_methods)
+            needed = count_needed_runs(np.clip(d, -FAR, FAR), PLANNED_RATIO, level)
+            counted.append((cell, needed))
+    return counted
 
 
 def list_world_notes(world: World) -> list[str]:
