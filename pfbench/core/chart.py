@@ -149,6 +149,15 @@ class Chart:
         """Number of components of a difference, d."""
         return sum(block.dimension for block in self.blocks)
 
+    @property
+    def identity(self) -> list[float]:
+        """State of which all components are 0, but 1 for the scalar part of a quaternion, [D]."""
+        return [
+            float(place == 0 and block.dimension < block.size)
+            for block in self.blocks
+            for place in range(block.size)
+        ]
+
     @cached_property
     def flat(self) -> bool:
         """True if all components are Euclidean."""

@@ -86,7 +86,9 @@ def run(
         check_settings(values)
         outcome = JobOutcome(path, "skipped", main_rmse(result.data, result.meta))
         repeat = "(overwrite=true to repeat)"
-        log.info("%sskipped   %s   result exists: %s   %s", counter, name, path, repeat)
+        first = result.meta["choices"]["filter"]
+        of = "" if first == job_choices["filter"] else f" of {first}, which has the same settings"
+        log.info("%sskipped   %s   result exists%s: %s   %s", counter, name, of, path, repeat)
         return outcome
     if inputs and not path.exists():
         _announce_change(path, job_choices, inputs)

@@ -117,6 +117,8 @@ def write_failure(
     path = Path(path)
     if path.exists():
         return None
+    if type(error).__name__ == "InstantiationException" and error.__cause__ is not None:
+        error = error.__cause__  # the sentence of the class, without that of Hydra
     note = {
         "key": path.stem,
         "choices": dict(choices),

@@ -27,6 +27,7 @@ from pfbench.door import laws, own_source
 from pfbench.job import IGNORED_IN_KEY, compose, job_key
 from pfbench.job.trust import FOLDERS
 from pfbench.results import main_component_group, store
+from pfbench.results.status import keeps_track
 from pfbench.scenario import ModelSimulation
 
 SMALL = {"runs": 4, "particles": 40}
@@ -536,7 +537,8 @@ def test_errors_are_those_of_the_files(study: pfbench.Study) -> None:
         for job in condition.jobs:
             group = main_component_group(job.meta["state"])
             error = job.load().data["error"][..., group.places] * group.scale
-            rmse = np.sqrt((error**2).sum(-1).mean(-1))
+            kept = keeps_track(job.load().data, job.meta)
+            rmse = np.where(kept, np.sqrt((error**2).sum(-1).mean(-1)), np.inf)
             np.testing.assert_allclose(errors.loc[condition.noise][job.label], rmse, rtol=1e-6)
     assert set(study.table("rmse")["metric"]) == {"rmse"}
     check_refused(
@@ -549,10 +551,10 @@ def test_errors_are_those_of_the_files(study: pfbench.Study) -> None:
 
 
 def test_a_comparison_is_the_one_of_the_page_and_of_the_errors(study: pfbench.Study) -> None:
-    """Word and interval are those of the view of the condition; the ratio is that of `errors()`, a lost run above all."""
+    """Word and interval are those of the view of the condition; the ratio is that of `errors()`, in which a lost run is infinite."""
     comparison = study.compare("sir", "ekf")
     keeps = study.table("rmse").pivot_table("keeps_track", ["noise", "run"], "label", "min", observed=True) > 0  # fmt: skip
-    errors = study.errors().where(keeps, 1e99)
+    errors = study.errors().clip(upper=1e99)
     rows = pd.read_csv(study.report(figure_formats=("svg",)).with_name("verdicts.csv"))
     for noise, verdict in zip(("nominal", "outliers"), comparison.verdicts.values(), strict=True):
         logs = np.log(errors.loc[noise])
