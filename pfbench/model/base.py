@@ -96,8 +96,8 @@ class StateSpaceModel(nn.Module, ABC):
 
     @property
     def origin(self) -> Tensor:
-        """State [D] about which `initial` is defined in the chart; zero by default."""
-        return self.anchor.new_zeros(self.chart.size)
+        """State [D] about which `initial` is defined in the chart; that with components 0 by default, without a turn."""
+        return self.anchor.new_tensor(self.chart.identity)
 
     @property
     def anchor(self) -> Tensor:

@@ -315,6 +315,22 @@ def test_a_file_that_an_own_stage_reads_must_be_stated(
     assert "input_files" not in repr(pfbench.check(notebook["Says"](), runs=20))
 
 
+@pytest.mark.parametrize(
+    ("weights", "sentence"),
+    [("log_w * float('nan')", "estimate must be finite"), ("log_w.sum(-1)", "Weighs must return log weights")],
+)  # fmt: skip
+def test_a_filter_that_gives_nothing_is_refused_before_the_jobs(
+    notebook: Notebook, weights: str, sentence: str
+) -> None:
+    notebook.run(
+        f"class Weighs:\n    is_exact = False\n    def __call__(self, model, log_w, x, log_ratio, record):\n        return {weights}"
+    )
+    part = notebook["Weighs"]()
+    assert not pfbench.check(part, runs=20).passed
+    check_refused([(sentence, lambda: pfbench.run(WALK, ["sir", part], study="n", **SMALL))])
+    assert not Path("results/n").exists()
+
+
 def test_names_of_own_parts(notebook: Notebook) -> None:
     notebook.run("SCALE = 3.0")
     notebook.run(PROPOSAL)
