@@ -294,8 +294,8 @@ def _take_steps(
     draws = PhiloxStream(plan.values["seed"], plan.runs[:2])
     try:
         with torch.no_grad():
-            taken = run_filter(method, model, first_steps(model, episode.record, 3), draws)
-        if not taken.mean.isfinite().any():
+            trial = run_filter(method, model, first_steps(model, episode.record, 3), draws)
+        if not trial.mean.isfinite().any():
             raise ValueError(
                 "the estimate must be finite in the first steps, got NaN in both runs of the trial. A NaN among the weights or "
                 "the states of one particle loses its run: print them"

@@ -151,11 +151,11 @@ class Chart:
 
     @property
     def identity(self) -> list[float]:
-        """State of which all components are 0, but 1 for the scalar part of a quaternion, [D]."""
+        """State [D] of zeros, with 1 for the scalar part of each quaternion."""
         return [
-            float(place == 0 and block.dimension < block.size)
+            float(component == 0 and block.dimension < block.size)
             for block in self.blocks
-            for place in range(block.size)
+            for component in range(block.size)
         ]
 
     @cached_property

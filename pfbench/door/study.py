@@ -269,6 +269,26 @@ class Study:
             continue_jobs(self, runs, workers, progress)
         return self
 
+    def remove(self, label: str) -> Study:
+        """Remove the results of a filter, such as one whose class has another name now. Other results stay as they are.
+
+        Args:
+            label: Label of the filter.
+
+        Returns:
+            The study.
+
+        Raises:
+            ValueError: If no result has this label.
+        """
+        jobs = [job for condition in self.conditions() for job in condition.jobs]
+        labels = sorted({job.label for job in jobs})
+        require(label in labels, "label", f"be one of {', '.join(labels)}", f"{label!r}", "List them: study.summary()")  # fmt: skip
+        for job in jobs:
+            for path in (job.parts or (job.path,)) if job.label == label else ():
+                path.unlink()
+        return self
+
     def to_xarray(self) -> Any:
         """Return errors, variances and traces as a data set of xarray.
 

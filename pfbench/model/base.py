@@ -215,8 +215,8 @@ class StateSpaceModel(nn.Module, ABC):
         A model whose groups are not components of a difference, such as Euler angles of a quaternion, overrides this method.
 
         Args:
-            truth: True values by group, [R, T, k]: components of the state, or, for a chart with a quaternion, of its difference
-                from `chart.identity`, in which a turn is a rotation vector.
+            truth: True values by group, [R, T, k]. They are components of the state. Those of a chart with a quaternion are components
+                of its difference from `chart.identity`, in which a turn is a rotation vector.
 
         Returns:
             States, [R, T, D]; NaN where the truth of a group is unknown.

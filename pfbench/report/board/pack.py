@@ -392,7 +392,7 @@ def _list_cells(
 
 
 def round_ratio(log_ratio: float) -> float | None:
-    """Return a ratio with eight digits, of which a page prints three; None without a number."""
+    """Return a ratio with eight digits, for pages that print three; None without a number."""
     if not math.isfinite(log_ratio):
         return None
     distance = float(
