@@ -1,21 +1,16 @@
-"""Command `pfbench check`: versions, device, data, and all configurations."""
+"""Command `pfbench check`: compose all configurations and print versions."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
 
+from pfbench.cli.command import Command
 from pfbench.cli.messages import format_error
 from pfbench.core.parameter_checks import require
 from pfbench.files.command_start import collect_rarely, start_work
 from pfbench.job.config import SUFFIX, compose, list_groups
 from pfbench.results.paper_block import read_part
-
-HELP = """\
-pfbench check
-
-Print versions, threads, device and data folder, and compose all configurations.
-The exit code is 1 if a configuration does not compose."""
 
 
 def check_installation(words: Sequence[str]) -> None:
@@ -74,3 +69,13 @@ def _add_needs(group: str, name: str) -> list[str]:
             if entry in read_part("scenario", scenario):
                 return [f"scenario={scenario}"]
     return []
+
+
+COMMAND = Command(
+    check_installation,
+    """\
+pfbench check
+
+Print versions, threads, device and data folder, and compose all configurations.
+The exit code is 1 if a configuration does not compose.""",
+)

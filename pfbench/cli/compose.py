@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from itertools import islice, product
 from typing import Any, NoReturn
 
-from pfbench.cli.messages import format_flag, suggest_similar
+from pfbench.cli.messages import format_flag
 from pfbench.core.parameter_checks import require
 from pfbench.job.config import CHOICES, JobConfig, compose, compose_tree, expand_filter_sets
+from pfbench.job.file_rules import FOLDER_KEYS
 from pfbench.job.settings import check_settings
-from pfbench.job.trust import UntrustedConfigError, check_study, trusted_packages
+from pfbench.job.trust import UntrustedConfigError, check_study
 from pfbench.results.paper_block import PAPER, experiments_dir, list_named_parts
 
 
@@ -36,35 +37,13 @@ def given_keys(words: Sequence[str]) -> set[str]:
     return {word.lstrip("+~").partition("=")[0] for word in words}
 
 
-def split_words(
-    words: Sequence[str], keys: Sequence[str], required: Sequence[str], usage: str
-) -> dict[str, str]:
-    """Split words into values by key and check the keys.
+PLACES = ("device", "threads", "checkpoint")  # where a stored job is computed again
 
-    Returns values by key.
-    """
-    values: dict[str, str] = {}
-    advice = f"See {' '.join(usage.split()[:2])} --help."
-    for word in words:
-        key, equals, value = word.partition("=")
-        if key == "hydra.searchpath":  # a word of the run: a result stores the configuration itself
-            continue
-        require(
-            equals and value and (key not in values),
-            "words",
-            "be key=value, each key once",
-            word,
-            advice,
-        )
-        if key not in keys:
-            raise ValueError(
-                f"key must be one of {', '.join(keys)}, got {key}.{suggest_similar(key, keys)} {advice}"
-            )
-        values[key] = value
-    for key in required:
-        if key not in values:
-            raise ValueError(f"{key} must be set. Use: {usage}")
-    return values
+
+def choose_places(values: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
+    """Return what replaces settings of a stored job: folders, data, and the places that words name."""
+    keys = ("data", *FOLDER_KEYS, *(key for key in PLACES if key in given_keys(words)))
+    return {key: values[key] for key in keys}
 
 
 def count_planned_jobs(study: str) -> int | None:
@@ -344,8 +323,6 @@ class StudyPlan:
 
     def compose_parts(self) -> Iterator[JobConfig]:
         """Compose a job of each combination of parts with classes of the user; a job that does not compose says so itself."""
-        if not (self.first.trusted or trusted_packages()):
-            return
         several = [
             options
             if {key.split(".")[0] for key in given_keys(options[:1])} <= {*CHOICES}

@@ -1,4 +1,4 @@
-"""Command `pfbench report`: reports of studies."""
+"""Command `pfbench report`: write the report of a study: figures, tables and tests."""
 
 from __future__ import annotations
 
@@ -8,54 +8,36 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from pfbench.cli.command import Command
 from pfbench.cli.compose import compose_study, count_planned_jobs, given_keys
 from pfbench.cli.messages import format_error, suggest_similar
 from pfbench.core.parameter_checks import require
 from pfbench.files.command_start import start_work
 from pfbench.files.recorded_folder import copy_published, describe_missing_runs, find_published_file
 from pfbench.job.config import JobConfig, compose
+from pfbench.results.conditions import DATASHEETS, list_stored_studies
 from pfbench.results.paper_block import experiments_dir, name_run_command
-
-HELP = """\
-pfbench report study=NAME [key=value ...]
-pfbench report all [key=value ...]
-
-Write the report of a study: figures, tables and statistical tests, as index.html and report.md.
-`all` writes the reports of all studies with results, and the page of the claims.
-
-  pfbench report study=quickstart
-  pfbench report study=mine report.figure_formats=[pdf,png]
-  pfbench list report        report configurations
-
-See also: pfbench claims, pfbench datasheet scenario=NAME"""
+from pfbench.results.store import list_failures
 
 CLAIMS = "claims_2"  # folder of the claims among results and reports
-_NOT_STUDIES = ("datasheets", "claims", CLAIMS)  # folders of other reports
+# folders that hold no study, and the commands that write them
+NOT_STUDIES = {DATASHEETS: "datasheet scenario=NAME", "claims": "claims", CLAIMS: "claims"}
 _PAGES = ("report.md", "index.html")
 
 
 def report_study(words: Sequence[str]) -> None:
     """Write the report of a study, or those of all studies."""
     if list(words[:1]) == ["all"]:
-        _report_all(list(words[1:]))
+        _report_all(words[1:])
         return
     keys = given_keys(words)
-    if "scenario" in keys and not keys & {"study", "experiment"}:
-        scenario = next(word.partition("=")[2] for word in words if "scenario=" in word)
-        raise ValueError(
-            f"study must be set, got scenario={scenario}. "
-            f"For its datasheet use: pfbench datasheet scenario={scenario}"
-        )
+    world = next((word for word in words if word.startswith("scenario=")), "")
+    is_study = not world or keys & {"study", "experiment"}
+    require(is_study, "study", "be set", world, f"For its datasheet use: pfbench datasheet {world}")
     config = compose_study(words)
     study = config.values["study"]
-    require(study not in ("claims", CLAIMS), "study", "be a study", study, "Use: pfbench claims")
-    require(
-        study != "datasheets",
-        "study",
-        "be a study",
-        "datasheets",
-        "Use: pfbench datasheet scenario=NAME",
-    )
+    other = f"Use: pfbench {NOT_STUDIES.get(study)}"
+    require(study not in NOT_STUDIES, "study", "be a study", study, other)
     if not find_page_data(config, words):
         check_has_results(study, Path(config.values["results_dir"]))
     print(f"report: {_write_page(config).resolve()}")
@@ -64,8 +46,6 @@ def report_study(words: Sequence[str]) -> None:
 def check_has_results(study: str, results: Path) -> None:
     """Check that a study has files of results."""
     from pfbench.report.stored_study import RUNS_FILE
-    from pfbench.results.conditions import list_stored_studies
-    from pfbench.results.store import list_failures
 
     if any((results / study).glob("*.npz")):
         return
@@ -91,14 +71,13 @@ def make_report_options(config: JobConfig) -> Any:
     from pfbench.report.options import ReportOptions
 
     values = config.values.get("report")
+    stated = values if isinstance(values, Mapping) else {str(values): None}
     names = [field.name for field in fields(ReportOptions)]
-    unknown = sorted({*values} - {*names}) if isinstance(values, Mapping) else [str(values)]
-    if unknown or values is None:
-        raise ValueError(
-            f"report must have keys of {', '.join(names)}, got {', '.join(unknown)}.{suggest_similar(unknown[0], names)} "
-            "Choose a file: pfbench list report"
-        )
-    options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    unknown = sorted({*stated} - {*names})
+    similar = suggest_similar(unknown[0], names) if unknown else ""
+    remedy = f"{similar} Choose a file: pfbench list report".strip()
+    require(not unknown, "report", f"have keys of {', '.join(names)}", ", ".join(unknown), remedy)
+    options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stated.items()}
     return ReportOptions(**options, planned=count_planned_jobs(config.values["study"]))
 
 
@@ -136,20 +115,18 @@ def find_page_data(config: JobConfig, words: Sequence[str] = ()) -> Path | None:
     return data
 
 
-def _report_all(words: list[str]) -> None:
+def _report_all(words: Sequence[str]) -> None:
     """Write the reports of all studies with results or stored data, and of the claims."""
     values = compose(words).values
     results, reports = Path(values["results_dir"]), Path(values["reports_dir"])
-    studies = {path.parent.name for path in results.glob("*/*.npz")} - {"datasheets", CLAIMS}
+    studies = {path.parent.name for path in results.glob("*/*.npz")} - NOT_STUDIES.keys()
     pages = [path for name in _PAGES for path in reports.glob(f"*/{name}")]
-    published = {path.parent.name for path in pages} - set(_NOT_STUDIES)
+    published = {path.parent.name for path in pages} - NOT_STUDIES.keys()
     failed = []
     start_work()  # a report that is refused stops no other
     for study in sorted(studies):
-        has_experiment = (experiments_dir() / f"{study}.yaml").exists()
-        choice = f"+experiment={study}" if has_experiment else f"study={study}"
         try:
-            print(f"{study}: {_write_page(compose([choice, *words])).resolve()}")
+            print(f"{study}: {_write_page(compose_study([f'study={study}', *words])).resolve()}")
         except Exception as error:
             failed.append(study)
             print(f"{study}: failed: {format_error(error, words)}", file=sys.stderr)
@@ -163,7 +140,7 @@ def _report_all(words: list[str]) -> None:
         )
 
 
-def _write_claims(words: list[str]) -> str:
+def _write_claims(words: Sequence[str]) -> str:
     """Write the page of the claims if there are runs of them, or a page that stores some; return a line for the user."""
     from pfbench.cli.claims import write_claims_page
 
@@ -190,3 +167,20 @@ def _renew_published(study: str, folder: Path, results: Path) -> str:
         f"{study}: the published report is unchanged, since {results} holds no results. "
         f"Next: {command}"
     )
+
+
+COMMAND = Command(
+    report_study,
+    """\
+pfbench report study=NAME [key=value ...]
+pfbench report all [key=value ...]
+
+Write the report of a study: figures, tables and statistical tests, as index.html and report.md.
+`all` writes the reports of all studies with results, and the page of the claims.
+
+  pfbench report study=quickstart
+  pfbench report study=mine report.figure_formats=[pdf,png]
+  pfbench list report        report configurations
+
+See also: pfbench claims, pfbench datasheet scenario=NAME""",
+)

@@ -1,18 +1,19 @@
-"""Command `pfbench run`: one job or a sweep, its progress, and the report of failed jobs."""
+"""Command `pfbench run`: run one job, or a sweep with -m."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import logging
 import os
 import re
 import shlex
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from pfbench.cli.command import Command
 from pfbench.cli.compose import (
     StudyPlan,
     check_words,
@@ -20,32 +21,13 @@ from pfbench.cli.compose import (
     replace_config_dir,
     wants_until_decided,
 )
-from pfbench.cli.messages import format_error, notes_of
-from pfbench.cli.progress import SweepCounter, SweepProgress, note_outcome
+from pfbench.cli.progress import Sweep, SweepCounter, SweepJobError, list_repeats, reported_failure
 from pfbench.cli.terminal import end_with_parent
 from pfbench.files.command_start import start_work
+from pfbench.files.reader_notes import SWEEP_LOG
 from pfbench.job.config import CHOICES, JobConfig, expand_filter_sets, register_experiments
-from pfbench.job.trust import ENVIRONMENT
+from pfbench.job.trust import ENVIRONMENT, trusted_packages
 from pfbench.results.paper_block import conf_dir
-
-HELP = """\
-pfbench run [-m] key=value ...
-
-Run one job (one filter in one condition), or with -m a sweep over comma-separated values.
-Finished jobs are skipped: repeat an interrupted command to resume.
-
-  pfbench run scenario=flight_300s noise=nominal filter=sir runs=100 seed=1
-  pfbench run -m scenario=flight_300s filter=ekf,sir noise=nominal,outliers study=mine
-  pfbench run -m +experiment=quickstart
-  pfbench run -m +experiment=quickstart hydra/launcher=cores     on all cores
-  pfbench run --dry-run -m scenario=flight_300s filter=ekf,sir runs=100
-                             prints jobs, memory and time, and runs nothing
-  pfbench run -m scenario=flight_300s filter=ekf,sir study=mine runs=until-decided
-                             adds runs until each pair of filters is decided
-
-  pfbench list               scenarios, noise regimes, filters and experiments
-  pfbench run --cfg job      all keys with their values"""
-
 
 _RETRIES = 3  # of a sweep that lost a process, as many as Ray allows
 
@@ -82,7 +64,8 @@ def run_jobs(words: Sequence[str]) -> None:
         print_dry_run(plan or plan_study(overrides, first), is_sweep=bool(flags))
         return
     if plan and not is_printed:
-        print_surprise(_try_parts(plan), overrides, is_sweep=bool(flags))
+        _try_parts(plan)
+        print_surprise(plan, overrides, is_sweep=bool(flags))
     if plan and wants_until_decided(plan):
         _run_until_decided(flags, overrides, plan)
     elif flags:
@@ -92,12 +75,12 @@ def run_jobs(words: Sequence[str]) -> None:
         _run_alone(overrides, plan)
 
 
-def _try_parts(plan: StudyPlan) -> StudyPlan:
-    """Try the own parts of a plan before its first job, and return the plan."""
-    from pfbench.cli.dry_run import try_own_parts
+def _try_parts(plan: StudyPlan) -> None:
+    """Try the own parts of a plan before its first job."""
+    if plan.first.trusted or trusted_packages():
+        from pfbench.cli.dry_run import try_own_parts  # which imports torch
 
-    try_own_parts(plan.compose_parts())
-    return plan
+        try_own_parts(plan.compose_parts())
 
 
 def _run_until_decided(flags: Sequence[str], overrides: Sequence[str], plan: StudyPlan) -> None:
@@ -179,16 +162,31 @@ def run_sweep(
 ) -> None:
     """Run all jobs of a sweep and print their counts."""
     sys.argv = ["pfbench run", *words]
-    sweep = SweepProgress.start(plan)
+    sweep = None
+    if plan is not None:  # else the sweep itself reports the error
+        sweep = Sweep.of_jobs(plan.first, plan.jobs)
+        os.environ[SWEEP_LOG] = str(sweep.file)
+    is_complete = False
     try:
         with hide_hydra_line():
             run_with_retries(application)
-    except BaseException as error:
-        sweep.finish(is_complete=False, is_part=is_part)
-        if isinstance(error, Exception):
-            raise summarise_failed_jobs(error, words) from error
-        raise
-    sweep.finish(is_part=is_part)
+        is_complete = True
+    except Exception as error:
+        raise summarise_failed_jobs(error, words) from error
+    finally:
+        os.environ.pop(SWEEP_LOG, None)
+        if is_complete or (sweep and sweep.file.is_file()):
+            start_work()  # in another process, for most launchers
+        if sweep and plan and plan.has_one_study:
+            _print_end(sweep, is_complete=is_complete, is_part=is_part)
+
+
+def _print_end(sweep: Sweep, *, is_complete: bool, is_part: bool) -> None:
+    """Print the counts of a sweep, the failed jobs with the words that repeat them, and the next command."""
+    counts = f"{sweep.count(is_complete)} in {time.time() - sweep.start_time:.0f} s."
+    has_page = any(sweep.folder.glob("*.npz")) and not is_part
+    command = f"  Next: pfbench report study={sweep.folder.name}" if has_page else ""
+    print(f"sweep: {counts}{command}", *list_repeats(sweep.folder, sweep.start_time), sep="\n")
 
 
 def delay_keys_of_swept_groups(words: Sequence[str]) -> list[str]:
@@ -224,24 +222,25 @@ def run_task(
     from pfbench import job
 
     application: Any = HydraConfig.get()
-    number = OmegaConf.select(
-        application, "job.num", throw_on_missing=False
-    )  # None outside a sweep
     choices, words = application.runtime.choices, list(application.overrides.task)
     end_with_parent()
-    counter = "" if number is None else SweepCounter.from_environment(number)
+
+    def run_job(counter: object) -> job.JobOutcome:
+        places = _list_place_words(application)
+        config = checked or job.resolve_config(cfg, choices, words=[*words, *places])
+        return job.run(config, choices, counter, announce)
+
+    number = OmegaConf.select(application, "job.num", throw_on_missing=False)
+    if number is None:  # outside of a sweep
+        return run_job("").rmse
+    counter = SweepCounter(number, Sweep.from_file(os.environ.get(SWEEP_LOG, "")))
     try:
-        config = checked or job.resolve_config(
-            cfg, choices, words=[*words, *_list_place_words(application)]
-        )
-        outcome = job.run(config, choices, counter, announce)
-    except Exception as error:
-        note_outcome(number, "failed")
-        if number is None:
-            raise
-        name = " / ".join(str(choices[group]) for group in ("scenario", "noise", "filter"))
-        raise report_failed_job(error, counter, name, words) from error
-    note_outcome(number, outcome.status)
+        with reported_failure(counter, choices, words):
+            outcome = run_job(counter)
+    except SweepJobError:
+        counter.note("failed")
+        raise
+    counter.note(outcome.status)
     return outcome.rmse
 
 
@@ -285,16 +284,9 @@ def run_with_retries(sweep: Callable[[], Any]) -> None:
 # --------------------------------------------------------------------------------------------------
 # Report of a failed job: once, on its line in a sweep, else as the error of the command.
 
-log = logging.getLogger("pfbench")
-
-
 _HYDRA_LINE = "Error executing job with overrides"
 
 _OTHER_TERMINAL = ("slurm", "ray_cluster")  # launchers whose jobs print elsewhere
-
-
-class SweepJobError(Exception):
-    """Error of a job that its own line has reported."""
 
 
 class _WithoutHydraLine:
@@ -317,18 +309,6 @@ def hide_hydra_line() -> Iterator[None]:
     stream: Any = _WithoutHydraLine(sys.stderr)
     with contextlib.redirect_stderr(stream):
         yield
-
-
-def report_failed_job(
-    error: Exception, start: object, name: str, words: Sequence[str]
-) -> Exception:
-    """Print the line of a failed job of a sweep.
-
-    Returns error to raise in its place, with the same message.
-    """
-    message = " ".join(format_error(error, words).split())
-    log.error("%sfailed    %s", start, "   ".join([name, message, *notes_of(error)]))
-    return SweepJobError(message)
 
 
 def summarise_failed_jobs(error: Exception, words: Sequence[str]) -> Exception:
@@ -414,3 +394,25 @@ def _run_overrides(task: Callable[[Any], Any], overrides: list[str], *, is_multi
 def _can_set_mode(overrides: Sequence[str]) -> bool:
     """Return whether overrides can set `hydra.mode`, which no file of pfbench sets. Other files need a search path."""
     return any(re.match(r"[+~]*hydra\b", word) for word in overrides)
+
+
+COMMAND = Command(
+    run_jobs,
+    """\
+pfbench run [-m] key=value ...
+
+Run one job (one filter in one condition), or with -m a sweep over comma-separated values.
+Finished jobs are skipped: repeat an interrupted command to resume.
+
+  pfbench run scenario=flight_300s noise=nominal filter=sir runs=100 seed=1
+  pfbench run -m scenario=flight_300s filter=ekf,sir noise=nominal,outliers study=mine
+  pfbench run -m +experiment=quickstart
+  pfbench run -m +experiment=quickstart hydra/launcher=cores     on all cores
+  pfbench run --dry-run -m scenario=flight_300s filter=ekf,sir runs=100
+                             prints jobs, memory and time, and runs nothing
+  pfbench run -m scenario=flight_300s filter=ekf,sir study=mine runs=until-decided
+                             adds runs until each pair of filters is decided
+
+  pfbench list               scenarios, noise regimes, filters and experiments
+  pfbench run --cfg job      all keys with their values""",
+)

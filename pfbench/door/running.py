@@ -10,11 +10,10 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 from pfbench.cli.current_folder import add_search_path
-from pfbench.cli.progress import SweepCounter, SweepProgress, list_repeats, note_outcome
+from pfbench.cli.progress import Sweep, SweepCounter, list_repeats, log
 from pfbench.core.parameter_checks import require
 from pfbench.door.own_parts import find_group, make_own
 from pfbench.door.parts import (
@@ -27,13 +26,11 @@ from pfbench.door.parts import (
     plain_errors,
 )
 from pfbench.door.study import Study, open_study
-from pfbench.door.worker import COUNTER, JobReply, WorkerPool, run_config
+from pfbench.door.worker import COUNTER, JobReply, WorkerPool, logging_to, run_request
 from pfbench.job.config import CHOICES, FILTER_SETS, JobConfig, compose
 from pfbench.job.run_job import list_used_packages
 from pfbench.job.settings import check_settings
 from pfbench.results.conditions import JobFile
-
-log = logging.getLogger("pfbench")
 
 
 def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
@@ -212,21 +209,20 @@ def check_trusted(meta: Mapping[str, Any], trusted: Sequence[str]) -> None:
 
 def _run_jobs(configs: Sequence[JobConfig], workers: int, progress: bool) -> None:
     """Run jobs and print a line of each, the counts, and the words that repeat failed jobs."""
-    values, total = configs[0].values, len(configs)
-    folder = Path(values["results_dir"]) / str(values["study"])
-    sweep = SweepProgress(total, str(values["study"]), folder)
+    total, sweep = len(configs), Sweep.of_jobs(configs[0], len(configs))
     failed: list[str] = []
-    with _printed_lines() if progress else contextlib.nullcontext():
+    printed = logging_to(logging.StreamHandler(sys.stdout))
+    with printed if progress else contextlib.nullcontext():
         try:
             for number, reply in _replies(configs, workers):
-                counter = str(SweepCounter(number, str(total), str(sweep.file)))
+                counter = str(SweepCounter(number, sweep))
                 for line in reply.lines:
                     log.info("%s", line.replace(COUNTER, counter))
-                note_outcome(number, reply.status, sweep.file)
+                sweep.note(number, reply.status)
                 failed += [reply.message] if reply.status == "failed" else []
         finally:
             log.info("run: %s in %.0f s", sweep.count(), time.time() - sweep.start_time)
-            for line in list_repeats(folder, sweep.start_time):
+            for line in list_repeats(sweep.folder, sweep.start_time):
                 log.info("%s", line)
     if len(failed) == total:
         raise RuntimeError(failed[0])
@@ -242,23 +238,7 @@ def _replies(configs: Sequence[JobConfig], workers: int) -> Iterator[tuple[int, 
         return
     with preserved_process():  # which imports torch, that workers import themselves
         for number, config in enumerate(configs):
-            yield number, run_config(config)
-
-
-@contextlib.contextmanager
-def _printed_lines() -> Iterator[None]:
-    """Print the lines of jobs while they run."""
-    handler = logging.StreamHandler(sys.stdout)
-    handler.setFormatter(logging.Formatter("%(message)s"))
-    level, log.level = log.level, logging.INFO
-    handlers = list(log.handlers)
-    log.addHandler(handler)
-    log.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        log.handlers[:] = handlers
-        log.setLevel(level)
+            yield number, run_request(vars(config))
 
 
 @contextlib.contextmanager

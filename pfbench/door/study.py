@@ -218,7 +218,7 @@ class Study:
         Returns:
             The files.
         """
-        from pfbench.cli.paper import write_study_paper
+        from pfbench.cli.paper import COMMAND as WRITE_PAPER
         from pfbench.door.parts import format_words
 
         folder = Path(self.reports) / self.name / "paper"
@@ -232,7 +232,7 @@ class Study:
             }
         )
         with plain_errors(words):
-            write_study_paper(words)
+            WRITE_PAPER(words)
         return sorted(path for path in folder.rglob("*") if path.is_file())
 
     def status(self) -> StudyState:
