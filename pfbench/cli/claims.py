@@ -44,7 +44,7 @@ from pfbench.job.config import compose
 
 def report_claims(words: Sequence[str]) -> None:
     """Write the page of the claims, run them, or verify them."""
-    actions = {"run": RUN, "verify": VERIFY}
+    actions = {"run": _RUN, "verify": _VERIFY}
     if words and words[0] in actions:
         actions[words[0]](words[1:])
         return
@@ -222,7 +222,7 @@ def verify_claims(words: Sequence[str], seed: int | None) -> None:
 
 
 _PLACES = ("results_dir", "reports_dir")
-RUN = Command(
+_RUN = Command(
     run_claims,
     "pfbench claims run [ID ...] [hours=H] [readings=NAME,...] [dry=true]\n\n  OPTIONS",
     options={
@@ -235,7 +235,7 @@ RUN = Command(
     keys=_PLACES,
     takes_names=True,
 )  # fmt: skip
-VERIFY = Command(
+_VERIFY = Command(
     verify_claims,
     "pfbench claims verify [seed=N]\n\n  OPTIONS",
     options={"seed": Option("1", "of the cells that are drawn; printed", in_range("whole [0, inf)"), None)},
@@ -263,7 +263,7 @@ readings of its paper, from the published runs. A claim without runs is open, wi
   results_dir=FOLDER         the runs are in RESULTS/{CLAIMS_STUDY}
   reports_dir=FOLDER         the page is REPORTS/{CLAIMS_STUDY}/index.html; its runs are not run again
 
-{RUN.format_help()}
+{_RUN.format_help()}
 
-{VERIFY.format_help()}""",
+{_VERIFY.format_help()}""",
 )

@@ -24,7 +24,7 @@ _FIRST = ("run", "report")  # in the list of commands
 _HEAD = re.compile(r'"""Command `pfbench (\w+)`: (.+?)\.?"""\n')
 
 
-def read_text(key: str, text: str, remedy: str) -> str:
+def read_word(key: str, text: str, remedy: str) -> str:
     """Return the text of an option."""
     return text
 
@@ -69,7 +69,7 @@ class Option(NamedTuple):
 
     text: str
     help: str
-    read: Reader = read_text
+    read: Reader = read_word
     default: Any = ...
 
     def take(self, key: str, text: str | None) -> Any:

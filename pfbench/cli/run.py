@@ -17,6 +17,7 @@ from pfbench.cli.command import Command
 from pfbench.cli.compose import (
     StudyPlan,
     check_words,
+    given_keys,
     plan_study,
     replace_config_dir,
     wants_until_decided,
@@ -53,17 +54,17 @@ def run_jobs(words: Sequence[str]) -> None:
     flags = [word for word in words if word in _FLAGS]  # first, else argparse drops later overrides
     overrides = expand_filter_sets([word for word in words if word not in flags])
     overrides = delay_keys_of_swept_groups(overrides) if flags else overrides
-    first = check_words([*flags, *overrides])
+    plan = check_words([*flags, *overrides])
     is_printed = any(word.partition("=")[0] in _PRINTING_FLAGS for word in words)
-    plan = None if is_printed else plan_or_none(overrides, first)
+    plan = None if is_printed else plan
     if plan and flags:
         plan.check_comparable()
     if is_dry:
         from pfbench.cli.dry_run import print_dry_run
 
-        print_dry_run(plan or plan_study(overrides, first), is_sweep=bool(flags))
+        print_dry_run(plan or plan_study(overrides), is_sweep=bool(flags))
         return
-    if plan and not is_printed:
+    if plan:
         _try_parts(plan)
         print_surprise(plan, overrides, is_sweep=bool(flags))
     if plan and wants_until_decided(plan):
@@ -110,32 +111,18 @@ def _run_alone(overrides: Sequence[str], plan: StudyPlan | None) -> None:
 
 def print_surprise(plan: StudyPlan, words: Sequence[str], *, is_sweep: bool) -> None:
     """Say first what a command does that its words do not show: defaults alone, or one job of an experiment."""
-    if not is_sweep and plan.experiments and plan.jobs > 1:
+    keys, choices = given_keys(words), plan.first.choices
+    if not is_sweep and "experiment" in keys and plan.jobs > 1:
         note = (
             f"{plan.jobs} jobs belong to the experiment, and without -m one of them runs. "
             f"Run all: pfbench run -m {shlex.join(words)}"
         )
-    elif not {word.lstrip("+").partition("=")[0] for word in words} & {
-        "scenario",
-        "filter",
-        "experiment",
-    }:
-        names = " ".join(
-            f"{key}={plan.first.choices[key]}" for key in ("scenario", "noise", "filter")
-        )
+    elif not keys & {"scenario", "filter", "experiment"}:
+        names = " ".join(f"{key}={choices[key]}" for key in ("scenario", "noise", "filter"))
         note = f"one job of the defaults runs: {names} runs={plan.first.values['runs']}. Choose others: pfbench list"
     else:
         return
     print(f"note: {note}", file=sys.stderr, flush=True)
-
-
-def plan_or_none(overrides: Sequence[str], first: JobConfig | None = None) -> StudyPlan | None:
-    """Plan a study; None if its configuration is not valid, which Hydra reports."""
-    words = [word for word in overrides if not word.startswith("-")]
-    try:
-        return plan_study(words, first if len(words) == len(overrides) else None)
-    except Exception:
-        return None
 
 
 def print_study_size(plan: StudyPlan | None) -> None:
