@@ -134,7 +134,9 @@ def small_study(home: Path) -> None:
 
 
 def test_every_kind_of_part_has_a_recipe() -> None:
-    kinds = "resampling scheme, filter, model, scenario, noise regime, metric, report figure, command"
+    kinds = (
+        "resampling scheme, filter, model, scenario, noise regime, metric, report figure, command"
+    )
     assert list(RECIPES) == [f"Add a {kind}" for kind in kinds.split(", ")]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from pfbench.cli.messages import require_choice
 from pfbench.core.parameter_checks import require
 from pfbench.report.board.curves import compute_error_norms
 from pfbench.report.board.pack import build_pack
@@ -36,13 +37,7 @@ def draw_study(study: Study, kind: str, ax: Axes | None, choice: Mapping[str, An
         "calibration": lambda axis, pack, *_: draw_coverage(axis, pack, _SETTING),
         "run": _draw_run,
     }
-    require(
-        kind in drawings,
-        "kind",
-        f"be one of {', '.join(drawings)}",
-        f"{kind!r}",
-        "Choose one of them.",
-    )
+    require_choice("kind", kind, list(drawings))
     condition = select_condition(study.conditions(), choice)
     pack = build_pack(study.name, [condition], ReportOptions())
     with matplotlib.rc_context(RC):

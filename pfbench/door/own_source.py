@@ -124,11 +124,15 @@ class _Script:
         return reached
 
 
+def name_file(title: str) -> str:
+    """Return the name of the file of a class or a part."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|\W+", "_", title).strip("_").lower()
+
+
 def _store_module(title: str, text: str) -> str:
     """Store the text of a module under a name with its digest, and import it. Returns the name."""
     digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-    stem = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|\W+", "_", title).strip("_").lower()
-    name = f"own_{stem}_{digest}"
+    name = f"own_{name_file(title)}_{digest}"
     path = Path(WRITTEN) / f"{name}.py"
     if not path.is_file() or path.read_text(encoding="utf-8") != text:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -184,7 +188,7 @@ class _Collector:
             dotted = [statement.text for statement in imports]
             self.lines[name] = "\n".join([f"import {value.__name__} as {name}", *dotted])
         elif kind == "import":
-            self.lines[name] = f"from {_find_home(value)} import {value.__qualname__} as {name}"
+            self.lines[name] = f"from {find_home(value)} import {value.__qualname__} as {name}"
         elif kind == "constant":
             self.lines[name] = f"{name} = {value!r}"
         elif kind == "class" and name not in self._together:
@@ -310,7 +314,7 @@ def _is_of_module(value: object) -> bool:
     return getattr(sys.modules.get(module), name, None) is value
 
 
-def _find_home(value: Any) -> str:
+def find_home(value: Any) -> str:
     """Return the module from which a class or function is imported: of pfbench the folder whose door has it."""
     module = str(value.__module__)
     room = module.split(".")[1] if module.startswith("pfbench.") else ""

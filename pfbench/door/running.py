@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any
 
+import pfbench
 from pfbench.cli.current_folder import add_search_path
 from pfbench.cli.progress import Sweep, SweepCounter, list_repeats, log
 from pfbench.core.parameter_checks import require
@@ -148,11 +149,9 @@ def _make_part(group: str, item: Any) -> Part:
 
 def simulate_model(item: Any) -> Part:
     """Make the scenario that simulates a model for 100 steps."""
-    from pfbench.scenario import ModelSimulation
-
     if isinstance(item, Part) and not item.folders:
         return add_changes(get_part("scenario", item.name), item.changes)
-    return make_own(ModelSimulation, model=item, steps=100)
+    return make_own(pfbench.scenario.ModelSimulation, model=item, steps=100)
 
 
 def _list_words(choice: Sequence[Part | None], words: Sequence[str]) -> list[str]:

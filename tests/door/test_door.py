@@ -692,7 +692,7 @@ def test_an_own_module_imports_public_names_from_their_door() -> None:
             value = getattr(door, name)
             room = str(getattr(value, "__module__", "")).partition("pfbench.")[2].partition(".")[0]
             if room in (folder, "logs") and getattr(value, "__qualname__", None) == name:
-                homes[f"{folder}.{name}"] = own_source._find_home(value)
+                homes[f"{folder}.{name}"] = own_source.find_home(value)
     assert len(homes) > 300
     wrong = {name: home for name, home in homes.items() if home != f"pfbench.{name.split('.')[0]}"}
     assert wrong == {}

@@ -61,9 +61,7 @@ def test_without_results_it_uses_the_stored_data_of_the_report(
         [
             (
                 r"options of the report need results, got report\.alpha=0\.1",
-                lambda: PAPER(
-                    [*words, f"results_dir={tmp_path}/none", "report.alpha=0.1"]
-                ),
+                lambda: PAPER([*words, f"results_dir={tmp_path}/none", "report.alpha=0.1"]),
             )
         ],
         remedy=False,
@@ -84,9 +82,7 @@ def test_errors_name_key_value_and_remedy(home: Path, words: list[str], message:
         [
             (
                 message,
-                lambda: PAPER(
-                    [*words, f"results_dir={home}/results", f"reports_dir={home}/none"]
-                ),
+                lambda: PAPER([*words, f"results_dir={home}/results", f"reports_dir={home}/none"]),
             )
         ],
         remedy=False,
