@@ -85,34 +85,52 @@ def read_description(text: str) -> str:
 # --------------------------------------------------------------------------------------------------
 # Check of a command before Hydra acts on it: Hydra makes folders and calls plugins before any job.
 
+SWEEP_FLAGS = ("-m", "--multirun")
 _MOST_VALUES = 100_000  # of one key of a sweep
 
 
-def check_words(words: Sequence[str]) -> StudyPlan | None:
+def check_words(words: Sequence[str]) -> tuple[Any, StudyPlan | None]:
     """Check the words of `pfbench run`, those of all jobs of a sweep included.
 
     A job whose configuration is invalid for another reason fails by itself later, and the other jobs
     of the sweep run.
 
-    Returns the plan of the jobs, None if the first one is not valid.
+    Returns the flags with the overrides, and the plan of the jobs, None if the first one is not valid.
     """
-    args = _parse_flags(list(words))
-    if args.config_path or args.config_name or args.config_dir or args.experimental_rerun:
-        raise UntrustedConfigError(
-            "--config-path, --config-name and --experimental-rerun must not be used, since pfbench has its "
-            "own main file. Use --config-dir=FOLDER for more files."
-        )
-    overrides = list(args.overrides)
+    args = _parse_flags(sorted(words, key=lambda word: word not in SWEEP_FLAGS))
+    args.overrides = overrides = expand_filter_sets(args.overrides)
+    if args.multirun:
+        args.overrides = overrides = delay_keys_of_swept_groups(overrides)
     try:
         alternatives = list_alternatives(overrides, is_sweep=args.multirun)
     except UntrustedConfigError:
         raise
     except Exception:  # Hydra reports an invalid override
-        return None
+        return args, None
     first = _check_composition([o[0] for o in alternatives] if args.multirun else overrides)
     if args.multirun:
         _check_values(alternatives, first)
-    return StudyPlan(alternatives, first) if first else None
+    return args, StudyPlan(alternatives, first) if first else None
+
+
+def delay_keys_of_swept_groups(words: Sequence[str]) -> list[str]:
+    """Write each key below a swept group as a sweep of one value, which Hydra applies to the jobs alone.
+
+    Hydra applies other keys first to a configuration without the swept choices, where they may not
+    exist: `scenario=linear_walk,growth scenario.steps=15`.
+
+    Returns the words in the same order.
+    """
+    pairs = [word.partition("=") for word in words]
+    groups = {key for key, _, value in pairs if "," in value and "." not in key}
+    if any(key.startswith("reading/") and re.search(r",|glob", value) for key, _, value in pairs):
+        groups |= {*CHOICES}  # a reading chooses the world
+    return [
+        f"{key}=choice({value})"
+        if key.split(".")[0] in groups and "." in key and re.fullmatch(r"[\w.+-]+", value)
+        else word
+        for word, (key, _, value) in zip(words, pairs, strict=True)
+    ]
 
 
 def replace_config_dir(words: Sequence[str]) -> list[str]:
@@ -166,6 +184,11 @@ def _parse_flags(words: list[str]) -> Any:
         refuse(message)
     if unknown:
         raise ValueError(format_flag(words, unknown[0], "run"))
+    if args.config_path or args.config_name or args.config_dir or args.experimental_rerun:
+        raise UntrustedConfigError(
+            "--config-path, --config-name and --experimental-rerun must not be used, since pfbench has its "
+            "own main file. Use --config-dir=FOLDER for more files."
+        )
     return args
 
 
@@ -281,12 +304,14 @@ class StudyPlan:
             return
         for key, remedy in _EQUAL_KEYS.items():
             values = [option.partition("=")[2] for option in self._swept_options().get(key, ())]
-            if len(set(values)) > 1 and not (key == "first_run" and self._continue_runs(values)):
-                raise ValueError(
-                    f"{key} must be one value in a study, since its report compares filters on equal data, got "
-                    f"{', '.join(values[:5])}. {remedy} To run them all the same, and to report them, add "
-                    "report.allow_mixed_versions=true to both commands."
-                )
+            require(
+                len(set(values)) < 2 or (key == "first_run" and self._continue_runs(values)),
+                key,
+                "be one value in a study, since its report compares filters on equal data",
+                ", ".join(values[:5]),
+                f"{remedy} To run them all the same, and to report them, add "
+                "report.allow_mixed_versions=true to both commands.",
+            )
 
     def _continue_runs(self, first_runs: Sequence[str]) -> bool:
         """Return whether jobs with these first runs continue each other, so that a report joins them."""

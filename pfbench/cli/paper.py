@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from pfbench import report
 from pfbench.cli.command import Command, Option
 from pfbench.cli.compose import compose_study
 from pfbench.cli.report import check_has_results, find_page_data, make_report_options
@@ -15,12 +16,10 @@ from pfbench.job.config import JobConfig
 
 def write_study_paper(words: Sequence[str], journal: str, width: str) -> None:
     """Write the paper export of a study."""
-    from pfbench.report.journal.figure_style import find_page_format
     from pfbench.report.journal.paper_folder import write_paper
-    from pfbench.report.stored_study import RUNS_FILE, format_runs
     from pfbench.report.study_report import format_verdicts
 
-    page = find_page_format(journal, width)
+    page = report.find_page_format(journal, width)
     config = compose_study(words)
     study, reports = config.values["study"], Path(config.values["reports_dir"])
     RecordedFolder(reports / study, is_complete=False)  # refuses a link
@@ -35,7 +34,7 @@ def write_study_paper(words: Sequence[str], journal: str, width: str) -> None:
     with RecordedFolder(reports / study / "paper") as folder:
         remarks = write_paper(pack, page, folder, drawings)
         folder.write("verdicts.csv", format_verdicts(pack))
-        folder.write(RUNS_FILE, format_runs(table, {**pack, "paper_figures": ()}))
+        folder.write(report.RUNS_FILE, report.format_runs(table, {**pack, "paper_figures": ()}))
     if stored is not None:
         print(f"note: without results, the paper is made of {stored}")
     for remark in remarks:
@@ -47,14 +46,13 @@ def _read_study(
     config: JobConfig, stored: Path | None
 ) -> tuple[dict[str, Any], Any, dict[str, Any]]:
     """Read a study from its results, or from its stored runs: data of its page, runs, and figures of its paper."""
-    from pfbench.report.stored_study import read_stored_study
     from pfbench.report.study_report import read_results
 
     if stored is None:
         study, results = config.values["study"], config.values["results_dir"]
         pack, data, files = read_results(study, results, make_report_options(config), ("pdf",))
         return pack, data.table, files
-    pack, table = read_stored_study(stored.parent)
+    pack, table = report.read_stored_study(stored.parent)
     names = [entry["file"] for entry in pack["paper_figures"]]
     return pack, table, {name: (stored.parent / name).read_bytes() for name in names}
 

@@ -8,6 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from pfbench import report
 from pfbench.cli.command import Command
 from pfbench.cli.compose import compose_study, count_planned_jobs, given_keys
 from pfbench.cli.messages import format_error, suggest_similar
@@ -45,8 +46,6 @@ def report_study(words: Sequence[str]) -> None:
 
 def check_has_results(study: str, results: Path) -> None:
     """Check that a study has files of results."""
-    from pfbench.report.stored_study import RUNS_FILE
-
     if any((results / study).glob("*.npz")):
         return
     experiments = {path.stem for path in experiments_dir().glob("*.yaml")}
@@ -59,7 +58,7 @@ def check_has_results(study: str, results: Path) -> None:
         f"study must be a study with results, got {study}.{similar}{failed} "
         f"Studies with results in {results}: {', '.join(available) or 'none'}. "
         f"Run its jobs first: {name_run_command(study)}{describe_missing_runs().rstrip()}"
-        f"{f'. Its published page: pfbench open study={study}' if find_published_file(f'{study}/{RUNS_FILE}') else ''}"
+        f"{f'. Its published page: pfbench open study={study}' if find_published_file(f'{study}/{report.RUNS_FILE}') else ''}"
     )
 
 
@@ -68,50 +67,45 @@ def make_report_options(config: JobConfig) -> Any:
 
     Returns the options.
     """
-    from pfbench.report.options import ReportOptions
-
     values = config.values.get("report")
     stated = values if isinstance(values, Mapping) else {str(values): None}
-    names = [field.name for field in fields(ReportOptions)]
+    names = [field.name for field in fields(report.ReportOptions)]
     unknown = sorted({*stated} - {*names})
     similar = suggest_similar(unknown[0], names) if unknown else ""
     remedy = f"{similar} Choose a file: pfbench list report".strip()
     require(not unknown, "report", f"have keys of {', '.join(names)}", ", ".join(unknown), remedy)
     options: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stated.items()}
-    return ReportOptions(**options, planned=count_planned_jobs(config.values["study"]))
+    return report.ReportOptions(**options, planned=count_planned_jobs(config.values["study"]))
 
 
 def _write_page(config: JobConfig) -> Path:
     """Write the report of one study, or make its page of the stored data where the results are missing."""
-    from pfbench.report.study_report import rebuild_page, write_report
-
     values = config.values
     if data := find_page_data(config):
         print(f"{values['study']}: without results, the page is made of {data}")
-        return rebuild_page(data.parent)
-    return write_report(
+        return report.rebuild_page(data.parent)
+    return report.write_report(
         values["study"], values["results_dir"], values["reports_dir"], make_report_options(config)
     )
 
 
 def find_page_data(config: JobConfig, words: Sequence[str] = ()) -> Path | None:
     """Return the stored data of the page of a study without results, if it has any or is published: then with a copy."""
-    from pfbench.report.stored_study import RUNS_FILE
-
-    study, results = (
-        config.values["study"],
-        Path(config.values["results_dir"]) / config.values["study"],
-    )
-    data = Path(config.values["reports_dir"]) / study / RUNS_FILE
-    is_stored = data.is_file() or find_published_file(f"{study}/{RUNS_FILE}") is not None
+    study = config.values["study"]
+    results = Path(config.values["results_dir"]) / study
+    data = Path(config.values["reports_dir"]) / study / report.RUNS_FILE
+    is_stored = data.is_file() or find_published_file(f"{study}/{report.RUNS_FILE}") is not None
     if any(results.glob("*.npz")) or not is_stored or data.parent.is_symlink():
         return None
-    if options := [word for word in words if word.lstrip("+").startswith(("report.", "report="))]:
-        raise ValueError(
-            f"options of the report need results, got {', '.join(options)} and no results in {results}. "
-            f"Leave them out to use {data}, or run: {name_run_command(study)}"
-        )
-    copy_published(data.parent, RUNS_FILE)
+    options = [word for word in words if word.lstrip("+").startswith(("report.", "report="))]
+    require(
+        not options,
+        "options of the report",
+        "have results",
+        f"{', '.join(options)} and no results in {results}",
+        f"Leave them out to use {data}, or run: {name_run_command(study)}",
+    )
+    copy_published(data.parent, report.RUNS_FILE)
     return data
 
 
@@ -156,11 +150,8 @@ def _write_claims(words: Sequence[str]) -> str:
 
 def _renew_published(study: str, folder: Path, results: Path) -> str:
     """Make the page of a published study of its stored data; return a line for the user."""
-    from pfbench.report.stored_study import RUNS_FILE
-    from pfbench.report.study_report import rebuild_page
-
-    if (folder / RUNS_FILE).is_file():
-        return f"{study}: {rebuild_page(folder).resolve()}, of the stored data"
+    if (folder / report.RUNS_FILE).is_file():
+        return f"{study}: {report.rebuild_page(folder).resolve()}, of the stored data"
     is_script = (experiments_dir() / f"{study}.py").is_file()
     command = f"python -m pfbench.experiments.{study}" if is_script else name_run_command(study)
     return (

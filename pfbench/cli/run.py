@@ -26,7 +26,8 @@ from pfbench.cli.progress import Sweep, SweepCounter, SweepJobError, list_repeat
 from pfbench.cli.terminal import end_with_parent
 from pfbench.files.command_start import start_work
 from pfbench.files.reader_notes import SWEEP_LOG
-from pfbench.job.config import CHOICES, JobConfig, expand_filter_sets, register_experiments
+from pfbench.job.config import JobConfig, register_experiments
+from pfbench.job.settings import check_settings
 from pfbench.job.trust import ENVIRONMENT, trusted_packages
 from pfbench.results.paper_block import conf_dir
 
@@ -38,10 +39,7 @@ _LOST_PROCESS = {
     "OwnerDiedError", "RaySystemError", "WorkerCrashedError",
 }  # fmt: skip
 
-_FLAGS = ("-m", "--multirun")
 DRY_RUN = "--dry-run"
-
-_PRINTING_FLAGS = {"--cfg", "-c", "--info", "-i", "--hydra-help", "--version", "--resolve"}
 
 
 def run_jobs(words: Sequence[str]) -> None:
@@ -49,29 +47,26 @@ def run_jobs(words: Sequence[str]) -> None:
     register_experiments()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    is_dry = DRY_RUN in words
-    words = replace_config_dir([word for word in words if word != DRY_RUN])
-    flags = [word for word in words if word in _FLAGS]  # first, else argparse drops later overrides
-    overrides = expand_filter_sets([word for word in words if word not in flags])
-    overrides = delay_keys_of_swept_groups(overrides) if flags else overrides
-    plan = check_words([*flags, *overrides])
-    is_printed = any(word.partition("=")[0] in _PRINTING_FLAGS for word in words)
-    plan = None if is_printed else plan
-    if plan and flags:
+    args, plan = check_words(replace_config_dir([word for word in words if word != DRY_RUN]))
+    overrides, is_sweep = args.overrides, args.multirun
+    if args.cfg or args.info:
+        print_configuration(args)
+        return
+    if plan and is_sweep:
         plan.check_comparable()
-    if is_dry:
+    if DRY_RUN in words:
         from pfbench.cli.dry_run import print_dry_run
 
-        print_dry_run(plan or plan_study(overrides), is_sweep=bool(flags))
+        print_dry_run(plan or plan_study(overrides), is_sweep=is_sweep)
         return
     if plan:
         _try_parts(plan)
-        print_surprise(plan, overrides, is_sweep=bool(flags))
+        print_surprise(plan, overrides, is_sweep=is_sweep)
     if plan and wants_until_decided(plan):
-        _run_until_decided(flags, overrides, plan)
-    elif flags:
+        _run_until_decided(overrides, plan, is_sweep=is_sweep)
+    elif is_sweep:
         print_study_size(plan)
-        run_sweep(make_application(run_task), [*flags, *overrides], plan)
+        run_sweep(overrides, plan)
     else:
         _run_alone(overrides, plan)
 
@@ -84,15 +79,14 @@ def _try_parts(plan: StudyPlan) -> None:
         try_own_parts(plan.compose_parts())
 
 
-def _run_until_decided(flags: Sequence[str], overrides: Sequence[str], plan: StudyPlan) -> None:
+def _run_until_decided(overrides: Sequence[str], plan: StudyPlan, *, is_sweep: bool) -> None:
     """Run a sweep that adds runs until its pairs are decided."""
     from pfbench.cli.until_decided import GrowingSweep, check_has_sweep
 
-    check_has_sweep(flags)
+    check_has_sweep(is_sweep)
     sweep = GrowingSweep.from_plan(plan)
     others = [word for word in overrides if not re.match(r"(runs|first_run)=", word)]
-    application = make_application(run_task)
-    sweep.run(lambda more: run_sweep(application, [*flags, *others, *more], plan, is_part=True))
+    sweep.run(lambda more: run_sweep([*others, *more], plan, is_part=True))
 
 
 def _run_alone(overrides: Sequence[str], plan: StudyPlan | None) -> None:
@@ -104,9 +98,8 @@ def _run_alone(overrides: Sequence[str], plan: StudyPlan | None) -> None:
     def run_with_plan(cfg: Any) -> float:
         return run_task(cfg, lambda: print_study_size(plan), checked)
 
-    sys.argv = ["pfbench run", *overrides]
     with hide_hydra_line():
-        make_application(run_with_plan)()
+        run_application(run_with_plan, overrides, is_sweep=False)
 
 
 def print_surprise(plan: StudyPlan, words: Sequence[str], *, is_sweep: bool) -> None:
@@ -127,28 +120,16 @@ def print_surprise(plan: StudyPlan, words: Sequence[str], *, is_sweep: bool) -> 
 
 def print_study_size(plan: StudyPlan | None) -> None:
     """Print what the chosen runs and worlds can show; nothing if the settings of the job are not valid."""
-    from pfbench.job.settings import check_settings
-
-    if plan is None:
-        return
-    try:
-        check_settings(plan.first.values)
-        sentence = plan.describe_size()
-    except Exception:  # a setting or a scenario is not valid: the job reports the error
-        return
-    if sentence:
-        print(sentence, flush=True)
+    with contextlib.suppress(Exception):  # a setting or a scenario: the job reports the error
+        if plan is not None:
+            check_settings(plan.first.values)
+            if sentence := plan.describe_size():
+                print(sentence, flush=True)
 
 
-def run_sweep(
-    application: Callable[[], Any],
-    words: Sequence[str],
-    plan: StudyPlan | None,
-    *,
-    is_part: bool = False,
-) -> None:
+def run_sweep(overrides: Sequence[str], plan: StudyPlan | None, *, is_part: bool = False) -> None:
     """Run all jobs of a sweep and print their counts."""
-    sys.argv = ["pfbench run", *words]
+    sys.argv = ["pfbench run", "-m", *overrides]  # what is to be repeated if a process is lost
     sweep = None
     if plan is not None:  # else the sweep itself reports the error
         sweep = Sweep.of_jobs(plan.first, plan.jobs)
@@ -156,10 +137,10 @@ def run_sweep(
     is_complete = False
     try:
         with hide_hydra_line():
-            run_with_retries(application)
+            run_with_retries(lambda: run_application(run_task, overrides, is_sweep=True))
         is_complete = True
     except Exception as error:
-        raise summarise_failed_jobs(error, words) from error
+        raise summarise_failed_jobs(error, overrides) from error
     finally:
         os.environ.pop(SWEEP_LOG, None)
         if is_complete or (sweep and sweep.file.is_file()):
@@ -174,26 +155,6 @@ def _print_end(sweep: Sweep, *, is_complete: bool, is_part: bool) -> None:
     has_page = any(sweep.folder.glob("*.npz")) and not is_part
     command = f"  Next: pfbench report study={sweep.folder.name}" if has_page else ""
     print(f"sweep: {counts}{command}", *list_repeats(sweep.folder, sweep.start_time), sep="\n")
-
-
-def delay_keys_of_swept_groups(words: Sequence[str]) -> list[str]:
-    """Write each key below a swept group as a sweep of one value, which Hydra applies to the jobs alone.
-
-    Hydra applies other keys first to a configuration without the swept choices, where they may not
-    exist: `scenario=linear_walk,growth scenario.steps=15`.
-
-    Returns the words in the same order.
-    """
-    pairs = [word.partition("=") for word in words]
-    groups = {key for key, _, value in pairs if "," in value and "." not in key}
-    if any(key.startswith("reading/") and re.search(r",|glob", value) for key, _, value in pairs):
-        groups |= {*CHOICES}  # a reading chooses the world
-    return [
-        f"{key}=choice({value})"
-        if key.split(".")[0] in groups and "." in key and re.fullmatch(r"[\w.+-]+", value)
-        else word
-        for word, (key, _, value) in zip(words, pairs, strict=True)
-    ]
 
 
 def run_task(
@@ -315,43 +276,9 @@ def summarise_failed_jobs(error: Exception, words: Sequence[str]) -> Exception:
 # Hydra's application, by the loader of pfbench.
 
 
-def make_application(task: Callable[[Any], Any]) -> Callable[[], None]:
-    """Make the application that runs a task for each job."""
-    import hydra
-
-    full = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(task)
-
-    def run() -> None:
-        words = sys.argv[1:]
-        flags = [word for word in words if word.startswith("-")]
-        if set(flags) <= set(_FLAGS):
-            overrides = [word for word in words if word not in flags]
-            _run_overrides(task, overrides, is_multirun=bool(flags))
-        else:
-            with _shared_loader():
-                full()
-
-    return run
-
-
 @contextmanager
-def _shared_loader() -> Iterator[None]:
-    """Let Hydra's own application load by the loader of pfbench, which checks what it loads."""
-    from hydra._internal import hydra as module
-
-    from pfbench.job.shared_loader import SharedLoader
-
-    hydra: Any = module
-    by_hydra = hydra.ConfigLoaderImpl
-    hydra.ConfigLoaderImpl = SharedLoader
-    try:
-        yield
-    finally:
-        hydra.ConfigLoaderImpl = by_hydra
-
-
-def _run_overrides(task: Callable[[Any], Any], overrides: list[str], *, is_multirun: bool) -> None:
-    """Run the jobs of overrides, as `hydra.main` does."""
+def _application(name: str) -> Iterator[Any]:
+    """Open Hydra's application, whose loader checks what it loads."""
     from hydra import version
     from hydra._internal import utils
     from hydra._internal.hydra import Hydra
@@ -360,22 +287,42 @@ def _run_overrides(task: Callable[[Any], Any], overrides: list[str], *, is_multi
     from pfbench.job.shared_loader import SharedLoader
 
     version.setbase("1.3")
-    name = utils.detect_task_name(*utils.detect_calling_file_or_module_from_task_function(task))
     application = Hydra(name, SharedLoader(utils.create_config_search_path(str(conf_dir()))))
     GlobalHydra.instance().initialize(application)
     try:
-        mode = application.get_mode("config", overrides) if _can_set_mode(overrides) else None
+        yield application
+    finally:
+        GlobalHydra.instance().clear()
+
+
+def run_application(
+    task: Callable[[Any], Any], overrides: Sequence[str], *, is_sweep: bool
+) -> None:
+    """Run a task for each job of overrides, as `hydra.main` does."""
+    from hydra._internal import utils
+
+    name = utils.detect_task_name(*utils.detect_calling_file_or_module_from_task_function(task))
+    with _application(name) as application:
+        words = list(overrides)
         utils._run_app(
-            run=not is_multirun,
-            multirun=is_multirun,
-            mode=mode,
+            run=not is_sweep,
+            multirun=is_sweep,
+            mode=application.get_mode("config", words) if _can_set_mode(words) else None,
             hydra=application,
             config_name="config",
             task_function=task,
-            overrides=overrides,
+            overrides=words,
         )
-    finally:
-        GlobalHydra.instance().clear()
+
+
+def print_configuration(args: Any) -> None:
+    """Print what the flags `--cfg` and `--info` ask for."""
+    with _application("run") as application:
+        if args.cfg:
+            more = args.cfg, args.package, args.resolve
+            application.show_cfg("config", args.overrides, *more)
+        else:
+            application.show_info(args.info, "config", args.overrides)
 
 
 def _can_set_mode(overrides: Sequence[str]) -> bool:

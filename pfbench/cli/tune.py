@@ -14,6 +14,7 @@ from pfbench.cli.compose import given_keys
 from pfbench.core.parameter_checks import require
 from pfbench.job.config import TUNED_METHODS, compose
 from pfbench.job.tuned_knobs import AUTO, NOMINAL, SEED_SHIFT
+from pfbench.results.paper_block import conf_dir, read_families
 
 if TYPE_CHECKING:
     from pfbench.job.tuning import CandidateSearch, TuningResult
@@ -122,11 +123,13 @@ def _check_same_world(path: Path, world: Mapping[str, Any]) -> None:
 
     stated = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("world", {})
     for key in world:
-        if stated.get(key) != world[key]:
-            raise ValueError(
-                f"{key} must be {stated.get(key)!r} as in {path}, to which filters are added, got {world[key]!r}. "
-                f"Add filter={','.join(TUNED_METHODS)} to tune all again, or name=NAME for another file."
-            )
+        require(
+            stated.get(key) == world[key],
+            key,
+            f"be {stated.get(key)!r} as in {path}, to which filters are added",
+            f"{world[key]!r}",
+            f"Add filter={','.join(TUNED_METHODS)} to tune all again, or name=NAME for another file.",
+        )
 
 
 def _name_file(choices: Mapping[str, str], regimes: Sequence[str], words: Sequence[str]) -> str:
@@ -146,8 +149,6 @@ def _own_folder(words: Sequence[str]) -> str:
 
 def _describe_use(folder: Path, words: Sequence[str]) -> str:
     """Say how a study finds the file, if it does not by itself."""
-    from pfbench.results.paper_block import conf_dir
-
     is_found = folder.resolve() == conf_dir() or any("hydra.searchpath" in word for word in words)
     return (
         "" if is_found else f"\nAdd to the words of a study: 'hydra.searchpath=[file://{folder}]'"
@@ -156,8 +157,6 @@ def _describe_use(folder: Path, words: Sequence[str]) -> str:
 
 def _check_new_name(name: str, folder: Path) -> None:
     """Check that the name of a file of a user's own folder differs from those of pfbench, since a run refuses it."""
-    from pfbench.results.paper_block import read_families
-
     require(
         name not in read_families("tuned"),
         "name",

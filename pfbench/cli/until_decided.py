@@ -233,10 +233,10 @@ class GrowingSweep:
         return f"Next: pfbench report study={self.study}"
 
 
-def check_has_sweep(flags: Sequence[str]) -> None:
+def check_has_sweep(is_sweep: bool) -> None:
     """Check that `runs=until-decided` is used for a sweep."""
     require(
-        flags,
+        is_sweep,
         f"runs={UNTIL_DECIDED}",
         "be a sweep over at least two filters",
         "one job",

@@ -43,6 +43,7 @@ _BASES = {
 }
 
 
+@plain_errors()
 def make_own(
     thing: Any, name: str | None = None, /, *, base: str = "sir", **arguments: Any
 ) -> Part:
@@ -66,32 +67,31 @@ def make_own(
         ValueError: If the class has not the methods of any part, or is defined inside of a function.
         TypeError: If an argument cannot be written into a file.
     """
-    with plain_errors():
-        if isinstance(thing, Part):
-            raise TypeError(
-                f"own must receive a class or an object, got the part {thing}. Pass it to run unchanged."
-            )
-        group, stage = find_group(thing)
-        title = name or _name_thing(thing, arguments)
-        if name_file(title) in list_groups()[group]:
-            title = f"Own {title}"
-        limit = arguments.pop("divergence_threshold", None) if group == "scenario" else None
-        writer = _NodeWriter()
-        if stage == "network":
-            node = writer.write_network(thing, arguments)
-        elif isinstance(thing, type):
-            node = writer.write_class(thing, arguments)
-        else:
-            node = writer.write(thing, title)
-        if not isinstance(thing, type) and arguments:
-            raise TypeError(
-                f"{title} must be a class if arguments are given, got an object. Use own({type(thing).__name__}, "
-                f"{next(iter(arguments))}=...)."
-            )
-        if stage:
-            node = writer.put_stage(base, stage, node)
-        node |= _describe_paper(group, title, node, limit)
-        return writer.store(group, title, node)
+    if isinstance(thing, Part):
+        raise TypeError(
+            f"own must receive a class or an object, got the part {thing}. Pass it to run unchanged."
+        )
+    group, stage = find_group(thing)
+    title = name or _name_thing(thing, arguments)
+    if name_file(title) in list_groups()[group]:
+        title = f"Own {title}"
+    limit = arguments.pop("divergence_threshold", None) if group == "scenario" else None
+    writer = _NodeWriter()
+    if stage == "network":
+        node = writer.write_network(thing, arguments)
+    elif isinstance(thing, type):
+        node = writer.write_class(thing, arguments)
+    else:
+        node = writer.write(thing, title)
+    if not isinstance(thing, type) and arguments:
+        raise TypeError(
+            f"{title} must be a class if arguments are given, got an object. Use own({type(thing).__name__}, "
+            f"{next(iter(arguments))}=...)."
+        )
+    if stage:
+        node = writer.put_stage(base, stage, node)
+    node |= _describe_paper(group, title, node, limit)
+    return writer.store(group, title, node)
 
 
 def _name_thing(thing: Any, arguments: Mapping[str, Any]) -> str:

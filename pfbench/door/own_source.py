@@ -52,12 +52,14 @@ def write_module(cls: type) -> str:
 
     Returns the name of the module. The same source gives the same module.
     """
-    if "<locals>" in cls.__qualname__:
-        outer = cls.__qualname__.partition(".<locals>")[0]
-        raise ValueError(
-            f"{cls.__name__} must be defined at the top level, got a class inside of {outer}, whose variables no other "
-            "process has. Move it out, and pass what it needs as arguments."
-        )
+    outer, is_local, _ = cls.__qualname__.partition(".<locals>")
+    require(
+        not is_local,
+        cls.__name__,
+        "be defined at the top level",
+        f"a class inside of {outer}, whose variables no other process has",
+        "Move it out, and pass what it needs as arguments.",
+    )
     values = vars(sys.modules[_MAIN])
     statements = read_statements(values)
     require(
@@ -337,10 +339,7 @@ def _is_constant(value: object) -> bool:
 
 def _check_statement(name: str, node: ast.stmt) -> None:
     """Check that a statement can be repeated when a module is imported."""
-    for call in ast.walk(node):
-        if isinstance(call, ast.Attribute) and ast.unparse(call) in [
-            f"pfbench.{v}" for v in _VERBS
-        ]:
-            raise ValueError(
-                f"{name} must not be used by the class, since it is the result of {ast.unparse(call)}. Pass it as an argument."
-            )
+    names = [ast.unparse(part) for part in ast.walk(node) if isinstance(part, ast.Attribute)]
+    calls = [call for call in names if call in {f"pfbench.{verb}" for verb in _VERBS}]
+    got = f"the result of {''.join(calls[:1])}"
+    require(not calls, name, "not be used by the class", got, "Pass it as an argument.")

@@ -80,14 +80,13 @@ def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
         f"{workers!r}",
         "Set workers=2.",
     )
-    parts = [
-        list_parts(group, value)
-        for group, value in (("scenario", scenario), ("noise", noise), ("filter", filters))
-    ]
-    models = [None] if model is None else list_parts("model", model)
+    chosen = {"scenario": scenario, "noise": noise, "model": model, "filter": filters}
+    if model is None:  # that of the scenario
+        del chosen["model"]
+    parts = [list_parts(group, value) for group, value in chosen.items()]
     settings_of_all = {"runs": runs, "particles": particles, "seed": seed}
     words = format_words({**settings_of_all, **settings, "study": study})
-    jobs = [_list_words(choice, words) for choice in product(*parts, models)]
+    jobs = [_list_words(choice, words) for choice in product(*parts)]
     configs = [_compose_job(list(job)) for job in dict.fromkeys(map(tuple, jobs))]
     if any(map(list_used_packages, configs)):
         from pfbench.cli.dry_run import try_own_parts
@@ -102,6 +101,7 @@ def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
     )
 
 
+@plain_errors()
 def list_parts(group: str, value: Any) -> list[Part]:
     """Return the parts of a group that a name, a part, an object or a list of them means."""
     items = list(value) if isinstance(value, list | tuple | set) else [value]
@@ -130,11 +130,7 @@ def _make_part(group: str, item: Any) -> Part:
         raise TypeError(
             f"{group} must be a name, a part or a class, got {describe_value(item)}. List the names: pfbench.names({group!r})."
         )
-    if isinstance(item, Part):
-        kind = item.group
-    else:
-        with plain_errors():
-            kind = find_group(item)[0]
+    kind = item.group if isinstance(item, Part) else find_group(item)[0]
     if group == "scenario" and kind == "model":
         return simulate_model(item)
     require(
@@ -154,11 +150,8 @@ def simulate_model(item: Any) -> Part:
     return make_own(pfbench.scenario.ModelSimulation, model=item, steps=100)
 
 
-def _list_words(choice: Sequence[Part | None], words: Sequence[str]) -> list[str]:
+def _list_words(parts: Sequence[Part], words: Sequence[str]) -> list[str]:
     """Return the words of one job."""
-    parts = [item for item in choice if item is not None]
-    order = {"scenario": 0, "noise": 1, "model": 2, "filter": 3}
-    parts = sorted(parts, key=lambda item: order[item.group])
     return [*(word for item in parts for word in item.words()), *words, *place_words(parts)]
 
 

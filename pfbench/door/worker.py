@@ -5,6 +5,7 @@ Workers start from this module and not from the script of the user, so that a sc
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import queue
@@ -34,18 +35,6 @@ class JobReply(NamedTuple):
     message: str = ""
 
 
-class _Lines(logging.Handler):
-    """Handler that keeps the lines of a job."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.INFO)
-        self.texts: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Keep a line."""
-        self.texts.append(record.getMessage())
-
-
 @contextmanager
 def logging_to(handler: logging.Handler, *, is_alone: bool = False) -> Iterator[None]:
     """Let a handler receive the lines of jobs, besides others or alone."""
@@ -63,16 +52,17 @@ def logging_to(handler: logging.Handler, *, is_alone: bool = False) -> Iterator[
 
 def run_request(request: Mapping[str, Any]) -> JobReply:
     """Run the job of the fields of a configuration; an error is a line, as in a sweep of the command line."""
-    lines = _Lines()
-    with logging_to(lines, is_alone=True):
+    lines = io.StringIO()
+    with logging_to(logging.StreamHandler(lines), is_alone=True):
         try:
             with reported_failure(COUNTER, request["choices"], request["words"]):
                 trusted = tuple(request["trusted"])
                 split_trust([f"trust=[{','.join(trusted)}]"])  # so that its modules are imported
                 config = JobConfig(**{**request, "trusted": trusted})
-                return JobReply(job.run(config, counter=COUNTER).status, lines.texts)
+                status, message = job.run(config, counter=COUNTER).status, ""
         except SweepJobError as error:
-            return JobReply("failed", lines.texts, str(error))
+            status, message = "failed", f"{error}"
+    return JobReply(status, lines.getvalue().splitlines(), message)
 
 
 def serve() -> None:

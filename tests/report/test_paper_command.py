@@ -60,7 +60,7 @@ def test_without_results_it_uses_the_stored_data_of_the_report(
     check_refused(
         [
             (
-                r"options of the report need results, got report\.alpha=0\.1",
+                r"options of the report must have results, got report\.alpha=0\.1",
                 lambda: PAPER([*words, f"results_dir={tmp_path}/none", "report.alpha=0.1"]),
             )
         ],
