@@ -200,10 +200,10 @@ def verify_claims(words: Sequence[str], seed: int | None) -> None:
     seed = secrets.randbelow(10**6) if seed is None else seed
     measures = find_measures(claims.plans)
     runs, decisions = claims.decide()
-    drawn = draw_records(runs, seed, measures)
-    print(f"verify: seed={seed}, {len(drawn)} of {len(runs.records)} stored jobs", flush=True)
+    records = draw_records(runs, seed, measures)
+    print(f"verify: seed={seed}, {len(records)} of {len(runs.records)} stored jobs", flush=True)
     faults = 0
-    for check in verify_records(drawn, measures, str(claims.results)):
+    for check in verify_records(records, measures, str(claims.results)):
         faults += bool(check.fault)
         word = "differs" if check.fault else "equal" if check.is_equal else "agrees"
         cell = " ".join(check.record.cell)

@@ -58,7 +58,7 @@ def in_range(rule: str) -> Reader:
 
 
 class Option(NamedTuple):
-    """Option of a command: a word KEY=VALUE that is no key of a job.
+    """Option of a command: a word KEY=VALUE besides the keys of a job.
 
     Attributes:
         text: Text of the default, or the form of a value where the default is another.
@@ -85,8 +85,8 @@ class Command:
     """A command.
 
     Attributes:
-        run: Function that receives the words that are no options, and the values of the options by name.
-        text: Help: a line of use, what the command does, examples, and OPTIONS, for which `options` stand.
+        run: Function that receives the other words, and the values of the options by name.
+        text: Help: a line of use, what the command does, examples, and a line OPTIONS for those below.
         options: Options by key.
         keys: Keys of a job that the command takes, each once; None for all, which are checked when the job is composed.
         required: Keys without which it does not run.
@@ -113,7 +113,9 @@ class Command:
         others = [
             word for word, (key, *_) in zip(words, pairs, strict=True) if key not in self.options
         ]
-        self.run(others, **{key: o.take(key, texts.get(key)) for key, o in self.options.items()})
+        self.run(
+            others, **{key: entry.take(key, texts.get(key)) for key, entry in self.options.items()}
+        )
 
     def _check_keys(self, words: Sequence[str], keys: Sequence[str]) -> None:
         """Check that each word sets one of some keys, each once."""
@@ -128,7 +130,7 @@ class Command:
                 names.append(key)
 
     def format_help(self) -> str:
-        """Format the help, whose line OPTIONS stands for a line of each option."""
+        """Format the help, with a line for each option in place of the line OPTIONS."""
         gap = "\n" + 29 * " "
         lines = [
             f"  {f'{key}={option.text}':26} {option.help}".replace("\n", gap)

@@ -107,7 +107,9 @@ def check_words(words: Sequence[str]) -> tuple[Any, StudyPlan | None]:
         raise
     except Exception:  # Hydra reports an invalid override
         return args, None
-    first = _check_composition([o[0] for o in alternatives] if args.multirun else overrides)
+    first = _check_composition(
+        [options[0] for options in alternatives] if args.multirun else overrides
+    )
     if args.multirun:
         _check_values(alternatives, first)
     return args, StudyPlan(alternatives, first) if first else None

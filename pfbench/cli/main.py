@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pfbench
 from pfbench.cli.command import list_commands
-from pfbench.cli.current_folder import add_search_path
 from pfbench.cli.messages import (
     describe_unknown,
     format_error,
@@ -103,6 +102,8 @@ def _run_command(command: str, options: Sequence[str]) -> None:
     try:
         loaded = list_commands()[command].load()
         if loaded.keys is None:
+            from pfbench.cli.list import add_search_path  # which imports numpy
+
             words = add_search_path(words)
         flag = next((w for w in words if w.startswith("--") and w != "--multirun"), None)
         if flag and command != "run":  # which has the flags of Hydra

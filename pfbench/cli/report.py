@@ -37,8 +37,8 @@ def report_study(words: Sequence[str]) -> None:
     require(is_study, "study", "be set", world, f"For its datasheet use: pfbench datasheet {world}")
     config = compose_study(words)
     study = config.values["study"]
-    other = f"Use: pfbench {NOT_STUDIES.get(study)}"
-    require(study not in NOT_STUDIES, "study", "be a study", study, other)
+    remedy = f"Use: pfbench {NOT_STUDIES.get(study)}"
+    require(study not in NOT_STUDIES, "study", "be a study", study, remedy)
     if not find_page_data(config, words):
         check_has_results(study, Path(config.values["results_dir"]))
     print(f"report: {_write_page(config).resolve()}")

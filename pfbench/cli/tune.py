@@ -61,10 +61,10 @@ def tune_filters(
         "start_time_s": float(study.values["report"]["start_time_s"]),
         "regimes": noise,
     }
-    place = Path(folder or _own_folder(words))
-    _check_new_name(name, place)
-    path = _search(settings, grids, world, fit_runs or runs, fit_particles, place, name)
-    print(f"tuned={name}: {path.resolve()}{_describe_use(place, words)}")
+    target = Path(folder or _own_folder(words))
+    _check_new_name(name, target)
+    path = _search(settings, grids, world, fit_runs or runs, fit_particles, target, name)
+    print(f"tuned={name}: {path.resolve()}{_describe_use(target, words)}")
 
 
 def _search(

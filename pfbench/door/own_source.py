@@ -339,7 +339,7 @@ def _is_constant(value: object) -> bool:
 
 def _check_statement(name: str, node: ast.stmt) -> None:
     """Check that a statement can be repeated when a module is imported."""
-    names = [ast.unparse(part) for part in ast.walk(node) if isinstance(part, ast.Attribute)]
+    names = [ast.unparse(item) for item in ast.walk(node) if isinstance(item, ast.Attribute)]
     calls = [call for call in names if call in {f"pfbench.{verb}" for verb in _VERBS}]
     got = f"the result of {''.join(calls[:1])}"
     require(not calls, name, "not be used by the class", got, "Pass it as an argument.")

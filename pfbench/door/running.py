@@ -13,7 +13,7 @@ from itertools import product
 from typing import Any
 
 import pfbench
-from pfbench.cli.current_folder import add_search_path
+from pfbench.cli.list import add_search_path
 from pfbench.cli.progress import Sweep, SweepCounter, list_repeats, log
 from pfbench.core.parameter_checks import require
 from pfbench.door.own_parts import find_group, make_own
@@ -80,10 +80,10 @@ def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
         f"{workers!r}",
         "Set workers=2.",
     )
-    chosen = {"scenario": scenario, "noise": noise, "model": model, "filter": filters}
+    groups = {"scenario": scenario, "noise": noise, "model": model, "filter": filters}
     if model is None:  # that of the scenario
-        del chosen["model"]
-    parts = [list_parts(group, value) for group, value in chosen.items()]
+        del groups["model"]
+    parts = [list_parts(group, value) for group, value in groups.items()]
     settings_of_all = {"runs": runs, "particles": particles, "seed": seed}
     words = format_words({**settings_of_all, **settings, "study": study})
     jobs = [_list_words(choice, words) for choice in product(*parts)]

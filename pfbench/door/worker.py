@@ -92,9 +92,9 @@ class WorkerPool:
 
     def run(self, jobs: Sequence[JobConfig]) -> Iterator[tuple[int, JobReply]]:
         """Run jobs; yield number and reply of each when it ends."""
-        asked = {self._threads.submit(self._ask, config): k for k, config in enumerate(jobs)}
-        for reply in as_completed(asked):
-            yield asked[reply], reply.result()
+        replies = {self._threads.submit(self._ask, config): k for k, config in enumerate(jobs)}
+        for reply in as_completed(replies):
+            yield replies[reply], reply.result()
 
     def _ask(self, config: JobConfig) -> JobReply:
         """Return the reply of an idle worker; a failure if its process has ended, which is replaced."""
