@@ -26,7 +26,7 @@ from refusals import check_refused
 
 from pfbench import job
 from pfbench.cli import run as run_command
-from pfbench.cli.check import _matching_scenario
+from pfbench.cli.check import _add_needs
 from pfbench.files import command_start
 from pfbench.files.command_start import reset_work, start_work
 from pfbench.job import shared_loader
@@ -88,7 +88,7 @@ def chosen_together() -> Iterator[list[str]]:
         for name in GROUPS[group]:
             yield [f"+{group}={name}"]
     for name in GROUPS["model"]:
-        yield [f"model={name}", *_matching_scenario("model", name)]
+        yield [f"model={name}", *_add_needs("model", name)]
 
 
 @pytest.mark.parametrize("part", range(3))
