@@ -247,7 +247,7 @@ def add_world(tree: Path) -> None:
 
 
 def add_command(tree: Path) -> None:
-    for name in ("pfbench/cli/worst.py", "tests/cli/test_worst.py"):
+    for name in ("pfbench/cli/lost.py", "tests/cli/test_lost.py"):
         (tree / name).write_text(WRITTEN[name])
 
 
@@ -259,7 +259,7 @@ CONTRIBUTIONS: dict[str, tuple[Callable[[Path], None], int, str]] = {
     "scenario and model": (add_world, 7, "test_configs.py"),
     "metric": (add_metric, 1, "report/test_report_metrics.py"),
     "figure": (add_figure, 1, "report/test_paper_figures.py"),
-    "command": (add_command, 2, "cli/test_worst.py"),
+    "command": (add_command, 2, "cli/test_lost.py"),
 }  # fmt: skip
 
 
