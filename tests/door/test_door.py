@@ -611,7 +611,9 @@ def test_summary_page_and_html(study: pfbench.Study, capsys: pytest.CaptureFixtu
         error = one.errors()[row[1].lower()].median()
         assert float(row[2].split()[0]) == pytest.approx(error, rel=5e-3)
         assert f"median RMS error {error:.4g} m" in capsys.readouterr().out or row[1] != "EKF"
-    check_refused([("label must be one of ekf, sir, got ukf. Similar: ekf", lambda: one.remove("ukf"))])
+    check_refused(
+        [("label must be one of ekf, sir, got ukf. Similar: ekf", lambda: one.remove("ukf"))]
+    )
     assert list(one.remove("sir").errors().columns) == ["ekf"]
     html = study._repr_html_()
     assert html.count("<tr>") == 4

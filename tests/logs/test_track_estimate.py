@@ -159,7 +159,10 @@ def test_the_command_writes_page_tables_and_maps(
     [
         ((), "estimate must have one folder, got none"),
         (("none_here",), "the log must be a folder with imu and gnss, got none_here"),
-        ((".", "filter="), "filter must be a list of distinct entries separated by commas, got ''. Default: filter=ekf,ukf"),
+        (
+            (".", "filter="),
+            "filter must be a list of distinct entries separated by commas, got ''. Default: filter=ekf,ukf",
+        ),
         ((".", "scenario.holdout=null"), "must be an own log with held-out fixes"),
     ],
 )
