@@ -203,19 +203,13 @@ def test_a_worker_that_ends_says_how(monkeypatch: pytest.MonkeyPatch, end: str, 
 
 def test_a_pool_that_is_left_early_starts_no_worker_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """As after an interrupt, when the other jobs wait and a worker is at one."""
-    started: list[subprocess.Popen[str]] = []
-
-    def start(program: str, **options: Any) -> subprocess.Popen[str]:
-        started.append(start_python(program, **options))
-        return started[-1]
-
-    monkeypatch.setattr(worker, "start_python", start)
     monkeypatch.setattr(worker, "_PROGRAM", "import time; time.sleep(60)")
     config = job.compose(["scenario=linear_walk", "filter=ekf"])
     with worker.WorkerPool(1) as pool:
+        (first,) = pool._processes
         replies = [pool._threads.submit(pool._ask, config) for _ in range(3)]
     pool._threads.shutdown()
-    assert [process.poll() for process in started] == [-signal.SIGKILL]
+    assert (pool._processes, first.poll()) == ([first], -signal.SIGKILL)
     assert [reply.cancelled() for reply in replies[1:]] == [True, True]
 
 

@@ -203,9 +203,8 @@ def test_an_application_runs_as_that_of_hydra(
     monkeypatch.setattr(sys, "argv", ["pfbench run", *words, "scenario=linear_walk"])
     path = str(job.conf_dir())
     decorated = hydra.main(version_base="1.3", config_path=path, config_name="config")(task)
-    flags, others = [w for w in words if w[0] == "-"], [w for w in words if w[0] != "-"]
-    overrides = [*others, "scenario=linear_walk"]
-    for run in (decorated, lambda: run_command.run_application(task, overrides, is_sweep=bool(flags))):  # fmt: skip
+    overrides = [*(w for w in words if w[0] != "-"), "scenario=linear_walk"]
+    for run in (decorated, lambda: run_command.run_application(task, overrides, is_sweep=words[:1] in (['-m'], ['--multirun']))):  # fmt: skip
         seen.append([])
         run()
     assert seen[0] == seen[1]
