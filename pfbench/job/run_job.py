@@ -195,9 +195,9 @@ def _read_meta(path: Path) -> dict[str, Any]:
         return {}
 
 
-def _name_other(stored: str, asked: str) -> str:
+def _name_other(stored: str, requested: str) -> str:
     """Name the filter whose result is that of another name, with the same settings; empty for one name."""
-    return "" if stored == asked else f" of {stored}, which has the same settings"
+    return "" if stored == requested else f" of {stored}, which has the same settings"
 
 
 def find_result_path(values: Mapping[str, Any], inputs: Inputs) -> Path:
