@@ -35,7 +35,6 @@ from pfbench.logs.judge.trajectory_table import (
     GEODETIC,
     LOCAL,
     POSITION_SD,
-    ROLES,
     TRAJECTORY,
     TrajectoryTable,
     check_trajectory,
@@ -97,19 +96,19 @@ ONE = "recording"  # name of the sequence of a pattern without {sequence}
 _FIELDS = {"sequence": r"(?P<sequence>[^/]+?)", "run": r"(?P<run>[^/]+?)"}
 _READERS: dict[str, dict[str, Callable[[Path, SourceOptions], list[TrajectoryTable]]]] = {
     TRAJECTORY: {
-        "table": partial(read_named_table, ROLES[TRAJECTORY]), "tum": read_tum_trajectory, "kf_gins": read_kf_gins_trajectory,
+        "table": partial(read_named_table, TRAJECTORY), "tum": read_tum_trajectory, "kf_gins": read_kf_gins_trajectory,
         "nmea": read_nmea_trajectory, "rtklib": read_rtklib, "result": read_result_trajectories,
     },
     "imu": {
-        "table": partial(read_named_table, ROLES["imu"]), "kf_gins": read_kf_gins_imu, "euroc": read_euroc_imu,
+        "table": partial(read_named_table, "imu"), "kf_gins": read_kf_gins_imu, "euroc": read_euroc_imu,
         "kitti": read_kitti,
     },
     "gnss": {
-        "table": partial(read_named_table, ROLES["gnss"]), "tum": read_tum_trajectory, "kf_gins": read_kf_gins_fixes,
+        "table": partial(read_named_table, "gnss"), "tum": read_tum_trajectory, "kf_gins": read_kf_gins_fixes,
         "nmea": read_nmea_trajectory, "rtklib": read_rtklib, "kitti": read_kitti,
     },
     "reference": {
-        "table": partial(read_named_table, ROLES["reference"]), "tum": read_tum_trajectory,
+        "table": partial(read_named_table, "reference"), "tum": read_tum_trajectory,
         "kf_gins": read_kf_gins_trajectory, "euroc": read_euroc_reference, "kitti": read_kitti,
     },
 }  # fmt: skip

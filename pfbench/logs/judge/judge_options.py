@@ -28,6 +28,7 @@ class SourceOptions:
         frame: Axes of a TUM file, "ned" or "enu".
         shift: Time added to the clock of the file, s.
         columns: Name in a CSV file by name of pfbench.
+        names: Names of pfbench by name in a table of an own log, beside those that are understood.
         scale: Factor by name of pfbench, for a column in another unit; before `shift`.
         format: One of `FORMATS`; empty to find it from the content.
         sd: KF-GINS file of standard deviations, or its pattern; empty for none.
@@ -38,6 +39,7 @@ class SourceOptions:
     frame: str = ""
     shift: float = 0.0
     columns: Mapping[str, str] = field(default_factory=dict)
+    names: Mapping[str, str] = field(default_factory=dict)
     scale: Mapping[str, float] = field(default_factory=dict)
     format: str = ""
     sd: str = ""

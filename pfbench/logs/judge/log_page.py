@@ -13,11 +13,12 @@ import yaml
 from matplotlib.figure import Figure
 
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.logs.doctor.finding import Finding, LogDiagnosis, Picture
+from pfbench.logs.doctor.finding import Finding, LogDiagnosis
 from pfbench.report import writers
 from pfbench.report.page_kit import Block, write_page
 from pfbench.results.plotting import FigureSpec, format_slug, stacked_axes
 
+_FEW_POINTS = 100  # of a curve whose points are marked
 _ABOUT = {
     "refuse": "A run refuses the log until it is mended.",
     "warn": "A run continues, and its result is probably wrong.",
@@ -122,7 +123,7 @@ def _describe(number: int, finding: Finding, folder: RecordedFolder, formats: Se
     drawings: list[dict[str, Any]] = []
     if finding.picture is not None:
         caption = f"{finding.check}: {finding.evidence}."
-        figure = FigureSpec(f"{number:02d}_{format_slug(finding.check)}", caption, partial(_draw, finding.picture))  # fmt: skip
+        figure = FigureSpec(f"{number:02d}_{format_slug(finding.check)}", caption, partial(draw_curves, *finding.picture))  # fmt: skip
         drawings = writers.write_figures([figure], "finding", folder, formats)
     mending = yaml.safe_dump(
         _plain({"scenario": finding.settings}), default_flow_style=None, width=100
@@ -138,14 +139,16 @@ def _describe(number: int, finding: Finding, folder: RecordedFolder, formats: Se
     ]  # fmt: skip
 
 
-def _draw(picture: Picture) -> Figure:
-    """Draw the curves of a finding, and its marks."""
-    figure, (axis,) = stacked_axes(1, 2.2)
-    for label, x, y in picture.curves:
-        marker = "." if len(x) < 100 else ""
-        axis.plot(x, y, marker=marker, linewidth=0.8, label=label)
-    for mark in picture.marks:
+def draw_curves(
+    xlabel: str, ylabel: str, curves: Sequence[tuple[Any, ...]], marks: Sequence[float] = (), *, is_map: bool = False
+) -> Figure:  # fmt: skip
+    """Draw curves, each with a label, horizontal and vertical values and perhaps a style, and marks; a map has equal scales."""
+    figure, (axis,) = stacked_axes(1, 3.2 if is_map else 2.2)
+    for label, x, y, *style in curves:
+        axis.plot(x, y, *(style or [".-" if len(x) < _FEW_POINTS else "-"]), linewidth=0.8, label=label)  # fmt: skip
+    for mark in marks:
         axis.axvline(mark, color="0.5", linewidth=0.8, linestyle=":")
-    axis.set(xlabel=picture.xlabel, ylabel=picture.ylabel)
-    axis.legend()
+    axis.set(xlabel=xlabel, ylabel=ylabel)
+    axis.set_aspect("equal" if is_map else "auto", adjustable="datalim")
+    axis.legend(fontsize="small")
     return figure

@@ -83,7 +83,7 @@ def _drop_repeats(role: str, table: TableFile, options: SourceOptions) -> TableF
     if not repeated.any():
         return table
     is_rounded = repeated.mean() > _MOST_REPEATS
-    remedy = f"Set {role}.repeats=first to keep the first of them."
+    remedy = f"Set {role}.repeats=first to keep the first of them, in Python repeats='first'."
     if is_rounded:
         remedy = (
             "The times have lost digits: write them again with more, since no key brings them back."
