@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pfbench.cli.current_folder import add_search_path
+from pfbench.logs.cli.inspect import split_folder
 
 HELP = """\
 pfbench estimate FOLDER [filter=NAME,...] [key=value ...]
@@ -28,20 +29,14 @@ _OWN = ("filter", "reports_dir")
 
 def estimate_log(words: Sequence[str]) -> None:
     """Estimate the track of a log, and write its page and files."""
-    folders = [word for word in words if "=" not in word]
-    if len(folders) != 1:
-        raise ValueError(
-            f"estimate needs one folder, got {' '.join(folders) or 'none'}. Use: pfbench estimate my_log"
-        )
-    options = {
-        key: value for key, _, value in (word.partition("=") for word in words) if key in _OWN
-    }
-    others = [word for word in words if "=" in word and word.partition("=")[0] not in _OWN]
+    folder, pairs = split_folder(words, "estimate")
+    options = {key: value for key, _, value in (w.partition("=") for w in pairs) if key in _OWN}
+    others = [word for word in pairs if word.partition("=")[0] not in _OWN]
     from pfbench.job import estimate_track
     from pfbench.logs.judge.track_page import describe_track, write_track_page
 
     names = [name for name in options.get("filter", "ekf,ukf").strip("[]").split(",") if name]
-    estimate = estimate_track(folders[0], names, add_search_path(others))
+    estimate = estimate_track(folder, names, add_search_path(others))
     page = write_track_page(estimate, options.get("reports_dir", "reports"))
     print("\n".join(describe_track(estimate)))
     print(f"report: {page.resolve()}")

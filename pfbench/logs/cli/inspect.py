@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pfbench.cli.compose import split_words
 from pfbench.core.parameter_checks import require
 from pfbench.logs.cli.judge import convert_numbers
 
@@ -33,7 +33,10 @@ _WARNED, _REFUSED = 3, 2
 
 def inspect_folder(words: Sequence[str]) -> None:
     """Inspect a log, print its findings and write the page."""
-    folder, values = _split_folder(words)
+    folder, others = split_folder([w.removeprefix("scenario.") for w in words], "inspect")
+    values = split_words(others, _KEYS, (), "pfbench inspect my_log")
+    must, folder = "be a folder with imu, gnss and, if there is one, reference", folder.resolve()
+    require(folder.is_dir(), folder, must, "none", "Check the path.")
     from pfbench.logs.doctor.thresholds import THRESHOLDS
     from pfbench.logs.judge.log_page import describe_run, write_log_page
     from pfbench.scenario import LogFiles, inspect_log
@@ -47,7 +50,10 @@ def inspect_folder(words: Sequence[str]) -> None:
         "name": folder.name,
         "root": folder.parent,
         "folder": folder.name,
-        "words": _describe_words(names, options),
+        "words": {
+            **({"files": names} if names else {}),
+            **{k: options[k] for k in ("origin", "fix_codes") if k in options},
+        },
     }
     page = write_log_page(diagnosis, source, values.get("reports_dir", "reports"))
     for finding in diagnosis.findings:
@@ -65,55 +71,28 @@ def inspect_folder(words: Sequence[str]) -> None:
         raise SystemExit(_REFUSED if counts["refuse"] else _WARNED)
 
 
-def _split_folder(words: Sequence[str]) -> tuple[Path, dict[str, str]]:
-    """Return the folder and the values by key."""
+def split_folder(words: Sequence[str], command: str) -> tuple[Path, list[str]]:
+    """Return the one word that is a folder, and the others."""
     folders = [word for word in words if "=" not in word]
-    values: dict[str, str] = {}
-    for word in words:
-        key, equals, value = word.removeprefix("scenario.").partition("=")  # as remedies name them
-        if not equals:
-            continue
-        require(
-            key in _KEYS and value and key not in values,
-            "words",
-            f"be FOLDER and key=value with the keys {', '.join(_KEYS)}, each once",
-            word,
-            "See pfbench inspect --help.",
-        )
-        values[key] = value
-    if len(folders) != 1:
-        raise ValueError(
-            f"inspect needs one folder, got {' '.join(folders) or 'none'}. Use: pfbench inspect my_log"
-        )
-    folder = Path(folders[0])
-    require(
-        folder.is_dir(),
-        folder,
-        "be a folder with imu, gnss and, if there is one, reference",
-        "none",
-        "Check the path.",
-    )
-    return folder.resolve(), values
+    require(len(folders) == 1, command, "receive one folder", " ".join(folders) or "none", f"Use: pfbench {command} my_log")  # fmt: skip
+    return Path(folders[0]), [word for word in words if "=" in word]
 
 
 def _convert_options(values: Mapping[str, str]) -> dict[str, Any]:
     """Convert numbers and lists."""
-    options: dict[str, Any] = {}
-    for key, name in (("path", "path"), ("sensor", "imu")):
-        if key in values:
-            options[name] = int(convert_numbers(key, values[key], 0.0))
-    if "origin" in values:
-        options["origin"] = list(convert_numbers("origin", values["origin"], ()))
-    codes = values.get("fix_codes", "")
-    if codes.startswith("["):
-        options["fix_codes"] = [int(code) for code in convert_numbers("fix_codes", codes, ())]
-    elif codes:
-        options["fix_codes"] = codes
+    numbers = {
+        "path": ("path", 0.0, int),
+        "sensor": ("imu", 0.0, int),
+        "origin": ("origin", (), list),
+    }
+    options = {
+        name: kind(convert_numbers(key, values[key], default))
+        for key, (name, default, kind) in numbers.items()
+        if key in values
+    }
+    if codes := values.get("fix_codes", ""):
+        is_list = codes.startswith("[")
+        options["fix_codes"] = (
+            [int(c) for c in convert_numbers("fix_codes", codes, ())] if is_list else codes
+        )
     return options
-
-
-def _describe_words(names: Mapping[str, str], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keys of the scenario that read the log in the same way."""
-    keys = {key: options[key] for key in ("origin", "fix_codes") if key in options}
-    files = {"files": json.loads(json.dumps(names))} if names else {}
-    return {**files, **keys}

@@ -133,12 +133,13 @@ def _check_programs(
     programs: Mapping[str, str], sources: Mapping[str, Any], option_keys: Sequence[str]
 ) -> None:
     """Check that the reference and a program are present, and that all names are valid."""
-    missing = "reference" if "reference" not in programs else "a program"
-    if "reference" not in programs or len(programs) < 2:
-        raise ValueError(
-            f"judge needs a reference and programs, got no {missing.removeprefix('a ')}. "
-            "Use: pfbench judge reference=truth.csv mine=a.csv theirs=b.csv"
-        )
+    require(
+        "reference" in programs and len(programs) > 1,
+        "judge",
+        "receive a reference and programs",
+        f"{', '.join(programs) or 'none'} alone",
+        "Use: pfbench judge reference=truth.csv mine=a.csv theirs=b.csv",
+    )
     for name, pattern in programs.items():
         is_path = "." in pattern or "/" in pattern or os.path.isfile(pattern)
         require(

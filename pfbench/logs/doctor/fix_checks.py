@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pfbench.files.table_file import Array
 from pfbench.logs.doctor.axis_orders import BODY_ORDERS, name_axes
+from pfbench.logs.doctor.bad_samples import list_stretches
 from pfbench.logs.doctor.finding import (
     REFUSE,
     TELL,
@@ -370,9 +371,8 @@ def find_frozen(position: Array, motion: Array) -> _Mask:
     Returns:
         Mask of repeated fixes, [m].
     """
-    is_equal = (np.diff(position, axis=0) == 0.0).all(1)
-    edges = np.flatnonzero(np.diff(np.r_[False, is_equal, False].astype(int)))
-    runs = [(first, last, motion[first:last].sum()) for first, last in zip(edges[::2], edges[1::2], strict=True)]  # fmt: skip
+    stretches = list_stretches((np.diff(position, axis=0) == 0.0).all(1))
+    runs = [(first, last, motion[first:last].sum()) for first, last in stretches.tolist()]
     largest = max((distance for _, _, distance in runs), default=0.0)
     frozen = np.zeros(len(position), bool)
     for first, last, distance in runs if largest > limit_of("frozen fixes") else ():

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from pfbench.files.table_file import Array
+from pfbench.logs.doctor.bad_samples import list_stretches
 from pfbench.logs.doctor.raw_log import RawImu, RawLog, RawReference
 from pfbench.logs.worlds.log_tables import ImuLog, ReferenceLog
 
@@ -46,14 +47,10 @@ def find_standing(imu: RawImu | ImuLog, reference: RawReference | ReferenceLog) 
     )  # fmt: skip
     turning = np.linalg.norm(rate - np.median(rate, 0), axis=1)
     quiet = (speed < _QUIET_SPEED) & (turning < _QUIET_RATE)
-    edges = np.flatnonzero(np.diff(np.r_[False, quiet, False].astype(int)))
-    if not len(edges):
-        return None
-    lengths = edges[1::2] - edges[::2]
-    i = int(lengths.argmax())
-    if lengths[i] * _BLOCK < _LEAST_STANDING:
-        return None
-    return slice(int(edges[2 * i]) * size, int(edges[2 * i + 1]) * size)
+    stretches = list_stretches(quiet).tolist()
+    first, last = max(stretches, key=lambda blocks: blocks[1] - blocks[0], default=(0, 0))
+    is_long = (last - first) * _BLOCK >= _LEAST_STANDING
+    return slice(first * size, last * size) if is_long else None
 
 
 def allan_deviation(values: Array, rate: float) -> Array:

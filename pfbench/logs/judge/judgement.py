@@ -139,9 +139,11 @@ def _check_sequences(
                 "Use {sequence} in all patterns, or in none.",
             )
         keys = [(file.sequence, file.run) for file in of_program]
-        if len(set(keys)) < len(keys):
-            double = next(key for key in keys if keys.count(key) > 1)
-            raise ValueError(
-                f"{program} must have one file per sequence and run, got several for {double}. Use "
-                "{run} in the pattern."
-            )
+        double = next((key for key in keys if keys.count(key) > 1), None)
+        require(
+            not double,
+            program,
+            "have one file per sequence and run",
+            f"several for {double}",
+            "Use {run} in the pattern.",
+        )

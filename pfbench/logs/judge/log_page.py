@@ -106,16 +106,7 @@ def format_settings(settings: Mapping[str, Any], source: Mapping[str, Any]) -> s
         **settings,
     }
     head = "# Written by pfbench inspect: settings that mend what it named.\n"
-    return head + yaml.safe_dump(_plain(content), sort_keys=False, default_flow_style=None, width=100)  # fmt: skip
-
-
-def _plain(value: Any) -> Any:
-    """Convert mappings, sequences and numbers to those of YAML."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return float(value) if isinstance(value, float) else value
+    return head + yaml.safe_dump(json.loads(json.dumps(content)), sort_keys=False, default_flow_style=None, width=100)  # fmt: skip
 
 
 def _describe(number: int, finding: Finding, folder: RecordedFolder, formats: Sequence[str]) -> list[Block]:  # fmt: skip
@@ -126,7 +117,7 @@ def _describe(number: int, finding: Finding, folder: RecordedFolder, formats: Se
         figure = FigureSpec(f"{number:02d}_{format_slug(finding.check)}", caption, partial(draw_curves, *finding.picture))  # fmt: skip
         drawings = writers.write_figures([figure], "finding", folder, formats)
     mending = yaml.safe_dump(
-        _plain({"scenario": finding.settings}), default_flow_style=None, width=100
+        json.loads(json.dumps({"scenario": finding.settings})), default_flow_style=None, width=100
     ).rstrip()
     return [
         Block("part", f"{number}. {finding.check} ({finding.level})"),

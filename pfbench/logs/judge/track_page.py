@@ -161,7 +161,9 @@ def _list_figures(estimate: TrackEstimate) -> list[FigureSpec]:
          [(answer.name, time, _distances(first, answer)) for answer in others]),
     ]  # fmt: skip
     return [
-        FigureSpec(name, caption, partial(draw_curves, xlabel, ylabel, curves, is_map=name == "map"))
+        FigureSpec(
+            name, caption, partial(draw_curves, xlabel, ylabel, curves, is_map=name == "map")
+        )
         for name, caption, xlabel, ylabel, curves in panels
         if curves
     ]

@@ -78,11 +78,13 @@ def parse_epochs(table: pd.DataFrame, epoch: float) -> pd.DataFrame:
     """
     table = table.copy()
     missing = [name for name in ("prn", *CLOCK, *ORBIT) if name not in table]
-    if missing:
-        raise ValueError(
-            f"the columns of ephemerides must include {', '.join(missing)}. "
-            f"Use the names of RINEX: {', '.join(LINES)}."
-        )
+    require(
+        not missing,
+        "the columns of ephemerides",
+        f"include {', '.join(missing)}",
+        ", ".join(map(str, table.columns)),
+        f"Use the names of RINEX: {', '.join(LINES)}.",
+    )
     unknown, optional = pd.Series(math.nan, table.index), ("week", "health", "tgd", "ttx")
     column = {name: table.get(name, unknown) for name in optional}
     system = table["sys"] if "sys" in table else pd.Series("G", table.index)
@@ -295,8 +297,7 @@ def _records(
         try:
             prn = lines[begin][version - 2 : indent].strip()
             require(prn.isascii() and prn.isdigit(), "it", "begin with a satellite", f"{prn!r}")
-            if end - begin != _RECORD_LINES:
-                raise ValueError(f"it must have {_RECORD_LINES} lines, got {end - begin}")
+            require(end - begin == _RECORD_LINES, "it", f"have {_RECORD_LINES} lines", end - begin)
             record = _parse_record(lines[begin:end], system, version)
         except ValueError as error:
             yield f"the record in line {begin + 1}, {lines[begin][:23]!r}, is dropped: {error}"

@@ -19,10 +19,10 @@ from pfbench.core.record import Episode, MeasuredTruth, Record
 from pfbench.files.reader_notes import announce_notes
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
 from pfbench.logs.sky.raw_gnss import RawGnss, RawGnssInputs, RawGnssTuning
-from pfbench.logs.units import DEGREE
+from pfbench.logs.sky.rinex_observations import RawEpochs
 from pfbench.logs.worlds.corrections import LogCorrections
 from pfbench.logs.worlds.drive import FixHoldout
-from pfbench.logs.worlds.log_frames import find_origin
+from pfbench.logs.worlds.log_frames import find_origin, place_of
 from pfbench.logs.worlds.log_reader import read_track
 from pfbench.logs.worlds.log_tables import (
     Array,
@@ -43,7 +43,7 @@ from pfbench.logs.worlds.raw_gnss import (
     make_sky_inputs,
     subtract_nominal_ranges,
 )
-from pfbench.logs.worlds.rinex_source import RawEpochs, RinexSource
+from pfbench.logs.worlds.rinex_source import RinexSource
 from pfbench.logs.worlds.signal_weights import SignalWeights
 from pfbench.logs.worlds.time_grid import encode_names, interpolate, select_fixes
 from pfbench.nav import earth
@@ -272,8 +272,8 @@ class UserRawLog(Scenario):
             "none",
             "Set scenario.standing=[lat_deg,lon_deg,h_m].",
         )
-        geodetic = earth.geodetic(torch.tensor(epochs.position, dtype=torch.float64)).tolist()
-        return geodetic[0] / DEGREE, geodetic[1] / DEGREE, geodetic[2]
+        at = earth.geodetic(torch.tensor(epochs.position, dtype=torch.float64))
+        return tuple((at / place_of((1.0, 1.0, 1.0))).tolist())
 
     def _read_truth(self, folder: Path, epochs: RawEpochs) -> tuple[ReferenceLog, Sequence[float]]:
         """Return the track of the antenna from an origin, and the origin."""
@@ -314,10 +314,8 @@ class UserRawLog(Scenario):
 
 def _move(centre: Sequence[float], enu: Array) -> tuple[float, ...]:
     """Return lat_deg, lon_deg, h_m of a position, East, North, Up from a place, m, [3]."""
-    lat, lon, h = centre
-    at = torch.tensor([math.radians(lat), math.radians(lon), h], dtype=torch.float64)
-    latitude, longitude, height = earth.from_local_enu(torch.from_numpy(enu)[None], at)[0].tolist()
-    return math.degrees(latitude), math.degrees(longitude), height
+    at = earth.from_local_enu(torch.from_numpy(enu)[None], place_of(centre))[0]
+    return tuple((at / place_of((1.0, 1.0, 1.0))).tolist())
 
 
 @dataclass(frozen=True)
