@@ -44,7 +44,11 @@ def write_log_page(
         Path of index.html.
     """
     name = format_slug(f"inspect_{source['name']}")
-    suggested = format_settings(diagnosis.settings, source)
+    content = {
+        "defaults": [source.get("scenario", "user_log"), "_self_"], "folder": source["folder"], **source["words"], **diagnosis.settings,
+    }  # fmt: skip
+    text = yaml.safe_dump(json.loads(json.dumps(content)), sort_keys=False, default_flow_style=None, width=100)  # fmt: skip
+    suggested = f"# Written by pfbench inspect: settings that mend what it named.\n{text}"
     with RecordedFolder(Path(out) / name) as folder:
         folder.write("scenario/suggested.yaml", suggested)
         findings = [
@@ -87,26 +91,6 @@ def describe_run(folder: Path, root: Path) -> str:
     """
     path = f"'hydra.searchpath=[own://{folder.resolve()}]'"
     return f"pfbench run data.root={root} {path} scenario=suggested filter=ekf runs=5"
-
-
-def format_settings(settings: Mapping[str, Any], source: Mapping[str, Any]) -> str:
-    """Return the text of suggested.yaml: the scenario user_log with the settings.
-
-    Args:
-        settings: Keys below `scenario`.
-        source: Folder and the words that read the log.
-
-    Returns:
-        YAML.
-    """
-    content: dict[str, Any] = {
-        "defaults": [source.get("scenario", "user_log"), "_self_"],
-        "folder": source["folder"],
-        **source["words"],
-        **settings,
-    }
-    head = "# Written by pfbench inspect: settings that mend what it named.\n"
-    return head + yaml.safe_dump(json.loads(json.dumps(content)), sort_keys=False, default_flow_style=None, width=100)  # fmt: skip
 
 
 def _describe(number: int, finding: Finding, folder: RecordedFolder, formats: Sequence[str]) -> list[Block]:  # fmt: skip

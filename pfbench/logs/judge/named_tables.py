@@ -58,12 +58,13 @@ def read_named_table(role: str, file: Path, options: SourceOptions) -> list[Traj
     if role in _NEEDED:
         rows, renamed = _understand_names(file, rows, role, options.names)
     columns = list(map(str, rows))
+    similar = "".join(f" Similar: {name}." for name in difflib.get_close_matches("time", columns, 1, 0.5))  # fmt: skip
     require(
         "t" in rows,
         file.name,
         "have the column t (time, s)",
         ", ".join(columns),
-        f"Rename it with NAME.columns=t:NAME_IN_FILE.{_similar('time', columns)}",
+        f"Rename it with NAME.columns=t:NAME_IN_FILE.{similar}",
     )
     lacking = [group for group in SD_GROUPS if not set(group) <= set(rows)]
     incomplete = [name for group in lacking for name in group]
@@ -185,8 +186,3 @@ def _numbers(file: Path, column: pd.Series, name: str, lines: np.ndarray) -> np.
             f"{str(column.iloc[row])[:40]!r}. Repair or remove this line."
         )
     return numbers
-
-
-def _similar(name: str, names: list[str]) -> str:
-    close = difflib.get_close_matches(name, names, 1, 0.5)
-    return f" Similar: {close[0]}." if close else ""

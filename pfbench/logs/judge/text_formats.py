@@ -262,7 +262,9 @@ def read_head(file: Path, rows: int = 20) -> tuple[list[str], list[list[str]]]:
     """Read names of columns and the first rows of a text; a line of names can be a comment."""
     heads: list[list[str]] = []
     fields: list[list[str]] = []
-    for line in map(str.strip, _read_first_lines(file)):
+    with file.open("rb") as stream:  # the last line can be cut
+        lines = split_lines(stream.read(_HEAD_BYTES).decode("utf-8-sig", "replace"))
+    for line in map(str.strip, lines):
         if line.startswith(_COMMENTS) or (not fields and _has_no_number(line)):
             heads.append(split_line(_UNIT.sub("", line.lstrip("#% "))))
         elif line:
@@ -272,12 +274,6 @@ def read_head(file: Path, rows: int = 20) -> tuple[list[str], list[list[str]]]:
     width = len(fields[0]) if fields else 0
     check_columns(file, width)
     return next((names for names in reversed(heads) if len(names) == width), []), fields
-
-
-def _read_first_lines(file: Path) -> list[str]:
-    """Return the lines at the start of a text. The last one can be cut."""
-    with file.open("rb") as stream:
-        return split_lines(stream.read(_HEAD_BYTES).decode("utf-8-sig", "replace"))
 
 
 def to_numbers(rows: Sequence[Sequence[str]]) -> Array:

@@ -210,7 +210,9 @@ def read_rinex(file: Path) -> RinexFile:
 
     A record that cannot be read is dropped, and a note names its line.
     """
-    lines = _lines(file)
+    # names and comments contain other letters, which are read but not used
+    text = read_text(file).removeprefix(b"\xef\xbb\xbf").decode("latin-1")
+    lines = [line.rstrip() for line in text.split("\n")]
     version = lines[0][:9].strip() if lines and "RINEX VERSION" in lines[0] else ""
     if version[:1] not in ("2", "3", "4") or lines[0][20:21] != "N":
         raise ValueError(
@@ -251,12 +253,6 @@ def _describe_kind(lines: Sequence[str]) -> str:
         "Choose the GPS or mixed navigation file (type N) of RINEX 2, 3 or 4 of the same day."
     )
     return f"got a {kind} file of RINEX {version}. {same_day}"
-
-
-def _lines(file: Path) -> list[str]:
-    # names and comments contain other letters, which are read but not used
-    text = read_text(file).removeprefix(b"\xef\xbb\xbf").decode("latin-1")
-    return [line.rstrip() for line in text.split("\n")]
 
 
 def _first_lines(lines: Sequence[str], body: int, version: int) -> list[int]:

@@ -76,9 +76,12 @@ def read_observations(file: Path, signals: Mapping[str, Sequence[str]]) -> RawEp
         "Record these signals, or name others on 1575.42 MHz in scenario.rinex.signals.",
     )
     columns = {
-        s: [_find(header.types[s], kind + code) for kind in "CDS"]
+        s: [
+            _FIRST + _WIDTH * header.types[s].index(kind + code) if kind + code in header.types[s] else None
+            for kind in "CDS"
+        ]
         for s, code in codes_in_use.items()
-    }
+    }  # fmt: skip
     others = ", ".join(sorted(set(header.types) - set(codes_in_use)))
     notes = [f"{file.name}: systems {others} are not read"] if others else []
     notes += [
@@ -163,11 +166,6 @@ def _read_header(name: str, lines: Sequence[str]) -> _Header:
                 "Write the file without scale factors.",
             )
     raise ValueError(f"{name} must have a line END OF HEADER, got none. Write the file again.")
-
-
-def _find(types: Sequence[str], kind: str) -> int | None:
-    """Return the first column of a type of observation."""
-    return _FIRST + _WIDTH * types.index(kind) if kind in types else None
 
 
 def _values(text: str, columns: Sequence[int | None]) -> list[float]:

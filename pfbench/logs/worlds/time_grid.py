@@ -68,6 +68,12 @@ class ResampledLog(NamedTuple):
         """Time from the start to the end of each step, s, [T]."""
         return self.time - self.start_s
 
+    @property
+    def recorded_fixes(self) -> dict[str, Tensor]:
+        """Recorded velocity, m/s, and position, m, at the end of each step, [T, 3]. NaN without a fix."""
+        position, velocity = torch.from_numpy(self.fixes).split(3, -1)
+        return {"velocity": velocity, "position": position}
+
     def sensed(self) -> dict[str, Array]:
         """Compute the mean force, m/s^2, and rate, rad/s, of each step, [T, 3].
 

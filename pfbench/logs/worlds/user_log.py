@@ -105,7 +105,7 @@ class AlignedLog(UserLog):
             note = "nothing is scored: the log has no reference, and no fix is withheld"
             truth = {"position": torch.full_like(episode.truth["position"], torch.nan)}
             return replace(episode, truth=truth, notes=(*episode.notes, note))
-        scored, count = self.holdout.withhold(episode, leg, runs)
+        scored, count = self.holdout.withhold(episode, leg.recorded_fixes, runs)
         sd = self.tuning.measurement_sd
         names = ("position", "velocity") if len(sd) == 6 else ("position",)
         truth = {name: scored.truth[name] for name in names}

@@ -143,26 +143,16 @@ class UserRawLog(Scenario):
 
     def _hold_out(self, episode: Episode, points: PointSolutions, runs: Tensor) -> Episode:
         """Withhold epochs, and make their solutions the only truth."""
-        position = torch.from_numpy(points.position[1:])
-        has_point = torch.isfinite(position[:, 0])
-        withheld = self.holdout.select(has_point, episode.time, runs)[..., None]
-        require(
-            withheld.any(1).all(),
-            "scenario.holdout",
-            "withhold an epoch with a solution in each run",
-            self.holdout,
-            "Withhold more epochs, or use a longer log.",
-        )
-        truth = {"position": torch.where(withheld, position, torch.nan)}
+        fixes = {"position": torch.from_numpy(points.position[1:])}
+        scored, count = self.holdout.withhold(episode, fixes, runs)
         sd = torch.from_numpy(np.sqrt(np.nanmean(points.position_sd[1:] ** 2, axis=0)))
-        record = episode.record._replace(y=torch.where(withheld, torch.nan, episode.record.y))
         notes = (
-            f"errors are distances to {int(withheld[0].sum())} {HELD_OUT_POINTS} (run 0), which the filter does not get; their "
+            f"errors are distances to {count} {HELD_OUT_POINTS} (run 0), which the filter does not get; their "
             f"standard deviations, {', '.join(f'{v:.1f}' for v in sd.tolist())} m East, North, Up, are part of NEES, scores and coverage",
             "errors that last for seconds, such as reflections, are in the ranges before and in the solution: the distance does not show them",
         )
         return replace(
-            episode, record=record, truth=truth, measured_truth=MeasuredTruth(HELD_OUT_POINTS, {"position": sd}),
+            scored, measured_truth=MeasuredTruth(HELD_OUT_POINTS, {"position": sd}),
             notes=(*episode.notes, *notes),
         )  # fmt: skip
 
