@@ -16,7 +16,6 @@ from torch import Tensor
 from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.files.table_file import Array
 from pfbench.files.track_files import format_gpx, format_kml
 from pfbench.filter.belief import StepInfo
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
@@ -24,7 +23,7 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.smoothing.gaussian_smoother import smooth
 from pfbench.job.config import compose
 from pfbench.job.plan import JobPlan, build_plan
-from pfbench.logs.worlds.log_tables import find_dataset, swap_frd_rfu
+from pfbench.logs.worlds.log_tables import Array, find_dataset, swap_frd_rfu
 from pfbench.logs.worlds.user_log import AlignedLog
 from pfbench.nav import earth
 from pfbench.nav.attitude import dcm_from_quaternion, euler_from_dcm

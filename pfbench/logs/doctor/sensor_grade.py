@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from pfbench.files.table_file import Array
 from pfbench.logs.doctor.bad_samples import list_stretches
 from pfbench.logs.doctor.raw_log import RawImu, RawLog, RawReference
-from pfbench.logs.worlds.log_tables import ImuLog, ReferenceLog
+from pfbench.logs.worlds.log_tables import Array, ImuLog, ReferenceLog
 
 _BLOCK = 0.5  # s; mean values that show rest
 _QUIET_SPEED, _QUIET_RATE, _LEAST_STANDING = 0.15, 0.03, 8.0  # m/s, rad/s, s

@@ -213,6 +213,11 @@ def _scale_columns(table: TrajectoryTable, factors: Mapping[str, float]) -> Traj
 _FIXED_AXES = "Remove the option: the axes of all other formats are North, East, Down or latitude, longitude, height."
 _PARQUET = b"PAR1"
 _SIGNATURES = {_PARQUET: "table", b"PK\x03\x04": "result"}
+_BINARY = {  # first bytes of files that other programs convert
+    b"\xb5b": "UBX of u-blox", b"ULog": "ULog of PX4", b"\xa3\x95": "a log of ArduPilot", b"#ROSBAG": "a bag of ROS 1",
+    b"SQLite format 3": "a bag of ROS 2 or another database", b"\x89MCAP": "a bag of ROS 2", b"\xaaD": "messages of NovAtel",
+    b"\x1f\x8b": "a compressed file",
+}  # fmt: skip
 _SUFFIXES = {
     ".csv": "table",
     ".parquet": "table",
@@ -242,6 +247,14 @@ def find_format(file: Path, options: SourceOptions, role: str = TRAJECTORY) -> s
         "have the suffix .parquet",
         "a Parquet file",
         f"Rename it to {file.with_suffix('.parquet').name}.",
+    )
+    kind = next((name for first, name in _BINARY.items() if head.startswith(first)), "")
+    require(
+        not kind,
+        file.name,
+        "be a text, a .parquet or a result of pfbench",
+        f"{kind}, by its first bytes",
+        "Convert it with a program of its maker to CSV, NMEA or RTKLIB .pos, or unpack it.",
     )
     if head[:4] in _SIGNATURES:
         return _SIGNATURES[head[:4]]

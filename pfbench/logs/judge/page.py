@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
@@ -152,7 +151,7 @@ def _describe_runs(sequence: SequenceResults, options: JudgeOptions) -> Iterator
                 "has. The error there is the largest one of any program. Set from or to, to leave out "
                 "a time for all programs."
             )
-        if math.isfinite(run.clock_offset) and abs(run.clock_offset) > _CLOCK_SHOWN:
+        if np.isfinite(run.clock_offset) and abs(run.clock_offset) > _CLOCK_SHOWN:
             yield (
                 f"Clock: {label} agrees best with the reference at an offset of "
                 f"{run.clock_offset:.3f} s. It is not removed."

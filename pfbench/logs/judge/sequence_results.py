@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -123,7 +122,7 @@ def _check_run(
     """Check a run against the reference and by itself; return it with its notes and its clock offset."""
     table = check_consistent_units(check_run(table, reference, align, source.shift))
     if align == "yaw":
-        return table, math.nan
+        return table, np.nan
     offset = check_clock(table, reference, source.shift)
     return check_frame_of(check_axes(table, reference), reference), offset
 

@@ -85,7 +85,8 @@ def _describe_innovations(answer: FilterAnswer) -> str:
     where = "within" if abs(mean - 1.0) <= band else "above" if mean > 1.0 else "below"
     cause = {
         "within": "", "above": ": the noise that the tuning states is too small, or the log has a fault, see pfbench inspect",
-        "below": ": the noise that the tuning states is too large",
+        "below": ": the noise that the tuning states is too large, or errors of the fixes last for seconds, which innovations do not "
+        "tell apart; the intervals do not hold for errors that last",
     }[where]  # fmt: skip
     return (
         f"{answer.name}: mean NIS per component {mean:.2f}, {where} {1.0 - band:.2f} to {1.0 + band:.2f}, the 95 % band of "
@@ -152,7 +153,7 @@ def _list_figures(estimate: TrackEstimate) -> list[FigureSpec]:
     panels = [
         ("map", "Tracks and fixes.", "East [m]", "North [m]",
          [*fixes, *((name, m.state[:, 7], m.state[:, 8]) for name, m in tracks)]),
-        ("intervals", f"Half-width of the 95 % intervals of {first.name}. They hold if the stated noise is right.", "t [s]", "half-width [m]",
+        ("intervals", f"Half-width of the 95 % intervals of {first.name}. They hold if the stated noise is right, and not for errors of fixes that last for seconds.", "t [s]", "half-width [m]",
          [(axis + ending, time, _NORMAL * m.sd[:, 6 + k], line) for k, axis in enumerate(("East", "North", "Up")) for ending, m, line in kinds]),
         ("held_out", "Horizontal distance to held-out fixes, each by a pass that did not get the fix.", "t [s]", "distance [m]",
          [(name, estimate.held_out_time[order], np.linalg.norm(m.held_out[order, :2], axis=1), ".") for name, m in tracks]),

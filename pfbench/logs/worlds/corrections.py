@@ -12,13 +12,13 @@ import torch
 from numpy.typing import NDArray
 
 from pfbench.core.parameter_checks import require
-from pfbench.files.table_file import Array
 from pfbench.logs.doctor.axis_orders import CONVENTIONS, axes_matrix, convert_angles
 from pfbench.logs.doctor.bad_samples import find_stuck, mend_samples
 from pfbench.logs.doctor.fix_checks import find_frozen, find_jumps
 from pfbench.logs.worlds.imu_gaps import CUT, cut_longest
 from pfbench.logs.worlds.log_frames import GEODETIC_COLUMNS
 from pfbench.logs.worlds.log_tables import (
+    Array,
     GnssLog,
     LogTable,
     ReferenceLog,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -84,7 +83,7 @@ class RecordedTrajectory:
         recorded = read_motion(find_dataset(self.root, self.folder), self.file, self.origin)
         low, high = (
             limit if setting is None else setting
-            for setting, limit in ((self.start_s, -math.inf), (self.end_s, math.inf))
+            for setting, limit in ((self.start_s, -np.inf), (self.end_s, np.inf))
         )
         selected_mask = (recorded.time >= low) & (recorded.time <= high)
         require(

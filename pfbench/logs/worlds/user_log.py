@@ -14,12 +14,11 @@ from typing_extensions import override
 from pfbench.core.parameter_checks import require
 from pfbench.core.record import Episode, MeasuredTruth
 from pfbench.files.reader_notes import announce_notes
-from pfbench.files.table_file import Array
 from pfbench.logs.worlds.constrained import ConstrainedDrive
 from pfbench.logs.worlds.corrections import LogCorrections
 from pfbench.logs.worlds.drive import RecordedDrive
 from pfbench.logs.worlds.log_reader import check_corrections
-from pfbench.logs.worlds.log_tables import NavigationLog, find_dataset
+from pfbench.logs.worlds.log_tables import Array, NavigationLog, find_dataset
 from pfbench.logs.worlds.odometer import SimulatedOdometer
 from pfbench.logs.worlds.start_alignment import StartAlignment, StartEstimate
 from pfbench.logs.worlds.time_grid import ResampledLog, interpolate
