@@ -27,6 +27,7 @@ def make_log(
     axes: str = "frd",
     time: str = "s",
     repeats: str = "refuse",
+    scale: Mapping[str, Mapping[str, float]] | None = None,
     **settings: Any,
 ) -> Part:
     """Make a scenario of your own recorded log, and print what was assumed.
@@ -39,7 +40,8 @@ def make_log(
         columns: Your names of columns that are not understood by themselves, such as `{"my_ax": "fx"}`.
         axes: Body axes of the IMU: frd (forward, right, down) or flu (forward, left, up).
         time: Unit of the times: s, ms, us, ns, minutes or hours.
-        repeats: refuse rows that repeat a time, or keep the first of them.
+        repeats: refuse rows that repeat a time, or first to keep the first of them.
+        scale: Factors by table and column, such as `{"reference": {"yaw": 0.0174533}}`.
         **settings: Other values of the scenario, such as `fix_codes="nmea"` or `filter_step_s=0.5`.
 
     Returns:
@@ -53,9 +55,11 @@ def make_log(
     tables: dict[str, TableFile] = {}
     with plain_errors(), tempfile.TemporaryDirectory() as scratch:
         for role, source in sources.items() if reference is not None else [*sources.items()][:2]:
-            scale = _TURNED[axes] if role == "imu" else {}
+            factors = dict((scale or {}).get(role, {}))
+            for column, sign in (_TURNED[axes] if role == "imu" else {}).items():
+                factors[column] = sign * factors.get(column, 1.0)
             with name_program(role):
-                options = SourceOptions(names=columns or {}, scale=scale, time=time, repeats=repeats)  # fmt: skip
+                options = SourceOptions(names=columns or {}, scale=factors, time=time, repeats=repeats)  # fmt: skip
                 tables[role] = import_table(role, _find_file(role, source, scratch), options)
         folder = _store(tables)
         words = format_words({"root": str(folder.parent), "folder": folder.name, **settings})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -56,7 +57,7 @@ def read_named_table(role: str, file: Path, options: SourceOptions) -> list[Traj
     lines = np.arange(len(rows)) + (1 if file.suffix == ".parquet" else 2)
     rows, renamed = _rename_columns(file, rows, options, accepted), tuple[str, ...]()
     if role in _NEEDED:
-        rows, renamed = _understand_names(file, rows, role, options.names)
+        rows, renamed = _understand_names(file, rows, role, options)
     columns = list(map(str, rows))
     similar = "".join(f" Similar: {name}." for name in difflib.get_close_matches("time", columns, 1, 0.5))  # fmt: skip
     require(
@@ -96,13 +97,15 @@ def _rename_columns(
 
 
 def _understand_names(
-    file: Path, rows: pd.DataFrame, role: str, names: Mapping[str, str]
+    file: Path, rows: pd.DataFrame, role: str, options: SourceOptions
 ) -> tuple[pd.DataFrame, tuple[str, ...]]:
     """Rename the columns of a role that have other names; refuse a table without those that are needed.
 
     Returns the rows, and a note on the names.
     """
-    found = {column: _find_name(column, names) for column in rows if column not in ROLES[role]}
+    found = {
+        column: _find_name(column, options.names) for column in rows if column not in ROLES[role]
+    }
     found = {column: name for column, name in found.items() if name in ROLES[role] and name not in rows}  # fmt: skip
     targets = [*found.values()]
     double = next((name for name in targets if targets.count(name) > 1), "")
@@ -122,6 +125,7 @@ def _understand_names(
         not missing, file.name, f"have the columns {', '.join(missing)}", ", ".join(rows),
         f"Name yours: NAME.columns={','.join(f'{name}:{c}' for c, name in guesses.items())}, in Python columns={guesses}.",
     )  # fmt: skip
+    _check_stated_units(file, replace(options, columns={name: column for column, name in found.items()}))  # fmt: skip
     note = ", ".join(f"{column} is {name}" for column, name in found.items())
     return rows.rename(columns=found), (note,) if note else ()
 
