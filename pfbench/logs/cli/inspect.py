@@ -28,6 +28,11 @@ each finding and scenario/suggested.yaml, settings that mend them.
 Exit codes: 0 no warning, 3 warnings, 2 refused: a run would refuse the log"""
 
 _KEYS = ("imu", "gnss", "reference", "path", "sensor", "fix_codes", "origin", "reports_dir")
+_SCENARIO = (
+    "files",
+    "origin",
+    "fix_codes",
+)  # keys of the scenario that read the log in the same way
 _WARNED, _REFUSED = 3, 2
 
 
@@ -50,10 +55,7 @@ def inspect_folder(words: Sequence[str]) -> None:
         "name": folder.name,
         "root": folder.parent,
         "folder": folder.name,
-        "words": {
-            **({"files": names} if names else {}),
-            **{k: options[k] for k in ("origin", "fix_codes") if k in options},
-        },
+        "words": {k: v for k, v in {"files": names, **options}.items() if v and k in _SCENARIO},
     }
     page = write_log_page(diagnosis, source, values.get("reports_dir", "reports"))
     for finding in diagnosis.findings:

@@ -148,9 +148,9 @@ def _list_figures(estimate: TrackEstimate) -> list[FigureSpec]:
     order = np.argsort(estimate.held_out_time)
     fixes = [("fixes", estimate.fixes[:, 1], estimate.fixes[:, 2], ".")]
     kinds = [("", first.filtered, "-"), *([(" smoothed", first.smoothed, "--")] if first.smoothed else [])]  # fmt: skip
-    nis = [(a.name, np.arange(len(a.nis)), a.nis / a.dof, ".") for a in estimate.answers if len(a.nis)]  # fmt: skip
+    nis: list[tuple[Any, ...]] = [(a.name, np.arange(len(a.nis)), a.nis / a.dof, ".") for a in estimate.answers if len(a.nis)]  # fmt: skip
     nis += [("expected", [0, max(len(a.nis) for a in estimate.answers)], [1.0, 1.0], ":")] if nis else []  # fmt: skip
-    panels = [
+    panels: list[tuple[Any, ...]] = [
         ("map", "Tracks and fixes.", "East [m]", "North [m]",
          [*fixes, *((name, m.state[:, 7], m.state[:, 8]) for name, m in tracks)]),
         ("intervals", f"Half-width of the 95 % intervals of {first.name}. They hold if the stated noise is right, and not for errors of fixes that last for seconds.", "t [s]", "half-width [m]",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -32,7 +32,6 @@ Tables = dict[str, LogTable]
 LogTables = tuple[LogTable, LogTable, LogTable | None]  # IMU, fixes and, if there is one, reference
 Vector = Sequence[float] | None
 Groups = Sequence[tuple[str, ...]]  # of columns
-Change = Callable[[Array], Array]  # of the numbers of columns, [n, k]
 _TABLES = ("imu", "gnss", "reference")
 _FORCE, _RATE, _ANGLES = ("fx", "fy", "fz"), ("wx", "wy", "wz"), ("roll", "pitch", "yaw")
 _POSITION, _VELOCITIES = ("pn", "pe", "pd"), (("vn", "ve", "vd"), ("vn_d", "ve_d", "vd_d"))
@@ -141,11 +140,11 @@ class LogCorrections:
         if {"spikes", "stuck"} & set(self.drop or ()):
             tables["imu"] = _drop_samples(tables["imu"], self.drop, notes)
         if self.gaps == "longest":
-            tables["imu"], note = cut_longest(tables["imu"], convert_column(tables["imu"], "t"))
-            notes += note
+            tables["imu"], cut = cut_longest(tables["imu"], convert_column(tables["imu"], "t"))
+            notes += cut
         return (tables["imu"], tables["gnss"], tables.get("reference")), tuple(notes)
 
-    def _list_changes(self, tables: Tables) -> Iterator[tuple[str, Groups, Change, str]]:
+    def _list_changes(self, tables: Tables) -> Iterator[tuple[str, Groups, Any, str]]:
         """Yield table, groups of columns, function of their numbers and note of the factors, axes, convention and biases."""
         for name, factors in (self.scale or {}).items():
             yield name, (tuple(factors),), lambda v, a=factors: v * [*a.values()], f"columns multiplied by {dict(factors)}"  # fmt: skip
@@ -217,7 +216,7 @@ def _wrong_fixes(fixes: GnssLog, reference: ReferenceLog, kind: str) -> NDArray[
 # Changes of a table.
 
 
-def _apply(table: LogTable, columns: Sequence[str], change: Change) -> LogTable:
+def _apply(table: LogTable, columns: Sequence[str], change: Any) -> LogTable:
     """Replace columns by a function of their numbers [n, k]."""
     missing = [column for column in columns if column not in table.rows]
     axes = ". Axes of lat_deg, lon_deg are exchanged in the file" if table.has(GEODETIC_COLUMNS) else ""  # fmt: skip
