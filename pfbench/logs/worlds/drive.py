@@ -232,12 +232,9 @@ class RecordedFlights(RecordedScenario):
         longest = max(legs, key=lambda leg: len(leg.time))
         for i, leg in zip(used, legs, strict=True):
             n = len(leg.time)
-            same = np.allclose(
-                leg.since_start, longest.since_start[:n], rtol=0.0, atol=TIME_TOLERANCE
-            )
-            same = same and np.array_equal(leg.fix_steps, longest.fix_steps[:n])
             require(
-                same,
+                np.allclose(leg.since_start, longest.since_start[:n], rtol=0.0, atol=TIME_TOLERANCE)
+                and np.array_equal(leg.fix_steps, longest.fix_steps[:n]),
                 "scenario.flights",
                 "have equal fix times",
                 f"different times in flight {self.flights[i]} of {folder}",

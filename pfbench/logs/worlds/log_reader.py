@@ -71,7 +71,7 @@ from pfbench.logs.worlds.log_tables import (
 )
 from pfbench.logs.worlds.time_order import check_overlap
 
-_OF_FIXES = ("lever arm", "fix shift")  # a reference that also gives the fixes has none
+_OF_FIXES = ("lever arm", "fix shift")
 _FORCE, _RATE, _ANGLES = ("fx", "fy", "fz"), ("wx", "wy", "wz"), ("roll", "pitch", "yaw")
 _VELOCITY, _DERIVED = ("vn", "ve", "vd"), ("vn_d", "ve_d", "vd_d")
 _REMEDY = "Leave these out. A lever arm is a key of scenario.constraints, too."
@@ -217,7 +217,12 @@ class LogSource:
             raw = self.take(tables)
             keep = np.isfinite(fixes.position[raw.fixes.rows, 0])
             findings, _, _ = run_checks(raw._replace(fixes=take_rows(raw.fixes, keep)))
-        diagnosed = judge_findings(findings, has_own_fixes=truth is None or gnss.name != truth.name)
+        refused = next((finding.text for finding in findings if finding.level == REFUSE), "")
+        remedy = "See all findings with pfbench inspect."
+        require(not refused, "the log", "agree in itself", refused.removesuffix("."), remedy)
+        # fixes that the reference gives have no lever arm and no shift, and the reader notes the gaps that it bridges
+        silent = {"imu gap", *(_OF_FIXES if truth and gnss.name == truth.name else ())}
+        diagnosed = (f"{f.check}: {f.text}" for f in findings if f.check not in silent)
         if truth and motion:
             rows += compare_fixes(gnss, fixes, motion, limits)
         return fixes, (*left_out, *rows, *diagnosed)
@@ -239,23 +244,6 @@ def read_log(folder: str | Path, files: LogFiles | None = None, **options: Any) 
         ValueError: If a check or the diagnosis refuses the log. The message names file, column, row, value and remedy.
     """
     return LogSource(Path(folder), files or LogFiles(), **options).read()
-
-
-def judge_findings(findings: Sequence[Finding], *, has_own_fixes: bool) -> tuple[str, ...]:
-    """Return findings as notes; raise the first that refuses the log. The reader notes the gaps that it bridges."""
-    refused = next((finding.text for finding in findings if finding.level == REFUSE), "")
-    require(
-        not refused,
-        "the log",
-        "agree in itself",
-        refused.removesuffix("."),
-        "See all findings with pfbench inspect.",
-    )
-    return tuple(
-        f"{finding.check}: {finding.text}"
-        for finding in findings
-        if (has_own_fixes or finding.check not in _OF_FIXES) and finding.check != "imu gap"
-    )
 
 
 def read_samples(table: LogTable) -> tuple[ImuLog, tuple[str, ...]]:
