@@ -199,11 +199,12 @@ def _scale_columns(table: TrajectoryTable, factors: Mapping[str, float]) -> Traj
 _FIXED_AXES = "Remove the option: the axes of all other formats are North, East, Down or latitude, longitude, height."
 _PARQUET = b"PAR1"
 _SIGNATURES = {_PARQUET: "table", b"PK\x03\x04": "result"}
-_BINARY = {  # first bytes of files that other programs convert
+_FOREIGN = {  # first bytes of files that other programs convert
     b"\xb5b": "UBX of u-blox", b"ULog": "ULog of PX4", b"\xa3\x95": "a log of ArduPilot", b"#ROSBAG": "a bag of ROS 1",
     b"SQLite format 3": "a bag of ROS 2 or another database", b"\x89MCAP": "a bag of ROS 2", b"\xaaD": "messages of NovAtel",
-    b"\x1f\x8b": "a compressed file",
+    b"#BESTPOS": "messages of NovAtel", b"#INSPVA": "messages of NovAtel", b"<?xml": "XML, as GPX or KML", b"\x1f\x8b": "a compressed file",
 }  # fmt: skip
+_WIDE = (b"\xff\xfe", b"\xfe\xff")  # first bytes of texts of two bytes a letter
 _SUFFIXES = {
     ".csv": "table",
     ".parquet": "table",
@@ -315,16 +316,17 @@ def find_format(file: Path, options: SourceOptions, role: str = TRAJECTORY) -> s
         "a Parquet file",
         f"Rename it to {file.with_suffix('.parquet').name}.",
     )
-    kind = next((name for first, name in _BINARY.items() if head.startswith(first)), "")
+    if head[:4] in _SIGNATURES:
+        return _SIGNATURES[head[:4]]
+    unknown = "bytes of no known kind" if b"\0" in head and not head.startswith(_WIDE) else ""
+    kind = next((name for first, name in _FOREIGN.items() if head.startswith(first)), unknown)
     require(
-        not kind,
+        not kind or _SENTENCE.search(head),  # receivers write NMEA among other messages
         file.name,
         "be a text, a .parquet or a result of pfbench",
         f"{kind}, by its first bytes",
         "Convert it with a program of its maker to CSV, NMEA or RTKLIB .pos, or unpack it.",
     )
-    if head[:4] in _SIGNATURES:
-        return _SIGNATURES[head[:4]]
     start = FileStart(head, *read_head(file), role, bool(options.columns))
     shown = next((name for name, item in FILE_FORMATS.items() if item.is_shown(start)), "")
     require(

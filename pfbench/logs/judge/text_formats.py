@@ -66,7 +66,8 @@ def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
     row = int((np.abs(length - 1) > 0.01).argmax())
     require(
         abs(length[row] - 1) <= 0.01, f"{file.name}: line {lines[row]}, columns qx ... qw", "be a quaternion of length 1",
-        f"length {length[row]:.3g}", f"Check the order of the columns: {' '.join(_TUM_COLUMNS)}.",
+        f"length {length[row]:.3g}",
+        f"Check the order of the columns: {' '.join(_TUM_COLUMNS)}." if length[row] else "Remove the lines without an attitude.",
     )  # fmt: skip
     if width > len(_TUM_COLUMNS):
         used = ", ".join(str(index + 1) for index in places)
