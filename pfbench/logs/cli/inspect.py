@@ -40,8 +40,7 @@ def inspect_folder(words: Sequence[str]) -> None:
     """Inspect a log, print its findings and write the page."""
     folder, others = split_folder([w.removeprefix("scenario.") for w in words], "inspect")
     values = split_words(others, _KEYS, (), "pfbench inspect my_log")
-    must, folder = "be a folder with imu, gnss and, if there is one, reference", folder.resolve()
-    require(folder.is_dir(), folder, must, "none", "Check the path.")
+    require(folder.is_dir(), folder, "be a folder with imu, gnss and, if there is one, reference", "none", "Check the path.")  # fmt: skip
     from pfbench.logs.doctor.thresholds import THRESHOLDS
     from pfbench.logs.judge.log_page import describe_run, write_log_page
     from pfbench.scenario import LogFiles, inspect_log
@@ -77,7 +76,7 @@ def split_folder(words: Sequence[str], command: str) -> tuple[Path, list[str]]:
     """Return the one word that is a folder, and the others."""
     folders = [word for word in words if "=" not in word]
     require(len(folders) == 1, command, "receive one folder", " ".join(folders) or "none", f"Use: pfbench {command} my_log")  # fmt: skip
-    return Path(folders[0]), [word for word in words if "=" in word]
+    return Path(folders[0]).resolve(), [word for word in words if "=" in word]
 
 
 def _convert_options(values: Mapping[str, str]) -> dict[str, Any]:

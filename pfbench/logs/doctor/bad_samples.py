@@ -125,7 +125,7 @@ def check_samples(log: RawLog, facts: dict[str, Any]) -> tuple[RawLog, list[Find
     samples, _, bad = mend_samples(imu.time, recorded)
     for column, values, wrong in zip(_COLUMNS, recorded.T, bad, strict=True):
         findings += _describe_bad(log, column, values, wrong)
-    facts["spike of force"], facts["spike of rate"] = (max(b.ratio for b in part) for part in (bad[:3], bad[3:]))  # fmt: skip
+    facts["spike of force"], facts["spike of rate"] = (max(b.ratio for b in columns) for columns in (bad[:3], bad[3:]))  # fmt: skip
     return log._replace(imu=imu._replace(force=samples[:, :3], rate=samples[:, 3:])), findings
 
 

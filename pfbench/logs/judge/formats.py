@@ -328,16 +328,16 @@ def find_format(file: Path, options: SourceOptions, role: str = TRAJECTORY) -> s
         "Convert it with a program of its maker to CSV, NMEA or RTKLIB .pos, or unpack it.",
     )
     start = FileStart(head, *read_head(file), role, bool(options.columns))
-    shown = next((name for name, item in FILE_FORMATS.items() if item.is_shown(start)), "")
+    by_content = next((name for name, item in FILE_FORMATS.items() if item.is_shown(start)), "")
     require(
-        shown or not _is_kitti(start.numbers),
+        by_content or not _is_kitti(start.numbers),
         file.name,
         "state times",
         "poses of KITTI, 12 numbers without a time",
         "Write a .csv with t from their times.txt, and pn, pe, pd from the position, columns 4, 8 and 12 of a pose.",
     )
     suffixes = {item.suffix: name for name, item in FILE_FORMATS.items() if item.suffix}
-    kind = shown or suffixes.get(file.suffix.lower(), "table" if start.names or role == "imu" else "")  # fmt: skip
+    kind = by_content or suffixes.get(file.suffix.lower(), "table" if start.names or role == "imu" else "")  # fmt: skip
     width = len(start.rows[0]) if start.rows else 0
     remedy = (
         "Insert a line with names, t,pn,pe,pd,..., or set NAME.format=table, tum, kf_gins or nmea."

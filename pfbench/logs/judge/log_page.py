@@ -98,7 +98,7 @@ def _describe(number: int, finding: Finding, folder: RecordedFolder, formats: Se
     drawings: list[dict[str, Any]] = []
     if finding.picture is not None:
         caption = f"{finding.check}: {finding.evidence}."
-        figure = FigureSpec(f"{number:02d}_{format_slug(finding.check)}", caption, partial(draw_curves, *finding.picture))  # fmt: skip
+        figure = FigureSpec(f"{number:02d}_{format_slug(finding.check)}", caption, partial(draw_labelled_curves, *finding.picture))  # fmt: skip
         drawings = writers.write_figures([figure], "finding", folder, formats)
     mending = yaml.safe_dump(
         json.loads(json.dumps({"scenario": finding.settings})), default_flow_style=None, width=100
@@ -114,7 +114,7 @@ def _describe(number: int, finding: Finding, folder: RecordedFolder, formats: Se
     ]  # fmt: skip
 
 
-def draw_curves(
+def draw_labelled_curves(
     xlabel: str, ylabel: str, curves: Sequence[tuple[Any, ...]], marks: Sequence[float] = (), *, is_map: bool = False
 ) -> Figure:  # fmt: skip
     """Draw curves, each with a label, horizontal and vertical values and perhaps a style, and marks; a map has equal scales."""

@@ -104,29 +104,29 @@ def _understand_names(
     Returns the rows, and a note on the names.
     """
     columns = [*map(str, rows)]
-    found = {c: _find_name(c, options.names) for c in columns if c not in ROLES[role]}
-    found = {column: name for column, name in found.items() if name in ROLES[role] and name not in rows}  # fmt: skip
-    targets = [*found.values()]
+    meanings = {c: _find_name(c, options.names) for c in columns if c not in ROLES[role]}
+    meanings = {column: name for column, name in meanings.items() if name in ROLES[role] and name not in rows}  # fmt: skip
+    targets = [*meanings.values()]
     double = next((name for name in targets if targets.count(name) > 1), "")
-    several = [column for column, name in found.items() if name == double]
+    several = [column for column, name in meanings.items() if name == double]
     require(
         not double, file.name, f"have one column for {double}", ", ".join(several),
         f"Name the right one: NAME.columns={double}:{''.join(several[:1])}",
     )  # fmt: skip
-    known = {*columns, *targets}
-    missing = [name for name in _NEEDED[role] if name not in known]
-    if role != "imu" and not (known >= {*GEODETIC} or known >= {*LOCAL}):
+    present = {*columns, *targets}
+    missing = [name for name in _NEEDED[role] if name not in present]
+    if role != "imu" and not (present >= {*GEODETIC} or present >= {*LOCAL}):
         missing.append(" ".join(GEODETIC))
     # a name is proposed for what it says alone: by order, gyro and force change places
-    guesses = {c: name for c in columns if c not in found and (name := _guess_name(c, missing))}
+    guesses = {c: name for c in columns if c not in meanings and (name := _guess_name(c, missing))}
     guesses = guesses or {"YOUR_COLUMN": "".join(missing[:1])}
     require(
         not missing, file.name, f"have the columns {', '.join(missing)}", ", ".join(columns),
         f"Name yours: NAME.columns={','.join(f'{name}:{c}' for c, name in guesses.items())}, in Python columns={guesses}.",
     )  # fmt: skip
-    _check_stated_units(file, replace(options, columns={name: column for column, name in found.items()}))  # fmt: skip
-    note = ", ".join(f"{column} is {name}" for column, name in found.items())
-    return rows.rename(columns=found), (note,) if note else ()
+    _check_stated_units(file, replace(options, columns={name: column for column, name in meanings.items()}))  # fmt: skip
+    note = ", ".join(f"{column} is {name}" for column, name in meanings.items())
+    return rows.rename(columns=meanings), (note,) if note else ()
 
 
 def _find_name(column: str, names: Mapping[str, str]) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.logs.judge.log_page import draw_curves
+from pfbench.logs.judge.log_page import draw_labelled_curves
 from pfbench.report import writers
 from pfbench.report.page_kit import Block, with_heading, write_page
 from pfbench.results.plotting import FigureSpec, format_slug
@@ -163,7 +163,9 @@ def _list_figures(estimate: TrackEstimate) -> list[FigureSpec]:
     ]  # fmt: skip
     return [
         FigureSpec(
-            name, caption, partial(draw_curves, xlabel, ylabel, curves, is_map=name == "map")
+            name,
+            caption,
+            partial(draw_labelled_curves, xlabel, ylabel, curves, is_map=name == "map"),
         )
         for name, caption, xlabel, ylabel, curves in panels
         if curves

@@ -31,7 +31,7 @@ from pfbench.nav.strapdown import rotate
 Tables = dict[str, LogTable]
 LogTables = tuple[LogTable, LogTable, LogTable | None]  # IMU, fixes and, if there is one, reference
 Vector = Sequence[float] | None
-Groups = Sequence[tuple[str, ...]]  # of columns
+ColumnGroups = Sequence[tuple[str, ...]]  # of columns
 _TABLES = ("imu", "gnss", "reference")
 _FORCE, _RATE, _ANGLES = ("fx", "fy", "fz"), ("wx", "wy", "wz"), ("roll", "pitch", "yaw")
 _POSITION, _VELOCITIES = ("pn", "pe", "pd"), (("vn", "ve", "vd"), ("vn_d", "ve_d", "vd_d"))
@@ -144,7 +144,7 @@ class LogCorrections:
             notes += cut
         return (tables["imu"], tables["gnss"], tables.get("reference")), tuple(notes)
 
-    def _list_changes(self, tables: Tables) -> Iterator[tuple[str, Groups, Any, str]]:
+    def _list_changes(self, tables: Tables) -> Iterator[tuple[str, ColumnGroups, Any, str]]:
         """Yield table, groups of columns, function of their numbers and note of the factors, axes, convention and biases."""
         for name, factors in (self.scale or {}).items():
             yield name, (tuple(factors),), lambda v, a=factors: v * [*a.values()], f"columns multiplied by {dict(factors)}"  # fmt: skip
