@@ -24,7 +24,7 @@ class SourceOptions:
         frame: Axes of a TUM file, "ned" or "enu".
         shift: Time added to the clock of the file, s.
         columns: Name in a CSV file by name of pfbench.
-        names: Names of pfbench by name in a table of an own log, beside those that are understood.
+        names: Names of pfbench by name in a table of an own log, which come before those that are understood.
         scale: Factor by name of pfbench, for a column in another unit; before `shift`.
         format: One of `FORMATS`; empty to find it from the content.
         sd: KF-GINS file of standard deviations, or its pattern; empty for none.

@@ -220,7 +220,7 @@ class LogSource:
         refused = next((finding.text for finding in findings if finding.level == REFUSE), "")
         remedy = "See all findings with pfbench inspect."
         require(not refused, "the log", "agree in itself", refused.removesuffix("."), remedy)
-        # fixes that the reference gives have no lever arm and no shift, and the reader notes the gaps that it bridges
+        # fixes of the reference do not have a lever arm or a shift, and the reader notes the gaps that it bridges
         silent = {"imu gap", *(_OF_FIXES if truth and gnss.name == truth.name else ())}
         diagnosed = (f"{f.check}: {f.text}" for f in findings if f.check not in silent)
         if truth and motion:
