@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pfbench.files.table_file import Array
 from pfbench.logs.doctor.axis_orders import BODY_ORDERS, name_axes
 from pfbench.logs.doctor.bad_samples import list_stretches
+from pfbench.logs.doctor.changes import describe_change_of
 from pfbench.logs.doctor.finding import (
     REFUSE,
     TELL,
@@ -241,11 +242,14 @@ def _check_slow(log: RawLog, at: Array, rest: Array, facts: dict[str, Any]) -> I
     i, largest = int(size.argmax()), max(limit_of("slow errors"), STANDARD_ERRORS * noise)
     facts["slow error of fixes [m]"] = float(size[i])
     if size[i] > largest:
-        start = float(at[0] + _BLOCK_S * np.flatnonzero(full)[i])
+        starts = at[0] + _BLOCK_S * np.flatnonzero(full)
+        start, axis = float(starts[i]), int(np.argmax(np.ptp(means, axis=0)))
+        is_short = (size > 0.5 * size[i]).sum() < 2
+        change = describe_change_of(np.append(starts, starts[-1] + _BLOCK_S), means[:, axis])
         yield Finding(
             "slow errors", WARN, float(size[i]), largest, "m",
             f"{log.names[1]}: the fixes are {size[i]:.1f} m off for {_BLOCK_S:g} s from t = {start:.1f}, beyond lever arm, "
-            "offset and shift",
+            f"offset and shift{'' if is_short else f': {_AXES[axis]} {change} m'}",
             "Nothing that was tried explains this: shift, turn, unit, axes, lever arm and clock",
             explanations=("reflections", "fixes that drift", f"a jump or another frame of {log.names[2]}"),
             picture=Picture("t [s]", "fix minus reference, horizontal [m]", (
