@@ -245,11 +245,11 @@ def _check_slow(log: RawLog, at: Array, rest: Array, facts: dict[str, Any]) -> I
         starts = at[0] + _BLOCK_S * np.flatnonzero(full)
         start, axis = float(starts[i]), int(np.argmax(np.ptp(means, axis=0)))
         is_short = (size > 0.5 * size[i]).sum() < 2
-        change = describe_change_of(np.append(starts, starts[-1] + _BLOCK_S), means[:, axis])
+        change = describe_change_of(np.append(starts, starts[-1] + _BLOCK_S), means[:, axis], "m")
         yield Finding(
             "slow errors", WARN, float(size[i]), largest, "m",
             f"{log.names[1]}: the fixes are {size[i]:.1f} m off for {_BLOCK_S:g} s from t = {start:.1f}, beyond lever arm, "
-            f"offset and shift{'' if is_short else f': {_AXES[axis]} {change} m'}",
+            f"offset and shift{'' if is_short else f': {_AXES[axis]} {change}'}",
             "Nothing that was tried explains this: shift, turn, unit, axes, lever arm and clock",
             explanations=("reflections", "fixes that drift", f"a jump or another frame of {log.names[2]}"),
             picture=Picture("t [s]", "fix minus reference, horizontal [m]", (
