@@ -60,7 +60,6 @@ from pfbench.logs.worlds.log_tables import (
     NavigationLog,
     ReferenceLog,
     check_changes,
-    check_increasing,
     check_seconds,
     convert_column,
     convert_columns,
@@ -69,7 +68,7 @@ from pfbench.logs.worlds.log_tables import (
     read_times,
     swap_frd_rfu,
 )
-from pfbench.logs.worlds.time_order import check_overlap
+from pfbench.logs.worlds.time_order import check_overlap, check_time_order
 
 _OF_FIXES = ("lever arm", "fix shift")
 _FORCE, _RATE, _ANGLES = ("fx", "fy", "fz"), ("wx", "wy", "wz"), ("roll", "pitch", "yaw")
@@ -277,7 +276,7 @@ def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
         notes += (
             f"{table.name}: {table.row(i)} repeats a time next to a double step. The time was set to the middle",
         )
-    check_increasing(table, time)
+    check_time_order(table.name, time, table.row)
     check_seconds(table, time, longest=0.5)
     (first, last, parts), i = find_longest(time), int(np.diff(time).argmax())
     require(
