@@ -16,7 +16,6 @@ from torch import Tensor
 from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Record
-from pfbench.files.table_file import Array
 from pfbench.files.track_files import format_gpx, format_kml
 from pfbench.filter.belief import StepInfo
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
@@ -24,12 +23,12 @@ from pfbench.filter.loop import run_filter
 from pfbench.filter.smoothing.gaussian_smoother import smooth
 from pfbench.job.config import compose
 from pfbench.job.plan import JobPlan, build_plan
-from pfbench.logs.worlds.log_tables import find_dataset, swap_frd_rfu
+from pfbench.logs.worlds.log_frames import place_of
+from pfbench.logs.worlds.log_tables import Array, find_dataset, swap_frd_rfu
 from pfbench.logs.worlds.user_log import AlignedLog
 from pfbench.nav import earth
 from pfbench.nav.attitude import dcm_from_quaternion, euler_from_dcm
 
-_DEGREE = np.pi / 180.0
 _SWAP = [1, 0, 2]  # deviations from East, North, Up to North, East, Down
 
 
@@ -123,10 +122,9 @@ class TrackEstimate:
             "local positions",
             "Set scenario.origin=[lat_deg,lon_deg,h_m] of pn = pe = pd = 0.",
         )
-        scale = np.array([_DEGREE, _DEGREE, 1.0])
-        at = torch.from_numpy(np.array(self.centre) * scale)
         enu = torch.from_numpy(np.ascontiguousarray(motion.state[:, 7:]))
-        return np.asarray(earth.from_local_enu(enu, at).numpy() / scale)
+        at = earth.from_local_enu(enu, place_of(self.centre or ()))
+        return np.asarray((at / place_of((1.0, 1.0, 1.0))).numpy())
 
     def table(self, motion: MotionEstimate) -> pd.DataFrame:
         """Return a track with the columns of a reference of an own log, and standard deviations.

@@ -158,7 +158,7 @@ def test_the_command_writes_page_tables_and_maps(
     ("words", "message"),
     [
         ((), "estimate must have one folder, got none"),
-        (("none_here",), "the log must be a folder with imu and gnss, got none_here"),
+        (("none_here",), "the log must be a folder with imu and gnss, got /"),
         (
             (".", "filter="),
             "filter must be a list of distinct entries separated by commas, got ''. Default: filter=ekf,ukf",

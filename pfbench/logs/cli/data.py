@@ -74,15 +74,8 @@ def list_data(words: Sequence[str]) -> None:
     if not folder:
         print("\nCheck a folder: pfbench data FOLDER. Use it: export PFBENCH_DATA=FOLDER")
         return
-    _refuse_damage(list(states.values()), folder)
-    count = sum(state.word == "complete" for state in states.values())
-    print(f"\n{count} of {len(states)} data sets are complete in {folder}. Use them: export PFBENCH_DATA={folder}")  # fmt: skip
-
-
-def _refuse_damage(states: Sequence[SetState], folder: str) -> None:
-    """Raise ValueError for data sets with files that are missing or differ."""
-    faults = [f"{state.name}/{file} is missing" for state in states for file in state.missing]
-    faults += [f"{state.name}/{file} differs" for state in states for file in state.changed]
+    faults = [f"{s.name}/{file} is missing" for s in states.values() for file in s.missing]
+    faults += [f"{s.name}/{file} differs" for s in states.values() for file in s.changed]
     require(
         not faults,
         "data sets",
@@ -90,6 +83,8 @@ def _refuse_damage(states: Sequence[SetState], folder: str) -> None:
         f"{folder} where {'; '.join(faults)}",
         "Copy these files again, or remove the folder of the data set.",
     )
+    count = sum(state.word == "complete" for state in states.values())
+    print(f"\n{count} of {len(states)} data sets are complete in {folder}. Use them: export PFBENCH_DATA={folder}")  # fmt: skip
 
 
 COMMAND = Command(

@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from pfbench.cli.command import Command, Option, read_list
-from pfbench.core.parameter_checks import require
+from pfbench.logs.cli.inspect import split_folder
 
 
 def estimate_log(words: Sequence[str], filter: list[str], reports_dir: str) -> None:  # noqa: A002
     """Estimate the track of a log, and write its page and files."""
-    folders = [word for word in words if "=" not in word]
-    got = " ".join(folders) or "none"
-    require(len(folders) == 1, "estimate", "have one folder", got, "Use: pfbench estimate my_log")
+    folder, others = split_folder(words, "estimate")
     from pfbench.job import estimate_track
     from pfbench.logs.judge.track_page import describe_track, write_track_page
 
-    estimate = estimate_track(folders[0], filter, [word for word in words if "=" in word])
+    estimate = estimate_track(folder, filter, others)
     page = write_track_page(estimate, reports_dir)
     print("\n".join(describe_track(estimate)))
     print(f"report: {page.resolve()}")

@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pfbench.cli.command import Command
+from pfbench.cli.messages import require_choice
 from pfbench.core.parameter_checks import require
 from pfbench.logs.cli.judge import convert_numbers
 
 _KEYS = ("imu", "gnss", "reference", "path", "sensor", "fix_codes", "origin", "reports_dir")
+_SCENARIO = (
+    "files",
+    "origin",
+    "fix_codes",
+)  # keys of the scenario that read the log in the same way
+_ADVICE = "See pfbench inspect --help."
 _WARNED, _REFUSED = 3, 2
 
 
 def inspect_folder(words: Sequence[str]) -> None:
     """Inspect a log, print its findings and write the page."""
-    folder, values = _split_folder(words)
+    folder, others = split_folder([w.removeprefix("scenario.") for w in words], "inspect")
+    values: dict[str, str] = {}
+    for key, _, value in (word.partition("=") for word in others):
+        require_choice("key", key, _KEYS, _ADVICE)
+        require(value and key not in values, "words", "be FOLDER and key=value, each key once", key, _ADVICE)  # fmt: skip
+        values[key] = value
+    require(folder.is_dir(), folder, "be a folder with imu, gnss and, if there is one, reference", "none", "Check the path.")  # fmt: skip
     from pfbench.logs.doctor.thresholds import THRESHOLDS
     from pfbench.logs.judge.log_page import describe_run, write_log_page
     from pfbench.scenario import LogFiles, inspect_log
@@ -31,7 +43,7 @@ def inspect_folder(words: Sequence[str]) -> None:
         "name": folder.name,
         "root": folder.parent,
         "folder": folder.name,
-        "words": _describe_words(names, options),
+        "words": {k: v for k, v in {"files": names, **options}.items() if v and k in _SCENARIO},
     }
     page = write_log_page(diagnosis, source, values.get("reports_dir", "reports"))
     for finding in diagnosis.findings:
@@ -49,56 +61,31 @@ def inspect_folder(words: Sequence[str]) -> None:
         raise SystemExit(_REFUSED if counts["refuse"] else _WARNED)
 
 
-def _split_folder(words: Sequence[str]) -> tuple[Path, dict[str, str]]:
-    """Return the folder and the values by key."""
+def split_folder(words: Sequence[str], command: str) -> tuple[Path, list[str]]:
+    """Return the one word that is a folder, and the others."""
     folders = [word for word in words if "=" not in word]
-    values: dict[str, str] = {}
-    for word in words:
-        key, equals, value = word.removeprefix("scenario.").partition("=")  # as remedies name them
-        if not equals:
-            continue
-        require(
-            key in _KEYS and value and key not in values,
-            "words",
-            f"be FOLDER and key=value with the keys {', '.join(_KEYS)}, each once",
-            word,
-            "See pfbench inspect --help.",
-        )
-        values[key] = value
-    got = " ".join(folders) or "none"
-    require(len(folders) == 1, "inspect", "have one folder", got, "Use: pfbench inspect my_log")
-    folder = Path(folders[0])
-    require(
-        folder.is_dir(),
-        folder,
-        "be a folder with imu, gnss and, if there is one, reference",
-        "none",
-        "Check the path.",
-    )
-    return folder.resolve(), values
+    require(len(folders) == 1, command, "have one folder", " ".join(folders) or "none", f"Use: pfbench {command} my_log")  # fmt: skip
+    return Path(folders[0]).resolve(), [word for word in words if "=" in word]
 
 
 def _convert_options(values: Mapping[str, str]) -> dict[str, Any]:
     """Convert numbers and lists."""
-    options: dict[str, Any] = {}
-    for key, name in (("path", "path"), ("sensor", "imu")):
-        if key in values:
-            options[name] = int(convert_numbers(key, values[key], 0.0))
-    if "origin" in values:
-        options["origin"] = list(convert_numbers("origin", values["origin"], ()))
-    codes = values.get("fix_codes", "")
-    if codes.startswith("["):
-        options["fix_codes"] = [int(code) for code in convert_numbers("fix_codes", codes, ())]
-    elif codes:
-        options["fix_codes"] = codes
+    numbers = {
+        "path": ("path", 0.0, int),
+        "sensor": ("imu", 0.0, int),
+        "origin": ("origin", (), list),
+    }
+    options = {
+        name: kind(convert_numbers(key, values[key], default))
+        for key, (name, default, kind) in numbers.items()
+        if key in values
+    }
+    if codes := values.get("fix_codes", ""):
+        is_list = codes.startswith("[")
+        options["fix_codes"] = (
+            [int(c) for c in convert_numbers("fix_codes", codes, ())] if is_list else codes
+        )
     return options
-
-
-def _describe_words(names: Mapping[str, str], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keys of the scenario that read the log in the same way."""
-    keys = {key: options[key] for key in ("origin", "fix_codes") if key in options}
-    files = {"files": json.loads(json.dumps(names))} if names else {}
-    return {**files, **keys}
 
 
 COMMAND = Command(

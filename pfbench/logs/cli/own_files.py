@@ -8,6 +8,7 @@ from typing import Any
 
 from pfbench.cli.command import Command
 from pfbench.core.parameter_checks import require
+from pfbench.logs.cli.inspect import inspect_folder, split_folder
 from pfbench.logs.cli.judge import convert_source
 
 _TABLES = ("imu", "gnss", "reference")
@@ -24,7 +25,6 @@ def import_log(words: Sequence[str]) -> None:
         "one that exists",
         "Choose another name, or remove it.",
     )
-    from pfbench.logs.cli.inspect import inspect_folder
     from pfbench.logs.judge.judge_options import SourceOptions, name_program
     from pfbench.logs.judge.own_log import import_table, write_log
 
@@ -43,15 +43,14 @@ def _split_words(
     words: Sequence[str],
 ) -> tuple[Path, dict[str, str], dict[str, dict[str, Any]], list[str]]:
     """Return the folder, the files, the options of each table, and the words of the inspection."""
+    folder, pairs = split_folder(words, "import")
     files: dict[str, str] = {}
     options: dict[str, dict[str, Any]] = {}
-    folders, others = [], []
-    for word in words:
-        key, equals, value = word.partition("=")
+    others = []
+    for word in pairs:
+        key, _, value = word.partition("=")
         role, _, name = key.partition(".")
-        if not equals:
-            folders.append(word)
-        elif key in _TABLES:
+        if key in _TABLES:
             files[key] = value
         elif key in ("reports_dir", "fix_codes", "origin"):
             others.append(word)
@@ -66,13 +65,10 @@ def _split_words(
             options.setdefault(role, {})[name] = convert_source(key, name, value)
     missing = [role for role in _TABLES[:2] if role not in files]
     require(
-        len(folders) == 1 and not missing,
-        "import",
-        "have a new folder and the files of imu and gnss",
-        f"no {', '.join(missing) or 'folder'}",
+        not missing, "import", "receive the files of imu and gnss", f"no {', '.join(missing)}",
         "Use: pfbench import my_log imu=a.csv gnss=b.csv reference=c.csv",
-    )
-    return Path(folders[0]), files, options, others
+    )  # fmt: skip
+    return folder, files, options, others
 
 
 COMMAND = Command(

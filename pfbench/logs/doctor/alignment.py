@@ -22,7 +22,7 @@ from pfbench.logs.doctor.finding import (
 )
 from pfbench.logs.doctor.force_windows import fit_force, integrate_force
 from pfbench.logs.doctor.raw_log import RawLog, dcm_of, interpolate_columns
-from pfbench.logs.doctor.thresholds import REFUSED_OFFSET, limit_of
+from pfbench.logs.doctor.thresholds import REFUSED_OFFSET, STANDARD_ERRORS, limit_of
 from pfbench.logs.doctor.turn_search import (
     FEWEST_TURNS,
     TURN_WINDOW,
@@ -308,7 +308,8 @@ def _describe_offset(
     spread = float(np.ptp(pieces[:, 1])) if len(pieces) > 1 else 0.0
     facts["imu offset spread [s]"] = spread
     half = 0.5 * float(np.median(np.diff(log.imu.time)))  # of a sample: slower samples show less
-    name, moves = log.names[0], spread > max(limit_of("imu clock drift"), half)
+    unclear = STANDARD_ERRORS * float(np.median(pieces[:, 2])) if len(pieces) else np.inf
+    name, moves = log.names[0], spread > max(limit_of("imu clock drift"), half, unclear)
     step = _find_step(log, search, turns, offset) if moves else None
     shift: Any = round(offset, 4)
     if moves:
@@ -341,7 +342,7 @@ def _describe_offset(
 
 
 def _offsets_of_pieces(search: TurnSearch, turns: Array, offset: float) -> Array:
-    """Return middle and offset of the pieces of the log that turn enough, [q, 2]."""
+    """Return middle, offset and its standard error of the pieces of the log that turn enough, [q, 3]."""
     first, last = search.nodes[0], search.nodes[-1]
     count = int(np.clip((last - first) / _PIECE, _FEWEST_PIECES, _MOST_PIECES))
     edges = np.linspace(first, last, count + 1)
@@ -355,8 +356,8 @@ def _offsets_of_pieces(search: TurnSearch, turns: Array, offset: float) -> Array
             continue
         lag, score = search.find(turns, offset, stretch)
         if score > _CERTAIN:
-            pieces.append((0.5 * (a + b), lag))
-    return np.array(pieces).reshape(-1, 2)
+            pieces.append((0.5 * (a + b), lag, search.find_error(turns, lag, stretch)))
+    return np.array(pieces).reshape(-1, 3)
 
 
 def _find_step(log: RawLog, search: TurnSearch, turns: Array, offset: float) -> list[list[float]] | None:  # fmt: skip

@@ -82,15 +82,37 @@ def _find_spikes(values: Array) -> tuple[NDArray[np.intp], float]:
     return np.flatnonzero(is_spike) + 1, float(ratio.max())
 
 
+def mend_samples(time: Array, samples: Array) -> tuple[Array, NDArray[np.bool_], list[BadSamples]]:
+    """Replace rows with a wrong sample by a line between their neighbours.
+
+    Args:
+        time: Times, s, [n].
+        samples: Force and rate, [n, 6].
+
+    Returns:
+        Samples, mask of the rows, [n], and the wrong samples of each column.
+    """
+    bad = [find_bad_samples(column, k < 3) for k, column in enumerate(samples.T)]
+    is_bad = np.zeros(len(time), bool)
+    is_bad[np.concatenate([rows for column in bad for rows in (column.absurd, column.spikes)])] = (
+        True
+    )
+    if is_bad.any() and not is_bad.all():
+        keep = ~is_bad
+        samples = np.stack([np.interp(time, time[keep], column[keep]) for column in samples.T], -1)
+    return samples, is_bad, bad
+
+
+def list_stretches(mask: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Return the first row of each stretch of a mask [n], and the row after its last, [q, 2]."""
+    return np.flatnonzero(np.diff(np.r_[False, mask, False].astype(int))).reshape(-1, 2)
+
+
 def find_stuck(samples: Array) -> tuple[int, int]:
     """Return the first and the last row of the longest stretch of equal samples. Shapes: samples [n, k]."""
-    is_equal = (np.diff(samples, axis=0) == 0.0).all(1)
-    edges = np.flatnonzero(np.diff(np.r_[False, is_equal, False].astype(int)))
-    starts, ends = edges[::2], edges[1::2]
-    if not len(starts):
-        return 0, 0
-    i = int(np.argmax(ends - starts))
-    return int(starts[i]), int(ends[i])
+    stretches = list_stretches((np.diff(samples, axis=0) == 0.0).all(1))
+    first, last = max(stretches.tolist(), key=lambda rows: rows[1] - rows[0], default=(0, 0))
+    return first, last
 
 
 def check_samples(log: RawLog, facts: dict[str, Any]) -> tuple[RawLog, list[Finding]]:
@@ -99,18 +121,11 @@ def check_samples(log: RawLog, facts: dict[str, Any]) -> tuple[RawLog, list[Find
     Returns the log, and findings.
     """
     imu, findings = log.imu, list(_check_stuck(log, facts))
-    samples = np.hstack([imu.force, imu.rate])
-    is_bad, ratios = np.zeros(len(imu.time), bool), {"force": 0.0, "rate": 0.0}
-    for k, column in enumerate(_COLUMNS):
-        bad = find_bad_samples(samples[:, k], k < 3)
-        kind = "force" if k < 3 else "rate"
-        ratios[kind] = max(ratios[kind], bad.ratio)
-        findings += _describe_bad(log, column, samples[:, k], bad)
-        is_bad[bad.absurd] = is_bad[bad.spikes] = True
-    facts["spike of force"], facts["spike of rate"] = ratios["force"], ratios["rate"]
-    keep = np.flatnonzero(~is_bad)
-    if is_bad.any() and keep.size:
-        samples = np.stack([np.interp(imu.time, imu.time[keep], s[keep]) for s in samples.T], -1)
+    recorded = np.hstack([imu.force, imu.rate])
+    samples, _, bad = mend_samples(imu.time, recorded)
+    for column, values, wrong in zip(_COLUMNS, recorded.T, bad, strict=True):
+        findings += _describe_bad(log, column, values, wrong)
+    facts["spike of force"], facts["spike of rate"] = (max(b.ratio for b in columns) for columns in (bad[:3], bad[3:]))  # fmt: skip
     return log._replace(imu=imu._replace(force=samples[:, :3], rate=samples[:, 3:])), findings
 
 

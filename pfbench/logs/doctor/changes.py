@@ -13,13 +13,16 @@ _OF_MEDIAN = (
 )  # standard error of a median of normal values, in median deviations over sqrt(n)
 
 
-def find_change(time: Array, values: Array, fewest: int) -> tuple[int, float, str] | None:
+def find_change(
+    time: Array, values: Array, fewest: int, unit: str
+) -> tuple[int, float, str] | None:
     """Find the column whose medians of blocks differ most; None within five standard errors, or with few values.
 
     Args:
         time: Times, s, [n].
         values: Residuals, [n, k].
         fewest: Values of a block.
+        unit: Unit of the residuals.
 
     Returns:
         Column, difference between its extreme blocks, and how it changes and when.
@@ -35,10 +38,10 @@ def find_change(time: Array, values: Array, fewest: int) -> tuple[int, float, st
     if size < STANDARD_ERRORS * error[axis]:
         return None
     borders = np.array([time[0], *(time[rows[-1]] for rows in blocks)])
-    return axis, size, describe_change_of(borders, medians[:, axis])
+    return axis, size, describe_change_of(borders, medians[:, axis], unit)
 
 
-def describe_change_of(borders: Array, levels: Array) -> str:
+def describe_change_of(borders: Array, levels: Array, unit: str) -> str:
     """Describe the levels of blocks as a drift or as a jump, whichever leaves less.
 
     Shapes: borders [n + 1], levels [n].
@@ -47,7 +50,6 @@ def describe_change_of(borders: Array, levels: Array) -> str:
     rests = [levels[:k].var() * k + levels[k:].var() * (len(levels) - k) for k in steps]
     best, line = int(np.argmin(rests)) + 1, np.polyval(np.polyfit(index, levels, 1), index)
     if len(levels) > 2 and np.square(levels - line).sum() < min(rests):
-        return f"drifts by {line[-1] - line[0]:+.3g}"
-    return (
-        f"jumps by {levels[best:].mean() - levels[:best].mean():+.3g} near t = {borders[best]:.1f}"
-    )
+        return f"drifts by {line[-1] - line[0]:+.3g} {unit}"
+    size = levels[best:].mean() - levels[:best].mean()
+    return f"jumps by {size:+.3g} {unit} near t = {borders[best]:.1f}"

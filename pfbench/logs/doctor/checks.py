@@ -33,8 +33,8 @@ def run_checks(log: RawLog) -> tuple[list[Finding], dict[str, Any], RawLog]:
     facts: dict[str, Any] = {}
     findings = [*check_clocks(log, facts), *check_repeated_columns(log)]
     log = sort_tables(log)
-    log, more = check_rows(log)
-    findings += more
+    reference, more = check_rows(log.names[2], log.reference, log.describe_row[2])
+    log, findings = log._replace(reference=reference), [*findings, *more]
     if len(log.imu.time) < FEWEST_ROWS or 0 < len(log.reference.time) < FEWEST_ROWS:
         return findings, facts, log
     log, more = check_samples(log, facts)

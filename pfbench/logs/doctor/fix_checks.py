@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from pfbench.files.table_file import Array
 from pfbench.logs.doctor.axis_orders import BODY_ORDERS, name_axes
+from pfbench.logs.doctor.bad_samples import list_stretches
+from pfbench.logs.doctor.changes import describe_change_of
 from pfbench.logs.doctor.finding import (
     REFUSE,
     TELL,
@@ -240,11 +242,14 @@ def _check_slow(log: RawLog, at: Array, rest: Array, facts: dict[str, Any]) -> I
     i, largest = int(size.argmax()), max(limit_of("slow errors"), STANDARD_ERRORS * noise)
     facts["slow error of fixes [m]"] = float(size[i])
     if size[i] > largest:
-        start = float(at[0] + _BLOCK_S * np.flatnonzero(full)[i])
+        starts = at[0] + _BLOCK_S * np.flatnonzero(full)
+        start, axis = float(starts[i]), int(np.argmax(np.ptp(means, axis=0)))
+        is_short = (size > 0.5 * size[i]).sum() < 2
+        change = describe_change_of(np.append(starts, starts[-1] + _BLOCK_S), means[:, axis], "m")
         yield Finding(
             "slow errors", WARN, float(size[i]), largest, "m",
             f"{log.names[1]}: the fixes are {size[i]:.1f} m off for {_BLOCK_S:g} s from t = {start:.1f}, beyond lever arm, "
-            "offset and shift",
+            f"offset and shift{'' if is_short else f': {_AXES[axis]} {change}'}",
             "Nothing that was tried explains this: shift, turn, unit, axes, lever arm and clock",
             explanations=("reflections", "fixes that drift", f"a jump or another frame of {log.names[2]}"),
             picture=Picture("t [s]", "fix minus reference, horizontal [m]", (
@@ -370,9 +375,8 @@ def find_frozen(position: Array, motion: Array) -> _Mask:
     Returns:
         Mask of repeated fixes, [m].
     """
-    is_equal = (np.diff(position, axis=0) == 0.0).all(1)
-    edges = np.flatnonzero(np.diff(np.r_[False, is_equal, False].astype(int)))
-    runs = [(first, last, motion[first:last].sum()) for first, last in zip(edges[::2], edges[1::2], strict=True)]  # fmt: skip
+    stretches = list_stretches((np.diff(position, axis=0) == 0.0).all(1))
+    runs = [(first, last, motion[first:last].sum()) for first, last in stretches.tolist()]
     largest = max((distance for _, _, distance in runs), default=0.0)
     frozen = np.zeros(len(position), bool)
     for first, last, distance in runs if largest > limit_of("frozen fixes") else ():

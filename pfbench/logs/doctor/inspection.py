@@ -59,7 +59,9 @@ def inspect_log(
             break
         settings = more
     if settings and not _is_mended(findings, remaining, rests):
-        findings, settings = withhold_remedies(findings), {}
+        withheld = "Nothing that was tried explains the log as a whole; tried: {}"
+        findings = [f._replace(settings={}, remedy=withheld.format(dict(f.settings))) if f.settings else f for f in findings]  # fmt: skip
+        settings = {}
     return LogDiagnosis(tuple(findings), facts, settings, tuple(checks))
 
 
@@ -71,15 +73,6 @@ def _is_mended(
         return False
     unmended = {finding.check for finding in findings if not finding.settings} - _SPOILS
     return all(f.level == TELL or (f.level != REFUSE and f.check in unmended) for f in remaining)
-
-
-def withhold_remedies(findings: Sequence[Finding]) -> list[Finding]:
-    """Take the settings from findings, and say that they were tried: together they do not mend the log."""
-    return [
-        f._replace(settings={}, remedy=f"Nothing that was tried explains the log as a whole; tried: {dict(f.settings)}")
-        if f.settings else f
-        for f in findings
-    ]  # fmt: skip
 
 
 def _inspect(source: LogSource, tables: LogTables) -> tuple[list[Finding], dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from pfbench.files.table_file import Array
 from pfbench.logs.doctor.axis_orders import BODY_ORDERS, name_axes
 from pfbench.logs.doctor.finding import REFUSE, WARN, Finding, Picture, thin_curve
-from pfbench.logs.doctor.raw_log import RawLog, RawReference, dcm_of, take_rows
+from pfbench.logs.doctor.raw_log import RawReference, dcm_of, take_rows
 from pfbench.logs.doctor.thresholds import limit_of
 from pfbench.logs.doctor.turn_search import integrate, select_nodes, turns_between
 from pfbench.logs.units import find_units
@@ -32,21 +33,20 @@ _LEAST_JUMP, _LEAST_TURN, _LEAST_KICK, _IMPOSSIBLE = (
     1.5,
 )  # m, rad and m/s of a wrong row, rad of an impossible one
 _ALONE, _USUAL = 4.0, 98.0  # times the jump that so many percent of the rows do not reach
-_RETURN, _MOST_WRONG = (
-    0.5,
-    0.01,
-)  # part of a jump that remains after the next row, and share of rows: more are another fault
+# part of a jump that remains after the next row, share of rows (more are another fault), and rows that show a jump
+_RETURN, _MOST_WRONG, _FEWEST_ROWS = 0.5, 0.01, 3
 
 
-def drop_wrong_rows(
-    reference: RawReference,
-) -> tuple[RawReference, list[tuple[tuple[str, str], float, int]]]:
-    """Leave out single rows that jump there and back, which spoil sums over all rows.
+def check_rows(
+    name: str, reference: RawReference, describe_row: Callable[[int], str]
+) -> tuple[RawReference, list[Finding]]:
+    """Name single rows whose attitude or velocity jumps there and back, and leave them out, since they spoil sums.
 
-    Returns the reference, and quantity, size and row of the largest jump of attitude and velocity; readers name those of
-    positions, with their limits.
+    Rows whose position jumps are left out, too; readers name them, with their limits.
     """
     time, velocity = reference.time, reference.velocity
+    if len(time) < _FEWEST_ROWS:
+        return reference, []
     difference = np.diff(reference.position, axis=0) - np.diff(integrate(time, velocity), axis=0)
     turned = turns_between(dcm_of(reference.angles), np.arange(len(time)))
     changes = {
@@ -54,35 +54,24 @@ def drop_wrong_rows(
         ("attitude", "rad"): (turned, _LEAST_TURN),
         ("velocity", "m/s"): (np.diff(velocity, axis=0), _LEAST_KICK),
     }
-    wrong, largest = np.zeros(len(time), bool), []
-    for quantity, (change, least) in changes.items():
+    wrong, findings = np.zeros(len(time), bool), []
+    for (quantity, unit), (change, least) in changes.items():
         size = np.linalg.norm(change, axis=1)
         jump = np.minimum(size[1:], size[:-1])
         rest = np.linalg.norm(change[1:] + change[:-1], axis=1)
         least = max(least, _ALONE * float(np.percentile(jump, _USUAL)))  # also in another unit
         jump[(jump <= least) | (rest >= _RETURN * jump)] = 0.0
         wrong[1:-1] |= jump > 0.0
-        if jump.any() and quantity[-1] != "m":
-            largest.append((quantity, float(jump.max()), int(jump.argmax()) + 1))
-    if wrong.mean() >= _MOST_WRONG:
+        largest, row = float(jump.max()), describe_row(int(reference.rows[jump.argmax() + 1]))
+        if largest and unit != "m":
+            findings.append(Finding(
+                "reference rows", REFUSE if unit == "rad" and largest > _IMPOSSIBLE else WARN, largest, 0.0, unit,
+                f"{name}: the {quantity} jumps by {largest:.3g} {unit} there and back in {row}",
+                "Correct or remove this row",
+            ))  # fmt: skip
+    if wrong.sum() > max(1.0, _MOST_WRONG * len(time)):
         return reference, []
-    return take_rows(reference, ~wrong), largest
-
-
-def check_rows(log: RawLog) -> tuple[RawLog, list[Finding]]:
-    """Name single rows of the reference whose attitude or velocity jumps there and back, and leave them out."""
-    reference, largest = (
-        drop_wrong_rows(log.reference) if len(log.reference.time) > 2 else (log.reference, [])
-    )
-    findings = []
-    for (name, unit), size, row in largest:
-        level = REFUSE if (name, size > _IMPOSSIBLE) == ("attitude", True) else WARN
-        findings.append(Finding(
-            "reference rows", level, size, 0.0, unit,
-            f"{log.names[2]}: the {name} jumps by {size:.3g} {unit} there and back in {log.row(2, row)}",
-            "Correct or remove this row",
-        ))  # fmt: skip
-    return log._replace(reference=reference), findings
+    return take_rows(reference, ~wrong), findings
 
 
 def check_reference(

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from pfbench.files.table_file import Array
+from pfbench.logs.doctor.bad_samples import list_stretches
 from pfbench.logs.doctor.raw_log import RawImu, RawLog, RawReference
-from pfbench.logs.worlds.log_tables import ImuLog, ReferenceLog
+from pfbench.logs.worlds.log_tables import Array, ImuLog, ReferenceLog
 
 _BLOCK = 0.5  # s; mean values that show rest
 _QUIET_SPEED, _QUIET_RATE, _LEAST_STANDING = 0.15, 0.03, 8.0  # m/s, rad/s, s
@@ -46,14 +46,10 @@ def find_standing(imu: RawImu | ImuLog, reference: RawReference | ReferenceLog) 
     )  # fmt: skip
     turning = np.linalg.norm(rate - np.median(rate, 0), axis=1)
     quiet = (speed < _QUIET_SPEED) & (turning < _QUIET_RATE)
-    edges = np.flatnonzero(np.diff(np.r_[False, quiet, False].astype(int)))
-    if not len(edges):
-        return None
-    lengths = edges[1::2] - edges[::2]
-    i = int(lengths.argmax())
-    if lengths[i] * _BLOCK < _LEAST_STANDING:
-        return None
-    return slice(int(edges[2 * i]) * size, int(edges[2 * i + 1]) * size)
+    stretches = list_stretches(quiet).tolist()
+    first, last = max(stretches, key=lambda blocks: blocks[1] - blocks[0], default=(0, 0))
+    is_long = (last - first) * _BLOCK >= _LEAST_STANDING
+    return slice(first * size, last * size) if is_long else None
 
 
 def allan_deviation(values: Array, rate: float) -> Array:

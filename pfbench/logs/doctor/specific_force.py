@@ -214,7 +214,7 @@ def _find_heading(state: ForceState, facts: dict[str, Any]) -> tuple[Finding, Ra
     ):
         return None
     change = _find_heading_change(turned, fit)
-    moves = f", and {change[2]} deg" if change else ""
+    moves = f", and {change[2]}" if change else ""
     finding = Finding(
         "heading", WARN if change else REFUSE, degrees, limit_of("mounting"), "deg",
         f"{log.names[2]}: yaw is {-degrees:.1f} deg off{moves}: it turns as the gyroscope does, and the force moves in another direction",
@@ -234,6 +234,7 @@ def _find_heading_change(windows: ForceWindows, fit: ForceFit) -> tuple[int, flo
         windows.time[used],
         np.rad2deg(np.angle(predicted * expected.conj()))[used, None],
         _FEWEST_FORCE,
+        "deg",
     )
     return change if change and change[1] > limit_of("heading") else None
 
@@ -397,7 +398,7 @@ def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Fi
     if change:
         yield Finding(
             "accelerometer bias drift", WARN, change[1], limit_of("accelerometer bias drift"), "m/s^2",
-            f"{name}: the bias of f{'xyz'[change[0]]} {change[2]} m/s^2",
+            f"{name}: the bias of f{'xyz'[change[0]]} {change[2]}",
             "Record again, or use the part without the change: a correction is one number for the whole log",
             explanations=("a sensor that warms up or was hit", "a saturated axis", "an attitude that changes"),
             picture=_force_picture(windows),
@@ -438,7 +439,7 @@ def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Fi
 def _find_force_change(windows: ForceWindows, fit: ForceFit) -> tuple[int, float, str] | None:
     """Find a change of the bias of the force that clean logs do not show."""
     body = np.einsum("nji,nj->ni", windows.rotation, fit.residual)
-    change = find_change(windows.time, -body, _FEWEST_FORCE)
+    change = find_change(windows.time, -body, _FEWEST_FORCE, "m/s^2")
     return change if change and change[1] > limit_of("accelerometer bias drift") else None
 
 
@@ -468,12 +469,12 @@ def _check_rate_errors(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Fi
         "t [s]", f"rate of imu minus reference about {'xyz'[axis]} [deg/s]",
         (thin_curve("difference", time, rates[:, axis]),),
     )  # fmt: skip
-    change = find_change(time, rates, _FEWEST_RATE)
+    change = find_change(time, rates, _FEWEST_RATE, "deg/s")
     facts["change of the gyro bias [deg/s]"] = round(change[1], 3) if change else 0.0
     if change and change[1] > limit_of("gyro bias drift"):
         yield Finding(
             "gyro bias drift", WARN, change[1], limit_of("gyro bias drift"), "deg/s",
-            f"{name}: the bias of w{'xyz'[change[0]]} {change[2]} deg/s",
+            f"{name}: the bias of w{'xyz'[change[0]]} {change[2]}",
             "Let the sensor warm up, or record in shorter parts: a correction of the bias is one number for the whole log",
             explanations=("a sensor that warms up", "a reference whose attitude drifts"),
             picture=picture._replace(ylabel=f"rate of imu minus reference about {'xyz'[change[0]]} [deg/s]",

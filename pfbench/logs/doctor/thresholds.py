@@ -37,7 +37,7 @@ THRESHOLDS = {
     "stuck samples": Threshold(0.1, "s", 0.0, 0.010),
     "dead axis": Threshold(5.0, "s", 0.0, 0.32),
     "saturated axis": Threshold(10.0, "samples", 1.0, 2.0),
-    "spikes": Threshold(29.0, "times the level", 5.1, 24.1),
+    "spikes": Threshold(25.0, "times the level", 5.1, 24.1),
     "unit of force": Threshold(2.0, "times gravity", 1.0, 1.3),
     "common motion": Threshold(0.5, "score", 1.0, 0.976),
     "imu clock": Threshold(0.02, "s", 0.003, 0.011),

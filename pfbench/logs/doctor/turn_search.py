@@ -97,6 +97,13 @@ class TurnSearch:
             return 0.0
         return float(np.linalg.svd(true.T @ measured, compute_uv=False).sum()) / size
 
+    def find_error(self, turns: Array, offset: float, stretch: _Mask | None = None) -> float:
+        """Return the standard error of an offset, s, by the bend of the scores around it; infinite without one."""
+        pair = self.pairs(turns, offset, stretch)
+        before, score, after = (self.score(turns, offset + a, stretch) for a in (-0.02, 0.0, 0.02))
+        bend = (2.0 * score - before - after) / 0.02**2
+        return float(np.sqrt((1.0 - score**2) / (score * len(pair[0]) * bend))) if pair and bend > 0.0 else np.inf  # fmt: skip
+
     def find(self, turns: Array, around: float | None = None, stretch: _Mask | None = None, reach: float = 0.6) -> tuple[float, float]:  # fmt: skip
         """Find the offset of the largest score.
 

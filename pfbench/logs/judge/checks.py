@@ -32,7 +32,7 @@ from pfbench.logs.judge.trajectory_table import (
     VELOCITY_COLUMNS,
     TrajectoryTable,
 )
-from pfbench.logs.judge.unit_checks import find_angle_factor, settle
+from pfbench.logs.judge.unit_checks import check_consistent_units, find_angle_factor, settle
 from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, QUANTITIES
 from pfbench.logs.units import UNIT_FACTORS
 from pfbench.stats.error_measures import Array
@@ -64,11 +64,16 @@ _COMPARED = (*LOCAL, GEODETIC[2], *GEODETIC[:2], *VELOCITY_COLUMNS, *ATTITUDE_CO
 
 def check_run(
     table: TrajectoryTable, reference: ReferenceTrack, align: str, applied: float
-) -> TrajectoryTable:
-    """Check a trajectory against the reference; return it with notes."""
+) -> tuple[TrajectoryTable, float]:
+    """Check a trajectory against the reference and by itself; return it with its notes, and its clock offset, s."""
     settle(table, _check_common_time(table, reference, applied))
     table = settle(table, _check_units(table, reference))
-    return settle(table, _check_place(table, reference) if align == "none" else ())
+    table = settle(table, _check_place(table, reference) if align == "none" else ())
+    table = check_consistent_units(table)
+    if align == "yaw":
+        return table, np.nan
+    offset = check_clock(table, reference, applied)
+    return check_frame_of(check_axes(table, reference), reference), offset
 
 
 # --------------------------------------------------------------------------------------------------

@@ -95,24 +95,6 @@ def _run_table(file: Path, result: JobResult, places: list[int], run: int) -> Tr
 
 ONE = "recording"  # name of the sequence of a pattern without {sequence}
 _FIELDS = {"sequence": r"(?P<sequence>[^/]+?)", "run": r"(?P<run>[^/]+?)"}
-_READERS: dict[str, dict[str, Callable[[Path, SourceOptions], list[TrajectoryTable]]]] = {
-    TRAJECTORY: {
-        "table": partial(read_named_table, ROLES[TRAJECTORY]), "tum": read_tum_trajectory, "kf_gins": read_kf_gins_trajectory,
-        "nmea": read_nmea_trajectory, "rtklib": read_rtklib, "result": read_result_trajectories,
-    },
-    "imu": {
-        "table": partial(read_named_table, ROLES["imu"]), "kf_gins": read_kf_gins_imu, "euroc": read_euroc_imu,
-        "kitti": read_kitti,
-    },
-    "gnss": {
-        "table": partial(read_named_table, ROLES["gnss"]), "tum": read_tum_trajectory, "kf_gins": read_kf_gins_fixes,
-        "nmea": read_nmea_trajectory, "rtklib": read_rtklib, "kitti": read_kitti,
-    },
-    "reference": {
-        "table": partial(read_named_table, ROLES["reference"]), "tum": read_tum_trajectory,
-        "kf_gins": read_kf_gins_trajectory, "euroc": read_euroc_reference, "kitti": read_kitti,
-    },
-}  # fmt: skip
 
 
 class TrajectoryFile(NamedTuple):
@@ -173,13 +155,13 @@ def read_trajectories(path: Path, options: SourceOptions) -> list[TrajectoryTabl
 def read_file(path: Path, options: SourceOptions, role: str = TRAJECTORY) -> list[TrajectoryTable]:
     """Read a file as trajectories or as a table of an own log; columns are multiplied by their factors."""
     kind = options.format or find_format(path, options, role)
-    readers = _READERS[role]
+    of_role = (name for name, item in FILE_FORMATS.items() if role in item.readers)
     require(
-        kind in readers,
+        role in FILE_FORMATS[kind].readers,
         role,
         "be of a format with such data",
         f"{kind} for {path.name}",
-        f"Formats of {role}: {', '.join(sorted(readers))}.",
+        f"Formats of {role}: {', '.join(sorted(of_role))}.",
     )
     for name, belongs, owner, remedy in (
         ("sd", kind == "kf_gins", "text file of KF-GINS", "Remove the option, and add columns sd_pn, sd_pe and sd_pd to the file."),
@@ -192,7 +174,10 @@ def read_file(path: Path, options: SourceOptions, role: str = TRAJECTORY) -> lis
             f"{Path(options.sd).name} for {path.name}" if name == "sd" else path.name,
             remedy,
         )
-    return [_scale_columns(table, options.factors) for table in readers[kind](path, options)]
+    return [
+        _scale_columns(table, options.factors)
+        for table in FILE_FORMATS[kind].readers[role](path, options)
+    ]
 
 
 def _scale_columns(table: TrajectoryTable, factors: Mapping[str, float]) -> TrajectoryTable:
@@ -214,6 +199,12 @@ def _scale_columns(table: TrajectoryTable, factors: Mapping[str, float]) -> Traj
 _FIXED_AXES = "Remove the option: the axes of all other formats are North, East, Down or latitude, longitude, height."
 _PARQUET = b"PAR1"
 _SIGNATURES = {_PARQUET: "table", b"PK\x03\x04": "result"}
+_FOREIGN = {  # first bytes of files that other programs convert
+    b"\xb5b": "UBX of u-blox", b"ULog": "ULog of PX4", b"\xa3\x95": "a log of ArduPilot", b"#ROSBAG": "a bag of ROS 1",
+    b"SQLite format 3": "a bag of ROS 2 or another database", b"\x89MCAP": "a bag of ROS 2", b"\xaaD": "messages of NovAtel",
+    b"#BESTPOS": "messages of NovAtel", b"#INSPVA": "messages of NovAtel", b"<?xml": "XML, as GPX or KML", b"\x1f\x8b": "a compressed file",
+}  # fmt: skip
+_WIDE = (b"\xff\xfe", b"\xfe\xff")  # first bytes of texts of two bytes a letter
 _SUFFIXES = {
     ".csv": "table",
     ".parquet": "table",
@@ -229,10 +220,91 @@ _RTKLIB = re.compile(
 )
 _EUROC = re.compile(rb"^(\xef\xbb\xbf)?#? ?timestamp ?\[ns\]", re.IGNORECASE)
 _HEAD = 1 << 16  # bytes
+_WIDTHS = {"imu": (KF_GINS_IMU,), "gnss": KF_GINS_FIXES}  # of KF-GINS without names
+
+
+class FileStart(NamedTuple):
+    """Start of a file.
+
+    Attributes:
+        content: First bytes.
+        names: Names of columns, empty without such a line.
+        rows: Fields of the first rows.
+        role: What is read: a trajectory, or a table of an own log.
+        has_columns: Whether the options name columns.
+    """
+
+    content: bytes
+    names: list[str]
+    rows: list[list[str]]
+    role: str
+    has_columns: bool
+
+    @property
+    def numbers(self) -> Array:
+        """Numbers of the first rows, [T, K]."""
+        return to_numbers(self.rows)
+
+
+class FileFormat(NamedTuple):
+    """Format of files.
+
+    Attributes:
+        readers: Readers by what is read.
+        suffix: Suffix that decides where the content does not; empty for none.
+        is_shown: Whether the start of a text shows the format.
+    """
+
+    readers: Mapping[str, Callable[[Path, SourceOptions], list[TrajectoryTable]]]
+    suffix: str
+    is_shown: Callable[[FileStart], object]
+
+
+def _is_named(start: FileStart) -> bool:
+    """Return whether the columns of a table have names, as those of an own log, of the options or of a trajectory."""
+    is_table = "t" in start.names and any(set(group) <= set(start.names) for group in (LOCAL, GEODETIC))  # fmt: skip
+    return bool(start.names) and (start.has_columns or start.role != TRAJECTORY or is_table)
+
+
+def _is_kf_gins(start: FileStart) -> bool:
+    """Return whether rows are week, second, latitude, longitude, height and six further numbers, or of a table of KF-GINS."""
+    numbers = start.numbers
+    if numbers.shape[1] != 11:
+        return not start.names and numbers.shape[1] in _WIDTHS.get(start.role, ())
+    week, second, lat, lon = numbers[:, :4].T
+    is_week = (week == week.round()) & (week >= 0) & (week < 10_000) & (np.ptp(week) <= 1)
+    is_place = (second >= 0) & (np.abs(lat) <= 90) & (np.abs(lon) <= 360)
+    return bool((is_week & is_place).all())
+
+
+# one table of the formats, in the order in which a content is compared with them
+FILE_FORMATS: dict[str, FileFormat] = {
+    "result": FileFormat({TRAJECTORY: read_result_trajectories}, ".npz", lambda start: False),
+    "kitti": FileFormat(dict.fromkeys(("imu", "gnss", "reference"), read_kitti), "", lambda start: False),
+    "euroc": FileFormat(
+        {"imu": read_euroc_imu, "reference": read_euroc_reference}, "",
+        lambda start: start.role != TRAJECTORY and not start.has_columns and _EUROC.search(start.content),
+    ),
+    "nmea": FileFormat(
+        dict.fromkeys((TRAJECTORY, "gnss"), read_nmea_trajectory), ".nmea", lambda start: _SENTENCE.search(start.content)
+    ),
+    "rtklib": FileFormat(dict.fromkeys((TRAJECTORY, "gnss"), read_rtklib), "", lambda start: _RTKLIB.search(start.content)),
+    "table": FileFormat({role: partial(read_named_table, role) for role in ROLES}, ".csv", _is_named),
+    "tum": FileFormat(
+        dict.fromkeys((TRAJECTORY, "gnss", "reference"), read_tum_trajectory), ".tum",
+        lambda start: start.role != "imu" and find_pose_columns(start.names, start.rows),
+    ),
+    "kf_gins": FileFormat(
+        {
+            TRAJECTORY: read_kf_gins_trajectory, "imu": read_kf_gins_imu, "gnss": read_kf_gins_fixes,
+            "reference": read_kf_gins_trajectory,
+        }, ".nav", _is_kf_gins,
+    ),
+}  # fmt: skip
 
 
 def find_format(file: Path, options: SourceOptions, role: str = TRAJECTORY) -> str:
-    """Find the format of a file."""
+    """Find the format of a file by its content, and by its suffix where the content does not show it."""
     if file.is_dir():
         return "kitti"
     with file.open("rb") as content:
@@ -246,71 +318,41 @@ def find_format(file: Path, options: SourceOptions, role: str = TRAJECTORY) -> s
     )
     if head[:4] in _SIGNATURES:
         return _SIGNATURES[head[:4]]
-    if role != TRAJECTORY and options.columns:
-        return "table"
-    if role != TRAJECTORY and _EUROC.search(head):
-        return "euroc"
-    if _SENTENCE.search(head):
-        return "nmea"
-    if _RTKLIB.search(head):
-        return "rtklib"
-    names, rows = read_head(file)
-    widths = {"imu": (KF_GINS_IMU,), "gnss": KF_GINS_FIXES}.get(role, ())
-    if not names and to_numbers(rows).shape[1] in widths:
-        return "kf_gins"
-    return (
-        "table"
-        if role == "imu"
-        else _find_text_format(file, bool(options.columns or role != TRAJECTORY))
-    )
-
-
-def _find_text_format(file: Path, has_names: bool) -> str:
-    """Return the format of a text with columns."""
-    names, rows = read_head(file)
-    by_suffix = _SUFFIXES.get(file.suffix.lower(), "")
-    numbers = to_numbers(rows)
-    is_table = "t" in names and any(set(columns) <= set(names) for columns in (LOCAL, GEODETIC))
-    if names and (has_names or is_table):
-        return "table"
-    if find_pose_columns(names, rows):
-        return "tum"
-    if _is_kf_gins(numbers):
-        return "kf_gins"
+    unknown = "bytes of no known kind" if b"\0" in head and not head.startswith(_WIDE) else ""
+    kind = next((name for first, name in _FOREIGN.items() if head.startswith(first)), unknown)
     require(
-        not _is_kitti(numbers),
+        not kind or _SENTENCE.search(head),  # receivers write NMEA among other messages
+        file.name,
+        "be a text, a .parquet or a result of pfbench",
+        f"{kind}, by its first bytes",
+        "Convert it with a program of its maker to CSV, NMEA or RTKLIB .pos, or unpack it.",
+    )
+    start = FileStart(head, *read_head(file), role, bool(options.columns))
+    by_content = next((name for name, item in FILE_FORMATS.items() if item.is_shown(start)), "")
+    require(
+        by_content or not _is_kitti(start.numbers),
         file.name,
         "state times",
         "poses of KITTI, 12 numbers without a time",
         "Write a .csv with t from their times.txt, and pn, pe, pd from the position, columns 4, 8 and 12 of a pose.",
     )
-    if by_suffix or names:
-        return by_suffix or "table"
-    raise _describe_unknown(file, len(rows[0]) if rows else 0)
-
-
-def _describe_unknown(file: Path, width: int) -> ValueError:
-    """Return the error for a text of no known format."""
+    suffixes = {item.suffix: name for name, item in FILE_FORMATS.items() if item.suffix}
+    kind = by_content or suffixes.get(file.suffix.lower(), "table" if start.names or role == "imu" else "")  # fmt: skip
+    width = len(start.rows[0]) if start.rows else 0
     remedy = (
         "Insert a line with names, t,pn,pe,pd,..., or set NAME.format=table, tum, kf_gins or nmea."
     )
     if width == KF_GINS_SD:
         remedy = "Use the navigation result of KF-GINS, and its deviations as NAME.sd."
-    return ValueError(
-        f"{file.name} must be a table with names of columns, a TUM file (8 numbers in a line, the last four a "
-        f"quaternion), a result of KF-GINS (11 numbers from week and second on) or NMEA, got {width} fields in "
-        f"the first row. {remedy}"
+    require(
+        kind,
+        file.name,
+        "be a table with names of columns, a TUM file (8 numbers in a line, the last four a quaternion), a result of KF-GINS "
+        "(11 numbers from week and second on) or NMEA",
+        f"{width} fields in the first row",
+        remedy,
     )
-
-
-def _is_kf_gins(numbers: Array) -> bool:
-    """Return whether rows are week, second, latitude, longitude, height and six further numbers."""
-    if numbers.shape[1] != 11:
-        return False
-    week, second, lat, lon = numbers[:, :4].T
-    is_week = (week == week.round()) & (week >= 0) & (week < 10_000) & (np.ptp(week) <= 1)
-    is_place = (second >= 0) & (np.abs(lat) <= 90) & (np.abs(lon) <= 360)
-    return bool((is_week & is_place).all())
+    return kind
 
 
 def _is_kitti(numbers: Array) -> bool:

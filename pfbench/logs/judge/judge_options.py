@@ -11,13 +11,9 @@ from pfbench.core.parameter_checks import require, require_range, require_ranges
 from pfbench.logs.judge.trajectory_table import ROLES
 from pfbench.logs.units import SECONDS
 
-FRAMES = ("", "ned", "enu")
 FORMATS = ("", "table", "tum", "kf_gins", "nmea", "rtklib", "euroc", "kitti", "result")
-REPEATS = ("refuse", "first")
-ALIGNMENTS = ("none", "offset", "yaw")
 _LARGEST_TIME = 1e10  # s, above the GPS and Unix times of this century
 _ORIGIN_LIMITS = (90.0, 360.0, 1e5)  # deg, deg, m
-HOLES = ("refuse", "skip")
 
 
 @dataclass(frozen=True)
@@ -28,6 +24,7 @@ class SourceOptions:
         frame: Axes of a TUM file, "ned" or "enu".
         shift: Time added to the clock of the file, s.
         columns: Name in a CSV file by name of pfbench.
+        names: Names of pfbench by name in a table of an own log, which come before those that are understood.
         scale: Factor by name of pfbench, for a column in another unit; before `shift`.
         format: One of `FORMATS`; empty to find it from the content.
         sd: KF-GINS file of standard deviations, or its pattern; empty for none.
@@ -38,6 +35,7 @@ class SourceOptions:
     frame: str = ""
     shift: float = 0.0
     columns: Mapping[str, str] = field(default_factory=dict)
+    names: Mapping[str, str] = field(default_factory=dict)
     scale: Mapping[str, float] = field(default_factory=dict)
     format: str = ""
     sd: str = ""
@@ -46,7 +44,9 @@ class SourceOptions:
 
     def __post_init__(self) -> None:
         require_range("NAME.shift", self.shift, f"[-{_LARGEST_TIME:g}, {_LARGEST_TIME:g}]")
-        choices = {"frame": FRAMES, "format": FORMATS, "time": tuple(SECONDS), "repeats": REPEATS}
+        choices = {
+            "frame": ("", "ned", "enu"), "format": FORMATS, "time": tuple(SECONDS), "repeats": ("refuse", "first"),
+        }  # fmt: skip
         for key, allowed in choices.items():
             require(
                 getattr(self, key) in allowed,
@@ -115,8 +115,8 @@ class JudgeOptions:
         rules = {**dict.fromkeys(least, "[0, inf]"), "tolerance": "(0, inf)", "coverage": "(0, 1]"}
         require_ranges("", self, **rules, margin="[1e-6, 1e6]", alpha="[1e-9, 1)")
         require(self.start < self.end, "from", "be before to", f"{self.start} and {self.end}")
-        require(self.holes in HOLES, "holes", f"be {' or '.join(HOLES)}", self.holes)
-        require(self.align in ALIGNMENTS, "align", f"be {' or '.join(ALIGNMENTS)}", self.align)
+        for key, allowed in (("holes", ("refuse", "skip")), ("align", ("none", "offset", "yaw"))):
+            require(getattr(self, key) in allowed, key, f"be {' or '.join(allowed)}", getattr(self, key))  # fmt: skip
         require(len(self.origin) in (0, 3), "origin", "be lat_deg,lon_deg,h_m", list(self.origin))
         for value, limit in zip(self.origin, _ORIGIN_LIMITS, strict=False):
             require_range("origin", value, f"[-{limit:g}, {limit:g}]")

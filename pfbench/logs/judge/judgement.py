@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
@@ -111,7 +110,7 @@ def _position_rmse(sequence: SequenceResults) -> dict[str, float]:
         program: (result.data["error"][~result.data["lost"]][..., :3] ** 2).sum(axis=-1)
         for program, result in sequence.results.items()
     }
-    return {name: float(np.sqrt(s.mean())) if s.size else math.nan for name, s in squares.items()}
+    return {name: float(np.sqrt(s.mean())) if s.size else np.nan for name, s in squares.items()}
 
 
 def _check_copies(table: pd.DataFrame) -> None:
@@ -139,9 +138,11 @@ def _check_sequences(
                 "Use {sequence} in all patterns, or in none.",
             )
         keys = [(file.sequence, file.run) for file in of_program]
-        if len(set(keys)) < len(keys):
-            double = next(key for key in keys if keys.count(key) > 1)
-            raise ValueError(
-                f"{program} must have one file per sequence and run, got several for {double}. Use "
-                "{run} in the pattern."
-            )
+        double = next((key for key in keys if keys.count(key) > 1), None)
+        require(
+            not double,
+            program,
+            "have one file per sequence and run",
+            f"several for {double}",
+            "Use {run} in the pattern.",
+        )

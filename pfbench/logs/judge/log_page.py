@@ -13,11 +13,12 @@ import yaml
 from matplotlib.figure import Figure
 
 from pfbench.files.recorded_folder import RecordedFolder
-from pfbench.logs.doctor.finding import Finding, LogDiagnosis, Picture
+from pfbench.logs.doctor.finding import Finding, LogDiagnosis
 from pfbench.report import writers
 from pfbench.report.page_kit import Block, write_page
 from pfbench.results.plotting import FigureSpec, format_slug, stacked_axes
 
+_FEW_POINTS = 100  # of a curve whose points are marked
 _ABOUT = {
     "refuse": "A run refuses the log until it is mended.",
     "warn": "A run continues, and its result is probably wrong.",
@@ -43,7 +44,11 @@ def write_log_page(
         Path of index.html.
     """
     name = format_slug(f"inspect_{source['name']}")
-    suggested = format_settings(diagnosis.settings, source)
+    content = {
+        "defaults": [source.get("scenario", "user_log"), "_self_"], "folder": source["folder"], **source["words"], **diagnosis.settings,
+    }  # fmt: skip
+    text = yaml.safe_dump(json.loads(json.dumps(content)), sort_keys=False, default_flow_style=None, width=100)  # fmt: skip
+    suggested = f"# Written by pfbench inspect: settings that mend what it named.\n{text}"
     with RecordedFolder(Path(out) / name) as folder:
         folder.write("scenario/suggested.yaml", suggested)
         findings = [
@@ -88,44 +93,15 @@ def describe_run(folder: Path, root: Path) -> str:
     return f"pfbench run data.root={root} {path} scenario=suggested filter=ekf runs=5"
 
 
-def format_settings(settings: Mapping[str, Any], source: Mapping[str, Any]) -> str:
-    """Return the text of suggested.yaml: the scenario user_log with the settings.
-
-    Args:
-        settings: Keys below `scenario`.
-        source: Folder and the words that read the log.
-
-    Returns:
-        YAML.
-    """
-    content: dict[str, Any] = {
-        "defaults": [source.get("scenario", "user_log"), "_self_"],
-        "folder": source["folder"],
-        **source["words"],
-        **settings,
-    }
-    head = "# Written by pfbench inspect: settings that mend what it named.\n"
-    return head + yaml.safe_dump(_plain(content), sort_keys=False, default_flow_style=None, width=100)  # fmt: skip
-
-
-def _plain(value: Any) -> Any:
-    """Convert mappings, sequences and numbers to those of YAML."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return float(value) if isinstance(value, float) else value
-
-
 def _describe(number: int, finding: Finding, folder: RecordedFolder, formats: Sequence[str]) -> list[Block]:  # fmt: skip
     """Return the blocks of a finding."""
     drawings: list[dict[str, Any]] = []
     if finding.picture is not None:
         caption = f"{finding.check}: {finding.evidence}."
-        figure = FigureSpec(f"{number:02d}_{format_slug(finding.check)}", caption, partial(_draw, finding.picture))  # fmt: skip
+        figure = FigureSpec(f"{number:02d}_{format_slug(finding.check)}", caption, partial(draw_labelled_curves, *finding.picture))  # fmt: skip
         drawings = writers.write_figures([figure], "finding", folder, formats)
     mending = yaml.safe_dump(
-        _plain({"scenario": finding.settings}), default_flow_style=None, width=100
+        json.loads(json.dumps({"scenario": finding.settings})), default_flow_style=None, width=100
     ).rstrip()
     return [
         Block("part", f"{number}. {finding.check} ({finding.level})"),
@@ -138,14 +114,16 @@ def _describe(number: int, finding: Finding, folder: RecordedFolder, formats: Se
     ]  # fmt: skip
 
 
-def _draw(picture: Picture) -> Figure:
-    """Draw the curves of a finding, and its marks."""
-    figure, (axis,) = stacked_axes(1, 2.2)
-    for label, x, y in picture.curves:
-        marker = "." if len(x) < 100 else ""
-        axis.plot(x, y, marker=marker, linewidth=0.8, label=label)
-    for mark in picture.marks:
+def draw_labelled_curves(
+    xlabel: str, ylabel: str, curves: Sequence[tuple[Any, ...]], marks: Sequence[float] = (), *, is_map: bool = False
+) -> Figure:  # fmt: skip
+    """Draw curves, each with a label, horizontal and vertical values and perhaps a style, and marks; a map has equal scales."""
+    figure, (axis,) = stacked_axes(1, 3.2 if is_map else 2.2)
+    for label, x, y, *style in curves:
+        axis.plot(x, y, *(style or [".-" if len(x) < _FEW_POINTS else "-"]), linewidth=0.8, label=label)  # fmt: skip
+    for mark in marks:
         axis.axvline(mark, color="0.5", linewidth=0.8, linestyle=":")
-    axis.set(xlabel=picture.xlabel, ylabel=picture.ylabel)
-    axis.legend()
+    axis.set(xlabel=xlabel, ylabel=ylabel)
+    axis.set_aspect("equal" if is_map else "auto", adjustable="datalim")
+    axis.legend(fontsize="small")
     return figure

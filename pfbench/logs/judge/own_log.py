@@ -14,7 +14,6 @@ from pfbench.files.table_file import TableFile
 from pfbench.logs.judge.formats import read_file
 from pfbench.logs.judge.judge_options import SourceOptions
 from pfbench.logs.judge.trajectory_table import (
-    ATTITUDE_COLUMNS,
     LOCAL,
     ROLES,
     VELOCITY_COLUMNS,
@@ -39,20 +38,12 @@ def import_table(role: str, path: Path, options: SourceOptions) -> TableFile:
     columns = {"t": table.time, **table.values}
     rows = pd.DataFrame({name: columns[name] for name in ROLES[role] if name in columns})
     result = _drop_repeats(role, TableFile(rows, {}, table.notes), options)
-    return _complete_reference(path, result) if role == "reference" else result
+    return _complete_reference(result) if role == "reference" else result
 
 
-def _complete_reference(path: Path, table: TableFile) -> TableFile:
-    """Check the attitude of a reference, and add the velocity as the change of local positions if it has none."""
+def _complete_reference(table: TableFile) -> TableFile:
+    """Add the velocity to a reference as the change of local positions if it has none."""
     rows = table.rows
-    missing = ", ".join(name for name in ATTITUDE_COLUMNS if name not in rows)
-    require(
-        not missing,
-        path.name,
-        "have an attitude for a reference",
-        f"none of {missing}",
-        "Use a trajectory with roll, pitch, yaw or a quaternion.",
-    )
     if VELOCITY_COLUMNS[0] in rows:
         return table
     require(
@@ -83,7 +74,7 @@ def _drop_repeats(role: str, table: TableFile, options: SourceOptions) -> TableF
     if not repeated.any():
         return table
     is_rounded = repeated.mean() > _MOST_REPEATS
-    remedy = f"Set {role}.repeats=first to keep the first of them."
+    remedy = f"Set {role}.repeats=first to keep the first of them, in Python repeats='first'."
     if is_rounded:
         remedy = (
             "The times have lost digits: write them again with more, since no key brings them back."

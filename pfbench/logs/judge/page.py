@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -56,13 +54,19 @@ def write_judgement(
     definitions = [
         d for d in metric_definitions() if has_sensors and d.startswith(("CRPS", "coverage"))
     ]
-    text = json.dumps(decisions_as_json(judgement, options), indent=1, allow_nan=False)
+    pairs = [{**pair._asdict(), **pair.verdict.to_row()} for pair in judgement.pairs]
+    verdicts = [{name: value for name, value in pair.items() if name != "verdict"} for pair in pairs]  # fmt: skip
+    decisions = writers.to_json_types({"options": asdict(options), "verdicts": verdicts})
     with RecordedFolder(Path(out) / name) as folder:
-        folder.write("decisions.json", text + "\n")
+        folder.write("decisions.json", json.dumps(decisions, indent=1, allow_nan=False) + "\n")
         for table, content in tables.items():
             if len(content):
                 writers.write_table(folder, table, content)
-        figures = error_figures(judgement.sequences)
+        caption = "Position error over time in {}: root mean square over valid runs, at the common epochs."
+        figures = [
+            FigureSpec(f"error_{k}", caption.format(sequence.name), partial(_plot_errors, sequence))
+            for k, sequence in enumerate(judgement.sequences[:_MOST_FIGURES])
+        ]
         blocks = [
             Block("title", f"Trajectories of programs: {name}"),
             Block("text", describe_material(judgement)),
@@ -82,21 +86,6 @@ def write_judgement(
             *with_heading(Block("heading", "Definitions"), Block("list", definitions)),
         ]  # fmt: skip
         return write_page(folder, f"Trajectories of programs: {name}", blocks)
-
-
-def decisions_as_json(judgement: Judgement, options: JudgeOptions) -> dict[str, Any]:
-    """Return all decisions in JSON types."""
-    return {
-        "options": writers.to_json_types(asdict(options)),
-        "verdicts": [_to_dict(pair) for pair in judgement.pairs],
-    }
-
-
-def _to_dict(pair: PairVerdict) -> dict[str, Any]:
-    """Return a verdict in JSON types; a number that is not finite becomes text."""
-    values = {**pair._asdict(), **pair.verdict.to_row(), "sequences": list(pair.sequences)}
-    del values["verdict"]
-    return writers.to_json_types(values)
 
 
 def describe_material(judgement: Judgement) -> str:
@@ -162,7 +151,7 @@ def _describe_runs(sequence: SequenceResults, options: JudgeOptions) -> Iterator
                 "has. The error there is the largest one of any program. Set from or to, to leave out "
                 "a time for all programs."
             )
-        if math.isfinite(run.clock_offset) and abs(run.clock_offset) > _CLOCK_SHOWN:
+        if np.isfinite(run.clock_offset) and abs(run.clock_offset) > _CLOCK_SHOWN:
             yield (
                 f"Clock: {label} agrees best with the reference at an offset of "
                 f"{run.clock_offset:.3f} s. It is not removed."
@@ -206,8 +195,8 @@ def _describe_reference(sequence: SequenceResults) -> Iterator[str]:
     """Yield a note if the interpolation of the reference is a part of the smallest error."""
     between = sequence.reference.interpolation_error(sequence.epochs.time)
     size = float(np.sqrt(np.mean(between**2)))
-    errors = {name: _valid_errors(sequence, name).reshape(-1, 3) for name in sequence.results}
-    sizes = [float(np.sqrt((e**2).sum(axis=1).mean())) for e in errors.values() if len(e)]
+    errors = (result.data["error"][~result.data["lost"]][..., :3].reshape(-1, 3) for result in sequence.results.values())  # fmt: skip
+    sizes = [float(np.sqrt((e**2).sum(axis=1).mean())) for e in errors if len(e)]
     if sizes and size > max(_INTERPOLATION_SHOWN * min(sizes), _CLOCK_SHOWN):
         yield (
             f"Reference: interpolation of {sequence.name} has an error of about {size:.3g} m, and the "
@@ -215,16 +204,10 @@ def _describe_reference(sequence: SequenceResults) -> Iterator[str]:
         )
 
 
-def _valid_errors(sequence: SequenceResults, program: str) -> Array:
-    """Return the position errors of the runs that are not lost, [R, T, 3], m."""
-    data = sequence.results[program].data
-    return np.asarray(data["error"][~data["lost"]][..., :3])
-
-
 # --------------------------------------------------------------------------------------------------
 # Tables and figures of a judgement.
 
-_QUANTILE = 0.95
+_QUANTILE, _MOST_FIGURES = 0.95, 8
 
 
 def tabulate_accuracy(sequences: Sequence[SequenceResults]) -> pd.DataFrame:
@@ -316,19 +299,6 @@ def files_table(sequences: Sequence[SequenceResults]) -> pd.DataFrame:
         for sequence in sequences
         for run, used, holes, unused, coverage in sequence.list_runs()
     )
-
-
-def error_figures(sequences: Sequence[SequenceResults], largest: int = 8) -> list[FigureSpec]:
-    """Return one figure of position errors over time per sequence."""
-    return [
-        FigureSpec(
-            f"error_{k}",
-            f"Position error over time in {sequence.name}: root mean square over valid runs, "
-            "at the common epochs.",
-            partial(_plot_errors, sequence),
-        )
-        for k, sequence in enumerate(sequences[:largest])
-    ]
 
 
 def _plot_errors(sequence: SequenceResults) -> Figure:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from pfbench.logs.judge.alignment import (
     find_common_epochs,
     position_errors,
 )
-from pfbench.logs.judge.checks import check_axes, check_clock, check_frame_of, check_run
+from pfbench.logs.judge.checks import check_run
 from pfbench.logs.judge.formats import TrajectoryFile, read_trajectories
 from pfbench.logs.judge.judge_options import JudgeOptions, SourceOptions, name_program
 from pfbench.logs.judge.reference_track import ReferenceTrack
@@ -33,7 +32,6 @@ from pfbench.logs.judge.trajectory_table import (
     TrajectoryTable,
     covariance_matrices,
 )
-from pfbench.logs.judge.unit_checks import check_consistent_units
 from pfbench.results.store import JobResult
 from pfbench.stats.error_measures import Array
 
@@ -110,22 +108,13 @@ def read_runs(
         sd = source.sd.format(sequence=file.sequence, run=file.run)
         with name_program(program):
             tables = read_trajectories(file.path, replace(source, sd=sd))
-            checked = [_check_run(reference.place(t), reference, source, align) for t in tables]
+            checked = [
+                check_run(reference.place(t), reference, align, source.shift) for t in tables
+            ]
         for table, offset in checked:
             number = f"{table.run:09d}" if len(tables) > 1 else ""
             runs.append(JudgedRun(program, f"{file.run}{number}", file.path, table, offset))
     return runs
-
-
-def _check_run(
-    table: TrajectoryTable, reference: ReferenceTrack, source: SourceOptions, align: str
-) -> tuple[TrajectoryTable, float]:
-    """Check a run against the reference and by itself; return it with its notes and its clock offset."""
-    table = check_consistent_units(check_run(table, reference, align, source.shift))
-    if align == "yaw":
-        return table, math.nan
-    offset = check_clock(table, reference, source.shift)
-    return check_frame_of(check_axes(table, reference), reference), offset
 
 
 def score_sequence(

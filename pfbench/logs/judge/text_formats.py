@@ -66,7 +66,8 @@ def read_tum_trajectory(file: Path, options: SourceOptions) -> list[TrajectoryTa
     row = int((np.abs(length - 1) > 0.01).argmax())
     require(
         abs(length[row] - 1) <= 0.01, f"{file.name}: line {lines[row]}, columns qx ... qw", "be a quaternion of length 1",
-        f"length {length[row]:.3g}", f"Check the order of the columns: {' '.join(_TUM_COLUMNS)}.",
+        f"length {length[row]:.3g}",
+        f"Check the order of the columns: {' '.join(_TUM_COLUMNS)}." if length[row] else "Remove the lines without an attitude.",
     )  # fmt: skip
     if width > len(_TUM_COLUMNS):
         used = ", ".join(str(index + 1) for index in places)
@@ -262,7 +263,9 @@ def read_head(file: Path, rows: int = 20) -> tuple[list[str], list[list[str]]]:
     """Read names of columns and the first rows of a text; a line of names can be a comment."""
     heads: list[list[str]] = []
     fields: list[list[str]] = []
-    for line in map(str.strip, _read_first_lines(file)):
+    with file.open("rb") as stream:  # the last line can be cut
+        lines = split_lines(stream.read(_HEAD_BYTES).decode("utf-8-sig", "replace"))
+    for line in map(str.strip, lines):
         if line.startswith(_COMMENTS) or (not fields and _has_no_number(line)):
             heads.append(split_line(_UNIT.sub("", line.lstrip("#% "))))
         elif line:
@@ -272,12 +275,6 @@ def read_head(file: Path, rows: int = 20) -> tuple[list[str], list[list[str]]]:
     width = len(fields[0]) if fields else 0
     check_columns(file, width)
     return next((names for names in reversed(heads) if len(names) == width), []), fields
-
-
-def _read_first_lines(file: Path) -> list[str]:
-    """Return the lines at the start of a text. The last one can be cut."""
-    with file.open("rb") as stream:
-        return split_lines(stream.read(_HEAD_BYTES).decode("utf-8-sig", "replace"))
 
 
 def to_numbers(rows: Sequence[Sequence[str]]) -> Array:

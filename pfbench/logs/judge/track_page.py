@@ -7,18 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.logs.judge.log_page import draw_labelled_curves
 from pfbench.report import writers
 from pfbench.report.page_kit import Block, with_heading, write_page
-from pfbench.results.plotting import FigureSpec, format_slug, stacked_axes
+from pfbench.results.plotting import FigureSpec, format_slug
 
 if TYPE_CHECKING:
     from pfbench.job import FilterAnswer, MotionEstimate, TrackEstimate
 
 _NORMAL = 1.96  # standard deviations of a 95 % interval
-_COLOURS = ("C0", "C1", "C2", "C3", "C4", "C5")
 
 
 class HeldOutDistance(NamedTuple):
@@ -86,7 +85,8 @@ def _describe_innovations(answer: FilterAnswer) -> str:
     where = "within" if abs(mean - 1.0) <= band else "above" if mean > 1.0 else "below"
     cause = {
         "within": "", "above": ": the noise that the tuning states is too small, or the log has a fault, see pfbench inspect",
-        "below": ": the noise that the tuning states is too large",
+        "below": ": the noise that the tuning states is too large, or errors of the fixes last for seconds, which innovations do not "
+        "tell apart; the intervals do not hold for errors that last",
     }[where]  # fmt: skip
     return (
         f"{answer.name}: mean NIS per component {mean:.2f}, {where} {1.0 - band:.2f} to {1.0 + band:.2f}, the 95 % band of "
@@ -143,75 +143,30 @@ def write_track_page(
 
 def _list_figures(estimate: TrackEstimate) -> list[FigureSpec]:
     """List the figures of the page."""
-    first = estimate.answers[0]
-    specs = [
-        ("map", "Tracks and fixes.", _draw_map),
-        ("intervals", f"Half-width of the 95 % intervals of {first.name}. They hold if the stated noise is right.", _draw_intervals),
-        ("held_out", "Horizontal distance to held-out fixes, each by a pass that did not get the fix.", _draw_held_out),
-    ]  # fmt: skip
-    if any(len(answer.nis) for answer in estimate.answers):
-        specs.append(("innovations", "Normalised innovations squared per component. 1 is expected in the mean.", _draw_innovations))  # fmt: skip
-    if len(estimate.answers) > 1:
-        specs.append(("agreement", f"Horizontal distance of each filter from {first.name}.", _draw_agreement))  # fmt: skip
-    return [FigureSpec(name, caption, partial(draw, estimate)) for name, caption, draw in specs]
-
-
-def _draw_map(estimate: TrackEstimate) -> Figure:
-    """Draw the tracks from above."""
-    figure, (axis,) = stacked_axes(1, 3.2)
-    axis.plot(estimate.fixes[:, 1], estimate.fixes[:, 2], ".", color="0.6", markersize=3, label="fixes")  # fmt: skip
-    for name, motion in estimate.tracks().items():
-        axis.plot(motion.state[:, 7], motion.state[:, 8], linewidth=0.9, label=name)
-    axis.set(xlabel="East [m]", ylabel="North [m]")
-    axis.set_aspect("equal", adjustable="datalim")
-    axis.legend(fontsize="x-small")
-    return figure
-
-
-def _draw_intervals(estimate: TrackEstimate) -> Figure:
-    """Draw the half-widths of the intervals of the first filter."""
-    figure, (axis,) = stacked_axes(1, 2.2)
-    first = estimate.answers[0]
-    kinds = [("", first.filtered, "-"), (" smoothed", first.smoothed, "--")]
-    for k, name in enumerate(("East", "North", "Up")):
-        for ending, motion, line in kinds:
-            if motion is not None:
-                axis.plot(estimate.time, _NORMAL * motion.sd[:, 6 + k], line, color=_COLOURS[k], linewidth=0.8, label=name + ending)  # fmt: skip
-    axis.set(xlabel="t [s]", ylabel="half-width [m]", ylim=(0.0, None))
-    axis.legend(fontsize="x-small", ncols=3)
-    return figure
-
-
-def _draw_held_out(estimate: TrackEstimate) -> Figure:
-    """Draw the distances to held-out fixes over time."""
-    figure, (axis,) = stacked_axes(1, 2.2)
-    order = np.argsort(estimate.held_out_time)
-    for name, motion in estimate.tracks().items():
-        distance = np.linalg.norm(motion.held_out[:, :2], axis=1)
-        axis.plot(estimate.held_out_time[order], distance[order], ".", markersize=4, label=name)
-    axis.set(xlabel="t [s]", ylabel="distance [m]", ylim=(0.0, None))
-    axis.legend(fontsize="x-small")
-    return figure
-
-
-def _draw_innovations(estimate: TrackEstimate) -> Figure:
-    """Draw the normalised innovations by number of the fix."""
-    figure, (axis,) = stacked_axes(1, 2.2)
-    for answer in estimate.answers:
-        if len(answer.nis):
-            axis.plot(answer.nis / answer.dof, ".", markersize=4, label=answer.name)
-    axis.axhline(1.0, color="0.5", linewidth=0.8)
-    axis.set(xlabel="measurement", ylabel="NIS per component")
-    axis.legend(fontsize="x-small")
-    return figure
-
-
-def _draw_agreement(estimate: TrackEstimate) -> Figure:
-    """Draw the distances of the other filters from the first one."""
-    figure, (axis,) = stacked_axes(1, 2.2)
     first, *others = estimate.answers
-    for k, answer in enumerate(others, 1):
-        axis.plot(estimate.time, _distances(first, answer), color=_COLOURS[k % len(_COLOURS)], linewidth=0.8, label=answer.name)  # fmt: skip
-    axis.set(xlabel="t [s]", ylabel="distance [m]", ylim=(0.0, None))
-    axis.legend(fontsize="x-small")
-    return figure
+    tracks, time = estimate.tracks().items(), estimate.time
+    order = np.argsort(estimate.held_out_time)
+    fixes = [("fixes", estimate.fixes[:, 1], estimate.fixes[:, 2], ".")]
+    kinds = [("", first.filtered, "-"), *([(" smoothed", first.smoothed, "--")] if first.smoothed else [])]  # fmt: skip
+    nis: list[tuple[Any, ...]] = [(a.name, np.arange(len(a.nis)), a.nis / a.dof, ".") for a in estimate.answers if len(a.nis)]  # fmt: skip
+    nis += [("expected", [0, max(len(a.nis) for a in estimate.answers)], [1.0, 1.0], ":")] if nis else []  # fmt: skip
+    panels: list[tuple[Any, ...]] = [
+        ("map", "Tracks and fixes.", "East [m]", "North [m]",
+         [*fixes, *((name, m.state[:, 7], m.state[:, 8]) for name, m in tracks)]),
+        ("intervals", f"Half-width of the 95 % intervals of {first.name}. They hold if the stated noise is right, and not for errors of fixes that last for seconds.", "t [s]", "half-width [m]",
+         [(axis + ending, time, _NORMAL * m.sd[:, 6 + k], line) for k, axis in enumerate(("East", "North", "Up")) for ending, m, line in kinds]),
+        ("held_out", "Horizontal distance to held-out fixes, each by a pass that did not get the fix.", "t [s]", "distance [m]",
+         [(name, estimate.held_out_time[order], np.linalg.norm(m.held_out[order, :2], axis=1), ".") for name, m in tracks]),
+        ("innovations", "Normalised innovations squared per component. 1 is expected in the mean.", "measurement", "NIS per component", nis),
+        ("agreement", f"Horizontal distance of each filter from {first.name}.", "t [s]", "distance [m]",
+         [(answer.name, time, _distances(first, answer)) for answer in others]),
+    ]  # fmt: skip
+    return [
+        FigureSpec(
+            name,
+            caption,
+            partial(draw_labelled_curves, xlabel, ylabel, curves, is_map=name == "map"),
+        )
+        for name, caption, xlabel, ylabel, curves in panels
+        if curves
+    ]

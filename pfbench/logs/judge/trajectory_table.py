@@ -10,7 +10,7 @@ import numpy as np
 from pfbench.core.parameter_checks import require
 from pfbench.logs.doctor.axis_orders import ENU_TO_NED
 from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, QUANTITIES, Quantity
-from pfbench.logs.worlds.time_order import find_order_remedy
+from pfbench.logs.worlds.time_order import check_time_order
 from pfbench.stats.error_measures import Array
 
 LOCAL = ("pn", "pe", "pd")
@@ -129,7 +129,7 @@ def check_trajectory(table: TrajectoryTable) -> TrajectoryTable:
     )
     for name, value in (("t", table.time), *table.values.items()):
         _check_finite(table, name, value)
-    _check_order(table)
+    check_time_order(table.file, table.time, lambda i: f"line {table.lines[i]}")
     for name, value in table.values.items():
         _check_range(table, name, value)
     _check_covariance(table)
@@ -153,18 +153,6 @@ def _check_finite(table: TrajectoryTable, name: str, value: Array) -> None:
         "be a finite number",
         f"{value[row]} (in {count} of {len(value)} rows)",
         remedy,
-    )
-
-
-def _check_order(table: TrajectoryTable) -> None:
-    rows = np.flatnonzero(np.diff(table.time) <= 0) + 1
-    if not len(rows):
-        return
-    row = int(rows[0])
-    remedy = find_order_remedy(table.time, lambda i: f"line {table.lines[i]}")
-    raise ValueError(
-        f"{_place(table, row, 't')} must be later than the row before, got {table.time[row]:.12g} after "
-        f"{table.time[row - 1]:.12g} ({len(rows)} such rows). {remedy}"
     )
 
 

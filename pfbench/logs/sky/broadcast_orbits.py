@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.files.limits import find_input
 from pfbench.files.reader_notes import announce_notes
 from pfbench.logs.sky.ephemeris import (
@@ -105,33 +105,26 @@ class BroadcastConstellation(Constellation):
 
     @override
     def at(self, time: Tensor) -> tuple[Tensor, Tensor]:
-        eph, valid = self._select(time)
-        position, velocity = broadcast_elements(eph).earth_fixed()
-        mask = valid[..., None]
-        return torch.where(mask, position, torch.nan), torch.where(mask, velocity, torch.nan)
+        return broadcast_elements(self._select(time)).earth_fixed()
 
     def clock(self, time: Tensor) -> tuple[Tensor, Tensor]:
         """Return clock offset s and drift [T, S] by the polynomial, without relativity."""
-        eph, valid = self._select(time)
+        eph = self._select(time)
         t = eph["tk"] + eph["toe"] - eph["toc"]
-        offset = eph["af0"] + (eph["af1"] + eph["af2"] * t) * t
-        drift = eph["af1"] + 2 * eph["af2"] * t
-        return torch.where(valid, offset, torch.nan), torch.where(valid, drift, torch.nan)
+        return eph["af0"] + (eph["af1"] + eph["af2"] * t) * t, eph["af1"] + 2 * eph["af2"] * t
 
     def relativity(self, time: Tensor) -> Tensor:
         """Return the relativistic term of the clock offset [T, S] s, to add to `clock`.
 
         [IS-GPS-200, 20.3.3.3.3.1]
         """
-        eph, valid = self._select(time)
+        eph = self._select(time)
         anomaly, _ = eccentric_anomaly(eph["M0"] + mean_motion(eph) * eph["tk"], eph["e"])
-        term = -2 * torch.sqrt(eph["gm"]) / LIGHT**2 * eph["e"] * eph["sqrtA"] * torch.sin(anomaly)
-        return torch.where(valid, term, torch.nan)
+        return -2 * torch.sqrt(eph["gm"]) / LIGHT**2 * eph["e"] * eph["sqrtA"] * torch.sin(anomaly)
 
     def group_delay(self, time: Tensor) -> Tensor:
         """Return the group delay [T, S] s to subtract from the clock offset (L1 users)."""
-        eph, valid = self._select(time)
-        return torch.where(valid, eph["tgd"], torch.nan)
+        return self._select(time)["tgd"]
 
     def transmit(self, time: Tensor, pseudorange: Tensor) -> Transmission:
         """Compute the satellites at the transmission of signals.
@@ -161,8 +154,8 @@ class BroadcastConstellation(Constellation):
             LIGHT * drift,
         )
 
-    def _select(self, time: Tensor) -> tuple[dict[str, Tensor], Tensor]:
-        """Return the current parameters [T, S], with `tk`, and a mask of valid ones."""
+    def _select(self, time: Tensor) -> dict[str, Tensor]:
+        """Return the current parameters [T, S], with `tk`; NaN where none is valid."""
         columns, names = self._ephemerides
         t = time.to(torch.float64)
         toe = columns[..., 0]
@@ -172,8 +165,9 @@ class BroadcastConstellation(Constellation):
             0, 1
         )
         eph = dict(zip(names, values.unbind(-1), strict=True))
-        eph["tk"] = t[:, None] - eph["toe"]
-        return eph, eph["tk"].abs() <= self.validity
+        since = t[:, None] - eph["toe"]
+        valid = since.abs() <= self.validity
+        return {name: torch.where(valid, v, torch.nan) for name, v in {**eph, "tk": since}.items()}
 
     @cached_property
     def _ephemerides(self) -> tuple[Tensor, tuple[str, ...]]:
@@ -203,18 +197,21 @@ class BroadcastConstellation(Constellation):
     def _table(self) -> pd.DataFrame:
         """The ephemerides in use, one row each. Of each `toe` the last transmission is used."""
         table = self._healthy[self._selection.mask]
-        if table.empty:
-            raise ValueError(
-                f"{self.path} must contain ephemerides that agree, got none of {len(self._file.rows)}: "
-                f"{next(iter(self.notes), 'no healthy satellite')}. Choose another file of this day."
-            )
-        if not (table["toe"].abs() <= self.validity).any():
-            first, last = (self.epoch + table["toe"].agg(["min", "max"])).tolist()
-            raise ValueError(
-                f"start_s must be within {self.validity:.0f} s of the ephemerides in {self.path} "
-                f"(GPS time {first:.0f} to {last:.0f} s), got {self.start_s} "
-                f"(GPS time {self.epoch:.0f} s). Give a time near them."
-            )
+        require(
+            not table.empty,
+            self.path,
+            "contain ephemerides that agree",
+            f"none of {len(self._file.rows)}: {next(iter(self.notes), 'no healthy satellite')}",
+            "Choose another file of this day.",
+        )
+        first, last = (self.epoch + table["toe"].agg(["min", "max"])).tolist()
+        require(
+            (table["toe"].abs() <= self.validity).any(),
+            "start_s",
+            f"be within {self.validity:.0f} s of the ephemerides in {self.path} (GPS time {first:.0f} to {last:.0f} s)",
+            f"{self.start_s} (GPS time {self.epoch:.0f} s)",
+            "Give a time near them.",
+        )
         announce_notes(self.path, self.notes)
         return table.drop_duplicates(["name", "toe"], keep="last").reset_index(drop=True)
 

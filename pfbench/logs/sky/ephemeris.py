@@ -78,11 +78,13 @@ def parse_epochs(table: pd.DataFrame, epoch: float) -> pd.DataFrame:
     """
     table = table.copy()
     missing = [name for name in ("prn", *CLOCK, *ORBIT) if name not in table]
-    if missing:
-        raise ValueError(
-            f"the columns of ephemerides must include {', '.join(missing)}. "
-            f"Use the names of RINEX: {', '.join(LINES)}."
-        )
+    require(
+        not missing,
+        "the columns of ephemerides",
+        f"include {', '.join(missing)}",
+        ", ".join(map(str, table.columns)),
+        f"Use the names of RINEX: {', '.join(LINES)}.",
+    )
     unknown, optional = pd.Series(math.nan, table.index), ("week", "health", "tgd", "ttx")
     column = {name: table.get(name, unknown) for name in optional}
     system = table["sys"] if "sys" in table else pd.Series("G", table.index)
@@ -208,7 +210,9 @@ def read_rinex(file: Path) -> RinexFile:
 
     A record that cannot be read is dropped, and a note names its line.
     """
-    lines = _lines(file)
+    # names and comments contain other letters, which are read but not used
+    text = read_text(file).removeprefix(b"\xef\xbb\xbf").decode("latin-1")
+    lines = [line.rstrip() for line in text.split("\n")]
     version = lines[0][:9].strip() if lines and "RINEX VERSION" in lines[0] else ""
     if version[:1] not in ("2", "3", "4") or lines[0][20:21] != "N":
         raise ValueError(
@@ -251,12 +255,6 @@ def _describe_kind(lines: Sequence[str]) -> str:
     return f"got a {kind} file of RINEX {version}. {same_day}"
 
 
-def _lines(file: Path) -> list[str]:
-    # names and comments contain other letters, which are read but not used
-    text = read_text(file).removeprefix(b"\xef\xbb\xbf").decode("latin-1")
-    return [line.rstrip() for line in text.split("\n")]
-
-
 def _first_lines(lines: Sequence[str], body: int, version: int) -> list[int]:
     """Return the first line of each record, and the end of the text."""
     end_of_text = len(lines)
@@ -295,8 +293,7 @@ def _records(
         try:
             prn = lines[begin][version - 2 : indent].strip()
             require(prn.isascii() and prn.isdigit(), "it", "begin with a satellite", f"{prn!r}")
-            if end - begin != _RECORD_LINES:
-                raise ValueError(f"it must have {_RECORD_LINES} lines, got {end - begin}")
+            require(end - begin == _RECORD_LINES, "it", f"have {_RECORD_LINES} lines", end - begin)
             record = _parse_record(lines[begin:end], system, version)
         except ValueError as error:
             yield f"the record in line {begin + 1}, {lines[begin][:23]!r}, is dropped: {error}"

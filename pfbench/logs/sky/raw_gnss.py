@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -151,7 +150,7 @@ class RawGnss(StateSpaceModel):
         duration = u.duration
         push = torch.diag_embed(self.acceleration_density * torch.sqrt(duration)[:, None])
         half = 0.5 * push * duration[:, None, None]
-        rows = [half, half / math.sqrt(3.0)], [push, torch.zeros_like(push)]
+        rows = [half, half / 3.0**0.5], [push, torch.zeros_like(push)]
         motion = torch.cat([torch.cat(row, -1) for row in rows], -2)
         walk = (self.other_walk * torch.sqrt(duration))[:, None, None]
         clock = block_diagonal(self.clock.noise_gain(duration), walk)

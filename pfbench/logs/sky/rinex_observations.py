@@ -7,10 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 
 from pfbench.core.parameter_checks import require
 from pfbench.files.limits import read_text
+from pfbench.files.table_file import Array
 from pfbench.logs.sky.ephemeris import parse_date
 
 # signals on 1575.42 MHz in order of preference: GPS L1 C/A, Galileo E1
@@ -21,19 +23,28 @@ _WIDTH, _FIRST = 16, 3  # columns of an observation, and where the first begins
 _WHOLE_EPOCH = "Write the file again, or remove this line and those of its epoch."
 
 
-class ObservationFile(NamedTuple):
+class RawEpochs(NamedTuple):
     """Observations of a RINEX file.
 
     Attributes:
         rows: A row per epoch and satellite: `time` (GPS time by the receiver's clock, s since 1980-01-06), `sys`, `svid`,
-            `pr` m, `doppler` Hz, `cn0` dB-Hz. NaN where the receiver gives none.
+            `pr` m, `doppler` Hz, `cn0` dB-Hz. NaN where the receiver gives none. `t`, s after `start`.
+        name: Name of the file.
         position: Position in the header, Earth-fixed, m, or None.
         notes: What was not read.
+        start: GPS time of t = 0, s since 1980-01-06.
     """
 
     rows: pd.DataFrame
+    name: str
     position: tuple[float, float, float] | None
     notes: tuple[str, ...]
+    start: float = 0.0
+
+    @property
+    def time(self) -> Array:
+        """Times of the epochs, s, [K]."""
+        return np.unique(self.rows["t"].to_numpy())
 
 
 class _Header(NamedTuple):
@@ -44,7 +55,7 @@ class _Header(NamedTuple):
     end: int
 
 
-def read_observations(file: Path, signals: Mapping[str, Sequence[str]]) -> ObservationFile:
+def read_observations(file: Path, signals: Mapping[str, Sequence[str]]) -> RawEpochs:
     """Read a RINEX 3 observation file; of each system the first signal that the file has."""
     lines = read_text(file).removeprefix(b"\xef\xbb\xbf").decode("latin-1").splitlines()
     check_version(file.name, lines[0] if lines else "")
@@ -65,9 +76,12 @@ def read_observations(file: Path, signals: Mapping[str, Sequence[str]]) -> Obser
         "Record these signals, or name others on 1575.42 MHz in scenario.rinex.signals.",
     )
     columns = {
-        s: [_find(header.types[s], kind + code) for kind in "CDS"]
+        s: [
+            _FIRST + _WIDTH * header.types[s].index(kind + code) if kind + code in header.types[s] else None
+            for kind in "CDS"
+        ]
         for s, code in codes_in_use.items()
-    }
+    }  # fmt: skip
     others = ", ".join(sorted(set(header.types) - set(codes_in_use)))
     notes = [f"{file.name}: systems {others} are not read"] if others else []
     notes += [
@@ -90,7 +104,7 @@ def read_observations(file: Path, signals: Mapping[str, Sequence[str]]) -> Obser
     require(
         len(table), f"{file.name}", f"contain ranges of {readable}", "none", "Choose another file."
     )
-    return ObservationFile(table, header.position, tuple(notes))
+    return RawEpochs(table, file.name, header.position, tuple(notes))
 
 
 def check_version(name: str, first: str) -> None:
@@ -152,11 +166,6 @@ def _read_header(name: str, lines: Sequence[str]) -> _Header:
                 "Write the file without scale factors.",
             )
     raise ValueError(f"{name} must have a line END OF HEADER, got none. Write the file again.")
-
-
-def _find(types: Sequence[str], kind: str) -> int | None:
-    """Return the first column of a type of observation."""
-    return _FIRST + _WIDTH * types.index(kind) if kind in types else None
 
 
 def _values(text: str, columns: Sequence[int | None]) -> list[float]:

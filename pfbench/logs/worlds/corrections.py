@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,12 +12,13 @@ import torch
 from numpy.typing import NDArray
 
 from pfbench.core.parameter_checks import require
-from pfbench.files.table_file import Array
 from pfbench.logs.doctor.axis_orders import CONVENTIONS, axes_matrix, convert_angles
-from pfbench.logs.doctor.bad_samples import find_bad_samples, find_stuck
+from pfbench.logs.doctor.bad_samples import find_stuck, mend_samples
 from pfbench.logs.doctor.fix_checks import find_frozen, find_jumps
 from pfbench.logs.worlds.imu_gaps import CUT, cut_longest
+from pfbench.logs.worlds.log_frames import GEODETIC_COLUMNS
 from pfbench.logs.worlds.log_tables import (
+    Array,
     GnssLog,
     LogTable,
     ReferenceLog,
@@ -30,6 +31,7 @@ from pfbench.nav.strapdown import rotate
 Tables = dict[str, LogTable]
 LogTables = tuple[LogTable, LogTable, LogTable | None]  # IMU, fixes and, if there is one, reference
 Vector = Sequence[float] | None
+ColumnGroups = Sequence[tuple[str, ...]]  # of columns
 _TABLES = ("imu", "gnss", "reference")
 _FORCE, _RATE, _ANGLES = ("fx", "fy", "fz"), ("wx", "wy", "wz"), ("roll", "pitch", "yaw")
 _POSITION, _VELOCITIES = ("pn", "pe", "pd"), (("vn", "ve", "vd"), ("vn_d", "ve_d", "vd_d"))
@@ -98,10 +100,17 @@ class LogCorrections:
         for frame, axes in (self.level_axes or {}).items():
             axes_matrix(frame, axes, is_level=True)
         for key in ("offset_m", "lever_arm"):
-            _check_vector(key, getattr(self, key))
+            value = getattr(self, key)
+            is_vector = value is None or (len(value) == 3 and np.isfinite(np.array(value, float)).all())  # fmt: skip
+            require(is_vector, f"scenario.corrections.{key}", "be 3 finite numbers in m", value, "Set null for none.")  # fmt: skip
         for key in ("scale", "bias"):
             for table, values in (getattr(self, key) or {}).items():
-                _check_columns(f"{key}.{table}", values)
+                _check_mapping(f"{key}.{table}", values, "by column")
+                wrong = [c for c, v in values.items() if not (isinstance(v, int | float) and np.isfinite(v) and (v or key == "bias"))]  # fmt: skip
+                require(
+                    not wrong, f"scenario.corrections.{key}.{table}.{''.join(wrong[:1])}",
+                    "be a finite number, and a factor not 0", [values[c] for c in wrong], "Set a number.",
+                )  # fmt: skip
         for table, shift in (self.shift_s or {}).items():
             _nodes_of(table, shift)
 
@@ -122,55 +131,38 @@ class LogCorrections:
             tables[name] = _sort(tables[name], notes)
             if order == "even":
                 tables[name] = _even(tables[name], notes)
-        self._correct_columns(tables, notes)
+        for name, groups, change, note in self._list_changes(tables):
+            for columns in groups:
+                tables[name] = _apply(tables[name], columns, change)
+            notes.append(f"{tables[name].name}: {note}")
         for name, shift in (self.shift_s or {}).items():
             tables[name] = _shift(tables[name], *_nodes_of(name, shift), notes)
         if {"spikes", "stuck"} & set(self.drop or ()):
             tables["imu"] = _drop_samples(tables["imu"], self.drop, notes)
         if self.gaps == "longest":
-            tables["imu"], note = cut_longest(tables["imu"], convert_column(tables["imu"], "t"))
-            notes += note
+            tables["imu"], cut = cut_longest(tables["imu"], convert_column(tables["imu"], "t"))
+            notes += cut
         return (tables["imu"], tables["gnss"], tables.get("reference")), tuple(notes)
 
-    def _correct_columns(self, tables: Tables, notes: list[str]) -> None:
-        """Apply factors, axes, convention and biases to the columns."""
+    def _list_changes(self, tables: Tables) -> Iterator[tuple[str, ColumnGroups, Any, str]]:
+        """Yield table, groups of columns, function of their numbers and note of the factors, axes, convention and biases."""
         for name, factors in (self.scale or {}).items():
-            tables[name] = _apply(
-                tables[name], tuple(factors), lambda v, a=factors: v * [*a.values()]
-            )
-            notes.append(f"{tables[name].name}: columns multiplied by {dict(factors)}")
-        for sensor, axes in (self.mounting or {}).items():
-            matrix = axes_matrix(sensor, axes)
-            for columns in _SENSORS[sensor]:
-                tables["imu"] = _apply(tables["imu"], columns, lambda v, a=matrix: v @ a.T)
-            notes.append(
-                f"{tables['imu'].name}: forward, right, down of the {sensor} are {list(axes)} of the table"
-            )
-        for frame, axes in (self.level_axes or {}).items():
-            name, groups = _LEVEL[frame]
-            matrix, tables[name] = (
-                axes_matrix(frame, axes, is_level=True),
-                _require_local(tables[name], frame),
-            )
-            for columns in groups:
-                if tables[name].has(columns):
-                    tables[name] = _apply(tables[name], columns, lambda v, a=matrix: v @ a.T)
-            notes.append(
-                f"{tables[name].name}: North, East, Down of the {frame} are {list(axes)} of the table"
-            )
+            yield name, (tuple(factors),), lambda v, a=factors: v * [*a.values()], f"columns multiplied by {dict(factors)}"  # fmt: skip
+        turned = [
+            ("imu", _SENSORS[sensor], axes_matrix(sensor, axes), f"forward, right, down of the {sensor} are {list(axes)}")
+            for sensor, axes in (self.mounting or {}).items()
+        ] + [
+            (name, [g for g in groups if g is _POSITION or tables[name].has(g)], axes_matrix(frame, axes, is_level=True),
+             f"North, East, Down of the {frame} are {list(axes)}")
+            for frame, axes in (self.level_axes or {}).items() for name, groups in (_LEVEL[frame],)
+        ]  # fmt: skip
+        for name, groups, matrix, note in turned:
+            yield name, groups, lambda v, a=matrix: v @ a.T, f"{note} of the table"
         if self.attitude is not None:
-            name = self.attitude
-            tables["reference"] = _apply(
-                tables["reference"], _ANGLES, lambda v: convert_angles(name, v)
-            )
-            notes.append(
-                f"{tables['reference'].name}: attitude converted, since {CONVENTIONS[name][0]}"
-            )
+            convention = self.attitude
+            yield "reference", (_ANGLES,), lambda v: convert_angles(convention, v), f"attitude converted, since {CONVENTIONS[convention][0]}"  # fmt: skip
         for name, values in (self.bias or {}).items():
-            tables[name] = _apply(
-                tables[name], tuple(values), lambda v, b=values: v - [*b.values()]
-            )
-            notes.append(f"{tables[name].name}: {dict(values)} subtracted")
+            yield name, (tuple(values),), lambda v, b=values: v - [*b.values()], f"{dict(values)} subtracted"  # fmt: skip
 
     def correct_fixes(self, fixes: GnssLog, reference: ReferenceLog | None, name: str) -> tuple[GnssLog, tuple[str, ...]]:  # fmt: skip
         """Correct the fixes with the reference.
@@ -227,24 +219,16 @@ def _wrong_fixes(fixes: GnssLog, reference: ReferenceLog, kind: str) -> NDArray[
 def _apply(table: LogTable, columns: Sequence[str], change: Any) -> LogTable:
     """Replace columns by a function of their numbers [n, k]."""
     missing = [column for column in columns if column not in table.rows]
-    if missing:
-        raise ValueError(
-            f"scenario.corrections must name columns of {table.name}, got {missing[0]}. "
-            f"It has {', '.join(map(str, table.rows.columns))}."
-        )
+    axes = ". Axes of lat_deg, lon_deg are exchanged in the file" if table.has(GEODETIC_COLUMNS) else ""  # fmt: skip
+    require(
+        not missing,
+        "scenario.corrections",
+        f"name columns of {table.name}",
+        ", ".join(missing),
+        f"It has {', '.join(map(str, table.rows.columns))}{axes}.",
+    )
     values = change(np.array([convert_column(table, column) for column in columns]).T)
-    rows = table.rows.assign(**dict(zip(columns, np.asarray(values).T, strict=True)))
-    return table._replace(rows=rows)
-
-
-def _require_local(table: LogTable, frame: str) -> LogTable:
-    """Return a table with local positions."""
-    if not table.has(_POSITION) and frame != "reference_velocity":
-        raise ValueError(
-            f"scenario.corrections.level_axes.{frame} needs columns pn, pe, pd in {table.name}, which has "
-            "lat_deg, lon_deg. Exchange these columns in the file."
-        )
-    return table
+    return table._replace(rows=table.rows.assign(**dict(zip(columns, np.asarray(values).T, strict=True))))  # fmt: skip
 
 
 def _sort(table: LogTable, notes: list[str]) -> LogTable:
@@ -292,21 +276,16 @@ def _shift(table: LogTable, nodes: Array, delays: Array, notes: list[str]) -> Lo
 
 def _drop_samples(table: LogTable, drop: Sequence[str], notes: list[str]) -> LogTable:
     """Replace spikes by a line between their neighbours, and leave out stuck rows."""
-    time = convert_column(table, "t")
-    samples = {column: convert_column(table, column) for column in (*_FORCE, *_RATE)}
+    time, *columns = (convert_column(table, column) for column in ("t", *_FORCE, *_RATE))
+    samples = np.stack(columns, -1)
     if "spikes" in drop:
-        bad = np.zeros(len(time), bool)
-        for column, values in samples.items():
-            wrong = find_bad_samples(values, column in _FORCE)
-            bad[wrong.absurd] = bad[wrong.spikes] = True
-        if not bad.all():
-            samples = {c: np.interp(time, time[~bad], v[~bad]) for c, v in samples.items()}
+        samples, bad, _ = mend_samples(time, samples)
         notes.append(
             f"{table.name}: {int(bad.sum())} rows with spikes or absurd values replaced by a line"
         )
-    rows = table.rows.assign(**samples)
+    rows = table.rows.assign(**dict(zip((*_FORCE, *_RATE), samples.T, strict=True)))
     if "stuck" in drop:
-        first, last = find_stuck(np.stack([samples[c] for c in (*_FORCE, *_RATE)], -1))
+        first, last = find_stuck(samples)
         rows = pd.concat([rows.iloc[: first + 1], rows.iloc[last + 1 :]]).reset_index(drop=True)
         notes.append(f"{table.name}: {last - first} rows with equal samples left out")
     return table._replace(rows=rows)
@@ -329,16 +308,6 @@ def _check_names(
         )
 
 
-def _check_vector(key: str, value: Vector) -> None:
-    require(
-        value is None or (len(value) == 3 and np.isfinite(np.array(value, float)).all()),
-        f"scenario.corrections.{key}",
-        "be 3 finite numbers in m",
-        value,
-        "Set null for none.",
-    )
-
-
 def _check_mapping(key: str, values: Any, kind: str) -> None:
     require(
         isinstance(values, Mapping),
@@ -347,20 +316,6 @@ def _check_mapping(key: str, values: Any, kind: str) -> None:
         values,
         f"Set {{NAME: {values}}}.",
     )
-
-
-def _check_columns(key: str, values: Mapping[str, float]) -> None:
-    _check_mapping(key, values, "by column")
-    for column, value in values.items():
-        require(
-            isinstance(value, int | float)
-            and np.isfinite(value)
-            and (value != 0 or not key.startswith("scale")),
-            f"scenario.corrections.{key}.{column}",
-            "be a finite number, and a factor not 0",
-            value,
-            "Set a number.",
-        )
 
 
 def _nodes_of(table: str, shift: float | Sequence[Sequence[float]]) -> tuple[Array, Array]:

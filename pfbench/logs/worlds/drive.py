@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -232,12 +232,9 @@ class RecordedFlights(RecordedScenario):
         longest = max(legs, key=lambda leg: len(leg.time))
         for i, leg in zip(used, legs, strict=True):
             n = len(leg.time)
-            same = np.allclose(
-                leg.since_start, longest.since_start[:n], rtol=0.0, atol=TIME_TOLERANCE
-            )
-            same = same and np.array_equal(leg.fix_steps, longest.fix_steps[:n])
             require(
-                same,
+                np.allclose(leg.since_start, longest.since_start[:n], rtol=0.0, atol=TIME_TOLERANCE)
+                and np.array_equal(leg.fix_steps, longest.fix_steps[:n]),
                 "scenario.flights",
                 "have equal fix times",
                 f"different times in flight {self.flights[i]} of {folder}",
@@ -466,7 +463,7 @@ class FixHoldout:
         Raises:
             ValueError: If a run does not have a withheld fix.
         """
-        scored, count = self.withhold(episode, leg, runs)
+        scored, count = self.withhold(episode, leg.recorded_fixes, runs)
         notes = (
             f"position and velocity are scored at {count} withheld fixes (run 0) only. "
             "Errors of these fixes increase the NEES, so that a consistent filter exceeds its band",
@@ -475,12 +472,14 @@ class FixHoldout:
         truth = {"attitude": episode.truth["attitude"], **scored.truth}
         return replace(scored, truth=truth, notes=(*scored.notes, *notes))
 
-    def withhold(self, episode: Episode, leg: ResampledLog, runs: Tensor) -> tuple[Episode, int]:
+    def withhold(
+        self, episode: Episode, fixes: Mapping[str, Tensor], runs: Tensor
+    ) -> tuple[Episode, int]:
         """Remove the withheld fixes from an episode, and make them its only truth.
 
         Args:
             episode: Episode whose first measurement components are those of the fixes.
-            leg: Resampled log with the fixes as recorded.
+            fixes: Fixes as recorded by quantity, with `position`, [T, k]; NaN where there is none.
             runs: Run numbers, [R].
 
         Returns:
@@ -489,21 +488,15 @@ class FixHoldout:
         Raises:
             ValueError: If a run does not have a withheld fix.
         """
-        recorded = torch.from_numpy(leg.fixes)
-        withheld_mask = self.select(
-            torch.from_numpy(leg.fix_steps) & ~torch.isnan(recorded[:, 0]), episode.time, runs
-        )
+        withheld_mask = self.select(torch.isfinite(fixes["position"][:, 0]), episode.time, runs)
         require(
             withheld_mask.any(1).all(),
             "scenario.holdout",
-            f"withhold a fix in each run between t = {leg.time[0]:.3f} and {leg.time[-1]:.3f}",
+            f"withhold a fix in each run between t = {episode.time[0]:.3f} and {episode.time[-1]:.3f}",
             self,
             "Start earlier or withhold more fixes.",
         )
         count, withheld_mask = int(withheld_mask[0].sum()), withheld_mask.unsqueeze(-1)
-        position, velocity = (
-            torch.where(withheld_mask, values, torch.nan) for values in recorded.split(3, -1)
-        )
-        truth = {"velocity": velocity, "position": position}
+        truth = {name: torch.where(withheld_mask, values, torch.nan) for name, values in fixes.items()}  # fmt: skip
         record = episode.record._replace(y=torch.where(withheld_mask, torch.nan, episode.record.y))
         return replace(episode, record=record, truth=truth), count

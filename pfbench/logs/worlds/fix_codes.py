@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from pfbench.core.parameter_checks import require
 from pfbench.logs.worlds.log_tables import LogTable, parse_numbers
 
 # names of the codes of each program, those of fixes that are not used in the second place
@@ -38,15 +39,14 @@ FixCodes = str | Sequence[int] | None
 
 def check_fix_codes(codes: FixCodes) -> None:
     """Check the configuration key `scenario.fix_codes`."""
-    is_list = not isinstance(codes, str | None) and len(codes) > 0
-    if codes is None or (isinstance(codes, str) and codes in PROGRAMS):
-        return
-    if not (is_list and all(type(code) is int and code >= 0 for code in codes)):
-        value = codes if isinstance(codes, str) else list(codes)
-        raise ValueError(
-            f"scenario.fix_codes must be {', '.join(PROGRAMS)}, null or whole numbers of at least 0, "
-            f"got {value}. Set the program that wrote the column fix, or the codes to use, such as [4,5]."
-        )
+    is_valid = codes in PROGRAMS if isinstance(codes, str | None) else len(codes) > 0 and all(type(code) is int and code >= 0 for code in codes)  # fmt: skip
+    require(
+        is_valid or codes is None,
+        "scenario.fix_codes",
+        f"be {', '.join(PROGRAMS)}, null or whole numbers of at least 0",
+        codes if isinstance(codes, str | None) else list(codes),
+        "Set the program that wrote the column fix, or the codes to use, such as [4,5].",
+    )
 
 
 def select_usable(table: LogTable, codes: FixCodes) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
@@ -69,13 +69,14 @@ def select_usable(table: LogTable, codes: FixCodes) -> tuple[NDArray[np.bool_], 
         f"{code:g}{f' ({name})' if (name := {**used, **unused}.get(int(code), '')) else ''} in {n} rows"
         for code, n in counts.items()
     ]
-    if not mask.any():
-        best = max(counts, key=lambda code: counts[code])
-        raise ValueError(
-            f"{table.name} must have a usable fix, got none of {len(mask)}: column fix is "
-            f"{', '.join(texts)}. If these fixes are good, set "
-            f"scenario.fix_codes=[{best:g}] with their codes. Use another receiver log otherwise."
-        )
+    require(
+        mask.any(),
+        table.name,
+        "have a usable fix",
+        f"none of {len(mask)}: column fix is {', '.join(texts)}",
+        f"If these fixes are good, set scenario.fix_codes=[{max(counts, key=lambda code: counts[code]):g}] with their codes. "
+        "Use another receiver log otherwise.",
+    )
     program = f" as codes of {codes}" if isinstance(codes, str) else ""
     note = (
         f"{table.name}: {int(mask.sum())} of {len(mask)} fixes used; column fix{program} is "

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pfbench.files.table_file import Array
-from pfbench.logs.worlds.log_tables import ImuLog, LogTable
+from pfbench.logs.worlds.log_tables import Array, ImuLog, LogTable
 
 LONGEST_BRIDGE = 0.2  # s; motion in a longer gap is lost
 GAP_SAMPLES = 3.0  # intervals beyond are gaps

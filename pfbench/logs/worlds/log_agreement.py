@@ -16,8 +16,6 @@ import torch
 from numpy.typing import NDArray
 
 from pfbench.core.parameter_checks import require
-from pfbench.logs.doctor.raw_log import RawReference
-from pfbench.logs.doctor.reference_checks import check_reference, drop_wrong_rows
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
 from pfbench.logs.units import DEGREE
 from pfbench.logs.worlds.log_frames import GEODETIC_COLUMNS
@@ -27,7 +25,6 @@ from pfbench.logs.worlds.log_tables import (
     LogTable,
     ReferenceLog,
     parse_numbers,
-    swap_frd_rfu,
 )
 from pfbench.logs.worlds.time_grid import interpolate
 from pfbench.nav import earth
@@ -97,27 +94,6 @@ DIRECTION = Agreement("az, el and the direction of the satellite", "degrees", 1.
 COMMON_TIME = 2.0  # s at an end of a table that other tables do not cover, without a note
 
 
-def compare_reference(table: LogTable, reference: ReferenceLog) -> tuple[str, ...]:
-    """Check that positions change as velocities say, for a whole reference and between its rows.
-
-    Returns notes.
-    """
-    notes = compare_velocities(table, reference)
-    angles = parse_numbers(table, ("roll", "pitch", "yaw"))
-    velocity, position = swap_frd_rfu(reference.velocity), swap_frd_rfu(reference.position)
-    raw = RawReference(reference.time, angles, velocity, position, np.arange(len(angles)))
-    _, findings = check_reference(table.name, drop_wrong_rows(raw)[0], {})
-    evidence = next((finding.evidence for finding in findings), "")
-    require(
-        not evidence,
-        "the columns",
-        "agree",
-        evidence,
-        "Correct units, signs and order of the columns.",
-    )
-    return notes
-
-
 def compare_velocities(table: LogTable, reference: ReferenceLog) -> tuple[str, ...]:
     """Compare the changes of position between rows with the velocities; return notes."""
     dt = np.diff(reference.time)
@@ -129,6 +105,21 @@ def compare_velocities(table: LogTable, reference: ReferenceLog) -> tuple[str, .
     return _judge_rows(MOTION, difference, table, np.arange(1, len(reference.time)))
 
 
+def find_far_fixes(
+    fixes: GnssLog, reference: ReferenceLog, limits: PlausibleLimits, largest: float = 0.0
+) -> NDArray[np.bool_]:
+    """Find the fixes that are off by more than a distance, m, or than that of the limits, [m].
+
+    Outside of the reference the change from the fix before is compared.
+    """
+    largest = largest or limits.fix_error_m
+    error = np.linalg.norm(fixes.position - interpolate(reference, fixes.time)[:, 7:], axis=1)
+    step = np.linalg.norm(np.diff(fixes.position, axis=0), axis=1)
+    reach = limits.speed_m_s * np.diff(fixes.time) + 2.0 * largest
+    # a jump after a wrong fix is not an error of the next one, which the reference confirms
+    return (error > largest) | np.concatenate([[False], step > reach]) & np.isnan(error)
+
+
 def drop_fixes(
     table: LogTable, fixes: GnssLog, reference: ReferenceLog, limits: PlausibleLimits
 ) -> tuple[GnssLog, tuple[str, ...]]:
@@ -136,46 +127,34 @@ def drop_fixes(
 
     Returns the fixes, and notes.
     """
-    wrong = _find_wrong(fixes, reference, limits.speed_m_s)(limits.fix_error_m)
+    wrong = find_far_fixes(fixes, reference, limits)
     if not (limits.drop_fixes and wrong.any() and np.isfinite(fixes.position[~wrong, 0]).any()):
         return fixes, ()
-    position, velocity = fixes.position.copy(), fixes.velocity.copy()
-    position[wrong] = velocity[wrong] = np.nan
+    position, velocity = (np.where(wrong[:, None], np.nan, column) for column in fixes[1:])
     text = f"{table.name}: {int(wrong.sum())} fixes dropped, the first off by {_describe_first(table, fixes, reference, wrong)}"
-    return fixes._replace(position=position, velocity=velocity), (text,)
+    return GnssLog(fixes.time, position, velocity), (text,)
 
 
 def compare_fixes(
     table: LogTable, fixes: GnssLog, reference: ReferenceLog, limits: PlausibleLimits
 ) -> tuple[str, ...]:
     """Compare fixes with the reference, and outside of it with the previous fix; return notes."""
-    is_wrong = _find_wrong(fixes, reference, limits.speed_m_s)
-    wrong = is_wrong(limits.fix_error_m)
+    wrong = find_far_fixes(fixes, reference, limits)
+    remedy = "Check the origin, axes and clock of the fixes, which are wrong in most rows."
+    if int(np.isfinite(fixes.position[~wrong, 0]).sum()) > int(wrong.sum()):
+        remedy = "Correct or remove these rows, or set scenario.limits.drop_fixes=true."
+    accepted = (f"{d:g}" for d in _FIX_LIMITS if not find_far_fixes(fixes, reference, limits, d).any())  # fmt: skip
+    wider = next(accepted, "") if wrong.any() else ""
     require(
         not wrong.any(),
         f"{table.name}: fixes",
         f"be at most {limits.fix_error_m:g} m from the reference and from neighbouring fixes at {limits.speed_m_s:g} m/s",
         f"{_describe_first(table, fixes, reference, wrong)} ({int(wrong.sum())} such rows)",
-        _fix_remedy(fixes, wrong, is_wrong),
-    )
+        remedy + (f" If fixes can be so wrong, set scenario.limits.fix_error_m={wider}." if wider else ""),
+    )  # fmt: skip
     true, rows = interpolate(reference, fixes.time), np.arange(len(fixes.time))
     off = np.nan_to_num(np.linalg.norm(fixes.velocity - true[:, 4:7], axis=1))
     return _judge_rows(FIX_VELOCITY, off, table, rows)
-
-
-def _find_wrong(
-    fixes: GnssLog, reference: ReferenceLog, speed: float
-) -> Callable[[float], NDArray[np.bool_]]:
-    """Return a function that finds the fixes, [m], that are off by more than a distance, m."""
-    error = np.linalg.norm(fixes.position - interpolate(reference, fixes.time)[:, 7:], axis=1)
-    step = np.linalg.norm(np.diff(fixes.position, axis=0), axis=1)
-
-    def is_wrong(largest: float) -> NDArray[np.bool_]:
-        reach = speed * np.diff(fixes.time) + 2.0 * largest
-        # a jump after a wrong fix is not an error of the next one, which the reference confirms
-        return (error > largest) | np.concatenate([[False], step > reach]) & np.isnan(error)
-
-    return is_wrong
 
 
 def _describe_first(
@@ -186,21 +165,6 @@ def _describe_first(
     error = fixes.position[i] - interpolate(reference, fixes.time[i : i + 1])[0, 7:]
     change = error if np.isfinite(error).all() else fixes.position[i] - fixes.position[i - 1]
     return f"{np.linalg.norm(change):.0f} m in {table.row(i)}"
-
-
-def _fix_remedy(
-    fixes: GnssLog, wrong_mask: NDArray[np.bool_], is_wrong: Callable[[float], NDArray[np.bool_]]
-) -> str:
-    """Advise to drop wrong fixes if others remain, and to widen the limit if that accepts all."""
-    remedy = "Check the origin, axes and clock of the fixes, which are wrong in most rows."
-    if int(np.isfinite(fixes.position[~wrong_mask, 0]).sum()) > int(wrong_mask.sum()):
-        remedy = "Correct or remove these rows, or set scenario.limits.drop_fixes=true."
-    largest = next((f"{limit:g}" for limit in _FIX_LIMITS if not is_wrong(limit).any()), "")
-    return (
-        f"{remedy} If fixes can be so wrong, set scenario.limits.fix_error_m={largest}."
-        if largest
-        else remedy
-    )
 
 
 def compare_wheels(

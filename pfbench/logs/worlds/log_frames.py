@@ -15,10 +15,14 @@ from pfbench.nav import attitude, earth
 GEODETIC_COLUMNS, LOCAL_COLUMNS = ("lat_deg", "lon_deg", "h_m"), ("pn", "pe", "pd")
 
 
-def to_east_north_up(geodetic: Array, origin: Array) -> Array:
+def place_of(geodetic: Sequence[float] | Array) -> torch.Tensor:
+    """Return places of deg, deg, m in rad, rad, m, [..., 3]."""
+    return torch.from_numpy(np.asarray(geodetic, float) * [DEGREE, DEGREE, 1.0])
+
+
+def to_east_north_up(geodetic: Array, origin: Sequence[float] | Array) -> Array:
     """Convert geodetic positions, deg, deg, m, to the tangent frame of an origin, [T, 3], m."""
-    places = (torch.from_numpy(np.asarray(a, float) * [DEGREE, DEGREE, 1.0]) for a in (geodetic, origin))  # fmt: skip
-    return np.asarray(earth.local_enu(*places).numpy())
+    return np.asarray(earth.local_enu(place_of(geodetic), place_of(origin)).numpy())
 
 
 def find_origin(
@@ -64,11 +68,7 @@ def read_positions(
     """Read positions in East, North, Up from the origin, m, [n, 3], by a reader of columns."""
     if table.has(LOCAL_COLUMNS) or not table.has(GEODETIC_COLUMNS):
         return swap_frd_rfu(read(table, LOCAL_COLUMNS))
-    pos = read(table, GEODETIC_COLUMNS)
-    scale = np.array([DEGREE, DEGREE, 1.0])
-    return earth.local_enu(
-        torch.from_numpy(pos * scale), torch.from_numpy(np.array(origin) * scale)
-    ).numpy()
+    return to_east_north_up(read(table, GEODETIC_COLUMNS), origin or ())
 
 
 def quaternion_of_angles(roll: Array, pitch: Array, yaw: Array) -> Array:

@@ -60,7 +60,6 @@ from pfbench.logs.worlds.log_tables import (
     NavigationLog,
     ReferenceLog,
     check_changes,
-    check_increasing,
     check_seconds,
     convert_column,
     convert_columns,
@@ -69,9 +68,9 @@ from pfbench.logs.worlds.log_tables import (
     read_times,
     swap_frd_rfu,
 )
-from pfbench.logs.worlds.time_order import check_overlap
+from pfbench.logs.worlds.time_order import check_overlap, check_time_order
 
-_OF_FIXES = ("lever arm", "fix shift")  # a reference that also gives the fixes has none
+_OF_FIXES = ("lever arm", "fix shift")
 _FORCE, _RATE, _ANGLES = ("fx", "fy", "fz"), ("wx", "wy", "wz"), ("roll", "pitch", "yaw")
 _VELOCITY, _DERIVED = ("vn", "ve", "vd"), ("vn_d", "ve_d", "vd_d")
 _REMEDY = "Leave these out. A lever arm is a key of scenario.constraints, too."
@@ -217,7 +216,12 @@ class LogSource:
             raw = self.take(tables)
             keep = np.isfinite(fixes.position[raw.fixes.rows, 0])
             findings, _, _ = run_checks(raw._replace(fixes=take_rows(raw.fixes, keep)))
-        diagnosed = judge_findings(findings, has_own_fixes=truth is None or gnss.name != truth.name)
+        refused = next((finding.text for finding in findings if finding.level == REFUSE), "")
+        remedy = "See all findings with pfbench inspect."
+        require(not refused, "the log", "agree in itself", refused.removesuffix("."), remedy)
+        # fixes of the reference do not have a lever arm or a shift, and the reader notes the gaps that it bridges
+        silent = {"imu gap", *(_OF_FIXES if truth and gnss.name == truth.name else ())}
+        diagnosed = (f"{f.check}: {f.text}" for f in findings if f.check not in silent)
         if truth and motion:
             rows += compare_fixes(gnss, fixes, motion, limits)
         return fixes, (*left_out, *rows, *diagnosed)
@@ -239,23 +243,6 @@ def read_log(folder: str | Path, files: LogFiles | None = None, **options: Any) 
         ValueError: If a check or the diagnosis refuses the log. The message names file, column, row, value and remedy.
     """
     return LogSource(Path(folder), files or LogFiles(), **options).read()
-
-
-def judge_findings(findings: Sequence[Finding], *, has_own_fixes: bool) -> tuple[str, ...]:
-    """Return findings as notes; raise the first that refuses the log. The reader notes the gaps that it bridges."""
-    refused = next((finding.text for finding in findings if finding.level == REFUSE), "")
-    require(
-        not refused,
-        "the log",
-        "agree in itself",
-        refused.removesuffix("."),
-        "See all findings with pfbench inspect.",
-    )
-    return tuple(
-        f"{finding.check}: {finding.text}"
-        for finding in findings
-        if (has_own_fixes or finding.check not in _OF_FIXES) and finding.check != "imu gap"
-    )
 
 
 def read_samples(table: LogTable) -> tuple[ImuLog, tuple[str, ...]]:
@@ -289,7 +276,7 @@ def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
         notes += (
             f"{table.name}: {table.row(i)} repeats a time next to a double step. The time was set to the middle",
         )
-    check_increasing(table, time)
+    check_time_order(table.name, time, table.row)
     check_seconds(table, time, longest=0.5)
     (first, last, parts), i = find_longest(time), int(np.diff(time).argmax())
     require(

@@ -17,7 +17,7 @@ from pfbench.files.limits import find_input
 from pfbench.files.table_file import Array as Array, read_table_file
 from pfbench.logs.sky.plausible_limits import LIMIT_COLUMNS, PlausibleLimits, Quantity
 from pfbench.logs.units import UNIT_FACTORS
-from pfbench.logs.worlds.time_order import find_order_remedy
+from pfbench.logs.worlds.time_order import check_time_order
 
 # --------------------------------------------------------------------------------------------------
 # Parquet and CSV tables with named columns.
@@ -248,25 +248,9 @@ def index_satellites(
 def read_times(table: LogTable, longest: float) -> Array:
     """Read and check the column t."""
     time = parse_numbers(table, ("t",))[:, 0]
-    check_increasing(table, time)
+    check_time_order(table.name, time, table.row)
     check_seconds(table, time, longest)
     return time
-
-
-def check_increasing(table: LogTable, time: Array) -> None:
-    """Check that times increase.
-
-    Shapes: time [n].
-    """
-    back = np.flatnonzero(np.diff(time) <= 0)
-    if back.size:
-        i = int(back[0]) + 1
-        problem = "repeats the previous time" if time[i] == time[i - 1] else "goes back in time"
-        raise ValueError(
-            f"{table.name}: column t must increase, got {time[i]} after {time[i - 1]} in "
-            f"{table.row(i)}, which {problem} ({back.size} such rows). "
-            f"{find_order_remedy(time, table.row)}"
-        )
 
 
 def check_seconds(table: LogTable, time: Array, longest: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +26,7 @@ from pfbench.logs.worlds.log_agreement import (
     compare_rates,
     describe_missing_times,
 )
+from pfbench.logs.worlds.log_frames import place_of
 from pfbench.logs.worlds.log_tables import (
     Array,
     LogFiles,
@@ -123,11 +123,13 @@ def collect_sky(
     value = _read_columns(table, receiver.weights, optional)
     row, is_near = _find_steps(value["t"], time)
     selected_mask = is_near & (value["el"] >= receiver.mask_deg)
-    if not selected_mask.any():
-        raise ValueError(
-            f"{table.name} does not contain a row above {receiver.mask_deg} degrees within {_SAME_EPOCH} s of the "
-            "end of a step. Use the same clock for t in all tables, or lower scenario.receiver.mask_deg."
-        )
+    require(
+        selected_mask.any(),
+        table.name,
+        f"contain a row above {receiver.mask_deg} degrees within {_SAME_EPOCH} s of the end of a step",
+        "none",
+        "Use the same clock for t in all tables, or lower scenario.receiver.mask_deg.",
+    )
     names = np.array(parse_satellites(table, value["svid"]))[selected_mask]
     satellites, index = index_satellites(table, row[selected_mask], names)
 
@@ -179,13 +181,14 @@ def _find_steps(epochs: Array, time: Array) -> tuple[NDArray[np.intp], NDArray[n
 def _local(table: LogTable, origin: Sequence[float] | None) -> tuple[Array, Array]:
     """Return Earth-fixed origin, m, [3], and axes East, North, Up, [3, 3]."""
     keys = [f"origin_{name}" for name in ("lat_deg", "lon_deg", "h_m")]
-    if origin is None and not all(key in table.stated for key in keys):
-        raise ValueError(
-            f"{table.name} does not contain the origin pn = pe = pd = 0. "
-            "Set scenario.origin=[lat_deg, lon_deg, h_m]."
-        )
-    lat, lon, h = [float(table.stated[key]) for key in keys] if origin is None else origin
-    pos = torch.tensor([math.radians(lat), math.radians(lon), h], dtype=torch.float64)
+    require(
+        origin is not None or all(key in table.stated for key in keys),
+        table.name,
+        "contain the origin pn = pe = pd = 0",
+        "none",
+        "Set scenario.origin=[lat_deg, lon_deg, h_m].",
+    )
+    pos = place_of([float(table.stated[key]) for key in keys] if origin is None else origin)
     return earth.ecef(pos).numpy(), earth.local_axes(pos).numpy()
 
 
@@ -203,11 +206,13 @@ def subtract_nominal_ranges(
     line = gnss_log.satellite_position / reach[..., None]
     ranges, rates = gnss_log.range - reach, gnss_log.rate - (line * gnss_log.velocity).sum(-1)
     is_other = list_other_system(gnss_log.names)
-    if np.isnan(ranges[0, ~is_other]).all():
-        raise ValueError(
-            f"scenario.start_s must have a {find_first_system(gnss_log.names)} satellite, "
-            f"got none at t = {time[0]:.3f}. Select another start."
-        )
+    require(
+        np.isfinite(ranges[0, ~is_other]).any(),
+        "scenario.start_s",
+        f"have a {find_first_system(gnss_log.names)} satellite",
+        f"none at t = {time[0]:.3f}",
+        "Select another start.",
+    )
     ranges, notes = remove_clock_jumps(ranges, time)
     approach = line[0] @ velocity
     drift = (

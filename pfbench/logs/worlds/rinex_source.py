@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -16,9 +14,14 @@ from pfbench.core.parameter_checks import require
 from pfbench.files.limits import find_input
 from pfbench.files.reader_notes import skip_notes
 from pfbench.logs.sky.broadcast_orbits import BroadcastConstellation, Transmission, parse_gps_time
-from pfbench.logs.sky.rinex_observations import SIGNALS, check_version, read_observations
+from pfbench.logs.sky.rinex_observations import (
+    SIGNALS,
+    RawEpochs,
+    check_version,
+    read_observations,
+)
 from pfbench.logs.units import WEEK
-from pfbench.logs.worlds.log_frames import GEODETIC_COLUMNS
+from pfbench.logs.worlds.log_frames import GEODETIC_COLUMNS, place_of
 from pfbench.logs.worlds.log_tables import Array, LogTable, ReferenceLog
 from pfbench.nav import earth
 from pfbench.nav.atmosphere import Sight, delay_in_ionosphere, delay_in_troposphere
@@ -27,29 +30,6 @@ from pfbench.nav.orbits import LIGHT, azimuth_elevation, sagnac
 WAVELENGTH = LIGHT / 1575.42e6  # m
 _HEAD = 200  # bytes of a file that show its kind
 _KINDS = {"observations": "O", "navigation": "N"}
-
-
-class RawEpochs(NamedTuple):
-    """Observations of a file, with the times of the tables.
-
-    Attributes:
-        rows: Rows of `ObservationFile`, with `t`, s.
-        name: Name of the file.
-        start: GPS time of t = 0, s since 1980-01-06.
-        position: Position in the header, Earth-fixed, m, or None.
-        notes: What was not read.
-    """
-
-    rows: pd.DataFrame
-    name: str
-    start: float
-    position: tuple[float, float, float] | None
-    notes: tuple[str, ...]
-
-    @property
-    def time(self) -> Array:
-        """Times of the epochs, s, [K]."""
-        return np.unique(self.rows["t"].to_numpy())
 
 
 @dataclass(frozen=True)
@@ -113,7 +93,7 @@ class RinexSource:
         if len(rows) < len(content.rows):
             notes += (f"{file.name}: {len(content.rows) - len(rows)} repeated rows are left out",)
         rows["t"] = rows["time"] - start
-        return RawEpochs(rows, file.name, start, content.position, notes)
+        return content._replace(rows=rows, start=start, notes=notes)
 
     def compute_sky(
         self, folder: Path, epochs: RawEpochs, track: ReferenceLog, centre: Sequence[float]
@@ -240,8 +220,7 @@ def _describe_missing(
 
 def _place(track: ReferenceLog, time: Array, centre: Sequence[float]) -> torch.Tensor:
     """Return Earth-fixed positions of the track, m, [T, 3]."""
-    lat, lon, h = centre
-    origin = torch.tensor([math.radians(lat), math.radians(lon), h], dtype=torch.float64)
+    origin = place_of(centre)
     enu = np.stack([np.interp(time, track.time, axis) for axis in track.position.T], -1)
     return earth.ecef(origin) + torch.from_numpy(enu) @ earth.local_axes(origin)
 

@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pfbench.core.parameter_checks import require
-from pfbench.files.table_file import Array
 from pfbench.logs.doctor.sensor_grade import find_standing
-from pfbench.logs.worlds.log_tables import ImuLog, NavigationLog
+from pfbench.logs.worlds.log_tables import Array, ImuLog, NavigationLog
 
 _WINDOW = 0.5  # s; at 0.2 s engine and hand hide in the noise, longer windows find a start late
 _QUANTILE = 0.95

@@ -68,6 +68,12 @@ class ResampledLog(NamedTuple):
         """Time from the start to the end of each step, s, [T]."""
         return self.time - self.start_s
 
+    @property
+    def recorded_fixes(self) -> dict[str, Tensor]:
+        """Recorded velocity, m/s, and position, m, at the end of each step, [T, 3]. NaN without a fix."""
+        position, velocity = torch.from_numpy(self.fixes).split(3, -1)
+        return {"velocity": velocity, "position": position}
+
     def sensed(self) -> dict[str, Array]:
         """Compute the mean force, m/s^2, and rate, rad/s, of each step, [T, 3].
 
@@ -102,30 +108,37 @@ def resample_log(
         f"{len(selection)} fixes between t = {low:.3f} and {high:.3f}",
         "Use a longer log, an earlier start or a later end.",
     )
-    if velocity and np.isnan(log.fixes.velocity).all():
-        raise ValueError(
-            "scenario.receiver.velocity_sd must be null for fixes without vn, ve, vd. "
-            "Set it to null or add these columns."
-        )
+    require(
+        not velocity or np.isfinite(log.fixes.velocity).any(),
+        "scenario.receiver.velocity_sd",
+        "be null for fixes without vn, ve, vd",
+        "a number",
+        "Set it to null or add these columns.",
+    )
     grid, fix_mask = divide_interval(log.fixes.time[selection], step)
     fixes = np.full((len(grid), 6), np.nan)
     fixes[fix_mask] = np.hstack([log.fixes.position, log.fixes.velocity])[selection]
     truth = interpolate(log.reference, grid)
-    if np.isnan(truth[0, 4:]).any():  # a reference can lack the attitude
-        raise ValueError(
-            f"scenario.start_s must not be in a gap of the reference, got t = {grid[0]:.3f}. "
-            "Select another start."
-        )
+    require(
+        np.isfinite(truth[0, 4:]).all(),  # a reference can lack the attitude
+        "scenario.start_s",
+        "not be in a gap of the reference",
+        f"t = {grid[0]:.3f}",
+        "Select another start.",
+    )
     origin = truth[0, 7:].copy()
     fixes[:, :3] -= origin
     truth[:, 7:] -= origin
     usable, total = int(np.isfinite(fixes[fix_mask, 0][1:]).sum()), int(fix_mask.sum()) - 1
-    if not usable:
-        raise ValueError(
-            f"the fixes from t = {grid[0]:.3f} to {grid[-1]:.3f} must include a usable one, got none of "
-            f"{total}: column fix excludes them, or they were dropped. Set scenario.start_s and "
-            f"scenario.end_s to a time with usable fixes{_usable_times(log)}."
-        )
+    times = log.fixes.time[np.isfinite(log.fixes.position[:, 0])]
+    when = f" (t = {times[0]:.3f} to {times[-1]:.3f})" if times.size else ""
+    require(
+        usable,
+        f"the fixes from t = {grid[0]:.3f} to {grid[-1]:.3f}",
+        "include a usable one",
+        f"none of {total}: column fix excludes them, or they were dropped",
+        f"Set scenario.start_s and scenario.end_s to a time with usable fixes{when}.",
+    )
     notes = log.notes + (
         (f"{usable} of {total} selected fixes used, the others are missing",)
         if usable < total
@@ -143,11 +156,6 @@ def resample_log(
         log.gravity,
         notes,
     )
-
-
-def _usable_times(log: NavigationLog) -> str:
-    time = log.fixes.time[np.isfinite(log.fixes.position[:, 0])]
-    return f" (t = {time[0]:.3f} to {time[-1]:.3f})" if time.size else ""
 
 
 def select_fixes(time: Array, interval: float, low: float, high: float) -> NDArray[np.intp]:

@@ -27,6 +27,21 @@ _FEW_REPEATS = 0.2  # share of rows that can be removed because they repeat a ti
 _FEW_ROWS = 0.01  # share of rows with a wrong time
 
 
+def check_time_order(name: str, time: Array, row: Callable[[int], str]) -> None:
+    """Check that the times of a table increase.
+
+    Shapes: time [n].
+    """
+    back = np.flatnonzero(np.diff(time) <= 0) + 1
+    if back.size:
+        i = int(back[0])
+        problem = "repeats the previous time" if time[i] == time[i - 1] else "goes back in time"
+        raise ValueError(
+            f"{name}: column t must increase, got {time[i]:.15g} after {time[i - 1]:.15g} in {row(i)}, which {problem} "
+            f"({back.size} such rows). {find_order_remedy(time, row)}"
+        )
+
+
 def find_order_remedy(time: Array, row: Callable[[int], str]) -> str:
     """Find what makes times increase.
 

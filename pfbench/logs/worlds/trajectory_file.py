@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,16 +12,18 @@ import torch
 from pfbench.core.parameter_checks import require
 from pfbench.files.atomic_write import hash_file
 from pfbench.files.reader_notes import announce_notes
-from pfbench.logs.worlds.log_agreement import compare_reference
+from pfbench.logs.doctor.raw_log import RawReference
+from pfbench.logs.doctor.reference_checks import check_reference, check_rows
+from pfbench.logs.worlds.log_agreement import compare_velocities
+from pfbench.logs.worlds.log_frames import place_of
 from pfbench.logs.worlds.log_reader import read_motion_log
 from pfbench.logs.worlds.log_tables import (
-    LogTable,
-    ReferenceLog,
     find_dataset,
     find_table,
     list_tables,
     parse_numbers,
     read_table,
+    swap_frd_rfu,
 )
 from pfbench.nav import attitude, earth
 from pfbench.nav.trajectory import MotionSpline, RecordedMotion, TrajectoryData
@@ -82,16 +83,16 @@ class RecordedTrajectory:
         recorded = read_motion(find_dataset(self.root, self.folder), self.file, self.origin)
         low, high = (
             limit if setting is None else setting
-            for setting, limit in ((self.start_s, -math.inf), (self.end_s, math.inf))
+            for setting, limit in ((self.start_s, -np.inf), (self.end_s, np.inf))
         )
         selected_mask = (recorded.time >= low) & (recorded.time <= high)
-        if int(selected_mask.sum()) < 2:
-            first, last = float(recorded.time[0]), float(recorded.time[-1])
-            raise ValueError(
-                "scenario.trajectory.start_s and end_s must select at least 2 rows, "
-                f"got {self.start_s} and {self.end_s}. "
-                f"The file covers t = {first:.3f} to {last:.3f} s."
-            )
+        require(
+            int(selected_mask.sum()) >= 2,
+            "scenario.trajectory.start_s and end_s",
+            "select at least 2 rows",
+            f"{self.start_s} and {self.end_s}",
+            f"The file covers t = {recorded.time[0]:.3f} to {recorded.time[-1]:.3f} s.",
+        )
         return MotionSpline(
             RecordedMotion(*(leaf[selected_mask] for leaf in recorded)),
             self.knot_interval_s,
@@ -117,41 +118,22 @@ def read_motion(folder: str | Path, name: str, origin: Sequence[float]) -> Recor
     table = read_table(Path(folder), name, {})
     announce_notes(folder, table.notes)
     motion = read_motion_log(table, tuple(origin), longest=1.0)
-    roll, pitch, yaw = parse_numbers(table, ("roll", "pitch", "yaw")).T
+    angles = parse_numbers(table, ("roll", "pitch", "yaw"))
+    roll, pitch, yaw = angles.T
     dcm = attitude.dcm_from_euler(torch.from_numpy(np.stack([pitch, roll, -yaw], axis=-1)))
-    check_single_velocities(table, motion)
+    velocity, position = swap_frd_rfu(motion.velocity), swap_frd_rfu(motion.position)
+    raw = RawReference(motion.time, angles, velocity, position, np.arange(len(angles)))
+    raw, findings = check_rows(table.name, raw, table.row)
+    findings += check_reference(table.name, raw, {})[1]
+    wrong = [*compare_velocities(table, motion), *(finding.text for finding in findings)]
     require(  # a truth is free of measurement errors
-        not (contradictions := compare_reference(table, motion)),
+        not wrong,
         "a trajectory",
         "have positions and velocities that agree",
-        "; ".join(contradictions),
-        "Correct or remove this row.",
+        "; ".join(wrong).removesuffix("."),
+        "Correct units, signs and order of the columns, or remove this row.",
     )
     time, vel, enu = map(torch.from_numpy, (motion.time, motion.velocity, motion.position))
-    centre = torch.tensor(
-        [math.radians(origin[0]), math.radians(origin[1]), origin[2]], dtype=torch.float64
-    )
+    centre = place_of(origin)
     plan = earth.from_local_enu(enu * enu.new_tensor([1.0, 1.0, 0.0]), centre)
     return RecordedMotion(time, torch.cat([plan[:, :2], centre[2] + enu[:, 2:]], -1), vel, dcm)
-
-
-def check_single_velocities(table: LogTable, motion: ReferenceLog) -> None:
-    """Check that no velocity is a single outlier among its neighbours.
-
-    The mean of both neighbours is as far from a single outlier as each of them. Smooth motion
-    leaves it by half of the change between rows at most, so the limit is half of that of a change:
-    5 m/s and 10 g [ours].
-    """
-    if len(motion.time) < 3:
-        return
-    quantity = table.limits.select("velocity")
-    middle = 0.5 * (motion.velocity[2:] + motion.velocity[:-2])
-    off = np.abs(motion.velocity[1:-1] - middle).max(axis=1)
-    largest = 0.5 * (quantity.allowance + quantity.rate * (motion.time[2:] - motion.time[:-2]) / 2)
-    wrong = np.flatnonzero(off > largest)
-    if wrong.size:
-        i = int(wrong[0])
-        raise ValueError(
-            f"{table.name}: a velocity must agree with its neighbours to {largest[i]:.3g} m/s, got "
-            f"{off[i]:.3g} m/s in {table.row(i + 1)}. Correct or remove this row."
-        )

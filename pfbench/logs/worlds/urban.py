@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.files.reader_notes import announce_notes
@@ -149,11 +150,13 @@ class UrbanDrive(Scenario):
     def _draw_start(self, drive: UrbanLog, draws: PhiloxStream) -> Tensor:
         """Draw starts [R, 9], about which the reference has the assumed distribution."""
         heading = interpolate_reference(drive)["heading"][0]
-        if bool(torch.isnan(heading)):
-            raise ValueError(
-                "scenario.start_s must be a time at which the car moves, "
-                f"got {self.start_s} (standing at {drive.time[0]} s). Select another start."
-            )
+        require(
+            heading.isfinite(),
+            "scenario.start_s",
+            "be a time at which the car moves",
+            f"{self.start_s} (standing at {drive.time[0]} s)",
+            "Select another start.",
+        )
         model = UrbanGnss(self.tuning, NormalRangeError())
         true = torch.cat([heading.new_zeros(3), heading, heading.new_zeros(5)])
         error = model.p0 * draws.at_step(0).normal("world.start", 1, len(model.p0))[:, 0]
@@ -219,20 +222,25 @@ def read_drive(folder: Path, limits: PlausibleLimits | None = None) -> UrbanLog:
     pseudoranges, wheels, truth = (read_table(folder, name, {}, limits) for name in TABLES)
     time = read_times(wheels, 1.0)
     reference = parse_numbers(truth, ("t", "lat_deg", "lon_deg", "h_m", "ve_d", "vn_d"))
-    if not np.array_equal(time, reference[:, 0]):
-        raise ValueError(
-            f"{folder}: {wheels.name} and {truth.name} must have equal times t. "
-            "Use the same epochs in both."
-        )
+    remedy = "Use the same epochs in both."
+    require(
+        np.array_equal(time, reference[:, 0]),
+        f"{folder}: {wheels.name} and {truth.name}",
+        "have equal times t",
+        "others",
+        remedy,
+    )
     t, svid, value, variance, cn0, *positions = parse_numbers(
         pseudoranges, ("t", "svid", "pr", "pr_var", "cn0", "sx", "sy", "sz")
     ).T
     row = np.searchsorted(time, t - _SAME_TIME).clip(max=len(time) - 1)
-    if np.abs(time[row] - t).max() > _SAME_TIME:
-        raise ValueError(
-            f"{folder}: {pseudoranges.name} must have only times t of {wheels.name}. "
-            "Use the same epochs in both."
-        )
+    require(
+        np.abs(time[row] - t).max() <= _SAME_TIME,
+        f"{folder}: {pseudoranges.name}",
+        f"have only times t of {wheels.name}",
+        "others",
+        remedy,
+    )
     satellites, index = index_satellites(pseudoranges, row, parse_satellites(pseudoranges, svid))
     columns = np.full((6, len(time), len(satellites)), np.nan)
     columns[(slice(None), *index)] = value, np.sqrt(variance), cn0, *positions
@@ -304,12 +312,13 @@ def select_stretch(drive: UrbanLog, start: float | None, end: float | None) -> U
     """
     low, high = (-np.inf if start is None else start), (np.inf if end is None else end)
     inside = (drive.time >= low) & (drive.time <= high)
-    if inside.sum() < 2:
-        raise ValueError(
-            "scenario.start_s and end_s must select at least 2 epochs, "
-            f"got {inside.sum()} between {start} and {end}. "
-            f"The drive covers {drive.time[0]} to {drive.time[-1]} s."
-        )
+    require(
+        inside.sum() >= 2,
+        "scenario.start_s and end_s",
+        "select at least 2 epochs",
+        f"{inside.sum()} between {start} and {end}",
+        f"The drive covers {drive.time[0]} to {drive.time[-1]} s.",
+    )
     leaves = {
         name: value[inside]
         for name, value in drive._asdict().items()

@@ -14,12 +14,11 @@ from typing_extensions import override
 from pfbench.core.parameter_checks import require
 from pfbench.core.record import Episode, MeasuredTruth
 from pfbench.files.reader_notes import announce_notes
-from pfbench.files.table_file import Array
 from pfbench.logs.worlds.constrained import ConstrainedDrive
 from pfbench.logs.worlds.corrections import LogCorrections
 from pfbench.logs.worlds.drive import RecordedDrive
 from pfbench.logs.worlds.log_reader import check_corrections
-from pfbench.logs.worlds.log_tables import NavigationLog, find_dataset
+from pfbench.logs.worlds.log_tables import Array, NavigationLog, find_dataset
 from pfbench.logs.worlds.odometer import SimulatedOdometer
 from pfbench.logs.worlds.start_alignment import StartAlignment, StartEstimate
 from pfbench.logs.worlds.time_grid import ResampledLog, interpolate
@@ -105,7 +104,7 @@ class AlignedLog(UserLog):
             note = "nothing is scored: the log has no reference, and no fix is withheld"
             truth = {"position": torch.full_like(episode.truth["position"], torch.nan)}
             return replace(episode, truth=truth, notes=(*episode.notes, note))
-        scored, count = self.holdout.withhold(episode, leg, runs)
+        scored, count = self.holdout.withhold(episode, leg.recorded_fixes, runs)
         sd = self.tuning.measurement_sd
         names = ("position", "velocity") if len(sd) == 6 else ("position",)
         truth = {name: scored.truth[name] for name in names}

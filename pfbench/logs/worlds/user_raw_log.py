@@ -19,10 +19,10 @@ from pfbench.core.record import Episode, MeasuredTruth, Record
 from pfbench.files.reader_notes import announce_notes
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
 from pfbench.logs.sky.raw_gnss import RawGnss, RawGnssInputs, RawGnssTuning
-from pfbench.logs.units import DEGREE
+from pfbench.logs.sky.rinex_observations import RawEpochs
 from pfbench.logs.worlds.corrections import LogCorrections
 from pfbench.logs.worlds.drive import FixHoldout
-from pfbench.logs.worlds.log_frames import find_origin
+from pfbench.logs.worlds.log_frames import find_origin, place_of
 from pfbench.logs.worlds.log_reader import read_track
 from pfbench.logs.worlds.log_tables import (
     Array,
@@ -43,7 +43,7 @@ from pfbench.logs.worlds.raw_gnss import (
     make_sky_inputs,
     subtract_nominal_ranges,
 )
-from pfbench.logs.worlds.rinex_source import RawEpochs, RinexSource
+from pfbench.logs.worlds.rinex_source import RinexSource
 from pfbench.logs.worlds.signal_weights import SignalWeights
 from pfbench.logs.worlds.time_grid import encode_names, interpolate, select_fixes
 from pfbench.nav import earth
@@ -143,26 +143,16 @@ class UserRawLog(Scenario):
 
     def _hold_out(self, episode: Episode, points: PointSolutions, runs: Tensor) -> Episode:
         """Withhold epochs, and make their solutions the only truth."""
-        position = torch.from_numpy(points.position[1:])
-        has_point = torch.isfinite(position[:, 0])
-        withheld = self.holdout.select(has_point, episode.time, runs)[..., None]
-        require(
-            withheld.any(1).all(),
-            "scenario.holdout",
-            "withhold an epoch with a solution in each run",
-            self.holdout,
-            "Withhold more epochs, or use a longer log.",
-        )
-        truth = {"position": torch.where(withheld, position, torch.nan)}
+        fixes = {"position": torch.from_numpy(points.position[1:])}
+        scored, count = self.holdout.withhold(episode, fixes, runs)
         sd = torch.from_numpy(np.sqrt(np.nanmean(points.position_sd[1:] ** 2, axis=0)))
-        record = episode.record._replace(y=torch.where(withheld, torch.nan, episode.record.y))
         notes = (
-            f"errors are distances to {int(withheld[0].sum())} {HELD_OUT_POINTS} (run 0), which the filter does not get; their "
+            f"errors are distances to {count} {HELD_OUT_POINTS} (run 0), which the filter does not get; their "
             f"standard deviations, {', '.join(f'{v:.1f}' for v in sd.tolist())} m East, North, Up, are part of NEES, scores and coverage",
             "errors that last for seconds, such as reflections, are in the ranges before and in the solution: the distance does not show them",
         )
         return replace(
-            episode, record=record, truth=truth, measured_truth=MeasuredTruth(HELD_OUT_POINTS, {"position": sd}),
+            scored, measured_truth=MeasuredTruth(HELD_OUT_POINTS, {"position": sd}),
             notes=(*episode.notes, *notes),
         )  # fmt: skip
 
@@ -272,8 +262,8 @@ class UserRawLog(Scenario):
             "none",
             "Set scenario.standing=[lat_deg,lon_deg,h_m].",
         )
-        geodetic = earth.geodetic(torch.tensor(epochs.position, dtype=torch.float64)).tolist()
-        return geodetic[0] / DEGREE, geodetic[1] / DEGREE, geodetic[2]
+        at = earth.geodetic(torch.tensor(epochs.position, dtype=torch.float64))
+        return tuple((at / place_of((1.0, 1.0, 1.0))).tolist())
 
     def _read_truth(self, folder: Path, epochs: RawEpochs) -> tuple[ReferenceLog, Sequence[float]]:
         """Return the track of the antenna from an origin, and the origin."""
@@ -314,10 +304,8 @@ class UserRawLog(Scenario):
 
 def _move(centre: Sequence[float], enu: Array) -> tuple[float, ...]:
     """Return lat_deg, lon_deg, h_m of a position, East, North, Up from a place, m, [3]."""
-    lat, lon, h = centre
-    at = torch.tensor([math.radians(lat), math.radians(lon), h], dtype=torch.float64)
-    latitude, longitude, height = earth.from_local_enu(torch.from_numpy(enu)[None], at)[0].tolist()
-    return math.degrees(latitude), math.degrees(longitude), height
+    at = earth.from_local_enu(torch.from_numpy(enu)[None], place_of(centre))[0]
+    return tuple((at / place_of((1.0, 1.0, 1.0))).tolist())
 
 
 @dataclass(frozen=True)

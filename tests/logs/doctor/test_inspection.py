@@ -181,7 +181,7 @@ def test_exit_codes_tell_warnings_from_refusals(
     [
         ((), "inspect must have one folder, got none"),
         (("nowhere",), "nowhere must be a folder with imu, gnss and, if there is one, reference"),
-        ((".", "imus=a"), "words must be FOLDER and key=value with the keys imu, gnss"),
+        ((".", "imus=a"), "key must be one of imu, gnss, reference"),
         ((".", "scenario.origin=a,b,c"), "origin must be"),  # as remedies for a run name the key
         ((".", "path=x"), "path must be a number, got x"),
         ((".",), "must contain imu.parquet or imu.csv"),

@@ -82,6 +82,7 @@ OTHERS = {
     "eleven numbers": (text(np.column_stack([TUM[1:, :8], VELOCITY[1:]])), "got 11 fields"),
     "prose": ("a flight\nof a day\n", "must be a table with names of columns, a TUM file"),
     "empty": ("", "got 0 fields in the first row"),
+    "ULog": ("ULog\x01\x12\x35\x00", "got ULog of PX4, by its first bytes. Convert it"),
     "blanks": (TRUTH.to_csv(index=False, sep=" "), r"got blanks as separators .* read_csv\('a.txt'"),
     "damaged": (text(TUM).replace("0.5000000000 ", "0.5x ", 1), "line 2 must have 8 numbers"),
 }  # fmt: skip

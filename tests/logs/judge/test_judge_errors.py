@@ -28,7 +28,7 @@ BAD: dict[str, tuple[Change, str, str]] = {
     "no time": (lambda d: d.rename(columns={"t": "time"}), "must have the column t", "mine.columns=t:"),
     "NaN": (lambda d: d.assign(pe=d.pe.where(d.index != 7)), "line 9, column pe must be a finite", "Remove these rows"),
     "text": (lambda d: d.assign(pe=d.pe.astype(object).where(d.index != 7, "x")), "line 9, column pe must be a number", "Repair"),
-    "repeated time": (lambda d: pd.concat([d[:5], d[4:]]), "line 7, column t must be later", "Keep one row for each time."),
+    "repeated time": (lambda d: pd.concat([d[:5], d[4:]]), "got 2 after 2 in line 7, which repeats the previous time", "Keep one row for each time."),
     "feet": (scale(POSITION, 3.28084), "column pn must be in m", "Multiply the column by 0.3048"),
     "km/h": (scale(["vn", "ve", "vd"], 3.6), "column vn must be in m/s", "0.277778"),
     "degrees": (scale(["roll", "pitch", "yaw"], 180 / np.pi), "column pitch must be", "0.017453"),

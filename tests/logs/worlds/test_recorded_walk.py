@@ -300,7 +300,7 @@ def test_the_truth_is_a_draw_of_the_initial_law_about_the_start(root: Path) -> N
             lambda root: walk(root, receiver=RawGnssReceiver(mask_deg=89)).draw(
                 NominalNoise(), numbers(0), 1
             ),
-            "does not contain a row above 89 degrees",
+            "must contain a row above 89 degrees",
         ),
     ],
 )
