@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,17 +26,23 @@ from pfbench.filter.guided.twisted import TwistedParticleFilter
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.ppl.ibis_smc2 import smc2
 from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood, MarginalLikelihood
+from pfbench.ppl.mixture_sampling import pick_evenly
 from pfbench.ppl.noise_job import infer_noise
 from pfbench.ppl.nuts_svi import normal_guide, nuts, svi
 from pfbench.ppl.parameter_posterior import ParameterPosterior
 from pfbench.ppl.parameterised_model import ParameterisedModel, Prior
 from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
-from pfbench.ppl.priors import find_range, prior_by_name, prior_by_quantiles
+from pfbench.ppl.priors import find_range, read_priors
 from pfbench.ppl.pyro_program import program
 from pfbench.results.plotting import FigureSpec, draw_figure
 from pfbench.results.store import compute_config_key, extend_key
 
-_BY_GRADIENT = ("nuts", "svi")
+_SETTINGS = {
+    "nuts": ("draws", "warmup", "chains", "first_chain"),
+    "svi": ("steps", "draws", "rate"),
+    "pmmh": ("draws", "warmup", "chains"),
+    "smc2": ("moves",),
+}
 _RULES = {
     "draws": "whole [1, inf)", "warmup": "whole [0, inf)", "chains": "whole [1, inf)", "values": "whole [2, inf)", "moves": "whole [0, inf)",
     "steps": "whole [1, inf)", "rate": "(0, inf)", "look_ahead": "null or whole [0, inf) Use 10, or 1 for a nearly linear model.",
@@ -76,27 +82,20 @@ def make_priors(
     remedy = f"{choice}: parameters={{{next(iter(numbers), 'KEY')}:[0.1,10]}}."
     ok = isinstance(parameters, Mapping) and parameters
     require(ok, "parameters", "name at least one unknown key of the model", parameters or "none", remedy)  # fmt: skip
-    priors = {}
-    for name, words in parameters.items():
-        require(name in numbers, "parameters", "name numbers of the model", name, f"{choice}.")
-        if isinstance(words, Mapping):
-            priors[name] = prior_by_name(name, words)
-        else:
-            ends = find_range(partial(_is_accepted, build, node, name), float(numbers[name]))
-            require(ends[0] < ends[1], f"parameters.{name}", "be a number that the model accepts near its value, too", numbers[name], "Choose another: it is a count or a seed.")  # fmt: skip
-            priors[name] = prior_by_quantiles(name, words, numbers[name], ends)
-    return priors
 
+    def is_accepted(name: str, value: float) -> bool:
+        try:
+            build(node, **{name: torch.tensor(value, dtype=torch.float64)})
+        except ValueError:
+            return False
+        return True
 
-def _is_accepted(
-    build: Callable[..., Any], node: Mapping[str, Any], name: str, value: float
-) -> bool:
-    """Return whether a model accepts a value of a number."""
-    try:
-        build(node, **{name: torch.tensor(value, dtype=torch.float64)})
-    except ValueError:
-        return False
-    return True
+    def find_ends(name: str) -> tuple[float, float]:
+        ends = find_range(partial(is_accepted, name), float(numbers[name]))
+        require(ends[0] < ends[1], f"parameters.{name}", "be a number that the model accepts near its value, too", numbers[name], "Choose another: it is a count or a seed.")  # fmt: skip
+        return ends
+
+    return read_priors(parameters, numbers, find_ends)
 
 
 def infer(
@@ -125,7 +124,6 @@ def infer(
         posterior = draw_equally(draws, weights, "importance sampling")
         drawing = FigureSpec(path.stem, "Prior and posterior of noise numbers.", lambda: figure)
         picture = draw_figure(drawing, ["svg"])["svg"]
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path.with_suffix(".svg"), lambda file: file.write(picture))
     else:
         folder = path.with_suffix(".parts")
@@ -144,7 +142,6 @@ def infer(
         "posterior": posterior.to_dict(),
     }
     text = json.dumps(content, default=str)
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda file: file.write(text.encode()))
     shutil.rmtree(path.with_suffix(".parts"), ignore_errors=True)
     return path, json.loads(text)
@@ -162,7 +159,7 @@ def _draw(
     for key in _RULES.keys() & values["infer"].keys():
         require_range(f"infer.{key}", values["infer"][key], _RULES[key])
     task, chains = _make_task(values, build), values["infer"].get("chains", 1)
-    if name in _BY_GRADIENT:
+    if name in ("nuts", "svi"):
         _check_gradient(name, task, choices["model"])
     start_work()
     size = 1 if name == "nuts" else -(-chains // cores)
@@ -194,9 +191,7 @@ def _draw_part(
         settings = {**values["infer"], "first_chain": group[0], "chains": group[1]}
         label = f"{name}, {group[1]} chains from {group[0] + 1} on"
         steps = Steps(label, path.with_suffix(".pt"))
-        posterior, extra = _METHODS[name](
-            _make_task(values, build), settings, int(values["seed"]), steps
-        )
+        posterior, extra = _draw_by(name, _make_task(values, build), settings, int(values["seed"]), steps)  # fmt: skip
         text = json.dumps([posterior.to_dict(), extra])
         write_atomically(path, lambda file: file.write(text.encode()))
     result: tuple[dict[str, Any], dict[str, Any]] = tuple(json.loads(path.read_text()))
@@ -210,11 +205,6 @@ class Steps:
         self.label, self.file, self.total = label, file, 0
         self.rates: list[float] = []
         self.first, self.reported = (-1, 0.0), time.monotonic()
-
-    def of(self, total: int) -> Steps:
-        """Note how many steps there are."""
-        self.total = total
-        return self
 
     def __call__(self, done: int, rate: float | None = None) -> None:
         """Note that steps are done, with an acceptance rate, and say so after a while."""
@@ -276,55 +266,31 @@ def choose_likelihood(task: InferenceTask) -> MarginalLikelihood:
     return GaussianHmmLikelihood() if is_plain else FilterLikelihood(task.method)
 
 
-_Found: TypeAlias = tuple[ParameterPosterior, dict[str, Any]]
-
-
-def _infer_by_nuts(task: InferenceTask, settings: Mapping[str, Any], seed: int, steps: Steps) -> _Found:  # fmt: skip
-    """Draw by the no-U-turn sampler."""
-    model = program(task.unknown, choose_likelihood(task))
-    counts = {key: settings[key] for key in ("draws", "warmup", "chains", "first_chain")}
-    tick = steps.of(settings["draws"] + settings["warmup"])
-    return nuts(model, task.record, seed=seed, tick=tick, **counts), {}
-
-
-def _infer_by_svi(task: InferenceTask, settings: Mapping[str, Any], seed: int, _: Steps) -> _Found:  # fmt: skip
-    """Draw from a fitted guide."""
-    model, guide = program(task.unknown, choose_likelihood(task)), normal_guide(task.unknown)
-    options = {key: settings[key] for key in ("steps", "draws", "rate")}
-    result = svi(model, task.record, guide, seed=seed, **options)
-    return result.posterior, {"losses": result.losses}
-
-
-def _infer_by_pmmh(task: InferenceTask, settings: Mapping[str, Any], seed: int, steps: Steps) -> _Found:  # fmt: skip
-    """Draw by chains of Metropolis-Hastings."""
-    counts = {key: settings[key] for key in ("draws", "warmup", "chains")}
-    tick = steps.of(settings["draws"] + settings["warmup"])
-    options = PmmhSettings(tick=tick, checkpoint=steps.file)
-    first = seed + 100_003 * settings["first_chain"]
-    return pmmh(task.unknown, task.method, task.record, seed=first, settings=options, **counts), {}
-
-
-def _infer_by_smc2(task: InferenceTask, settings: Mapping[str, Any], seed: int, steps: Steps) -> _Found:  # fmt: skip
-    """Draw from the weighted values after the last measurement."""
-    counts = {"particles": settings["values"], "moves": settings["moves"]}
-    tick = steps.of(task.record.y.shape[1])
-    result = smc2(task.unknown, task.method, task.record, seed=seed, tick=tick, **counts)
-    extra = {"log_evidence": float(result.log_evidence[-1]), "ess": float(result.ess[-1])}
-    return draw_equally(result.values, result.weights, "SMC2"), extra
+def _draw_by(
+    name: str, task: InferenceTask, settings: Mapping[str, Any], seed: int, steps: Steps
+) -> tuple[ParameterPosterior, dict[str, Any]]:
+    """Draw by a method; return the posterior and what else is stored."""
+    unknown, record = task.unknown, task.record
+    steps.total = settings["draws"] + settings["warmup"] if "warmup" in settings else record.y.shape[1]  # fmt: skip
+    options = {key: settings[key] for key in _SETTINGS[name]}
+    if name == "smc2":
+        particles = settings["values"]
+        result = smc2(unknown, task.method, record, particles, seed, tick=steps, **options)
+        extra = {"log_evidence": float(result.log_evidence[-1]), "ess": float(result.ess[-1])}
+        return draw_equally(result.values, result.weights, "SMC2"), extra
+    if name == "pmmh":
+        files = PmmhSettings(tick=steps, checkpoint=steps.file)
+        first = seed + 100_003 * settings["first_chain"]
+        return pmmh(unknown, task.method, record, seed=first, settings=files, **options), {}
+    model = program(unknown, choose_likelihood(task))
+    if name == "nuts":
+        return nuts(model, record, seed=seed, tick=steps, **options), {}
+    fit = svi(model, record, normal_guide(unknown), seed=seed, **options)
+    return fit.posterior, {"losses": fit.losses}
 
 
 def draw_equally(values: Mapping[str, Tensor], weights: Tensor, method: str) -> ParameterPosterior:
     """Resample weighted values at equal quantiles, so that all have the same weight: as many as there are."""
-    count = len(weights)
-    levels = (torch.arange(count, dtype=torch.float64) + 0.5) / count
-    indices = torch.searchsorted(weights.cumsum(0), levels).clamp(max=count - 1)
+    indices = pick_evenly(weights, len(weights))
     draws = {key: value[indices].unsqueeze(0) for key, value in values.items()}
     return ParameterPosterior(draws, method=method)
-
-
-_METHODS = {
-    "nuts": _infer_by_nuts,
-    "svi": _infer_by_svi,
-    "pmmh": _infer_by_pmmh,
-    "smc2": _infer_by_smc2,
-}

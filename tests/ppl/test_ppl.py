@@ -326,7 +326,7 @@ def test_the_exact_likelihood_refuses_what_it_cannot_say() -> None:
         torch.eye(2), [[0.0], [1.0]], [[1.0, 0.0]], [1.0], [0.0] * 2, [1.0] * 2
     )
     for model in (UnivariateGrowth(), level(1.0, 1.0), singular):
-        with pytest.raises(ValueError, match="needs a linear model with full noise"):
+        with pytest.raises(ValueError, match="must have a linear model with full noise"):
             GaussianHmmLikelihood()(model, Record(y))
     check_refused(
         [
