@@ -181,12 +181,14 @@ def _differing(models: Sequence[StateSpaceModel]) -> dict[str, Tensor]:
             "Scale the noise inside `propagate`.",
         )
     rows = [dict(model.named_buffers()) for model in models]
-    stacked = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
     names = [
-        k for k, a in stacked.items() if a.requires_grad or not torch.equal(a, a[:1].expand_as(a))
+        name
+        for name, a in rows[0].items()
+        if any(row[name].requires_grad or not torch.equal(row[name], a) for row in rows)
     ]
     # if all models are equal, vmap still needs the number of runs
-    return {name: stacked[name] for name in names or list(stacked)[:1]}
+    names = names or list(rows[0])[:1]
+    return {name: torch.stack([row[name] for row in rows]) for name in names}
 
 
 def list_differences(a: StateSpaceModel, b: StateSpaceModel) -> list[str]:

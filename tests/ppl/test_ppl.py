@@ -460,7 +460,7 @@ def test_chains_that_start_elsewhere_come_to_the_posterior_by_steps_and_by_leaps
     ticks: list[None] = []
     found = pmmh(
         LEVELS, EKF, Record(torch.full((1, 1, 1), torch.nan, dtype=torch.float64)), 5, 16, chains=120, seed=3,
-        settings=PmmhSettings(start=start, leaps=leaps, thin=4, tick=lambda: ticks.append(None)),
+        settings=PmmhSettings(start=start, leaps=leaps, thin=4, tick=lambda *_: ticks.append(None)),
     )  # fmt: skip
     assert len(ticks) == 36
     for name, law in LEVELS.prior.items():
