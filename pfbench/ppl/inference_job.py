@@ -20,16 +20,22 @@ from pfbench.core.parameter_checks import require, require_range
 from pfbench.core.record import Record
 from pfbench.files.atomic_write import write_atomically
 from pfbench.files.command_start import start_work
+from pfbench.files.escapes import markdown_head, markdown_row
 from pfbench.filter.belief import Filter
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.guided.twisted import TwistedParticleFilter
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.ppl.ibis_smc2 import smc2
-from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood, MarginalLikelihood
+from pfbench.ppl.likelihood import (
+    FilterLikelihood,
+    GaussianHmmLikelihood,
+    MarginalLikelihood,
+    repeat_runs,
+)
 from pfbench.ppl.mixture_sampling import pick_evenly
 from pfbench.ppl.noise_job import infer_noise
 from pfbench.ppl.nuts_svi import normal_guide, nuts, svi
-from pfbench.ppl.parameter_posterior import ParameterPosterior
+from pfbench.ppl.parameter_posterior import ParameterPosterior, simulation_based_calibration
 from pfbench.ppl.parameterised_model import ParameterisedModel, Prior
 from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
 from pfbench.ppl.priors import find_range, read_priors
@@ -47,6 +53,7 @@ _RULES = {
     "draws": "whole [1, inf)", "warmup": "whole [0, inf)", "chains": "whole [1, inf)", "values": "whole [2, inf)", "moves": "whole [0, inf)",
     "steps": "whole [1, inf)", "rate": "(0, inf)", "look_ahead": "null or whole [0, inf) Use 10, or 1 for a nearly linear model.",
 }  # fmt: skip
+_BINS = 5  # of ranks, so that 40 data sets suffice for a test
 _SILENCE, _RECENT = 10.0, 200  # s between two lines of progress; steps of their acceptance rate
 _KEYS = ("model", "scenario", "noise", "filter", "infer", "seed", "runs", "first_run")
 
@@ -156,11 +163,8 @@ def _draw(
     cores: int,
 ) -> tuple[ParameterPosterior, dict[str, Any]]:
     """Draw by a method from the posterior of the parameters that the configuration names, in parts that are stored in a folder."""
-    for key in _RULES.keys() & values["infer"].keys():
-        require_range(f"infer.{key}", values["infer"][key], _RULES[key])
-    task, chains = _make_task(values, build), values["infer"].get("chains", 1)
-    if name in ("nuts", "svi"):
-        _check_gradient(name, task, choices["model"])
+    _make_checked_task(name, values, choices, build)
+    chains = values["infer"].get("chains", 1)
     start_work()
     size = 1 if name == "nuts" else -(-chains // cores)
     parts = [(first, min(size, chains - first)) for first in range(0, chains, size)]
@@ -175,6 +179,60 @@ def _draw(
     posterior = ParameterPosterior.join([ParameterPosterior.from_dict(p) for p in posteriors])
     rate = posterior.accepted
     return posterior, extras[0] | ({} if rate is None else {"acceptance": float(rate.mean())})
+
+
+def calibrate(
+    name: str,
+    values: Mapping[str, Any],
+    choices: Mapping[str, str],
+    build: Callable[..., Any],
+    count: int,
+) -> str:
+    """Return a table of the ranks of true parameters among draws of a method, see `simulation_based_calibration`.
+
+    Parameters of `count` data sets are drawn from the prior. Measurements are drawn from the model, with the inputs, the steps and the
+    gaps of the scenario, and each data set is inferred by itself.
+    """
+    require_range("calibrate", count, "whole [20, inf) Use calibrate=100.")
+    require(name in _SETTINGS, "calibrate", "have a method with named parameters", f"method={name}", f"Use one of {', '.join(_SETTINGS)}.")  # fmt: skip
+    require(values["runs"] == 1, "runs", "be 1 for calibrate, which simulates the data sets", values["runs"])  # fmt: skip
+    task, seed = _make_checked_task(name, values, choices, build), int(values["seed"])
+    start_work()
+    settings = {**values["infer"], "first_chain": 0}
+
+    def infer_each(record: Record) -> ParameterPosterior:
+        fits = [
+            _draw_by(
+                name,
+                task._replace(record=record.select_runs(slice(r, r + 1))),
+                settings,
+                seed + r,
+                Steps(f"data set {r + 1} of {count}", None),
+            )[0]
+            for r in range(count)
+        ]
+        draws = {k: torch.stack([fit.pooled_draws(k) for fit in fits], -1) for k in fits[0].draws}
+        return ParameterPosterior({k: a.unsqueeze(0) for k, a in draws.items()}, method=name)
+
+    template = repeat_runs(task.record._replace(feedback=None), count)
+    ranks = simulation_based_calibration(task.unknown, template, infer_each, seed=seed)
+    lines = markdown_head("parameter", "data sets in each fifth of the ranks", "p")
+    for key in task.unknown.names:
+        counts = " ".join(map(str, ranks.counts(key, _BINS)))
+        lines.append(markdown_row(key, counts, f"{ranks.p_value(key, _BINS):.2g}"))
+    return "\n".join(lines)
+
+
+def _make_checked_task(
+    name: str, values: Mapping[str, Any], choices: Mapping[str, str], build: Callable[..., Any]
+) -> InferenceTask:
+    """Check the settings of a method, and build its task."""
+    for key in _RULES.keys() & values["infer"].keys():
+        require_range(f"infer.{key}", values["infer"][key], _RULES[key])
+    task = _make_task(values, build)
+    if name in ("nuts", "svi"):
+        _check_gradient(name, task, choices["model"])
+    return task
 
 
 def _draw_part(
@@ -201,7 +259,7 @@ def _draw_part(
 class Steps:
     """Steps of a part of an inference: lines on standard error, at most one in ten seconds, and the file of their state."""
 
-    def __init__(self, label: str, file: Path) -> None:
+    def __init__(self, label: str, file: Path | None) -> None:
         self.label, self.file, self.total = label, file, 0
         self.rates: list[float] = []
         self.first, self.reported = (-1, 0.0), time.monotonic()

@@ -445,11 +445,7 @@ def test_the_likelihood_moves_with_each_number(name: str) -> None:
     """Of a few steps by a particle filter, where the world is simulated; of recorded ones the model, for which data are needed."""
     values, models = vary(name)
     first = models[""]
-    fixed = [
-        key
-        for key, model in models.items()
-        if not list_differences(first, model)
-    ]
+    fixed = [key for key, model in models.items() if not list_differences(first, model)]
     assert [key for key in fixed[1:] if not any(part in key for part in OF_THE_SCENARIO)] == []
     kept = {key: model for key, model in models.items() if key not in fixed[1:]}
     assert len(kept) > 2
