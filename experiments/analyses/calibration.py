@@ -172,15 +172,15 @@ def list_cases(runs: int) -> dict[str, tuple[ParameterisedModel, Record, Infer]]
     return {
         "local level, exact grid": (LEVELS, short, by_grid),
         f"local level, {PLANTED}": (LEVELS, short, by_pmmh(planted, EKF, 600, 200)),
-        "local level, PMMH": (LEVELS, short, by_pmmh(LEVELS, ParticleFilter(60), 600, 200)),
+        "local level, PMMH": (LEVELS, short, by_pmmh(LEVELS, ParticleFilter(300), 800, 200)),
         "local level, SVI": (LEVELS, short, by_svi(LEVELS, hmm, 200)),
         "local level, SMC2": (LEVELS, short, by_smc2(LEVELS, EKF, 300)),
-        "volatility, SMC2": (VOLATILITY, returns, by_smc2(VOLATILITY, ParticleFilter(60), 300)),
-        "local level, NUTS": (LEVELS, few[0], by_nuts(LEVELS, hmm, 100, 60)),
-        "local level, particle Gibbs": (LEVELS, few[0], by_gibbs(LEVELS, 16, 10, 20)),
+        "volatility, SMC2": (VOLATILITY, few[1], by_smc2(VOLATILITY, ParticleFilter(60), 300)),
         "INS, SVI by EKF": (INS, few[2], by_svi(INS, FilterLikelihood(EKF), 80)),
-        "volatility, PMMH": (VOLATILITY, returns, by_pmmh(VOLATILITY, ParticleFilter(100), 800, 200)),
-        "INS, PMMH by EKF": (INS, few[2], by_pmmh(INS, EKF, 600, 200)),
+        "local level, NUTS": (LEVELS, few[0], by_nuts(LEVELS, hmm, 60, 50)),
+        "volatility, PMMH": (VOLATILITY, few[1], by_pmmh(VOLATILITY, ParticleFilter(200), 800, 200)),
+        "INS, PMMH by EKF": (INS, few[2], by_pmmh(INS, EKF, 500, 150)),
+        "local level, particle Gibbs": (LEVELS, few[0], by_gibbs(LEVELS, 16, 10, 20)),
         "volatility, PMMH that looks ahead": (VOLATILITY, few[1], by_pmmh(VOLATILITY, ahead, 500, 150)),
     }  # fmt: skip
 

@@ -61,8 +61,7 @@ def infer_parameters(words: Sequence[str]) -> None:
     config = compose(composed)
     values, choices = config.values, config.choices
     job.apply_global_settings(values)
-    is_simulated = is_simulated_from(values["scenario"], choices["scenario"])
-    truth = values["model"] if is_simulated and choices["noise"] == "nominal" else {}
+    has_truth = choices["noise"] == "nominal" and is_simulated_from(values["scenario"], choices["scenario"])  # fmt: skip
     about = {"versions": job.read_versions(), "inputs": find_inputs(values, config.trusted)}
     if count := options["calibrate"]:
         print(calibrate(method, values, choices, _build, int(count) if count.isdigit() else count))
@@ -73,7 +72,9 @@ def infer_parameters(words: Sequence[str]) -> None:
         scenario_file = check_scenario_name(name, options["folder"])
     cores = int(options["cores"]) if options["cores"].isdigit() else 0
     require(cores > 0, "cores", "be a number of processes from 1 on", options["cores"], "Use cores=2.")  # fmt: skip
-    path, content = infer(method, values, choices, _build, about, truth, cores)
+    path, content = infer(
+        method, values, choices, _build, about, values["model"] if has_truth else {}, cores
+    )
     print(format_noise(content) if scenario_file else format_posterior(content))
     print(f"inference: {path.resolve()}")
     if scenario_file:

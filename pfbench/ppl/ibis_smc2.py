@@ -24,7 +24,7 @@ from pfbench.filter.loop import FilterPass, prepare_record
 from pfbench.filter.particle.stages import Systematic
 from pfbench.ppl.likelihood import repeat_runs
 from pfbench.ppl.mixture_sampling import choose_rows
-from pfbench.ppl.parameterised_model import ParameterisedModel, Values, check_arguments
+from pfbench.ppl.parameterised_model import ParameterisedModel, Values, check_inference_call
 
 
 class Smc2Result(NamedTuple):
@@ -89,7 +89,7 @@ def smc2(
         N. Chopin (2002), A sequential particle filter method for static models.
         N. Chopin, P. Jacob and O. Papaspiliopoulos (2013), SMC^2.
     """
-    check_arguments(
+    check_inference_call(
         "smc2", unknown=(unknown, ParameterisedModel), record=(record, Record), method=(method, Filter), particles=(particles, 2),
         moves=(moves, 0), seed=(seed, 0),
     )  # fmt: skip
@@ -154,25 +154,24 @@ class _ParameterSampler:
         """
         draws = PhiloxStream(self.seed, torch.arange(1)).at_step(t + 1)
         root, slots = self._walk_factor(), torch.full((1, 1), self.particles)
-        resampling = relabel(draws, f"online_{count}.")
-        ancestors = Systematic()(self.log_w.exp().unsqueeze(0), slots, resampling)[0]
+        w = self.log_w.exp().unsqueeze(0)
+        ancestors = Systematic()(w, slots, relabel(draws, f"online_{count}."))[0]
         rows = (ancestors.unsqueeze(-1) * self.runs + torch.arange(self.runs)).flatten()
         filters.belief = _map_belief(lambda a: a[rows], filters.belief)
-        self.z = self.z[ancestors]
-        self.log_w = torch.full_like(self.log_w, -math.log(self.particles))
+        self.z, self.log_w = self.z[ancestors], self.log_w.new_full((self.particles,), -math.log(self.particles))  # fmt: skip
         log_p = self.unknown.constrained(self.z)[1] + self._log_likelihood(filters)
         accepted = torch.zeros_like(self.log_w)
         for j in range(moves):
-            e = draws.normal(f"online.walk_{count}_{j}", self.particles, self.z.shape[-1])[0]
+            e = draws.normal(f"online.walk_{count}_{j}", *self.z.shape)[0]
             z = self.z + e @ root.mT
-            moved, log_prior = self._start_filters(z, f"online_{count}_{j}.")
-            for _ in islice(moved, t + 1):
+            trial, log_prior = self._start_filters(z, f"online_{count}_{j}.")
+            for _ in islice(trial, t + 1):
                 pass
-            new_log_p = log_prior + self._log_likelihood(moved)
+            new_log_p = log_prior + self._log_likelihood(trial)
             u = draws.uniform(f"online.accept_{count}_{j}", self.particles, 1)[0, :, 0]
             accept = (u.log() < new_log_p - log_p) & torch.isfinite(new_log_p)
             choose = partial(choose_rows, accept.repeat_interleave(self.runs))
-            filters.belief = _map_belief(choose, moved.belief, filters.belief)
+            filters.belief = _map_belief(choose, trial.belief, filters.belief)
             self.z = torch.where(accept.unsqueeze(-1), z, self.z)
             log_p = torch.where(accept, new_log_p, log_p)
             accepted += accept

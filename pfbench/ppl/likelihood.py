@@ -93,8 +93,7 @@ def gaussian_hmm(model: StateSpaceModel, record: Record) -> GaussianHMM:
     has_inputs = bool(record.u) or record.start is not None
     ok = is_regular and not (model.observes_initial or has_inputs)
     must = "have a linear model with full noise, without inputs, with a step before the first measurement"
-    remedy = "Use FilterLikelihood(GaussianFilter(TaylorLinearisation())), which is exact on every linear model."
-    require(ok, "GaussianHmmLikelihood", must, kind, remedy)
+    require(ok, "GaussianHmmLikelihood", must, kind, "Use FilterLikelihood(GaussianFilter(TaylorLinearisation())), which is exact on every linear model.")  # fmt: skip
     is_complete = not bool(torch.isnan(record.y).any())
     require(is_complete, "GaussianHmmLikelihood", "have complete measurements", "missing components (NaN)", "Use FilterLikelihood.")  # fmt: skip
     assert gain is not None

@@ -19,7 +19,7 @@ from torch.distributions import biject_to
 from pfbench.core.parameter_checks import require_range
 from pfbench.core.record import Record
 from pfbench.ppl.parameter_posterior import ParameterPosterior
-from pfbench.ppl.parameterised_model import ParameterisedModel, Values, check_arguments
+from pfbench.ppl.parameterised_model import ParameterisedModel, Values, check_inference_call
 
 Program = Callable[[Record], Values]
 
@@ -66,7 +66,7 @@ def nuts(
     Raises:
         ValueError: If a count is too small, or an argument is of another class.
     """
-    check_arguments(
+    check_inference_call(
         "nuts", program=(program, Callable), record=(record, Record), draws=(draws, 1), warmup=(warmup, 0), chains=(chains, 1),
         seed=(seed, 0),
     )  # fmt: skip
@@ -126,7 +126,7 @@ def svi(
     Raises:
         ValueError: If a value is out of range, or an argument is of another class.
     """
-    check_arguments(
+    check_inference_call(
         "svi", program=(program, Callable), record=(record, Record), guide=(guide, Callable), steps=(steps, 1), draws=(draws, 1),
         seed=(seed, 0), particles=(particles, 1),
     )  # fmt: skip

@@ -19,7 +19,7 @@ from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
 from pfbench.ppl.likelihood import evaluate_fixes
-from pfbench.ppl.parameterised_model import ParameterisedModel, check_arguments
+from pfbench.ppl.parameterised_model import ParameterisedModel, check_inference_call
 from pfbench.ppl.pyro_program import simulate
 from pfbench.results.plotting import COLUMN, RC, add_legend, line_styles
 
@@ -318,7 +318,7 @@ def simulation_based_calibration(
     Raises:
         ValueError: If a count is too small, or an argument is of another class.
     """
-    check_arguments(
+    check_inference_call(
         "simulation_based_calibration",
         unknown=(unknown, ParameterisedModel), template=(template, Record), infer=(infer, Callable), draws=(draws, 1), seed=(seed, 0),
     )  # fmt: skip

@@ -205,7 +205,7 @@ def draw_prior(distribution: Prior, stream: RandomStream, use: str, n: int) -> T
 # Checks of the arguments of inference algorithms.
 
 
-def check_arguments(algorithm: str, **arguments: tuple[Any, Any]) -> None:
+def check_inference_call(algorithm: str, **arguments: tuple[Any, Any]) -> None:
     """Check arguments of an algorithm, each a pair: a whole number and its least value, or an object and its class."""
     for name, (value, allowed) in arguments.items():
         key = f"{algorithm}.{name}"

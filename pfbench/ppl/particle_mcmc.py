@@ -23,7 +23,7 @@ from pfbench.filter.belief import Filter
 from pfbench.filter.smoothing.noise_space import ConditionalSmcKernel, NoiseSpace, PathKernel
 from pfbench.ppl.likelihood import PosteriorEstimator, repeat_runs
 from pfbench.ppl.parameter_posterior import ParameterPosterior
-from pfbench.ppl.parameterised_model import ParameterisedModel, Prior, check_arguments
+from pfbench.ppl.parameterised_model import ParameterisedModel, Prior, check_inference_call
 
 _STORE_EVERY = 20.0  # s between two stored states of the chains
 _Proposal: TypeAlias = Callable[[Tensor, RandomStream], tuple[Tensor, Tensor]]
@@ -57,7 +57,7 @@ class PmmhSettings:
     checkpoint: Path | None = None
 
     def __post_init__(self) -> None:
-        check_arguments("pmmh", thin=(self.thin, 1), leaps=(self.leaps, 0))
+        check_inference_call("pmmh", thin=(self.thin, 1), leaps=(self.leaps, 0))
 
 
 def pmmh(
@@ -100,7 +100,7 @@ def pmmh(
             filter is lost for all starts of a chain.
     """
     settings = settings or PmmhSettings()
-    check_arguments(
+    check_inference_call(
         "pmmh", unknown=(unknown, ParameterisedModel), record=(record, Record), method=(method, Filter),
         settings=(settings, PmmhSettings), draws=(draws, 1), warmup=(warmup, 0), chains=(chains, 1), seed=(seed, 0),
     )  # fmt: skip
@@ -236,7 +236,7 @@ def particle_gibbs(
     References:
         Andrieu, Doucet and Holenstein 2010. Lindsten, Jordan and Schon 2014.
     """
-    check_arguments(
+    check_inference_call(
         "particle_gibbs", unknown=(unknown, ParameterisedModel), record=(record, Record), draws=(draws, 1), warmup=(warmup, 0),
         chains=(chains, 1), seed=(seed, 0),
     )  # fmt: skip

@@ -22,7 +22,7 @@ from pfbench.core.record import Record, iterate_steps
 from pfbench.core.simulate import draw_initial_state, draw_measurements, simulate_steps
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.ppl.likelihood import MarginalLikelihood
-from pfbench.ppl.parameterised_model import ParameterisedModel, Prior, Values, check_arguments
+from pfbench.ppl.parameterised_model import ParameterisedModel, Prior, Values, check_inference_call
 from pfbench.ppl.priors import as_pyro
 from pfbench.ppl.step_program import value_at
 
@@ -160,7 +160,7 @@ def simulate(model: StateSpaceModel, record: Record, seed: int) -> tuple[Record,
     Raises:
         ValueError: If an argument is of another class, or the seed is negative.
     """
-    check_arguments("simulate", model=(model, StateSpaceModel), record=(record, Record), seed=(seed, 0))  # fmt: skip
+    check_inference_call("simulate", model=(model, StateSpaceModel), record=(record, Record), seed=(seed, 0))  # fmt: skip
     stream = PhiloxStream(seed, torch.arange(len(record.y)), model.anchor.dtype)
     converted = record.to(model.anchor)
     with torch.no_grad():

@@ -20,7 +20,7 @@ from pfbench.filter.belief import ParticleBelief
 from pfbench.filter.particle.stages import Proposal, ProposalSample
 from pfbench.model.base import StateSpaceModel
 
-STATE, MEASUREMENT, NOISE = "x", "y", "noise"
+STATE, MEASUREMENT, GUIDE_SITE = "x", "y", "noise"
 Guide: TypeAlias = Callable[[StateSpaceModel, Tensor, Record], Any]
 
 
@@ -152,12 +152,12 @@ class GuideProposal(Proposal):
         z = draws.normal("guide", belief.x.shape[1], model.noise_dim)
         with torch.no_grad(), _Sites(belief.x.shape[:2], z, None) as sites:
             self.guide(model, belief.x, record)
-        remedy = f"Write pyro.sample({NOISE!r}, ...). Other sites would have to be integrated out: make them parameters (pyro.param)."
-        require(list(sites.laws) == [NOISE], "proposal.guide", f"sample the site {NOISE!r} and no other one", list(sites.laws) or "none", remedy)  # fmt: skip
-        law, width = sites.laws[NOISE], model.noise_dim
-        require(law.event_shape == (width,), "proposal.guide", f"have a site of {width} noises (event [{width}])", list(law.event_shape))  # fmt: skip
-        w = sites.values[NOISE].to(belief.x.dtype)
-        log_ratio = model.noise.log_prob(w) - law.log_prob(sites.values[NOISE])
+        remedy = f"Write pyro.sample({GUIDE_SITE!r}, ...). Other sites would have to be integrated out: make them parameters (pyro.param)."
+        require(list(sites.laws) == [GUIDE_SITE], "proposal.guide", f"sample the site {GUIDE_SITE!r} and no other one", list(sites.laws) or "none", remedy)  # fmt: skip
+        distribution, width = sites.laws[GUIDE_SITE], model.noise_dim
+        require(distribution.event_shape == (width,), "proposal.guide", f"have a site of {width} noises (event [{width}])", list(distribution.event_shape))  # fmt: skip
+        w = sites.values[GUIDE_SITE].to(belief.x.dtype)
+        log_ratio = model.noise.log_prob(w) - distribution.log_prob(sites.values[GUIDE_SITE])
         return ProposalSample(model.propagate(belief.x, record.u, w), log_ratio, belief.memory, w)
 
 
