@@ -38,14 +38,15 @@ def as_prior(name: str, distribution: Any) -> Any:
     """Return a distribution of torch or Pyro as one that Pyro samples, without errors outside its support.
 
     Raises:
-        ValueError: If it is not a distribution, not scalar, or discrete.
+        ValueError: If it is not a distribution, not scalar, improper, or discrete.
     """
     ok = isinstance(distribution, Distribution) and not (
-        getattr(distribution.support, "is_discrete", True)
+        isinstance(distribution, laws.ImproperUniform)
+        or getattr(distribution.support, "is_discrete", True)
         or distribution.batch_shape + distribution.event_shape
     )
     remedy = "Take one of pyro.distributions or torch.distributions for each parameter."
-    require(ok, f"prior[{name}]", "be a continuous scalar distribution", distribution, remedy)
+    require(ok, f"prior[{name}]", "be a proper continuous scalar distribution", distribution, remedy)  # fmt: skip
     return as_pyro(distribution)
 
 
