@@ -143,9 +143,11 @@ class _ParameterSampler:
             if tick:
                 tick(t + 1)
         means, sds, *columns = (torch.stack(column) for column in zip(*rows, strict=True))
-        moments = (dict(zip(self.unknown.names, a.unbind(1), strict=True)) for a in (means, sds))
-        values_by_name, _ = self.unknown.constrained(self.z)
-        return Smc2Result(values_by_name, self.log_w.exp(), *moments, *columns)
+        mean_by_name, sd_by_name = (
+            dict(zip(self.unknown.names, a.unbind(1), strict=True)) for a in (means, sds)
+        )
+        last, _ = self.unknown.constrained(self.z)
+        return Smc2Result(last, self.log_w.exp(), mean_by_name, sd_by_name, *columns)
 
     def _resample_move(self, filters: FilterPass, t: int, moves: int, count: int) -> Tensor:
         """Resample the parameters with their filters and move them; moved ones get beliefs of new filters.

@@ -186,7 +186,7 @@ def calibrate(
     values: Mapping[str, Any],
     choices: Mapping[str, str],
     build: Callable[..., Any],
-    count: int,
+    count: Any,
 ) -> str:
     """Return a table of the ranks of true parameters among draws of a method, see `simulation_based_calibration`.
 

@@ -207,7 +207,8 @@ def plot_posterior(
         for (trace, density), name in zip(axes, prior, strict=True):
             for label, posterior in posteriors.items():
                 _plot_draws(trace, density, posterior, name, label, styles[label])
-            x = torch.linspace(*density.get_xlim(), 200)
+            low, high = density.get_xlim()
+            x = torch.linspace(low, high, 200)
             x = x[prior[name].support.check(x)]
             density.plot(
                 x, prior[name].log_prob(x).exp(), color="0.5", linestyle=":", label="prior"
@@ -233,7 +234,8 @@ def _plot_draws(
         percent = np.linspace(0.0, 100.0, chains.shape[1])
         for chain in chains:
             trace.plot(percent, chain, color=style.colour, linewidth=0.4, alpha=0.7)
-    x = np.linspace(*np.quantile(chains, [0.001, 0.999]), 200)
+    low, high = np.quantile(chains, [0.001, 0.999])
+    x = np.linspace(low, high, 200)
     density.plot(x, gaussian_kde(chains.ravel())(x), color=style.colour, linestyle=style.dash, label=label)  # fmt: skip
 
 
