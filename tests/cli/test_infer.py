@@ -107,9 +107,12 @@ def test_ranks_of_a_right_method_are_uniform_and_of_too_few_values_are_not(tmp_p
     """The first by chi-square at one in a thousand; with 2 values, 19 draws are 2 numbers and ranks are in few bins."""
     p = []
     for values in ("infer.values=150", "infer.values=2"):
-        said = command("infer", *WORLD[:2], "scenario.steps=8", "method=smc2", "calibrate=60", values, home=tmp_path)  # fmt: skip
+        said = command(
+            "infer", "model=local_level", "parameters={measurement_sd:[20,500]}", "scenario.steps=12", "method=smc2", "calibrate=60",
+            values, home=tmp_path,
+        )  # fmt: skip
         assert said.code == 0, said.err
-        counts, last = re.findall(r"level_sd \| ([\d ]+) \| (\S+)", said.out)[0]
+        counts, last = re.findall(r"measurement_sd \| ([\d ]+) \| (\S+)", said.out)[0]
         assert sum(map(int, counts.split())) == 60
         p.append(float(last))
     assert p[0] > 1e-3 > 1e-6 > p[1]
