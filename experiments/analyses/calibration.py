@@ -3,10 +3,11 @@
     python experiments/analyses/calibration.py [data sets]
 
 Parameters come from their prior, measurements from the model with them. The rank of a parameter among 19 draws of a method must be
-uniform. Dear methods get 40 of 100 data sets. Draws of a chain depend on each other: where nine of ten chains have fewer than 19
-effective draws, ranks are not uniform though the sampler is right, and the case is named. Two controls are of the local level. Draws
+uniform. Dear methods get 40 of 100 data sets. Draws of a chain depend on each other: where one chain in ten has fewer than 19
+effective draws, ranks need not be uniform though the sampler is right, and the case is named. Two controls are of the local level. Draws
 from a grid of the exact posterior must pass. Chains whose density lacks the Jacobian of the logarithm must fail.
-Finished cases are kept in results/calibration.json, or that of PFBENCH_RESULTS. The script prints the table of the page on inference.
+Finished cases are kept in results/calibration.json. The script prints the table of the page on inference, and its cases are in the file
+beside the script: with PFBENCH_RESULTS=experiments/analyses it goes on with those that are missing.
 """
 
 from __future__ import annotations

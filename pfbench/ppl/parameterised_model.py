@@ -106,9 +106,14 @@ class ParameterisedModel:
         ), is_possible
 
     def models_at(self, z: Tensor, runs_per_model: int) -> tuple[StateSpaceModel, Tensor]:
-        """Build one model for each point z [G, P] of unconstrained parameters, as `models_per_run` does.
+        """Build one model for each point of unconstrained parameters, as `models_per_run` does.
 
-        Returns the model, and the log prior density of the points [G], -inf where a model is impossible.
+        Args:
+            z: Points, [G, P].
+            runs_per_model: Number of consecutive runs that share a model.
+
+        Returns:
+            Model, and the log prior density of the points [G], -inf where a model is impossible.
         """
         values, log_prior = self.constrained(z)
         model, is_possible = self.models_per_run(values, runs_per_model)
