@@ -41,6 +41,7 @@ from data sheets (method=noise). The numbers become a scenario that run, tune an
   infer.draws=500            settings of the method: pfbench list infer
   cores=2                    processes of the chains of nuts and pmmh
   overwrite=true             infer again
+  calibrate=100              ranks of true parameters in 100 simulated data sets, uniform if the method is right
   name=SCENARIO_noise        of the scenario of method=noise, a file of folder=conf
 
 Python: pfbench.ppl, docs/parameter_inference.md"""
@@ -53,26 +54,28 @@ def infer_parameters(words: Sequence[str]) -> None:
     """Infer the parameters of a model, and print their posterior."""
     from pfbench import job
     from pfbench.job.inputs import find_inputs
-    from pfbench.ppl.inference_job import infer
+    from pfbench.ppl.inference_job import calibrate, infer
 
-    options = {"name": "", "folder": "conf", "cores": "1"}
+    options = {"name": "", "folder": "conf", "cores": "1", "calibrate": ""}
     options |= {k: v for k, _, v in (word.partition("=") for word in words) if k in options}
     method, composed = _read_words([w for w in words if w.partition("=")[0] not in options])
     config = compose(composed)
     values, choices = config.values, config.choices
     job.apply_global_settings(values)
-    is_simulated = is_simulated_from(values["scenario"], choices["scenario"])
-    truth = values["model"] if is_simulated and choices["noise"] == "nominal" else {}
+    has_truth = choices["noise"] == "nominal" and is_simulated_from(values["scenario"], choices["scenario"])  # fmt: skip
     about = {"versions": job.read_versions(), "inputs": find_inputs(values, config.trusted)}
+    if count := options["calibrate"]:
+        print(calibrate(method, values, choices, _build, int(count) if count.isdigit() else count))
+        return
     scenario_file = None
     if method == NOISE:
         name = options["name"] or f"{choices['scenario']}_noise"
         scenario_file = check_scenario_name(name, options["folder"])
-    is_count = options["cores"].isdigit() and int(options["cores"]) > 0
-    require(
-        is_count, "cores", "be a number of processes from 1 on", options["cores"], "Use cores=2."
+    cores = int(options["cores"]) if options["cores"].isdigit() else 0
+    require(cores > 0, "cores", "be a number of processes from 1 on", options["cores"], "Use cores=2.")  # fmt: skip
+    path, content = infer(
+        method, values, choices, _build, about, values["model"] if has_truth else {}, cores
     )
-    path, content = infer(method, values, choices, _build, about, truth, int(options["cores"]))
     print(format_noise(content) if scenario_file else format_posterior(content))
     print(f"inference: {path.resolve()}")
     if scenario_file:
@@ -98,8 +101,7 @@ def _read_words(words: Sequence[str]) -> tuple[str, list[str]]:
     if "scenario" in keys and not keys & {"method", "parameters"}:
         words, keys = [*words, f"method={NOISE}"], keys | {"method"}
     if not {"model", "scenario"} & keys or "method" not in keys:
-        missing = "method" if {"model", "scenario"} & keys else "model"
-        raise ValueError(f"{missing} must be set. {_USAGE}")
+        raise ValueError(f"{'method' if {'model', 'scenario'} & keys else 'model'} must be set. {_USAGE}")  # fmt: skip
     methods = list_groups()["infer"]
     words_by_key = {word.partition("=")[0]: word.partition("=")[2] for word in words}
     method = words_by_key["method"]
@@ -107,9 +109,8 @@ def _read_words(words: Sequence[str]) -> tuple[str, list[str]]:
         raise ValueError(
             f"method must be one of {', '.join(methods)}, got {method}.{suggest_similar(method, methods)} {_USAGE}"
         )
-    remedy = "Leave it out, or use method=pmmh."
     by_kalman = method in (NOISE, "nuts", "svi")
-    require(not by_kalman or "particles" not in keys, "particles", f"be left out for method={method}, a Kalman filter", words_by_key.get("particles"), remedy)  # fmt: skip
+    require(not by_kalman or "particles" not in keys, "particles", f"be left out for method={method}, a Kalman filter", words_by_key.get("particles"), "Leave it out, or use method=pmmh.")  # fmt: skip
     others = [
         f"++infer.{word}" if word.startswith("parameters") else word
         for word in words
@@ -122,10 +123,8 @@ def _read_words(words: Sequence[str]) -> tuple[str, list[str]]:
 
 def _find_scenario(model: str) -> str:
     """Return the scenario of the name of a model."""
-    if model not in list_groups()["scenario"]:
-        raise ValueError(
-            f"scenario must be set for model={model}, since none has its name. Choose one: pfbench list scenario"
-        )
+    has_name = model in list_groups()["scenario"]
+    require(has_name, "scenario", f"be set for model={model}", "none of its name", "Choose one: pfbench list scenario.")  # fmt: skip
     return model
 
 

@@ -1,6 +1,5 @@
 """Public names of `pfbench.ppl` and the modules that define them."""
 
-from pfbench.ppl.guide_proposal import GuideProposal as GuideProposal
 from pfbench.ppl.ibis_smc2 import smc2 as smc2
 from pfbench.ppl.likelihood import (
     FilterLikelihood as FilterLikelihood,
@@ -34,4 +33,7 @@ from pfbench.ppl.pyro_program import (
     program as program,
     simulate as simulate,
 )
-from pfbench.ppl.step_program import PyroModel as PyroModel
+from pfbench.ppl.step_program import (
+    GuideProposal as GuideProposal,
+    PyroModel as PyroModel,
+)

@@ -7,27 +7,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from itertools import islice
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import tree_map
 
 from pfbench.core.parameter_checks import require, require_range
-from pfbench.core.random_stream import PhiloxStream, RandomStream, relabel
+from pfbench.core.random_stream import PhiloxStream, relabel
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
 from pfbench.filter.exactness import check_has_evidence
 from pfbench.filter.loop import FilterPass, prepare_record
 from pfbench.filter.particle.stages import Systematic
-from pfbench.model.base import StateSpaceModel
 from pfbench.ppl.likelihood import repeat_runs
-from pfbench.ppl.parameterised_model import (
-    ParameterisedModel,
-    Values,
-    check_counts,
-    check_kinds,
-)
+from pfbench.ppl.mixture_sampling import choose_rows
+from pfbench.ppl.parameterised_model import ParameterisedModel, Values, check_inference_call
 
 
 class Smc2Result(NamedTuple):
@@ -92,9 +89,10 @@ def smc2(
         N. Chopin (2002), A sequential particle filter method for static models.
         N. Chopin, P. Jacob and O. Papaspiliopoulos (2013), SMC^2.
     """
-    check_kinds("smc2", {"unknown": (unknown, ParameterisedModel), "record": (record, Record)})
-    check_kinds("smc2", {"method": (method, Filter)})
-    check_counts("smc2", {"particles": (particles, 2), "moves": (moves, 0), "seed": (seed, 0)})
+    check_inference_call(
+        "smc2", unknown=(unknown, ParameterisedModel), record=(record, Record), method=(method, Filter), particles=(particles, 2),
+        moves=(moves, 0), seed=(seed, 0),
+    )  # fmt: skip
     require_range("smc2.threshold", threshold, "[0, 1]")
     with torch.no_grad():
         sampler = _ParameterSampler(unknown, method, record, particles, seed)
@@ -117,10 +115,10 @@ class _ParameterSampler:
     def run(self, moves: int, threshold: float, tick: Callable[[int], object] | None) -> Smc2Result:
         """Process the record."""
         log_evidence, rows, resamplings = torch.zeros((), dtype=torch.float64), [], 0
-        filters = self._start_filters(self._models(), self._stream(""))
-        before = self._log_likelihood(filters.belief)
+        filters, _ = self._start_filters(self.z, "")
+        before = self._log_likelihood(filters)
         for t, *_ in filters:
-            gain = self._log_likelihood(filters.belief) - before
+            gain = self._log_likelihood(filters) - before
             log_w = self.log_w + gain.nan_to_num(nan=-torch.inf, neginf=-torch.inf)
             total = log_w.logsumexp(0)
             require(
@@ -131,90 +129,67 @@ class _ParameterSampler:
                 "Use a wider prior or more particles.",
             )
             self.log_w, log_evidence = log_w - total, log_evidence + total
-            ess = 1.0 / self.log_w.exp().square().sum()
-            mean, sd = self._moments()  # before resampling, which increases their variance
-            accepted = torch.tensor(torch.nan, dtype=torch.float64)
+            w = self.log_w.exp()
+            ess, accepted = 1.0 / w.square().sum(), w.new_tensor(torch.nan)
+            # moments before resampling, which increases their variance
+            values = torch.stack(list(self.unknown.constrained(self.z)[0].values()), -1)
+            mean = w @ values
+            sd = (w @ (values - mean).square()).sqrt()
             if float(ess) < threshold * self.particles:
                 resamplings += 1
-                filters.belief, accepted = self._resample_move(
-                    filters.belief, t, moves, resamplings
-                )
-                filters.model = self._models()
-            before = self._log_likelihood(filters.belief)
+                accepted = self._resample_move(filters, t, moves, resamplings)
+            before = self._log_likelihood(filters)
             rows.append((mean, sd, log_evidence, ess, accepted))
             if tick:
                 tick(t + 1)
-        means, sds, *columns = zip(*rows, strict=True)
-        mean, sd = (
-            {name: torch.stack([row[name] for row in moment]) for name in self.unknown.names}
-            for moment in (means, sds)
+        means, sds, *columns = (torch.stack(column) for column in zip(*rows, strict=True))
+        mean_by_name, sd_by_name = (
+            dict(zip(self.unknown.names, a.unbind(1), strict=True)) for a in (means, sds)
         )
-        values = self.unknown.constrained(self.z)[0]
-        stacked = [torch.stack(column) for column in columns]
-        return Smc2Result(values, self.log_w.exp(), mean, sd, *stacked)
+        last, _ = self.unknown.constrained(self.z)
+        return Smc2Result(last, self.log_w.exp(), mean_by_name, sd_by_name, *columns)
 
-    def _moments(self) -> tuple[Values, Values]:
-        """Return the weighted means and standard deviations of the parameters."""
-        values, w = self.unknown.constrained(self.z)[0], self.log_w.exp()
-        mean = {name: (w * a).sum() for name, a in values.items()}
-        sd = {name: (w * (a - mean[name]).square()).sum().sqrt() for name, a in values.items()}
-        return mean, sd
+    def _resample_move(self, filters: FilterPass, t: int, moves: int, count: int) -> Tensor:
+        """Resample the parameters with their filters and move them; moved ones get beliefs of new filters.
 
-    def _resample_move(self, belief: Any, t: int, moves: int, count: int) -> tuple[Any, Tensor]:
-        """Resample and move the parameters; moved particles get beliefs of new filters."""
+        Returns the acceptance rate.
+        """
         draws = PhiloxStream(self.seed, torch.arange(1)).at_step(t + 1)
-        root = self._walk_factor()
-        belief = self._resample(belief, relabel(draws, f"online_{count}."))
-        log_p = self.unknown.constrained(self.z)[1] + self._log_likelihood(belief)
+        root, slots = self._walk_factor(), torch.full((1, 1), self.particles)
+        w = self.log_w.exp().unsqueeze(0)
+        ancestors = Systematic()(w, slots, relabel(draws, f"online_{count}."))[0]
+        rows = (ancestors.unsqueeze(-1) * self.runs + torch.arange(self.runs)).flatten()
+        filters.belief = _map_belief(lambda a: a[rows], filters.belief)
+        self.z, self.log_w = self.z[ancestors], self.log_w.new_full((self.particles,), -math.log(self.particles))  # fmt: skip
+        log_p = self.unknown.constrained(self.z)[1] + self._log_likelihood(filters)
         accepted = torch.zeros_like(self.log_w)
         for j in range(moves):
-            e = draws.normal(f"online.walk_{count}_{j}", self.particles, self.z.shape[-1])[0]
+            e = draws.normal(f"online.walk_{count}_{j}", *self.z.shape)[0]
             z = self.z + e @ root.mT
-            new_belief, new_log_p = self._run_filters(z, t, self._stream(f"online_{count}_{j}."))
+            trial, log_prior = self._start_filters(z, f"online_{count}_{j}.")
+            for _ in islice(trial, t + 1):
+                pass
+            new_log_p = log_prior + self._log_likelihood(trial)
             u = draws.uniform(f"online.accept_{count}_{j}", self.particles, 1)[0, :, 0]
-            accept = u.log() < new_log_p - log_p
-            belief = _select_by_run(accept.repeat_interleave(self.runs), new_belief, belief)
+            accept = (u.log() < new_log_p - log_p) & torch.isfinite(new_log_p)
+            choose = partial(choose_rows, accept.repeat_interleave(self.runs))
+            filters.belief = _map_belief(choose, trial.belief, filters.belief)
             self.z = torch.where(accept.unsqueeze(-1), z, self.z)
             log_p = torch.where(accept, new_log_p, log_p)
             accepted += accept
-        return belief, accepted.mean() / max(moves, 1)
+        filters.model, _ = self.unknown.models_at(self.z, self.runs)
+        return accepted.mean() / max(moves, 1)
 
-    def _resample(self, belief: Any, draws: RandomStream) -> Any:
-        """Resample the parameters with their filters."""
-        slots = torch.full((1, 1), self.particles)
-        ancestors = Systematic()(self.log_w.exp().unsqueeze(0), slots, draws)[0]
-        self.z = self.z[ancestors]
-        self.log_w = torch.full_like(self.log_w, -math.log(self.particles))
-        rows = (ancestors.unsqueeze(-1) * self.runs + torch.arange(self.runs)).flatten()
-        return _map_belief(lambda a: a[rows], belief)
+    def _start_filters(self, z: Tensor, purpose: str) -> tuple[FilterPass, Tensor]:
+        """Start the filters of parameters z with the random numbers of a purpose; return them and log p(z) [M]."""
+        model, log_prior = self.unknown.models_at(z, self.runs)
+        draws = relabel(PhiloxStream(self.seed, torch.arange(len(z) * self.runs)), purpose)
+        return FilterPass(self.method, model, prepare_record(model, self.record), draws), log_prior
 
-    def _run_filters(self, z: Tensor, t: int, draws: RandomStream) -> tuple[Any, Tensor]:
-        """Return beliefs given y_1:t, and log p(z) + log p(y_1:t | z) [M]."""
-        values, log_prior = self.unknown.constrained(z)
-        model, valid = self.unknown.models_per_run(values, self.runs)
-        filters = self._start_filters(model, draws)
-        for _ in islice(filters, t + 1):
-            pass
-        log_likelihood = self._log_likelihood(filters.belief)
-        valid = valid & torch.isfinite(log_prior) & torch.isfinite(log_likelihood)
-        return filters.belief, torch.where(valid, log_prior + log_likelihood, -torch.inf)
-
-    def _start_filters(self, model: StateSpaceModel, draws: RandomStream) -> FilterPass:
-        """Start the filters of a batch of models."""
-        return FilterPass(self.method, model, prepare_record(model, self.record), draws)
-
-    def _models(self) -> StateSpaceModel:
-        """Return a batch of models, one for each run of each parameter particle."""
-        return self.unknown.models_per_run(self.unknown.constrained(self.z)[0], self.runs)[0]
-
-    def _log_likelihood(self, belief: Any) -> Tensor:
+    def _log_likelihood(self, filters: FilterPass) -> Tensor:
         """Return log p(y_1:t | z) [M] from the evidence of all runs."""
-        total: Tensor = belief.log_evidence.view(self.particles, self.runs).sum(1)
+        total: Tensor = filters.belief.log_evidence.view(self.particles, self.runs).sum(1)
         return total
-
-    def _stream(self, name: str) -> RandomStream:
-        """Return the random stream of the filters under a name."""
-        return relabel(PhiloxStream(self.seed, torch.arange(self.particles * self.runs)), name)
 
     def _walk_factor(self) -> Tensor:
         """Return the covariance factor of the random walk."""
@@ -225,24 +200,10 @@ class _ParameterSampler:
         return 2.38 / p**0.5 * torch.linalg.cholesky((w * d).mT @ d + 1e-8 * eye)
 
 
-def _select_by_run(mask: Tensor, new: Any, old: Any) -> Any:
-    """Return the new belief for runs in the mask [R], else the old."""
-
-    def select(a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(mask.view(-1, *[1] * (a.dim() - 1)), a, b)
-
-    return _map_belief(select, new, old)
-
-
 def _map_belief(function: Callable[..., Tensor], *beliefs: Any) -> Any:
     """Apply a function to the tensors of beliefs, including those in dicts."""
-    fields: list[Any] = []
-    for values in zip(*beliefs, strict=True):
-        if isinstance(values[0], Tensor):
-            fields.append(function(*values))
-        elif isinstance(values[0], dict):
-            names = values[0]
-            fields.append({name: function(*(value[name] for value in values)) for name in names})
-        else:
-            fields.append(values[0])
+    fields = (
+        tree_map(function, *values) if isinstance(values[0], Tensor | dict) else values[0]
+        for values in zip(*beliefs, strict=True)
+    )
     return type(beliefs[0])(*fields)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,27 +20,40 @@ from pfbench.core.parameter_checks import require, require_range
 from pfbench.core.record import Record
 from pfbench.files.atomic_write import write_atomically
 from pfbench.files.command_start import start_work
+from pfbench.files.escapes import markdown_head, markdown_row
 from pfbench.filter.belief import Filter
 from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
 from pfbench.filter.guided.twisted import TwistedParticleFilter
 from pfbench.model.linear_gaussian import LinearGaussian
 from pfbench.ppl.ibis_smc2 import smc2
-from pfbench.ppl.likelihood import FilterLikelihood, GaussianHmmLikelihood, MarginalLikelihood
+from pfbench.ppl.likelihood import (
+    FilterLikelihood,
+    GaussianHmmLikelihood,
+    MarginalLikelihood,
+    repeat_runs,
+)
+from pfbench.ppl.mixture_sampling import pick_evenly
 from pfbench.ppl.noise_job import infer_noise
 from pfbench.ppl.nuts_svi import normal_guide, nuts, svi
-from pfbench.ppl.parameter_posterior import ParameterPosterior
+from pfbench.ppl.parameter_posterior import ParameterPosterior, simulation_based_calibration
 from pfbench.ppl.parameterised_model import ParameterisedModel, Prior
 from pfbench.ppl.particle_mcmc import PmmhSettings, pmmh
-from pfbench.ppl.priors import find_range, prior_by_name, prior_by_quantiles
+from pfbench.ppl.priors import find_range, read_priors
 from pfbench.ppl.pyro_program import program
 from pfbench.results.plotting import FigureSpec, draw_figure
 from pfbench.results.store import compute_config_key, extend_key
 
-_BY_GRADIENT = ("nuts", "svi")
+_SETTINGS = {
+    "nuts": ("draws", "warmup", "chains", "first_chain"),
+    "svi": ("steps", "draws", "rate"),
+    "pmmh": ("draws", "warmup", "chains"),
+    "smc2": ("moves",),
+}
 _RULES = {
     "draws": "whole [1, inf)", "warmup": "whole [0, inf)", "chains": "whole [1, inf)", "values": "whole [2, inf)", "moves": "whole [0, inf)",
     "steps": "whole [1, inf)", "rate": "(0, inf)", "look_ahead": "null or whole [0, inf) Use 10, or 1 for a nearly linear model.",
 }  # fmt: skip
+_BINS = 5  # of ranks, so that 40 data sets suffice for a test
 _SILENCE, _RECENT = 10.0, 200  # s between two lines of progress; steps of their acceptance rate
 _KEYS = ("model", "scenario", "noise", "filter", "infer", "seed", "runs", "first_run")
 
@@ -76,27 +89,20 @@ def make_priors(
     remedy = f"{choice}: parameters={{{next(iter(numbers), 'KEY')}:[0.1,10]}}."
     ok = isinstance(parameters, Mapping) and parameters
     require(ok, "parameters", "name at least one unknown key of the model", parameters or "none", remedy)  # fmt: skip
-    priors = {}
-    for name, words in parameters.items():
-        require(name in numbers, "parameters", "name numbers of the model", name, f"{choice}.")
-        if isinstance(words, Mapping):
-            priors[name] = prior_by_name(name, words)
-        else:
-            ends = find_range(partial(_is_accepted, build, node, name), float(numbers[name]))
-            require(ends[0] < ends[1], f"parameters.{name}", "be a number that the model accepts near its value, too", numbers[name], "Choose another: it is a count or a seed.")  # fmt: skip
-            priors[name] = prior_by_quantiles(name, words, numbers[name], ends)
-    return priors
 
+    def is_accepted(name: str, value: float) -> bool:
+        try:
+            build(node, **{name: torch.tensor(value, dtype=torch.float64)})
+        except ValueError:
+            return False
+        return True
 
-def _is_accepted(
-    build: Callable[..., Any], node: Mapping[str, Any], name: str, value: float
-) -> bool:
-    """Return whether a model accepts a value of a number."""
-    try:
-        build(node, **{name: torch.tensor(value, dtype=torch.float64)})
-    except ValueError:
-        return False
-    return True
+    def find_ends(name: str) -> tuple[float, float]:
+        ends = find_range(partial(is_accepted, name), float(numbers[name]))
+        require(ends[0] < ends[1], f"parameters.{name}", "be a number that the model accepts near its value, too", numbers[name], "Choose another: it is a count or a seed.")  # fmt: skip
+        return ends
+
+    return read_priors(parameters, numbers, find_ends)
 
 
 def infer(
@@ -125,7 +131,6 @@ def infer(
         posterior = draw_equally(draws, weights, "importance sampling")
         drawing = FigureSpec(path.stem, "Prior and posterior of noise numbers.", lambda: figure)
         picture = draw_figure(drawing, ["svg"])["svg"]
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path.with_suffix(".svg"), lambda file: file.write(picture))
     else:
         folder = path.with_suffix(".parts")
@@ -144,7 +149,6 @@ def infer(
         "posterior": posterior.to_dict(),
     }
     text = json.dumps(content, default=str)
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda file: file.write(text.encode()))
     shutil.rmtree(path.with_suffix(".parts"), ignore_errors=True)
     return path, json.loads(text)
@@ -159,11 +163,8 @@ def _draw(
     cores: int,
 ) -> tuple[ParameterPosterior, dict[str, Any]]:
     """Draw by a method from the posterior of the parameters that the configuration names, in parts that are stored in a folder."""
-    for key in _RULES.keys() & values["infer"].keys():
-        require_range(f"infer.{key}", values["infer"][key], _RULES[key])
-    task, chains = _make_task(values, build), values["infer"].get("chains", 1)
-    if name in _BY_GRADIENT:
-        _check_gradient(name, task, choices["model"])
+    _make_checked_task(name, values, choices, build)
+    chains = values["infer"].get("chains", 1)
     start_work()
     size = 1 if name == "nuts" else -(-chains // cores)
     parts = [(first, min(size, chains - first)) for first in range(0, chains, size)]
@@ -180,6 +181,60 @@ def _draw(
     return posterior, extras[0] | ({} if rate is None else {"acceptance": float(rate.mean())})
 
 
+def calibrate(
+    name: str,
+    values: Mapping[str, Any],
+    choices: Mapping[str, str],
+    build: Callable[..., Any],
+    count: Any,
+) -> str:
+    """Return a table of the ranks of true parameters among draws of a method, see `simulation_based_calibration`.
+
+    Parameters of `count` data sets are drawn from the prior. Measurements are drawn from the model, with the inputs, the steps and the
+    gaps of the scenario, and each data set is inferred by itself.
+    """
+    require_range("calibrate", count, "whole [20, inf) Use calibrate=100.")
+    require(name in _SETTINGS, "calibrate", "have a method with named parameters", f"method={name}", f"Use one of {', '.join(_SETTINGS)}.")  # fmt: skip
+    require(values["runs"] == 1, "runs", "be 1 for calibrate, which simulates the data sets", values["runs"])  # fmt: skip
+    task, seed = _make_checked_task(name, values, choices, build), int(values["seed"])
+    start_work()
+    settings = {**values["infer"], "first_chain": 0}
+
+    def infer_each(record: Record) -> ParameterPosterior:
+        fits = [
+            _draw_by(
+                name,
+                task._replace(record=record.select_runs(slice(r, r + 1))),
+                settings,
+                seed + r,
+                Steps(f"data set {r + 1} of {count}", None),
+            )[0]
+            for r in range(count)
+        ]
+        draws = {k: torch.stack([fit.pooled_draws(k) for fit in fits], -1) for k in fits[0].draws}
+        return ParameterPosterior({k: a.unsqueeze(0) for k, a in draws.items()}, method=name)
+
+    template = repeat_runs(task.record._replace(feedback=None), count)
+    ranks = simulation_based_calibration(task.unknown, template, infer_each, seed=seed)
+    lines = markdown_head("parameter", "data sets in each fifth of the ranks", "p")
+    for key in task.unknown.names:
+        counts = " ".join(map(str, ranks.counts(key, _BINS)))
+        lines.append(markdown_row(key, counts, f"{ranks.p_value(key, _BINS):.2g}"))
+    return "\n".join(lines)
+
+
+def _make_checked_task(
+    name: str, values: Mapping[str, Any], choices: Mapping[str, str], build: Callable[..., Any]
+) -> InferenceTask:
+    """Check the settings of a method, and build its task."""
+    for key in _RULES.keys() & values["infer"].keys():
+        require_range(f"infer.{key}", values["infer"][key], _RULES[key])
+    task = _make_task(values, build)
+    if name in ("nuts", "svi"):
+        _check_gradient(name, task, choices["model"])
+    return task
+
+
 def _draw_part(
     name: str,
     values: Mapping[str, Any],
@@ -194,9 +249,7 @@ def _draw_part(
         settings = {**values["infer"], "first_chain": group[0], "chains": group[1]}
         label = f"{name}, {group[1]} chains from {group[0] + 1} on"
         steps = Steps(label, path.with_suffix(".pt"))
-        posterior, extra = _METHODS[name](
-            _make_task(values, build), settings, int(values["seed"]), steps
-        )
+        posterior, extra = _draw_by(name, _make_task(values, build), settings, int(values["seed"]), steps)  # fmt: skip
         text = json.dumps([posterior.to_dict(), extra])
         write_atomically(path, lambda file: file.write(text.encode()))
     result: tuple[dict[str, Any], dict[str, Any]] = tuple(json.loads(path.read_text()))
@@ -206,15 +259,10 @@ def _draw_part(
 class Steps:
     """Steps of a part of an inference: lines on standard error, at most one in ten seconds, and the file of their state."""
 
-    def __init__(self, label: str, file: Path) -> None:
+    def __init__(self, label: str, file: Path | None) -> None:
         self.label, self.file, self.total = label, file, 0
         self.rates: list[float] = []
         self.first, self.reported = (-1, 0.0), time.monotonic()
-
-    def of(self, total: int) -> Steps:
-        """Note how many steps there are."""
-        self.total = total
-        return self
 
     def __call__(self, done: int, rate: float | None = None) -> None:
         """Note that steps are done, with an acceptance rate, and say so after a while."""
@@ -276,55 +324,31 @@ def choose_likelihood(task: InferenceTask) -> MarginalLikelihood:
     return GaussianHmmLikelihood() if is_plain else FilterLikelihood(task.method)
 
 
-_Found: TypeAlias = tuple[ParameterPosterior, dict[str, Any]]
-
-
-def _infer_by_nuts(task: InferenceTask, settings: Mapping[str, Any], seed: int, steps: Steps) -> _Found:  # fmt: skip
-    """Draw by the no-U-turn sampler."""
-    model = program(task.unknown, choose_likelihood(task))
-    counts = {key: settings[key] for key in ("draws", "warmup", "chains", "first_chain")}
-    tick = steps.of(settings["draws"] + settings["warmup"])
-    return nuts(model, task.record, seed=seed, tick=tick, **counts), {}
-
-
-def _infer_by_svi(task: InferenceTask, settings: Mapping[str, Any], seed: int, _: Steps) -> _Found:  # fmt: skip
-    """Draw from a fitted guide."""
-    model, guide = program(task.unknown, choose_likelihood(task)), normal_guide(task.unknown)
-    options = {key: settings[key] for key in ("steps", "draws", "rate")}
-    result = svi(model, task.record, guide, seed=seed, **options)
-    return result.posterior, {"losses": result.losses}
-
-
-def _infer_by_pmmh(task: InferenceTask, settings: Mapping[str, Any], seed: int, steps: Steps) -> _Found:  # fmt: skip
-    """Draw by chains of Metropolis-Hastings."""
-    counts = {key: settings[key] for key in ("draws", "warmup", "chains")}
-    tick = steps.of(settings["draws"] + settings["warmup"])
-    options = PmmhSettings(tick=tick, checkpoint=steps.file)
-    first = seed + 100_003 * settings["first_chain"]
-    return pmmh(task.unknown, task.method, task.record, seed=first, settings=options, **counts), {}
-
-
-def _infer_by_smc2(task: InferenceTask, settings: Mapping[str, Any], seed: int, steps: Steps) -> _Found:  # fmt: skip
-    """Draw from the weighted values after the last measurement."""
-    counts = {"particles": settings["values"], "moves": settings["moves"]}
-    tick = steps.of(task.record.y.shape[1])
-    result = smc2(task.unknown, task.method, task.record, seed=seed, tick=tick, **counts)
-    extra = {"log_evidence": float(result.log_evidence[-1]), "ess": float(result.ess[-1])}
-    return draw_equally(result.values, result.weights, "SMC2"), extra
+def _draw_by(
+    name: str, task: InferenceTask, settings: Mapping[str, Any], seed: int, steps: Steps
+) -> tuple[ParameterPosterior, dict[str, Any]]:
+    """Draw by a method; return the posterior and what else is stored."""
+    unknown, record = task.unknown, task.record
+    steps.total = settings["draws"] + settings["warmup"] if "warmup" in settings else record.y.shape[1]  # fmt: skip
+    options = {key: settings[key] for key in _SETTINGS[name]}
+    if name == "smc2":
+        particles = settings["values"]
+        result = smc2(unknown, task.method, record, particles, seed, tick=steps, **options)
+        extra = {"log_evidence": float(result.log_evidence[-1]), "ess": float(result.ess[-1])}
+        return draw_equally(result.values, result.weights, "SMC2"), extra
+    if name == "pmmh":
+        files = PmmhSettings(tick=steps, checkpoint=steps.file)
+        first = seed + 100_003 * settings["first_chain"]
+        return pmmh(unknown, task.method, record, seed=first, settings=files, **options), {}
+    model = program(unknown, choose_likelihood(task))
+    if name == "nuts":
+        return nuts(model, record, seed=seed, tick=steps, **options), {}
+    fit = svi(model, record, normal_guide(unknown), seed=seed, **options)
+    return fit.posterior, {"losses": fit.losses}
 
 
 def draw_equally(values: Mapping[str, Tensor], weights: Tensor, method: str) -> ParameterPosterior:
     """Resample weighted values at equal quantiles, so that all have the same weight: as many as there are."""
-    count = len(weights)
-    levels = (torch.arange(count, dtype=torch.float64) + 0.5) / count
-    indices = torch.searchsorted(weights.cumsum(0), levels).clamp(max=count - 1)
+    indices = pick_evenly(weights, len(weights))
     draws = {key: value[indices].unsqueeze(0) for key, value in values.items()}
     return ParameterPosterior(draws, method=method)
-
-
-_METHODS = {
-    "nuts": _infer_by_nuts,
-    "svi": _infer_by_svi,
-    "pmmh": _infer_by_pmmh,
-    "smc2": _infer_by_smc2,
-}

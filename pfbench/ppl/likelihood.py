@@ -12,6 +12,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.linear_algebra import distribution_covariance
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import PhiloxStream, relabel
 from pfbench.core.record import Record, map_inputs
 from pfbench.filter.belief import Filter
@@ -88,20 +89,14 @@ def gaussian_hmm(model: StateSpaceModel, record: Record) -> GaussianHMM:
     """
     kind = type(model.model if isinstance(model, ModelBatch) else model).__name__
     gain = model.noise_gain(()) if model.linear else None
-    singular = model.noise_dim < model.chart.dimension
+    is_regular = gain is not None and model.noise_dim >= model.chart.dimension
     has_inputs = bool(record.u) or record.start is not None
-    if gain is None or singular or model.observes_initial or has_inputs:
-        raise ValueError(
-            "GaussianHmmLikelihood needs a linear model with full noise, without inputs, with a "
-            f"step before the first measurement, got {kind}. Use "
-            "FilterLikelihood(GaussianFilter(TaylorLinearisation())), which is exact on every "
-            "linear model."
-        )
-    if bool(torch.isnan(record.y).any()):
-        raise ValueError(
-            "GaussianHmmLikelihood needs complete measurements, got missing components (NaN). "
-            "Use FilterLikelihood."
-        )
+    ok = is_regular and not (model.observes_initial or has_inputs)
+    must = "have a linear model with full noise, without inputs, with a step before the first measurement"
+    require(ok, "GaussianHmmLikelihood", must, kind, "Use FilterLikelihood(GaussianFilter(TaylorLinearisation())), which is exact on every linear model.")  # fmt: skip
+    is_complete = not bool(torch.isnan(record.y).any())
+    require(is_complete, "GaussianHmmLikelihood", "have complete measurements", "missing components (NaN)", "Use FilterLikelihood.")  # fmt: skip
+    assert gain is not None
     runs, d = len(record.y), model.chart.dimension
     eye = torch.eye(d, dtype=gain.dtype, device=gain.device).expand(runs, -1, -1)
     initial: Any = initial_law(model, runs)
@@ -131,13 +126,11 @@ def evaluate_fixes(
 
     Returns log densities, [S, F] for the F steps of all runs that have a measurement, run after run.
     """
-    count, runs = len(next(iter(values.values()))), len(record.y)
-    is_fix = (~torch.isnan(record.y)).any(-1).flatten()
+    runs, is_fix = len(record.y), (~torch.isnan(record.y)).any(-1).flatten()
     rows = []
-    for first in range(0, count, _BATCH):
-        some = {name: a[first : first + _BATCH] for name, a in values.items()}
-        model, _ = unknown.models_per_run(some, runs)
-        size = len(next(iter(some.values())))
+    for some in zip(*(a.split(_BATCH) for a in values.values()), strict=True):
+        size = len(some[0])
+        model, _ = unknown.models_per_run(dict(zip(values, some, strict=True)), runs)
         prepared = prepare_record(model, repeat_runs(record, size))
         filters = FilterPass(method, model, prepared, PhiloxStream(0, torch.arange(size * runs)))
         totals = [filters.belief.log_evidence, *(filters.belief.log_evidence for _ in filters)]
@@ -179,15 +172,12 @@ class PosteriorEstimator:
 
         Returns log density [C, Q]. Shapes: z [C, Q, P].
         """
-        values, log_prior = self.unknown.constrained(z.flatten(0, 1))
-        model, is_possible = self.unknown.models_per_run(values, self.runs_per_model)
-        is_valid = is_possible & torch.isfinite(log_prior)
-        runs = torch.arange(is_valid.numel() * self.runs_per_model)
+        model, log_prior = self.unknown.models_at(z.flatten(0, 1), self.runs_per_model)
+        runs = torch.arange(len(log_prior) * self.runs_per_model)
         stream: Any = relabel(PhiloxStream(self.seed, runs), f"pmmh_{iteration}.")
         log_z = run_filter(self.method, model, self.record, stream).log_evidence
-        log_z = log_z.view(-1, self.runs_per_model).sum(1)
-        total = torch.where(is_valid & torch.isfinite(log_z), log_prior + log_z, -torch.inf)
-        return total.view(self.shape)
+        total = log_prior + log_z.view(-1, self.runs_per_model).sum(1)
+        return torch.where(torch.isfinite(total), total, -torch.inf).view(self.shape)
 
     def draw_start(self, start: ParameterisedModel) -> tuple[Tensor, Tensor]:
         """Draw the starts of the chains, repeated while the filter is lost.
@@ -195,22 +185,17 @@ class PosteriorEstimator:
         Returns unconstrained parameters [C, Q, P], and their log densities, [C, Q].
         """
         log_p = torch.full(self.shape, -torch.inf, dtype=torch.float64)
-        z = self._sample(start, 0)
+        z = torch.zeros(*self.shape, len(start.prior), dtype=torch.float64)
         for attempt in range(_START_ATTEMPTS):
             is_lost = ~torch.isfinite(log_p)
-            z = torch.where(is_lost.unsqueeze(-1), self._sample(start, attempt), z)
+            if not bool(is_lost.any()):
+                break
+            values = start.draw(is_lost.numel(), self.seed + 7919 * (attempt + 1))
+            z = torch.where(is_lost.unsqueeze(-1), self.unknown.unconstrained(values).view_as(z), z)
             log_p = torch.where(is_lost, self(z, -attempt - 1), log_p)
-            if bool(torch.isfinite(log_p).all()):
-                return z, log_p
         lost = int((~torch.isfinite(log_p)).sum())
-        raise ValueError(
-            f"pmmh needs a start at which the filter is not lost, got {lost} chains lost at "
-            f"{_START_ATTEMPTS} draws. Narrow the prior, or use more particles."
-        )
-
-    def _sample(self, start: ParameterisedModel, attempt: int) -> Tensor:
-        values = start.draw(self.shape[0] * self.shape[1], self.seed + 7919 * (attempt + 1))
-        return self.unknown.unconstrained(values).view(*self.shape, -1)
+        require(not lost, "pmmh", "have a start at which the filter is not lost", f"{lost} chains lost at {_START_ATTEMPTS} draws", "Narrow the prior, or use more particles.")  # fmt: skip
+        return z, log_p
 
 
 def repeat_runs(record: Record, copies: int) -> Record:

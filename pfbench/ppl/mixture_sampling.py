@@ -91,9 +91,7 @@ class Mixture(NamedTuple):
 
     def draw(self, draws: RandomStream, use: str, n: int) -> Tensor:
         """Draw n points, each component in proportion to its weight, [n, P]."""
-        k, p = self.loc.shape
-        levels = (torch.arange(n, dtype=torch.float64) + 0.5) / n
-        components = torch.searchsorted(self.weight.cumsum(0), levels).clamp(max=k - 1)
+        p, components = self.loc.shape[1], pick_evenly(self.weight, n)
         e = draws.normal(use, n, p + _DOF)[0]
         tail = e[:, p:].square().mean(1, keepdim=True).rsqrt()
         return self.loc[components] + (
@@ -123,6 +121,12 @@ class Mixture(NamedTuple):
         wide = 1.5 * self.root @ self.root.mT
         both = torch.lerp(wide, covariance, trust[:, None, None])
         return Mixture((mass + 0.02) / (mass + 0.02).sum(), loc, torch.linalg.cholesky(both))
+
+
+def pick_evenly(weights: Tensor, n: int) -> Tensor:
+    """Pick n indices in proportion to normalised weights, at equal quantiles."""
+    levels = (torch.arange(n, dtype=torch.float64) + 0.5) / n
+    return torch.searchsorted(weights.cumsum(0), levels).clamp(max=len(weights) - 1)
 
 
 class WeightedDraws(NamedTuple):
@@ -169,15 +173,17 @@ def _climb(target: NoiseTarget, z: Tensor, free: Tensor) -> Slopes:
         trial = target.differentiate(best.z + step, free)
         better = trial.value > best.value
         gain = torch.where(better, trial.value - best.value, 0.0)
-        best = Slopes(*(_choose(better, new, old) for new, old in zip(trial, best, strict=True)))
+        best = Slopes(
+            *(choose_rows(better, new, old) for new, old in zip(trial, best, strict=True))
+        )
         damping = torch.where(better[:, None, None], 0.2 * damping, 8.0 * damping.clamp(min=1e-2))
         if bool(((gain < 0.01) & better | (damping[:, 0, 0] > 1e4)).all()):
             break
     return best
 
 
-def _choose(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """Choose rows by a mask [K]."""
+def choose_rows(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """Choose rows of the new values where a mask [K] holds, else those of the old."""
     return torch.where(mask.reshape(-1, *[1] * (new.dim() - 1)), new, old)
 
 

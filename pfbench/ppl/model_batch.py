@@ -11,12 +11,12 @@ from pyro.distributions import Independent
 from torch import Tensor, nn
 from torch.distributions import Distribution, MixtureSameFamily, MultivariateNormal, Normal
 from torch.func import functional_call
-from torch.utils._pytree import tree_map
+from torch.utils._pytree import tree_leaves, tree_map
 from typing_extensions import override
 
 from pfbench.core.density import dense_normal, independent_normal
 from pfbench.core.parameter_checks import require
-from pfbench.core.record import Record, map_inputs
+from pfbench.core.record import Record
 from pfbench.model.base import ModelWrapper, StateSpaceModel
 
 
@@ -45,13 +45,14 @@ class ModelBatch(ModelWrapper):
     @override
     def prepare(self, record: Record) -> Record:
         first = self.model.prepare(record)
-        if all(_same(first.u, model.prepare(record).u) for model in self.models[1:]):
+        others = (model.prepare(record).u for model in self.models[1:])
+        if all(all(map(_equal, tree_leaves(first.u), tree_leaves(u))) for u in others):
             return first
         records = [
             self.models[r // self.runs_per_model].prepare(record.select_runs(slice(r, r + 1)))
             for r in range(self.size)
         ]
-        y, u = torch.cat([run.y for run in records]), _joined([run.u for run in records])
+        y, u = tree_map(lambda *a: torch.cat(a), *((run.y, run.u) for run in records))
         return records[0]._replace(y=y, u=u)
 
     @override
@@ -93,15 +94,15 @@ class ModelBatch(ModelWrapper):
         """Evaluate f(model, ...) of every run as a batch of one, stacked [R, 1, ...]."""
 
         def call_run(buffers: dict[str, Tensor], *run_args: Any) -> Any:
-            batched = (_map_leaves(lambda a: a.unsqueeze(0), value) for value in run_args)
+            batched = tree_map(lambda a: a.unsqueeze(0), run_args)
             return functional_call(self._call, buffers, (f, *batched))
 
-        expanded = [_map_leaves(lambda a: a.expand(self.size, *a.shape[1:]), a) for a in args]
+        expanded = tree_map(lambda a: a.expand(self.size, *a.shape[1:]), args)
         if self._is_mapped:
             return torch.vmap(call_run)(self._buffers_by_run, *expanded)
 
         def call_alone(r: int) -> Any:
-            run_args = (_map_leaves(lambda a: a[r : r + 1], value) for value in expanded)
+            run_args = tree_map(lambda a: a[r : r + 1], expanded)
             return f(self.models[r // self.runs_per_model], *run_args)
 
         return tree_map(lambda *a: torch.stack(a), *map(call_alone, range(self.size)))
@@ -179,13 +180,21 @@ def _differing(models: Sequence[StateSpaceModel]) -> dict[str, Tensor]:
             "different ones",
             "Scale the noise inside `propagate`.",
         )
-    names = [name for name, _ in first.named_buffers()]
-    stacked = {name: [dict(model.named_buffers())[name] for model in models] for name in names}
-    differing = {name: torch.stack(v) for name, v in stacked.items() if not _all_same(v)}
-    if differing:
-        return differing
-    name, values = next(iter(stacked.items()))
-    return {name: torch.stack(values)}  # all models are equal: vmap still needs the number of runs
+    rows = [dict(model.named_buffers()) for model in models]
+    names = [
+        name
+        for name, a in rows[0].items()
+        if any(row[name].requires_grad or not torch.equal(row[name], a) for row in rows)
+    ]
+    # if all models are equal, vmap still needs the number of runs
+    names = names or list(rows[0])[:1]
+    return {name: torch.stack([row[name] for row in rows]) for name in names}
+
+
+def list_differences(a: StateSpaceModel, b: StateSpaceModel) -> list[str]:
+    """List what differs between two models of one class: buffers, or else other attributes."""
+    pairs = zip(a.named_buffers(), b.buffers(), strict=True)
+    return [name for (name, x), y in pairs if not torch.equal(x, y)] or list_non_buffers(a, b)
 
 
 def list_non_buffers(a: StateSpaceModel, b: StateSpaceModel) -> list[str]:
@@ -203,31 +212,5 @@ def list_non_buffers(a: StateSpaceModel, b: StateSpaceModel) -> list[str]:
 
 def _equal(a: Any, b: Any) -> bool:
     if isinstance(a, Tensor) or isinstance(b, Tensor):
-        return torch.equal(torch.as_tensor(a), torch.as_tensor(b))
+        return a is b or torch.equal(torch.as_tensor(a), torch.as_tensor(b))
     return isinstance(a, FunctionType) or bool(a == b)
-
-
-def _all_same(values: Sequence[Tensor]) -> bool:
-    if any(a.requires_grad for a in values):
-        return False
-    return all(torch.equal(values[0], a) for a in values[1:])
-
-
-def _same(a: Any, b: Any) -> bool:
-    if isinstance(a, Tensor):
-        return a is b or torch.equal(a, b)
-    return all(_same(first, second) for first, second in zip(a, b, strict=True))
-
-
-def _joined(inputs: Sequence[Any]) -> Any:
-    """Concatenate inputs of several records along the runs."""
-    first = inputs[0]
-    if isinstance(first, Tensor):
-        return torch.cat(list(inputs))
-    if not first:
-        return first
-    return type(first)(*(_joined(parts) for parts in zip(*inputs, strict=True)))
-
-
-def _map_leaves(f: Callable[[Tensor], Tensor], inputs: Any) -> Any:
-    return f(inputs) if isinstance(inputs, Tensor) else map_inputs(f, inputs)

@@ -13,23 +13,19 @@ import torch
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 from torch import Tensor
-from torch.distributions import biject_to
 
-from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import RandomStream
 from pfbench.ppl.fix_filter import DENSITIES, LEVER, FixFilter
 from pfbench.ppl.mixture_sampling import NoiseTarget, WeightedDraws, find_modes, sample_mixture
-from pfbench.ppl.parameterised_model import draw_prior
-from pfbench.ppl.priors import prior_by_name, prior_by_quantiles
+from pfbench.ppl.parameterised_model import constrain, draw_prior, unconstrain
+from pfbench.ppl.priors import read_priors
 from pfbench.results.plotting import COLUMN, PLAIN_COLOURS, RC
 
 _UNITS = {
     "gyro_density": "rad/s/sqrt(Hz)", "accelerometer_density": "m/s^2/sqrt(Hz)", "gyro_bias_walk": "rad/s/sqrt(s)",
     "accelerometer_bias_walk": "m/s^2/sqrt(s)", "velocity_horizontal": "m/s", "velocity_vertical": "m/s", "delay": "s",
 }  # fmt: skip
-_VIBRATION = (
-    5.0  # prior median of a density over that of the data sheet: sensors on vehicles vibrate
-)
+_VIBRATION = 5.0  # prior median of a density over that of the data sheet: sensors vibrate
 _WALK_SHARE = 30.0  # prior median of a density over that of its bias walk
 _SENSOR_FACTOR, _FIX_FACTOR = 10.0, 3.0  # one standard deviation of the logarithm
 _LEVER_SD, _LONGEST_DELAY = 1.0, 0.5  # m, s
@@ -49,10 +45,7 @@ class NoiseFit(NamedTuple):
     @property
     def values(self) -> dict[str, Tensor]:
         """Draws of the numbers, [S]."""
-        return {
-            name: biject_to(prior.support)(column)
-            for (name, prior), column in zip(self.target.prior.items(), self.draws.z.T, strict=True)
-        }
+        return constrain(self.target.prior, self.draws.z)[0]
 
     def quantiles(self, name: str, levels: tuple[float, ...] = (0.05, 0.5, 0.95)) -> list[float]:
         """Return quantiles of a number."""
@@ -71,7 +64,6 @@ def make_noise_priors(
     walk is about a thirtieth of the density, a fix about the number of the scenario. `replacements` has priors by name or by quantiles that
     replace these.
     """
-    choice = f"Choose from {', '.join(numbers)}."
     priors: dict[str, Any] = {}
     for name, number in numbers.items():
         stated = sheet.get(name)
@@ -86,12 +78,8 @@ def make_noise_priors(
             priors[name] = laws.Normal(*torch.tensor([0.0, _LEVER_SD]).double())
         else:
             priors[name] = _log_normal(number, _FIX_FACTOR)
-    for name, words in replacements.items():
-        require(name in numbers, "parameters", "name noise numbers that change the fixes of this log", name, choice)  # fmt: skip
-        ends = (0.0 if numbers[name] else -math.inf, math.inf)
-        is_named = isinstance(words, Mapping)
-        priors[name] = prior_by_name(name, words) if is_named else prior_by_quantiles(name, words, numbers[name], ends)  # fmt: skip
-    return priors
+    must = "name noise numbers that change the fixes of this log"
+    return priors | read_priors(replacements, numbers, lambda k: (0.0 if numbers[k] else -math.inf, math.inf), must)  # fmt: skip
 
 
 def _log_normal(median: Any, factor: float) -> Any:
@@ -103,11 +91,7 @@ def fit_noise(
     passes: FixFilter, prior: Mapping[str, Any], stream: RandomStream, draws: int, rounds: int
 ) -> NoiseFit:
     """Find modes and draw; mean and deviation of the prior are those of draws of it."""
-    columns = [
-        biject_to(d.support).inv(draw_prior(d, stream, f"prior.{name}", 4000)[0])
-        for name, d in prior.items()
-    ]
-    z = torch.stack(columns, -1)
+    z = unconstrain(prior, {k: draw_prior(d, stream, f"prior.{k}", 4000)[0] for k, d in prior.items()})  # fmt: skip
     target = NoiseTarget(passes, prior, z.mean(0), z.std(0))
     return NoiseFit(target, sample_mixture(target, find_modes(target, stream), stream, draws, rounds))  # fmt: skip
 
@@ -131,18 +115,18 @@ def choose_values(fit: NoiseFit) -> dict[str, float]:
 
 def summarise_noise(fit: NoiseFit) -> dict[str, dict[str, Any]]:
     """Return the row of each number: posterior, prior, value for a filter, and a verdict on what the log says of it."""
-    z, weights = fit.draws.z, fit.draws.weights
-    mean = weights @ z
-    ratio = (weights @ (z - mean).square()).sqrt() / fit.target.scale
-    shift = (mean - fit.target.centre) / fit.target.scale
+    target, weights = fit.target, fit.draws.weights
+    mean = weights @ fit.draws.z
+    ratio = (weights @ (fit.draws.z - mean).square()).sqrt() / target.scale
+    shift = (mean - target.centre) / target.scale
+    levels = torch.tensor([[-1.645], [0.0], [1.645]]).double()
+    priors, _ = constrain(target.prior, target.centre + levels * target.scale)
     plug_in, rows = choose_values(fit), {}
-    for i, (name, prior) in enumerate(fit.target.prior.items()):
-        to_support = biject_to(prior.support)
-        prior_ends = [float(to_support(fit.target.centre[i] + a * fit.target.scale[i])) for a in (-1.645, 0.0, 1.645)]  # fmt: skip
+    for i, (name, (prior_low, prior, prior_high)) in enumerate(priors.items()):
         low, median, high = fit.quantiles(name)
         word = "not identified" if ratio[i] > NOT_IDENTIFIED else "prior conflict" if abs(shift[i]) > CONFLICT else ""  # fmt: skip
         rows[name] = {
-            "prior low": prior_ends[0], "prior": prior_ends[1], "prior high": prior_ends[2], "median": median, "low": low,
+            "prior low": float(prior_low), "prior": float(prior), "prior high": float(prior_high), "median": median, "low": low,
             "high": high, "value": plug_in[name], "sd/prior": float(ratio[i]), "unit": _UNITS.get(name, "m"), "note": word,
         }  # fmt: skip
     return rows
@@ -177,10 +161,8 @@ def score_settings(
 def _score_positions(error: Tensor, variance: Tensor) -> dict[str, float]:
     """Return the RMS of the horizontal and the vertical error, and the share of 90 % intervals that have the reference."""
     has_reference = torch.isfinite(error).all(-1)
-    squares, inside = (
-        error[has_reference].square(),
-        error[has_reference].square() < 1.645**2 * variance[has_reference],
-    )
+    squares = error[has_reference].square()
+    inside = squares < 1.645**2 * variance[has_reference]
     level, up = squares[:, :2].sum(-1).mean().sqrt(), squares[:, 2].mean().sqrt()
     return {"RMS level [m]": float(level), "RMS up [m]": float(up), "position in 90 %": float(inside.double().mean())}  # fmt: skip
 
@@ -196,11 +178,10 @@ def plot_noise(fit: NoiseFit) -> Figure:
         for i, (name, prior) in enumerate(fit.target.prior.items()):
             z, centre, scale = fit.draws.z[:, i].numpy(), fit.target.centre[i], fit.target.scale[i]
             edges = np.linspace(min(float(centre - 2.5 * scale), z.min()), max(float(centre + 2.5 * scale), z.max()), 61)  # fmt: skip
-            to_support, at = biject_to(prior.support), torch.from_numpy(edges)
+            at, log_density = constrain({name: prior}, torch.from_numpy(edges)[:, None])
             height = np.histogram(z, edges, weights=fit.draws.weights.numpy(), density=True)[0]
-            axes[i].stairs(height, to_support(at).numpy(), fill=True, alpha=0.6, color=PLAIN_COLOURS[0], label="posterior")  # fmt: skip
-            density = prior.log_prob(to_support(at)) + to_support.log_abs_det_jacobian(at, to_support(at))  # fmt: skip
-            axes[i].plot(to_support(at), density.exp(), color="0.4", linestyle=":", label="prior")
+            axes[i].stairs(height, at[name].numpy(), fill=True, alpha=0.6, color=PLAIN_COLOURS[0], label="posterior")  # fmt: skip
+            axes[i].plot(at[name], log_density.exp(), color="0.4", linestyle=":", label="prior")
             axes[i].set(xlabel=f"{name.replace('_', ' ')}\n[{_UNITS.get(name, 'm')}]", yticks=[])
             if isinstance(prior, laws.LogNormal):
                 axes[i].set_xscale("log")

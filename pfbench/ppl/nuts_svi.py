@@ -19,12 +19,7 @@ from torch.distributions import biject_to
 from pfbench.core.parameter_checks import require_range
 from pfbench.core.record import Record
 from pfbench.ppl.parameter_posterior import ParameterPosterior
-from pfbench.ppl.parameterised_model import (
-    ParameterisedModel,
-    Values,
-    check_counts,
-    check_kinds,
-)
+from pfbench.ppl.parameterised_model import ParameterisedModel, Values, check_inference_call
 
 Program = Callable[[Record], Values]
 
@@ -71,9 +66,10 @@ def nuts(
     Raises:
         ValueError: If a count is too small, or an argument is of another class.
     """
-    check_kinds("nuts", {"program": (program, Callable), "record": (record, Record)})
-    counts = {"draws": (draws, 1), "warmup": (warmup, 0), "chains": (chains, 1), "seed": (seed, 0)}
-    check_counts("nuts", counts)
+    check_inference_call(
+        "nuts", program=(program, Callable), record=(record, Record), draws=(draws, 1), warmup=(warmup, 0), chains=(chains, 1),
+        seed=(seed, 0),
+    )  # fmt: skip
     samples: list[dict[str, Tensor]] = []
     accepted, diverging = [], torch.zeros(chains, draws)
 
@@ -93,8 +89,7 @@ def nuts(
                 hook_fn=count,
             )
             sampler.run(record)
-        all_draws = sampler.get_samples().items()
-        samples.append({name: a for name, a in all_draws if a.dim() <= 2})
+        samples.append({k: a for k, a in sampler.get_samples().items() if a.dim() <= 2})
         diagnostics = sampler.diagnostics()
         accepted.append(diagnostics["acceptance rate"]["chain 0"])
         diverging[row, diagnostics["divergences"]["chain 0"]] = 1.0
@@ -131,10 +126,10 @@ def svi(
     Raises:
         ValueError: If a value is out of range, or an argument is of another class.
     """
-    kinds = {"program": (program, Callable), "record": (record, Record), "guide": (guide, Callable)}
-    check_kinds("svi", kinds)
-    counts = {"steps": (steps, 1), "draws": (draws, 1), "seed": (seed, 0)}
-    check_counts("svi", {**counts, "particles": (particles, 1)})
+    check_inference_call(
+        "svi", program=(program, Callable), record=(record, Record), guide=(guide, Callable), steps=(steps, 1), draws=(draws, 1),
+        seed=(seed, 0), particles=(particles, 1),
+    )  # fmt: skip
     require_range("svi.rate", rate, "(0, inf)")
     with torch.random.fork_rng(), pyro.get_param_store().scope():
         torch.manual_seed(seed)

@@ -19,7 +19,7 @@ from pfbench.core.parameter_checks import require
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter
 from pfbench.ppl.likelihood import evaluate_fixes
-from pfbench.ppl.parameterised_model import ParameterisedModel, check_counts, check_kinds
+from pfbench.ppl.parameterised_model import ParameterisedModel, check_inference_call
 from pfbench.ppl.pyro_program import simulate
 from pfbench.results.plotting import COLUMN, RC, add_legend, line_styles
 
@@ -44,23 +44,21 @@ class ParameterPosterior:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a dictionary that JSON can store and `from_dict` reads."""
-        accepted = None if self.accepted is None else self.accepted.tolist()
         draws, stats = (
             {k: a.tolist() for k, a in group.items()} for group in (self.draws, self.stats)
         )
+        accepted = None if self.accepted is None else self.accepted.tolist()
         return {"draws": draws, "accepted": accepted, "how": self.method, "stats": stats}
 
     @staticmethod
     def from_dict(content: Mapping[str, Any]) -> ParameterPosterior:
         """Build a posterior from the dictionary of `to_dict`."""
-        groups = (content["draws"], content.get("stats", {}))
-        draws, stats = (
-            {k: torch.tensor(a, dtype=torch.float64) for k, a in group.items()} for group in groups
+        rate = {} if content["accepted"] is None else {"": content["accepted"]}
+        draws, stats, rates = (
+            {k: torch.tensor(a, dtype=torch.float64) for k, a in group.items()}
+            for group in (content["draws"], content.get("stats", {}), rate)
         )
-        accepted = content["accepted"]
-        if accepted is not None:
-            accepted = torch.tensor(accepted, dtype=torch.float64)
-        return ParameterPosterior(draws, accepted, content["how"], stats)
+        return ParameterPosterior(draws, rates.get(""), content["how"], stats)
 
     @staticmethod
     def join(posteriors: Sequence[ParameterPosterior]) -> ParameterPosterior:
@@ -103,11 +101,7 @@ class ParameterPosterior:
         """
         rows = {}
         for name, a in self.draws.items():
-            if a.dim() != 2:
-                raise ValueError(
-                    "table needs parameters shared by all runs, got one set per run. Use "
-                    "posterior.run(r).table()."
-                )
+            require(a.dim() == 2, "table", "have parameters shared by all runs", "one set per run", "Use posterior.run(r).table().")  # fmt: skip
             flat = a.flatten().double()
             low, high = hpdi(flat, mass).tolist()
             chained = self.accepted is not None and a.shape[1] >= 4
@@ -152,11 +146,10 @@ class ParameterPosterior:
             raise ModuleNotFoundError(
                 "to_arviz must have arviz-base, got no such package. Install it: pip install pfbench[arviz]"
             ) from error
-        groups = {"posterior": self.draws}
-        stats, first = dict(self.stats), next(iter(self.draws.values()))
+        groups, first = {"posterior": self.draws}, next(iter(self.draws.values()))
+        stats = dict(self.stats)
         if self.accepted is not None:
-            rate = self.accepted.unsqueeze(1)
-            stats["acceptance_rate"] = rate.expand(first.shape)
+            stats["acceptance_rate"] = self.accepted.unsqueeze(1).expand(first.shape)
         groups |= {"sample_stats": stats} if stats else {}
         if unknown is not None and method is not None and record is not None:
             values = {name: a.flatten(0, 1) for name, a in self.draws.items()}
@@ -214,7 +207,12 @@ def plot_posterior(
         for (trace, density), name in zip(axes, prior, strict=True):
             for label, posterior in posteriors.items():
                 _plot_draws(trace, density, posterior, name, label, styles[label])
-            _plot_prior(density, prior[name])
+            low, high = density.get_xlim()
+            x = torch.linspace(low, high, 200)
+            x = x[prior[name].support.check(x)]
+            density.plot(
+                x, prior[name].log_prob(x).exp(), color="0.5", linestyle=":", label="prior"
+            )
             if name in truth:
                 density.axvline(truth[name], color="black", linewidth=0.8, label="truth")
             trace.set_ylabel(axis_labels[name])
@@ -236,23 +234,9 @@ def _plot_draws(
         percent = np.linspace(0.0, 100.0, chains.shape[1])
         for chain in chains:
             trace.plot(percent, chain, color=style.colour, linewidth=0.4, alpha=0.7)
-    x, height = _estimate_density(chains.ravel())
-    density.plot(x, height, color=style.colour, linestyle=style.dash, label=label)
-
-
-def _plot_prior(axis: Any, distribution: Any) -> None:
-    """Plot a prior density over the limits of an axis."""
-    low, high = axis.get_xlim()
-    x = torch.linspace(low, high, 200)
-    x = x[distribution.support.check(x)]
-    height = distribution.log_prob(x).exp()
-    axis.plot(x, height, color="0.5", linestyle=":", label="prior")
-
-
-def _estimate_density(draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    low, high = np.quantile(draws, [0.001, 0.999])
+    low, high = np.quantile(chains, [0.001, 0.999])
     x = np.linspace(low, high, 200)
-    return x, gaussian_kde(draws)(x)
+    density.plot(x, gaussian_kde(chains.ravel())(x), color=style.colour, linestyle=style.dash, label=label)  # fmt: skip
 
 
 # --------------------------------------------------------------------------------------------------
@@ -336,9 +320,10 @@ def simulation_based_calibration(
     Raises:
         ValueError: If a count is too small, or an argument is of another class.
     """
-    kinds = {"unknown": (unknown, ParameterisedModel), "template": (template, Record)}
-    check_kinds("simulation_based_calibration", {**kinds, "infer": (infer, Callable)})
-    check_counts("simulation_based_calibration", {"draws": (draws, 1), "seed": (seed, 0)})
+    check_inference_call(
+        "simulation_based_calibration",
+        unknown=(unknown, ParameterisedModel), template=(template, Record), infer=(infer, Callable), draws=(draws, 1), seed=(seed, 0),
+    )  # fmt: skip
     truth = unknown.sample(len(template.y), seed)
     record, _ = simulate(unknown.models_per_run(truth)[0], template, seed)
     posterior = infer(record)

@@ -14,7 +14,7 @@ from pfbench.core.parameter_checks import require, require_range
 from pfbench.core.random_stream import PhiloxStream, RandomStream
 from pfbench.core.simulate import draw_values
 from pfbench.model.base import StateSpaceModel
-from pfbench.ppl.model_batch import ModelBatch, list_non_buffers
+from pfbench.ppl.model_batch import ModelBatch, list_differences
 from pfbench.ppl.priors import as_prior
 
 Values: TypeAlias = dict[str, Tensor]
@@ -44,19 +44,17 @@ class ParameterisedModel:
         require(self.prior, "prior", "have at least one parameter", "none", remedy)
         priors = {name: as_prior(name, prior) for name, prior in self.prior.items()}
         object.__setattr__(self, "prior", priors)
-        samples = self.sample(2, 0)
-        values = {name: sample[0] for name, sample in samples.items()}
+        values, others = self._rows(self.sample(2, 0))
         first = self.model(values)
         for name in self.prior:
-            second = self.find_model({**values, name: samples[name][1]})
-            if second is not None and all(map(torch.equal, first.buffers(), second.buffers())):
-                require(
-                    list_non_buffers(first, second),
-                    f"prior[{name}]",
-                    "change the model",
-                    f"a {type(first).__name__} whose buffers do not depend on it",
-                    f"Check that `make` uses `{name}`.",
-                )
+            second = self.find_model({**values, name: others[name]})
+            require(
+                second is None or list_differences(first, second),
+                f"prior[{name}]",
+                "change the model",
+                f"a {type(first).__name__} whose buffers do not depend on it",
+                f"Check that `make` uses `{name}`.",
+            )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -100,12 +98,27 @@ class ParameterisedModel:
             The runs of the others have any model.
         """
         models = [self.find_model(row) for row in self._rows(values)]
-        spare = next((model for model in models if model is not None), None) or self.some_model()
         is_possible = torch.tensor([model is not None for model in models])
+        spare = next(filter(None, models), None) or self.some_model()
         possible = [model or spare for model in models]
         return possible[0] if len(possible) == 1 else ModelBatch(
             possible, runs_per_model
         ), is_possible
+
+    def models_at(self, z: Tensor, runs_per_model: int) -> tuple[StateSpaceModel, Tensor]:
+        """Build one model for each point of unconstrained parameters, as `models_per_run` does.
+
+        Args:
+            z: Points, [G, P].
+            runs_per_model: Number of consecutive runs that share a model.
+
+        Returns:
+            Model, and the log prior density of the points [G], -inf where a model is impossible.
+        """
+        values, log_prior = self.constrained(z)
+        model, is_possible = self.models_per_run(values, runs_per_model)
+        is_valid = is_possible & torch.isfinite(log_prior)
+        return model, torch.where(is_valid, log_prior, -torch.inf)
 
     def draw(self, count: int, seed: int, attempt: int = 0) -> Values:
         """Draw parameters from the prior by counters, whether the model accepts them or not.
@@ -168,8 +181,7 @@ class ParameterisedModel:
 
     def unconstrained(self, values: Mapping[str, Tensor]) -> Tensor:
         """Map parameters to unconstrained numbers [..., P]; the inverse of `constrained`."""
-        columns = [biject_to(d.support).inv(values[name]) for name, d in self.prior.items()]
-        return torch.stack(columns, -1)
+        return unconstrain(self.prior, values)
 
 
 def constrain(prior: Mapping[str, Prior], z: Tensor) -> tuple[Values, Tensor]:
@@ -183,6 +195,11 @@ def constrain(prior: Mapping[str, Prior], z: Tensor) -> tuple[Values, Tensor]:
     return values, log_prior
 
 
+def unconstrain(prior: Mapping[str, Prior], values: Mapping[str, Tensor]) -> Tensor:
+    """Map values of a prior by name to unconstrained numbers [..., P]; the inverse of `constrain`."""
+    return torch.stack([biject_to(d.support).inv(values[name]) for name, d in prior.items()], -1)
+
+
 def draw_prior(distribution: Prior, stream: RandomStream, use: str, n: int) -> Tensor:
     """Draw n values of a scalar distribution for each run of a stream, [R, n]."""
     event = Independent(distribution.expand(torch.Size((1,))), 1)
@@ -193,19 +210,14 @@ def draw_prior(distribution: Prior, stream: RandomStream, use: str, n: int) -> T
 # Checks of the arguments of inference algorithms.
 
 
-def check_counts(algorithm: str, counts: Mapping[str, tuple[Any, int]]) -> None:
-    """Check whole numbers."""
-    for name, (value, least) in counts.items():
-        require_range(f"{algorithm}.{name}", value, f"whole [{least}, inf)")
-
-
-def check_kinds(algorithm: str, values: Mapping[str, tuple[Any, Any]]) -> None:
-    """Check the classes of arguments."""
-    for name, (value, kind) in values.items():
-        is_class = isinstance(value, type) and kind is not Callable
-        if is_class or not isinstance(value, kind):
-            class_name = (value if isinstance(value, type) else type(value)).__name__
-            raise ValueError(
-                f"{algorithm}.{name} must be a {kind.__name__}, got {class_name}. "
-                f"Pass an instance of {kind.__name__}."
-            )
+def check_inference_call(algorithm: str, **arguments: tuple[Any, Any]) -> None:
+    """Check arguments of an algorithm, each a pair: a whole number and its least value, or an object and its class."""
+    for name, (value, allowed) in arguments.items():
+        key = f"{algorithm}.{name}"
+        if isinstance(allowed, int):
+            require_range(key, value, f"whole [{allowed}, inf)")
+            continue
+        is_class = isinstance(value, type)
+        got, kind = (value if is_class else type(value)).__name__, allowed.__name__
+        ok = isinstance(value, allowed) and (allowed is Callable or not is_class)
+        require(ok, key, f"be a {kind}", got, f"Pass an instance of {kind}.")

@@ -23,12 +23,7 @@ from pfbench.filter.belief import Filter
 from pfbench.filter.smoothing.noise_space import ConditionalSmcKernel, NoiseSpace, PathKernel
 from pfbench.ppl.likelihood import PosteriorEstimator, repeat_runs
 from pfbench.ppl.parameter_posterior import ParameterPosterior
-from pfbench.ppl.parameterised_model import (
-    ParameterisedModel,
-    Prior,
-    check_counts,
-    check_kinds,
-)
+from pfbench.ppl.parameterised_model import ParameterisedModel, Prior, check_inference_call
 
 _STORE_EVERY = 20.0  # s between two stored states of the chains
 _Proposal: TypeAlias = Callable[[Tensor, RandomStream], tuple[Tensor, Tensor]]
@@ -62,7 +57,7 @@ class PmmhSettings:
     checkpoint: Path | None = None
 
     def __post_init__(self) -> None:
-        check_counts("pmmh", {"thin": (self.thin, 1), "leaps": (self.leaps, 0)})
+        check_inference_call("pmmh", thin=(self.thin, 1), leaps=(self.leaps, 0))
 
 
 def pmmh(
@@ -105,10 +100,10 @@ def pmmh(
             filter is lost for all starts of a chain.
     """
     settings = settings or PmmhSettings()
-    check_kinds("pmmh", {"unknown": (unknown, ParameterisedModel), "record": (record, Record)})
-    check_kinds("pmmh", {"method": (method, Filter), "settings": (settings, PmmhSettings)})
-    counts = {"draws": (draws, 1), "warmup": (warmup, 0), "chains": (chains, 1), "seed": (seed, 0)}
-    check_counts("pmmh", counts)
+    check_inference_call(
+        "pmmh", unknown=(unknown, ParameterisedModel), record=(record, Record), method=(method, Filter),
+        settings=(settings, PmmhSettings), draws=(draws, 1), warmup=(warmup, 0), chains=(chains, 1), seed=(seed, 0),
+    )  # fmt: skip
     start = unknown
     if settings.start is not None:
         require(
@@ -118,13 +113,12 @@ def pmmh(
             sorted(settings.start),
             "Name the same parameters.",
         )
-        distributions = {name: settings.start[name] for name in unknown.names}
-        start = ParameterisedModel(unknown.make, distributions)
+        start = ParameterisedModel(unknown.make, {k: settings.start[k] for k in unknown.names})
     target = PosteriorEstimator(unknown, method, record, chains, seed, settings.separate_parameters)
-    with torch.no_grad():
-        return _run_chains(target, start, draws, warmup, settings)
+    return _run_chains(target, start, draws, warmup, settings)
 
 
+@torch.no_grad()
 def _run_chains(
     target: PosteriorEstimator,
     start: ParameterisedModel,
@@ -133,18 +127,8 @@ def _run_chains(
     settings: PmmhSettings,
 ) -> ParameterPosterior:
     """Run all chains of a posterior."""
-    call = repr(
-        (
-            target.shape,
-            target.seed,
-            draws,
-            warmup,
-            settings.thin,
-            settings.leaps,
-            start.names,
-            float(target.record.y.nansum()),
-        )
-    )
+    counts = (target.shape, target.seed, draws, warmup, settings.thin, settings.leaps)
+    call = repr((*counts, start.names, float(target.record.y.nansum())))
     z, log_p, moments, samples, accepted_count, done = _find_chains(target, start, settings, call)
     walk, stored = ParameterWalk(*moments), time.monotonic()
     for i in range(done + 1, warmup + draws * settings.thin + 1):
@@ -191,10 +175,15 @@ def _metropolis_step(
     stream = PhiloxStream(target.seed, torch.arange(log_p.numel())).at_step(iteration)
     proposed_z, log_back = proposal(z, stream)
     proposed_log_p = target(proposed_z, iteration)
-    probability = torch.exp(proposed_log_p - log_p + log_back).clamp(max=1.0)
-    is_accepted = stream.uniform("pmmh.accept", 1, 1).view_as(probability) < probability
+    probability, is_accepted = _accept(proposed_log_p - log_p + log_back, stream, "pmmh")
     z = torch.where(is_accepted.unsqueeze(-1), proposed_z, z)
     return z, torch.where(is_accepted, proposed_log_p, log_p), probability, is_accepted
+
+
+def _accept(log_ratio: Tensor, stream: RandomStream, use: str) -> tuple[Tensor, Tensor]:
+    """Return the acceptance probability of each chain, and whether it accepts; from an impossible state it always does."""
+    probability = torch.exp(log_ratio).nan_to_num(nan=1.0).clamp(max=1.0)
+    return probability, stream.uniform(f"{use}.accept", 1, 1).view_as(probability) < probability
 
 
 # --------------------------------------------------------------------------------------------------
@@ -247,13 +236,12 @@ def particle_gibbs(
     References:
         Andrieu, Doucet and Holenstein 2010. Lindsten, Jordan and Schon 2014.
     """
-    kinds = {"unknown": (unknown, ParameterisedModel), "record": (record, Record)}
-    check_kinds("particle_gibbs", kinds)
-    counts = {"draws": (draws, 1), "warmup": (warmup, 0), "chains": (chains, 1), "seed": (seed, 0)}
-    check_counts("particle_gibbs", counts)
-    with torch.no_grad():
-        target = _PathPosterior(unknown, record, chains)
-        return _run_sweeps(target, draws, warmup, seed, kernel or ConditionalSmcKernel(20))
+    check_inference_call(
+        "particle_gibbs", unknown=(unknown, ParameterisedModel), record=(record, Record), draws=(draws, 1), warmup=(warmup, 0),
+        chains=(chains, 1), seed=(seed, 0),
+    )  # fmt: skip
+    target = _PathPosterior(unknown, record, chains)
+    return _run_sweeps(target, draws, warmup, seed, kernel or ConditionalSmcKernel(20))
 
 
 @dataclass(frozen=True)
@@ -266,10 +254,8 @@ class _PathPosterior:
 
     def make_space(self, z: Tensor) -> tuple[NoiseSpace, Tensor]:
         """Return the noise space of the models of z [C, 1, P], and the log prior [C, 1], -inf where a model is impossible."""
-        values, log_prior = self.unknown.constrained(z[:, 0])
-        model, is_possible = self.unknown.models_per_run(values, len(self.record.y))
-        space = NoiseSpace(model, repeat_runs(self.record, self.chains))
-        return space, torch.where(is_possible, log_prior, -torch.inf).unsqueeze(1)
+        model, log_prior = self.unknown.models_at(z[:, 0], len(self.record.y))
+        return NoiseSpace(model, repeat_runs(self.record, self.chains)), log_prior.unsqueeze(1)
 
     def evaluate(
         self, space: NoiseSpace, log_prior: Tensor, theta: Tensor, states: Tensor | None
@@ -296,6 +282,7 @@ def _find_vectors(space: NoiseSpace, theta: Tensor, states: Tensor) -> tuple[Ten
     return torch.cat(parts, -1), total
 
 
+@torch.no_grad()
 def _run_sweeps(
     target: _PathPosterior, draws: int, warmup: int, seed: int, kernel: PathKernel
 ) -> GibbsSample:
@@ -312,10 +299,10 @@ def _run_sweeps(
             proposed, _ = walks[j].step(z, stream)
             after, new_theta = target.evaluate(*target.make_space(proposed), theta, states)
             after -= target.evaluate(*current, theta, states)[0]
-            probability = torch.exp(after).nan_to_num(nan=1.0).clamp(max=1.0)
-            is_accepted = stream.uniform("gibbs.accept", 1, 1) < probability.unsqueeze(-1)
-            z = torch.where(is_accepted, proposed, z)
-            theta = torch.where(is_accepted.repeat_interleave(runs, 0), new_theta, theta)
+            probability, is_accepted = _accept(after, stream, "gibbs")
+            z = torch.where(is_accepted.unsqueeze(-1), proposed, z)
+            is_new = is_accepted.repeat_interleave(runs, 0).unsqueeze(-1)
+            theta = torch.where(is_new, new_theta, theta)
             current = target.make_space(z)
             if i < warmup:
                 walks[j] = walks[j].adapt(z, probability.mean(0), (i + 2.0) ** -0.6)

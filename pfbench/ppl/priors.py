@@ -38,20 +38,26 @@ def as_prior(name: str, distribution: Any) -> Any:
     """Return a distribution of torch or Pyro as one that Pyro samples, without errors outside its support.
 
     Raises:
-        ValueError: If it is not a distribution, not scalar, or discrete.
+        ValueError: If it is not a distribution, not scalar, improper, or discrete.
     """
-    kind: Any = type(distribution)
     ok = isinstance(distribution, Distribution) and not (
-        getattr(distribution.support, "is_discrete", True)
+        isinstance(distribution, laws.ImproperUniform)
+        or getattr(distribution.support, "is_discrete", True)
         or distribution.batch_shape + distribution.event_shape
     )
     remedy = "Take one of pyro.distributions or torch.distributions for each parameter."
-    require(ok, f"prior[{name}]", "be a continuous scalar distribution", distribution, remedy)
-    prior = copy.copy(distribution)
-    if not isinstance(prior, TorchDistributionMixin):
-        prior.__class__ = type(kind.__name__, (kind, TorchDistributionMixin), {})
-    prior._validate_args = False
-    return prior
+    require(ok, f"prior[{name}]", "be a proper continuous scalar distribution", distribution, remedy)  # fmt: skip
+    return as_pyro(distribution)
+
+
+def as_pyro(distribution: Any) -> Any:
+    """Return a distribution of torch or Pyro as one that Pyro samples, without errors outside its support."""
+    kind: Any = type(distribution)
+    copied = copy.copy(distribution)
+    if not isinstance(copied, TorchDistributionMixin):
+        copied.__class__ = type(kind.__name__, (kind, TorchDistributionMixin), {})
+    copied._validate_args = False
+    return copied
 
 
 def find_range(accepts: Callable[[float], bool], value: float) -> tuple[float, float]:
@@ -73,6 +79,23 @@ def find_range(accepts: Callable[[float], bool], value: float) -> tuple[float, f
             inside, outside = (middle, outside) if accepts(middle) else (inside, middle)
         ends.append(round(outside, 9) + 0.0 if has_end else side * math.inf)
     return ends[0], ends[1]
+
+
+def read_priors(
+    parameters: Mapping[str, Any],
+    numbers: Mapping[str, float],
+    find_ends: Callable[[str], tuple[float, float]],
+    must: str = "name numbers of the model",
+) -> dict[str, Any]:
+    """Read priors by name or by quantiles of some of the numbers, whose ranges `find_ends` finds; others are refused."""
+    priors = {}
+    for name, words in parameters.items():
+        require(name in numbers, "parameters", must, name, f"Choose from {', '.join(numbers)}.")
+        if isinstance(words, Mapping):
+            priors[name] = prior_by_name(name, words)
+        else:
+            priors[name] = prior_by_quantiles(name, words, numbers[name], find_ends(name))
+    return priors
 
 
 def prior_by_quantiles(name: str, quantiles: Any, value: float, ends: tuple[float, float]) -> Any:

@@ -12,10 +12,9 @@ from typing import Any
 
 import pyro
 import torch
-from pyro.distributions import DiscreteHMM, Normal, TorchDistribution, Unit
+from pyro.distributions import DiscreteHMM, Normal, Unit
 from torch import Tensor
-from torch.distributions import Distribution, Independent
-from typing_extensions import override
+from torch.distributions import Independent
 
 from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import PhiloxStream
@@ -23,13 +22,9 @@ from pfbench.core.record import Record, iterate_steps
 from pfbench.core.simulate import draw_initial_state, draw_measurements, simulate_steps
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.ppl.likelihood import MarginalLikelihood
-from pfbench.ppl.parameterised_model import (
-    ParameterisedModel,
-    Prior,
-    Values,
-    check_counts,
-    check_kinds,
-)
+from pfbench.ppl.parameterised_model import ParameterisedModel, Prior, Values, check_inference_call
+from pfbench.ppl.priors import as_pyro
+from pfbench.ppl.step_program import value_at
 
 
 def program(
@@ -127,32 +122,6 @@ def compute_path(
     return torch.stack(path, 1), torch.stack(log_like, 1)
 
 
-class _PyroDistribution(TorchDistribution):
-    """A torch distribution as a Pyro site of batch shape []."""
-
-    def __init__(self, inner: Distribution) -> None:
-        self.inner = inner
-        self.has_rsample = inner.has_rsample
-        super().__init__(torch.Size(), inner.batch_shape + inner.event_shape, validate_args=False)
-
-    @property
-    @override
-    def support(self) -> Any:
-        return self.inner.support
-
-    @override
-    def sample(self, sample_shape: Any = torch.Size()) -> Tensor:  # noqa: B008
-        return self.inner.sample(sample_shape)
-
-    @override
-    def rsample(self, sample_shape: Any = torch.Size()) -> Tensor:  # noqa: B008
-        return self.inner.rsample(sample_shape)
-
-    @override
-    def log_prob(self, value: Tensor) -> Tensor:
-        return self.inner.log_prob(value).sum()
-
-
 def _sample_prior(unknown: ParameterisedModel) -> Values:
     """Sample a site for each parameter."""
     return {name: pyro.sample(name, prior) for name, prior in unknown.prior.items()}
@@ -161,14 +130,12 @@ def _sample_prior(unknown: ParameterisedModel) -> Values:
 def _sample_site(name: str, distribution: Any, shape: tuple[int, ...]) -> Tensor:
     """Sample a site [*shape, k]; normal distributions scale a standard normal site."""
     base = distribution.base_dist if isinstance(distribution, Independent) else distribution
-    size = [*shape, distribution.event_shape[0]]
-    if not isinstance(base, torch.distributions.Normal | torch.distributions.MultivariateNormal):
-        return pyro.sample(name, _PyroDistribution(distribution.expand(torch.Size(shape))))
-    standard = Normal(base.loc.new_zeros(()), 1.0).expand(size).to_event(len(size))
-    z: Tensor = pyro.sample(name, standard)
-    if isinstance(base, torch.distributions.Normal):
-        return base.loc + base.scale * z
-    return base.loc + (base.scale_tril @ z.unsqueeze(-1)).squeeze(-1)
+    if isinstance(base, torch.distributions.Normal | torch.distributions.MultivariateNormal):
+        standard = Normal(base.loc.new_zeros(*shape, *distribution.event_shape), 1.0)
+        z: Tensor = pyro.sample(name, standard.to_event(len(shape) + 1))
+        return value_at(name, distribution, z)
+    value: Tensor = pyro.sample(name, as_pyro(distribution).expand(shape).to_event(len(shape)))
+    return value
 
 
 # --------------------------------------------------------------------------------------------------
@@ -193,8 +160,7 @@ def simulate(model: StateSpaceModel, record: Record, seed: int) -> tuple[Record,
     Raises:
         ValueError: If an argument is of another class, or the seed is negative.
     """
-    check_kinds("simulate", {"model": (model, StateSpaceModel), "record": (record, Record)})
-    check_counts("simulate", {"seed": (seed, 0)})
+    check_inference_call("simulate", model=(model, StateSpaceModel), record=(record, Record), seed=(seed, 0))  # fmt: skip
     stream = PhiloxStream(seed, torch.arange(len(record.y)), model.anchor.dtype)
     converted = record.to(model.anchor)
     with torch.no_grad():
@@ -235,12 +201,7 @@ class SwitchingNoise:
     @property
     def prior(self) -> dict[str, Prior]:
         """Distributions of the parameters by name."""
-        return {
-            "sd": self.sd,
-            "ratio": self.ratio,
-            "stay": self.stay,
-            "surge_stay": self.surge_stay,
-        }
+        return dict(vars(self))
 
     def program(self) -> Callable[[Record], Values]:
         """Build a Pyro program of a record whose y [R, T, Dy] are the errors.

@@ -1,9 +1,10 @@
-"""A Pyro program of a step as a state-space model for all filters."""
+"""Pyro programs of a step: as a state-space model for all filters, and as a guide that proposes its noise."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import pyro
 import torch
@@ -13,9 +14,14 @@ from torch.distributions import Distribution, Independent, MultivariateNormal, N
 from typing_extensions import override
 
 from pfbench.core.parameter_checks import require
+from pfbench.core.random_stream import RandomStream
+from pfbench.core.record import Record
+from pfbench.filter.belief import ParticleBelief
+from pfbench.filter.particle.stages import Proposal, ProposalSample
 from pfbench.model.base import StateSpaceModel
 
-STATE, MEASUREMENT = "x", "y"
+STATE, MEASUREMENT, GUIDE_SITE = "x", "y", "noise"
+Guide: TypeAlias = Callable[[StateSpaceModel, Tensor, Record], Any]
 
 
 def value_at(name: str, distribution: Any, z: Tensor) -> Tensor:
@@ -124,43 +130,75 @@ class PyroModel(StateSpaceModel):
         return self._trace(x, u).laws[STATE] if self.has_density else None
 
 
+@dataclass(frozen=True)
+class GuideProposal(Proposal):
+    """Draw the noise of a step by a guide: a program with one sample site, `noise`, of independent components or normal.
+
+    The weights are corrected by the ratio p(w) / q(w), so that any guide that covers the noise of the model is exact. Parameters of
+    the guide (`pyro.param`) are those of Pyro's store when the filter runs.
+
+    Attributes:
+        guide: Function of the model, the parents [R, N, D] and the record of the step. It samples `noise`, batch [R, N] and
+            event [W]. The distribution is normal, or has an inverse distribution function.
+    """
+
+    guide: Guide
+    is_exact = True
+
+    @override
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, record: Record, draws: RandomStream
+    ) -> ProposalSample:
+        z = draws.normal("guide", belief.x.shape[1], model.noise_dim)
+        with torch.no_grad(), _Sites(belief.x.shape[:2], z, None) as sites:
+            self.guide(model, belief.x, record)
+        remedy = f"Write pyro.sample({GUIDE_SITE!r}, ...). Other sites would have to be integrated out: make them parameters (pyro.param)."
+        require(list(sites.laws) == [GUIDE_SITE], "proposal.guide", f"sample the site {GUIDE_SITE!r} and no other one", list(sites.laws) or "none", remedy)  # fmt: skip
+        distribution, width = sites.laws[GUIDE_SITE], model.noise_dim
+        require(distribution.event_shape == (width,), "proposal.guide", f"have a site of {width} noises (event [{width}])", list(distribution.event_shape))  # fmt: skip
+        w = sites.values[GUIDE_SITE].to(belief.x.dtype)
+        log_ratio = model.noise.log_prob(w) - distribution.log_prob(sites.values[GUIDE_SITE])
+        return ProposalSample(model.propagate(belief.x, record.u, w), log_ratio, belief.memory, w)
+
+
 class _Sites(Messenger):
-    """Handler that gives the sites of a batch their values, and keeps their distributions in order."""
+    """Handler that gives the sites of a batch their values, and keeps these and their distributions in order."""
 
     def __init__(self, batch: torch.Size, z: Tensor | None, new: Tensor | None) -> None:
         super().__init__()
         self.batch, self.z, self.new = batch, z, new
         self.laws: dict[str, Any] = {}
-        self.state: Tensor | None = None
+        self.values: dict[str, Tensor] = {}
         self.used = 0
 
-    def _pyro_sample(self, message: Any) -> None:
-        """Set the value of a site."""
-        name, distribution = message["name"], message["fn"]
-        if message["infer"].get("_deterministic"):
-            message["value"] = value = self._find_state(name, lambda: message["value"])
-        else:
-            event, free = tuple(distribution.event_shape), name not in self.laws
-            require(len(event) == 1 and free, f"site {name!r}", "have one event dimension, and occur once", list(event), "Use .to_event(1).")  # fmt: skip
-            self.laws[name] = distribution = distribution.expand(self.batch)
-            value = self._find_state(name, lambda: self._draw(name, distribution))
-        message["value"], message["done"], message["stop"] = value, True, True
+    @property
+    def state(self) -> Tensor | None:
+        """The new state."""
+        return self.values.get(STATE)
 
-    def _find_state(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
-        """Return the value of a site: the given new state, or what is computed."""
-        value = self.new if name == STATE and self.new is not None else compute()
-        if name == STATE:
-            self.state = value
-        return value
+    def _pyro_sample(self, message: Any) -> None:
+        """Set the value of a site: of the given new state, or at the next numbers of the noise."""
+        name, distribution = message["name"], message["fn"]
+        is_computed = message["infer"].get("_deterministic")
+        if not is_computed:
+            event = tuple(distribution.event_shape)
+            is_free = name not in self.laws and not message["is_observed"]
+            require(len(event) == 1 and is_free, f"site {name!r}", "have one event dimension, occur once, and not be observed", list(event), "Use .to_event(1).")  # fmt: skip
+            self.laws[name] = distribution = distribution.expand(self.batch)
+        if name == STATE and self.new is not None:
+            value = self.new
+        else:
+            value = message["value"] if is_computed else self._draw(name, distribution)
+        self.values[name] = message["value"] = value
+        message["done"], message["stop"] = True, True
 
     def _draw(self, name: str, distribution: Any) -> Tensor:
         """Return the value of a site at the next numbers of the noise; zeros for a measurement, which nothing may read."""
         (width,) = distribution.event_shape
-        if name == MEASUREMENT:
-            return torch.zeros(*self.batch, width, dtype=torch.float64)
         zero = torch.zeros(*self.batch, width, dtype=torch.float64)
+        if name == MEASUREMENT:
+            return zero
         z = zero if self.z is None else self.z[..., self.used : self.used + width]
         self.used += width
-        return value_at(
-            f"site {name!r}", distribution, z if z.shape[-1] == width else zero * torch.nan
-        )
+        enough = z.shape[-1] == width
+        return value_at(f"site {name!r}", distribution, z if enough else zero * torch.nan)

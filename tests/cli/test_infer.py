@@ -102,6 +102,22 @@ def test_a_finished_inference_is_not_computed_again_and_another_prior_is_another
     assert len(list(folder.glob("*.json"))) == 2
 
 
+@pytest.mark.slow
+def test_ranks_of_a_right_method_are_uniform_and_of_too_few_values_are_not(tmp_path: Path) -> None:
+    """The first by chi-square at one in a thousand; with 2 values, 19 draws are 2 numbers and ranks are in few bins."""
+    p = []
+    for values in ("infer.values=150", "infer.values=2"):
+        said = command(
+            "infer", "model=local_level", "parameters={measurement_sd:[20,500]}", "scenario.steps=12", "method=smc2", "calibrate=60",
+            values, home=tmp_path,
+        )  # fmt: skip
+        assert said.code == 0, said.err
+        counts, last = re.findall(r"measurement_sd \| ([\d ]+) \| (\S+)", said.out)[0]
+        assert sum(map(int, counts.split())) == 60
+        p.append(float(last))
+    assert p[0] > 1e-3 > 1e-6 > p[1]
+
+
 def test_finished_chains_of_an_interrupted_inference_are_not_drawn_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -146,6 +162,10 @@ def test_finished_chains_of_an_interrupted_inference_are_not_drawn_again(
         (("model=local_level", "method=nuts", "parameters={levle_sd:[1,2]}"), "parameters must name numbers of the model, got levle_sd. Choose from level_sd"),
         (("model=local_level", "method=nuts", "parameters={level_sd:[5,2]}"), "parameters.level_sd must be two positive numbers"),
         (("model=ins_gnss", "method=nuts", PARAMETERS), "scenario must be set for model=ins_gnss"),
+        (("model=local_level", "method=smc2", PARAMETERS, "calibrate=3"), "calibrate must be a whole number of at least 20, got 3. Use calibrate=100."),
+        (("model=local_level", "method=smc2", PARAMETERS, "calibrate=x"), "calibrate must be a whole number of at least 20, got 'x'"),
+        (("model=local_level", "method=smc2", PARAMETERS, "calibrate=40", "runs=2"), "runs must be 1 for calibrate"),
+        (("scenario=local_level", "method=noise", PARAMETERS, "calibrate=40"), "calibrate must have a method with named parameters, got method=noise. Use one of nuts, svi, pmmh, smc2."),
         (("-m", "model=local_level", "method=nuts", PARAMETERS), "must be run without -m"),
     ],
 )  # fmt: skip

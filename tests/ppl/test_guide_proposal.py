@@ -100,9 +100,9 @@ def test_the_numbers_are_those_of_the_stream_and_not_of_torch() -> None:
 @pytest.mark.parametrize(
     ("guide", "sentence"),
     [
-        (lambda model, x, record: None, "must sample the site 'noise', got none"),
-        (lambda model, x, record: pyro.sample("z", Normal(x, 1.0).to_event(1)), "and no other one, got 'z'"),
-        (lambda model, x, record: pyro.sample("noise", Normal(x, 1.0)), "must have a site of 1 noises (event [1]), got []"),
+        (lambda model, x, record: None, "must sample the site 'noise' and no other one, got none"),
+        (lambda model, x, record: pyro.sample("z", Normal(x, 1.0).to_event(1)), "and no other one, got ['z']"),
+        (lambda model, x, record: pyro.sample("noise", Normal(x, 1.0)), "site 'noise' must have one event dimension, occur once, and not be observed, got []"),
         (lambda model, x, record: pyro.sample("noise", Gamma(x.abs() + 1, 1.0).to_event(1)), "got Gamma. Use Normal"),
     ],
 )  # fmt: skip

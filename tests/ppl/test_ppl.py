@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from pyro import poutine
-from pyro.distributions import Beta, LogNormal, Normal
+from pyro.distributions import Beta, ImproperUniform, LogNormal, Normal
 from refusals import Refusal, check_refused
 from scipy.stats import f as f_law, kstest, multivariate_t
 from torch import Tensor
@@ -209,6 +209,7 @@ REFUSED: dict[str, list[Refusal]] = {
         (r"prior\[c\] must change the model, got a LinearGaussian", lambda: ParameterisedModel(lambda a, c: walk(a, 1.0), {"a": LOG, "c": LOG})),
         ("scalar distribution", lambda: ParameterisedModel(lambda a: walk(a, 1.0), {"a": LogNormal(torch.zeros(2), 1.0)})),
         (r"pyro\.distributions", lambda: ParameterisedModel(lambda a: walk(a, 1.0), {"a": "log_normal"})),
+        (r"be a proper continuous scalar distribution, got Improper", lambda: ParameterisedModel(lambda a: walk(a, 1.0), {"a": ImproperUniform(LOG.support, (), ())})),
         (r"continuous scalar distribution, got Poisson", lambda: ParameterisedModel(lambda a: walk(a, 1.0), {"a": torch.distributions.Poisson(3.0)})),
         (r"a must be .*positive", lambda: ParameterisedModel(lambda a: walk(check_positive("a", a), 1.0), {"a": Normal(-9.0, 1.0)})),
         ("at least one parameter", lambda: ParameterisedModel(lambda: walk(1.0, 1.0), {})),
@@ -326,7 +327,7 @@ def test_the_exact_likelihood_refuses_what_it_cannot_say() -> None:
         torch.eye(2), [[0.0], [1.0]], [[1.0, 0.0]], [1.0], [0.0] * 2, [1.0] * 2
     )
     for model in (UnivariateGrowth(), level(1.0, 1.0), singular):
-        with pytest.raises(ValueError, match="needs a linear model with full noise"):
+        with pytest.raises(ValueError, match="must have a linear model with full noise"):
             GaussianHmmLikelihood()(model, Record(y))
     check_refused(
         [
@@ -460,7 +461,7 @@ def test_chains_that_start_elsewhere_come_to_the_posterior_by_steps_and_by_leaps
     ticks: list[None] = []
     found = pmmh(
         LEVELS, EKF, Record(torch.full((1, 1, 1), torch.nan, dtype=torch.float64)), 5, 16, chains=120, seed=3,
-        settings=PmmhSettings(start=start, leaps=leaps, thin=4, tick=lambda: ticks.append(None)),
+        settings=PmmhSettings(start=start, leaps=leaps, thin=4, tick=lambda *_: ticks.append(None)),
     )  # fmt: skip
     assert len(ticks) == 36
     for name, law in LEVELS.prior.items():
