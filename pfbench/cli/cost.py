@@ -66,7 +66,10 @@ def _time_study(
             write_step_times(folder, measured)
         jobs, steps = measured[key]["jobs"], measured[key]["steps"]
         used = len(next(iter(jobs.values()))["cpu"])
+        engines = {label: timed["engine"] for label, timed in jobs.items()}
+        others = ", ".join(f"{label} by {engine}" for label, engine in engines.items())
         size = f"{len(jobs)} filters, {steps} steps, {used} rounds; about {rest:.0f} s left"
+        size += f"; engines: {others}" * (len(set(engines.values())) > 1)
         print(f"[{number}/{len(conditions)}] {state}  {condition.name}   {size}", flush=True)
     return len(conditions)
 
