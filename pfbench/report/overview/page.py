@@ -120,7 +120,7 @@ def render_overview(
             | {"time": format_times(times, m)}
             for view, times in (
                 (overview, overviews[timed]),
-                *((v, v) for v in [overviews.get(WITH_KNOBS)] if v),
+                *((v, v._replace(times={})) for v in [overviews.get(WITH_KNOBS)] if v),
             )
             for m in view.methods
         ],
