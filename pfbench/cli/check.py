@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pfbench.cli.messages import format_error
 from pfbench.core.parameter_checks import require
 from pfbench.files.command_start import collect_rarely, start_work
-from pfbench.job.config import compose, list_groups
+from pfbench.job.config import SUFFIX, compose, list_groups
 from pfbench.results.paper_block import read_part
 
 HELP = """\
@@ -54,14 +54,17 @@ def _compose_all() -> Iterator[tuple[str, str]]:
             sign = "+" if group in _ADDED else ""
             choice = f"{sign}{group}={name}"
             try:
-                compose([choice, *_matching_scenario(group, name), "data.root=somewhere"])
+                compose([choice, *_add_needs(group, name), "data.root=somewhere"])
                 yield choice, ""
             except Exception as error:
                 yield choice, format_error(error, [choice])
 
 
-def _matching_scenario(group: str, name: str) -> list[str]:
-    """Return the scenario of a model, or of the model that it extends."""
+def _add_needs(group: str, name: str) -> list[str]:
+    """Return the scenario of a model or of the model that it extends, and a world in which a filter is tuned."""
+    if group == "filter" and name.endswith(f"_{SUFFIX}"):
+        knobs = f"\n{name.removesuffix(f'_{SUFFIX}')}:"
+        return [f"tuned={w}" for w in list_groups()["tuned"] if knobs in read_part("tuned", w)][:1]
     if group != "model":
         return []
     parts = name.split("_")

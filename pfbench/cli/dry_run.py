@@ -186,17 +186,20 @@ def try_own_parts(configs: Iterable[JobConfig]) -> None:
 
     episodes: dict[str, Episode] = {}
     errors: dict[str, Exception] = {}
+    has_line = False  # of the user's code
     for config in configs:
         packages = list_used_packages(config)
         try:
             if packages:
                 _try_job(config, episodes)
         except AssertionError as error:
+            has_line |= _is_of_user(error, packages, others=())
             classes = dict.fromkeys(t.rpartition(".")[2] for t in list_user_targets(config.values))
             errors[
                 f"{' and '.join(classes)} must keep {'its' if len(classes) == 1 else 'their'} contract: {error}."
             ] = error
         except Exception as error:
+            has_line = True
             if _is_of_user(error, packages):
                 errors[format_error(error, config.words)] = error
     if errors:
@@ -204,15 +207,20 @@ def try_own_parts(configs: Iterable[JobConfig]) -> None:
         refusal = ValueError("\n".join(errors))
         for note in notes_of(first):
             refusal.add_note(note)
-        raise refusal from first
+        raise refusal from (first if has_line else None)
 
 
-def _is_of_user(error: BaseException | None, packages: Sequence[str]) -> bool:
+def _is_of_user(
+    error: BaseException | None,
+    packages: Sequence[str],
+    others: tuple[str, ...] = (
+        "pfbench.testing.",
+    ),  # contracts that are checked for own parts only
+) -> bool:
     """Return whether code of the user raised an error, or got what it does not take."""
     while error is not None:
         modules = (str(f.f_globals.get("__name__")) for f, _ in walk_tb(error.__traceback__))
-        # the contracts of `pfbench.testing` are checked for own parts only
-        is_own = any(name.startswith((*packages, "pfbench.testing.")) for name in modules)
+        is_own = any(name.startswith((*packages, *others)) for name in modules)
         if is_own or isinstance(error, TypeError):
             return True
         error = error.__cause__
@@ -286,6 +294,11 @@ def _take_steps(
     draws = PhiloxStream(plan.values["seed"], plan.runs[:2])
     try:
         with torch.no_grad():
-            run_filter(method, model, first_steps(model, episode.record, 3), draws)
+            trial = run_filter(method, model, first_steps(model, episode.record, 3), draws)
+        if not trial.mean.isfinite().any():
+            raise ValueError(
+                "the estimate must be finite in the first steps, got NaN in both runs of the trial. A NaN among the weights or "
+                "the states of one particle loses its run: print them"
+            )
     except Exception as error:  # a model or a filter of the user took part
         raise AssertionError(format_error(error, config.words).rstrip(".")) from error

@@ -149,6 +149,15 @@ class Chart:
         """Number of components of a difference, d."""
         return sum(block.dimension for block in self.blocks)
 
+    @property
+    def identity(self) -> list[float]:
+        """State [D] of zeros, with 1 for the scalar part of each quaternion."""
+        return [
+            float(component == 0 and block.dimension < block.size)
+            for block in self.blocks
+            for component in range(block.size)
+        ]
+
     @cached_property
     def flat(self) -> bool:
         """True if all components are Euclidean."""

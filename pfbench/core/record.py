@@ -151,9 +151,9 @@ def name_inputs(u: Any, name: str = "") -> list[tuple[str, Tensor]]:
     require(
         isinstance(u, tuple),
         f"record.u{name}",
-        "be a tensor or a tuple of tensors",
+        "be a tensor or a NamedTuple of tensors",
         type(u).__name__,
-        "Convert it, for instance by torch.as_tensor.",
+        "Convert numbers by torch.as_tensor, and a dataclass to a NamedTuple.",
     )
     fields = getattr(u, "_fields", range(len(u)))
     return [

@@ -133,7 +133,7 @@ def check_state_shape(model: str, before: Tensor, after: Tensor, w: Tensor) -> N
         f"{model}.propagate",
         f"return states {list(before.shape)} for noise {list(w.shape)}",
         list(after.shape),
-        "Return one component for each of its names; noise_dim is the number of components of the noise.",
+        "Return one component for each of its names: x[..., 1:2] keeps the axis that x[..., 1] removes; noise_dim is the number of components of the noise.",
     )
 
 

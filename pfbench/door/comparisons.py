@@ -22,7 +22,8 @@ from pfbench.report.options import ReportOptions
 from pfbench.report.study_page.page_writer import describe_opening
 from pfbench.results.conditions import Condition
 from pfbench.results.looks import study_looks
-from pfbench.stats.comparison import NO_DECISION, Verdict
+from pfbench.stats.comparison import ALPHA, NO_DECISION, Verdict
+from pfbench.stats.pair_states import find_level
 from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
 from pfbench.stats.sentences import format_with_interval
 
@@ -186,7 +187,8 @@ def compare_in_conditions(conditions: Sequence[Condition], a: str, b: str) -> Co
     require(a != b, "filters", "be two", f"{a} twice", f"Choose from {', '.join(labels)}.")
     table = build_run_table(conditions)
     table = drop_runs(table, assess_runs(table, "rmse", RUN).copies, RUN)
-    court = open_court(table, study_looks(conditions), ReportOptions())
+    level, _ = find_level(conditions[0].jobs[0].path.parent, ALPHA)
+    court = open_court(table, study_looks(conditions), ReportOptions(alpha=level))
     present = court.runs.conditions
     verdicts, chances = {}, {}
     for condition, regime in zip(conditions, name_regimes(conditions), strict=True):

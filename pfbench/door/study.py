@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,6 +64,8 @@ class Study:
     def errors(self, group: str | None = None) -> pd.DataFrame:
         """Return the root mean square error over time, a row per run and a column per filter.
 
+        A run that a filter loses is infinite, as in all comparisons; `table("rmse")` has its error.
+
         Args:
             group: Group of the state. The main group by default.
 
@@ -87,6 +90,7 @@ class Study:
             for key in zip(frame["scenario"], frame["noise"], frame["model"], strict=True)
         ]
         rows = frame[(frame["group"] == selected) & (frame["component"] == "norm")]
+        rows = rows.assign(value=rows["value"].where(rows["keeps_track"], math.inf))
         index = [n for n in ("scenario", "noise", "model") if rows[n].nunique() > 1]
         table = rows.pivot_table("value", [*index, "run"], "label", observed=True)
         table.attrs["unit"] = dict(zip(rows["scenario"], rows["unit"], strict=True))
@@ -263,6 +267,26 @@ class Study:
 
         with plain_errors():
             continue_jobs(self, runs, workers, progress)
+        return self
+
+    def remove(self, label: str) -> Study:
+        """Remove the results of a filter, such as one whose class has another name now. Other results stay as they are.
+
+        Args:
+            label: Label of the filter.
+
+        Returns:
+            The study.
+
+        Raises:
+            ValueError: If no result has this label.
+        """
+        jobs = [job for condition in self.conditions() for job in condition.jobs]
+        labels = sorted({job.label for job in jobs})
+        require(label in labels, "label", f"be one of {', '.join(labels)}", f"{label!r}", "List them: study.summary()")  # fmt: skip
+        for job in jobs:
+            for path in (job.parts or (job.path,)) if job.label == label else ():
+                path.unlink()
         return self
 
     def to_xarray(self) -> Any:

@@ -85,8 +85,8 @@ def run(
     if result is not None:
         check_settings(values)
         outcome = JobOutcome(path, "skipped", main_rmse(result.data, result.meta))
-        repeat = "(overwrite=true to repeat)"
-        log.info("%sskipped   %s   result exists: %s   %s", counter, name, path, repeat)
+        of = _name_other(result.meta["choices"]["filter"], job_choices["filter"])
+        log.info("%sskipped   %s   result exists%s: %s   (overwrite=true to repeat)", counter, name, of, path)  # fmt: skip
         return outcome
     if inputs and not path.exists():
         _announce_change(path, job_choices, inputs)
@@ -193,6 +193,11 @@ def _read_meta(path: Path) -> dict[str, Any]:
         return store.read_metadata(path)
     except (ValueError, OSError):
         return {}
+
+
+def _name_other(stored: str, asked: str) -> str:
+    """Name the filter whose result is that of another name, with the same settings; empty for one name."""
+    return "" if stored == asked else f" of {stored}, which has the same settings"
 
 
 def find_result_path(values: Mapping[str, Any], inputs: Inputs) -> Path:

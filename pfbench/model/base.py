@@ -96,8 +96,8 @@ class StateSpaceModel(nn.Module, ABC):
 
     @property
     def origin(self) -> Tensor:
-        """State [D] about which `initial` is defined in the chart; zero by default."""
-        return self.anchor.new_zeros(self.chart.size)
+        """State [D] about which `initial` is defined in the chart; that with components 0 by default, without a turn."""
+        return self.anchor.new_tensor(self.chart.identity)
 
     @property
     def anchor(self) -> Tensor:
@@ -212,14 +212,31 @@ class StateSpaceModel(nn.Module, ABC):
     def assemble(self, truth: dict[str, Tensor]) -> Tensor:
         """Assemble true states from the groups of an episode.
 
-        Groups are placed as components of a difference. A model whose states differ from that
-        layout (a quaternion, for example) overrides this method.
+        A model whose groups are not components of a difference, such as Euler angles of a quaternion, overrides this method.
+
+        Args:
+            truth: True values by group, [R, T, k]. They are components of the state. Those of a chart with a quaternion are components
+                of its difference from `chart.identity`, in which a turn is a rotation vector.
+
+        Returns:
+            States, [R, T, D]; NaN where the truth of a group is unknown.
+
+        Raises:
+            ValueError: As `place_groups`.
+        """
+        placed = self.place_groups(truth)
+        if self.chart.size == self.chart.dimension:
+            return placed
+        return self.chart.add(placed.new_tensor(self.chart.identity), placed)
+
+    def place_groups(self, truth: dict[str, Tensor]) -> Tensor:
+        """Place the true values of groups at their components.
 
         Args:
             truth: True values by group, [R, T, k].
 
         Returns:
-            States, [R, T, D]; NaN where the truth of a group is unknown.
+            Values in double precision, [R, T, d]; NaN where the truth of a group is unknown.
 
         Raises:
             ValueError: If no group of this model has a truth, or a truth has other components.
@@ -234,10 +251,11 @@ class StateSpaceModel(nn.Module, ABC):
         )
         check_truth_sizes(truth, {name: len(places) for name, places in self.groups.items()})
         first = truth[available[0]]
-        state = first.new_full((*first.shape[:-1], self.chart.size), torch.nan)
+        shape = *first.shape[:-1], self.chart.dimension
+        placed = torch.full(shape, torch.nan, dtype=torch.float64, device=first.device)
         for name in available:
-            state[..., list(self.groups[name])] = truth[name]
-        return state
+            placed[..., list(self.groups[name])] = truth[name].double()
+        return placed
 
     def error(self, mean: Tensor, truth: Tensor) -> Tensor:
         """Compute the error of an estimate in the chart.

@@ -238,9 +238,9 @@ class SinsSar(InsErrorModel):
 
     @override
     def assemble(self, truth: dict[str, Tensor]) -> Tensor:
-        vectors = super().assemble(truth)  # [R, T, 16], the last component unused
+        vectors = self.place_groups(truth)
         q = attitude.quaternion_from_dcm(attitude.dcm_from_euler(vectors[..., :3]))
-        return torch.cat([q, vectors[..., 3:15]], -1)
+        return torch.cat([q, vectors[..., 3:]], -1)
 
     @override
     def error(self, mean: Tensor, truth: Tensor) -> Tensor:

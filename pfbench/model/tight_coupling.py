@@ -368,7 +368,7 @@ class SinsGnssTightNl(_TightModel):
 
     @override
     def assemble(self, truth: dict[str, Tensor]) -> Tensor:
-        flat = super().assemble(truth | {"attitude": truth["attitude"]})[..., :17]
+        flat = self.place_groups(truth | {"attitude": truth["attitude"]})
         q = attitude.quaternion_from_dcm(attitude.dcm_from_euler(flat[..., :3]).mT)
         return torch.cat([q, flat[..., 3:]], -1)
 

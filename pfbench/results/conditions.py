@@ -371,6 +371,7 @@ _DISPLAY_UNITS = {
     "rad": ("arcmin", 60 * 180 / np.pi),
     "rad/s": ("deg/h", 3600 * 180 / np.pi),
     "m/s^2": ("mg", 1e3 / 9.80665),
+    "1": ("", 1.0),
 }
 
 

@@ -115,6 +115,8 @@ def write_failure(
     Returns the note `<key>.failed.json`, or None if a result of that key exists, which is kept.
     """
     path = Path(path)
+    if type(error).__name__ == "InstantiationException" and error.__cause__ is not None:
+        error = error.__cause__  # the sentence of the class, without that of Hydra
     if path.exists():
         return None
     note = {

@@ -101,6 +101,8 @@ class ModelSimulation(Scenario):
             groups = take_groups(steps)
             parts = [_join_steps(model, group, draw_errors, stream, noise) for group in groups]
         states, y = (torch.cat(group, 1) for group in zip(*parts, strict=True))
+        if model.chart.size != model.chart.dimension:
+            states = model.chart.subtract(states, states.new_tensor(model.chart.identity))
         truth = {name: states[..., list(indices)] for name, indices in model.groups.items()}
         return Episode(Record(y, u), time, truth)
 

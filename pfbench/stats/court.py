@@ -108,7 +108,7 @@ class Court:
     def weigh(self, metric: str, mask: Flags, a: str, b: str) -> str:
         """Name the probabilities that the first of two filters is better, equal and worse in a condition; empty without runs.
 
-        They are no verdict: they say where an undecided pair tends. The region of equality is that of the verdict.
+        A verdict needs tests, these probabilities show where an undecided pair tends. The region of equality is that of the verdict.
         """
         index = [self.runs.filters.index(label) for label in (a, b)]
         first, second = self.losses(metric, mask)[index].reshape(2, -1)

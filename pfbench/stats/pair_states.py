@@ -205,6 +205,28 @@ class LookRecord:
         write_atomically(self.path, lambda file: file.write(text.encode()))
 
 
+def find_level(folder: Path, alpha: float) -> tuple[float, str]:
+    """Return the level of the last look of a study that adds runs, with a sentence; `alpha` and nothing for another study.
+
+    Args:
+        folder: Results of the study.
+        alpha: Error rate of all looks together.
+    """
+    path = folder / RECORD
+    stored = _read_record(path) if path.is_file() else {"looks": []}
+    if not stored["looks"]:
+        return alpha, ""
+    number, runs = (
+        len(stored["looks"]),
+        LookSchedule(stored["request"]["until_decided.max_runs"]).runs,
+    )
+    level = math.floor(1e4 * look_levels(runs, alpha)[number - 1]) / 1e4
+    return level, (
+        f"Runs were added until look {number} of {len(runs)}: its tests and intervals have the level {100 * level:.3g} %, "
+        f"so that all looks together have {100 * alpha:g} %."
+    )
+
+
 def _read_record(path: Path) -> dict[str, Any]:
     """Read a record and check its digest."""
     try:

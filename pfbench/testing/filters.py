@@ -218,6 +218,10 @@ def check_causality(
     statement = "an estimate uses no later measurement"
     record = y
     before = compute_twice("filter", lambda: run(method, case_model, record), _estimates)
+    assert before.mean.isfinite().any(), (
+        "the estimate of a run must be finite, got NaN in all runs and steps. A NaN among the weights or the states of one "
+        "particle loses its run: print them"
+    )
     for t in range(1, y.shape[1]):
         changed_y = y.clone()
         changed_y[:, t:] = changed_y[:, t:] + 0.7

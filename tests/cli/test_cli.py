@@ -429,12 +429,13 @@ def test_report_of_a_study_that_does_not_exist(tmp_path: Path) -> None:
 
 
 def test_check_finds_nothing_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It asks for every file. Here every tenth is composed: test_configs composes each."""
+    """It asks for every file. Here every tenth and each tuned filter is composed: test_configs composes each."""
     compose, requested, empty = check.compose, [], job.compose([])
 
     def tenth(words: list[str]) -> Any:
         requested.append(words[0] if words else "")
-        return compose(words) if len(requested) % 10 == 1 else empty
+        is_composed = len(requested) % 10 == 1 or requested[-1].endswith("_tuned")
+        return compose(words) if is_composed else empty
 
     monkeypatch.setattr(check, "compose", tenth)
     said = pfbench("check", home=tmp_path)

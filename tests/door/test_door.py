@@ -27,6 +27,7 @@ from pfbench.door import laws, own_source
 from pfbench.job import IGNORED_IN_KEY, compose, job_key
 from pfbench.job.trust import FOLDERS
 from pfbench.results import main_component_group, store
+from pfbench.results.status import keeps_track
 from pfbench.scenario import ModelSimulation
 
 SMALL = {"runs": 4, "particles": 40}
@@ -314,6 +315,22 @@ def test_a_file_that_an_own_stage_reads_must_be_stated(
     assert "input_files" not in repr(pfbench.check(notebook["Says"](), runs=20))
 
 
+@pytest.mark.parametrize(
+    ("weights", "sentence"),
+    [("log_w * float('nan')", "estimate must be finite"), ("log_w.sum(-1)", "Weighs must return log weights")],
+)  # fmt: skip
+def test_a_filter_that_gives_nothing_is_refused_before_the_jobs(
+    notebook: Notebook, weights: str, sentence: str
+) -> None:
+    notebook.run(
+        f"class Weighs:\n    is_exact = False\n    def __call__(self, model, log_w, x, log_ratio, record):\n        return {weights}"
+    )
+    part = notebook["Weighs"]()
+    assert not pfbench.check(part, runs=20).passed
+    check_refused([(sentence, lambda: pfbench.run(WALK, ["sir", part], study="n", **SMALL))])
+    assert not Path("results/n").exists()
+
+
 def test_names_of_own_parts(notebook: Notebook) -> None:
     notebook.run("SCALE = 3.0")
     notebook.run(PROPOSAL)
@@ -536,7 +553,8 @@ def test_errors_are_those_of_the_files(study: pfbench.Study) -> None:
         for job in condition.jobs:
             group = main_component_group(job.meta["state"])
             error = job.load().data["error"][..., group.places] * group.scale
-            rmse = np.sqrt((error**2).sum(-1).mean(-1))
+            kept = keeps_track(job.load().data, job.meta)
+            rmse = np.where(kept, np.sqrt((error**2).sum(-1).mean(-1)), np.inf)
             np.testing.assert_allclose(errors.loc[condition.noise][job.label], rmse, rtol=1e-6)
     assert set(study.table("rmse")["metric"]) == {"rmse"}
     check_refused(
@@ -549,10 +567,10 @@ def test_errors_are_those_of_the_files(study: pfbench.Study) -> None:
 
 
 def test_a_comparison_is_the_one_of_the_page_and_of_the_errors(study: pfbench.Study) -> None:
-    """Word and interval are those of the view of the condition; the ratio is that of `errors()`, a lost run above all."""
+    """Word and interval are those of the view of the condition; the ratio is that of `errors()`, in which a lost run is infinite."""
     comparison = study.compare("sir", "ekf")
     keeps = study.table("rmse").pivot_table("keeps_track", ["noise", "run"], "label", "min", observed=True) > 0  # fmt: skip
-    errors = study.errors().where(keeps, 1e99)
+    errors = study.errors().clip(upper=1e99)
     rows = pd.read_csv(study.report(figure_formats=("svg",)).with_name("verdicts.csv"))
     for noise, verdict in zip(("nominal", "outliers"), comparison.verdicts.values(), strict=True):
         logs = np.log(errors.loc[noise])
@@ -593,6 +611,8 @@ def test_summary_page_and_html(study: pfbench.Study, capsys: pytest.CaptureFixtu
         error = one.errors()[row[1].lower()].median()
         assert float(row[2].split()[0]) == pytest.approx(error, rel=5e-3)
         assert f"median RMS error {error:.4g} m" in capsys.readouterr().out or row[1] != "EKF"
+    check_refused([("label must be one of ekf, sir, got 'ukf'", lambda: one.remove("ukf"))])
+    assert list(one.remove("sir").errors().columns) == ["ekf"]
     html = study._repr_html_()
     assert html.count("<tr>") == 4
     assert summary.rows[0][1] in html

@@ -131,7 +131,7 @@ def test_a_page_without_enough_data_states_why(case: str, tmp_path: Path) -> Non
     words = set(pd.read_csv(folder / "decisions.csv")["word"])
     text = (folder / "report.md").read_text()
     assert words == {"identical" if case == "identical" else "not decided"}
-    shown = {"one run": "not decided, 1 run, 10 are required", "all lost": "loses runs in 100 % of runs", "identical": "identical, all runs agree"}  # fmt: skip
+    shown = {"one run": "not decided, 1 run, 10 are required", "all lost": "loses 100 % of runs", "identical": "identical, all runs agree"}  # fmt: skip
     assert shown[case] in text
     assert "nan" not in text.replace("provenance", "")
 

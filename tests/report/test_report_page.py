@@ -206,7 +206,7 @@ def test_a_filter_that_lost_every_run_has_the_largest_errors_and_no_number(tmp_p
     made = study_report.write_report("demo", tmp_path, tmp_path / "reports", QUICK)
     rows = pd.read_csv(made.parent / "verdicts.csv").query("baseline == 'ekf' and metric == 'rmse'")
     doomed = rows[rows["filter"] == "doomed"]
-    assert set(doomed["words"]) == {"loses runs in 100 % of runs"}
+    assert set(doomed["words"]) == {"loses 100 % of runs"}
     assert doomed["ratio"].isna().all()  # no number stands for a lost run
     assert set(doomed["loses"]) == {"loses more"}
     assert doomed["value"].isna().all()

@@ -5,14 +5,27 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch
 from scipy import stats
+from torch import Tensor
 
 import pfbench
-from pfbench.model import LinearGaussian, Pendulum, StochasticVolatility, linear_walk, local_level
+from pfbench.core import Chart, EuclideanBlock, QuaternionBlock
+from pfbench.model import (
+    LinearGaussian,
+    Pendulum,
+    StateSpaceModel,
+    StochasticVolatility,
+    independent_normal,
+    linear_walk,
+    local_level,
+    normal_batch,
+)
+from pfbench.nav.strapdown import rotate
 from pfbench.noise import MeasurementOutage, NominalNoise, OutlierNoise, VarianceSurge
 from pfbench.scenario.simulated import ModelSimulation
 
@@ -158,3 +171,42 @@ def test_numbers_of_a_scenario_are_checked() -> None:
             ModelSimulation(model, 5, interval)
     with pytest.raises(ValueError, match=r"scenario\.steps must be a whole number .* got 5\.5"):
         ModelSimulation(model, 5.5)  # type: ignore[arg-type]
+
+
+class Turning(StateSpaceModel):
+    """Attitude as a quaternion and a bias; the stars in two directions are measured."""
+
+    chart = Chart((QuaternionBlock(), EuclideanBlock(1)))
+    names, units, noise_dim = ("a", "b", "c", "bias"), ("rad", "rad", "rad", "m"), 4
+    groups: ClassVar = {"attitude": (0, 1, 2), "bias": (3,)}
+    sd: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("sd", torch.full((7,), 0.01, dtype=torch.float64))
+
+    def initial(self, runs: int) -> Any:
+        return normal_batch(runs, torch.full((4,), 0.5, dtype=torch.float64))
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return self.chart.add(x, 0.1 * w)
+
+    def observation(self, x: Tensor, u: Any) -> Any:
+        stars = torch.eye(3, dtype=torch.float64)[:2]
+        seen = [rotate(x[..., :4], star.expand(*x.shape[:-1], 3)) for star in stars]
+        return independent_normal(torch.cat([*seen, x[..., 4:]], -1), self.sd)
+
+
+def test_the_truth_of_a_model_with_a_quaternion_is_its_state() -> None:
+    """Its measurements differ from those of the assembled truth by the noise, and the groups are rotation vectors."""
+    model = Turning()
+    episode = ModelSimulation(model, STEPS).draw(NominalNoise(), torch.arange(200), 4)
+    single = {
+        name: value.float() for name, value in episode.truth.items()
+    }  # of an author who mixes types
+    for truth in (episode.truth, single | {"bias": episode.truth["bias"]}):
+        x = model.assemble(truth)
+        z = (episode.record.y - model.observation(x, ()).mean) / 0.01
+        assert abs(z.square().mean() - 1) < 4.5 * math.sqrt(2 / z.numel())
+    turn = episode.truth["attitude"][:, -1].norm(dim=-1)
+    torch.testing.assert_close(2 * torch.acos(x[:, -1, 0].abs()), turn, rtol=1e-4, atol=1e-5)

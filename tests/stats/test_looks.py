@@ -20,6 +20,7 @@ from pfbench.stats.pair_states import (
     LookSchedule,
     decide_at_looks,
     describe_end,
+    find_level,
     format_look,
     look_levels,
 )
@@ -128,6 +129,10 @@ def test_the_record_keeps_its_plan(tmp_path: Path) -> None:
     LookRecord(path, plan).write(["look 1"], "all decided")
     record = LookRecord(path, plan)
     assert (record.looks, record.state) == (["look 1"], "all decided")
+    level, sentence = find_level(tmp_path, 0.05)  # of the first of five looks
+    assert level == pytest.approx(look_levels(LookSchedule(320).runs, 0.05)[0], abs=1e-4)
+    assert "until look 1 of 5" in sentence
+    assert find_level(tmp_path / "other", 0.05) == (0.05, "")
     check_refused(
         [
             (

@@ -252,6 +252,13 @@ class ParticleFilter(Filter):
         log_w, carried, counts = compute_updated_weights(
             update, model, parents.log_w, x, log_ratio, record, parents.memory
         )
+        require(
+            log_w.shape == x.shape[:2],
+            type(update).__name__,
+            f"return log weights [R, N] = {[*x.shape[:2]]}",
+            [*log_w.shape],
+            "Return one number for each particle of each run.",
+        )
         fused = model.chart.flat and dispatch.runs_operators(x, log_w)
         if fused:
             *weights, mean, variance = dispatch.weigh_particles(x, log_w)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -68,6 +68,7 @@ from pfbench.results.store import JobResult, list_failures
 from pfbench.stats.comparison import MIN_RUNS, NO_DECISION, Verdict, decide
 from pfbench.stats.court import Court, fix_pairs
 from pfbench.stats.error_measures import Flags
+from pfbench.stats.pair_states import find_level
 from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
 from pfbench.stats.study_runs import (
     arrange_runs,
@@ -89,6 +90,9 @@ def build_pack(
     regime). None is a value that does not exist.
     """
     data = data or read_study(conditions, options)
+    folder = conditions[0].jobs[0].path.parent
+    level, looks = find_level(folder, options.alpha)
+    options = replace(options, alpha=level)
     table, metadata = data.table, [job.meta for c in conditions for job in c.jobs]
     regimes = study_part_names(conditions, "noise")
     differing = [
@@ -103,8 +107,8 @@ def build_pack(
         regimes,
         options,
         data.times,
-        list_failures(conditions[0].jobs[0].path.parent),
-        " ".join(filter(None, (conditions[0].older, data.warning))),
+        list_failures(folder),
+        " ".join(filter(None, (conditions[0].older, looks, data.warning))),
         " ".join(filter(None, (describe_uncommitted(metadata), *differing))),
         data.records,
     )
@@ -387,17 +391,14 @@ def _list_cells(
     ]
 
 
-_NEAR = 0.1  # distance from 1 that is shown in percent with digits of its own
-
-
 def round_ratio(log_ratio: float) -> float | None:
-    """Return a ratio with four digits, and four of its distance from 1 if it is near; None without a number."""
+    """Return a ratio with eight digits, for pages that print three; None without a number."""
     if not math.isfinite(log_ratio):
         return None
-    distance = math.expm1(min(log_ratio, 700.0))
-    if abs(distance) < _NEAR:
-        return round(1 + float(f"{distance:.4g}"), 12)
-    return float(f"{1 + distance:.4g}")
+    distance = float(
+        f"{math.expm1(min(log_ratio, 700.0)):.8g}"
+    )  # of a ratio near 1, it has the digits
+    return round(1 + distance, 12) if abs(distance) < 1 else float(f"{1 + distance:.8g}")
 
 
 def show_ratio(verdict: Verdict) -> dict[str, float | None]:

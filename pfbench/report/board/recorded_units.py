@@ -249,7 +249,7 @@ def _compare_drives(drives: int, cell: StudyRuns, losses: Array, pair: tuple[str
 def _to_entry(verdict: Verdict) -> dict[str, Any]:
     """Return the plain values of a verdict."""
     names = ("word", "ratio", "low", "high", "p", "n", "reason")
-    return {**round_values({name: getattr(verdict, name) for name in names}), "reason": verdict.reason}  # fmt: skip
+    return {**round_values({name: getattr(verdict, name) for name in names}, 8), "reason": verdict.reason}  # fmt: skip
 
 
 # --------------------------------------------------------------------------------------------------

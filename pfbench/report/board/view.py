@@ -328,11 +328,12 @@ def word_verdict(verdict: Verdict, margin: float = EQUALITY_MARGIN) -> str:
 def _word_lost(view: View, label: str) -> str:
     """State that a filter loses track, with the share of runs or the conditions; empty if it is not shown."""
     lost, count = view.filters[label]["lost_conditions"], len(view.runs.conditions)
-    verb = "loses track" if view.has_limit else "loses runs"
     if not lost:
         return ""
-    share = f"{100 * (1 - view.filters[label]['track']):.0f} %"
-    return f"{verb} in {lost}/{count}" if count > 1 else f"{verb} in {share} of runs"
+    if count > 1:
+        return f"loses {'track' if view.has_limit else 'runs'} in {lost}/{count}"
+    share = f"{100 * (1 - view.filters[label]['track']):.0f} % of runs"
+    return f"loses track in {share}" if view.has_limit else f"loses {share}"
 
 
 def describe_filters(runs: StudyRuns, alpha: float = 0.05) -> dict[str, BoardRow]:
@@ -387,12 +388,10 @@ def describe_view(
         value = next((row for row in rows if row["filter"] == baseline), rows[0])
         if value["verdict"] == MISSING:
             return f"{base} has no runs {where}, so that no filter is compared with it."
-        number = (
-            ""
-            if math.isnan(value["value"])
-            else f" of {value['value']:.3g} {value['unit']}".rstrip()
-        )
-        return f"{base} has a median {metric}{number} {where}; no other filter is compared with it."
+        level = f"has a median {metric} of {value['value']:.3g} {value['unit']}".rstrip()
+        if math.isnan(value["value"]):  # of runs that are lost
+            level = value["words"].partition(", ")[2] or f"has no finite median {metric}"
+        return f"{base} {level} {where}; no other filter is compared with it."
     better = [row for row in others if row["verdict"] == "better"]  # in the order of the table
     words = {
         "equal to it": EQUAL_WORDS, "not decided": ["not decided"], "worse": ["worse"], "without track": [LOSES_TRACK]
