@@ -134,7 +134,9 @@ def small_study(home: Path) -> None:
 
 
 def test_every_kind_of_part_has_a_recipe() -> None:
-    kinds = "resampling scheme, filter, model, scenario, noise regime, metric, report figure"
+    kinds = (
+        "resampling scheme, filter, model, scenario, noise regime, metric, report figure, command"
+    )
     assert list(RECIPES) == [f"Add a {kind}" for kind in kinds.split(", ")]
 
 
@@ -244,6 +246,11 @@ def add_world(tree: Path) -> None:
     (tree / "conf/scenario/room.yaml").write_text(WRITTEN["conf/scenario/room.yaml"])
 
 
+def add_command(tree: Path) -> None:
+    for name in ("pfbench/cli/lost.py", "tests/cli/test_lost.py"):
+        (tree / name).write_text(WRITTEN[name])
+
+
 WRITTEN_METRIC = dict(BLOCK.findall(RECIPES["Add a metric"]))["python"]
 CONTRIBUTIONS: dict[str, tuple[Callable[[Path], None], int, str]] = {
     "resampler": (partial(add_class, source="mylab/resampling.py", module="filter/particle/resampling.py"), 2, "filter/particle/test_resampling.py"),
@@ -252,6 +259,7 @@ CONTRIBUTIONS: dict[str, tuple[Callable[[Path], None], int, str]] = {
     "scenario and model": (add_world, 7, "test_configs.py"),
     "metric": (add_metric, 1, "report/test_report_metrics.py"),
     "figure": (add_figure, 1, "report/test_paper_figures.py"),
+    "command": (add_command, 2, "cli/test_lost.py"),
 }  # fmt: skip
 
 

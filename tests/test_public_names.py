@@ -79,6 +79,9 @@ def names_of_text(text: str) -> set[str]:
 
 
 def names_of_page(text: str) -> set[str]:
+    text = re.sub(
+        r"^File `pfbench/[^`]+`:\n\n```.*?^```$", "", text, flags=re.M | re.S
+    )  # of the package itself
     blocks = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     return names_of_text(text).union(*map(names_of_code, blocks))
 

@@ -12,8 +12,9 @@ from pathlib import Path
 from types import ModuleType
 
 import pfbench
+from pfbench.cli.command import list_commands
 from pfbench.cli.compose import read_description
-from pfbench.cli.main import COMMANDS, USAGE, open_module
+from pfbench.cli.main import USAGE
 from pfbench.job import conf_dir
 from pfbench.job.config import list_groups
 from pfbench.results.paper_block import read_part
@@ -191,7 +192,8 @@ def _format_group(group: str, names: list[str]) -> str:
 
 def _write_commands() -> str:
     """Write the page of the command line: the help of all commands."""
-    rows = [f"| [`{name}`](#pfbench-{name}) | {text} |" for name, (_, text) in COMMANDS.items()]
+    commands = list_commands()
+    rows = [f"| [`{name}`](#pfbench-{name}) | {file.summary} |" for name, file in commands.items()]
     end = USAGE.partition("Exit codes: ")[2].partition("\n")[0]
     lines = [
         "# Command line",
@@ -203,7 +205,7 @@ def _write_commands() -> str:
         f"Exit codes: {end}.",
         "",
     ]
-    for name in COMMANDS:
-        text = open_module(name).HELP.strip()
+    for name, file in commands.items():
+        text = file.load().format_help().strip()
         lines += [f"## pfbench {name}", "", "```text", text, "```", ""]
     return "\n".join(lines)

@@ -1,21 +1,18 @@
-"""Command `pfbench check`: versions, device, data, and all configurations."""
+"""Command `pfbench check`: compose all configurations and print versions."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from itertools import islice
 
+from pfbench import job
+from pfbench.cli.command import Command
 from pfbench.cli.messages import format_error
 from pfbench.core.parameter_checks import require
 from pfbench.files.command_start import collect_rarely, start_work
 from pfbench.job.config import SUFFIX, compose, list_groups
 from pfbench.results.paper_block import read_part
-
-HELP = """\
-pfbench check
-
-Print versions, threads, device and data folder, and compose all configurations.
-The exit code is 1 if a configuration does not compose."""
 
 
 def check_installation(words: Sequence[str]) -> None:
@@ -23,23 +20,23 @@ def check_installation(words: Sequence[str]) -> None:
     require(not words, "check", "be without words", " ".join(words), "Use: pfbench check")
     import torch
 
-    from pfbench import job
-
     start_work()  # to compose all files is the work
     collect_rarely()  # it makes millions of objects, and no arrays
-    rows = [(name, value or "unknown", "ok") for name, value in job.read_versions().items()]
-    rows.append(("threads", f"{torch.get_num_threads()} of {os.cpu_count()} cores", "ok"))
     has_cuda = torch.cuda.is_available()
-    rows.append(("device", torch.cuda.get_device_name() if has_cuda else "cpu", "ok"))
     root = compose([]).values["data"]["root"]
     hint = "recorded scenarios need PFBENCH_DATA or data.root=..."
-    rows.append(("data root", str(root or "not set"), "ok" if root else hint))
     errors = [f"{choice}: {error}" for choice, error in _compose_all() if error]
     total = sum(map(len, list_groups().values()))
-    composed = f"{total - len(errors)} of {total}"
-    rows.append(("configurations", composed, "failed" if errors else "ok"))
-    for row in (("item", "value", "status"), *rows):
-        print(f"{row[0]:15} {row[1]:24} {row[2]}")
+    rows = [
+        ("item", "value", "status"),
+        *((name, value or "unknown", "ok") for name, value in job.read_versions().items()),
+        ("threads", f"{torch.get_num_threads()} of {os.cpu_count()} cores", "ok"),
+        ("device", torch.cuda.get_device_name() if has_cuda else "cpu", "ok"),
+        ("data root", str(root or "not set"), "ok" if root else hint),
+        ("configurations", f"{total - len(errors)} of {total}", "failed" if errors else "ok"),
+    ]
+    for item, value, status in rows:
+        print(f"{item:15} {value:24} {status}")
     if errors:
         raise ValueError("configurations must compose, got errors:\n  " + "\n  ".join(errors))
 
@@ -68,9 +65,17 @@ def _add_needs(group: str, name: str) -> list[str]:
     if group != "model":
         return []
     parts = name.split("_")
-    for model in ("_".join(parts[:n]) for n in range(len(parts), 0, -1)):
-        entry = f"/model@_global_.model: {model}\n"
-        for scenario in list_groups()["scenario"]:
-            if entry in read_part("scenario", scenario):
-                return [f"scenario={scenario}"]
-    return []
+    entries = [f"/model@_global_.model: {'_'.join(parts[:n])}\n" for n in range(len(parts), 0, -1)]
+    texts = {scenario: read_part("scenario", scenario) for scenario in list_groups()["scenario"]}
+    fitting = (scenario for entry in entries for scenario in texts if entry in texts[scenario])
+    return [f"scenario={scenario}" for scenario in islice(fitting, 1)]
+
+
+COMMAND = Command(
+    check_installation,
+    """\
+pfbench check
+
+Print versions, threads, device and data folder, and compose all configurations.
+The exit code is 1 if a configuration does not compose.""",
+)

@@ -10,12 +10,21 @@ from dataclasses import dataclass
 from itertools import islice, product
 from typing import Any, NoReturn
 
-from pfbench.cli.messages import format_flag, suggest_similar
+import yaml
+
+from pfbench.cli.messages import format_flag
 from pfbench.core.parameter_checks import require
 from pfbench.job.config import CHOICES, JobConfig, compose, compose_tree, expand_filter_sets
+from pfbench.job.file_rules import FOLDER_KEYS
 from pfbench.job.settings import check_settings
-from pfbench.job.trust import UntrustedConfigError, check_study, trusted_packages
-from pfbench.results.paper_block import PAPER, experiments_dir, list_named_parts
+from pfbench.job.trust import UntrustedConfigError, check_study
+from pfbench.results.paper_block import (
+    PAPER,
+    experiments_dir,
+    list_named_parts,
+    plan_installed_pairs,
+    read_part,
+)
 
 
 def compose_study(words: Sequence[str]) -> JobConfig:
@@ -36,35 +45,13 @@ def given_keys(words: Sequence[str]) -> set[str]:
     return {word.lstrip("+~").partition("=")[0] for word in words}
 
 
-def split_words(
-    words: Sequence[str], keys: Sequence[str], required: Sequence[str], usage: str
-) -> dict[str, str]:
-    """Split words into values by key and check the keys.
+PLACES = ("device", "threads", "checkpoint")  # where a stored job is computed again
 
-    Returns values by key.
-    """
-    values: dict[str, str] = {}
-    advice = f"See {' '.join(usage.split()[:2])} --help."
-    for word in words:
-        key, equals, value = word.partition("=")
-        if key == "hydra.searchpath":  # a word of the run: a result stores the configuration itself
-            continue
-        require(
-            equals and value and (key not in values),
-            "words",
-            "be key=value, each key once",
-            word,
-            advice,
-        )
-        if key not in keys:
-            raise ValueError(
-                f"key must be one of {', '.join(keys)}, got {key}.{suggest_similar(key, keys)} {advice}"
-            )
-        values[key] = value
-    for key in required:
-        if key not in values:
-            raise ValueError(f"{key} must be set. Use: {usage}")
-    return values
+
+def choose_places(values: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
+    """Return what replaces settings of a stored job: folders, data, and the places that words name."""
+    keys = ("data", *FOLDER_KEYS, *(key for key in PLACES if key in given_keys(words)))
+    return {key: values[key] for key in keys}
 
 
 def count_planned_jobs(study: str) -> int | None:
@@ -72,27 +59,21 @@ def count_planned_jobs(study: str) -> int | None:
 
     Returns the number, or None if the experiment does not exist or does not define a sweep.
     """
-    from omegaconf import OmegaConf
-
-    overrides = read_sweep(study)
-    if not overrides:
-        return None
-    total = math.prod(map(len, expand_sweep(overrides)))
-    for path in experiments_dir().glob(f"{study}_*.yaml"):
-        if OmegaConf.select(OmegaConf.load(path), "study") == study:
-            total += math.prod(map(len, expand_sweep(read_sweep(path.stem))))
-    return total
+    parts = [path.stem for path in experiments_dir().glob(f"{study}_*.yaml")]
+    parts = [name for name in parts if _load_experiment(name).get("study") == study]
+    sweeps = map(read_sweep, (study, *parts)) if read_sweep(study) else ()
+    return sum(math.prod(map(len, expand_sweep(sweep))) for sweep in sweeps) or None
 
 
 def read_sweep(experiment: str) -> list[str]:
     """Read the sweep of an experiment as overrides. Empty if there is none."""
-    from omegaconf import OmegaConf
-
-    path = experiments_dir() / f"{experiment}.yaml"
-    if not path.exists():
-        return []
-    params = OmegaConf.select(OmegaConf.load(path), "hydra.sweeper.params") or {}
+    params = _load_experiment(experiment).get("hydra", {}).get("sweeper", {}).get("params") or {}
     return expand_filter_sets([f"{name}={value}" for name, value in params.items()])
+
+
+def _load_experiment(name: str) -> dict[str, Any]:
+    """Load the file of an experiment, empty if there is none."""
+    return yaml.safe_load(read_part("experiment", name)) or {}
 
 
 def read_description(text: str) -> str:
@@ -104,25 +85,54 @@ def read_description(text: str) -> str:
 # --------------------------------------------------------------------------------------------------
 # Check of a command before Hydra acts on it: Hydra makes folders and calls plugins before any job.
 
+SWEEP_FLAGS = ("-m", "--multirun")
 _MOST_VALUES = 100_000  # of one key of a sweep
 
 
-def check_words(words: Sequence[str]) -> JobConfig | None:
+def check_words(words: Sequence[str]) -> tuple[Any, StudyPlan | None]:
     """Check the words of `pfbench run`, those of all jobs of a sweep included.
 
     A job whose configuration is invalid for another reason fails by itself later, and the other jobs
     of the sweep run.
 
-    Returns configuration of the first job, None if it is not valid.
+    Returns the flags with the overrides, and the plan of the jobs, None if the first one is not valid.
     """
-    args = _parse_flags(list(words))
-    if args.config_path or args.config_name or args.config_dir or args.experimental_rerun:
-        raise UntrustedConfigError(
-            "--config-path, --config-name and --experimental-rerun must not be used, since pfbench has its "
-            "own main file. Use --config-dir=FOLDER for more files."
-        )
-    overrides = list(args.overrides)
-    return _check_sweep(overrides) if args.multirun else _check_composition(overrides)
+    args = _parse_flags(sorted(words, key=lambda word: word not in SWEEP_FLAGS))
+    args.overrides = overrides = expand_filter_sets(args.overrides)
+    if args.multirun:
+        args.overrides = overrides = delay_keys_of_swept_groups(overrides)
+    try:
+        alternatives = list_alternatives(overrides, is_sweep=args.multirun)
+    except UntrustedConfigError:
+        raise
+    except Exception:  # Hydra reports an invalid override
+        return args, None
+    first = _check_composition(
+        [options[0] for options in alternatives] if args.multirun else overrides
+    )
+    if args.multirun:
+        _check_values(alternatives, first)
+    return args, StudyPlan(alternatives, first) if first else None
+
+
+def delay_keys_of_swept_groups(words: Sequence[str]) -> list[str]:
+    """Write each key below a swept group as a sweep of one value, which Hydra applies to the jobs alone.
+
+    Hydra applies other keys first to a configuration without the swept choices, where they may not
+    exist: `scenario=linear_walk,growth scenario.steps=15`.
+
+    Returns the words in the same order.
+    """
+    pairs = [word.partition("=") for word in words]
+    groups = {key for key, _, value in pairs if "," in value and "." not in key}
+    if any(key.startswith("reading/") and re.search(r",|glob", value) for key, _, value in pairs):
+        groups |= {*CHOICES}  # a reading chooses the world
+    return [
+        f"{key}=choice({value})"
+        if key.split(".")[0] in groups and "." in key and re.fullmatch(r"[\w.+-]+", value)
+        else word
+        for word, (key, _, value) in zip(words, pairs, strict=True)
+    ]
 
 
 def replace_config_dir(words: Sequence[str]) -> list[str]:
@@ -176,7 +186,19 @@ def _parse_flags(words: list[str]) -> Any:
         refuse(message)
     if unknown:
         raise ValueError(format_flag(words, unknown[0], "run"))
+    if args.config_path or args.config_name or args.config_dir or args.experimental_rerun:
+        raise UntrustedConfigError(
+            "--config-path, --config-name and --experimental-rerun must not be used, since pfbench has its "
+            "own main file. Use --config-dir=FOLDER for more files."
+        )
     return args
+
+
+def parse_words(words: Sequence[str]) -> list[Any]:
+    """Parse overrides as Hydra does."""
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    return list(OverridesParser.create().parse_overrides(list(words)))
 
 
 def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
@@ -184,10 +206,8 @@ def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
 
     Returns for each key the alternatives, each as an override.
     """
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-
     alternatives: dict[str, list[str]] = {}
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
+    for override in parse_words(overrides):
         key = override.get_key_element()
         if override.is_sweep_override():
             texts = list(islice(override.sweep_string_iterator(), _MOST_VALUES + 1))
@@ -213,24 +233,18 @@ def _check_composition(words: list[str]) -> JobConfig | None:
         return None
 
 
-def _check_sweep(overrides: list[str]) -> JobConfig | None:
-    """Check the first job of a sweep, all settings, and all values that can choose a file that is not pfbench's.
+def list_alternatives(overrides: Sequence[str], *, is_sweep: bool = True) -> list[list[str]]:
+    """Expand overrides and the sweep of their experiment. Returns for each key the alternatives, each as an override."""
+    if not is_sweep and "experiment" not in given_keys(overrides):
+        return expand_sweep(overrides)
+    tree = compose_tree([options[0] for options in expand_sweep(overrides)])
+    params = tree.hydra.sweeper.params or {}
+    return expand_sweep([*(f"{name}={value}" for name, value in params.items()), *overrides])
 
-    Returns the configuration of the first job, None if it is not valid.
-    """
-    from hydra.core.override_parser.overrides_parser import OverridesParser
 
-    try:
-        tree = compose_tree([options[0] for options in expand_sweep(overrides)])
-        params = tree.hydra.sweeper.params or {}
-        swept = [f"{name}={value}" for name, value in params.items()]
-        alternatives = expand_sweep([*swept, *overrides])
-    except UntrustedConfigError:
-        raise
-    except Exception:  # Hydra reports an invalid override
-        return None
-    first, parser = [options[0] for options in alternatives], OverridesParser.create()
-    config = _check_composition(first)
+def _check_values(alternatives: Sequence[Sequence[str]], config: JobConfig | None) -> None:
+    """Check all settings of a sweep, and all values that can choose a file that is not pfbench's."""
+    first = [options[0] for options in alternatives]
     values: Mapping[str, object] = config.values if config else {}
     for index, options in enumerate(alternatives):
         for option in options if values and len(options) > 1 else options[1:]:
@@ -239,10 +253,9 @@ def _check_sweep(overrides: list[str]) -> JobConfig | None:
                 check_study(value.strip("'\""))
             is_plain = key in values and not isinstance(values[key], Mapping)
             if is_plain and value != UNTIL_DECIDED:  # known before a job starts
-                check_settings({**values, "runs": 1, key: parser.parse_override(option).value()})
+                check_settings({**values, "runs": 1, key: parse_words([option])[0].value()})
             elif not is_plain and value not in list_named_parts(key):
                 _check_composition([*first[:index], option, *first[index + 1 :]])
-    return config
 
 
 # --------------------------------------------------------------------------------------------------
@@ -271,25 +284,20 @@ class StudyPlan:
     Attributes:
         alternatives: Alternatives of each key, each as an override.
         first: Configuration of the first job.
-        experiments: Names of the experiments.
     """
 
-    alternatives: tuple[tuple[str, ...], ...]
+    alternatives: Sequence[Sequence[str]]
     first: JobConfig
-    experiments: tuple[str, ...]
 
     @property
     def jobs(self) -> int:
         """Number of jobs."""
-        jobs = 1
-        for options in self.alternatives:
-            jobs *= len(options)
-        return jobs
+        return math.prod(map(len, self.alternatives))
 
     @property
     def has_one_study(self) -> bool:
         """Return whether all jobs belong to one study."""
-        return "study" not in self._swept_options() and len(self.experiments) < 2
+        return not {"study", "experiment"} & self._swept_options().keys()
 
     def check_comparable(self) -> None:
         """Check that the report of the study can compare the jobs, which needs equal data in each condition."""
@@ -298,12 +306,14 @@ class StudyPlan:
             return
         for key, remedy in _EQUAL_KEYS.items():
             values = [option.partition("=")[2] for option in self._swept_options().get(key, ())]
-            if len(set(values)) > 1 and not (key == "first_run" and self._continue_runs(values)):
-                raise ValueError(
-                    f"{key} must be one value in a study, since its report compares filters on equal data, got "
-                    f"{', '.join(values[:5])}. {remedy} To run them all the same, and to report them, add "
-                    "report.allow_mixed_versions=true to both commands."
-                )
+            require(
+                len(set(values)) < 2 or (key == "first_run" and self._continue_runs(values)),
+                key,
+                "be one value in a study, since its report compares filters on equal data",
+                ", ".join(values[:5]),
+                f"{remedy} To run them all the same, and to report them, add "
+                "report.allow_mixed_versions=true to both commands.",
+            )
 
     def _continue_runs(self, first_runs: Sequence[str]) -> bool:
         """Return whether jobs with these first runs continue each other, so that a report joins them."""
@@ -316,25 +326,18 @@ class StudyPlan:
 
     def list_families(self) -> dict[str, str]:
         """Return the family of each scenario of the sweep."""
-        families: dict[str, str] = {}
-        for k, options in enumerate(self.alternatives):
-            if len(options) > 1 and given_keys(options[:1]) == {"scenario"}:
-                for option in options:
-                    words = [values[0] for values in self.alternatives]
-                    words[k] = option
-                    families |= dict([_family(compose_words(words))])
-        return families or dict([_family(self.first)])
+        scenarios = self._swept_options().get("scenario", ())
+        firsts = [options[0] for options in self.alternatives]
+        others = [word for word in firsts if given_keys([word]) != {"scenario"}]
+        worlds = [compose_words([*others, scenario]) for scenario in scenarios]
+        return dict(map(_family, worlds or [self.first]))
 
     def count_pairs(self) -> int:
         """Count the planned pairs of filters; at least 1, since one filter is compared later."""
-        from pfbench.results.paper_block import plan_installed_pairs
-
         swept = self._swept_options()
         names = [option.partition("=")[2] for option in swept.pop("filter", ("filter=one",))]
-        settings = [len(swept[key]) for key in swept if re.match(r"filter\.|particles$", key)]
-        variants = 1
-        for count in settings:
-            variants *= count
+        settings = (len(swept[key]) for key in swept if re.match(r"filter\.|particles$", key))
+        variants = math.prod(settings)
         labels = names if variants == 1 else [f"{n} {k}" for n in names for k in range(variants)]
         return max(1, len(plan_installed_pairs(labels)))
 
@@ -344,8 +347,6 @@ class StudyPlan:
 
     def compose_parts(self) -> Iterator[JobConfig]:
         """Compose a job of each combination of parts with classes of the user; a job that does not compose says so itself."""
-        if not (self.first.trusted or trusted_packages()):
-            return
         several = [
             options
             if {key.split(".")[0] for key in given_keys(options[:1])} <= {*CHOICES}
@@ -367,22 +368,16 @@ class StudyPlan:
         worlds = len(set(self.list_families().values()))
         return f"plan: {describe_study_size(runs, worlds, self.count_pairs())}"
 
-    def _swept_options(self) -> dict[str, tuple[str, ...]]:
+    def _swept_options(self) -> dict[str, Sequence[str]]:
         """Return the alternatives of each key that has several."""
         several = [options for options in self.alternatives if len(options) > 1]
         return {next(iter(given_keys(options[:1]))): options for options in several}
 
 
-def plan_study(overrides: Sequence[str], first: JobConfig | None = None) -> StudyPlan:
-    """Plan a sweep, or a single job.
-
-    Returns the plan.
-    """
-    names = [word.partition("=")[2] for word in overrides if word.startswith("+experiment=")]
-    params = [word for name in names for word in read_sweep(name)]
-    alternatives = tuple(tuple(options) for options in expand_sweep([*params, *overrides]))
-    first = first or compose_words([options[0] for options in alternatives])
-    return StudyPlan(alternatives, first, tuple(names))
+def plan_study(overrides: Sequence[str]) -> StudyPlan:
+    """Plan a sweep."""
+    alternatives = list_alternatives(overrides)
+    return StudyPlan(alternatives, compose_words([options[0] for options in alternatives]))
 
 
 def compose_words(words: Sequence[str]) -> JobConfig:

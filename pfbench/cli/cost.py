@@ -1,4 +1,4 @@
-"""Command `pfbench cost`: time per step of the filters of a study, measured in turn."""
+"""Command `pfbench cost`: measure the time per step of the filters of a study in turn."""
 
 from __future__ import annotations
 
@@ -7,57 +7,28 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pfbench.cli.compose import split_words
+from pfbench.cli.command import Command, Option, in_range
+from pfbench.cli.compose import PLACES, choose_places
 from pfbench.cli.report import check_has_results
 from pfbench.core.parameter_checks import require
 from pfbench.job.config import compose
-from pfbench.job.file_rules import FOLDER_KEYS
-
-HELP = """\
-pfbench cost study=NAME [rounds=7] [overwrite=true] [key=value ...]
-
-Measure the time per step of the filters of a study with results. All filters of a condition are built
-once and take turns over the first steps, after one run each that is not counted. The report then
-states medians with quartiles, and the ratio to the baseline with its interval. Without this command it has
-one timing per job. Finished conditions are skipped: repeat an interrupted command to resume.
-
-  pfbench cost study=quickstart
-  pfbench cost study=mine rounds=15
-
-  rounds=7                   at least 5
-  seconds=0.05               mean time of a filter in a round; at least 20 steps are taken
-  overwrite=true             measure finished conditions again
-  device=cpu threads=1       where to measure; by default as stored
-  trust=[mylab]              packages of filters of your own, as in their runs
-  checkpoint=FILE            weights that are not in results_dir
-  results_dir=FOLDER         the file is RESULTS/STUDY/step_times.json
-
-See also: pfbench report study=NAME"""
-
-_PLACES = ("device", "threads", "checkpoint")
-_KEYS = ("study", "rounds", "seconds", "overwrite", "results_dir", "episode_cache_dir", *_PLACES)
+from pfbench.results.step_times import (
+    FEWEST_ROUNDS,
+    measurement_key,
+    read_commit,
+    read_step_times,
+    write_step_times,
+)
 
 
-def measure_cost(words: Sequence[str]) -> None:
+def measure_cost(words: Sequence[str], rounds: int, seconds: float) -> None:
     """Measure the time per step of all filters of a study."""
-    values = split_words(words, _KEYS, ("study",), "pfbench cost study=NAME")
-    rounds, seconds = _read_numbers(values)
-    composed = [f"{key}={values[key]}" for key in _KEYS if key in values and key not in ("rounds", "seconds")]  # fmt: skip
-    config = compose(composed).values
-    require(
-        type(config["overwrite"]) is bool,
-        "overwrite",
-        "be true or false",
-        config["overwrite"],
-        "Set overwrite=true.",
-    )
+    config = compose(words).values
+    is_flag = type(config["overwrite"]) is bool
+    require(is_flag, "overwrite", "be true or false", config["overwrite"], "Set overwrite=true.")
     study, results = config["study"], Path(config["results_dir"])
     check_has_results(study, results)
-    changes: dict[str, Any] = {
-        key: config[key]
-        for key in ("data", *FOLDER_KEYS, *_PLACES)
-        if key in values or key not in _PLACES
-    }
+    changes = choose_places(config, words)
     start_time = time.perf_counter()
     count = _time_study(results / study, changes, (rounds, seconds), config["overwrite"])
     elapsed = time.perf_counter() - start_time
@@ -71,12 +42,6 @@ def _time_study(
     from pfbench.job.replay import describe_changed_code
     from pfbench.job.step_timing import estimate_time, time_condition
     from pfbench.results.conditions import load_conditions
-    from pfbench.results.step_times import (
-        measurement_key,
-        read_commit,
-        read_step_times,
-        write_step_times,
-    )
 
     rounds, seconds = numbers
     conditions = load_conditions(folder.name, folder.parent, allow_mixed_versions=True)
@@ -106,24 +71,33 @@ def _time_study(
     return len(conditions)
 
 
-def _read_numbers(values: dict[str, str]) -> tuple[int, float]:
-    """Read the number of rounds and the time of a filter in a round, s."""
-    from pfbench.results.step_times import FEWEST_ROUNDS
+COMMAND = Command(
+    measure_cost,
+    """\
+pfbench cost study=NAME [rounds=7] [overwrite=true] [key=value ...]
 
-    text = values.get("rounds", "7")
-    require(
-        text.isdecimal() and FEWEST_ROUNDS <= int(text) <= 1000,
-        "rounds",
-        f"be a whole number from {FEWEST_ROUNDS} to 1000",
-        text,
-        "Set rounds=7.",
-    )
-    try:
-        seconds = float(values.get("seconds", "0.05"))
-    except ValueError:
-        seconds = 0.0
-    if not 0.001 <= seconds <= 3600:
-        raise ValueError(
-            f"seconds must be a time from 0.001 to 3600 s, got {values['seconds']}. Set seconds=0.05."
-        )
-    return int(text), seconds
+Measure the time per step of the filters of a study with results. All filters of a condition are built
+once and take turns over the first steps, after one run each that is not counted. The report then
+states medians with quartiles, and the ratio to the baseline with its interval. Without this command it has
+one timing per job. Finished conditions are skipped: repeat an interrupted command to resume.
+
+  pfbench cost study=quickstart
+  pfbench cost study=mine rounds=15
+
+  OPTIONS
+  overwrite=true             measure finished conditions again
+  device=cpu threads=1       where to measure; by default as stored
+  trust=[mylab]              packages of filters of your own, as in their runs
+  checkpoint=FILE            weights that are not in results_dir
+  results_dir=FOLDER         the file is RESULTS/STUDY/step_times.json
+
+See also: pfbench report study=NAME""",
+    options={
+        "rounds": Option("7", "at least 5", in_range(f"whole [{FEWEST_ROUNDS}, 1000]")),
+        "seconds": Option(
+            "0.05", "mean time of a filter in a round, s; at least 20 steps are taken", in_range("[0.001, 3600]")
+        ),
+    },
+    keys=("study", "overwrite", "results_dir", "episode_cache_dir", *PLACES),
+    required=("study",),
+)  # fmt: skip

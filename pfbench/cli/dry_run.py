@@ -3,20 +3,33 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 from traceback import walk_tb
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import torch
+
+from pfbench import testing
 from pfbench.cli.compose import StudyPlan
 from pfbench.cli.messages import format_error, notes_of
-from pfbench.cli.progress import format_duration
+from pfbench.cli.progress import format_duration, name_job
+from pfbench.core import Episode, PhiloxStream, map_inputs
+from pfbench.filter import ParticleFilter, run_filter
+from pfbench.job.budget import EpisodeSource, apply_budget, estimate_job_memory
 from pfbench.job.config import JobConfig
-
-if TYPE_CHECKING:
-    from pfbench.core.record import Episode
-    from pfbench.job.budget import EpisodeSource
-    from pfbench.job.plan import JobPlan
+from pfbench.job.filter_pass import choose_engine, wrap_steps
+from pfbench.job.inputs import find_inputs
+from pfbench.job.memory import first_steps
+from pfbench.job.plan import JobPlan, build_plan
+from pfbench.job.run_job import find_result_path, list_used_packages
+from pfbench.job.trust import list_user_packages, list_user_targets, trusted_packages
+from pfbench.kernels import dispatch
+from pfbench.results.conditions import select_main_group
+from pfbench.testing.models import check_regime_in
+from pfbench.testing.results import check_is_model
 
 _STEPS = 10  # of the trial of a filter
 
@@ -41,7 +54,7 @@ def print_dry_run(plan: StudyPlan, *, is_sweep: bool) -> None:
     estimates: list[JobEstimate] = []
     worlds = DrawnWorlds()
     for number, config in enumerate(configs):
-        name = " / ".join(config.choices[key] for key in ("scenario", "noise", "filter"))
+        name = name_job(config.choices)
         try:
             estimates.append(estimate_job(config, worlds))
         except Exception as error:
@@ -97,13 +110,6 @@ class DrawnWorlds:
 
 def estimate_job(config: JobConfig, worlds: DrawnWorlds) -> JobEstimate:
     """Estimate a job by a trial: all runs of the filter take a few steps of the data of two runs."""
-    from dataclasses import replace
-
-    from pfbench.job.budget import apply_budget, estimate_job_memory
-    from pfbench.job.inputs import find_inputs
-    from pfbench.job.plan import build_plan
-    from pfbench.job.run_job import find_result_path
-
     values = config.values
     file = find_result_path(values, find_inputs(values, config.trusted))
     if file.is_file() and not values["overwrite"]:
@@ -119,8 +125,6 @@ def estimate_job(config: JobConfig, worlds: DrawnWorlds) -> JobEstimate:
 
 def _without_cache(config: JobConfig) -> JobConfig:
     """Return a configuration that stores no episodes."""
-    from dataclasses import replace
-
     scenario = config.values["scenario"]
     changes = {"cache_dir": None} if "cache_dir" in scenario else {}
     return replace(config, values={**config.values, "scenario": {**scenario, **changes}})
@@ -128,17 +132,6 @@ def _without_cache(config: JobConfig) -> JobConfig:
 
 def _time_filter(plan: JobPlan, episode: Episode) -> float:
     """Measure some steps of all runs, whose data are copies of those of the episode; return the time of all steps [s]."""
-    import time
-
-    import torch
-
-    from pfbench.core.random_stream import PhiloxStream
-    from pfbench.core.record import map_inputs
-    from pfbench.filter.loop import run_filter
-    from pfbench.job.filter_pass import choose_engine, wrap_steps
-    from pfbench.job.memory import first_steps
-    from pfbench.kernels import dispatch
-
     model, runs = plan.make_filter_model(episode), len(plan.runs)
     steps = episode.record.y.shape[1]
     short = first_steps(model, episode.record, min(_STEPS, steps))
@@ -181,9 +174,6 @@ def try_own_parts(configs: Iterable[JobConfig]) -> None:
     Raises:
         ValueError: If parts break their contracts.
     """
-    from pfbench.job.run_job import list_used_packages
-    from pfbench.job.trust import list_user_targets
-
     episodes: dict[str, Episode] = {}
     errors: dict[str, Exception] = {}
     has_line = False  # of the user's code
@@ -229,14 +219,6 @@ def _is_of_user(
 
 def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:
     """Try the parts of a job without a result; its world only if no job before has the same."""
-    from pfbench import testing
-    from pfbench.job.inputs import find_inputs
-    from pfbench.job.plan import build_plan
-    from pfbench.job.run_job import find_result_path
-    from pfbench.job.trust import list_user_packages, trusted_packages
-    from pfbench.testing.models import check_regime_in
-    from pfbench.testing.results import check_is_model
-
     trusted = (*config.trusted, *trusted_packages())
     if find_result_path(config.values, find_inputs(config.values, trusted)).is_file():
         return
@@ -259,8 +241,6 @@ def _try_job(config: JobConfig, episodes: dict[str, Episode]) -> None:
 
 def _check_truth(plan: JobPlan, truth: Collection[str]) -> None:
     """Check that a scenario of the user has a truth of the main group, and misspells no other group of the model."""
-    from pfbench.results.conditions import select_main_group
-
     groups = plan.model.groups
     lacking = [name for name in groups if name not in truth]
     has_main = select_main_group(list(groups)) in truth
@@ -280,12 +260,6 @@ def _take_steps(
     config: JobConfig, plan: JobPlan, episode: Episode, own_groups: Collection[str]
 ) -> None:
     """Take three steps of a filter of the user, else of a bootstrap filter."""
-    import torch
-
-    from pfbench.core.random_stream import PhiloxStream
-    from pfbench.filter import ParticleFilter, run_filter
-    from pfbench.job.memory import first_steps
-
     if "scenario" in own_groups:
         _check_truth(plan, episode.truth)
     model = plan.make_filter_model(episode).to("cpu", torch.float64)

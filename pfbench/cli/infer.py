@@ -1,4 +1,4 @@
-"""Command `pfbench infer`: parameters of a model from measurements."""
+"""Command `pfbench infer`: infer parameters of a model by NUTS, SVI, PMMH or SMC2."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pfbench.cli.command import Command
 from pfbench.cli.compose import given_keys
 from pfbench.cli.messages import suggest_similar
 from pfbench.cli.noise_scenario import (
@@ -171,3 +172,6 @@ def format_posterior(content: dict[str, Any]) -> str:
     note = "" if content["converged"] else "\nr_hat is above 1.05: the chains have not mixed. Use more draws: infer.warmup=... infer.draws=..."  # fmt: skip
     renamed = table.rename(columns={"low": "low 90 %", "high": "high 90 %"})
     return f"{head}\n{renamed.to_string(float_format=lambda value: f'{value:.4g}')}{note}"
+
+
+COMMAND = Command(infer_parameters, HELP)

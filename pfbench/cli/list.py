@@ -1,24 +1,17 @@
-"""Command `pfbench list`: the files of each configuration group."""
+"""Command `pfbench list`: list what a configuration can choose."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Sequence
+from pathlib import Path
 
+from pfbench.cli.command import Command
 from pfbench.cli.compose import given_keys, read_description
-from pfbench.cli.current_folder import list_own_files
-from pfbench.cli.messages import suggest_similar
-from pfbench.job.config import FILTER_SETS, list_groups
-from pfbench.results.paper_block import read_part
-
-HELP = """\
-pfbench list [GROUP] [key=value ...]
-
-List the configuration groups with their files, or the files of a group with their descriptions.
-
-  pfbench list
-  pfbench list filter
-  pfbench list model scenario=sar_flight     the models that fit a scenario
-  pfbench list scenario model=ins_gnss       the scenarios that fit a model"""
+from pfbench.cli.messages import require_choice
+from pfbench.core.parameter_checks import require
+from pfbench.job.config import FILTER_SETS, compose_tree, list_groups
+from pfbench.results.paper_block import conf_dir, read_part
 
 _OTHER = {"model": "scenario", "scenario": "model"}
 
@@ -31,15 +24,16 @@ def list_options(words: Sequence[str]) -> None:
             print(f"{group:12} {', '.join(names)}")
         print("\nNext: pfbench list GROUP")
         return
-    _check_group(words[0], list(groups))
-    texts = describe_files(words[0])
+    group = words[0] or "an empty word"
+    require_choice("group", group, list(groups))
+    texts = describe_files(group)
     if len(words) > 1:
-        fitting = _list_fitting(words[0], words[1:])
+        fitting = _list_fitting(group, words[1:])
         texts = {name: text for name, text in texts.items() if name in fitting}
     for name, text in texts.items():
         print(f"{name:24} {text}")
     if not texts:
-        print(f"No {words[0]} fits.")
+        print(f"No {group} fits.")
 
 
 def describe_files(group: str) -> dict[str, str]:
@@ -54,30 +48,68 @@ def describe_choices(group: str | None) -> dict[str, str]:
     groups = list_groups()
     if group is None:
         return {name: f"{len(describe_files(name))} names" for name in groups}
-    _check_group(group, list(groups))
+    require_choice("group", group, list(groups))
     sets = {name: ", ".join(names) for name, names in FILTER_SETS.items()}
     return {**describe_files(group), **(sets if group == "filter" else {})}
 
 
-def _check_group(group: str, groups: Sequence[str]) -> None:
-    """Check the name of a group."""
-    if group not in groups:
-        similar = suggest_similar(group, groups)
-        raise ValueError(
-            f"group must be one of {', '.join(groups)}, got {group or 'an empty word'}.{similar}"
-        )
-
-
 def _list_fitting(group: str, words: Sequence[str]) -> Collection[str]:
     """List the models or scenarios that fit overrides, which name the other one."""
-    from pfbench.job.config import compose_tree
     from pfbench.job.model_fit import list_fitting_models, list_fitting_scenarios
 
     needed = _OTHER.get(group)
-    if needed is None or needed not in given_keys(words):
-        example = f"pfbench list {group} {needed}=NAME" if needed else f"pfbench list {group}"
-        raise ValueError(f"words must be {example}, got {' '.join(words)}. See pfbench list --help")
+    example = f"pfbench list {group} {needed}=NAME" if needed else f"pfbench list {group}"
+    is_fit = needed in given_keys(words)
+    require(is_fit, "words", f"be {example}", " ".join(words), "See pfbench list --help")
     if group == "scenario":
         return list_fitting_scenarios(words)
     tree = compose_tree(words)
     return list_fitting_models(tree, scenario=tree.hydra.runtime.choices["scenario"])
+
+
+# of a file of the user in `conf` of the current folder, which the command line and Python use without a search path
+_CHOICE = re.compile(r"\+?(\w+)=([\w,]+)")
+
+
+def list_own_files(group: str) -> list[Path]:
+    """List the files of a group in `conf` of the current folder, unless that is the folder of pfbench. A link may lead out of it."""
+    folder = Path("conf")
+    if not folder.is_dir() or folder.resolve() == conf_dir().resolve():
+        return []
+    return sorted(
+        p
+        for p in (folder / group).glob("*.yaml")
+        if p.is_file() and not p.is_symlink() and p.name.isprintable()
+    )
+
+
+def add_search_path(words: Sequence[str]) -> list[str]:
+    """Add the folder `conf` to words that choose one of its files, unless they set a search path.
+
+    A file with the name of a shipped one counts, too: Hydra's loader then refuses it.
+    """
+    if not Path("conf").is_dir() or any(
+        re.match(r"[+~]*hydra\.searchpath\b|--config-dir\b|-cd\b", word) for word in words
+    ):
+        return list(words)
+    for match in filter(None, map(_CHOICE.fullmatch, words)):
+        has_knobs = match[1] == "filter" and re.search(r"_tuned\b|tuned_baselines", match[2])
+        if {*match[2].split(",")} & {path.stem for path in list_own_files(match[1])} or (
+            has_knobs and list_own_files("tuned")
+        ):
+            return [*words, "hydra.searchpath=[file://conf]"]
+    return list(words)
+
+
+COMMAND = Command(
+    list_options,
+    """\
+pfbench list [GROUP] [key=value ...]
+
+List the configuration groups with their files, or the files of a group with their descriptions.
+
+  pfbench list
+  pfbench list filter
+  pfbench list model scenario=sar_flight     the models that fit a scenario
+  pfbench list scenario model=ins_gnss       the scenarios that fit a model""",
+)

@@ -9,10 +9,9 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import pfbench
-from pfbench.cli.current_folder import add_search_path
+from pfbench.cli.command import list_commands
 from pfbench.cli.messages import (
     describe_unknown,
     format_error,
@@ -26,46 +25,6 @@ from pfbench.files.command_start import collect_as_usual, has_work_started, rese
 from pfbench.files.foreign_folder import make_child_environment
 from pfbench.job.trust import ENVIRONMENT, split_trust
 
-# command: function of the module of the same name, summary
-COMMANDS = {
-    "run": ("run_jobs", "run one job, or a sweep with -m"),
-    "report": ("report_study", "write the report of a study: figures, tables and tests"),
-    "compare": ("compare_study", "compare an own study with a published one in the same runs"),
-    "cost": ("measure_cost", "measure the time per step of the filters of a study in turn"),
-    "paper": ("write_study_paper", "write figures, tables and text of a study for a journal"),
-    "claims": ("report_claims", "write the page of the papers' claims and verdicts"),
-    "datasheet": ("report_scenario", "write the datasheet of a scenario"),
-    "replay": ("replay_run", "compute one stored run again, with all its traces"),
-    "import": ("import_log", "write the tables of an own log from files of other programs"),
-    "inspect": ("inspect_folder", "name the faults of an own log, and the settings that mend them"),
-    "estimate": ("estimate_log", "estimate the track of an own log without a reference"),
-    "judge": ("judge_trajectories", "compare trajectories of other programs with a reference"),
-    "tune": ("tune_filters", "tune the baselines of a study of robustness alike"),
-    "train": ("train_network", "train the network of a neural_* filter or of kalman_net"),
-    "infer": ("infer_parameters", "infer parameters of a model by NUTS, SVI, PMMH or SMC2"),
-    "data": ("list_data", "list the recorded data sets, and check a folder of them"),
-    "status": ("report_status", "print what is finished, failed and running, and the time left"),
-    "open": (
-        "open_report",
-        "show the report of a study in a browser, and write it if it is missing",
-    ),
-    "new": (
-        "write_script",
-        "write a script of your own filter, proposal, model, scenario, noise regime or log",
-    ),
-    "list": ("list_options", "list what a configuration can choose"),
-    "check": ("check_installation", "compose all configurations and print versions"),
-    "completion": ("print_completion", "print the completion of words for a shell"),
-}
-_OF_LOGS = ("data", "estimate", "import", "inspect", "judge")  # in pfbench/logs/cli
-_COMPOSING = (
-    "run",
-    "tune",
-    "train",
-    "infer",
-    "datasheet",
-    "list",
-)  # that may choose files of the current folder
 _ENVIRONMENT = (ENVIRONMENT, "PYTHONSAFEPATH", "PYTHONPATH")
 USAGE = """\
 pfbench {version}: benchmarks of particle filters in integrated navigation
@@ -124,20 +83,15 @@ def _dispatch(words: Sequence[str]) -> None:
         print(f"pfbench {pfbench.__version__}")
         return
     command, options = words[0], words[1:]
-    if command not in COMMANDS:
-        similar = suggest_similar(command, list(COMMANDS))
+    commands = list_commands()
+    if command not in commands:
+        similar = suggest_similar(command, list(commands))
         print(f"error: command '{command}' does not exist.{similar}\n\n{_usage()}", file=sys.stderr)
         raise SystemExit(2)
     if {"-h", "--help"} & set(options):
-        print(open_module(command).HELP)
+        print(commands[command].load().format_help())
         return
     _run_command(command, options)
-
-
-def open_module(command: str) -> Any:
-    """Import the module of a command; `import` is a word of Python and no name of a module."""
-    folder = "logs.cli" if command in _OF_LOGS else "cli"
-    return import_module(f"pfbench.{folder}.{'own_files' if command == 'import' else command}")
 
 
 def _run_command(command: str, options: Sequence[str]) -> None:
@@ -146,7 +100,10 @@ def _run_command(command: str, options: Sequence[str]) -> None:
     words = [word for word in options if word != "--traceback"]
     reset_work()
     try:
-        if command in _COMPOSING:
+        loaded = list_commands()[command].load()
+        if loaded.keys is None:
+            from pfbench.cli.list import add_search_path  # which imports numpy
+
             words = add_search_path(words)
         flag = next((w for w in words if w.startswith("--") and w != "--multirun"), None)
         if flag and command != "run":  # which has the flags of Hydra
@@ -155,7 +112,7 @@ def _run_command(command: str, options: Sequence[str]) -> None:
         os.environ[ENVIRONMENT] = ",".join(
             packages
         )  # for all parts, and the processes of a launcher
-        getattr(open_module(command), COMMANDS[command][0])(words)
+        loaded(words)
     except Exception as error:
         if shows_traceback:
             raise
@@ -180,5 +137,5 @@ def _report(command: str, words: Sequence[str], error: Exception) -> None:
 
 def _usage() -> str:
     """Format the overview of all commands."""
-    lines = (f"  pfbench {name:10} {summary}" for name, (_, summary) in COMMANDS.items())
+    lines = (f"  pfbench {name:10} {file.summary}" for name, file in list_commands().items())
     return USAGE.format(version=pfbench.__version__, commands="\n".join(lines)).rstrip()

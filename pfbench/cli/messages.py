@@ -13,6 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from pfbench.core.parameter_checks import require
 from pfbench.files.escapes import ESCAPED
 from pfbench.job.trust import WRITTEN
 
@@ -53,6 +54,9 @@ def _choose_sentence(error: BaseException, words: Sequence[str]) -> str:
     if isinstance(error, MemoryError):
         return "memory must be enough for the command, got an array that is too large. Reduce runs, particles or steps."
     text = f"{error}".strip() or type(error).__name__
+    if match := re.search(r"tried to allocate (\d+) bytes", text):
+        size = int(match[1]) / 2**30
+        return f"memory must hold an array of {size:.3g} GiB. Reduce runs, particles or steps."
     if message := _format_hydra_error(text, words):
         return message
     return text if is_named(error) else describe_unknown(error)
@@ -62,15 +66,17 @@ def _format_hydra_error(text: str, words: Sequence[str]) -> str:
     """Format an error of Hydra; empty for other errors."""
     if match := re.search(r"Could not override '([^']*)'", text):
         return _format_override(match[1], words)
-    launchers = "|".join(_EXTRAS)
-    if match := re.search(rf"[Cc]ould not (?:find|load) 'hydra/launcher/({launchers})", text):
+    if match := re.search(
+        rf"[Cc]ould not (?:find|load) 'hydra/launcher/({'|'.join(_EXTRAS)})", text
+    ):
         launcher = next((word for word in words if word.startswith("hydra/launcher=")), "launcher")
         return f'{launcher} is not installed. Run pip install "pfbench[{_EXTRAS[match[1]]}]"'
     if message := format_choice_error(text, words):
         return message
     if match := re.search(r"Could not find '(.+)/([^/']*)'", text):
         return format_unknown_choice(match[1], match[2], re.findall(r"^\t(\w+)$", text, re.M))
-    return format_value_error(text)
+    matches = ((re.search(pattern, text), sentence) for pattern, sentence in _SENTENCES.items())
+    return next((sentence.format(**match.groupdict()) for match, sentence in matches if match), "")
 
 
 def _format_override(key: str, words: Sequence[str]) -> str:
@@ -110,6 +116,13 @@ def suggest_similar(name: str, options: Sequence[str]) -> str:
     }
     best = [option for option, score in scores.items() if score > max(scores.values()) - 0.1]
     return f" Similar: {', '.join(best[:3])}." if best else ""
+
+
+def require_choice(key: object, value: Any, options: Sequence[str], remedy: str = "") -> None:
+    """Raise an error unless a value is one of some names."""
+    got = value if isinstance(value, str) and value else repr(value)
+    advice = f"{suggest_similar(got, options)} {remedy}".strip()
+    require(value in options, key, f"be one of {', '.join(options)}", got, advice or "Choose one.")
 
 
 def format_unknown_choice(group: str, name: str, options: Sequence[str]) -> str:
@@ -200,46 +213,19 @@ def _dotted_keys(node: Any, path: str = "") -> Iterator[str]:
 # --------------------------------------------------------------------------------------------------
 # Messages for errors of Hydra, which name neither key nor remedy.
 
-# how Hydra's parser begins its errors
-_GRAMMAR = (
-    "mismatched input",
-    "extraneous input",
-    "no viable alternative",
-    "token recognition error",
-)
-
-
-def format_value_error(text: str) -> str:
-    """Format an error of Hydra about a single value.
-
-    Returns the key, the value given, and a remedy. Empty for other errors.
-    """
-    if match := re.search(r"Ambiguous value for argument '([^']+)'", text):
-        return f"{match[1]} must be one value, got several. Add -m to run all: pfbench run -m ..."
-    if match := re.search(r"Interpolation key '([^']+)' not found\s+full_key: (\S+)", text):
-        group, _, name = match[1].partition(".")
-        return (
-            f"{match[2]} must be set, since {match[1]} does not exist. "
-            f"Set {match[2]}=... or choose a {group} that defines {name}."
-        )
-    if match := re.search(r"Missing mandatory value: (\S+)", text):
-        return f"{match[1]} must be set. Set {match[1]}=..."
-    if "LexerNoViableAlt" in text or text.startswith(_GRAMMAR):
-        return (
-            "each word must be key=value. Quote a value with spaces or signs; names consist of a-z, A-Z, "
-            "0-9 and underscores."
-        )
-    if match := re.search(r"tried to allocate (\d+) bytes", text):
-        size = int(match[1]) / 2**30
-        return f"memory must hold an array of {size:.3g} GiB. Reduce runs, particles or steps."
-    if match := re.search(r"Error parsing override '([^']*)'", text):
-        return f"'{match[1]}' must be key=value. Quote it if the shell reads brackets or spaces."
-    if match := re.search(r"Error merging override (\S+)=(\S*)", text):
-        key = match[1].lstrip("+~")
-        return f"{key} must have a value of its type, got {match[2]}. See its default: pfbench run --cfg all"
-    if match := re.search(r"An item is already at '([^']+)'", text):
-        return f"{match[1]} exists already. Leave out the plus sign: {match[1]}=VALUE"
-    return ""
+# of the texts of Hydra and other libraries about a single value
+_SENTENCES = {
+    r"Ambiguous value for argument '(?P<key>[^']+)'": "{key} must be one value, got several. Add -m to run all: pfbench run -m ...",
+    r"Interpolation key '(?P<other>(?P<group>[^'.]+)\.?(?P<name>[^']*))' not found\s+full_key: (?P<key>\S+)":
+        "{key} must be set, since {other} does not exist. Set {key}=... or choose a {group} that defines {name}.",
+    r"Missing mandatory value: (?P<key>\S+)": "{key} must be set. Set {key}=...",
+    r"LexerNoViableAlt|^(mismatched input|extraneous input|no viable alternative|token recognition error)":
+        "each word must be key=value. Quote a value with spaces or signs; names consist of a-z, A-Z, 0-9 and underscores.",
+    r"Error parsing override '(?P<word>[^']*)'": "'{word}' must be key=value. Quote it if the shell reads brackets or spaces.",
+    r"Error merging override [+~]*(?P<key>[^\s=]+)=(?P<value>\S*)":
+        "{key} must have a value of its type, got {value}. See its default: pfbench run --cfg all",
+    r"An item is already at '(?P<key>[^']+)'": "{key} exists already. Leave out the plus sign: {key}=VALUE",
+}  # fmt: skip
 
 
 def format_flag(words: Sequence[str], flag: str, command: str) -> str:

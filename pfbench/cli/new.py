@@ -1,4 +1,4 @@
-"""Command `pfbench new`: a script of your own part that runs at once."""
+"""Command `pfbench new`: write a script of your own filter, proposal, model, scenario, noise regime or log."""
 
 from __future__ import annotations
 
@@ -6,17 +6,9 @@ import importlib.util
 from collections.abc import Sequence
 from pathlib import Path
 
-from pfbench.cli.messages import suggest_similar
+from pfbench.cli.command import Command
+from pfbench.cli.messages import require_choice
 from pfbench.core.parameter_checks import require
-
-HELP = """\
-pfbench new filter|proposal|model|scenario|noise|log NAME
-
-Write NAME.py into the current folder: a class of your own and a study of it beside filters of pfbench. It runs
-without a change. Change the class.
-
-  pfbench new filter careful
-  python careful.py"""
 
 
 def write_script(words: Sequence[str]) -> None:
@@ -29,9 +21,7 @@ def write_script(words: Sequence[str]) -> None:
         "Use: pfbench new filter NAME",
     )
     kind, name = words
-    if kind not in SCRIPTS:
-        similar = suggest_similar(kind, list(SCRIPTS))
-        raise ValueError(f"kind must be one of {', '.join(SCRIPTS)}, got {kind}.{similar}")
+    require_choice("kind", kind, list(SCRIPTS))
     require(
         name.isidentifier() and name.islower(),
         "name",
@@ -258,3 +248,16 @@ SCRIPTS = {
     "noise": _NOISE,
     "log": _LOG,
 }
+
+
+COMMAND = Command(
+    write_script,
+    """\
+pfbench new filter|proposal|model|scenario|noise|log NAME
+
+Write NAME.py into the current folder: a class of your own and a study of it beside filters of pfbench. It runs
+without a change. Change the class.
+
+  pfbench new filter careful
+  python careful.py""",
+)

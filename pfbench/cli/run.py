@@ -1,51 +1,35 @@
-"""Command `pfbench run`: one job or a sweep, its progress, and the report of failed jobs."""
+"""Command `pfbench run`: run one job, or a sweep with -m."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
-import logging
 import os
 import re
 import shlex
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from pfbench.cli.command import Command
 from pfbench.cli.compose import (
     StudyPlan,
     check_words,
+    given_keys,
     plan_study,
     replace_config_dir,
     wants_until_decided,
 )
-from pfbench.cli.messages import format_error, notes_of
-from pfbench.cli.progress import SweepCounter, SweepProgress, note_outcome
+from pfbench.cli.progress import Sweep, SweepCounter, SweepJobError, list_repeats, reported_failure
 from pfbench.cli.terminal import end_with_parent
 from pfbench.files.command_start import start_work
-from pfbench.job.config import CHOICES, JobConfig, expand_filter_sets, register_experiments
-from pfbench.job.trust import ENVIRONMENT
+from pfbench.files.reader_notes import SWEEP_LOG
+from pfbench.job.config import JobConfig, register_experiments
+from pfbench.job.settings import check_settings
+from pfbench.job.trust import ENVIRONMENT, trusted_packages
 from pfbench.results.paper_block import conf_dir
-
-HELP = """\
-pfbench run [-m] key=value ...
-
-Run one job (one filter in one condition), or with -m a sweep over comma-separated values.
-Finished jobs are skipped: repeat an interrupted command to resume.
-
-  pfbench run scenario=flight_300s noise=nominal filter=sir runs=100 seed=1
-  pfbench run -m scenario=flight_300s filter=ekf,sir noise=nominal,outliers study=mine
-  pfbench run -m +experiment=quickstart
-  pfbench run -m +experiment=quickstart hydra/launcher=cores     on all cores
-  pfbench run --dry-run -m scenario=flight_300s filter=ekf,sir runs=100
-                             prints jobs, memory and time, and runs nothing
-  pfbench run -m scenario=flight_300s filter=ekf,sir study=mine runs=until-decided
-                             adds runs until each pair of filters is decided
-
-  pfbench list               scenarios, noise regimes, filters and experiments
-  pfbench run --cfg job      all keys with their values"""
-
 
 _RETRIES = 3  # of a sweep that lost a process, as many as Ray allows
 
@@ -55,10 +39,7 @@ _LOST_PROCESS = {
     "OwnerDiedError", "RaySystemError", "WorkerCrashedError",
 }  # fmt: skip
 
-_FLAGS = ("-m", "--multirun")
 DRY_RUN = "--dry-run"
-
-_PRINTING_FLAGS = {"--cfg", "-c", "--info", "-i", "--hydra-help", "--version", "--resolve"}
 
 
 def run_jobs(words: Sequence[str]) -> None:
@@ -66,49 +47,46 @@ def run_jobs(words: Sequence[str]) -> None:
     register_experiments()
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    is_dry = DRY_RUN in words
-    words = replace_config_dir([word for word in words if word != DRY_RUN])
-    flags = [word for word in words if word in _FLAGS]  # first, else argparse drops later overrides
-    overrides = expand_filter_sets([word for word in words if word not in flags])
-    overrides = delay_keys_of_swept_groups(overrides) if flags else overrides
-    first = check_words([*flags, *overrides])
-    is_printed = any(word.partition("=")[0] in _PRINTING_FLAGS for word in words)
-    plan = None if is_printed else plan_or_none(overrides, first)
-    if plan and flags:
+    args, plan = check_words(replace_config_dir([word for word in words if word != DRY_RUN]))
+    overrides, is_sweep = args.overrides, args.multirun
+    if args.cfg or args.info:
+        print_configuration(args)
+        return
+    if plan and is_sweep:
         plan.check_comparable()
-    if is_dry:
+    if DRY_RUN in words:
         from pfbench.cli.dry_run import print_dry_run
 
-        print_dry_run(plan or plan_study(overrides, first), is_sweep=bool(flags))
+        print_dry_run(plan or plan_study(overrides), is_sweep=is_sweep)
         return
-    if plan and not is_printed:
-        print_surprise(_try_parts(plan), overrides, is_sweep=bool(flags))
+    if plan:
+        _try_parts(plan)
+        print_surprise(plan, overrides, is_sweep=is_sweep)
     if plan and wants_until_decided(plan):
-        _run_until_decided(flags, overrides, plan)
-    elif flags:
+        _run_until_decided(overrides, plan, is_sweep=is_sweep)
+    elif is_sweep:
         print_study_size(plan)
-        run_sweep(make_application(run_task), [*flags, *overrides], plan)
+        run_sweep(overrides, plan)
     else:
         _run_alone(overrides, plan)
 
 
-def _try_parts(plan: StudyPlan) -> StudyPlan:
-    """Try the own parts of a plan before its first job, and return the plan."""
-    from pfbench.cli.dry_run import try_own_parts
+def _try_parts(plan: StudyPlan) -> None:
+    """Try the own parts of a plan before its first job."""
+    if plan.first.trusted or trusted_packages():
+        from pfbench.cli.dry_run import try_own_parts  # which imports torch
 
-    try_own_parts(plan.compose_parts())
-    return plan
+        try_own_parts(plan.compose_parts())
 
 
-def _run_until_decided(flags: Sequence[str], overrides: Sequence[str], plan: StudyPlan) -> None:
+def _run_until_decided(overrides: Sequence[str], plan: StudyPlan, *, is_sweep: bool) -> None:
     """Run a sweep that adds runs until its pairs are decided."""
     from pfbench.cli.until_decided import GrowingSweep, check_has_sweep
 
-    check_has_sweep(flags)
+    check_has_sweep(is_sweep)
     sweep = GrowingSweep.from_plan(plan)
     others = [word for word in overrides if not re.match(r"(runs|first_run)=", word)]
-    application = make_application(run_task)
-    sweep.run(lambda more: run_sweep(application, [*flags, *others, *more], plan, is_part=True))
+    sweep.run(lambda more: run_sweep([*others, *more], plan, is_part=True))
 
 
 def _run_alone(overrides: Sequence[str], plan: StudyPlan | None) -> None:
@@ -120,95 +98,63 @@ def _run_alone(overrides: Sequence[str], plan: StudyPlan | None) -> None:
     def run_with_plan(cfg: Any) -> float:
         return run_task(cfg, lambda: print_study_size(plan), checked)
 
-    sys.argv = ["pfbench run", *overrides]
     with hide_hydra_line():
-        make_application(run_with_plan)()
+        run_application(run_with_plan, overrides, is_sweep=False)
 
 
 def print_surprise(plan: StudyPlan, words: Sequence[str], *, is_sweep: bool) -> None:
     """Say first what a command does that its words do not show: defaults alone, or one job of an experiment."""
-    if not is_sweep and plan.experiments and plan.jobs > 1:
+    keys, choices = given_keys(words), plan.first.choices
+    if not is_sweep and "experiment" in keys and plan.jobs > 1:
         note = (
             f"{plan.jobs} jobs belong to the experiment, and without -m one of them runs. "
             f"Run all: pfbench run -m {shlex.join(words)}"
         )
-    elif not {word.lstrip("+").partition("=")[0] for word in words} & {
-        "scenario",
-        "filter",
-        "experiment",
-    }:
-        names = " ".join(
-            f"{key}={plan.first.choices[key]}" for key in ("scenario", "noise", "filter")
-        )
+    elif not keys & {"scenario", "filter", "experiment"}:
+        names = " ".join(f"{key}={choices[key]}" for key in ("scenario", "noise", "filter"))
         note = f"one job of the defaults runs: {names} runs={plan.first.values['runs']}. Choose others: pfbench list"
     else:
         return
     print(f"note: {note}", file=sys.stderr, flush=True)
 
 
-def plan_or_none(overrides: Sequence[str], first: JobConfig | None = None) -> StudyPlan | None:
-    """Plan a study; None if its configuration is not valid, which Hydra reports."""
-    words = [word for word in overrides if not word.startswith("-")]
-    try:
-        return plan_study(words, first if len(words) == len(overrides) else None)
-    except Exception:
-        return None
-
-
 def print_study_size(plan: StudyPlan | None) -> None:
     """Print what the chosen runs and worlds can show; nothing if the settings of the job are not valid."""
-    from pfbench.job.settings import check_settings
-
-    if plan is None:
-        return
-    try:
-        check_settings(plan.first.values)
-        sentence = plan.describe_size()
-    except Exception:  # a setting or a scenario is not valid: the job reports the error
-        return
-    if sentence:
-        print(sentence, flush=True)
+    with contextlib.suppress(Exception):  # a setting or a scenario: the job reports the error
+        if plan is not None:
+            check_settings(plan.first.values)
+            if sentence := plan.describe_size():
+                print(sentence, flush=True)
 
 
-def run_sweep(
-    application: Callable[[], Any],
-    words: Sequence[str],
-    plan: StudyPlan | None,
-    *,
-    is_part: bool = False,
-) -> None:
+def run_sweep(overrides: Sequence[str], plan: StudyPlan | None, *, is_part: bool = False) -> None:
     """Run all jobs of a sweep and print their counts."""
-    sys.argv = ["pfbench run", *words]
-    sweep = SweepProgress.start(plan)
+    sys.argv = ["pfbench run", "-m", *overrides]  # what is to be repeated if a process is lost
+    sweep = None
+    if plan is not None:  # else the sweep itself reports the error
+        sweep = Sweep.of_jobs(plan.first, plan.jobs)
+        os.environ[SWEEP_LOG] = str(sweep.file)
+    is_complete = False
     try:
         with hide_hydra_line():
-            run_with_retries(application)
-    except BaseException as error:
-        sweep.finish(is_complete=False, is_part=is_part)
-        if isinstance(error, Exception):
-            raise summarise_failed_jobs(error, words) from error
-        raise
-    sweep.finish(is_part=is_part)
+            run_with_retries(lambda: run_application(run_task, overrides, is_sweep=True))
+        is_complete = True
+    except Exception as error:
+        raise summarise_failed_jobs(error, overrides) from error
+    finally:
+        os.environ.pop(SWEEP_LOG, None)
+        if is_complete or (sweep and sweep.file.is_file()):
+            start_work()  # in another process, for most launchers
+        if sweep and plan and plan.has_one_study:
+            _print_end(sweep, is_complete=is_complete, is_part=is_part)
 
 
-def delay_keys_of_swept_groups(words: Sequence[str]) -> list[str]:
-    """Write each key below a swept group as a sweep of one value, which Hydra applies to the jobs alone.
-
-    Hydra applies other keys first to a configuration without the swept choices, where they may not
-    exist: `scenario=linear_walk,growth scenario.steps=15`.
-
-    Returns the words in the same order.
-    """
-    pairs = [word.partition("=") for word in words]
-    groups = {key for key, _, value in pairs if "," in value and "." not in key}
-    if any(key.startswith("reading/") and re.search(r",|glob", value) for key, _, value in pairs):
-        groups |= {*CHOICES}  # a reading chooses the world
-    return [
-        f"{key}=choice({value})"
-        if key.split(".")[0] in groups and "." in key and re.fullmatch(r"[\w.+-]+", value)
-        else word
-        for word, (key, _, value) in zip(words, pairs, strict=True)
-    ]
+def _print_end(sweep: Sweep, *, is_complete: bool, is_part: bool) -> None:
+    """Print the counts of a sweep, the failed jobs with the words that repeat them, and the next command."""
+    counts = f"{sweep.count(is_complete)} in {time.time() - sweep.start_time:.0f} s."
+    has_page = any(sweep.folder.glob("*.npz")) and not is_part
+    command = f"  Next: pfbench report study={sweep.folder.name}" if has_page else ""
+    print(f"sweep: {counts}{command}", *list_repeats(sweep.folder, sweep.start_time), sep="\n")
 
 
 def run_task(
@@ -224,24 +170,25 @@ def run_task(
     from pfbench import job
 
     application: Any = HydraConfig.get()
-    number = OmegaConf.select(
-        application, "job.num", throw_on_missing=False
-    )  # None outside a sweep
     choices, words = application.runtime.choices, list(application.overrides.task)
     end_with_parent()
-    counter = "" if number is None else SweepCounter.from_environment(number)
+
+    def run_job(counter: object) -> job.JobOutcome:
+        places = _list_place_words(application)
+        config = checked or job.resolve_config(cfg, choices, words=[*words, *places])
+        return job.run(config, choices, counter, announce)
+
+    number = OmegaConf.select(application, "job.num", throw_on_missing=False)
+    if number is None:  # outside of a sweep
+        return run_job("").rmse
+    counter = SweepCounter(number, Sweep.from_file(os.environ.get(SWEEP_LOG, "")))
     try:
-        config = checked or job.resolve_config(
-            cfg, choices, words=[*words, *_list_place_words(application)]
-        )
-        outcome = job.run(config, choices, counter, announce)
-    except Exception as error:
-        note_outcome(number, "failed")
-        if number is None:
-            raise
-        name = " / ".join(str(choices[group]) for group in ("scenario", "noise", "filter"))
-        raise report_failed_job(error, counter, name, words) from error
-    note_outcome(number, outcome.status)
+        with reported_failure(counter, choices, words):
+            outcome = run_job(counter)
+    except SweepJobError:
+        counter.note("failed")
+        raise
+    counter.note(outcome.status)
     return outcome.rmse
 
 
@@ -285,16 +232,9 @@ def run_with_retries(sweep: Callable[[], Any]) -> None:
 # --------------------------------------------------------------------------------------------------
 # Report of a failed job: once, on its line in a sweep, else as the error of the command.
 
-log = logging.getLogger("pfbench")
-
-
 _HYDRA_LINE = "Error executing job with overrides"
 
 _OTHER_TERMINAL = ("slurm", "ray_cluster")  # launchers whose jobs print elsewhere
-
-
-class SweepJobError(Exception):
-    """Error of a job that its own line has reported."""
 
 
 class _WithoutHydraLine:
@@ -319,18 +259,6 @@ def hide_hydra_line() -> Iterator[None]:
         yield
 
 
-def report_failed_job(
-    error: Exception, start: object, name: str, words: Sequence[str]
-) -> Exception:
-    """Print the line of a failed job of a sweep.
-
-    Returns error to raise in its place, with the same message.
-    """
-    message = " ".join(format_error(error, words).split())
-    log.error("%sfailed    %s", start, "   ".join([name, message, *notes_of(error)]))
-    return SweepJobError(message)
-
-
 def summarise_failed_jobs(error: Exception, words: Sequence[str]) -> Exception:
     """Return the error that ends a sweep."""
     if isinstance(error, SweepJobError):
@@ -348,43 +276,9 @@ def summarise_failed_jobs(error: Exception, words: Sequence[str]) -> Exception:
 # Hydra's application, by the loader of pfbench.
 
 
-def make_application(task: Callable[[Any], Any]) -> Callable[[], None]:
-    """Make the application that runs a task for each job."""
-    import hydra
-
-    full = hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(task)
-
-    def run() -> None:
-        words = sys.argv[1:]
-        flags = [word for word in words if word.startswith("-")]
-        if set(flags) <= set(_FLAGS):
-            overrides = [word for word in words if word not in flags]
-            _run_overrides(task, overrides, is_multirun=bool(flags))
-        else:
-            with _shared_loader():
-                full()
-
-    return run
-
-
 @contextmanager
-def _shared_loader() -> Iterator[None]:
-    """Let Hydra's own application load by the loader of pfbench, which checks what it loads."""
-    from hydra._internal import hydra as module
-
-    from pfbench.job.shared_loader import SharedLoader
-
-    hydra: Any = module
-    by_hydra = hydra.ConfigLoaderImpl
-    hydra.ConfigLoaderImpl = SharedLoader
-    try:
-        yield
-    finally:
-        hydra.ConfigLoaderImpl = by_hydra
-
-
-def _run_overrides(task: Callable[[Any], Any], overrides: list[str], *, is_multirun: bool) -> None:
-    """Run the jobs of overrides, as `hydra.main` does."""
+def _application(name: str) -> Iterator[Any]:
+    """Open Hydra's application, whose loader checks what it loads."""
     from hydra import version
     from hydra._internal import utils
     from hydra._internal.hydra import Hydra
@@ -393,24 +287,66 @@ def _run_overrides(task: Callable[[Any], Any], overrides: list[str], *, is_multi
     from pfbench.job.shared_loader import SharedLoader
 
     version.setbase("1.3")
-    name = utils.detect_task_name(*utils.detect_calling_file_or_module_from_task_function(task))
     application = Hydra(name, SharedLoader(utils.create_config_search_path(str(conf_dir()))))
     GlobalHydra.instance().initialize(application)
     try:
-        mode = application.get_mode("config", overrides) if _can_set_mode(overrides) else None
+        yield application
+    finally:
+        GlobalHydra.instance().clear()
+
+
+def run_application(
+    task: Callable[[Any], Any], overrides: Sequence[str], *, is_sweep: bool
+) -> None:
+    """Run a task for each job of overrides, as `hydra.main` does."""
+    from hydra._internal import utils
+
+    name = utils.detect_task_name(*utils.detect_calling_file_or_module_from_task_function(task))
+    with _application(name) as application:
+        words = list(overrides)
         utils._run_app(
-            run=not is_multirun,
-            multirun=is_multirun,
-            mode=mode,
+            run=not is_sweep,
+            multirun=is_sweep,
+            mode=application.get_mode("config", words) if _can_set_mode(words) else None,
             hydra=application,
             config_name="config",
             task_function=task,
-            overrides=overrides,
+            overrides=words,
         )
-    finally:
-        GlobalHydra.instance().clear()
+
+
+def print_configuration(args: Any) -> None:
+    """Print what the flags `--cfg` and `--info` ask for."""
+    with _application("run") as application:
+        if args.cfg:
+            more = args.cfg, args.package, args.resolve
+            application.show_cfg("config", args.overrides, *more)
+        else:
+            application.show_info(args.info, "config", args.overrides)
 
 
 def _can_set_mode(overrides: Sequence[str]) -> bool:
     """Return whether overrides can set `hydra.mode`, which no file of pfbench sets. Other files need a search path."""
     return any(re.match(r"[+~]*hydra\b", word) for word in overrides)
+
+
+COMMAND = Command(
+    run_jobs,
+    """\
+pfbench run [-m] key=value ...
+
+Run one job (one filter in one condition), or with -m a sweep over comma-separated values.
+Finished jobs are skipped: repeat an interrupted command to resume.
+
+  pfbench run scenario=flight_300s noise=nominal filter=sir runs=100 seed=1
+  pfbench run -m scenario=flight_300s filter=ekf,sir noise=nominal,outliers study=mine
+  pfbench run -m +experiment=quickstart
+  pfbench run -m +experiment=quickstart hydra/launcher=cores     on all cores
+  pfbench run --dry-run -m scenario=flight_300s filter=ekf,sir runs=100
+                             prints jobs, memory and time, and runs nothing
+  pfbench run -m scenario=flight_300s filter=ekf,sir study=mine runs=until-decided
+                             adds runs until each pair of filters is decided
+
+  pfbench list               scenarios, noise regimes, filters and experiments
+  pfbench run --cfg job      all keys with their values""",
+)

@@ -1,4 +1,4 @@
-"""Command `pfbench train`: training of a filter with a network."""
+"""Command `pfbench train`: train the network of a neural_* filter or of kalman_net."""
 
 from __future__ import annotations
 
@@ -6,17 +6,9 @@ import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from pfbench.cli.command import Command
 from pfbench.core.parameter_checks import require
 from pfbench.job.config import compose
-
-HELP = """\
-pfbench train key=value ...
-
-Train the network of a neural_* filter or of kalman_net. The resulting file is the value of `checkpoint` of a job.
-An interrupted training resumes when the command is repeated.
-
-  pfbench train filter=neural_sir scenario=passive_1 train=vsmc train.epochs=20
-  pfbench list train         training configurations"""
 
 _NOT_OF_A_JOB = ("train.", "train=", "overwrite=", "checkpoint=")
 
@@ -76,3 +68,16 @@ def _draw_losses(checkpoint: Path) -> Path:
         name: [line[name] for line in lines] for name in ("epoch", "loss", "validation", "ess")
     }
     return write_training_figure(checkpoint.with_suffix(".svg"), losses)
+
+
+COMMAND = Command(
+    train_network,
+    """\
+pfbench train key=value ...
+
+Train the network of a neural_* filter or of kalman_net. The resulting file is the value of `checkpoint` of a job.
+An interrupted training resumes when the command is repeated.
+
+  pfbench train filter=neural_sir scenario=passive_1 train=vsmc train.epochs=20
+  pfbench list train         training configurations""",
+)

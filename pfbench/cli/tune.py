@@ -1,78 +1,54 @@
-"""Command `pfbench tune`: knobs of the baselines, chosen alike on seeds that no study scores."""
+"""Command `pfbench tune`: tune the baselines of a study of robustness alike."""
 
 from __future__ import annotations
 
+import math
 import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pfbench.cli.command import Command, Option, in_range, read_list
+from pfbench.cli.compose import given_keys
 from pfbench.core.parameter_checks import require
-from pfbench.job.config import TUNED_METHODS, JobConfig, compose
+from pfbench.job.config import TUNED_METHODS, compose
 from pfbench.job.tuned_knobs import AUTO, NOMINAL, SEED_SHIFT
+from pfbench.results.paper_block import conf_dir, read_families
 
 if TYPE_CHECKING:
     from pfbench.job.tuning import CandidateSearch, TuningResult
 
-HELP = """\
-pfbench tune scenario=NAME [model=NAME] [filter=NAME,NAME] [key=value ...]
-
-Tune the filters of a world, a scenario with a model: a factor on R and one knob of the method, which
-its file states, 16 candidates each, in three noise regimes, with the seed of the study plus 1000. Write the
-chosen knobs and the record of all candidates into one file, FOLDER/tuned/NAME.yaml, which a study
-finds by its scenario and model and gives to the filters that end in _tuned. The file states the best
-of these filters, ekf and ukf (`best`), and whether Kalman filters fit the world (`kalman_fits`).
-
-  pfbench tune scenario=benes folder=conf
-  pfbench run -m 'hydra.searchpath=[file://conf]' scenario=benes filter=tuned_baselines
-
-  filter=...         filters to tune, default ekf_scaled,gate,huber,student; others, such as rpf, are added
-                     to a file of the same world
-  runs=20 seed=1     runs of a candidate, and seed of the study
-  noise=...          noise regimes, default nominal,outliers,student. noise=nominal for a study of
-                     nominal noise alone, whose choice is tuned=nominal
-  r_factors=1,2,4,8  factors on R of the candidates, for all filters alike
-  fit_runs=RUNS      further runs, which decide on best, and by sir and rpf in the first noise regime on
-                     kalman_fits
-  fit_particles=10000     their particles
-  report.start_time_s=0   time before which errors do not count, as in the report of the study
-  name=...           name of the file, default SCENARIO, SCENARIO_with_MODEL, and _nominal behind it;
-                     a file of this name is replaced if ekf_scaled is tuned
-  folder=conf        folder of the file, default that of hydra.searchpath if there is one"""
-
-_OPTIONS = {
-    "filter": ",".join(TUNED_METHODS), "name": "", "folder": "", "noise": "nominal,outliers,student",
-    "r_factors": "1,2,4,8", "fit_runs": "", "fit_particles": "10000",
-}  # fmt: skip
-_DEFAULTS = {"runs": "runs=20", "fit_runs": "fit_runs=RUNS", "fit_particles": "fit_particles=10000"}
 CONTROL = "ekf_scaled"  # without which no filter is the best of a world
-_FEWEST_RUNS = 2  # a median of one run is that run
+_RUNS = Option("20", "", in_range("whole [2, inf)"))  # a median of one run is that run
 _TAKEN = (AUTO, NOMINAL)  # choices that look for a file
 _OWN = ("seed", "runs", "study", "results_dir", "report.start_time_s")  # not settings of the world
 
 
-def tune_filters(words: Sequence[str]) -> None:
+def tune_filters(
+    words: Sequence[str],
+    filter: list[str],  # noqa: A002
+    noise: list[str],
+    r_factors: tuple[float, ...],
+    fit_runs: int | None,
+    fit_particles: int,
+    name: str,
+    folder: str,
+) -> None:
     """Tune filters, and write their knobs with the best filter of the world."""
     from pfbench.job.tuning import check_seed, list_candidates
 
-    options = _OPTIONS | {k: v for k, _, v in (w.partition("=") for w in words) if k in _OPTIONS}
-    lists = {key: _split_list(key, options[key]) for key in ("filter", "noise", "r_factors")}
-    others = [word for word in words if word.partition("=")[0] not in _OPTIONS]
-    grids = {method: list_candidates(method, _numbers(lists["r_factors"])) for method in lists["filter"]}  # fmt: skip
-    study = _compose_world(others)
-    if "scenario" not in {word.partition("=")[0] for word in others}:
-        print(
-            f"note: the world of the defaults is tuned: scenario={study.choices['scenario']}",
-            file=sys.stderr,
-        )
-    name = options["name"] or _name_file(study.choices, lists["noise"], others)
-    runs = study.values["runs"]
-    _check_choices(name, runs)
-    fit_runs = _count("fit_runs", options["fit_runs"] or str(runs))
-    particles = _count("fit_particles", options["fit_particles"])
+    grids = {method: list_candidates(method, r_factors) for method in filter}
+    keys = given_keys(words)
+    study = compose([*words, *([] if "runs" in keys else [f"runs={_RUNS.text}"])])
+    if "scenario" not in keys:
+        default = f"scenario={study.choices['scenario']}"
+        print(f"note: the world of the defaults is tuned: {default}", file=sys.stderr)
+    name = name or _name_file(study.choices, noise, words)
+    runs = _RUNS.take("runs", str(study.values["runs"]))
+    _check_name(name)
     check_seed(study, study.values["seed"] + SEED_SHIFT)
-    settings = [word for word in others if word.partition("=")[0] not in _OWN]
+    settings = [word for word in words if word.partition("=")[0] not in _OWN]
     world = {
         **{key: study.choices[key] for key in ("scenario", "model")},
         "settings": [
@@ -83,12 +59,12 @@ def tune_filters(words: Sequence[str]) -> None:
         "seed": study.values["seed"] + SEED_SHIFT,
         "runs": runs,
         "start_time_s": float(study.values["report"]["start_time_s"]),
-        "regimes": lists["noise"],
+        "regimes": noise,
     }
-    folder = Path(options["folder"] or _own_folder(words))
-    _check_new_name(name, folder)
-    path = _search(settings, grids, world, fit_runs, particles, folder, name)
-    print(f"tuned={name}: {path.resolve()}{_describe_use(folder, words)}")
+    target = Path(folder or _own_folder(words))
+    _check_new_name(name, target)
+    path = _search(settings, grids, world, fit_runs or runs, fit_particles, target, name)
+    print(f"tuned={name}: {path.resolve()}{_describe_use(target, words)}")
 
 
 def _search(
@@ -147,11 +123,13 @@ def _check_same_world(path: Path, world: Mapping[str, Any]) -> None:
 
     stated = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("world", {})
     for key in world:
-        if stated.get(key) != world[key]:
-            raise ValueError(
-                f"{key} must be {stated.get(key)!r} as in {path}, to which filters are added, got {world[key]!r}. "
-                f"Add filter={','.join(TUNED_METHODS)} to tune all again, or name=NAME for another file."
-            )
+        require(
+            stated.get(key) == world[key],
+            key,
+            f"be {stated.get(key)!r} as in {path}, to which filters are added",
+            f"{world[key]!r}",
+            f"Add filter={','.join(TUNED_METHODS)} to tune all again, or name=NAME for another file.",
+        )
 
 
 def _name_file(choices: Mapping[str, str], regimes: Sequence[str], words: Sequence[str]) -> str:
@@ -171,8 +149,6 @@ def _own_folder(words: Sequence[str]) -> str:
 
 def _describe_use(folder: Path, words: Sequence[str]) -> str:
     """Say how a study finds the file, if it does not by itself."""
-    from pfbench.results.paper_block import conf_dir
-
     is_found = folder.resolve() == conf_dir() or any("hydra.searchpath" in word for word in words)
     return (
         "" if is_found else f"\nAdd to the words of a study: 'hydra.searchpath=[file://{folder}]'"
@@ -181,8 +157,6 @@ def _describe_use(folder: Path, words: Sequence[str]) -> str:
 
 def _check_new_name(name: str, folder: Path) -> None:
     """Check that the name of a file of a user's own folder differs from those of pfbench, since a run refuses it."""
-    from pfbench.results.paper_block import read_families
-
     require(
         name not in read_families("tuned"),
         "name",
@@ -192,8 +166,8 @@ def _check_new_name(name: str, folder: Path) -> None:
     )
 
 
-def _check_choices(name: str, runs: int) -> None:
-    """Check the name of the file, and that there are runs for a median."""
+def _check_name(name: str) -> None:
+    """Check the name of the file."""
     require(
         re.fullmatch("\\w+", name) and name not in _TAKEN,
         "name",
@@ -201,46 +175,53 @@ def _check_choices(name: str, runs: int) -> None:
         f"{name!r}",
         "It is a file of folder=.",
     )
-    _count("runs", str(runs))
 
 
-def _count(key: str, text: str) -> int:
-    """Return a number of runs or particles, at least two."""
-    require(
-        text.isdecimal() and int(text) >= _FEWEST_RUNS,
-        key,
-        f"be at least {_FEWEST_RUNS} for a tuning",
-        text,
-        f"Default: {_DEFAULTS[key]}.",
+def _read_factors(key: str, text: str, remedy: str) -> tuple[float, ...]:
+    """Read factors on R, which must be positive numbers."""
+    entries = read_list(key, text, remedy)
+    is_number = [re.fullmatch(r"[\d.]+(e[+-]?\d+)?", entry) for entry in entries]
+    values = tuple(
+        float(entry) if ok else 0.0 for entry, ok in zip(entries, is_number, strict=True)
     )
-    return int(text)
-
-
-def _compose_world(words: Sequence[str]) -> JobConfig:
-    """Compose the world of a tuning, with 20 runs unless the words set them."""
-    keys = {word.partition("=")[0] for word in words}
-    return compose([*words, *([] if "runs" in keys else ["runs=20"])])
-
-
-def _split_list(key: str, text: str) -> list[str]:
-    """Split a list of the command line, which must have an entry."""
-    entries = [entry.strip() for entry in text.split(",")]
-    if not all(entries) or len(set(entries)) < len(entries):
-        raise ValueError(
-            f"{key} must be a list of distinct entries separated by commas, got {text!r}. "
-            f"Default: {key}={_OPTIONS[key]}"
-        )
-    return entries
-
-
-def _numbers(entries: Sequence[str]) -> tuple[float, ...]:
-    """Return factors on R, which must be positive numbers."""
-    try:
-        values = tuple(map(float, entries))
-    except ValueError:
-        values = (0.0,)
-    if not all(0.0 < value < float("inf") for value in values):
-        raise ValueError(
-            f"r_factors must be positive numbers, got {','.join(entries)}. Default: r_factors={_OPTIONS['r_factors']}"
-        )
+    require(all(0.0 < v < math.inf for v in values), key, "be positive numbers", text, remedy)
     return values
+
+
+COMMAND = Command(
+    tune_filters,
+    """\
+pfbench tune scenario=NAME [model=NAME] [filter=NAME,NAME] [key=value ...]
+
+Tune the filters of a world, a scenario with a model: a factor on R and one knob of the method, which
+its file states, 16 candidates each, in three noise regimes, with the seed of the study plus 1000. Write the
+chosen knobs and the record of all candidates into one file, FOLDER/tuned/NAME.yaml, which a study
+finds by its scenario and model and gives to the filters that end in _tuned. The file states the best
+of these filters, ekf and ukf (`best`), and whether Kalman filters fit the world (`kalman_fits`).
+
+  pfbench tune scenario=benes folder=conf
+  pfbench run -m 'hydra.searchpath=[file://conf]' scenario=benes filter=tuned_baselines
+
+  runs=20 seed=1             runs of a candidate, and seed of the study
+  report.start_time_s=0      time before which errors do not count, as in the report of the study
+  OPTIONS""",
+    options={
+        "filter": Option(
+            ",".join(TUNED_METHODS), "filters to tune; others, such as rpf, are added\nto a file of the same world", read_list
+        ),
+        "noise": Option(
+            "nominal,outliers,student", "noise regimes. noise=nominal for a study of\nnominal noise alone, whose choice is tuned=nominal", read_list
+        ),
+        "r_factors": Option("1,2,4,8", "factors on R of the candidates, for all filters alike", _read_factors),
+        "fit_runs": Option(
+            "20", "further runs, by default as many as runs, which decide on best, and by sir\nand rpf in the first noise regime on kalman_fits",
+            in_range("whole [2, inf)"), None
+        ),
+        "fit_particles": Option("10000", "their particles", in_range("whole [2, inf)")),
+        "name": Option(
+            "NAME", "name of the file, default SCENARIO, SCENARIO_with_MODEL, and _nominal behind\n"
+            "it; a file of this name is replaced if ekf_scaled is tuned", default=""
+        ),
+        "folder": Option("conf", "folder of the file, default that of hydra.searchpath if there is one", default=""),
+    },
+)  # fmt: skip

@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
-from pfbench.core.parameter_checks import require
-from pfbench.job.config import JobConfig
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from pfbench.results.conditions import Condition
-    from pfbench.stats.pair_states import LookRecord, LookSchedule, PairStates
+import pandas as pd
 
 from pfbench.cli.compose import UNTIL_DECIDED, StudyPlan
+from pfbench.core.parameter_checks import require
+from pfbench.job.config import JobConfig
+from pfbench.job.inputs import find_inputs
+from pfbench.job.settings import job_key
+from pfbench.report.board.entries import build_run_table
+from pfbench.results.conditions import load_conditions
+from pfbench.results.metrics import check_page_metric
+from pfbench.results.paper_block import plan_installed_pairs
+from pfbench.stats.pair_states import (
+    RECORD,
+    LookRecord,
+    LookSchedule,
+    PairStates,
+    decide_at_looks,
+    describe_end,
+    format_look,
+)
+from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
+from pfbench.stats.study_runs import arrange_runs, share_conditions
 
 _HOUR = 3600.0
 
@@ -31,14 +42,12 @@ class LookResults(NamedTuple):
 
     Attributes:
         table: One row per filter, condition and run, without copies of runs.
-        conditions: Conditions with their jobs.
         parts: Number of result files.
         seconds: Time that the simulation and the filters used, s.
         warning: Sentence on runs that are not independent; empty if none is shown.
     """
 
     table: pd.DataFrame
-    conditions: Sequence[Condition]
     parts: int
     seconds: float
     warning: str
@@ -69,9 +78,6 @@ class GrowingSweep:
     @classmethod
     def from_plan(cls, plan: StudyPlan) -> GrowingSweep:
         """Read the settings of a study."""
-        from pfbench.results.metrics import check_page_metric
-        from pfbench.stats.pair_states import LookSchedule
-
         values = plan.first.values
         settings = values["until_decided"]
         require(
@@ -113,18 +119,12 @@ class GrowingSweep:
 
     def job_keys(self, number: int) -> set[str]:
         """Return the keys of all jobs until a look."""
-        from pfbench.job.inputs import find_inputs
-        from pfbench.job.settings import job_key
-
         keys = set()
         for config in self.jobs:
-            values, inputs = (
-                copy.deepcopy(config.values),
-                find_inputs(config.values, config.trusted),
-            )
+            inputs = find_inputs(config.values, config.trusted)
             for first, runs in self.schedule.parts(number):
                 numbers = {"first_run": config.values["first_run"] + first, "runs": runs}
-                keys.add(job_key({**values, **numbers}, inputs))
+                keys.add(job_key({**config.values, **numbers}, inputs))
         return keys
 
     def has_results(self, number: int) -> bool:
@@ -134,24 +134,16 @@ class GrowingSweep:
 
     def read(self, number: int) -> LookResults:
         """Read the results until a look: one row per filter, condition and run, without copies of runs."""
-        from pfbench.report.board.entries import build_run_table
-        from pfbench.results.conditions import load_conditions
-        from pfbench.stats.run_dependence import RUN, assess_runs, drop_runs
-
         conditions = load_conditions(self.study, self.results, keys=self.job_keys(number))
         table = build_run_table(conditions, self.report["start_time_s"], self.report["metric"])
         copies, warning = assess_runs(table, "rmse", RUN)
         jobs = [job for condition in conditions for job in condition.jobs]
         seconds = sum(job.meta["seconds"]["world"] + job.meta["seconds"]["filter"] for job in jobs)
         parts = sum(len(job.parts) for job in jobs)
-        return LookResults(
-            drop_runs(table, copies, RUN), conditions, parts, float(seconds), warning
-        )
+        return LookResults(drop_runs(table, copies, RUN), parts, float(seconds), warning)
 
     def run(self, run_part: Callable[[Sequence[str]], None]) -> None:
         """Run look after look until all pairs are decided or a cap is reached."""
-        from pfbench.stats.pair_states import describe_end, format_look
-
         record = self._open_record()
         numbers = range(1, len(self.schedule.runs) + 1)
         if record.state and self.has_results(len(record.looks)) and not self.repeats_jobs:
@@ -179,8 +171,6 @@ class GrowingSweep:
 
     def _open_record(self) -> LookRecord:
         """Open the record of the study, with the settings that must not change between looks."""
-        from pfbench.stats.pair_states import RECORD, LookRecord
-
         request = {
             "until_decided.max_runs": self.schedule.max_runs,
             **{f"report.{name}": self.report[name] for name in _DECIDING_SETTINGS},
@@ -210,10 +200,6 @@ class GrowingSweep:
 
     def _decide(self, data: LookResults) -> PairStates:
         """Decide the pairs that were fixed in advance with the runs so far."""
-        from pfbench.results.paper_block import plan_installed_pairs
-        from pfbench.stats.pair_states import decide_at_looks
-        from pfbench.stats.study_runs import arrange_runs, share_conditions
-
         count, required = len(data.table[["seed", "run"]].drop_duplicates()), self.schedule.runs[0]
         require(
             not count < required,
@@ -247,10 +233,10 @@ class GrowingSweep:
         return f"Next: pfbench report study={self.study}"
 
 
-def check_has_sweep(flags: Sequence[str]) -> None:
+def check_has_sweep(is_sweep: bool) -> None:
     """Check that `runs=until-decided` is used for a sweep."""
     require(
-        flags,
+        is_sweep,
         f"runs={UNTIL_DECIDED}",
         "be a sweep over at least two filters",
         "one job",

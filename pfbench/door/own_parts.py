@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import importlib
 import inspect
-import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import yaml
+
+import pfbench
 from pfbench.core.parameter_checks import require
-from pfbench.door.own_source import write_module
+from pfbench.door.own_source import find_home, name_file, write_module
 from pfbench.door.parts import Part, describe_value, place_words, plain_errors
 from pfbench.files.atomic_write import write_atomically
 from pfbench.job.config import compose, list_groups
@@ -42,6 +43,7 @@ _BASES = {
 }
 
 
+@plain_errors()
 def make_own(
     thing: Any, name: str | None = None, /, *, base: str = "sir", **arguments: Any
 ) -> Part:
@@ -65,51 +67,46 @@ def make_own(
         ValueError: If the class has not the methods of any part, or is defined inside of a function.
         TypeError: If an argument cannot be written into a file.
     """
-    with plain_errors():
-        if isinstance(thing, Part):
-            raise TypeError(
-                f"own must receive a class or an object, got the part {thing}. Pass it to run unchanged."
-            )
-        group, stage = find_group(thing)
-        title = name or _name_thing(thing, arguments)
-        if _name_file(title) in list_groups()[group]:
-            title = f"Own {title}"
-        limit = arguments.pop("divergence_threshold", None) if group == "scenario" else None
-        writer = _NodeWriter()
-        if stage == "network":
-            node = writer.write_network(thing, arguments)
-        elif isinstance(thing, type):
-            node = writer.write_class(thing, arguments)
-        else:
-            node = writer.write(thing, title)
-        if not isinstance(thing, type) and arguments:
-            raise TypeError(
-                f"{title} must be a class if arguments are given, got an object. Use own({type(thing).__name__}, "
-                f"{next(iter(arguments))}=...)."
-            )
-        if stage:
-            node = writer.put_stage(base, stage, node)
-        node |= _describe_paper(group, title, node, limit)
-        return writer.store(group, title, node)
+    if isinstance(thing, Part):
+        raise TypeError(
+            f"own must receive a class or an object, got the part {thing}. Pass it to run unchanged."
+        )
+    group, stage = find_group(thing)
+    title = name or _name_thing(thing, arguments)
+    if name_file(title) in list_groups()[group]:
+        title = f"Own {title}"
+    limit = arguments.pop("divergence_threshold", None) if group == "scenario" else None
+    writer = _NodeWriter()
+    if stage == "network":
+        node = writer.write_network(thing, arguments)
+    elif isinstance(thing, type):
+        node = writer.write_class(thing, arguments)
+    else:
+        node = writer.write(thing, title)
+    if not isinstance(thing, type) and arguments:
+        raise TypeError(
+            f"{title} must be a class if arguments are given, got an object. Use own({type(thing).__name__}, "
+            f"{next(iter(arguments))}=...)."
+        )
+    if stage:
+        node = writer.put_stage(base, stage, node)
+    node |= _describe_paper(group, title, node, limit)
+    return writer.store(group, title, node)
 
 
 def _name_thing(thing: Any, arguments: Mapping[str, Any]) -> str:
     """Name an object or a class by its class, a plain simulation of a model by its model."""
-    from pfbench.scenario import ModelSimulation
-
     cls = thing if isinstance(thing, type) else type(thing)
     model = arguments.get("model", getattr(thing, "model", None))
-    if cls is not ModelSimulation or model is None:
+    if cls is not pfbench.scenario.ModelSimulation or model is None:
         return cls.__name__
     return model.name if isinstance(model, Part) else _name_thing(model, {})
 
 
 def find_group(thing: Any) -> tuple[str, str]:
     """Find the group of an object or a class by its methods, and its stage of a particle filter, if it is one."""
-    from pfbench.model.base import StateSpaceModel
-
     cls = thing if isinstance(thing, type) else type(thing)
-    if issubclass(cls, StateSpaceModel):
+    if issubclass(cls, pfbench.model.StateSpaceModel):
         missing = sorted(getattr(cls, "__abstractmethods__", ()))
         require(
             not missing,
@@ -198,11 +195,9 @@ class _NodeWriter:
 
     def write(self, value: Any, path: str) -> Any:
         """Describe a value: an object of dataclasses, a model, a part, numbers, texts and lists of them."""
-        from pfbench.model.base import StateSpaceModel
-
         if isinstance(value, Part):
             return self._write_part(value)
-        if isinstance(value, StateSpaceModel):
+        if isinstance(value, pfbench.model.StateSpaceModel):
             return self._write_model(value)
         if isinstance(value, type):
             return self.write_class(value, {})
@@ -295,13 +290,15 @@ class _NodeWriter:
     def name_class(self, cls: type) -> str:
         """Name a class so that another process can import it."""
         if cls.__module__.startswith("pfbench."):
-            for folder in FOLDERS:
-                if getattr(importlib.import_module(f"pfbench.{folder}"), cls.__name__, None) is cls:
-                    return f"pfbench.{folder}.{cls.__name__}"
-            raise ValueError(
-                f"{cls.__name__} must be a public class of pfbench, got one of {cls.__module__}. Choose a name of "
-                "pfbench.filter, pfbench.model, pfbench.noise or pfbench.scenario."
+            home = find_home(cls)
+            require(
+                home in [f"pfbench.{folder}" for folder in FOLDERS],
+                cls.__name__,
+                "be a public class of pfbench",
+                f"one of {cls.__module__}",
+                "Choose a name of pfbench.filter, pfbench.model, pfbench.noise or pfbench.scenario.",
             )
+            return f"{home}.{cls.__name__}"
         module = (
             write_module(cls)
             if cls.__module__ == "__main__" or "<locals>" in cls.__qualname__
@@ -329,9 +326,7 @@ class _NodeWriter:
 
     def store(self, group: str, title: str, node: dict[str, Any]) -> Part:
         """Write the file of a part into a folder named by its content."""
-        import yaml
-
-        name = _name_file(title)
+        name = name_file(title)
         head: dict[str, Any] = {}
         if self.model is not None:
             head = {"defaults": ["_self_", {"override /model@_global_.model": self.model.name}]}
@@ -349,11 +344,6 @@ class _NodeWriter:
         return Part(
             group, name, tuple(changes), tuple(folders), tuple(dict.fromkeys(self.packages))
         )
-
-
-def _name_file(title: str) -> str:
-    """Return the name of the file of a part."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|\W+", "_", title).strip("_").lower()
 
 
 def _is_without_state(value: object) -> bool:

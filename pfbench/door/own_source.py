@@ -52,12 +52,14 @@ def write_module(cls: type) -> str:
 
     Returns the name of the module. The same source gives the same module.
     """
-    if "<locals>" in cls.__qualname__:
-        outer = cls.__qualname__.partition(".<locals>")[0]
-        raise ValueError(
-            f"{cls.__name__} must be defined at the top level, got a class inside of {outer}, whose variables no other "
-            "process has. Move it out, and pass what it needs as arguments."
-        )
+    outer, is_local, _ = cls.__qualname__.partition(".<locals>")
+    require(
+        not is_local,
+        cls.__name__,
+        "be defined at the top level",
+        f"a class inside of {outer}, whose variables no other process has",
+        "Move it out, and pass what it needs as arguments.",
+    )
     values = vars(sys.modules[_MAIN])
     statements = read_statements(values)
     require(
@@ -124,11 +126,15 @@ class _Script:
         return reached
 
 
+def name_file(title: str) -> str:
+    """Return the name of the file of a class or a part."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])|\W+", "_", title).strip("_").lower()
+
+
 def _store_module(title: str, text: str) -> str:
     """Store the text of a module under a name with its digest, and import it. Returns the name."""
     digest = hashlib.sha256(text.encode()).hexdigest()[:10]
-    stem = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|\W+", "_", title).strip("_").lower()
-    name = f"own_{stem}_{digest}"
+    name = f"own_{name_file(title)}_{digest}"
     path = Path(WRITTEN) / f"{name}.py"
     if not path.is_file() or path.read_text(encoding="utf-8") != text:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -184,7 +190,7 @@ class _Collector:
             dotted = [statement.text for statement in imports]
             self.lines[name] = "\n".join([f"import {value.__name__} as {name}", *dotted])
         elif kind == "import":
-            self.lines[name] = f"from {_find_home(value)} import {value.__qualname__} as {name}"
+            self.lines[name] = f"from {find_home(value)} import {value.__qualname__} as {name}"
         elif kind == "constant":
             self.lines[name] = f"{name} = {value!r}"
         elif kind == "class" and name not in self._together:
@@ -310,7 +316,7 @@ def _is_of_module(value: object) -> bool:
     return getattr(sys.modules.get(module), name, None) is value
 
 
-def _find_home(value: Any) -> str:
+def find_home(value: Any) -> str:
     """Return the module from which a class or function is imported: of pfbench the folder whose door has it."""
     module = str(value.__module__)
     room = module.split(".")[1] if module.startswith("pfbench.") else ""
@@ -333,10 +339,7 @@ def _is_constant(value: object) -> bool:
 
 def _check_statement(name: str, node: ast.stmt) -> None:
     """Check that a statement can be repeated when a module is imported."""
-    for call in ast.walk(node):
-        if isinstance(call, ast.Attribute) and ast.unparse(call) in [
-            f"pfbench.{v}" for v in _VERBS
-        ]:
-            raise ValueError(
-                f"{name} must not be used by the class, since it is the result of {ast.unparse(call)}. Pass it as an argument."
-            )
+    names = [ast.unparse(item) for item in ast.walk(node) if isinstance(item, ast.Attribute)]
+    calls = [call for call in names if call in {f"pfbench.{verb}" for verb in _VERBS}]
+    got = f"the result of {''.join(calls[:1])}"
+    require(not calls, name, "not be used by the class", got, "Pass it as an argument.")

@@ -9,9 +9,14 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
-from pfbench.cli.list import describe_files
-from pfbench.cli.messages import format_error, format_unknown_choice, is_named, notes_of
-from pfbench.core.parameter_checks import require
+from pfbench.cli.list import describe_choices, describe_files
+from pfbench.cli.messages import (
+    format_error,
+    format_unknown_choice,
+    is_named,
+    notes_of,
+    require_choice,
+)
 
 PART_GROUPS = ("scenario", "noise", "filter", "model")
 _PLAIN_TEXT = re.compile(r"[A-Za-z_][\w./-]*")
@@ -90,6 +95,7 @@ def format_html_table(heads: Sequence[str], rows: Sequence[Sequence[object]]) ->
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
+@plain_errors()
 def list_names(group: str | None = None) -> NameList:
     """List what can be chosen, as `pfbench list` does.
 
@@ -102,10 +108,7 @@ def list_names(group: str | None = None) -> NameList:
     Raises:
         ValueError: If the group does not exist.
     """
-    from pfbench.cli.list import describe_choices
-
-    with plain_errors():
-        return NameList(describe_choices(group))
+    return NameList(describe_choices(group))
 
 
 def get_part(group: str, name: str, /, **changes: Any) -> Part:
@@ -122,21 +125,14 @@ def get_part(group: str, name: str, /, **changes: Any) -> Part:
     Raises:
         ValueError: If the group or the name does not exist.
     """
-    require(
-        group in PART_GROUPS,
-        "group",
-        f"be one of {', '.join(PART_GROUPS)}",
-        f"{group!r}",
-        "List the names: pfbench.names('filter').",
-    )
+    require_choice("group", group, PART_GROUPS, "List the names: pfbench.names('filter').")
     if not isinstance(name, str):
         raise TypeError(
             f"{group} must be a name, got {describe_value(name)}. List the names: pfbench.names({group!r})."
         )
     names = list(describe_files(group))
     if name not in names:
-        message = format_unknown_choice(group, name, names)
-        raise ValueError(message)
+        raise ValueError(format_unknown_choice(group, name, names))
     return Part(group, name, tuple(f"{group}.{word}" for word in format_words(changes)))
 
 

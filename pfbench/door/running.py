@@ -10,11 +10,11 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
-from pathlib import Path
 from typing import Any
 
-from pfbench.cli.current_folder import add_search_path
-from pfbench.cli.progress import SweepCounter, SweepProgress, list_repeats, note_outcome
+import pfbench
+from pfbench.cli.list import add_search_path
+from pfbench.cli.progress import Sweep, SweepCounter, list_repeats, log
 from pfbench.core.parameter_checks import require
 from pfbench.door.own_parts import find_group, make_own
 from pfbench.door.parts import (
@@ -27,13 +27,11 @@ from pfbench.door.parts import (
     plain_errors,
 )
 from pfbench.door.study import Study, open_study
-from pfbench.door.worker import COUNTER, JobReply, WorkerPool, run_config
+from pfbench.door.worker import COUNTER, JobReply, WorkerPool, logging_to, run_request
 from pfbench.job.config import CHOICES, FILTER_SETS, JobConfig, compose
 from pfbench.job.run_job import list_used_packages
 from pfbench.job.settings import check_settings
 from pfbench.results.conditions import JobFile
-
-log = logging.getLogger("pfbench")
 
 
 def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
@@ -82,14 +80,13 @@ def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
         f"{workers!r}",
         "Set workers=2.",
     )
-    parts = [
-        list_parts(group, value)
-        for group, value in (("scenario", scenario), ("noise", noise), ("filter", filters))
-    ]
-    models = [None] if model is None else list_parts("model", model)
+    groups = {"scenario": scenario, "noise": noise, "model": model, "filter": filters}
+    if model is None:  # that of the scenario
+        del groups["model"]
+    parts = [list_parts(group, value) for group, value in groups.items()]
     settings_of_all = {"runs": runs, "particles": particles, "seed": seed}
     words = format_words({**settings_of_all, **settings, "study": study})
-    jobs = [_list_words(choice, words) for choice in product(*parts, models)]
+    jobs = [_list_words(choice, words) for choice in product(*parts)]
     configs = [_compose_job(list(job)) for job in dict.fromkeys(map(tuple, jobs))]
     if any(map(list_used_packages, configs)):
         from pfbench.cli.dry_run import try_own_parts
@@ -104,6 +101,7 @@ def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
     )
 
 
+@plain_errors()
 def list_parts(group: str, value: Any) -> list[Part]:
     """Return the parts of a group that a name, a part, an object or a list of them means."""
     items = list(value) if isinstance(value, list | tuple | set) else [value]
@@ -132,11 +130,7 @@ def _make_part(group: str, item: Any) -> Part:
         raise TypeError(
             f"{group} must be a name, a part or a class, got {describe_value(item)}. List the names: pfbench.names({group!r})."
         )
-    if isinstance(item, Part):
-        kind = item.group
-    else:
-        with plain_errors():
-            kind = find_group(item)[0]
+    kind = item.group if isinstance(item, Part) else find_group(item)[0]
     if group == "scenario" and kind == "model":
         return simulate_model(item)
     require(
@@ -151,18 +145,13 @@ def _make_part(group: str, item: Any) -> Part:
 
 def simulate_model(item: Any) -> Part:
     """Make the scenario that simulates a model for 100 steps."""
-    from pfbench.scenario import ModelSimulation
-
     if isinstance(item, Part) and not item.folders:
         return add_changes(get_part("scenario", item.name), item.changes)
-    return make_own(ModelSimulation, model=item, steps=100)
+    return make_own(pfbench.scenario.ModelSimulation, model=item, steps=100)
 
 
-def _list_words(choice: Sequence[Part | None], words: Sequence[str]) -> list[str]:
+def _list_words(parts: Sequence[Part], words: Sequence[str]) -> list[str]:
     """Return the words of one job."""
-    parts = [item for item in choice if item is not None]
-    order = {"scenario": 0, "noise": 1, "model": 2, "filter": 3}
-    parts = sorted(parts, key=lambda item: order[item.group])
     return [*(word for item in parts for word in item.words()), *words, *place_words(parts)]
 
 
@@ -212,21 +201,20 @@ def check_trusted(meta: Mapping[str, Any], trusted: Sequence[str]) -> None:
 
 def _run_jobs(configs: Sequence[JobConfig], workers: int, progress: bool) -> None:
     """Run jobs and print a line of each, the counts, and the words that repeat failed jobs."""
-    values, total = configs[0].values, len(configs)
-    folder = Path(values["results_dir"]) / str(values["study"])
-    sweep = SweepProgress(total, str(values["study"]), folder)
+    total, sweep = len(configs), Sweep.of_jobs(configs[0], len(configs))
     failed: list[str] = []
-    with _printed_lines() if progress else contextlib.nullcontext():
+    printed = logging_to(logging.StreamHandler(sys.stdout))
+    with printed if progress else contextlib.nullcontext():
         try:
             for number, reply in _replies(configs, workers):
-                counter = str(SweepCounter(number, str(total), str(sweep.file)))
+                counter = str(SweepCounter(number, sweep))
                 for line in reply.lines:
                     log.info("%s", line.replace(COUNTER, counter))
-                note_outcome(number, reply.status, sweep.file)
+                sweep.note(number, reply.status)
                 failed += [reply.message] if reply.status == "failed" else []
         finally:
             log.info("run: %s in %.0f s", sweep.count(), time.time() - sweep.start_time)
-            for line in list_repeats(folder, sweep.start_time):
+            for line in list_repeats(sweep.folder, sweep.start_time):
                 log.info("%s", line)
     if len(failed) == total:
         raise RuntimeError(failed[0])
@@ -242,23 +230,7 @@ def _replies(configs: Sequence[JobConfig], workers: int) -> Iterator[tuple[int, 
         return
     with preserved_process():  # which imports torch, that workers import themselves
         for number, config in enumerate(configs):
-            yield number, run_config(config)
-
-
-@contextlib.contextmanager
-def _printed_lines() -> Iterator[None]:
-    """Print the lines of jobs while they run."""
-    handler = logging.StreamHandler(sys.stdout)
-    handler.setFormatter(logging.Formatter("%(message)s"))
-    level, log.level = log.level, logging.INFO
-    handlers = list(log.handlers)
-    log.addHandler(handler)
-    log.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        log.handlers[:] = handlers
-        log.setLevel(level)
+            yield number, run_request(vars(config))
 
 
 @contextlib.contextmanager

@@ -8,10 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pfbench.cli.compose import choose_places
+from pfbench.cli.messages import require_choice
+from pfbench.cli.paper import COMMAND as WRITE_PAPER
 from pfbench.cli.progress import StudyState, format_repeat, read_state
-from pfbench.core.parameter_checks import require
-from pfbench.door.parts import plain_errors
+from pfbench.cli.report import check_has_results
+from pfbench.door.parts import format_words, plain_errors
+from pfbench.job.config import compose
 from pfbench.job.trust import trusted_packages, trusting
+from pfbench.report.options import ReportOptions
+from pfbench.results.conditions import Condition, load_conditions
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -19,7 +25,6 @@ if TYPE_CHECKING:
 
     from pfbench.door.comparisons import Comparison, Summary
     from pfbench.report.published_study import PublishedComparison
-    from pfbench.results.conditions import Condition
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,7 @@ class Study:
     reports: str = "reports"
     trust: tuple[str, ...] = ()
 
+    @plain_errors()
     def table(self, metric: str | None = None) -> pd.DataFrame:
         """Load the results as one table.
 
@@ -49,17 +55,12 @@ class Study:
         """
         from pfbench.results.frame import load_frame
 
-        with plain_errors():
-            frame = load_frame(self.name, self.results)
+        frame = load_frame(self.name, self.results)
         names = sorted(frame["metric"].unique())
-        require(
-            metric is None or metric in names,
-            "metric",
-            f"be one of {', '.join(names)}",
-            f"{metric!r}",
-            "Leave it out for all.",
-        )
-        return frame if metric is None else frame[frame["metric"] == metric].reset_index(drop=True)
+        if metric is None:
+            return frame
+        require_choice("metric", metric, names, "Leave it out for all.")
+        return frame[frame["metric"] == metric].reset_index(drop=True)
 
     def errors(self, group: str | None = None) -> pd.DataFrame:
         """Return the root mean square error over time, a row per run and a column per filter.
@@ -78,13 +79,8 @@ class Study:
         frame = self.table("rmse")
         mains = list_main_groups(self.conditions())
         names = sorted(set(frame["group"]))
-        require(
-            group is None or group in names,
-            "group",
-            f"be one of {', '.join(names)}",
-            f"{group!r}",
-            "Leave it out for the main group.",
-        )
+        if group is not None:
+            require_choice("group", group, names, "Leave it out for the main group.")
         selected = [
             group or mains[key]
             for key in zip(frame["scenario"], frame["noise"], frame["model"], strict=True)
@@ -96,6 +92,7 @@ class Study:
         table.attrs["unit"] = dict(zip(rows["scenario"], rows["unit"], strict=True))
         return table
 
+    @plain_errors()
     def summary(self, **options: Any) -> Summary:
         """Summarise the study as the first view of its report.
 
@@ -109,10 +106,10 @@ class Study:
 
         has_results = any((Path(self.results) / self.name).glob("*.npz"))
         failures = self.failed()
-        with plain_errors():
-            conditions = self.conditions() if has_results or not failures else []
-            return summarise_study(self.name, conditions, failures, options)
+        conditions = self.conditions() if has_results or not failures else []
+        return summarise_study(self.name, conditions, failures, options)
 
+    @plain_errors()
     def compare(self, a: str, b: str) -> Comparison:
         """Compare two filters in the runs that both have, as all pages do.
 
@@ -125,9 +122,9 @@ class Study:
         """
         from pfbench.door.comparisons import compare_in_conditions
 
-        with plain_errors():
-            return compare_in_conditions(self.conditions(), a, b)
+        return compare_in_conditions(self.conditions(), a, b)
 
+    @plain_errors()
     def against(self, published: str | Path) -> PublishedComparison:
         """Compare the filters of this study with all filters of a published one, which do not run again.
 
@@ -144,10 +141,10 @@ class Study:
         """
         from pfbench.report.published_study import compare_with_published, find_published
 
-        with plain_errors():
-            folder = find_published(str(published), Path(self.reports))
-            return compare_with_published(self.conditions(), folder)
+        folder = find_published(str(published), Path(self.reports))
+        return compare_with_published(self.conditions(), folder)
 
+    @plain_errors()
     def plot(self, kind: str = "cost", ax: Axes | None = None, **choice: Any) -> Axes:
         """Draw a figure in the looks of the report.
 
@@ -162,9 +159,9 @@ class Study:
         """
         from pfbench.door.figures import draw_study
 
-        with plain_errors():
-            return draw_study(self, kind, ax, choice)
+        return draw_study(self, kind, ax, choice)
 
+    @plain_errors()
     def replay(self, label: str, run: int, **choice: str) -> pd.DataFrame:
         """Compute one stored run again with all its traces.
 
@@ -177,18 +174,16 @@ class Study:
             A row per step: time, error, standard deviation, NEES and traces such as the effective sample size.
         """
         from pfbench.door.running import check_trusted, preserved_process
-        from pfbench.job.config import compose
         from pfbench.job.replay import recompute_run, tabulate_traces
         from pfbench.job.run_selection import find_run
 
-        with plain_errors(), preserved_process(), trusting(self.trust):
+        with preserved_process(), trusting(self.trust):
             stored = find_run(self.name, self.results, run, label, choice)
             check_trusted(stored.result.meta, trusted_packages())
-            places = compose([]).values
-            names = ("data", "results_dir", "reports_dir", "episode_cache_dir")
-            changes = {name: places[name] for name in names}
+            changes = choose_places(compose([]).values, ())
             return tabulate_traces(recompute_run(stored, changes))
 
+    @plain_errors()
     def report(self, open: bool = False, **options: Any) -> Path:  # noqa: A002
         """Write the report.
 
@@ -200,10 +195,8 @@ class Study:
             Path of index.html.
         """
         from pfbench.report import write_report
-        from pfbench.report.options import ReportOptions
 
-        with plain_errors():
-            path = write_report(self.name, self.results, self.reports, ReportOptions(**options))
+        path = write_report(self.name, self.results, self.reports, ReportOptions(**options))
         if open:
             webbrowser.open(path.resolve().as_uri())
         return path
@@ -218,21 +211,11 @@ class Study:
         Returns:
             The files.
         """
-        from pfbench.cli.paper import write_study_paper
-        from pfbench.door.parts import format_words
-
         folder = Path(self.reports) / self.name / "paper"
-        words = format_words(
-            {
-                "study": self.name,
-                "journal": journal,
-                "results_dir": self.results,
-                "reports_dir": self.reports,
-                **settings,
-            }
-        )
+        places = {"results_dir": self.results, "reports_dir": self.reports}
+        words = format_words({"study": self.name, "journal": journal, **places, **settings})
         with plain_errors(words):
-            write_study_paper(words)
+            WRITE_PAPER(words)
         return sorted(path for path in folder.rglob("*") if path.is_file())
 
     def status(self) -> StudyState:
@@ -252,6 +235,7 @@ class Study:
             for note in self.status().failures
         ]
 
+    @plain_errors()
     def more(self, runs: int, workers: int = 1, progress: bool = True) -> Study:
         """Add runs to all jobs. Their numbers continue those of the study.
 
@@ -265,10 +249,10 @@ class Study:
         """
         from pfbench.door.running import continue_jobs
 
-        with plain_errors():
-            continue_jobs(self, runs, workers, progress)
+        continue_jobs(self, runs, workers, progress)
         return self
 
+    @plain_errors()
     def remove(self, label: str) -> Study:
         """Remove the results of a filter, such as one whose class has another name now. Other results stay as they are.
 
@@ -283,12 +267,13 @@ class Study:
         """
         jobs = [job for condition in self.conditions() for job in condition.jobs]
         labels = sorted({job.label for job in jobs})
-        require(label in labels, "label", f"be one of {', '.join(labels)}", f"{label!r}", "List them: study.summary()")  # fmt: skip
+        require_choice("label", label, labels, "List them: study.summary()")
         for job in jobs:
             for path in (job.parts or (job.path,)) if job.label == label else ():
                 path.unlink()
         return self
 
+    @plain_errors()
     def to_xarray(self) -> Any:
         """Return errors, variances and traces as a data set of xarray.
 
@@ -297,15 +282,12 @@ class Study:
         """
         from pfbench.door.figures import make_dataset
 
-        with plain_errors():
-            return make_dataset(self.conditions())
+        return make_dataset(self.conditions())
 
+    @plain_errors()
     def conditions(self) -> list[Condition]:
         """Return the conditions of the study, whose filters have the same data."""
-        from pfbench.results.conditions import load_conditions
-
-        with plain_errors():
-            return load_conditions(self.name, self.results)
+        return load_conditions(self.name, self.results)
 
     def __repr__(self) -> str:
         try:
@@ -317,6 +299,7 @@ class Study:
         return self.summary()._repr_html_()
 
 
+@plain_errors()
 def open_study(
     name: str, results: str = "results", reports: str = "reports", *, trust: tuple[str, ...] = ()
 ) -> Study:
@@ -334,14 +317,11 @@ def open_study(
     Raises:
         ValueError: If it has neither results nor failed jobs.
     """
-    from pfbench.cli.report import check_has_results
-
     if not isinstance(name, str):
         raise TypeError(
             f"study must be the name of a study, got {name!r}. List them: pfbench status"
         )
     study = Study(name, str(results), str(reports), tuple(trust))
     if not study.status().failures:
-        with plain_errors():
-            check_has_results(name, Path(results))
+        check_has_results(name, Path(results))
     return study

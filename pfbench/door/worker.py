@@ -5,26 +5,26 @@ Workers start from this module and not from the script of the user, so that a sc
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import queue
 import signal
 import subprocess
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager, suppress
 from typing import Any, NamedTuple, Self
 
-from pfbench.cli.messages import format_error, notes_of
+from pfbench import job
+from pfbench.cli.progress import SweepJobError, log, name_job, reported_failure
 from pfbench.files.foreign_folder import start_python
 from pfbench.job.config import JobConfig
 from pfbench.job.trust import split_trust
 
 COUNTER = "[...] "  # in the line of a job, replaced where the line is printed
 _PROGRAM = "from pfbench.door.worker import serve; serve()"
-
-log = logging.getLogger("pfbench")
 
 
 class JobReply(NamedTuple):
@@ -35,101 +35,76 @@ class JobReply(NamedTuple):
     message: str = ""
 
 
-class _Lines(logging.Handler):
-    """Handler that keeps the lines of a job."""
-
-    def __init__(self) -> None:
-        super().__init__(logging.INFO)
-        self.texts: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Keep a line."""
-        self.texts.append(record.getMessage())
-
-
-def run_config(config: JobConfig) -> JobReply:
-    """Run a job and collect its lines; an error is a line, as in a sweep of the command line."""
-    from pfbench import job
-
-    handler, level, propagate = _Lines(), log.level, log.propagate
-    handlers = list(log.handlers)
-    log.handlers[:], log.propagate = [handler], False
+@contextmanager
+def logging_to(handler: logging.Handler, *, is_alone: bool = False) -> Iterator[None]:
+    """Let a handler receive the lines of jobs, besides others or alone."""
+    handlers, propagate, level = list(log.handlers), log.propagate, log.level
+    if is_alone:
+        log.handlers[:], log.propagate = [], False
+    log.addHandler(handler)
     log.setLevel(logging.INFO)
     try:
-        outcome = job.run(config, counter=COUNTER)
-        return JobReply(outcome.status, handler.texts)
-    except Exception as error:
-        message = " ".join(format_error(error, config.words).split())
-        name = _name(config)
-        line = f"{COUNTER}failed    {'   '.join([name, message, *notes_of(error)])}"
-        return JobReply("failed", [*handler.texts, line], message)
+        yield
     finally:
         log.handlers[:], log.propagate = handlers, propagate
         log.setLevel(level)
 
 
-def _name(config: JobConfig) -> str:
-    """Name a job by its choices."""
-    return " / ".join(config.choices[group] for group in ("scenario", "noise", "filter"))
+def run_request(request: Mapping[str, Any]) -> JobReply:
+    """Run the job of the fields of a configuration; an error is a line, as in a sweep of the command line."""
+    lines = io.StringIO()
+    with logging_to(logging.StreamHandler(lines), is_alone=True):
+        try:
+            with reported_failure(COUNTER, request["choices"], request["words"]):
+                trusted = tuple(request["trusted"])
+                split_trust([f"trust=[{','.join(trusted)}]"])  # so that its modules are imported
+                config = JobConfig(**{**request, "trusted": trusted})
+                status, message = job.run(config, counter=COUNTER).status, ""
+        except SweepJobError as error:
+            status, message = "failed", f"{error}"
+    return JobReply(status, lines.getvalue().splitlines(), message)
 
 
 def serve() -> None:
     """Answer the requests of the standard input until it ends."""
     replies, sys.stdout = sys.stdout, sys.stderr  # a class of the user may print
     for line in sys.stdin:
-        print(json.dumps(_answer(json.loads(line))._asdict()), file=replies, flush=True)
-
-
-def _answer(request: dict[str, Any]) -> JobReply:
-    """Run the job of a request. A class that this process cannot import is a failure, too."""
-    try:
-        split_trust([f"trust=[{','.join(request['trusted'])}]"])  # so that its modules are imported
-        config = JobConfig(**{**request, "trusted": tuple(request["trusted"])})
-    except Exception as error:
-        message = format_error(error)
-        return JobReply("failed", [f"{COUNTER}failed    {message}"], message)
-    return run_config(config)
+        print(json.dumps(run_request(json.loads(line))._asdict()), file=replies, flush=True)
 
 
 class WorkerPool:
     """Worker processes that take jobs one by one. They end with the pool."""
 
     def __init__(self, size: int) -> None:
+        self._idle: queue.SimpleQueue[subprocess.Popen[str]] = queue.SimpleQueue()
         self._processes = [self._start() for _ in range(size)]
+        self._threads = ThreadPoolExecutor(size)
+        self._is_closed = False
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
+        self._is_closed = True
+        self._threads.shutdown(wait=False, cancel_futures=True)
         for process in self._processes:
             _end(process)
 
     def run(self, jobs: Sequence[JobConfig]) -> Iterator[tuple[int, JobReply]]:
         """Run jobs; yield number and reply of each when it ends."""
-        pending: queue.SimpleQueue[int] = queue.SimpleQueue()
-        replies: queue.SimpleQueue[tuple[int, JobReply]] = queue.SimpleQueue()
-        for number in range(len(jobs)):
-            pending.put(number)
+        replies = {self._threads.submit(self._ask, config): k for k, config in enumerate(jobs)}
+        for reply in as_completed(replies):
+            yield replies[reply], reply.result()
 
-        def feed(slot: int) -> None:
-            while True:
-                try:
-                    number = pending.get_nowait()
-                except queue.Empty:
-                    return
-                replies.put((number, self._ask(slot, jobs[number])))
-
-        for slot in range(len(self._processes)):
-            threading.Thread(target=feed, args=(slot,), daemon=True).start()
-        for _ in jobs:
-            yield replies.get()
-
-    def _ask(self, slot: int, config: JobConfig) -> JobReply:
-        """Return the reply of a worker; a failure if its process has ended, which is replaced."""
-        process = self._processes[slot]
-        _send(process, vars(config))
+    def _ask(self, config: JobConfig) -> JobReply:
+        """Return the reply of an idle worker; a failure if its process has ended, which is replaced."""
+        process = self._idle.get()
+        with suppress(OSError, ValueError):  # it may have ended
+            assert process.stdin is not None
+            print(json.dumps(vars(config)), file=process.stdin, flush=True)
         answer = process.stdout.readline() if process.stdout else ""
         if answer:
+            self._idle.put(process)
             return JobReply(**json.loads(answer))
         code = process.wait()
         end = signal.Signals(-code).name if code < 0 else f"exit code {code}"
@@ -138,23 +113,19 @@ class WorkerPool:
             "(SIGKILL), memory is short: use fewer workers, or limit each job by memory_limit_gib=... (GiB). Else its own "
             "lines above state the reason, and workers=1 shows it here."
         )
-        name = _name(config)
         _end(process)
-        self._processes[slot] = self._start()
-        return JobReply("failed", [f"{COUNTER}failed    {name}   {message}"], message)
+        if not self._is_closed:
+            self._processes[self._processes.index(process)] = self._start()
+        return JobReply(
+            "failed", [f"{COUNTER}failed    {name_job(config.choices)}   {message}"], message
+        )
 
     def _start(self) -> subprocess.Popen[str]:
         """Start a worker."""
         pipe = subprocess.PIPE
-        return start_python(_PROGRAM, stdin=pipe, stdout=pipe, text=True)
-
-
-def _send(process: subprocess.Popen[str], message: Any) -> None:
-    """Send a message to a worker, which may have ended."""
-    with suppress(OSError, ValueError):
-        assert process.stdin is not None
-        process.stdin.write(f"{json.dumps(message)}\n")
-        process.stdin.flush()
+        process = start_python(_PROGRAM, stdin=pipe, stdout=pipe, text=True)
+        self._idle.put(process)
+        return process
 
 
 def _end(process: subprocess.Popen[str]) -> None:
@@ -162,7 +133,6 @@ def _end(process: subprocess.Popen[str]) -> None:
     with suppress(OSError):
         process.kill()
     process.wait()
-    for stream in (process.stdin, process.stdout):
-        if stream is not None:
-            with suppress(OSError):
-                stream.close()
+    for stream in filter(None, (process.stdin, process.stdout)):
+        with suppress(OSError):
+            stream.close()

@@ -476,8 +476,8 @@ def test_runs_of_particles_agree_if_their_mean_difference_is_within_its_error() 
 def test_words_of_the_command_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
     for words, message in (
         (["run", "C009"], r"ID must be a claim such as C001-7 or a paper such as 001, got C009"),
-        (["run", "hours=0"], r"hours must be a positive number, got 0"),
-        (["run", "workers=3"], r"workers must be 1 or 2, got 3"),
+        (["run", "hours=0"], r"hours must be positive, got 0"),
+        (["run", "workers=3"], r"workers must be a whole number in .1, 2., got 3"),
         (["run", "hour=2"], r"key must be one of hours"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -524,10 +524,10 @@ def test_a_dry_run_prints_prices_and_runs_nothing(tmp_path: Path, capsys: pytest
 
 
 def test_a_new_clone_runs_only_what_is_not_published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    monkeypatch.setattr(claim_runs, "decide_claims", lambda plans, runs: {})
+    monkeypatch.setattr(command, "decide_claims", lambda plans, runs: {})
     places = {"": tmp_path, "published": Path(__file__).parents[2] / "reports"}
     prices = [
-        command.list_prices(command.read_request(["C001-5", f"results_dir={tmp_path}", f"reports_dir={folder}"]))
+        command.SelectedClaims(command.select_plans(["C001-5"]), tmp_path, folder).list_prices("")
         for folder in places.values()
     ]  # fmt: skip
     assert [price.stage for price in prices[0]] == ["screen"]

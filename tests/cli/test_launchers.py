@@ -201,6 +201,18 @@ def test_a_worker_that_ends_says_how(monkeypatch: pytest.MonkeyPatch, end: str, 
     assert f"ended with {said}." in reply.message
 
 
+def test_a_pool_that_is_left_early_starts_no_worker_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As after an interrupt, when the other jobs wait and a worker is at one."""
+    monkeypatch.setattr(worker, "_PROGRAM", "import time; time.sleep(60)")
+    config = job.compose(["scenario=linear_walk", "filter=ekf"])
+    with worker.WorkerPool(1) as pool:
+        (first,) = pool._processes
+        replies = [pool._threads.submit(pool._ask, config) for _ in range(3)]
+    pool._threads.shutdown()
+    assert (pool._processes, first.poll()) == ([first], -signal.SIGKILL)
+    assert [reply.cancelled() for reply in replies[1:]] == [True, True]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["cores", "ray_local"])
 def test_a_study_in_a_hostile_folder_runs_and_is_reported(hostile: Path, launcher: str) -> None:

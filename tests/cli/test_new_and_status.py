@@ -21,7 +21,7 @@ from command_line import environment, pfbench
 from pfbench.cli import progress
 from pfbench.cli.completion import make_script
 from pfbench.cli.new import SCRIPTS
-from pfbench.cli.open import open_report
+from pfbench.cli.open import COMMAND as OPEN
 from pfbench.results import store
 
 WALK = ("scenario=linear_walk", "scenario.steps=5", "runs=3", "particles=30")
@@ -170,12 +170,12 @@ def test_the_state_of_a_study_lists_failed_jobs_with_the_words_that_repeat_them(
 
 def test_time_left_is_that_of_the_jobs_that_were_computed(tmp_path: Path) -> None:
     """200 s for two computed jobs of five, and one that was skipped: two more take 200 s."""
-    sweep = progress.SweepProgress(5, "s", tmp_path / "s", time.time() - 200)
+    sweep = progress.Sweep(tmp_path / "s", 5, start_time=time.time() - 200)
     for number, status in enumerate(("finished", "skipped", "finished")):
-        progress.note_outcome(number, status, sweep.file)
-    left = progress.estimate_time_left(sweep.file)
+        sweep.note(number, status)
+    left = sweep.estimate_time_left()
     np.testing.assert_allclose(left, 200.0, rtol=0.05)
-    counter = progress.SweepCounter(2, "5", str(sweep.file))
+    counter = progress.SweepCounter(2, progress.Sweep.from_file(sweep.file))
     assert re.fullmatch(r"\[3/5, 3 min left\] ", str(counter))
     state = progress.read_state(tmp_path / "s")
     assert state.running == ((3, 5),)
@@ -254,9 +254,9 @@ def test_open_writes_the_report_once(tmp_path: Path, monkeypatch: pytest.MonkeyP
         f"results_dir={tmp_path / 'results'}",
         f"reports_dir={tmp_path / 'reports'}",
     ]
-    open_report(words)
+    OPEN(words)
     page = tmp_path / "reports" / "s" / "index.html"
     written = page.stat().st_mtime_ns
-    open_report(words)
+    OPEN(words)
     assert page.stat().st_mtime_ns == written
     assert shown == [page.resolve().as_uri()] * 2

@@ -26,7 +26,7 @@ from refusals import check_refused
 
 from pfbench import job
 from pfbench.cli import run as run_command
-from pfbench.cli.check import _matching_scenario
+from pfbench.cli.check import _add_needs
 from pfbench.files import command_start
 from pfbench.files.command_start import reset_work, start_work
 from pfbench.job import shared_loader
@@ -88,7 +88,7 @@ def chosen_together() -> Iterator[list[str]]:
         for name in GROUPS[group]:
             yield [f"+{group}={name}"]
     for name in GROUPS["model"]:
-        yield [f"model={name}", *_matching_scenario("model", name)]
+        yield [f"model={name}", *_add_needs("model", name)]
 
 
 @pytest.mark.parametrize("part", range(3))
@@ -203,7 +203,8 @@ def test_an_application_runs_as_that_of_hydra(
     monkeypatch.setattr(sys, "argv", ["pfbench run", *words, "scenario=linear_walk"])
     path = str(job.conf_dir())
     decorated = hydra.main(version_base="1.3", config_path=path, config_name="config")(task)
-    for run in (decorated, run_command.make_application(task)):
+    overrides = [*(w for w in words if w[0] != "-"), "scenario=linear_walk"]
+    for run in (decorated, lambda: run_command.run_application(task, overrides, is_sweep=words[:1] in (['-m'], ['--multirun']))):  # fmt: skip
         seen.append([])
         run()
     assert seen[0] == seen[1]

@@ -611,7 +611,9 @@ def test_summary_page_and_html(study: pfbench.Study, capsys: pytest.CaptureFixtu
         error = one.errors()[row[1].lower()].median()
         assert float(row[2].split()[0]) == pytest.approx(error, rel=5e-3)
         assert f"median RMS error {error:.4g} m" in capsys.readouterr().out or row[1] != "EKF"
-    check_refused([("label must be one of ekf, sir, got 'ukf'", lambda: one.remove("ukf"))])
+    check_refused(
+        [("label must be one of ekf, sir, got ukf. Similar: ekf", lambda: one.remove("ukf"))]
+    )
     assert list(one.remove("sir").errors().columns) == ["ekf"]
     html = study._repr_html_()
     assert html.count("<tr>") == 4
@@ -692,7 +694,7 @@ def test_an_own_module_imports_public_names_from_their_door() -> None:
             value = getattr(door, name)
             room = str(getattr(value, "__module__", "")).partition("pfbench.")[2].partition(".")[0]
             if room in (folder, "logs") and getattr(value, "__qualname__", None) == name:
-                homes[f"{folder}.{name}"] = own_source._find_home(value)
+                homes[f"{folder}.{name}"] = own_source.find_home(value)
     assert len(homes) > 300
     wrong = {name: home for name, home in homes.items() if home != f"pfbench.{name.split('.')[0]}"}
     assert wrong == {}

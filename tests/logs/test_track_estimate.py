@@ -157,9 +157,12 @@ def test_the_command_writes_page_tables_and_maps(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ((), "estimate needs one folder, got none"),
+        ((), "estimate must have one folder, got none"),
         (("none_here",), "the log must be a folder with imu and gnss, got none_here"),
-        ((".", "filter="), "filters must name a filter, got none"),
+        (
+            (".", "filter="),
+            "filter must be a list of distinct entries separated by commas, got ''. Default: filter=ekf,ukf",
+        ),
         ((".", "scenario.holdout=null"), "must be an own log with held-out fixes"),
     ],
 )

@@ -66,8 +66,8 @@ def test_a_changed_job_is_measured_again_and_old_times_are_not_used(home: Path) 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("rounds=3",), "rounds must be a whole number from 5 to 1000, got 3"),
-        (("seconds=-1",), "seconds must be a time from 0.001 to 3600 s, got -1"),
+        (("rounds=3",), "rounds must be a whole number in [5, 1000], got 3. Default: rounds=7"),
+        (("seconds=-1",), "seconds must be in [0.001, 3600], got -1"),
         (("round=9",), "key must be one of"),
     ],
 )

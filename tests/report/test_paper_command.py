@@ -10,7 +10,7 @@ import pytest
 import synthetic_results as synthetic
 from refusals import check_refused
 
-from pfbench.cli.paper import write_study_paper
+from pfbench.cli.paper import COMMAND as PAPER
 from pfbench.report.study_report import write_report
 
 
@@ -29,7 +29,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_it_writes_figures_tables_text_and_data(home: Path) -> None:
     words = ["study=demo", "width=120mm", f"results_dir={home}/results", f"reports_dir={home}/out"]
-    write_study_paper(words)
+    PAPER(words)
     folder = home / "out" / "demo" / "paper"
     names = {path.name for path in folder.iterdir()}
     assert names >= {
@@ -47,23 +47,21 @@ def test_without_results_it_uses_the_stored_data_of_the_report(
 ) -> None:
     """The same files as from results, byte for byte."""
     words = ["study=demo", "width=120mm", f"reports_dir={tmp_path}"]
-    write_study_paper([*words, f"results_dir={home}/results"])
+    PAPER([*words, f"results_dir={home}/results"])
     paper = tmp_path / "demo" / "paper"
     expected = {path.name: path.read_bytes() for path in paper.iterdir()}
     shutil.rmtree(paper)
     write_report("demo", home / "results", tmp_path)
     capsys.readouterr()
-    write_study_paper([*words, f"results_dir={tmp_path}/none"])
+    PAPER([*words, f"results_dir={tmp_path}/none"])
     assert {path.name: path.read_bytes() for path in paper.iterdir()} == expected
     data = tmp_path / "demo" / "runs.parquet"
     assert f"note: without results, the paper is made of {data}" in capsys.readouterr().out
     check_refused(
         [
             (
-                r"options of the report need results, got report\.alpha=0\.1",
-                lambda: write_study_paper(
-                    [*words, f"results_dir={tmp_path}/none", "report.alpha=0.1"]
-                ),
+                r"options of the report must have results, got report\.alpha=0\.1",
+                lambda: PAPER([*words, f"results_dir={tmp_path}/none", "report.alpha=0.1"]),
             )
         ],
         remedy=False,
@@ -84,9 +82,7 @@ def test_errors_name_key_value_and_remedy(home: Path, words: list[str], message:
         [
             (
                 message,
-                lambda: write_study_paper(
-                    [*words, f"results_dir={home}/results", f"reports_dir={home}/none"]
-                ),
+                lambda: PAPER([*words, f"results_dir={home}/results", f"reports_dir={home}/none"]),
             )
         ],
         remedy=False,

@@ -11,7 +11,7 @@ from checkout import ROOT
 from refusals import check_refused
 
 import pfbench
-from pfbench.cli.compare import compare_study
+from pfbench.cli.compare import COMMAND as COMPARE
 from pfbench.report.published_study import compare_tables, find_witness
 from pfbench.report.stored_study import RUNS_FILE, StoredStudy, read_stored_study
 from pfbench.report.study_report import find_overviews
@@ -47,7 +47,7 @@ def test_verdicts_are_those_of_one_study_of_all_filters(
     assert ("apf against 3 filters" in str(compared), "A part" in str(compared)) == (True, False)
     other = pfbench.run("linear_walk", ["ukf", "apf"], scenario__steps=20, study="other", **{**WORLD, "particles": 40})  # fmt: skip
     assert "2 published filters have 50 particles, the own ones another number" in str(other.against("public"))  # fmt: skip
-    compare_study(["study=mine", "published=public"])
+    COMPARE(["study=mine", "published=public"])
     assert "ukf has the errors of the published study" in capsys.readouterr().out
     table = pd.read_csv(home / "reports" / "mine" / "published.csv")
     assert list(table["ratio"]) == pytest.approx([v.ratio for v in verdicts])
@@ -155,7 +155,7 @@ def test_a_filter_that_ignores_the_measurements_is_no_witness(home: Path) -> Non
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["study=mine"], r"published must be one name of a report, got none\. Add published=all_seven"),
+        (["study=mine"], r"published must be set\. Use: pfbench compare study=NAME published=all_seven"),
         (["study=mine", "published=nothing"], rf"published must be a report with {RUNS_FILE}, got 'nothing'.*public"),
         (["study=nothing", "published=public"], r"study must be a study with results, got nothing"),
     ],
@@ -164,4 +164,4 @@ def test_what_is_missing_is_said(
     words: list[str], message: str, home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(home)
-    check_refused([(message, lambda: compare_study(words))], remedy=False)
+    check_refused([(message, lambda: COMPARE(words))], remedy=False)

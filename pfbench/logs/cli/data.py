@@ -1,4 +1,4 @@
-"""Command `pfbench data`: the recorded data sets, and which of them a folder has."""
+"""Command `pfbench data`: list the recorded data sets, and check a folder of them."""
 
 from __future__ import annotations
 
@@ -9,20 +9,9 @@ from typing import Any, NamedTuple
 
 import yaml
 
+from pfbench.cli.command import Command
 from pfbench.core.parameter_checks import require
 from pfbench.files.atomic_write import hash_file
-
-HELP = """\
-pfbench data [FOLDER]
-
-List the recorded data sets with source, licence and size, and check a folder by the checksums of their files.
-Without FOLDER that of the environment variable PFBENCH_DATA is checked, or none.
-
-  pfbench data
-  pfbench data ~/navigation_data
-
-A whole data set may be missing: its scenarios are then refused. A file that is missing from a data set, or that
-differs, is an error. Page: docs/data_sets.md"""
 
 _LIST = Path(__file__).parents[1] / "worlds" / "data_sets.yaml"
 
@@ -101,3 +90,19 @@ def _refuse_damage(states: Sequence[SetState], folder: str) -> None:
         f"{folder} where {'; '.join(faults)}",
         "Copy these files again, or remove the folder of the data set.",
     )
+
+
+COMMAND = Command(
+    list_data,
+    """\
+pfbench data [FOLDER]
+
+List the recorded data sets with source, licence and size, and check a folder by the checksums of their files.
+Without FOLDER that of the environment variable PFBENCH_DATA is checked, or none.
+
+  pfbench data
+  pfbench data ~/navigation_data
+
+A whole data set may be missing: its scenarios are then refused. A file that is missing from a data set, or that
+differs, is an error. Page: docs/data_sets.md""",
+)

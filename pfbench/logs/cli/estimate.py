@@ -1,12 +1,35 @@
-"""Command `pfbench estimate`: the track of an own log without a reference, as tables, GPX and KML."""
+"""Command `pfbench estimate`: estimate the track of an own log without a reference."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pfbench.cli.current_folder import add_search_path
+from pfbench.cli.command import Command, Option, read_list
+from pfbench.core.parameter_checks import require
 
-HELP = """\
+
+def estimate_log(words: Sequence[str], filter: list[str], reports_dir: str) -> None:  # noqa: A002
+    """Estimate the track of a log, and write its page and files."""
+    folders = [word for word in words if "=" not in word]
+    got = " ".join(folders) or "none"
+    require(len(folders) == 1, "estimate", "have one folder", got, "Use: pfbench estimate my_log")
+    from pfbench.job import estimate_track
+    from pfbench.logs.judge.track_page import describe_track, write_track_page
+
+    estimate = estimate_track(folders[0], filter, [word for word in words if "=" in word])
+    page = write_track_page(estimate, reports_dir)
+    print("\n".join(describe_track(estimate)))
+    print(f"report: {page.resolve()}")
+
+
+def _read_filters(key: str, text: str, remedy: str) -> list[str]:
+    """Read names of filters, perhaps in brackets."""
+    return read_list(key, text.strip("[]"), remedy)
+
+
+COMMAND = Command(
+    estimate_log,
+    """\
 pfbench estimate FOLDER [filter=NAME,...] [key=value ...]
 
 Estimate the track of an own log without a reference (docs/use_your_data.md). The folder has the tables imu and gnss.
@@ -17,31 +40,12 @@ reports/estimate_NAME/ with a page, a table of each track, and track.gpx and tra
   pfbench estimate my_log
   pfbench estimate my_log filter=ekf,student scenario.alignment.heading_deg=30
 
-  filter=NAME,...                    filters, the answer is that of the first one (ekf,ukf)
+  OPTIONS
   scenario.KEY=VALUE ...             keys of scenario=user_log_aligned
   scenario=NAME                      a variant of it, such as one with noise numbers of pfbench infer
-  particles=N seed=N ...             other keys of pfbench run
-  reports_dir=FOLDER                 folder of reports (reports)"""
-
-_OWN = ("filter", "reports_dir")
-
-
-def estimate_log(words: Sequence[str]) -> None:
-    """Estimate the track of a log, and write its page and files."""
-    folders = [word for word in words if "=" not in word]
-    if len(folders) != 1:
-        raise ValueError(
-            f"estimate needs one folder, got {' '.join(folders) or 'none'}. Use: pfbench estimate my_log"
-        )
-    options = {
-        key: value for key, _, value in (word.partition("=") for word in words) if key in _OWN
-    }
-    others = [word for word in words if "=" in word and word.partition("=")[0] not in _OWN]
-    from pfbench.job import estimate_track
-    from pfbench.logs.judge.track_page import describe_track, write_track_page
-
-    names = [name for name in options.get("filter", "ekf,ukf").strip("[]").split(",") if name]
-    estimate = estimate_track(folders[0], names, add_search_path(others))
-    page = write_track_page(estimate, options.get("reports_dir", "reports"))
-    print("\n".join(describe_track(estimate)))
-    print(f"report: {page.resolve()}")
+  particles=N seed=N ...             other keys of pfbench run""",
+    options={
+        "filter": Option("ekf,ukf", "filters, the answer is that of the first one", _read_filters),
+        "reports_dir": Option("reports", "folder of reports"),
+    },
+)

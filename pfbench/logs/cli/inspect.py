@@ -1,4 +1,4 @@
-"""Command `pfbench inspect`: the faults of an own log, with evidence and the settings that mend them."""
+"""Command `pfbench inspect`: name the faults of an own log, and the settings that mend them."""
 
 from __future__ import annotations
 
@@ -7,25 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pfbench.cli.command import Command
 from pfbench.core.parameter_checks import require
 from pfbench.logs.cli.judge import convert_numbers
-
-HELP = """\
-pfbench inspect FOLDER [key=value ...]
-
-Check an own log (docs/use_your_data.md), name its faults, and write reports/inspect_NAME/ with a picture for
-each finding and scenario/suggested.yaml, settings that mend them.
-
-  pfbench inspect my_log
-  pfbench inspect my_log gnss=fixes fix_codes=nmea
-
-  imu=NAME gnss=NAME reference=NAME   names of the tables (imu, gnss, reference); a log can have no reference
-  path=N sensor=N            flight and sensor of tables with the columns path and imu
-  fix_codes=NAME|[4,5]       codes of the column fix: nmea, rtklib, mavlink, ublox or a list
-  origin=LAT,LON,H           origin of local positions, deg, deg, m
-  reports_dir=FOLDER         folder of reports (reports)
-
-Exit codes: 0 no warning, 3 warnings, 2 refused: a run would refuse the log"""
 
 _KEYS = ("imu", "gnss", "reference", "path", "sensor", "fix_codes", "origin", "reports_dir")
 _WARNED, _REFUSED = 3, 2
@@ -81,10 +65,8 @@ def _split_folder(words: Sequence[str]) -> tuple[Path, dict[str, str]]:
             "See pfbench inspect --help.",
         )
         values[key] = value
-    if len(folders) != 1:
-        raise ValueError(
-            f"inspect needs one folder, got {' '.join(folders) or 'none'}. Use: pfbench inspect my_log"
-        )
+    got = " ".join(folders) or "none"
+    require(len(folders) == 1, "inspect", "have one folder", got, "Use: pfbench inspect my_log")
     folder = Path(folders[0])
     require(
         folder.is_dir(),
@@ -117,3 +99,24 @@ def _describe_words(names: Mapping[str, str], options: Mapping[str, Any]) -> dic
     keys = {key: options[key] for key in ("origin", "fix_codes") if key in options}
     files = {"files": json.loads(json.dumps(names))} if names else {}
     return {**files, **keys}
+
+
+COMMAND = Command(
+    inspect_folder,
+    """\
+pfbench inspect FOLDER [key=value ...]
+
+Check an own log (docs/use_your_data.md), name its faults, and write reports/inspect_NAME/ with a picture for
+each finding and scenario/suggested.yaml, settings that mend them.
+
+  pfbench inspect my_log
+  pfbench inspect my_log gnss=fixes fix_codes=nmea
+
+  imu=NAME gnss=NAME reference=NAME   names of the tables (imu, gnss, reference); a log can have no reference
+  path=N sensor=N            flight and sensor of tables with the columns path and imu
+  fix_codes=NAME|[4,5]       codes of the column fix: nmea, rtklib, mavlink, ublox or a list
+  origin=LAT,LON,H           origin of local positions, deg, deg, m
+  reports_dir=FOLDER         folder of reports (reports)
+
+Exit codes: 0 no warning, 3 warnings, 2 refused: a run would refuse the log""",
+)

@@ -1,4 +1,4 @@
-"""Command `pfbench judge`: trajectories of other programs under the metrics of a study."""
+"""Command `pfbench judge`: compare trajectories of other programs with a reference."""
 
 from __future__ import annotations
 
@@ -8,37 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
+from pfbench.cli.command import Command
 from pfbench.cli.messages import suggest_similar
 from pfbench.core.parameter_checks import require
 
 if TYPE_CHECKING:
     from pfbench.logs.judge.judge_options import SourceOptions
-
-HELP = """\
-pfbench judge reference=FILE NAME=FILE NAME=FILE ... [key=value ...]
-
-Compare trajectories of any programs with a reference and with each other, and write a report.
-
-  pfbench judge reference=truth.csv mine=a.csv theirs=b.tum theirs.frame=enu
-  pfbench judge reference=truth/{sequence}.csv 'mine=mine/{sequence}_{run}.csv' 'theirs=theirs/{sequence}.nav'
-
-Formats, found by content: CSV and .parquet with the columns t, pn, pe, pd (or lat_deg, lon_deg, h_m), optional
-vn, ve, vd, roll, pitch, yaw, sd_pn, ..., cov_nn, ...; TUM; NMEA; KF-GINS; RTKLIB .pos; .npz of pfbench.
-
-  study=NAME             name of the report (judge)        reports_dir=FOLDER   folder of reports (reports)
-  from=S to=S every=S    scored time and distance of epochs
-  tolerance=S            largest difference of common epochs (0.01)
-  holes=skip             leave out long gaps of the reference; largest_gap=S sets their length
-  coverage=SHARE         least share of the time that a run covers (0.9)
-  limit=M                position error above which a run diverges
-  align=offset|yaw       remove a motion from positions (none)
-  origin=LAT,LON,H       origin of local positions, deg, deg, m
-  block=S                length of the blocks of time (30 blocks)
-  baseline=NAME          compare all with one program (all pairs)
-  alpha=0.05 margin=0.05 level of the tests, margin of equality
-  NAME.frame=enu|ned     axes of a TUM file                NAME.shift=S   time added to a clock
-  NAME.columns=t:time,pn:north,...   names of columns      NAME.sd=FILE   deviations of KF-GINS
-  NAME.scale=t:0.001,yaw:0.0174533   factors of columns    NAME.format=table|tum|kf_gins|nmea|rtklib|result"""
 
 _RENAMED = {"from": "start", "to": "end"}  # words of the command line that Python reserves
 _OTHER_PAGES = ("claims", "datasheets")  # folders of reports
@@ -133,12 +108,13 @@ def _check_programs(
     programs: Mapping[str, str], sources: Mapping[str, Any], option_keys: Sequence[str]
 ) -> None:
     """Check that the reference and a program are present, and that all names are valid."""
-    missing = "reference" if "reference" not in programs else "a program"
-    if "reference" not in programs or len(programs) < 2:
-        raise ValueError(
-            f"judge needs a reference and programs, got no {missing.removeprefix('a ')}. "
-            "Use: pfbench judge reference=truth.csv mine=a.csv theirs=b.csv"
-        )
+    require(
+        "reference" in programs and len(programs) > 1,
+        "judge",
+        "have a reference and programs",
+        "no program" if "reference" in programs else "no reference",
+        "Use: pfbench judge reference=truth.csv mine=a.csv theirs=b.csv",
+    )
     for name, pattern in programs.items():
         is_path = "." in pattern or "/" in pattern or os.path.isfile(pattern)
         require(
@@ -222,3 +198,33 @@ def _split_pairs(key: str, value: str, form: str, example: str) -> dict[str, str
         pairs[match["name"]] = match["plain"] if quoted is None else quoted.replace('""', '"')
         start = match.end()
     return pairs
+
+
+COMMAND = Command(
+    judge_trajectories,
+    """\
+pfbench judge reference=FILE NAME=FILE NAME=FILE ... [key=value ...]
+
+Compare trajectories of any programs with a reference and with each other, and write a report.
+
+  pfbench judge reference=truth.csv mine=a.csv theirs=b.tum theirs.frame=enu
+  pfbench judge reference=truth/{sequence}.csv 'mine=mine/{sequence}_{run}.csv' 'theirs=theirs/{sequence}.nav'
+
+Formats, found by content: CSV and .parquet with the columns t, pn, pe, pd (or lat_deg, lon_deg, h_m), optional
+vn, ve, vd, roll, pitch, yaw, sd_pn, ..., cov_nn, ...; TUM; NMEA; KF-GINS; RTKLIB .pos; .npz of pfbench.
+
+  study=NAME             name of the report (judge)        reports_dir=FOLDER   folder of reports (reports)
+  from=S to=S every=S    scored time and distance of epochs
+  tolerance=S            largest difference of common epochs (0.01)
+  holes=skip             leave out long gaps of the reference; largest_gap=S sets their length
+  coverage=SHARE         least share of the time that a run covers (0.9)
+  limit=M                position error above which a run diverges
+  align=offset|yaw       remove a motion from positions (none)
+  origin=LAT,LON,H       origin of local positions, deg, deg, m
+  block=S                length of the blocks of time (30 blocks)
+  baseline=NAME          compare all with one program (all pairs)
+  alpha=0.05 margin=0.05 level of the tests, margin of equality
+  NAME.frame=enu|ned     axes of a TUM file                NAME.shift=S   time added to a clock
+  NAME.columns=t:time,pn:north,...   names of columns      NAME.sd=FILE   deviations of KF-GINS
+  NAME.scale=t:0.001,yaw:0.0174533   factors of columns    NAME.format=table|tum|kf_gins|nmea|rtklib|result""",
+)

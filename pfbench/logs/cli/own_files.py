@@ -1,4 +1,4 @@
-"""Command `pfbench import`: files of other programs as the tables of an own log, and its inspection."""
+"""Command `pfbench import`: write the tables of an own log from files of other programs."""
 
 from __future__ import annotations
 
@@ -6,29 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from pfbench.cli.command import Command
 from pfbench.core.parameter_checks import require
 from pfbench.logs.cli.judge import convert_source
-
-HELP = """\
-pfbench import FOLDER imu=FILE gnss=FILE [reference=FILE] [NAME.key=value ...]
-
-Write the tables imu, gnss and, if there is one, reference of an own log to a new folder, and inspect it.
-
-  pfbench import my_log imu=imu.csv gnss=rover.pos reference=truth.tum reference.frame=enu
-  pfbench import my_log imu=raw.csv imu.columns=t:time,fx:ax,fy:ay,fz:az,wx:gx,wy:gy,wz:gz imu.time=ms ...
-
-Formats, found by content: tables with names; TUM, KF-GINS (result, IMU increments, fixes), NMEA, RTKLIB .pos, EuRoC,
-KITTI (the folder of a drive for each of the three).
-
-  NAME.format=table|tum|kf_gins|nmea|rtklib|euroc|kitti
-  NAME.columns=t:time,...   name of pfbench:name in the file
-  NAME.scale=lat_deg:1e-7,...   factors of columns
-  NAME.time=s|ms|us|ns      unit of the time of a table
-  NAME.repeats=first        keep the first row of each time
-  NAME.frame=enu|ned        axes of a TUM file
-  reports_dir=FOLDER        folder of reports (reports)
-
-Exit codes: those of pfbench inspect"""
 
 _TABLES = ("imu", "gnss", "reference")
 _KEYS = ("format", "frame", "time", "repeats", "columns", "scale")
@@ -85,9 +65,36 @@ def _split_words(
             )
             options.setdefault(role, {})[name] = convert_source(key, name, value)
     missing = [role for role in _TABLES[:2] if role not in files]
-    if len(folders) != 1 or missing:
-        raise ValueError(
-            f"import needs a new folder and the files of imu and gnss, got no "
-            f"{', '.join(missing) or 'folder'}. Use: pfbench import my_log imu=a.csv gnss=b.csv reference=c.csv"
-        )
+    require(
+        len(folders) == 1 and not missing,
+        "import",
+        "have a new folder and the files of imu and gnss",
+        f"no {', '.join(missing) or 'folder'}",
+        "Use: pfbench import my_log imu=a.csv gnss=b.csv reference=c.csv",
+    )
     return Path(folders[0]), files, options, others
+
+
+COMMAND = Command(
+    import_log,
+    """\
+pfbench import FOLDER imu=FILE gnss=FILE [reference=FILE] [NAME.key=value ...]
+
+Write the tables imu, gnss and, if there is one, reference of an own log to a new folder, and inspect it.
+
+  pfbench import my_log imu=imu.csv gnss=rover.pos reference=truth.tum reference.frame=enu
+  pfbench import my_log imu=raw.csv imu.columns=t:time,fx:ax,fy:ay,fz:az,wx:gx,wy:gy,wz:gz imu.time=ms ...
+
+Formats, found by content: tables with names; TUM, KF-GINS (result, IMU increments, fixes), NMEA, RTKLIB .pos, EuRoC,
+KITTI (the folder of a drive for each of the three).
+
+  NAME.format=table|tum|kf_gins|nmea|rtklib|euroc|kitti
+  NAME.columns=t:time,...   name of pfbench:name in the file
+  NAME.scale=lat_deg:1e-7,...   factors of columns
+  NAME.time=s|ms|us|ns      unit of the time of a table
+  NAME.repeats=first        keep the first row of each time
+  NAME.frame=enu|ned        axes of a TUM file
+  reports_dir=FOLDER        folder of reports (reports)
+
+Exit codes: those of pfbench inspect""",
+)

@@ -23,7 +23,7 @@ from refusals import check_refused
 from pfbench import job
 from pfbench.cli.compose import read_sweep
 from pfbench.cli.messages import format_error
-from pfbench.cli.tune import tune_filters
+from pfbench.cli.tune import COMMAND as TUNE
 from pfbench.job import tuning
 from pfbench.job.config import FILTER_SETS, TUNED_METHODS, expand_filter_sets
 from pfbench.job.tuned_files import Ratio, compare_errors, decide_fit, find_best
@@ -284,7 +284,7 @@ def test_a_search_finds_that_errors_are_larger_than_the_model_says(
         tuning, "KNOBS", {"ekf_scaled": Knob("noise_adaptations.0.q_factor", (1.0,))}
     )
     monkeypatch.chdir(tmp_path)
-    tune_filters([
+    TUNE([
         "scenario=linear_walk", "scenario.steps=60", "runs=20", "filter=ekf_scaled",
         "noise=outliers", "name=walk", "folder=lab", "r_factors=1,4", "report.start_time_s=5",
         "fit_runs=10", "fit_particles=200",
@@ -346,12 +346,12 @@ def test_a_filter_is_added_to_the_file_of_its_world(
         "folder=lab",
     ]
     world += ["r_factors=1,4", "fit_runs=2", "fit_particles=50"]
-    tune_filters([*world, "runs=4", "filter=ekf_scaled"])
+    TUNE([*world, "runs=4", "filter=ekf_scaled"])
     path = tmp_path / "lab/tuned/walk.yaml"
     first = path.read_text()
     assert "\n  first_run: 4\n" in first  # the best filter is chosen by other runs
     for _ in range(2):
-        tune_filters([*world, "runs=4", "filter=rpf"])
+        TUNE([*world, "runs=4", "filter=rpf"])
         assert path.read_text().startswith(first)
     node = yaml.safe_load(path.read_text())["rpf"]
     candidates, _ = read_candidates(node)
@@ -377,7 +377,7 @@ def test_a_filter_is_added_to_the_file_of_its_world(
         [
             (
                 r"runs must be 4 as in .*walk\.yaml.*got 6",
-                lambda: tune_filters([*world, "runs=6", "filter=rpf"]),
+                lambda: TUNE([*world, "runs=6", "filter=rpf"]),
             )
         ],
         remedy=False,
@@ -396,9 +396,9 @@ def test_a_filter_is_added_to_the_file_of_its_world(
         (["scenario=linear_walk", "r_factors=1,many"], r"r_factors must be positive numbers, got 1,many"),
         (["scenario=linear_walk", "name=../x"], r"name must consist of letters.*got '../x'\. It"),
         (["scenario=linear_walk", "name=auto"], r"name must.*not be auto or nominal, got 'auto'\. It"),
-        (["scenario=linear_walk", "fit_runs=1"], r"fit_runs must be at least 2.*got 1\. Default"),
-        (["scenario=linear_walk", "fit_particles=1"], r"fit_particles must be at least 2.*got 1\. Default"),
-        (["scenario=linear_walk", "runs=1"], r"runs must be at least 2 for a tuning, got 1\. Default"),
+        (["scenario=linear_walk", "fit_runs=1"], r"fit_runs must be a whole number of at least 2, got 1\. Use fit_runs="),
+        (["scenario=linear_walk", "fit_particles=1"], r"fit_particles must be a whole number of at least 2, got 1\. Default"),
+        (["scenario=linear_walk", "runs=1"], r"runs must be a whole number of at least 2, got 1\. Default: runs=20"),
         (["scenario=passiv_1"], r"scenario=passiv_1 does not exist. Similar: passive_1"),
         (["scenario=flight_500s", "seed=-999"], r"a seed that no study scores in flight_500s, got 1, which \w+ scores"),
         (["scenario=flight_500s", "seed=-1001"], r"seed must be at least -1000, got -1001"),
@@ -409,7 +409,7 @@ def test_bad_input_is_refused_before_any_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(Exception, match=r".") as caught:
-        tune_filters(words)
+        TUNE(words)
     assert re.search(message, format_error(caught.value, words))
     assert list(tmp_path.rglob("*.npz")) == []
 
@@ -492,7 +492,7 @@ def test_a_tuned_filter_takes_the_knobs_of_its_world_or_prints_the_command_that_
     made = shlex.split(command[1])[2:]
     assert made == ["scenario=stroll", "model=linear_walk", words[0]]
     small = ["filter=gate", "runs=3", "fit_particles=20", "r_factors=1", "noise=nominal,outliers"]
-    tune_filters([*made, *small])
+    TUNE([*made, *small])
     assert "hydra.searchpath" not in capsys.readouterr().out.splitlines()[-1]  # it is found
     named = job.compose([*words, "filter=gate_tuned"]).values["filter"]["paper"]
     assert named["name"] == "Gated EKF (tuned)"

@@ -179,7 +179,7 @@ def test_exit_codes_tell_warnings_from_refusals(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((), "inspect needs one folder, got none"),
+        ((), "inspect must have one folder, got none"),
         (("nowhere",), "nowhere must be a folder with imu, gnss and, if there is one, reference"),
         ((".", "imus=a"), "words must be FOLDER and key=value with the keys imu, gnss"),
         ((".", "scenario.origin=a,b,c"), "origin must be"),  # as remedies for a run name the key
