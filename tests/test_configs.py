@@ -280,6 +280,21 @@ def test_the_choices_of_every_experiment_compose(experiment: str) -> None:
     assert len(names) == len(cells)  # a choice that reached no job would make two cells one
 
 
+def test_a_scenario_may_bring_its_noise_and_another_can_be_asked_for() -> None:
+    """Whatever the order of the words; without a word for it all other scenarios have nominal noise."""
+    home, bursts, outliers = "scenario=home_002_bursts", "noise=paper_bursts", "noise=outliers"
+    assert composed(home).noise == composed(bursts).noise != composed().noise
+    assert (
+        composed(home, outliers).noise == composed(outliers, home).noise == composed(outliers).noise
+    )
+    homes = {name: composed(f"scenario={name}").noise for name in GROUPS["scenario"]}
+    assert {n for n, noise in homes.items() if noise != composed().noise} == {
+        "home_002_bursts", "home_004_outliers",
+    }  # fmt: skip
+    scenarios = [OmegaConf.to_container(composed(f"scenario={n}").scenario) for n in ("home_002_bursts", "anshun_short")]  # fmt: skip
+    assert {**scenarios[0], "paper": ""} == {**scenarios[1], "paper": ""}  # type: ignore[dict-item]
+
+
 def test_the_scenario_brings_its_model_and_another_can_be_asked_for() -> None:
     assert composed("scenario=flight_500s").model.markov is True
     assert composed("scenario=flight_300s").model.markov is False

@@ -73,6 +73,7 @@ LEFT_OUT = {
     "[robustness.md](robustness.md#terrain-referenced-navigation).",
     "`recorded_car_constrained`": "the scenario `recorded_car_drive` with further components of the measurement.",
     "`recorded_canyon`, `gps_ins_inflated`": "the scenarios `recorded_berlin` and `gps_ins_generic` with another model.",
+    "`home_002_bursts`, `home_004_outliers`": "the scenarios `anshun_short` and `gps_ins_inflated` with another noise.",
     "`user_log`, `user_log_aligned`, `user_raw_log`, `user_ins_log`": "the data are of the user.",
 }
 

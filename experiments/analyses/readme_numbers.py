@@ -199,22 +199,29 @@ def claims() -> str:
 
 
 @cache
-def read_overviews() -> Any:
-    """Tables of the first page of the study of all methods."""
-    return find_overviews(*read_stored_study(TOP / "reports" / "all_seven", decides=False))
+def read_overviews(study: str = "all_seven") -> Any:
+    """Tables of the first page of a study of all methods."""
+    return find_overviews(*read_stored_study(TOP / "reports" / study, decides=False))
 
 
-def all_seven() -> str:
-    """First sentences of the study of all methods, and its heat map as a table."""
-    folder = TOP / "reports" / "all_seven"
-    head, rows = tabulate_heat_map(read_overviews())
+def all_seven(study: str = "all_seven") -> str:
+    """First sentences of a study of all methods, and its heat map as a table."""
+    folder = TOP / "reports" / study
+    head, rows = tabulate_heat_map(read_overviews(study))
     legend = (
         "Ratio of errors to the best Kalman filter of the world. Bold: shown to be better. Plain: shown to be worse. In brackets: not decided. "
         "=: within 5 %. A percentage is the share of runs that keep track, where lost runs leave no ratio."
     )
     text = (folder / "report.md").read_text()
     _, first, second, *_ = text.split("\n\n")
-    return f"{first}\n\n{second}\n\n{format_table(head, rows)}\n\n{legend}{describe_knobs('all_seven')}".rstrip()
+    return f"{first}\n\n{second}\n\n{format_table(head, rows)}\n\n{legend}{describe_knobs(study)}".rstrip()
+
+
+def seven_at_home() -> str:
+    """First sentences of the study of the methods at home, its heat map, and the words on tuned forms."""
+    lines = (TOP / "reports" / "seven_at_home" / "report.md").read_text().splitlines()
+    tuned = next(line for line in lines if line.startswith("The seven tuned"))
+    return f"{all_seven('seven_at_home')}\n\n{tuned}"
 
 
 def speed() -> str:
@@ -439,6 +446,7 @@ BLOCKS: dict[str, Callable[[], str]] = {
         claims_2,
         claims,
         all_seven,
+        seven_at_home,
         equal_time,
         learned_gain,
         speed,

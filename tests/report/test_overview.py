@@ -777,6 +777,14 @@ def test_the_first_sentence_says_what_holds_at_equal_time(tabs: dict[TabKey, Ove
     fewer = first._replace(cells=[c for c in first.cells if c.filter != "mcmc_rpf"])
     assert choose_level({**tabs, 1000: fewer}) == 100  # the number that most methods ran with
     assert all(len(text.split()) <= 55 for text in said)
+    alike = [word_headline(first, None, page) for page in stars[0]]
+    assert f"worlds. All tuned alike, so is: {name} (azimuth). Against" in alike[0]
+    assert "worlds. All tuned alike, none is. Against" in alike[1]
+    star = tell_story(stars[0][0]._replace(cells=[
+        c._replace(wins=True, verdict=c.verdict._replace(word="better")) for c in first.cells
+    ]), "mcmc_rpf", "")["wins"]  # fmt: skip
+    assert star.count("☆") == len(first.worlds)
+    assert "†" not in star
 
 
 def test_the_page_shows_all_tables(tabs: dict[TabKey, Overview]) -> None:

@@ -76,9 +76,12 @@ def render_overview(
     )
     pictures = draw_pictures(overviews)
     files = {f"{name}.svg": text for name, text in pictures.items() if not name.endswith("_390")}
-    for name, tables in (("cells", list_verdicts), ("pairs", list_comparisons)):
-        parts = [tables(item).assign(table=key or "") for key, item in overviews.items()]
-        files[f"{name}.csv"] = format_csv(pd.concat(parts))
+    files |= {
+        f"{name}.csv": format_csv(
+            pd.concat([tables(item).assign(table=key or "") for key, item in overviews.items()])
+        )
+        for name, tables in (("cells", list_verdicts), ("pairs", list_comparisons))
+    }
     context = {
         "pack": pack,
         "overview": overview,
@@ -91,7 +94,7 @@ def render_overview(
             for key, item in overviews.items()
             if key not in (level, WITH_KNOBS)
         ],
-        "headline": word_headline(overview, overviews.get(EQUAL_TIME)),
+        "headline": word_headline(overview, overviews.get(EQUAL_TIME), overviews.get(WITH_KNOBS)),
         "setting": describe_setting(overview, level),
         "has_printed": PRINTED in overviews,
         "has_stars": any(cell.wins for item in overviews.values() for cell in item.cells),
@@ -108,10 +111,18 @@ def render_overview(
         "filters": [overview.names[label] for label in overview.columns],
         "stories": [
             tell_story(
-                overview, m, str(read_paper_block("filter", parse_label(m)[0]).get("summary", ""))
+                view,
+                m,
+                str(
+                    read_paper_block("filter", parse_label(m)[0]).get("summary", "The same, tuned.")
+                ),
             )
-            | {"time": format_times(overviews[timed], m)}
-            for m in overview.methods
+            | {"time": format_times(times, m)}
+            for view, times in (
+                (overview, overviews[timed]),
+                *((v, v._replace(times={})) for v in [overviews.get(WITH_KNOBS)] if v),
+            )
+            for m in view.methods
         ],
         "tuned": describe_tuned(overview, overviews[WITH_KNOBS]) if WITH_KNOBS in overviews else "",
         "forms": list_forms(overview, overviews[WITH_KNOBS]) if WITH_KNOBS in overviews else [],
@@ -134,16 +145,14 @@ def render_overview(
 def list_overview_blocks(page: Mapping[str, Any]) -> list[Block]:
     """List the blocks of report.md."""
     pack, overview = page["pack"], page["overview"]
-    printed = " The methods are repaired where a printed form fails; as printed they have a table in index.html."
     heads = (
         "method", "in one line", "better than the best Kalman filter", "equal to it", "not decided", "worse",
         f"time of a step{page['timed']} / that of the best Kalman filter, median over worlds (range); / that of SIR",
     )  # fmt: skip
-    columns = ("name", "is", "wins", "equal", "open", "loses", "time")
     return [
         Block("title", pack["title"]),
         Block("text", page["headline"]),
-        Block("text", page["setting"] + printed * page["has_printed"]),
+        Block("text", page["setting"] + " The methods are repaired where a printed form fails; as printed they have a table in index.html." * page["has_printed"]),
         Block("text", page["foreign_knobs"]),
         Block("text", Markup("![Ratio of the error of each method to that of the best Kalman filter, in each world](heat_map.svg)")),
         Block("text", Markup("![Worlds in which each method is better and worse than each other](matrices.svg)")),
@@ -152,9 +161,9 @@ def list_overview_blocks(page: Mapping[str, Any]) -> list[Block]:
         *with_heading(
             Block("text", "Before you quote a number of these worlds:"), Block("list", [f"{name}: {text}." for name, text in page["notes"]])
         ),
-        make_rows(heads, [[story[name] for name in columns] for story in page["stories"]]),
+        make_rows(heads, [[story[name] for name in ("name", "is", "wins", "equal", "open", "loses", "time")] for story in page["stories"]]),
         Block("text", page["power"]),
-        Block("text", "†: not shown to be better than every single Kalman filter of that world."),
+        Block("text", "†: not shown to be better than every single Kalman filter of that world. ☆: better than every conventional filter."),
         *with_heading(
             Block("text", "The figures of the papers from our runs, with the numbers that the papers print as crosses:"),
             Block("list", [Markup(f"[{plain(p['paper'])}](../{p['study']}/report.md): {plain(p['figures'])}") for p in page["papers"]]),
@@ -292,19 +301,22 @@ def describe_price(overview: Overview) -> str:
     """Say what the tuning of the methods took, and what it would take where they are not tuned."""
     names = {parse_label(label)[0]: overview.names[label] for label in overview.methods}
     tunings = {w.part_name.name: w.facts.tuning for w in overview.worlds}
-    seconds = sum(t[n]["seconds"] for t in tunings.values() for n in names if n in t)
     texts = [
         f"{world} ({'all' if len(hours) == len(names) else ', '.join(names[n] for n in hours)}: {sum(hours.values()):.2g} CPU hours)"
         for world, tuning in tunings.items()
         if (hours := tuning.get("not_tuned_hours"))
     ]
-    return f"The tuning took {seconds / 60:.0f} CPU minutes. Not tuned in this world: {'; '.join(texts) or 'none'}. These are estimates."
+    return f"The tuning took {sum(t[n]['seconds'] for t in tunings.values() for n in names if n in t) / 60:.0f} CPU minutes. Not tuned in this world: {'; '.join(texts) or 'none'}. These are estimates."
 
 
-def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> str:
-    """Word the two sentences that open the page, at most 55 words."""
+def word_headline(
+    overview: Overview, at_equal_time: Overview | None = None, tuned: Overview | None = None
+) -> str:
+    """Word the two sentences that open the page, at most 55 words, and a third one if the methods are tuned too."""
     count, better = spell_number(len(overview.methods)), "better than every conventional filter"
-    winners, timed = (_name_winners(some) if some else "" for some in (overview, at_equal_time))
+    winners, timed, alike = (
+        _name_winners(some) if some else "" for some in (overview, at_equal_time, tuned)
+    )
     first = f"{better.capitalize()} with as many particles: {winners}."
     nor = (
         f", nor at equal time in {len(at_equal_time.worlds)}" if at_equal_time and not timed else ""
@@ -316,11 +328,12 @@ def word_headline(overview: Overview, at_equal_time: Overview | None = None) -> 
     elif winners and at_equal_time:
         first += " At equal time none is."
     words, single = Counter(map(name_word, overview.of_methods)), sum(c.beats_kalman for c in overview.of_methods)  # fmt: skip
-    alone = f" (in {single} than all single ones)" if single else ""
-    lost = f" Lost in {words['loses track']}." if words["loses track"] else ""
     return (
-        f"{first} Against each world's best Kalman filter: better in {words['better']} of {words.total()} cells{alone}, "
-        f"equal in {words['equal']}, not decided in {words['not decided']}, worse in {words['worse']}.{lost}"
+        f"{first}{f' All tuned alike, so is: {alike}.' if alike else ' All tuned alike, none is.' if tuned else ''} "
+        f"Against each world's best Kalman filter: better in {words['better']} of {words.total()} cells"
+        f"{f' (in {single} than all single ones)' if single else ''}, "
+        f"equal in {words['equal']}, not decided in {words['not decided']}, worse in {words['worse']}."
+        f"{' Lost in {}.'.format(words['loses track']) if words['loses track'] else ''}"
     )
 
 
@@ -362,8 +375,10 @@ def _describe_reference(overview: Overview) -> str:
         for world in overview.worlds
         if (v := find_outdone(world, overview.single))
     ]
-    text = "The best Kalman filter of a world was chosen on another seed, tuned ones among the candidates; the methods are not tuned."
-    return text + (f" In these runs another one is better: {', '.join(better)}." if better else "")
+    return (
+        "The best Kalman filter of a world was chosen on another seed, tuned ones among the candidates; the methods are not tuned."
+        + f" In these runs another one is better: {', '.join(better)}." * bool(better)
+    )
 
 
 def describe_power(overview: Overview) -> str:
@@ -487,7 +502,7 @@ def _format_cell(overview: Overview, world: World, label: str) -> str:
 def list_verdicts(overview: Overview) -> pd.DataFrame:
     """List the filters against the reference of each world."""
     worlds = {world.key: world for world in overview.worlds}
-    rows = [
+    return pd.DataFrame([
         {
             "world": cell.world, "filter": cell.filter, "reference": overview.names[worlds[cell.world].reference],
             "limit": worlds[cell.world].part_name.limit, **cell.verdict.to_row(),
@@ -495,8 +510,7 @@ def list_verdicts(overview: Overview) -> pd.DataFrame:
             "p_every_baseline": cell.p_every, "is_winner": cell.wins, "ms_per_step": overview.times.get((cell.world, cell.filter), ""),
         }
         for cell in overview.cells
-    ]  # fmt: skip
-    return pd.DataFrame(rows).drop(columns=["a", "b"], errors="ignore")
+    ]).drop(columns=["a", "b"], errors="ignore")  # fmt: skip
 
 
 def list_comparisons(overview: Overview) -> pd.DataFrame:

@@ -601,7 +601,7 @@ def build_world(
 def tell_story(overview: Overview, method: str, summary: str) -> dict[str, str]:
     """Return what a method is, where it wins and loses, and the time of its step, with numbers from the tables.
 
-    A win that is not shown against every single Kalman filter has a dagger.
+    A win that is not shown against every single Kalman filter has a dagger, one against every conventional filter a star.
     """
     cells = [cell for cell in overview.cells if cell.filter == method]
     cells.sort(key=_distance, reverse=True)
@@ -610,7 +610,7 @@ def tell_story(overview: Overview, method: str, summary: str) -> dict[str, str]:
         """Join the worlds of a word, with the ratios of those that are not near 1."""
         return "; ".join(
             overview.world_names[cell.world]
-            + f" ({name_size(cell)}{mark * (not cell.beats_kalman)})" * (word in ("better", "worse"))
+            + f" ({name_size(cell)}{'☆' if cell.wins else mark * (not cell.beats_kalman)})" * (word in ("better", "worse"))
             for cell in cells if name_word(cell) == word
         )  # fmt: skip
 
