@@ -402,7 +402,7 @@ def tie() -> str:
     pack = read_stored_study(TOP / "reports" / "robust_simulated").pack
     views, name = (
         pack["views"],
-        next(w["name"] for w in pack["facts"]["worlds"] if w["key"] == "passive_1"),
+        next(w["name"] for w in pack["worlds"] if w["key"] == "passive_1"),
     )
     rows = views["rmse", "passive_1", "nominal", "ekf_scaled_tuned"]["rows"]
     row = next(row for row in rows if row["filter"] == "rpf")
