@@ -1,7 +1,5 @@
 """`pfbench ...` without a new process, whose start costs seconds; and with one, where that is the point."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging

@@ -1,7 +1,5 @@
 """Records, runs and comparisons of filters whose steps are compiled."""
 
-from __future__ import annotations
-
 import shutil
 from typing import Any
 

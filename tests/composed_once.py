@@ -5,8 +5,6 @@ whose messages users see. Files of conf/ do not change during a test. Words that
 each time, and processes that a test starts compose as users do.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

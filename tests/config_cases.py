@@ -1,7 +1,5 @@
 """Composed configurations and short episodes of scenarios, for tests of all of conf/."""
 
-from __future__ import annotations
-
 import tempfile
 from copy import deepcopy
 from functools import cache

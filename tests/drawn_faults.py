@@ -4,8 +4,6 @@
 an EKF with the printed settings over that of the clean log.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from collections import Counter

@@ -1,7 +1,5 @@
 """Two made-up ephemerides, carried on in time and written as RINEX."""
 
-from __future__ import annotations
-
 import math
 from datetime import datetime, timedelta
 

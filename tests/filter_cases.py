@@ -1,7 +1,5 @@
 """The filters of conf/filter, and the models and records that some of them refuse."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import is_dataclass
 from functools import cache

@@ -1,7 +1,5 @@
 """Laws of every filter, stated once: no later measurement, no other run, lost runs, single precision, angles."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

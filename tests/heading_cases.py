@@ -3,8 +3,6 @@
 A vehicle weaves at 10 m/s from rest, with position fixes of 1 m each second. docs/methods/invariant.md has tables of them.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Hostile configuration files, and a check that a command changes nothing because of them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

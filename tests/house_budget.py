@@ -5,8 +5,6 @@ lines and comments change nothing. A ceiling rises only with an equal fall of ot
 from one commit to a later one. A change of this ruler is a commit of its own and raises `ruler` in the file.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import os

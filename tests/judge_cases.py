@@ -1,7 +1,5 @@
 """Made-up drives and the files of programs for the tests of judge."""
 
-from __future__ import annotations
-
 from functools import reduce
 from operator import xor
 from pathlib import Path

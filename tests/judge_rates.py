@@ -5,8 +5,6 @@ law in three axes. A rate of false verdicts counts "better" and "worse" of two s
 errors that are larger by the margin.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Faults of own logs, planted in tables: each with the checks that name it, and those that may follow from it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple

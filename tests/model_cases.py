@@ -1,7 +1,5 @@
 """Models and records of several tests of filters."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

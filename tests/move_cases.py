@@ -1,7 +1,5 @@
 """Moves for the tests: filters with a move, and one that accepts everything."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -3,8 +3,6 @@
 Each fault of mutants.toml replaces a text that occurs once. It is applied in a temporary copy of the checkout, never in place.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import re

@@ -1,7 +1,5 @@
 """Networks of learned proposals, small and with random weights."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

@@ -1,7 +1,5 @@
 """A notebook in this process: a main module whose cells are executed one after the other."""
 
-from __future__ import annotations
-
 import sys
 import types
 from typing import Any

@@ -4,8 +4,6 @@ One-dimensional grid filter and the closed form of the Benes filter. The Kalman 
 pfbench.testing, which share no code with the filters.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Models whose filtering problem has a known answer, for the tests of particle filters."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -6,8 +6,6 @@ study=NAME` writes them, in a fresh clone from runs.parquet.
 Run: make recompute STUDY=all_seven, or python tests/recompute.py [STUDY ...]; without a name all published studies.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from pathlib import Path

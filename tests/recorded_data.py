@@ -1,7 +1,5 @@
 """Where recorded data lie, and what filters believe of a made-up log."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """Tables of refusals: what cannot be made, and the sentence that says so."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable
 from typing import Any

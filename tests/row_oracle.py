@@ -3,8 +3,6 @@
 It follows docs/statistics.md: all rows of verdicts.csv, and all pairs of decisions.csv.
 """
 
-from __future__ import annotations
-
 import base64
 import functools
 import gzip

@@ -1,7 +1,5 @@
 """The cubature rules of the tests, by name."""
 
-from __future__ import annotations
-
 from pfbench.filter.gaussian.linearisation_rules import (
     AxisDegree3,
     AxisDegree5,

@@ -1,7 +1,5 @@
 """Linear and curved models for the tests of smoothers, and the dense solve of a whole path."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A level drive through bends with exact sensors, written as a log: forward-right-down axes, North-East-Down frame."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

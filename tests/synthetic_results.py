@@ -1,7 +1,5 @@
 """Results of filters that were never run, with known truth about who is better, in the files that a job would write."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Every yaml of conf/ and experiments/ says what it is, composes, lies where its class lies, and runs five steps."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The recipes of CONTRIBUTING.md are followed: files are written, blocks executed and commands run."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

@@ -4,8 +4,6 @@ The rules are those of the house: nouns for values, one word per concept, `Args:
 sentences of at most 30 words and plain words. Each check is a function of a syntax tree or a text.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Callable, Iterator

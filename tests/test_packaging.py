@@ -1,7 +1,5 @@
 """What is installed works without the checkout, and what others build on it works without being registered."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """What pages, YAML files and scripts name is public: listed in `__all__` of pfbench or of one of its folders."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import pkgutil

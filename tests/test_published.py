@@ -1,7 +1,5 @@
 """Files in git: no ignored file, no figure twice, reports reduced, numbers of README from the files."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import importlib.util

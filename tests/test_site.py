@@ -1,7 +1,5 @@
 """The site: pages that are written from the code have all names, tutorials run and are short, every page is in a list."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import inspect

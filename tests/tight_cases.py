@@ -1,7 +1,5 @@
 """A flight of tightly coupled SINS/GNSS, its model, and a Kalman filter written out."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

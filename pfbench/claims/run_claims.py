@@ -175,10 +175,6 @@ def _list_timings(plan: ClaimPlan, runs: ClaimRuns) -> Iterator[Task]:
                 )  # fmt: skip
 
 
-# --------------------------------------------------------------------------------------------------
-# Jobs.
-
-
 def run_claim_task(task: Task, results: str) -> StoredValues:
     """Run a job, or read it if it exists, and write its values."""
     folder = Path(results) / CLAIMS_STUDY

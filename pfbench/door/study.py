@@ -265,12 +265,14 @@ class Study:
         Raises:
             ValueError: If no result has this label.
         """
+        from pfbench.results.store import remove_result
+
         jobs = [job for condition in self.conditions() for job in condition.jobs]
         labels = sorted({job.label for job in jobs})
         require_choice("label", label, labels, "List them: study.summary()")
         for job in jobs:
             for path in (job.parts or (job.path,)) if job.label == label else ():
-                path.unlink()
+                remove_result(path)
         return self
 
     @plain_errors()

@@ -194,9 +194,6 @@ def compute_run_quantiles(values: np.ndarray, q: Sequence[float]) -> np.ndarray:
     return result
 
 
-# --------------------------------------------------------------------------------------------------
-# Scales, limits and tick labels of axes.
-
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 

@@ -107,6 +107,11 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
         return _meta(path, file)
 
 
+def remove_result(path: Path) -> None:
+    """Remove a result that a user no longer wants in a study."""
+    path.unlink(missing_ok=True)
+
+
 def write_failure(
     path: str | Path, choices: Mapping[str, Any], error: BaseException, words: Sequence[str] = ()
 ) -> Path | None:

@@ -249,9 +249,6 @@ def _shorten(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-# --------------------------------------------------------------------------------------------------
-# Lines after each look of a study that adds runs: what is decided and what is open.
-
 _LISTED = 6  # pairs in a line
 
 

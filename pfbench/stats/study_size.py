@@ -121,9 +121,6 @@ def count_needed_runs(d: Array, ratio: float, alpha: float) -> float:
     return needed if needed <= _MOST_RUNS else math.inf
 
 
-# --------------------------------------------------------------------------------------------------
-# Sentence about what a study can show, printed before it runs.
-
 _LARGEST_RATIO = 1000.0
 
 

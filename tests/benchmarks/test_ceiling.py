@@ -1,7 +1,5 @@
 """What any filter could reach: the limit is that of a Kalman filter on a linear model, and the page states the store."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

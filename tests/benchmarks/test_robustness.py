@@ -1,7 +1,5 @@
 """The page of robust filters is that of the stored reports, and its sentences follow from their verdicts."""
 
-from __future__ import annotations
-
 import math
 import sys
 from functools import cache

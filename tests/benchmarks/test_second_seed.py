@@ -1,7 +1,5 @@
 """A second seed confirms or contradicts verdicts, and newer jobs enter a published study only on the same data."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Words under laws whose differences are skewed: the stored table, and a part of it again."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys

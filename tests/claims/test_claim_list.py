@@ -1,7 +1,5 @@
 """The 88 claims of the papers as data: ids, kinds, factors with readings, proofs, and where a decision turns."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from functools import cache

@@ -1,7 +1,5 @@
 """Runs of claims: what decides each, plans and prices, keys of `pfbench run`, stored values, verification, the page."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

@@ -1,7 +1,5 @@
 """Proofs: statements on the papers that need no runs, margins or choices of ours. Each quotes its equation."""
 
-from __future__ import annotations
-
 import ast
 import math
 from pathlib import Path

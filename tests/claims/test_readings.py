@@ -1,7 +1,5 @@
 """Readings of the papers: each composes, says why, and leaves no value of its world silent; a glob launches them all."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any

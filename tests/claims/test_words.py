@@ -1,7 +1,5 @@
 """The five words: planted effects with their power, error rates, order of readings, halves of the runs, lost runs."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 from types import ModuleType

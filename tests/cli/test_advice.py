@@ -1,7 +1,5 @@
 """Advice for mistakes that are easy to make on the command line."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The command line speaks to people: what was given, what is wrong with it, what to give instead; and leaves nothing behind."""
 
-from __future__ import annotations
-
 import re
 import time
 from pathlib import Path

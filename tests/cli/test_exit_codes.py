@@ -1,7 +1,5 @@
 """Exit codes follow from where an error arises: 2 before the work of a command starts, 1 after it."""
 
-from __future__ import annotations
-
 import errno
 import json
 import shutil

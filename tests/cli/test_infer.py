@@ -1,7 +1,5 @@
 """`pfbench infer`: posteriors of a linear model against a grid of exact likelihoods, and sentences for what is not valid."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """Presets of launchers, and what a sweep does if a launcher loses a process."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """Commands for a person's own work: new scripts that run at once, state, dry run, completion, and the folder conf."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import os

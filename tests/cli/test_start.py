@@ -1,7 +1,5 @@
 """The start of a command imports what it needs: no torch for a version or a finished job, no tables for a job."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A sweep that is killed goes on where it stopped, and ends as if nothing had happened."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

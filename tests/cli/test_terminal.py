@@ -1,7 +1,5 @@
 """A command goes on without its reader, ends in words at a signal, takes its workers along, and leaves the process as it was."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import io

@@ -1,7 +1,5 @@
 """Every error is a sentence: what must be, what was got, what to do; of an error that nobody foresaw, where its trace is."""
 
-from __future__ import annotations
-
 import errno
 import re
 import tempfile

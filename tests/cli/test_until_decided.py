@@ -1,7 +1,5 @@
 """`runs=until-decided`: the decisions of the joined table, resumed after a stop, ended by its caps."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from pathlib import Path

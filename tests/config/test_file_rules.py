@@ -1,7 +1,5 @@
 """What a file of a search path may do: laws of the loader, each with a file that keeps it and one that does not."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Models that fit a scenario: what is measured is what is read, and anything else is refused in words before the first step."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache

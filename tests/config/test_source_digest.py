@@ -1,7 +1,5 @@
 """The code of a user's classes is part of a job's key: a changed default is another job."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Hostile files: nothing runs, is written or is deleted because a file says so."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Any

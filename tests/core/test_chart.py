@@ -1,7 +1,5 @@
 """Charts: adding and subtracting undo each other, means are where their residuals vanish, plain numbers stay plain."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Observation distributions of particle and Gaussian filters: densities, missing components, existence of moments."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

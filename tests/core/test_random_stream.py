@@ -1,7 +1,5 @@
 """Draws: the published generator, the right laws, and numbers that depend on nothing but their address."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The simulator draws each distribution of a model, and run i never depends on the other runs."""
 
-from __future__ import annotations
-
 import ast
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The Python door: the jobs of the command line, own classes of a notebook, and a study that is read from the same files."""
 
-from __future__ import annotations
-
 import importlib
 import logging
 import os

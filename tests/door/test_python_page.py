@@ -1,7 +1,5 @@
 """README.md and docs/python.md run as scripts in empty folders: their classes are those of a script, as a reader's are."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Training from Python: a network of your own, the command line's checkpoint, and its filter in a study."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

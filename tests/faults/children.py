@@ -1,7 +1,5 @@
 """Child processes of the harness: forked with all modules loaded, limited in time and memory, and killed as a group."""
 
-from __future__ import annotations
-
 import json
 import os
 import resource

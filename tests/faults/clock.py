@@ -1,7 +1,5 @@
 """A clock that jumps: sweeps whose calendar and files are hours or years off, forwards and backwards."""
 
-from __future__ import annotations
-
 import os
 import random
 import time

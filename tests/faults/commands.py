@@ -7,8 +7,6 @@ files that lead to them or to a secret. Each program leaves a mark. The hook rec
 undeclared (`watched/sitecustomize.py`), in the processes that a command starts too.
 """
 
-from __future__ import annotations
-
 import copy
 import gc
 import importlib

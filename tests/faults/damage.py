@@ -1,7 +1,5 @@
 """Damaged and swapped files of each kind: none may be read with another content than was written."""
 
-from __future__ import annotations
-
 import logging
 import random
 import tempfile

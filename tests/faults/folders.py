@@ -4,8 +4,6 @@ Each folder is of one kind. What pfbench accepts is composed by Hydra alone: eac
 folder must have been checked, and the result must be free of foreign settings, classes and secrets.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import re

@@ -1,7 +1,5 @@
 """Hostile configuration files: all cases of the tests of trust, as outcomes."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Kills of a sweep by SIGKILL: at random times, at operations on files, and in the middle of a file."""
 
-from __future__ import annotations
-
 import io
 import os
 import random

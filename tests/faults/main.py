@@ -5,8 +5,6 @@ Batches are stored in results/faults, so that the same command continues after a
 `--short` runs a few trials of each class in minutes, and neither stores nor writes anything.
 """
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 import sys

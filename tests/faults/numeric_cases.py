@@ -1,7 +1,5 @@
 """Models and measurements at the edge of what numbers can represent."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -7,8 +7,6 @@ The evidence of a particle filter is random: it may exceed the bound by four of 
 fits R to its innovations is under the fitted R, and has no bound.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import math

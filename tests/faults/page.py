@@ -1,7 +1,5 @@
 """The page of the harness: docs/reliability.md, whose table is generated from experiments/analyses/reliability.json."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

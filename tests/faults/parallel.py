@@ -1,7 +1,5 @@
 """Two and three sweeps of one study at the same time, some with a damaged result from before."""
 
-from __future__ import annotations
-
 import random
 from pathlib import Path
 

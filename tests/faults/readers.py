@@ -1,7 +1,5 @@
 """Damaged logs of recorded flights: the mutations of tests/logs/worlds/mutations.py."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from types import ModuleType

@@ -1,7 +1,5 @@
 """AddressSanitizer and UndefinedBehaviorSanitizer over random calls of the C++ operators and over their tests."""
 
-from __future__ import annotations
-
 import ast
 import importlib
 import re

@@ -1,7 +1,5 @@
 """Storage that refuses: full disks, limits of the file size and folders that cannot be written; then the sweep is repeated."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import random

@@ -1,7 +1,5 @@
 """The sweep that is disturbed, its undisturbed numbers, and the judgement of its end."""
 
-from __future__ import annotations
-
 import re
 import tempfile
 from collections.abc import Iterator

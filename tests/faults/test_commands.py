@@ -1,7 +1,5 @@
 """Whole commands in a stranger's folder open, import and start nothing undeclared, and a door that is opened is seen."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The harness of faults in a short form, its power against planted faults, and the page of its counts."""
 
-from __future__ import annotations
-
 import errno
 import importlib
 import json

@@ -1,7 +1,5 @@
 """Runs that were false before their health was marked, and errors that were unclear."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from filter_cases import method_of

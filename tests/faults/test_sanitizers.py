@@ -1,7 +1,5 @@
 """The sanitizers in a short form, and what the harness makes of their reports."""
 
-from __future__ import annotations
-
 from subprocess import CompletedProcess
 
 import pytest

@@ -1,7 +1,5 @@
 """Damaged and swapped files are found: none is read with other numbers than were written."""
 
-from __future__ import annotations
-
 import json
 import logging
 import random

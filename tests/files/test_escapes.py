@@ -1,7 +1,5 @@
 """Text of other people has no meaning in any format that a report writes."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

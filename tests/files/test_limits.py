@@ -1,7 +1,5 @@
 """Limits of files that are read: a file that would fill the memory is refused by what it states, before it is read."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import io

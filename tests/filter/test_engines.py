@@ -1,7 +1,5 @@
 """Every filter of conf/ computes the same in every engine and in any batch, in double precision."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from dataclasses import replace

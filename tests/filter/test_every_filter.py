@@ -1,7 +1,5 @@
 """Every filter of conf/: on every world of conf/, with empty slots, with what is not seen, and as exact as it says."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

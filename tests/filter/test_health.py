@@ -1,7 +1,5 @@
 """Health of runs: ok, or what a filter sees of its own failures, without the truth."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """The door of `run_filter`: what does not fit is refused at the start, with key, value and remedy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -173,7 +171,7 @@ WRONG: dict[str, tuple[Any, Record, PhiloxStream, str]] = {
         MODEL,
         Record(Y, Inputs(3.0)),  # type: ignore[arg-type]
         DRAWS,
-        r"record.u.force must be a tensor or a tuple of tensors, got float",
+        r"record.u.force must be a tensor or a NamedTuple of tensors, got float",
     ),
     "particles that are mixed": (
         Mixing(*parameters(MODEL)),

@@ -1,7 +1,5 @@
 """The time loop: what it refuses, what it hands to watchers, and that watching changes nothing."""
 
-from __future__ import annotations
-
 import ast
 import math
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """k-hat of weights: numbers of ArviZ, a loop in NumPy, and what is no tail."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Settings that nothing can work with are refused where a filter is made: key, requirement, value and remedy."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

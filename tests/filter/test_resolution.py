@@ -1,7 +1,5 @@
 """Resolution of the number type: single precision is refused or marked where it does not suffice."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

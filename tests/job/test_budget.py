@@ -1,7 +1,5 @@
 """Equal budgets: every particle filter has as many particles as cost what SIR's do, and a report says what jobs measured."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

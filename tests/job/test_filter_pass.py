@@ -1,7 +1,5 @@
 """Steps of a job: their batches, and their times after what a process loads once."""
 
-from __future__ import annotations
-
 import json
 import statistics
 import subprocess

@@ -1,7 +1,5 @@
 """One job: a file that numpy alone reads, computed once, the same numbers however it is cut, and a note where it failed."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

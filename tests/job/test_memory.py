@@ -1,7 +1,5 @@
 """Memory: what a job takes is known before it starts, does not grow with R x N x T, and runs in parts give the same numbers."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The posterior bound: Kalman's covariance on linear models, the published recursion on others, and no filter below."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

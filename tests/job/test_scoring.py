@@ -1,7 +1,5 @@
 """Scores of laws against the truth: closed forms, and calibration of an exact filter."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator

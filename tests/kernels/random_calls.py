@@ -4,8 +4,6 @@ With an argument `sanitize` the operators are built with AddressSanitizer and Un
 runtimes must be preloaded, see sanitized.py.
 """
 
-from __future__ import annotations
-
 import random
 import sys
 from typing import Any

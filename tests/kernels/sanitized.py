@@ -3,8 +3,6 @@
 Their runtimes must be preloaded: run the process with `make_environment()`.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Fusible functions: fused they compute what they compute eagerly."""
 
-from __future__ import annotations
-
 import shutil
 from itertools import product
 from pathlib import Path

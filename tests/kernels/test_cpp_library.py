@@ -1,7 +1,5 @@
 """The C++ library: what it takes of torch, and its variants."""
 
-from __future__ import annotations
-
 import os
 import platform
 import shutil

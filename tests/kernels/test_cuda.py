@@ -1,7 +1,5 @@
 """The loops of particles.cu against what they stand for: on a CUDA device, and, compiled as C++, anywhere."""
 
-from __future__ import annotations
-
 import ctypes
 import random
 import re

@@ -1,7 +1,5 @@
 """On a CUDA device, where there is one: every filter, engine, job and training gives what it gives on the CPU."""
 
-from __future__ import annotations
-
 import csv
 import math
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """The door of the C++ operators: wrong calls raise, in Python and in C++ for the same reason, and nothing crashes."""
 
-from __future__ import annotations
-
 import random
 import shutil
 from collections.abc import Callable

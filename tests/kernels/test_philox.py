@@ -1,7 +1,5 @@
 """The generator: published words, numbers true to their type, and the same bits in torch, C++ and a compiled graph."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Gradients of a filter's evidence through each kind of resampling, against Kalman's by automatic differentiation."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple

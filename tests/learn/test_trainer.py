@@ -1,7 +1,5 @@
 """Training: what each objective is worth where the answer is known, the loop's promises, and the command line."""
 
-from __future__ import annotations
-
 import csv
 import math
 import re

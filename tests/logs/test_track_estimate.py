@@ -1,7 +1,5 @@
 """The answer for a log without a reference: what is held out, intervals against the truth, files, and the command."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from xml.etree import ElementTree as Tree
 

@@ -1,7 +1,5 @@
 """The INS/GNSS model: matrices against exact ones, errors against simulated truth, filters against chi-square."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

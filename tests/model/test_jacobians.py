@@ -1,7 +1,5 @@
 """Jacobians that models state: finite differences, the extended Kalman filter, and classes that override a map."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

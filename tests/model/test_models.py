@@ -1,7 +1,5 @@
 """Models: shapes, the laws they claim to follow, and that what was not seen weighs nothing."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Airborne passive location: what is measured against differences along the motion, its frames, its laws."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Tightly coupled SINS/GNSS: transitions against the mechanisation, filters against a Kalman filter written out, flights."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

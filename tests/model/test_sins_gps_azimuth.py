@@ -1,7 +1,5 @@
 """SINS/GPS with a large azimuth error: equations against the mechanisation and finite differences, filters against chi-square."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """SINS/SAR: the error model against the mechanisation and the linear equations, the instruments, the filter's consistency."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The model with barometer and magnetometer: the model of the motion inside, plain geometry of the field, walking biases."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

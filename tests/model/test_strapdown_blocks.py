@@ -1,7 +1,5 @@
 """Constraints, odometer, lever arm and delay: plain geometry, closed-form derivatives, and worlds of the model's own law."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The tightly coupled total-state model: plain geometry, its derivatives, its clock, and the loosely coupled model inside."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The total-state model: preintegration against fine integration of the motion, its derivatives, its noise, its frames."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

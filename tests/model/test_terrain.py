@@ -1,7 +1,5 @@
 """Terrain-referenced navigation: the surface and its statistics, the exact point-mass filter, its grid, bad input."""
 
-from __future__ import annotations
-
 import math
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The car in a city: arcs, clocks, ranges without cancellation, and the law of a range that may be reflected."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Satellites: mechanics, foreign libraries, and positions that an independent program computed from the same ephemerides."""
 
-from __future__ import annotations
-
 import math
 from datetime import datetime
 from pathlib import Path

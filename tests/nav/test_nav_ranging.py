@@ -1,7 +1,5 @@
 """Ranges: expansions against plain geometry by pymap3d, clocks against their covariance, satellites that come and go."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

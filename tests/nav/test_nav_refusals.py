@@ -1,7 +1,5 @@
 """What cannot be flown, sensed or integrated is refused by its key, with its value and a remedy."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

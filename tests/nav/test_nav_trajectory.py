@@ -1,7 +1,5 @@
 """Trajectories: kinematics that differentiate into each other, sensors that feel what they should."""
 
-from __future__ import annotations
-
 import hydra
 import numpy as np
 import pyproj

@@ -1,7 +1,5 @@
 """Noise regimes: what they promise about the errors of a receiver, and that a change of regime changes nothing else."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A guide of a Pyro program as a proposal, against the exact answers of a linear model."""
 
-from __future__ import annotations
-
 import math
 import re
 from typing import Any

@@ -1,7 +1,5 @@
 """Noise numbers of a log: the batched filter against that of the product, and what its posterior must do."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any

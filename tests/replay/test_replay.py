@@ -1,7 +1,5 @@
 """One run computed again equals the run of the batch, a changed number is found, and mistakes have advice."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

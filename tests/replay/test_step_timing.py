@@ -1,7 +1,5 @@
 """Filters of a stored study are timed in turn: a slower filter is found slower, and the report states it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Texts of another person, and the faults that they cause in a file of a report whose writer does not escape them."""
 
-from __future__ import annotations
-
 import csv
 import re
 from html.parser import HTMLParser

@@ -1,7 +1,5 @@
 """A study of another person, all of whose texts are hostile, and its report."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 from unittest import mock

@@ -1,7 +1,5 @@
 """Packs of report pages with invented numbers, of any size and with any gap."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import itertools

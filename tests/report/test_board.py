@@ -1,7 +1,5 @@
 """The board: ratios, verdicts and sentences of invented studies, held against scipy and against the laws of a table."""
 
-from __future__ import annotations
-
 import math
 from itertools import combinations
 from pathlib import Path

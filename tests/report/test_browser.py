@@ -1,7 +1,5 @@
 """The ledger in a real browser, without a window: no errors, the filters filter, nothing is fetched."""
 
-from __future__ import annotations
-
 import html
 import json
 import re

@@ -1,7 +1,5 @@
 """The script of the page runs no text of another person, whatever is clicked."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Names, units and messages of another person have no meaning in any file of a report, a datasheet or the claims."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock

@@ -1,7 +1,5 @@
 """Names and looks of the configuration files: distinct, readable, and the same in every figure."""
 
-from __future__ import annotations
-
 from itertools import combinations
 from pathlib import Path
 from typing import Any

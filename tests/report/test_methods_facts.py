@@ -1,7 +1,5 @@
 """The methods paragraph is written from facts alone: of results, of a stored page, and for a paper."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

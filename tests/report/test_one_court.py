@@ -4,8 +4,6 @@ The crawler reads the texts that a reader gets: the data in the html page, repor
 `compare` print. An oracle without code of pfbench computes the tables again from the stored runs.
 """
 
-from __future__ import annotations
-
 import base64
 import gzip
 import io

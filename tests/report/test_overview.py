@@ -1,7 +1,5 @@
 """The first page of a study of methods in worlds: held against scipy, and against what it must not depend on."""
 
-from __future__ import annotations
-
 import io
 import math
 import re
@@ -779,7 +777,9 @@ def test_the_first_sentence_says_what_holds_at_equal_time(tabs: dict[TabKey, Ove
     assert all(len(text.split()) <= 55 for text in said)
     alike = [word_headline(first, None, page) for page in stars[0]]
     assert f"worlds. All tuned alike, so is: {name} (azimuth). Against" in alike[0]
-    assert "worlds. All tuned alike, none is. Against" in alike[1]
+    assert re.search(
+        r"worlds\. None is in the \d+ cells where all are tuned alike\. Against", alike[1]
+    )
     star = tell_story(stars[0][0]._replace(cells=[
         c._replace(wins=True, verdict=c.verdict._replace(word="better")) for c in first.cells
     ]), "mcmc_rpf", "")["wins"]  # fmt: skip

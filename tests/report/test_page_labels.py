@@ -1,7 +1,5 @@
 """Every label of every published page is whole: on a screen, a tablet and a telephone."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from pathlib import Path

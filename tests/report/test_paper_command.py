@@ -1,7 +1,5 @@
 """The command `pfbench paper`: files of a study at the width of a journal, and its errors."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Figures have exact widths and TrueType fonts, tables fit by computed and by TeX's widths, the paper compiles."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

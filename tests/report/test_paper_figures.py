@@ -1,7 +1,5 @@
 """Figures of the papers: the catalogue names filters that its studies run, and the drawings match the results."""
 
-from __future__ import annotations
-
 import io
 import re
 import shutil

@@ -1,7 +1,5 @@
 """An own filter beside a published study: the verdicts of one study of all filters, and no comparison of other worlds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Recorded data by three units: each p-value holds its level for its own question, and no other; pages say which."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

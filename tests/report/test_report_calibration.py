@@ -1,7 +1,5 @@
 """Scores of the whole law in a report: in the right units, cut in time with the rest, honest about narrow and wide intervals."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

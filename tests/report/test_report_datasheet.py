@@ -1,7 +1,5 @@
 """The page of a datasheet: figures where there are data, a sentence where there are none, numbers that are right."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

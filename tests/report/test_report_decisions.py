@@ -1,7 +1,5 @@
 """Verdicts of a report from results: all pairs, worlds, thresholds, and what happens without enough data."""
 
-from __future__ import annotations
-
 import math
 import os
 from itertools import product

@@ -1,7 +1,5 @@
 """Figures as they are drawn: letters can be read, names are whole and do not cover each other, colours are kept."""
 
-from __future__ import annotations
-
 import io
 from itertools import pairwise
 from pathlib import Path

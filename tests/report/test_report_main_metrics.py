@@ -1,7 +1,5 @@
 """The metric that decides a study, its choice, and the bands of consistency of a report."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The table of metrics, the status of runs, and signed-rank tests of many pairs at once."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import synthetic_results as synthetic

@@ -1,7 +1,5 @@
 """Published studies: their figure, and their page without results."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json

@@ -1,7 +1,5 @@
 """The page of a study without a browser: its data, its escapes, its size and its text."""
 
-from __future__ import annotations
-
 import re
 from html.parser import HTMLParser
 from typing import Any

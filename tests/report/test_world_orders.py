@@ -1,7 +1,5 @@
 """A study of two or three worlds is answered world by world: sentences, tables and panels in the order of each."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import subprocess

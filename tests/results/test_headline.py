@@ -1,7 +1,5 @@
 """Line of a job: error with unit, and the status of its runs."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Results of another person, with a valid digest: each is refused with its file, or is read without harm."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """Jobs of consecutive runs are one result; jobs with gaps, overlaps or other settings are not."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

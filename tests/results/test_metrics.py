@@ -1,7 +1,5 @@
 """Closed forms of the measures, and what becomes of lost runs and missing truth."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Times per step: the file survives a round trip and shows damage, and intervals of ratios cover the truth."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

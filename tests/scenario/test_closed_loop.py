@@ -1,7 +1,5 @@
 """Closed loop: a corrected INS is the same flight seen from nearer the truth, and a filter that corrects it learns the same."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

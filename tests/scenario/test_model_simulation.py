@@ -1,7 +1,5 @@
 """Episodes simulated from a model have its moments (exact recursion) and its convention of the first step."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

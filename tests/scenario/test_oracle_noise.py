@@ -1,7 +1,5 @@
 """A filter that is told the noise regime knows the law of every step: closed forms, oracles, the regimes' own errors."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

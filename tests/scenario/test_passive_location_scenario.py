@@ -1,7 +1,5 @@
 """Scenes of airborne passive location: whose world it is, what is measured, how filters start, and what can be reached."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """Simulated flights: a run's world is its own, whoever else flies, whatever the cache holds, whatever filters come after."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

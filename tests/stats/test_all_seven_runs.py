@@ -3,8 +3,6 @@
 One row for each filter and run in single precision, with the divergence threshold that its scenario had.
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 from pathlib import Path
 

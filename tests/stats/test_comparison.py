@@ -1,7 +1,5 @@
 """Effects of pairs and verdicts of families, held against scipy and against their error rates."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

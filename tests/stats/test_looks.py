@@ -1,7 +1,5 @@
 """A study that adds runs: levels of its looks, states of pairs, lines and record."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rank tests against scipy, statsmodels and numbers that R prints, and a filter against itself."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Losses of filters in the conditions of a study: lost runs, weights, units, and error rates of verdicts."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

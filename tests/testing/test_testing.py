@@ -1,7 +1,5 @@
 """pfbench.testing: what is right passes, planted faults fail with numbers, and a silent stage is never called exact."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import math

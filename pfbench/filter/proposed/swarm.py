@@ -160,10 +160,6 @@ def _quantiles(p: float, maximum: int) -> list[float]:
     return [0.0, *(float(scipy.special.chdtri(k, 1.0 - p)) for k in range(1, maximum + 1))]
 
 
-# --------------------------------------------------------------------------------------------------
-# Particle swarm proposal: move particles towards the measurement, then weight.
-
-
 @dataclass(frozen=True)
 class SwarmProposal(Proposal):
     """Bootstrap prediction followed by particle swarm optimisation [Tian et al.].

@@ -38,6 +38,7 @@ KF_GINS_SD = 22  # columns of the file of standard deviations: time, 9 of naviga
 KF_GINS_IMU, KF_GINS_FIXES = 7, (7, 10, 13)  # columns; fixes with deviations, and with velocities
 _EUROC_WITH_BIASES, _KITTI_PACKET = 17, 30  # columns
 _COMMENTS, _BOM = ("#", "%"), "\ufeff"
+_HEAD_LINES = 5000  # with the first rows among them
 _HEAD_BYTES = 2**20  # with all comments before the first row
 _UNIT = re.compile(r"[\[(][^\[(\])]*[\])]")  # as in time [s]
 _QUATERNION = re.compile(r"(?:.*\W)?(?:q|quat|quaternion|orientation|rot|rotation)\w*?_?([wxyz])")
@@ -265,7 +266,7 @@ def read_head(file: Path, rows: int = 20) -> tuple[list[str], list[list[str]]]:
     fields: list[list[str]] = []
     with file.open("rb") as stream:  # the last line can be cut
         lines = split_lines(stream.read(_HEAD_BYTES).decode("utf-8-sig", "replace"))
-    for line in map(str.strip, lines):
+    for line in map(str.strip, lines[:_HEAD_LINES]):
         if line.startswith(_COMMENTS) or (not fields and _has_no_number(line)):
             heads.append(split_line(_UNIT.sub("", line.lstrip("#% "))))
         elif line:

@@ -151,10 +151,6 @@ def _without_drift(error: Array) -> Array:
     return steady
 
 
-# --------------------------------------------------------------------------------------------------
-# Decisions: one family by unit and condition.
-
-
 def decide_records(
     records: Sequence[RecordedCondition], court: Court, baselines: Sequence[str]
 ) -> list[dict[str, Any]]:
@@ -250,10 +246,6 @@ def _to_entry(verdict: Verdict) -> dict[str, Any]:
     """Return the plain values of a verdict."""
     names = ("word", "ratio", "low", "high", "p", "n", "reason")
     return {**round_values({name: getattr(verdict, name) for name in names}, 8), "reason": verdict.reason}  # fmt: skip
-
-
-# --------------------------------------------------------------------------------------------------
-# Sentences.
 
 
 def describe_reach(

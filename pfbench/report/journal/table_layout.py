@@ -143,9 +143,6 @@ def _format_row(row: Sequence[LatexCell]) -> str:
     return " & ".join(cells) + r" \\"
 
 
-# --------------------------------------------------------------------------------------------------
-# Widths of text in a table, from the metrics of a font with the widths of Times.
-
 _FONTS = {False: "STIXGeneral.ttf", True: "STIXGeneralBol.ttf"}
 _OTHER_WIDTHS = {"%": 0.833}  # in which Times differs
 _UNITS = 1000  # size at which the glyphs are measured, in points

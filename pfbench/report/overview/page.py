@@ -329,7 +329,7 @@ def word_headline(
         first += " At equal time none is."
     words, single = Counter(map(name_word, overview.of_methods)), sum(c.beats_kalman for c in overview.of_methods)  # fmt: skip
     return (
-        f"{first}{f' All tuned alike, so is: {alike}.' if alike else ' All tuned alike, none is.' if tuned else ''} "
+        f"{first}{f' All tuned alike, so is: {alike}.' if alike else f' None is in the {len(tuned.of_methods)} cells where all are tuned alike.' if tuned else ''} "
         f"Against each world's best Kalman filter: better in {words['better']} of {words.total()} cells"
         f"{f' (in {single} than all single ones)' if single else ''}, "
         f"equal in {words['equal']}, not decided in {words['not decided']}, worse in {words['worse']}."

@@ -204,10 +204,6 @@ def select_valid(result: store.JobResult, values: np.ndarray) -> np.ndarray:
     return values[~result.data["lost"]].astype(np.float64)
 
 
-# --------------------------------------------------------------------------------------------------
-# Curves, points, scales and legends of all plots.
-
-
 class Levels(NamedTuple):
     """Values of one panel: medians by name of the filter, what else is drawn, and the printed numbers."""
 

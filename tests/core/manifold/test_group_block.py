@@ -1,7 +1,5 @@
 """Lie groups as chart blocks, against matrix exponentials of scipy, its rotations, and numbers of 40 digits."""
 
-from __future__ import annotations
-
 import math
 
 import mpmath

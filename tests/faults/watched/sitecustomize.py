@@ -3,8 +3,6 @@
 The harness puts this folder on PYTHONPATH, so that processes that a command starts are watched too.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """Observation distributions in Gaussian filters: grids of one dimension, limits, missing values, angles, bad input."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Forms of the papers' methods: to the letter, as printed with named completions, repaired by the law of admission."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Gaussian filters: Kalman's answer on linear models, exact moments of the rules, and no failure that stays silent or spreads."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any, NamedTuple

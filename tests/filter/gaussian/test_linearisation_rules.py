@@ -1,7 +1,5 @@
 """Cubature rules as sphere times radius: exact moments to the stated degree, closed forms beyond it, and signs of weights."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """Cubature filters on the flight of their paper: what a rule changes there, and the accuracy that a prototype measured."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Cubature filters and what adapts them: Kalman's answer, an independent COFM in NumPy, closed forms, exact off switches."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Sigma points far from the mean in angles are refused with a spread that would do; others are not."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

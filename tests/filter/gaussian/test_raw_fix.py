@@ -1,7 +1,5 @@
 """Raw fix and dead reckoning, the two ends of any filter: the measurement alone, and the prediction alone."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

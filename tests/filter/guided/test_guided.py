@@ -1,7 +1,5 @@
 """Guided proposals: exact ratios, the Kalman filter where it applies, off switches, and the pitfalls that are known."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

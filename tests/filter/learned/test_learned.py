@@ -1,7 +1,5 @@
 """Learned proposals: any network leaves the target as it is; a wrong ratio is seen; checkpoints are refused in words."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import partial

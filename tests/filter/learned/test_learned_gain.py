@@ -1,7 +1,5 @@
 """KalmanNet: with the Kalman gain it is the Kalman filter, training approaches that gain, and it states no distribution."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The covariance at the updated mean, against samples of the exact posterior about it, and its effect in flight."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Filters in invariant charts: the error does not hold the state, turns carry over, errors are as large as stated."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -6,8 +6,6 @@ errors over 100 runs and all times [Brossard, Barrau and Bonnabel 2020, document
 Benchmark"]. The plane is a subspace of SE(3), and the charts of SE(3) restricted to it are those of SE(2).
 """
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Bank of filters: the mixture that it starts from, NumPy's bank on a linear model, one filter alone, bad input."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The filter of split normal distributions: unbiased where it is linear, a grid filter where it is not, and any heading."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The Rao-Blackwellised particle filter: Kalman where it may be, unbiased where it says so, better than sampling everything."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple

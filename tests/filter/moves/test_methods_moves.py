@@ -1,7 +1,5 @@
 """Whole filters with moves beside the Kalman filter: spread of the cloud, error and what is accepted, kernel by kernel."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cache

@@ -1,7 +1,5 @@
 """Moves leave the law of the whole path as it is; broken ones are seen. What particles carry of their past agrees with it."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Paths under fixed noise by a tape are those of the model's own operations."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """A filter whose step is one compiled graph computes what it computes step by step."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The Gaussian particle filter: the Kalman filter in the limit, faster on even points, and wrong where the law is not normal."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

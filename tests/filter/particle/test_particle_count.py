@@ -1,7 +1,5 @@
 """Adaptive particle numbers, and the entropy regularisation of resampling probabilities."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

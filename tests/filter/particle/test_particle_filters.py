@@ -1,7 +1,5 @@
 """Particle filters: unbiased where they say they are exact, at the rate 1/sqrt N, and every run on its own."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from itertools import product

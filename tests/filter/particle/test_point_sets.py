@@ -1,7 +1,5 @@
 """Points: uniform one by one, more even than chance together, fresh at each draw, and addressed like all other draws."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Resamplers: every scheme gives particle i on average n a_i copies, never indexes out of range, and loses nothing on the way."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Sequential quasi-Monte-Carlo: a Hilbert curve that is one, ancestors with the right frequencies, unbiased and less noisy."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

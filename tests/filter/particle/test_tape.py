@@ -1,7 +1,5 @@
 """A filter whose model is a tape computes what the operators compute, and what a filter in numpy computes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import product
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Polymerisation: cells are counted once, mass and moments are kept where that is claimed, and lost where it is not."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

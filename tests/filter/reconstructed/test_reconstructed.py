@@ -1,7 +1,5 @@
 """State reconstruction: the control law's algebra, ratios that integrate to 1, and which versions find the posterior."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

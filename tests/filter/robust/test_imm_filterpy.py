@@ -1,7 +1,5 @@
 """The interacting filter against the IMM of FilterPy, an independent package, on the same model and data."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Several hypotheses: NumPy's IMM, the exact mixture over all sequences, evidence, limits, angles, bad input."""
 
-from __future__ import annotations
-
 import math
 from itertools import product
 from typing import Any

@@ -1,7 +1,5 @@
 """Learned measurement noise: recursions in NumPy, the true variance in the long run, limits, missing values, bad input."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

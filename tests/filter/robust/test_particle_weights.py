@@ -1,7 +1,5 @@
 """Robust weights of particles against the same recursion on a grid, against NumPy, and at their limits."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """Robust updates: limits, weights and fixed points against NumPy, rejection as a missing value, counts, evidence."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

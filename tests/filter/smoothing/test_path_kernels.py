@@ -1,7 +1,5 @@
 """Kernels of paths: started at exact draws of a linear model's path they leave its moments, and broken ones do not."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

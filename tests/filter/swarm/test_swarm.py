@@ -1,7 +1,5 @@
 """Particle swarms: chaos is chaotic, limits hold, the mixture converges to the Kalman filter, the printed weights to the fix."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable

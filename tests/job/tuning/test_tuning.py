@@ -1,7 +1,5 @@
 """Tuning: equal grids, a choice that anyone can repeat, and knobs that reach the filter."""
 
-from __future__ import annotations
-
 import math
 import re
 import shlex

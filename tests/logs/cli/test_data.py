@@ -1,7 +1,5 @@
 """`pfbench data`: the list is that of the page, and a folder is checked file by file."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Inspection of a folder: clean logs stay quiet, suggested settings run as they are, and pages are the same for the same log."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

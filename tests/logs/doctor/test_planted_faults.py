@@ -1,7 +1,5 @@
 """Faults planted in recorded logs: each named and none misnamed, each remedy removes its finding and brings no new one."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

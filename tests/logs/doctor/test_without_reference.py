@@ -1,7 +1,5 @@
 """Inspection of a log without a reference: which checks work, and the gyro against the course."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

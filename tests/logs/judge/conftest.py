@@ -1,7 +1,5 @@
 """A folder with a reference and a program for the tests of judge."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import judge_cases as cases

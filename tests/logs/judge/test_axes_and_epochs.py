@@ -1,7 +1,5 @@
 """Wrong axes are refused, true ones are not; holes have the weight of their time; results find their place."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

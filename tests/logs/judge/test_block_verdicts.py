@@ -1,7 +1,5 @@
 """Verdicts by blocks of time: the variance of dependent blocks, and the rates of words for equal programs."""
 
-from __future__ import annotations
-
 import math
 import re
 

@@ -1,7 +1,5 @@
 """A fault is planted, the remedies of the messages are followed, and the numbers are those of the unharmed file."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Real output of KF-GINS and pyins: the numbers of the report against a computation that shares no code."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

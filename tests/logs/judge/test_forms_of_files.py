@@ -1,7 +1,5 @@
 """Files in the forms that programs and receivers write: read as the same trajectory, or refused with a remedy."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reports of judge: numbers of known errors, common epochs, several sequences, and the files."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Each kind of bad input gives one sentence with file, column, value and remedy; nothing is written."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """One track written in each format is read as the same trajectory."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import judge_cases as cases

@@ -1,7 +1,5 @@
 """Other separators, useless options, wrong axes and clocks: the message names the fault and its remedy."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import judge_cases as cases

@@ -1,7 +1,5 @@
 """Import of own logs: files of other programs, written by the test from one drive, become the same tables."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

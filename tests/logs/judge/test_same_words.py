@@ -1,7 +1,5 @@
 """The same runs give the same verdict in a study and in a judgement."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import judge_cases as cases

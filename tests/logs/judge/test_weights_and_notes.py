@@ -1,7 +1,5 @@
 """Epochs count by their time; what is missing, lost or doubtful stands above the decisions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import judge_cases as cases

@@ -1,7 +1,5 @@
 """Ephemerides: blank and impossible parameters, and records that their neighbours contradict."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

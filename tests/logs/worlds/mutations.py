@@ -5,8 +5,6 @@ Each damaged file ends in an error, in numbers within a tolerance of the undamag
 Run: python tests/logs/worlds/mutations.py [count] [readers]
 """
 
-from __future__ import annotations
-
 import io
 import sys
 import tempfile

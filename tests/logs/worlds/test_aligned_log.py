@@ -1,7 +1,5 @@
 """A log without a reference: its start from level and course, its withheld fixes, and what is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Offsets of clocks: found to hundredths of a second where the motion shows them, and never where there is none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest

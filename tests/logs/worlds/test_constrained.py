@@ -1,7 +1,5 @@
 """Recorded drives with constraints: standing found by the IMU alone, odometers, refusals in words, and what a car gains."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Tables of a drive: signs of wheels, positions given twice, and the scale of slow axes."""
 
-from __future__ import annotations
-
 import math
 from contextlib import nullcontext
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Codes of fixes: what each program calls usable, what is refused, and that the console says it once."""
 
-from __future__ import annotations
-
 import logging
 import os
 import re

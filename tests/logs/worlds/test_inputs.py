@@ -1,7 +1,5 @@
 """A job's key and its result name every byte that the job reads: a changed file is another job."""
 
-from __future__ import annotations
-
 import logging
 import os
 from pathlib import Path

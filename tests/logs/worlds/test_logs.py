@@ -1,7 +1,5 @@
 """Reading logs: frames, layouts, and a plain word about everything that can be wrong with one."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Limits of logs: impossible values are errors, outliers stay data, and damaged files never give wrong numbers silently."""
 
-from __future__ import annotations
-
 import math
 import re
 from contextlib import nullcontext

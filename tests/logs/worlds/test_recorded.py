@@ -1,7 +1,5 @@
 """Recorded worlds: steps that fall on fixes, honest starts, and the figures of the data sheets."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

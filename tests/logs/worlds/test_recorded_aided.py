@@ -1,7 +1,5 @@
 """Readings of a barometer and a magnetometer beside recorded fixes: exact on a synthetic log, seen where fixes are withheld."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Real motion for simulated sensors: axes and units from the file to the sensors, and the recorded drive itself."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

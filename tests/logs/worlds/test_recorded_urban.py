@@ -1,7 +1,5 @@
 """The recorded city: ranges from tables to steps, honest starts, laws found again, and the figures of the data sheet."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

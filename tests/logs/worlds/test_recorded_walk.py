@@ -1,7 +1,5 @@
 """The walk with raw measurements: exact on a synthetic sky, honest starts, regimes by satellite, the data sheet's figures."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass, replace

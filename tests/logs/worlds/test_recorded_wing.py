@@ -1,7 +1,5 @@
 """A flight scored on withheld fixes: what is withheld, what is scored, and the figures of the data sheet."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

@@ -5,8 +5,6 @@ no correlation from one instant to the next, and none between components of an i
 of its own; the bands hold for all numbers together.
 """
 
-from __future__ import annotations
-
 import zlib
 from typing import Any
 

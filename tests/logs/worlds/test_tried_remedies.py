@@ -1,7 +1,5 @@
 """A fault is planted, the reader says what to do, the test does it, and the log reads."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Raw ranges of one's own: exact on a simulated sky, equal to a recorded set, refused in words, run as a new user does."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path
