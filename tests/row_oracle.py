@@ -247,10 +247,11 @@ def compare_rows(folder: Path, metric: str = "") -> tuple[int, list[str]]:
         if key[0] == "log_score" or (metric and key[0] != metric):
             continue
         if key[:3] not in scopes:
-            present = set(view[view["verdict"] != "missing"]["filter"])
-            runs = select_complete(stored.runs, key[1], key[2], present)
+            runs = select_complete(stored.runs, key[1], key[2], set(view[view["verdict"] != "missing"]["filter"]))  # fmt: skip
+            # a regime of one world has the pairs that are fixed in it
+            only = runs["scenario"].iloc[0] if runs["scenario"].nunique() == 1 else key[1]
             scopes[key[:3]] = decide_scope(
-                runs, fixed.get(key[1], fixed.get("all", set())), key[0], levels
+                runs, fixed.get(only, fixed.get("all", set())), key[0], levels
             )
         for row in view.to_dict("records"):
             expected = scopes[key[:3]].get((row["filter"], key[3]))

@@ -64,21 +64,19 @@ def print_dry_run(plan: StudyPlan, *, is_sweep: bool) -> None:
             continue
         print(f"[{number + 1}/{len(configs)}] {_format(estimates[-1])}   {name}")
     fresh = [estimate for estimate in estimates if estimate.state == "new"]
-    seconds = sum(estimate.seconds for estimate in fresh)
-    peak = max((estimate.bytes for estimate in fresh), default=0.0)
     print(
         f"dry run: {len(configs)} jobs, {len(fresh)} new, {len(estimates) - len(fresh)} skipped, "
-        f"{len(configs) - len(estimates)} refused; about {format_duration(seconds)} in one process, {peak / 2**30:.2g} GiB "
-        "at the peak. Nothing was run."
+        f"{len(configs) - len(estimates)} refused; about {format_duration(sum(e.seconds for e in fresh))} in one process, "
+        f"{max((e.bytes for e in fresh), default=0.0) / 2**30:.2g} GiB at the peak. Nothing was run."
     )
 
 
 def _format(estimate: JobEstimate) -> str:
     """Format an estimate."""
-    if estimate.state != "new":
-        return f"{estimate.state:9}"
     return (
         f"new       about {format_duration(estimate.seconds):>6}   {estimate.bytes / 2**30:.2g} GiB"
+        if estimate.state == "new"
+        else f"{estimate.state:9}"
     )
 
 
@@ -256,17 +254,24 @@ def _check_truth(plan: JobPlan, truth: Collection[str]) -> None:
         )
 
 
+def _check_numbers(scenario: str, episode: Episode) -> None:
+    """Check that the times of a scenario of the user increase, and that no measurement is infinite."""
+    assert (episode.time.diff() > 0).all(), f"{scenario}.draw must return times that increase"
+    assert not episode.record.y.isinf().any(), f"{scenario}.draw must return finite measurements, or NaN for a missing one"  # fmt: skip
+
+
 def _take_steps(
     config: JobConfig, plan: JobPlan, episode: Episode, own_groups: Collection[str]
 ) -> None:
     """Take three steps of a filter of the user, else of a bootstrap filter."""
     if "scenario" in own_groups:
         _check_truth(plan, episode.truth)
-    model = plan.make_filter_model(episode).to("cpu", torch.float64)
-    model.assemble(episode.truth)
+        _check_numbers(type(plan.scenario).__name__, episode)
     method = plan.method if "filter" in own_groups else ParticleFilter(20)
     draws = PhiloxStream(plan.values["seed"], plan.runs[:2])
     try:
+        model = plan.make_filter_model(episode).to("cpu", torch.float64)
+        model.assemble(episode.truth)
         with torch.no_grad():
             trial = run_filter(method, model, first_steps(model, episode.record, 3), draws)
         if not trial.mean.isfinite().any():
