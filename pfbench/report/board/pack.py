@@ -395,9 +395,8 @@ def round_ratio(log_ratio: float) -> float | None:
     """Return a ratio with eight digits, for pages that print three; None without a number."""
     if not math.isfinite(log_ratio):
         return None
-    distance = float(
-        f"{math.expm1(min(log_ratio, 700.0)):.8g}"
-    )  # of a ratio near 1, it has the digits
+    # the distance from 1 has the digits of a ratio near 1
+    distance = float(f"{math.expm1(min(log_ratio, 700.0)):.8g}")
     return round(1 + distance, 12) if abs(distance) < 1 else float(f"{1 + distance:.8g}")
 
 

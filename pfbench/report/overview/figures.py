@@ -378,5 +378,5 @@ def _draw_key(figure: Figure, size: Format, foot: int) -> None:
 def _short(name: str, size: Format) -> str:
     """Break a long name of a world into two lines where the figure is narrow."""
     limit = 34 if size.width > 600 else 17
-    space = name.rfind(" ", 0, limit) if len(name) > limit else 0
+    space = name.rfind(" ", 0, limit + 1) if len(name) > limit else 0
     return f"{name[:space]}\n{name[space + 1 :]}" if space > 0 else name

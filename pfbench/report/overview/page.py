@@ -329,7 +329,7 @@ def word_headline(
         first += " At equal time none is."
     words, single = Counter(map(name_word, overview.of_methods)), sum(c.beats_kalman for c in overview.of_methods)  # fmt: skip
     return (
-        f"{first}{f' All tuned alike, so is: {alike}.' if alike else f' None is in the {len(tuned.of_methods)} cells where all are tuned alike.' if tuned else ''} "
+        f"{first}{f' Tuned, so is: {alike}.' if alike else f' Nor is a tuned form, in {len(tuned.of_methods)} cells.' if tuned else ''} "
         f"Against each world's best Kalman filter: better in {words['better']} of {words.total()} cells"
         f"{f' (in {single} than all single ones)' if single else ''}, "
         f"equal in {words['equal']}, not decided in {words['not decided']}, worse in {words['worse']}."
@@ -392,7 +392,7 @@ def describe_power(overview: Overview) -> str:
     ]
     return (
         f"In {len(counted) - len(texts)} of {len(counted)} cells the runs suffice to show a method with {PLANNED_RATIO:g} of the error of the "
-        f"strongest conventional filter, with power {POWER:g} and Holm's correction over all cells."
+        f"strongest conventional filter, with power {POWER:g} by sign and signed-rank test and Holm's correction over all cells."
         + f" They are too few for {'; '.join(texts)}."
         * bool(texts)
     )
