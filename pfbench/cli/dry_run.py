@@ -209,7 +209,8 @@ def _is_of_user(
     while error is not None:
         modules = (str(f.f_globals.get("__name__")) for f, _ in walk_tb(error.__traceback__))
         is_own = any(name.startswith((*packages, *others)) for name in modules)
-        if is_own or isinstance(error, TypeError):
+        # of a model and a scenario that do not fit, one is the user's
+        if is_own or isinstance(error, TypeError) or str(error).startswith("model must fit the scenario"):  # fmt: skip
             return True
         error = error.__cause__
     return False
