@@ -203,10 +203,6 @@ def _make_record(content: Mapping[str, Any]) -> StoredValues:
     return StoredValues(**{**content, **changes})
 
 
-# --------------------------------------------------------------------------------------------------
-# Cells of claims, and dots from the stored values.
-
-
 def name_timing(a: Cell, b: Cell) -> Cell:
     """Name the cell of two filters that are timed in turn."""
     return ("time", *a, "against", *b)

@@ -146,10 +146,6 @@ def _forward(f: Map, value: Tensor, d: int, subtract: Subtract) -> Tensor:
     return torch.zeros_like(primal).mT if tangent is None else tangent.mT
 
 
-# --------------------------------------------------------------------------------------------------
-# Affine maps of particles with sparse matrices.
-
-
 def affine_map(phi: Tensor, x: Tensor, gain: Tensor, w: Tensor) -> Tensor:
     """Compute phi x + gain w.
 

@@ -68,7 +68,6 @@ from pfbench.filter.learned.gain_filter import (
     LearnedGain as LearnedGain,
     LearnedGainFilter as LearnedGainFilter,
 )
-from pfbench.filter.learned.mcmc_kernel import LearnedRandomWalk as LearnedRandomWalk
 from pfbench.filter.learned.networks import (
     DiagonalNormalHead as DiagonalNormalHead,
     LowRankNormalHead as LowRankNormalHead,
@@ -78,7 +77,6 @@ from pfbench.filter.learned.networks import (
 )
 from pfbench.filter.learned.objectives import (
     EvidenceLowerBound as EvidenceLowerBound,
-    ExpectedSquaredJump as ExpectedSquaredJump,
     InferenceCompilation as InferenceCompilation,
     Objective as Objective,
     StateErrorLoss as StateErrorLoss,

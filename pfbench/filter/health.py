@@ -34,10 +34,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-import scipy  # scipy.special is imported at its first use
 import torch
 from torch import Tensor
 
+from pfbench.core.chi_square import chi_square_limit
 from pfbench.core.density import has_finite_moments
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, StepInfo, compute_once, join_runs
@@ -96,7 +96,7 @@ class HealthMonitor:
             if (k + 1) * count >= _CHECKS
         )
         self._limits = torch.tensor(
-            [torch.inf, *scipy.special.chdtri(range(1, record.y.shape[2] + 1), 0.001)],
+            [torch.inf, *(chi_square_limit(k + 1, 0.001) for k in range(record.y.shape[2]))],
             dtype=torch.float64,
             device=record.y.device,
         )
@@ -283,10 +283,6 @@ def _has_spread(model: StateSpaceModel, mean: Tensor, variance: Tensor) -> Tenso
 def _is_far(misfit: Tensor, observed: Tensor) -> Tensor:
     """Return where an estimate is farther from the raw measurement than the limit."""
     return misfit.double() > _MISFIT**2 * observed
-
-
-# --------------------------------------------------------------------------------------------------
-# Distance of estimates from the raw measurements, for the health of runs.
 
 
 @contextmanager

@@ -169,9 +169,6 @@ def _reclaimable(file: Path) -> float:
     return float(values.get("total_inactive_file", values.get("inactive_file", 0)))
 
 
-# --------------------------------------------------------------------------------------------------
-# Memory of a job before it starts, and the number of runs that fit at a time.
-
 _BASE = 256.0 * MIB  # libraries and compiled code
 
 _TRIAL_STEPS = 8

@@ -152,9 +152,6 @@ def _refusal(difference: str, fitting: Mapping[str, str]) -> ValueError:
     return ValueError(f"model must fit the scenario: {difference}. {advice}")
 
 
-# --------------------------------------------------------------------------------------------------
-# Objects of a configuration, and which models fit a scenario.
-#
 # This module imports Hydra and torch only on use.
 
 

@@ -59,9 +59,6 @@ def read_source() -> str:
     return text.replace(line, generator)
 
 
-# --------------------------------------------------------------------------------------------------
-# Kernels of particles.cu: operators of `pfbench.kernels.dispatch` on a CUDA device, compiled by torch's NVRTC.
-
 log = logging.getLogger("pfbench")
 _REAL = {torch.float32: "float", torch.float64: "double"}
 _ROWS = 65535  # blocks along the second axis of a grid

@@ -128,9 +128,6 @@ def inflate_noise(gain: Tensor, inflation: ProcessNoiseInflation, gyro: int) -> 
     return root
 
 
-# --------------------------------------------------------------------------------------------------
-# Loosely coupled INS/GNSS: the linear small-angle error model, 15 or 18 states.
-
 _TAYLOR = 4  # terms of exp(F T), at 1 s the fifth is below 1e-6 in any entry
 
 

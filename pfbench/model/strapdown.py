@@ -209,9 +209,6 @@ class StrapdownTotal(StrapdownModel):
         return torch.cat(blocks, -1)
 
 
-# --------------------------------------------------------------------------------------------------
-# Total-state INS/GNSS of an aircraft with barometer and magnetometer.
-#
 # Motion and sensor biases are as in the loosely coupled model. Pressure measures the height plus a
 # bias that varies with weather, airspeed and temperature. The magnetometer measures the Earth's
 # field in body axes plus the field of the aircraft. The three field components are used, and not a

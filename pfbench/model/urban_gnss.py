@@ -213,9 +213,6 @@ class NormalExponentialMixture(TorchDistribution):
             return self.loc + self.sd * n.normal_() + self.tail * detour.exponential_() * delayed
 
 
-# --------------------------------------------------------------------------------------------------
-# Car in a city, with direct or reflected pseudoranges and odometry.
-
 _CHART = Chart((EuclideanBlock(3), AngleBlock(1), EuclideanBlock(5)))
 
 

@@ -229,9 +229,6 @@ def azimuth_elevation(receiver: Tensor, satellite: Tensor) -> tuple[Tensor, Tens
     return torch.atan2(east, north) % (2 * torch.pi), torch.atan2(up, torch.hypot(east, north))
 
 
-# --------------------------------------------------------------------------------------------------
-# Lines of sight to satellites, and exact range differences without cancellation.
-#
 # Ranges are 2e7 m and their errors are metres, so the difference of two ranges loses seven
 # digits. `SatelliteGeometry` expands exactly about the INS position, which also suits float32.
 

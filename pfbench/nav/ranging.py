@@ -83,10 +83,6 @@ class ReceiverClock:
         return torch.stack([bias, drift], -1)
 
 
-# --------------------------------------------------------------------------------------------------
-# GNSS receiver that aids an INS by pseudoranges and range rates, with its clock.
-
-
 class RangingInputs(NamedTuple):
     """Inputs of a tightly coupled filter: INS intervals, and satellites at their ends.
 

@@ -136,9 +136,6 @@ def make_no_distribution_error(noise: str, reason: str) -> ValueError:
     )
 
 
-# --------------------------------------------------------------------------------------------------
-# Noise regimes without memory: nominal, heavy-tailed and impulsive errors.
-#
 # The nominal part of each regime uses the random numbers of the nominal regime, so filters are compared
 # across regimes on common random numbers.
 

@@ -74,10 +74,6 @@ def window_edges(window: Sequence[float | None]) -> tuple[float, float]:
     return window[0], math.inf if window[1] is None else window[1]
 
 
-# --------------------------------------------------------------------------------------------------
-# Noise regimes that change with time: variance surges and bias steps.
-
-
 @dataclass(frozen=True)
 class VarianceSurge(NoiseRegime):
     """Variances of measurement and process noise multiplied in time windows.

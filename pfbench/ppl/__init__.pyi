@@ -28,7 +28,6 @@ from pfbench.ppl.particle_mcmc import (
     pmmh as pmmh,
 )
 from pfbench.ppl.pyro_program import (
-    SwitchingNoise as SwitchingNoise,
     latent_program as latent_program,
     program as program,
     simulate as simulate,

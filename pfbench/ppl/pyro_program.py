@@ -7,12 +7,11 @@ states.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import pyro
 import torch
-from pyro.distributions import DiscreteHMM, Normal, Unit
+from pyro.distributions import Normal
 from torch import Tensor
 from torch.distributions import Independent
 
@@ -22,7 +21,7 @@ from pfbench.core.record import Record, iterate_steps
 from pfbench.core.simulate import draw_initial_state, draw_measurements, simulate_steps
 from pfbench.model.base import StateSpaceModel, initial_law
 from pfbench.ppl.likelihood import MarginalLikelihood
-from pfbench.ppl.parameterised_model import ParameterisedModel, Prior, Values, check_inference_call
+from pfbench.ppl.parameterised_model import ParameterisedModel, Values, check_inference_call
 from pfbench.ppl.priors import as_pyro
 from pfbench.ppl.step_program import value_at
 
@@ -171,97 +170,3 @@ def simulate(model: StateSpaceModel, record: Record, seed: int) -> tuple[Record,
         y = draw_measurements([s.distribution for s in steps], stream, "world.receiver")
     y = torch.where(torch.isnan(record.y), torch.nan, y.to(record.y))
     return record._replace(y=y), torch.cat([step.x for step in steps], 1)
-
-
-# --------------------------------------------------------------------------------------------------
-# Noise levels that switch by a Markov chain, by Pyro's DiscreteHMM.
-
-
-@dataclass(frozen=True)
-class SwitchingNoise:
-    """Independent normal errors of two sizes, switched by a Markov chain.
-
-    It fits errors that are independent from step to step given the regime: errors of a sensor at
-    rest or against a reference, or innovations of a filter. The sum over the chain is exact, so
-    the program is differentiable.
-
-    Attributes:
-        sd: Distribution of the nominal standard deviation.
-        ratio: Distribution of the ratio of the surge's standard deviation to the nominal one.
-            Values must exceed 1, or the regimes could exchange their meaning.
-        stay: Distribution of the probability to stay in the nominal regime.
-        surge_stay: Distribution of the probability to stay in the surge.
-    """
-
-    sd: Prior
-    ratio: Prior
-    stay: Prior
-    surge_stay: Prior
-
-    @property
-    def prior(self) -> dict[str, Prior]:
-        """Distributions of the parameters by name."""
-        return dict(vars(self))
-
-    def program(self) -> Callable[[Record], Values]:
-        """Build a Pyro program of a record whose y [R, T, Dy] are the errors.
-
-        NaN marks a missing error. A regime applies to all Dy components.
-        """
-
-        def run(record: Record) -> Values:
-            values = {name: pyro.sample(name, prior) for name, prior in self.prior.items()}
-            pyro.factor("evidence", self.chain(values, emission_distribution(record, values)).sum())
-            return values
-
-        return run
-
-    def chain(self, values: Values, table: Tensor) -> Tensor:
-        """Compute log p(y_1:T).
-
-        Args:
-            values: Parameters, [].
-            table: Log densities of each step under each regime, [R, T, 2].
-
-        Returns:
-            Log evidence, [R].
-        """
-        stay, surge_stay = values["stay"].double(), values["surge_stay"].double()
-        rows = [torch.stack([stay, 1.0 - stay]), torch.stack([1.0 - surge_stay, surge_stay])]
-        log_transition = torch.stack(rows).log()
-        to_surge, to_nominal = 1.0 - stay, 1.0 - surge_stay
-        log_total = (to_surge + to_nominal).log()
-        log_initial = torch.stack([to_nominal, to_surge]).log() - log_total  # stationary
-        observation = Unit(table, validate_args=False)
-        hmm = DiscreteHMM(log_initial, log_transition, observation, duration=table.shape[1])
-        log_evidence: Tensor = hmm.log_prob(table.new_empty(*table.shape[:2], 0))
-        return log_evidence
-
-    def probability(self, record: Record, values: Values) -> Tensor:
-        """Compute the probability of the surge at each step, given the whole record.
-
-        It is the derivative of log p(y_1:T) by the log density of that step under that regime.
-
-        Args:
-            record: Errors, y [R, T, Dy].
-            values: Parameters, [].
-
-        Returns:
-            Probabilities, [R, T].
-        """
-        with torch.enable_grad():
-            table = emission_distribution(record, values).detach().requires_grad_()
-            (gradient,) = torch.autograd.grad(self.chain(values, table).sum(), table)
-        return gradient[..., 1].detach()
-
-
-def emission_distribution(record: Record, values: Values) -> Tensor:
-    """Compute log densities of the errors under each regime.
-
-    Returns log densities, [R, T, 2]; 0 where all components are missing. Shapes: record [R, T, Dy].
-    """
-    observed_mask = ~torch.isnan(record.y)
-    ratios = torch.stack([torch.ones_like(values["ratio"]), values["ratio"]])
-    sds = values["sd"].double() * ratios.double()
-    y = torch.where(observed_mask, record.y, 0.0).unsqueeze(-1)
-    return (Normal(0.0, sds).log_prob(y) * observed_mask.unsqueeze(-1)).sum(2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -38,6 +39,10 @@ _KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     ),
     "metric": ("a name", lambda value: isinstance(value, str)),
     "baseline": ("the label of a filter", lambda value: isinstance(value, str)),
+    "home": (
+        "the name of a study",
+        lambda value: isinstance(value, str) and bool(re.fullmatch(r"\w*", value)),
+    ),
 }
 
 
@@ -59,6 +64,8 @@ class ReportOptions:
         title: Title of the page; empty for the name of the study.
         baseline: Label of the filter with which the opening view compares the others; empty for the first of
             `REFERENCES` that the study has. Pairs compared in advance do not depend on it.
+        home: Published study of the methods in the worlds of their papers, shown on a first page of several methods;
+            empty for none.
     """
 
     alpha: float = 0.05
@@ -72,6 +79,7 @@ class ReportOptions:
     metric: str = "rmse"
     title: str = ""
     baseline: str = ""
+    home: str = ""
 
     def __post_init__(self) -> None:
         for key, (requirement, is_valid) in _KINDS.items():

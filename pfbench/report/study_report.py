@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pfbench.files.recorded_folder import RecordedFolder
+from pfbench.files.recorded_folder import RecordedFolder, find_published_file
 from pfbench.report import provenance, writers
 from pfbench.report.board.entries import StudyFacts, ViewKey
 from pfbench.report.board.pack import (
@@ -22,9 +22,11 @@ from pfbench.report.board.pack import (
 )
 from pfbench.report.journal.ratio_figures import HEADLINE, render_headline
 from pfbench.report.options import ReportOptions
-from pfbench.report.overview.page import BOARD_PAGE, render_overview
+from pfbench.report.overview.page import BOARD_PAGE, choose_level, render_overview
 from pfbench.report.overview.tables import (
+    AT_HOME,
     FEWEST_WORLDS,
+    WITH_KNOBS,
     Overview,
     TabKey,
     add_levels,
@@ -179,7 +181,8 @@ def render_study(
     overviews = find_overviews(pack, table)
     if overviews is None:
         return files | render_page(pack)
-    return files | render_page(pack, BOARD_PAGE) | render_overview(overviews, pack)
+    home = collect_home(str(pack["facts"]["options"].get("home", "")))
+    return files | render_page(pack, BOARD_PAGE) | render_overview({**overviews, **home}, pack)
 
 
 def find_overviews(pack: Mapping[str, Any], table: pd.DataFrame) -> dict[TabKey, Overview] | None:
@@ -200,6 +203,15 @@ def find_overviews(pack: Mapping[str, Any], table: pd.DataFrame) -> dict[TabKey,
     overviews = build_overviews(table, facts.looks, facts.worlds, court)
     enough = all(len(overview.worlds) >= FEWEST_WORLDS for overview in overviews.values())
     return overviews if enough else None  # without references of worlds there is nothing to show
+
+
+def collect_home(study: str) -> dict[TabKey, Overview]:
+    """Collect the table of a published study of the methods in the worlds of their papers: of tuned forms, if it has some; none without it."""
+    path = find_published_file(f"{study}/{RUNS_FILE}")
+    if path is None:
+        return {}
+    tables = find_overviews(*read_stored_study(path.parent, decides=False)) or {}
+    return {AT_HOME: tables.get(WITH_KNOBS, tables[choose_level(tables)])} if tables else {}
 
 
 def format_verdicts(pack: Mapping[str, Any]) -> str:

@@ -246,9 +246,6 @@ def compute_seconds_per_step(data: MetricInput) -> ByComponent:
     return {k: np.full(data.lost.size, rounds[n]) for k, n in names.items() if n in rounds}
 
 
-# --------------------------------------------------------------------------------------------------
-# Table of metrics: name, function, unit, direction and caption of each, defined once.
-
 COVERAGE_LEVELS = (50, 90, 99)  # percent
 GROUP_UNIT = "unit of the group"  #: unit of a metric that is in the unit of its group, such as m
 MetricScope = Literal["components", "group", "job"]

@@ -24,8 +24,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy  # scipy.special is imported at its first use
 
+from pfbench.core.chi_square import chi_square_limit
 from pfbench.results.conditions import main_component_group
 from pfbench.results.paper_block import read_stored_block
 from pfbench.stats.error_measures import Array, Flags, finite_mean, rmse_per_run
@@ -87,7 +87,7 @@ def is_overconfident(nees: Array, dof: int, lost: Flags) -> Flags:
     """
     with np.errstate(over="ignore"):
         mean = finite_mean(np.asarray(nees, dtype=np.float64), axis=1)
-    return (mean > scipy.special.chdtri(dof, 0.001)) & ~np.asarray(lost, dtype=bool)
+    return (mean > chi_square_limit(dof, 0.001)) & ~np.asarray(lost, dtype=bool)
 
 
 def is_severely_overconfident(

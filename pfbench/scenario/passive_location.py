@@ -121,9 +121,6 @@ def first_fix(
     return start, spread, measured_range != r
 
 
-# --------------------------------------------------------------------------------------------------
-# Passive location of an emitter from an aircraft.
-
 _KINDS = ("angle", "angle", "rate", "rate", "rate")
 
 

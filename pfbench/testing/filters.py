@@ -184,9 +184,6 @@ def has_particles(method: object) -> bool:
     return is_instance and "particles" in {field.name for field in fields(method)}  # type: ignore[arg-type]
 
 
-# --------------------------------------------------------------------------------------------------
-# Tests of filters: causality, independence of runs, and all tests that apply.
-
 Runner = Callable[[Filter, StateSpaceModel, Tensor], FilterResult]
 _NAMES = ("mean", "variance", "log_evidence")
 

@@ -1,5 +1,6 @@
 """Observation distributions of particle and Gaussian filters: densities, missing components, existence of moments."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from pyro import distributions as dist
 from refusals import check_refused
 from scipy import stats
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtri
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
@@ -21,6 +23,7 @@ from pfbench.core import (
     linear_algebra as jacobian_module,
     wrap_angle,
 )
+from pfbench.core.chi_square import chi_square_limit
 from pfbench.core.density import ChartNormal, has_finite_moments, normal_batch
 from pfbench.core.linear_algebra import jacobian
 from pfbench.filter import (
@@ -375,3 +378,10 @@ def test_values_that_wrap_and_values_that_stand_still() -> None:
                 jacobian(lambda xi: AT[..., :2].expand(-1, xi.shape[1], -1), AT[..., :2], D),
                 torch.zeros(R, 2, D).double(),
             )
+
+
+@pytest.mark.parametrize("tail", [1e-12, 0.001, 0.3, 0.99])
+def test_limits_of_chi_square_are_those_of_scipy(tail: float) -> None:
+    limits = [chi_square_limit(dof, tail) for dof in range(1, 60)]
+    assert limits == pytest.approx(chdtri(range(1, 60), tail), rel=1e-11)
+    assert chi_square_limit(3, 0.0) == math.inf

@@ -154,8 +154,6 @@ REFUSED: dict[str, list[Refusal]] = {
         (r"defensive_fraction must be in \[0, 1\), got 1\.0", lambda: f.LearnedProposal(f.DiagonalNormalHead, defensive_fraction=1.0)),
         (r"proposal\.defensive_fraction must be in \[0, 1\), got -0\.1", lambda: f.LearnedProposal(f.DiagonalNormalHead, defensive_fraction=-0.1)),
         ("memory must be at least 0, got -1", lambda: f.LearnedProposal(f.DiagonalNormalHead, memory=-1)),
-        ("lag must be at least 1, got 0", lambda: f.LearnedRandomWalk(f.DiagonalNormalHead, lag=0)),
-        ("scale must be positive, got 0", lambda: f.LearnedRandomWalk(f.DiagonalNormalHead, scale=0.0)),
     ],
 }  # fmt: skip
 

@@ -50,7 +50,6 @@ NEURAL = (
     "neural_ckf",
     "neural_flow",
     "neural_lowrank",
-    "neural_mh",
     "neural_mixture",
     "neural_sir",
 )

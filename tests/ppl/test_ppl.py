@@ -1,6 +1,5 @@
 """Models as programs: gradients against finite differences, one model for each run against each alone, factors and sites."""
 
-import itertools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -57,9 +56,7 @@ from pfbench.ppl import (
 from pfbench.ppl.model_batch import ModelBatch
 from pfbench.ppl.particle_mcmc import ParameterWalk, PmmhSettings, pmmh
 from pfbench.ppl.pyro_program import (
-    SwitchingNoise,
     compute_path,
-    emission_distribution,
     latent_program,
     program,
     simulate,
@@ -502,46 +499,6 @@ def test_a_table_tells_chains_that_have_not_met() -> None:
     short = ParameterPosterior({"a": met[:, :3]}, torch.full((4,), 0.3))
     assert not short.has_converged
     assert math.isnan(short.table().r_hat["a"])
-
-
-REGIMES = SwitchingNoise(LogNormal(0.0, 1.0), LogNormal(1.0, 0.5), Beta(9.0, 1.0), Beta(4.0, 1.0))
-VALUES = dict(
-    zip(REGIMES.prior, torch.tensor([0.5, 4.0, 0.9, 0.7], dtype=torch.float64), strict=True)
-)
-
-
-def test_switching_sums_over_all_paths_of_the_regime() -> None:
-    y = torch.tensor([[[0.2], [-1.9], [torch.nan], [2.5], [0.1]]], dtype=torch.float64)
-    table, total, surged = emission_distribution(Record(y), VALUES)[0], [], []
-    assert float(table[2].abs().max()) == 0.0
-    torch.testing.assert_close(
-        table[1, 1], Normal(0.0, 2.0).log_prob(torch.tensor(-1.9)).double(), rtol=1e-6, atol=0
-    )
-    steps = torch.tensor([[0.9, 0.1], [0.3, 0.7]], dtype=torch.float64)
-    start = torch.tensor([0.75, 0.25], dtype=torch.float64)
-    torch.testing.assert_close(start @ steps, start)
-    for path in itertools.product((0, 1), repeat=5):
-        value = start[path[0]].log() + table[0, path[0]]
-        for t in range(1, 5):
-            value = value + steps[path[t - 1], path[t]].log() + table[t, path[t]]
-        total.append(value)
-        surged.append(torch.tensor(path, dtype=torch.float64))
-    each = torch.stack(total)
-    torch.testing.assert_close(REGIMES.chain(VALUES, table.unsqueeze(0))[0], each.logsumexp(0))
-    weights = torch.softmax(each, 0)
-    torch.testing.assert_close(
-        REGIMES.probability(Record(y), VALUES)[0], weights @ torch.stack(surged)
-    )
-
-
-def test_the_switching_program_is_prior_times_chain() -> None:
-    record = Record(torch.tensor([[[0.2], [-1.9]], [[0.3], [0.1]]], dtype=torch.float64))
-    traced = poutine.trace(poutine.condition(REGIMES.program(), VALUES)).get_trace(record)
-    prior = sum(law.log_prob(VALUES[name]) for name, law in REGIMES.prior.items())
-    torch.testing.assert_close(
-        traced.log_prob_sum(),
-        prior + REGIMES.chain(VALUES, emission_distribution(record, VALUES)).sum(),
-    )
 
 
 GOOD: dict[str, Any] = {"draws": 2, "warmup": 1, "chains": 1, "seed": 0}

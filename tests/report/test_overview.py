@@ -22,6 +22,7 @@ from pfbench.report.overview import figures
 from pfbench.report.overview.page import (
     choose_level,
     count_better_worlds,
+    describe_home,
     describe_price,
     describe_setting,
     describe_times,
@@ -34,6 +35,7 @@ from pfbench.report.overview.page import (
     word_headline,
 )
 from pfbench.report.overview.tables import (
+    AT_HOME,
     EQUAL_TIME,
     PRINTED,
     WITH_KNOBS,
@@ -58,6 +60,7 @@ from pfbench.report.overview.tables import (
     read_world_facts,
     tell_story,
 )
+from pfbench.report.study_report import collect_home
 from pfbench.results.conditions import make_distinct_label
 from pfbench.results.looks import MethodLook, PartName, find_looks
 from pfbench.stats.comparison import EQUAL_WORDS
@@ -807,6 +810,27 @@ def test_the_page_shows_all_tables(tabs: dict[TabKey, Overview]) -> None:
     cells = pd.read_csv(io.StringIO(files["cells.csv"]))
     assert set(cells["table"]) == {"100", "1000", EQUAL_TIME, PRINTED, WITH_KNOBS}
     assert {"heat_map_equal_time.svg", "matrices_as_printed.svg"} <= set(files)
+
+
+def test_the_page_shows_what_tuned_methods_do_at_home(overview: Overview) -> None:
+    assert collect_home("unknown") == {}
+    home = collect_home("seven_at_home")
+    (at_home,) = home.values()
+    assert at_home.methods
+    assert all(label.endswith("_tuned") for label in at_home.methods)
+    pack = {
+        "study": "s", "title": "T", "generated": {"version": "0", "commit": "abc", "date": ""},
+        "facts": {"options": {"home": "seven_at_home"}},
+    }  # fmt: skip
+    files = render_overview({0: overview, **home}, pack)
+    assert f"Nor is one at home, in {len(at_home.of_methods)} cells." in files["report.md"]
+    cells = pd.read_csv(io.StringIO(files["cells.csv"]))
+    assert len(cells[cells["table"] == AT_HOME]) == len(at_home.cells)
+    for name, text in describe_home(at_home):
+        assert f"{name}: {text}." in files["report.md"]
+        for ratio in re.findall(r"[(](\d[.]\d\d)", text):
+            verdicts = [c.verdict for c in at_home.cells if at_home.names[c.filter] == name]
+            assert ratio in {f"{v.ratio:.2f}" for v in verdicts}
 
 
 def test_which_studies_have_the_page(table: pd.DataFrame, looks: dict[str, MethodLook]) -> None:

@@ -19,14 +19,12 @@ from pfbench.core.record import Record
 from pfbench.core.simulate import draw_initial_state, draw_values, simulate_steps
 from pfbench.filter.belief import StepInfo
 from pfbench.filter.learned.gain_filter import LearnedGain, LearnedGainFilter
-from pfbench.filter.learned.mcmc_kernel import LearnedRandomWalk
 from pfbench.filter.learned.proposal import LearnedProposal
-from pfbench.filter.moves.metropolis import MetropolisHastings
 from pfbench.filter.particle.particle_filter import ParticleFilter
 from pfbench.model.base import StateSpaceModel, StaticModel, initial_law
 
 TrainableFilter = ParticleFilter | LearnedGainFilter
-LearnedPart = LearnedProposal | LearnedRandomWalk | LearnedGain
+LearnedPart = LearnedProposal | LearnedGain
 
 
 class TrainingStep(NamedTuple):
@@ -143,13 +141,6 @@ class InferenceCompilation(Objective):
     @override
     def __call__(self, step: TrainingStep) -> Tensor:
         proposal = step.method.proposal
-        require(
-            isinstance(proposal, LearnedProposal),
-            "filter.proposal",
-            "be LearnedProposal for train.objective=InferenceCompilation",
-            type(proposal).__name__,
-            "Choose filter=neural_sir.",
-        )
         if isinstance(step.model, StaticModel):
             return torch.zeros_like(step.after.log_w[:, 0])
         assert step.parent is not None
@@ -157,52 +148,13 @@ class InferenceCompilation(Objective):
         return -proposal.log_density(step.model, step.before, step.record, step.parent, step.noise)
 
 
-@dataclass(frozen=True)
-class ExpectedSquaredJump(Objective):
-    """Negative expected squared jump of a learned kernel: acceptance times squared step length.
-
-    References:
-        C. Pasarica and A. Gelman (2010).
-    """
-
-    needs_filter_gradient = False
-    needs_simulated_data = False
-    needs_particles = True
-
-    @override
-    def __call__(self, step: TrainingStep) -> Tensor:
-        kernels = [
-            move.kernel for move in step.method.moves if isinstance(move, MetropolisHastings)
-        ]
-        learned = [kernel for kernel in kernels if isinstance(kernel, LearnedRandomWalk)]
-        require(
-            learned,
-            "filter.moves",
-            "have a LearnedRandomWalk for train.objective=ExpectedSquaredJump",
-            "none",
-            "Choose filter=neural_mh.",
-        )
-        _, log_alpha, increment = learned[0].propose_step(step.model, step.after, step.draws)
-        acceptance = torch.exp(torch.nan_to_num(log_alpha, -torch.inf, 0.0).clamp(max=0.0))
-        weighted = acceptance * step.after.log_w.exp()
-        return -(weighted * increment.square().mean(-1)).sum(-1)
-
-
 def find_learned_parts(method: TrainableFilter) -> dict[str, LearnedPart]:
     """Return the trainable parts of a filter, by their name in a checkpoint."""
-    stages = [
-        getattr(method, "gain", None),
-        getattr(method, "proposal", None),
-        *(
-            move.kernel
-            for move in getattr(method, "moves", ())
-            if isinstance(move, MetropolisHastings)
-        ),
-    ]
+    stages = getattr(method, "gain", None), getattr(method, "proposal", None)
     parts = {
         stage.checkpoint_key: stage
         for stage in stages
-        if isinstance(stage, LearnedProposal | LearnedRandomWalk | LearnedGain)
+        if isinstance(stage, LearnedProposal | LearnedGain)
     }
     require(
         parts, "filter", "have a network to train", "none", "Choose one such as filter=neural_sir."

@@ -154,9 +154,6 @@ def first_primes(count: int) -> list[int]:
     return numbers[:count]
 
 
-# --------------------------------------------------------------------------------------------------
-# Sequential quasi-Monte Carlo (SQMC).
-
 _BITS = 62  # of a Hilbert index, in an int64
 
 

@@ -261,9 +261,6 @@ def select_rows(a: Tensor, index: Tensor) -> Tensor:
     return a.gather(1, index.unsqueeze(-1).expand(-1, -1, a.shape[-1]))
 
 
-# --------------------------------------------------------------------------------------------------
-# Polymerised resampling: aggregate particles by cell, then place new ones there.
-
 _ESS_ROUNDING = 1e-5  # relative error of ESS for a million equal weights in single precision
 
 

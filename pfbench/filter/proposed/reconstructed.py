@@ -276,9 +276,6 @@ def _identity_minus(a: Tensor) -> Tensor:
     return torch.eye(a.shape[-1], dtype=a.dtype, device=a.device) - a
 
 
-# --------------------------------------------------------------------------------------------------
-# State reconstruction: shift of particles by Dynamic Matrix Control (DMC).
-#
 # The states are outputs of a plant with inputs [particle filter with state reconstruction by Dynamic
 # Matrix Control, eqs 21 to 28]. The inputs are those of the state (`ReconstructedProposal`) or the
 # process noise (`ReconstructedNoiseProposal`).

@@ -10,13 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
 
-import scipy
 import torch
 from torch import Tensor
 from typing_extensions import override
 
+from pfbench.core.chi_square import chi_square_limit
 from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
@@ -150,14 +149,16 @@ class ChiSquareStopping:
         observed_mask = ~torch.isnan(record.y)
         nearest = model.log_likelihood(torch.where(observed_mask, y_hat, torch.nan), best, record.u)
         distance = 2.0 * (nearest - model.log_likelihood(record.y, best, record.u))[:, 0]
-        limits = distance.new_tensor(_quantiles(self.quantile, observed_mask.shape[-1]))
+        limits = distance.new_tensor(
+            [
+                0.0,
+                *(
+                    chi_square_limit(k + 1, 1.0 - self.quantile)
+                    for k in range(observed_mask.shape[-1])
+                ),
+            ]
+        )
         return distance <= limits[observed_mask.sum(-1)]
-
-
-@cache
-def _quantiles(p: float, maximum: int) -> list[float]:
-    """Return chi-square quantiles for 0 to `maximum` degrees of freedom."""
-    return [0.0, *(float(scipy.special.chdtri(k, 1.0 - p)) for k in range(1, maximum + 1))]
 
 
 @dataclass(frozen=True)

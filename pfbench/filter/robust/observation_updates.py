@@ -161,9 +161,6 @@ def _refusal(model: StateSpaceModel, distribution: Any, kinds: str, update: type
     )
 
 
-# --------------------------------------------------------------------------------------------------
-# Parameters of observation distributions: Student's t with Cauchy, and mixtures of normal distributions.
-
 MOST_PARTS = 256
 
 

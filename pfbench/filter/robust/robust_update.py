@@ -10,12 +10,12 @@ from functools import lru_cache
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-import scipy
 import torch
 from torch import Tensor
 from torch.special import gammainc, gammaincc, gammaln
 from typing_extensions import override
 
+from pfbench.core.chi_square import chi_square_limit
 from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.filter.belief import GaussianBelief
 from pfbench.filter.gaussian.innovation import (
@@ -333,7 +333,7 @@ def _chi_nodes(k: int) -> tuple[Tensor, Tensor]:
     """Return squared distances and their probabilities for d ~ chi_k."""
     d = np.linspace(0.0, math.sqrt(k) + 12.0, _NODES + 1)[1:]
     probability = np.exp(
-        (k - 1) * np.log(d) - d * d / 2 - (k / 2 - 1) * math.log(2.0) - scipy.special.gammaln(k / 2)
+        (k - 1) * np.log(d) - d * d / 2 - (k / 2 - 1) * math.log(2.0) - math.lgamma(k / 2)
     )
     probability *= d[1] - d[0]
     return torch.from_numpy(d * d), torch.from_numpy(probability)
@@ -388,9 +388,7 @@ def quantile_table(probability: float, count: Tensor) -> Tensor:
 
     Shapes: count [R, k].
     """
-    return _look_up(
-        [float(scipy.special.chdtri(n, 1.0 - probability)) for n in _counts(count)], count
-    )
+    return _look_up([chi_square_limit(n, 1.0 - probability) for n in _counts(count)], count)
 
 
 def _counts(count: Tensor) -> range:

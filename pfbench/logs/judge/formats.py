@@ -90,9 +90,6 @@ def _run_table(file: Path, result: JobResult, places: list[int], run: int) -> Tr
     return table.keep_rows(used)
 
 
-# --------------------------------------------------------------------------------------------------
-# Files of trajectories: patterns with sequence and run, and the readers of each format by what is read.
-
 ONE = "recording"  # name of the sequence of a pattern without {sequence}
 _FIELDS = {"sequence": r"(?P<sequence>[^/]+?)", "run": r"(?P<run>[^/]+?)"}
 

@@ -30,9 +30,6 @@ from pfbench.results.store import JobResult
 from pfbench.stats.error_measures import Array, finite_mean
 from pfbench.stats.sentences import format_count
 
-# --------------------------------------------------------------------------------------------------
-# Page of a judgement: report.md, index.html, decisions.json, tables and figures.
-
 
 def write_judgement(
     judgement: Judgement,
@@ -203,9 +200,6 @@ def _describe_reference(sequence: SequenceResults) -> Iterator[str]:
             f"smallest position RMSE is {min(sizes):.3g} m. Use a reference with shorter steps."
         )
 
-
-# --------------------------------------------------------------------------------------------------
-# Tables and figures of a judgement.
 
 _QUANTILE, _MOST_FIGURES = 0.95, 8
 

@@ -153,10 +153,6 @@ def read_kf_gins_fixes(file: Path, options: SourceOptions) -> list[TrajectoryTab
     return [TrajectoryTable(file.name, numbers[:, 0], values, lines, notes)]
 
 
-# --------------------------------------------------------------------------------------------------
-# RTKLIB, EuRoC and KITTI.
-
-
 def read_rtklib(file: Path, options: SourceOptions) -> list[TrajectoryTable]:
     """Read a solution of RTKLIB with latitude, longitude and height; t is the second of the GPS week of the first row."""
     texts = split_lines(read_text(file).decode("utf-8-sig", "replace"))

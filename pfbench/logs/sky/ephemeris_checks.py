@@ -16,9 +16,6 @@ from pfbench.logs.sky.ephemeris import CLOCK, ORBIT, broadcast_elements
 from pfbench.logs.units import WEEK
 from pfbench.nav import earth
 
-# --------------------------------------------------------------------------------------------------
-# Plausibility of broadcast ephemerides: ranges of parameters, and agreement of neighbours.
-#
 # Merged files contain records with reception errors. Such a record is ignored, and a note names it.
 
 _TURN = 2 * math.pi

@@ -48,9 +48,6 @@ from pfbench.noise.base import (
 )
 from pfbench.scenario.base import Scenario, check_added_sd, check_duration
 
-# --------------------------------------------------------------------------------------------------
-# Recorded drives and flights with degraded fixes, scored against a reference.
-#
 # All runs of a drive have the same motion. They differ in receiver errors and initial errors.
 
 

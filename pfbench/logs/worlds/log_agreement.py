@@ -331,10 +331,6 @@ def _without_clocks(names: Sequence[str], residual: Array) -> Array:
     return off.ravel()
 
 
-# --------------------------------------------------------------------------------------------------
-# The rule for notes and errors.
-
-
 def _judge_rows(agreement: Agreement, difference: Array, table: LogTable, rows: NDArray[np.intp]) -> tuple[str, ...]:  # fmt: skip
     """Reject, note or accept differences [n] at rows [n] of a table."""
     return _judge(agreement, difference, table.name, lambda i: table.row(int(rows[i])))

@@ -400,9 +400,6 @@ class LogTable(NamedTuple):
         return f"line {i + 2}" if self.lines else f"row {i} (from 0)"
 
 
-# --------------------------------------------------------------------------------------------------
-# Ranges and rates of change of the columns of a table.
-
 _MANY_ROWS = 4  # wrong rows that are not an accident
 _FEW = 0.01  # share of rows that can be removed
 _NEIGHBOUR = 0.1  # least share of a value that a neighbour has, unless the value is a single error

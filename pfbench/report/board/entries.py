@@ -40,7 +40,7 @@ class ViewKey(NamedTuple):
     baseline: str
 
 
-_OPTIONS = ("alpha", "equivalence_margin", "metric", "baseline")  # that decide
+_OPTIONS = ("alpha", "equivalence_margin", "metric", "baseline", "home")  # that decide
 CellKey = tuple[str, str]  # world and regime
 
 

@@ -233,9 +233,6 @@ def _list_particles(pack: Pack) -> Mapping[str, str]:
     }
 
 
-# --------------------------------------------------------------------------------------------------
-# The paper: a document with all figures and tables that compiles.
-
 _PACKAGES = (
     r"\usepackage[T1]{fontenc}",
     r"\usepackage[utf8]{inputenc}",

@@ -14,6 +14,7 @@ from markupsafe import Markup
 
 from pfbench.report.overview import figures
 from pfbench.report.overview.tables import (
+    AT_HOME,
     EQUAL_TIME,
     PLANNED_RATIO,
     PRINTED,
@@ -92,9 +93,11 @@ def render_overview(
         "others": [
             (_name_tab(key, item), _suffix(key))
             for key, item in overviews.items()
-            if key not in (level, WITH_KNOBS)
+            if key not in (level, WITH_KNOBS, AT_HOME)
         ],
-        "headline": word_headline(overview, overviews.get(EQUAL_TIME), overviews.get(WITH_KNOBS)),
+        "headline": word_headline(
+            overview, *(overviews.get(key) for key in (EQUAL_TIME, WITH_KNOBS, AT_HOME))
+        ),
         "setting": describe_setting(overview, level),
         "has_printed": PRINTED in overviews,
         "has_stars": any(cell.wins for item in overviews.values() for cell in item.cells),
@@ -126,6 +129,7 @@ def render_overview(
         ],
         "tuned": describe_tuned(overview, overviews[WITH_KNOBS]) if WITH_KNOBS in overviews else "",
         "forms": list_forms(overview, overviews[WITH_KNOBS]) if WITH_KNOBS in overviews else [],
+        "home": describe_home(overviews[AT_HOME]) if AT_HOME in overviews else [],
         "price": describe_price(overview) if WITH_KNOBS in overviews else "",
         "count": spell_number(len(overview.methods)),
         "pictures": {
@@ -158,6 +162,10 @@ def list_overview_blocks(page: Mapping[str, Any]) -> list[Block]:
         Block("text", Markup("![Worlds in which each method is better and worse than each other](matrices.svg)")),
         Block("text", f"The {page['count']} tuned as the baselines are. {page['tuned']} {page['price']}" if page["tuned"] else ""),
         make_rows(["ratio, and that of the tuned form", *(overview.names[m] for m in overview.methods)], page["forms"]),
+        *with_heading(
+            Block("text", Markup("At home, all tuned: the worlds and the noise of the papers. ![Ratios at home](heat_map_at_home.svg)")),
+            Block("list", [f"{name}: {text}." for name, text in page["home"]]),
+        ),
         *with_heading(
             Block("text", "Before you quote a number of these worlds:"), Block("list", [f"{name}: {text}." for name, text in page["notes"]])
         ),
@@ -245,7 +253,7 @@ def draw_pictures(overviews: Mapping[TabKey, Overview]) -> dict[str, str]:
         suffix = "" if key == first else _suffix(key)
         for size in figures.HEAT_FORMATS:
             pictures[f"heat_map{suffix}{size.name}"] = figures.draw_heat_map(overview, size)
-        for size in figures.MATRIX_FORMATS if key != WITH_KNOBS else ():
+        for size in figures.MATRIX_FORMATS if key not in (WITH_KNOBS, AT_HOME) else ():
             pictures[f"matrices{suffix}{size.name}"] = figures.draw_matrices(overview, size)
     worlds = order_dose_worlds(overviews[first])
     for axis, size in itertools.product(axes, figures.DOSE_FORMATS):
@@ -297,6 +305,24 @@ def list_forms(overview: Overview, tuned: Overview) -> list[list[str]]:
     ]
 
 
+def describe_home(home: Overview) -> list[tuple[str, str]]:
+    """Say of each method where it wins in the worlds of the papers, all tuned, and what it does in the others."""
+    stories = [tell_story(home, method, "") for method in home.methods]
+    words = (("wins", "Better than the best Kalman filter"), ("equal", "Equal"), ("open", "Not decided"), ("loses", "Worse"))  # fmt: skip
+    return [
+        (
+            story["name"],
+            ". ".join(
+                f"{word}: {story[key]}"
+                for key, word in words
+                if story[key] not in ("–", "None shown.")
+            )
+            or "Nothing shown",
+        )
+        for story in stories
+    ]
+
+
 def describe_price(overview: Overview) -> str:
     """Say what the tuning of the methods took, and what it would take where they are not tuned."""
     names = {parse_label(label)[0]: overview.names[label] for label in overview.methods}
@@ -310,12 +336,15 @@ def describe_price(overview: Overview) -> str:
 
 
 def word_headline(
-    overview: Overview, at_equal_time: Overview | None = None, tuned: Overview | None = None
+    overview: Overview,
+    at_equal_time: Overview | None = None,
+    tuned: Overview | None = None,
+    home: Overview | None = None,
 ) -> str:
-    """Word the two sentences that open the page, at most 55 words, and a third one if the methods are tuned too."""
+    """Word the two sentences that open the page, at most 55 words, and others if the methods are tuned too, or at home."""
     count, better = spell_number(len(overview.methods)), "better than every conventional filter"
-    winners, timed, alike = (
-        _name_winners(some) if some else "" for some in (overview, at_equal_time, tuned)
+    winners, timed, alike, at_home = (
+        _name_winners(some) if some else "" for some in (overview, at_equal_time, tuned, home)
     )
     first = f"{better.capitalize()} with as many particles: {winners}."
     nor = (
@@ -329,7 +358,8 @@ def word_headline(
         first += " At equal time none is."
     words, single = Counter(map(name_word, overview.of_methods)), sum(c.beats_kalman for c in overview.of_methods)  # fmt: skip
     return (
-        f"{first}{f' Tuned, so is: {alike}.' if alike else f' Nor is a tuned form, in {len(tuned.of_methods)} cells.' if tuned else ''} "
+        f"{first}{f' Tuned, so is: {alike}.' if alike else f' Nor is a tuned form, in {len(tuned.of_methods)} cells.' if tuned else ''}"
+        f"{f' At home: {at_home}.' if at_home else f' Nor is one at home, in {len(home.of_methods)} cells.' if home else ''} "
         f"Against each world's best Kalman filter: better in {words['better']} of {words.total()} cells"
         f"{f' (in {single} than all single ones)' if single else ''}, "
         f"equal in {words['equal']}, not decided in {words['not decided']}, worse in {words['worse']}."

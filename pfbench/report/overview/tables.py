@@ -43,7 +43,7 @@ PLANNED_RATIO = 0.8  # for which the runs of a cell are counted
 METRIC = "rmse"  # of all words of the page
 DEAD_RECKONING, PLAIN = "dead_reckoning", "ukf"
 TabKey = int | str  # a number of particles, 0 for a study of one number, or one of those below
-EQUAL_TIME, PRINTED, WITH_KNOBS = "equal time", "as printed", "tuned"
+EQUAL_TIME, PRINTED, WITH_KNOBS, AT_HOME = "equal time", "as printed", "tuned", "at home"
 _TUNING_BYTES = 1_000_000
 _FAMILIES = ("particle", "guided", "swarm", "gaussian", "learned", "kalman", "")
 

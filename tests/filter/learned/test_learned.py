@@ -1,7 +1,7 @@
 """Learned proposals: any network leaves the target as it is; a wrong ratio is seen; checkpoints are refused in words."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -31,7 +31,6 @@ from pfbench.filter import (
     EssResampler,
     GaussianFilter,
     GuidedNoiseProposal,
-    LearnedRandomWalk,
     ParticleBelief,
     ParticleFilter,
     ProposalSample,
@@ -49,15 +48,12 @@ from pfbench.filter.learned.proposal import (
     SpreadFeature,
     make_feature_context,
 )
-from pfbench.filter.moves.metropolis import MetropolisHastings, StateHistory
 from pfbench.model import LinearGaussian, StateSpaceModel
 from pfbench.testing import (
     check_evidence,
     check_independence,
     filter_record,
-    simulate_path_posterior,
 )
-from pfbench.testing.moves import STEPS
 
 ALWAYS = EssResampler(Systematic(), 1.0)
 EKF, CKF = (
@@ -417,87 +413,6 @@ def test_any_law_may_be_proposed_from() -> None:
         check_evidence(
             ParticleFilter(60, ALWAYS, proposal=LearnedProposal(Heavy)), model, y, exact, runs=500
         )
-
-
-# the learned kernel
-
-
-@dataclass(frozen=True)
-class Careless:
-    """The kernel with a part of its ratio left out."""
-
-    inner: LearnedRandomWalk
-    mistake: str
-    is_exact = True
-
-    def propose(
-        self, model: StateSpaceModel, belief: ParticleBelief, draws: Any
-    ) -> tuple[ParticleBelief, Tensor]:
-        moved, log_alpha, step = self.inner.propose_step(model, belief, draws)
-        delta = step / (self.inner.scale * step.shape[-1] ** -0.5)
-        assert self.inner.network is not None
-        xi, new = (c.window["noise"][:, :, -self.inner.lag :].flatten(2) for c in (belief, moved))
-        back, forward = (
-            self.inner._step_distribution(model, *pair) for pair in ((moved, new), (belief, xi))
-        )
-        log_q = back.log_prob(-delta) - forward.log_prob(delta)
-        prior = 0.5 * (xi.square() - new.square()).sum(-1)
-        return moved, {
-            "no Hastings": log_alpha - log_q,
-            "no prior": log_alpha - prior,
-            "none": log_alpha,
-        }[self.mistake]
-
-
-def after(mistake: str, size: float, sweeps: int = 4) -> float:
-    """p-value of the drift of exact paths under the kernel."""
-    exact = simulate_path_posterior(0.5, 15_000)
-    cloud = exact.belief(StateHistory(STEPS, store_noise=True, store_density=True))
-    kernel = LearnedRandomWalk(shaken(NETWORKS["diagonal"], size), lag=2)
-    draws = PhiloxStream(5, torch.arange(1))
-    with torch.no_grad():
-        kernel.build(exact.model, 1)
-        for sweep in range(sweeps):
-            proposed, log_alpha = Careless(kernel, mistake).propose(
-                exact.model, cloud, draws.at_step(sweep)
-            )
-            toss = torch.log(
-                draws.at_step(sweep).uniform("accept", log_alpha.shape[1], 1).squeeze(2)
-            )
-            accept = toss < log_alpha
-            window = {
-                name: torch.where(
-                    accept[..., None, None] if a.dim() == 4 else accept[..., None],
-                    proposed.window[name],
-                    a,
-                )
-                for name, a in cloud.window.items()
-                if a.shape[1] > 1
-            }
-            cloud = cloud._replace(window=cloud.window | window)
-        assert 0.1 < accept.double().mean() < 0.9
-    return exact.log_density_p_value(exact.paths_after(cloud))
-
-
-@pytest.mark.parametrize("size", [0.0, 0.6], ids=["untrained", "random"])
-def test_the_learned_kernel_leaves_the_law_of_the_path(size: float) -> None:
-    assert after("none", size) > 1e-4
-
-
-@pytest.mark.parametrize("mistake", ["no Hastings", "no prior"])
-def test_the_test_of_invariance_sees_mistakes_of_the_learned_kernel(mistake: str) -> None:
-    assert after(mistake, 0.6) < 1e-6
-
-
-def test_a_filter_with_the_learned_kernel_is_unbiased_and_moves() -> None:
-    model, y, exact = CASES["growth"]()
-    method = ParticleFilter(
-        60, ALWAYS, moves=(MetropolisHastings(LearnedRandomWalk(shaken(DiagonalNormalHead)), 2),)
-    )
-    assert method.is_exact
-    with torch.no_grad():
-        check_evidence(method, model, y, exact, runs=300)
-        assert filter_record(method, model, y, runs=20).trace["accepted_0"][:, 2:].mean() > 0.1
 
 
 # checkpoints are refused in words
