@@ -9,18 +9,14 @@ from torch import nn
 
 from pfbench.filter.learned.networks import (
     DiagonalNormalHead,
-    LowRankNormalHead,
     NormalMixtureHead,
-    SplineFlowHead,
 )
 
 SMALL = (8,)
 
 NETWORKS: dict[str, Callable[[int, int], nn.Module]] = {
     "diagonal": partial(DiagonalNormalHead, hidden=SMALL),
-    "low rank": partial(LowRankNormalHead, hidden=SMALL),
     "mixture": partial(NormalMixtureHead, hidden=SMALL),
-    "flow": partial(SplineFlowHead, hidden=SMALL),
 }
 
 

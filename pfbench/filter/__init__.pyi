@@ -70,10 +70,8 @@ from pfbench.filter.learned.gain_filter import (
 )
 from pfbench.filter.learned.networks import (
     DiagonalNormalHead as DiagonalNormalHead,
-    LowRankNormalHead as LowRankNormalHead,
     NormalMixtureHead as NormalMixtureHead,
     SkipMlp as SkipMlp,
-    SplineFlowHead as SplineFlowHead,
 )
 from pfbench.filter.learned.objectives import (
     EvidenceLowerBound as EvidenceLowerBound,

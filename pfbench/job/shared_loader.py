@@ -13,14 +13,12 @@ import pickle
 import re
 import traceback
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from functools import cache
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from hydra._internal import defaults_list as hydra_defaults
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import CachingConfigRepository, ConfigRepository
 from hydra._internal.defaults_list import Overrides
-from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.default_element import InputDefault, ResultDefault
@@ -283,10 +281,10 @@ class _SharedRepository(CachingConfigRepository):
     def _find_source(self, config_path: str) -> ConfigSource | None:
         """Return the source of a file, which must be the only one if it is in a search path."""
         if not self.has_search_path:
-            return next((s for s in self.delegate.sources if _has_file(s, config_path)), None)
+            return next((s for s in self.delegate.sources if s.is_config(config_path)), None)
         from pfbench.job.search_folders import ForeignFolder
 
-        holders = [source for source in self.delegate.sources if _has_file(source, config_path)]
+        holders = [source for source in self.delegate.sources if source.is_config(config_path)]
         folder = next((source for source in holders if isinstance(source, ForeignFolder)), None)
         if folder is not None:
             self.folders[config_path] = folder
@@ -320,19 +318,6 @@ def _name_file(source: ConfigSource, config_path: str) -> str:
     if isinstance(source, ForeignFolder):
         return f"{source.file_of(config_path)}"
     return f"pfbench's own {group or 'main file'} {name}"
-
-
-def _has_file(source: ConfigSource, config_path: str) -> bool:
-    """Return whether a source has a file."""
-    is_own = source.full_path() == _OWN_PACKAGE
-    return _has_own_file(config_path) if is_own else source.is_config(config_path)
-
-
-@cache
-def _has_own_file(config_path: str) -> bool:
-    """Return whether Hydra's own package has a file."""
-    source = SourcesRegistry.instance().resolve("pkg")("hydra", _OWN_PACKAGE)
-    return source.is_config(config_path)
 
 
 def _find_version(source: ConfigSource, config_path: str, schema: ConfigSource) -> Hashable | None:

@@ -48,8 +48,6 @@ RUNS = torch.arange(2)
 WORLDS = ("growth", "flight_500s", "sar_flight_short", "azimuth_small", "passive_1")
 NEURAL = (
     "neural_ckf",
-    "neural_flow",
-    "neural_lowrank",
     "neural_mixture",
     "neural_sir",
 )

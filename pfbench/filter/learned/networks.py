@@ -11,16 +11,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, cast
+from typing import Any
 
 import torch
 from pyro.distributions import (
     Independent,
-    LowRankMultivariateNormal,
     MixtureSameFamily,
     Normal,
-    TransformedDistribution,
-    transforms,
 )
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution
@@ -84,31 +81,6 @@ class DiagonalNormalHead(nn.Module):
         return independent_heads(mean, bounded_log_scale(log_scale))
 
 
-class LowRankNormalHead(nn.Module):
-    """N(m, diag(s^2) + F F') with `rank` columns in F.
-
-    Initially close to N(0, I). With F = 0 the gradient with respect to F would always be 0.
-    """
-
-    def __init__(
-        self, features: int, noise: int, hidden: Sequence[int] = (32, 32), rank: int = 2
-    ) -> None:
-        super().__init__()
-        self.rank = min(rank, noise)
-        self.net = SkipMlp(features, (2 + self.rank) * noise, hidden)
-        nn.init.normal_(self.net.skip_layer.bias[2 * noise :], std=0.1)
-
-    @override
-    def forward(self, features: Tensor) -> Distribution:
-        mean, log_scale, *columns = self.net(features).chunk(2 + self.rank, -1)
-        return LowRankMultivariateNormal(
-            mean,
-            torch.stack(columns, -1),
-            bounded_log_scale(log_scale).square(),
-            validate_args=False,
-        )
-
-
 class NormalMixtureHead(nn.Module):
     """Mixture of diagonal normal distributions.
 
@@ -132,55 +104,6 @@ class NormalMixtureHead(nn.Module):
         )
         return MixtureSameFamily(
             Categorical(logits=logits, validate_args=False), component, validate_args=False
-        )
-
-
-class SplineFlowHead(nn.Module):
-    """Conditional normalising flow: rational splines, then shift and scale.
-
-    Splines of [Durkan et al. 2019]. With more than one component, affine couplings come first and
-    mix the components [Dinh, Sohl-Dickstein, Bengio 2017]. The transforms are Pyro's.
-    """
-
-    def __init__(
-        self,
-        features: int,
-        noise: int,
-        hidden: Sequence[int] = (32, 32),
-        bins: int = 6,
-        bound: float = 4.0,
-    ) -> None:
-        super().__init__()
-        widths = list(hidden)
-        self.net = SkipMlp(features, 2 * noise, hidden)
-        couplings = [
-            transforms.conditional_affine_coupling(noise, features, widths)
-            for _ in range(2 if noise > 1 else 0)
-        ]
-        self.couplings = nn.ModuleList(couplings)
-        self.spline: Any = transforms.conditional_spline(
-            noise, features, widths, count_bins=bins, bound=bound
-        )
-
-    @override
-    def forward(self, features: Tensor) -> Distribution:
-        mean, log_scale = self.net(features).chunk(2, -1)
-        reversal = transforms.Permute(
-            torch.arange(mean.shape[-1] - 1, -1, -1, device=features.device)
-        )
-        steps = [
-            step
-            for coupling in self.couplings
-            for step in (cast(Any, coupling).condition(features), reversal)
-        ]
-        steps += [
-            self.spline.condition(features),
-            transforms.AffineTransform(mean, bounded_log_scale(log_scale), event_dim=1),
-        ]
-        return TransformedDistribution(
-            independent_heads(torch.zeros_like(mean), torch.ones_like(mean)),
-            steps,
-            validate_args=False,
         )
 
 

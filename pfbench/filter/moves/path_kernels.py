@@ -508,7 +508,7 @@ class PathBlockKernel(McmcKernel):
             - window["log_like"][:, :, first:]
             - transition_log_density(model, old)
         )
-        log_alpha = log_ratios[..., -1] if log_g is None else log_ratios.sum(-1) + log_g
+        log_alpha = log_ratios.sum(-1) + log_g
         new_window = {"states": new.states[:, :, 1:], "log_like": log_like}
         if "noise" in window:
             new_window["noise"] = driving_noise(model, new)

@@ -47,7 +47,7 @@ class SegmentProposal(Protocol):
 
     def __call__(
         self, model: StateSpaceModel, old: PathSegment, child: Tensor, draws: RandomStream
-    ) -> tuple[Tensor, Tensor | None]:
+    ) -> tuple[Tensor, Tensor]:
         """Draw the states between the fixed one and the child.
 
         Args:
@@ -123,7 +123,7 @@ class PriorSegment(SegmentProposal):
     @override
     def __call__(
         self, model: StateSpaceModel, old: PathSegment, child: Tensor, draws: RandomStream
-    ) -> tuple[Tensor, Tensor | None]:
+    ) -> tuple[Tensor, Tensor]:
         states = [old.states[:, :, 0]]
         for j, record in enumerate(old.records[:-1]):
             w = draw_noise(model, child.shape[1], relabel(draws, f"block_{j}."))
@@ -134,21 +134,6 @@ class PriorSegment(SegmentProposal):
         log_new = transition_log_density(model, PathSegment(path, old.records[:-1]))
         before = PathSegment(old.states[:, :, :-1], old.records[:-1])
         return path[:, :, 1:], (transition_log_density(model, before) - log_new).sum(-1)
-
-
-@dataclass(frozen=True)
-class CopiedSegment(SegmentProposal):
-    """Block of another particle. It lacks a density, so the ratio is approximate."""
-
-    is_exact = False
-
-    @override
-    def __call__(
-        self, model: StateSpaceModel, old: PathSegment, child: Tensor, draws: RandomStream
-    ) -> tuple[Tensor, Tensor | None]:
-        n = child.shape[1]
-        index = (draws.uniform("other", n, 1).squeeze(2) * n).long().clamp(max=n - 1)
-        return torch.take_along_dim(old.states[:, :, 1:-1], index[:, :, None, None], 1), None
 
 
 @dataclass(frozen=True)
@@ -175,7 +160,7 @@ class SmoothedSegment(SegmentProposal):
     @override
     def __call__(
         self, model: StateSpaceModel, old: PathSegment, child: Tensor, draws: RandomStream
-    ) -> tuple[Tensor, Tensor | None]:
+    ) -> tuple[Tensor, Tensor]:
         length, ratio = len(old.records) - 1, torch.zeros_like(child[..., 0])
         if length == 0:
             return old.states[:, :, :0], ratio

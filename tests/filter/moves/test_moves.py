@@ -50,7 +50,6 @@ from pfbench.filter.moves.path_kernels import (
     propagate_path,
 )
 from pfbench.filter.moves.path_proposals import (
-    CopiedSegment,
     PathSegment,
     PriorSegment,
     SmoothedSegment,
@@ -384,7 +383,6 @@ BROKEN: dict[str, tuple[float, Callable[[RandomWalk], Any]]] = {
     "flow without the likelihood": (0.1, lambda w: Broken(NoiseFlowKernel(STEPS, w), no_likelihood)),
     "flow without the first likelihood": (0.1, lambda w: Broken(NoiseFlowKernel(STEPS, w), lambda a, b: (a.seen - b.seen)[..., 0])),
     "noises renewed without shrinking": (0.1, lambda w: Drifting(STEPS, w, 0.3)),
-    "copied block, which says that it is not exact": (1.0, lambda w: PathBlockKernel(3, CopiedSegment(), w)),
     "a walk with a pull": (0.1, lambda w: NoiseFlowKernel(STEPS, Pulled(w.scale))),
 }  # fmt: skip
 
@@ -415,17 +413,6 @@ def test_ratios_are_what_the_formulas_say(name: str) -> None:
     if name in expected:
         assert torch.allclose(log_alpha, expected[name], rtol=1e-7, atol=1e-7)
     assert torch.equal(proposed.x, proposed.window["states"][:, :, -1])
-
-
-def test_the_ratio_of_a_copied_block_is_that_of_the_last_state() -> None:
-    """The paper gives no density of the copied block, so the ratio is that of the last state alone."""
-    case = simulate_path_posterior(0.3, 200)
-    kernel = PathBlockKernel(3, CopiedSegment(), RandomWalk())
-    proposed, log_alpha = kernel.propose(case.model, case.belief(FULL), one())
-    old, new = terms(case.model, case.belief(FULL)), terms(case.model, proposed)
-    expected = (new.moved + new.seen - old.moved - old.seen)[..., -1]
-    assert expected.std() > 0.1
-    torch.testing.assert_close(log_alpha, expected, rtol=1e-7, atol=1e-7)
 
 
 # nonlinear models: successive-conditional simulation
@@ -731,7 +718,6 @@ def test_every_stage_says_whether_it_is_exact() -> None:
     }
     assert all(moving(MetropolisHastings(kernel)).is_exact for kernel in kernels.values())
     for kernel in (
-        PathBlockKernel(3, CopiedSegment()),
         NoiseFlowKernel(),
         NoiseFlowStatKernel(),
         NoiseFlowGibbsKernel(),
