@@ -225,7 +225,9 @@ def test_the_wheel_holds_every_module_yaml_and_template(wheel: Path) -> None:
             for variant in library_build.find_variants()
         }
     wanted |= {"pfbench/conf/__init__.py"} | {
-        f"pfbench/{file.relative_to(ROOT)}" for file in (ROOT / "experiments").glob("*.py")
+        f"pfbench/{file.relative_to(ROOT)}"
+        for pattern in ("*.py", "oracles/*.py", "oracles/*.csv", "oracles/*.json")
+        for file in (ROOT / "experiments").glob(pattern)
     }
     assert wanted <= names
     head = subprocess.run(
@@ -370,21 +372,22 @@ def test_the_installed_package_needs_no_checkout(installed: Path, tmp_path: Path
     assert engine_of_job(tmp_path) == ("eager" if COMPILER is None else "kernels")
 
     env = os.environ | environment(tmp_path) | {"PYTHONPATH": str(installed)}
-    words = ("list", "report study=adhoc report.figure_formats=[svg]", "check")
+    words = ("list", "report study=adhoc report.figure_formats=[svg]", "check", "check oracles earth_radii")  # fmt: skip
     command = [sys.executable, "-c", ASK, *words]
     done = subprocess.run(
         command, env=env, cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    where, listed, _, checked = re.split(r"^pfbench: .*\n", done.stdout, flags=re.M)
+    where, listed, _, checked, book = re.split(r"^pfbench: .*\n", done.stdout, flags=re.M)
     module, conf, experiments = map(Path, where.splitlines())
     assert module == installed / "pfbench" / "__init__.py"
     assert conf == installed / "pfbench" / "conf"
     assert experiments == installed / "pfbench" / "experiments"
     assert all(name in listed for name in ("sir", "flight_500s", "quickstart"))
     assert (tmp_path / "reports" / "adhoc" / "index.html").is_file()
-    files = [*job.conf_dir().glob("*/*.yaml"), *job.experiments_dir().glob("*.yaml")]
-    assert re.search(rf"configurations +{len(files)} of {len(files)} +ok", checked)
+    total = sum(map(len, job.list_groups().values()))
+    assert re.search(rf"configurations +{total} of {total} +ok", checked)
+    assert book.endswith("4 of 4 rows are met\n")
 
 
 READ = """

@@ -40,7 +40,13 @@ SCRIPTS = [
     file
     for file in (ROOT / "experiments").rglob("*.py")
     if file.name
-    not in ("method_pictures.py", "site_pages.py", "word_rates.py", "urban_error_fit.py")
+    not in (
+        "earth_rows.py",
+        "method_pictures.py",
+        "site_pages.py",
+        "word_rates.py",
+        "urban_error_fit.py",
+    )
 ]
 
 

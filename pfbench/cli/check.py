@@ -1,10 +1,12 @@
-"""Command `pfbench check`: compose all configurations and print versions."""
+"""Command `pfbench check`: compose all configurations and print versions, or compute printed numbers of other projects."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from importlib import import_module
 from itertools import islice
+from pathlib import Path
 
 from pfbench import job
 from pfbench.cli.command import Command
@@ -16,8 +18,11 @@ from pfbench.results.paper_block import read_part
 
 
 def check_installation(words: Sequence[str]) -> None:
-    """Print the state of the installation as a table of item, value and status."""
-    require(not words, "check", "be without words", " ".join(words), "Use: pfbench check")
+    """Print the state of the installation as a table of item, value and status, or that of the oracle book."""
+    if words[:1] == ["oracles"]:
+        _check_oracles(words[1:])
+        return
+    require(not words, "check", "be without words", " ".join(words), "Use: pfbench check, or pfbench check oracles")  # fmt: skip
     import torch
 
     start_work()  # to compose all files is the work
@@ -39,6 +44,17 @@ def check_installation(words: Sequence[str]) -> None:
         print(f"{item:15} {value:24} {status}")
     if errors:
         raise ValueError("configurations must compose, got errors:\n  " + "\n  ".join(errors))
+
+
+def _check_oracles(words: Sequence[str]) -> None:
+    """Compute the rows of the oracle book, or of one recipe, and print them."""
+    names = [word for word in words if "=" not in word]
+    require(len(names) < 2, "oracles", "have at most one name", " ".join(names), "Use: pfbench check oracles NAME")  # fmt: skip
+    config = compose([word for word in words if "=" in word])
+    book = import_module("pfbench.experiments.oracles.book")
+    book.list_recipes(*names)  # refuses an unknown name before the work starts
+    start_work()
+    book.run_book("".join(names), Path(config.values["results_dir"]) / "oracles")
 
 
 _ADDED = ("experiment", "infer")  # groups that are not in the list of defaults
@@ -75,7 +91,17 @@ COMMAND = Command(
     check_installation,
     """\
 pfbench check
+pfbench check oracles [NAME] [results_dir=results]
 
 Print versions, threads, device and data folder, and compose all configurations.
-The exit code is 1 if a configuration does not compose.""",
+The exit code is 1 if a configuration does not compose.
+
+oracles: numbers that other projects printed, with their settings, and those of pfbench: z, hit or miss, cheapest first. Finished
+rows are kept in results/oracles until pfbench or the recipes change. NAME is that of a recipe or of a row.
+
+  pfbench check oracles                    all, in three minutes on one core
+  pfbench check oracles pomp_walk          those of a recipe
+  pfbench check oracles pomp_walk.kalman   one
+
+Page: docs/oracles.md""",
 )

@@ -170,7 +170,16 @@ def format_posterior(content: dict[str, Any]) -> str:
     head = f"{content['method']}: {choices['model']} by {choices['filter']}, data of {choices['scenario']}, {content['seconds']:.0f} s"
     note = "" if content["converged"] else "\nr_hat is above 1.05: the chains have not mixed. Use more draws: infer.warmup=... infer.draws=..."  # fmt: skip
     renamed = table.rename(columns={"low": "low 90 %", "high": "high 90 %"})
-    return f"{head}\n{renamed.to_string(float_format=lambda value: f'{value:.4g}')}{note}"
+    return f"{head}\n{renamed.to_string(float_format=lambda value: f'{value:.4g}')}{format_evidence(content)}{note}"
+
+
+def format_evidence(content: Mapping[str, Any]) -> str:
+    """Format the log evidence of a result and its floor; empty for a method without evidence."""
+    evidence, floor = content.get("log_evidence"), content.get("evidence_floor")
+    if evidence is None or floor is None:
+        return "" if evidence is None else f"\nlog evidence {evidence:.2f}"
+    verdict = "above" if evidence > floor else "below: this model is worse than no model"
+    return f"\nlog evidence {evidence:.2f}, {verdict}; an autoregression or independent normals fitted to the measurements have {floor:.2f}"
 
 
 COMMAND = Command(infer_parameters, HELP)

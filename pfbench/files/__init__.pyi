@@ -18,3 +18,4 @@ from pfbench.files.recorded_folder import (
     find_published_file as find_published_file,
     write_manifest as write_manifest,
 )
+from pfbench.files.source_digest import hash_folder as hash_folder

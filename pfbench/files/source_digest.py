@@ -41,6 +41,13 @@ def hash_folder(top: Path, omitted: Collection[str] = ()) -> str:
     """Compute a digest of the files of a folder, except compiled ones and those in the folders `omitted`.
 
     It depends on the names and contents of the files only, not on times.
+
+    Args:
+        top: Folder.
+        omitted: Paths of folders below it, each beginning with that of `top`.
+
+    Returns:
+        Twelve hexadecimal digits.
     """
     sha256 = hashlib.sha256()
     for folder, below, files in os.walk(top):  # an order of its own for each file system

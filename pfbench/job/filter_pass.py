@@ -28,6 +28,7 @@ from pfbench.kernels.cpp_library import is_library_loaded
 from pfbench.model.base import StateSpaceModel
 from pfbench.results import store
 from pfbench.results.step_times import WARM_UP
+from pfbench.stats.likelihood_floor import likelihood_floor
 
 if TYPE_CHECKING:
     from pfbench.filter.particle.compiled_filter import CompiledParticleFilter
@@ -77,6 +78,9 @@ class TimedFilterPass(NamedTuple):
             "pareto_k": estimate.pareto_k.float(),
             **{name: a if a.dtype == torch.bool else a.float() for name, a in trace.items()},
         }
+        if episode.record.feedback is None and not self.model.has_counts:
+            y = episode.record.y.double().cpu().numpy()
+            outputs["evidence_floor"] = torch.from_numpy(likelihood_floor(y))
         scores = self.recorder.arrays()
         outputs |= {name: a.float() if a.is_floating_point() else a for name, a in scores.items()}
         optional = {"track": episode.track, "pcrb": pcrb, "range": episode.datasheet.get("range")}

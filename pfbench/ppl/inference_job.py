@@ -42,6 +42,7 @@ from pfbench.ppl.priors import find_range, read_priors
 from pfbench.ppl.pyro_program import program
 from pfbench.results.plotting import FigureSpec, draw_figure
 from pfbench.results.store import compute_config_key, extend_key
+from pfbench.stats.likelihood_floor import likelihood_floor
 
 _SETTINGS = {
     "nuts": ("draws", "warmup", "chains", "first_chain"),
@@ -334,7 +335,12 @@ def _draw_by(
     if name == "smc2":
         particles = settings["values"]
         result = smc2(unknown, task.method, record, particles, seed, tick=steps, **options)
-        extra = {"log_evidence": float(result.log_evidence[-1]), "ess": float(result.ess[-1])}
+        floor = None if unknown.some_model().has_counts else likelihood_floor(record.y.numpy())
+        extra = {
+            "log_evidence": float(result.log_evidence[-1]),
+            "evidence_floor": None if floor is None else float(floor.sum()),
+            "ess": float(result.ess[-1]),
+        }
         return draw_equally(result.values, result.weights, "SMC2"), extra
     if name == "pmmh":
         files = PmmhSettings(tick=steps, checkpoint=steps.file)

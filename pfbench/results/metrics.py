@@ -203,6 +203,14 @@ def compute_log_evidence(data: MetricInput) -> ByComponent:
     return {"": run_log_evidence(data.result)} if is_density else {}
 
 
+def compute_evidence_floor(data: MetricInput) -> ByComponent:
+    """Return the stored floor of the log evidence for each run; empty without a density of the measurements."""
+    floor = data.result.data.get("evidence_floor")
+    if floor is None or not _has_evidence(data.result, of_counts=False):
+        return {}
+    return {"": np.where(data.lost, np.nan, floor)}
+
+
 def compute_log_probability(data: MetricInput) -> ByComponent:
     """Return the log probability of the counts of each run; empty for other measurements."""
     if not _has_evidence(data.result, of_counts=True):
@@ -428,6 +436,11 @@ METRICS: tuple[Metric, ...] = (
         "log_evidence", compute_log_evidence, "job", "", "higher",
         "Logarithm of the estimated marginal likelihood of a run. A filter whose weights or noise "
         "depend on the measurement does not estimate it.",
+    ),
+    Metric(
+        "log_evidence_floor", compute_evidence_floor, "job", "", "target",
+        "Log likelihood of independent normal values or of an autoregression of order 1 that is fitted to the measurements of the run. A "
+        "filter whose log evidence is below has a model that is worse than no model.",
     ),
     Metric(
         "log_probability", compute_log_probability, "job", "", "higher",

@@ -259,6 +259,7 @@ _OPTIONAL = {
     "health": "R",
     "pareto_k": "R",
     "run": "R",
+    "evidence_floor": "R",
 }
 
 _META = ("key", "study", "choices", "config", "label", "seed", "runs", "state")

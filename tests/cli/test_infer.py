@@ -82,6 +82,7 @@ def test_the_posterior_is_that_of_a_grid_of_exact_likelihoods(tmp_path: Path, me
     assert draws.std() == pytest.approx(sd, rel=4 / np.sqrt(2 * ess) + 0.15 * (method == "svi"))
     assert content["truth"] == {"level_sd": 38.33}
     assert re.search(r"level_sd .* 38\.33", said.out)
+    assert ("log evidence" in said.out) == (method == "smc2")
 
 
 @pytest.mark.slow

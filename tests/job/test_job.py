@@ -87,6 +87,8 @@ def test_a_job_leaves_one_file_that_numpy_reads(twice: Any) -> None:
     assert arrays["nees"].shape == (3, 25, 1)
     assert arrays["log_evidence"].shape == arrays["lost"].shape == (3,)
     assert np.isfinite(arrays["error"]).all()
+    assert arrays["evidence_floor"].shape == (3,)
+    assert np.isfinite(arrays["evidence_floor"]).all()
     assert not arrays["lost"].any()
     assert meta["key"] == file.stem
     assert (meta["runs"], meta["first_run"], meta["seed"], meta["steps"], meta["particles"]) == (

@@ -141,3 +141,12 @@ def test_fixes_are_counted_over_the_run_and_a_filter_without_evidence_shows_none
     assert compute_metric("log_evidence", MetricInput(gated)) == {}
     assert compute_metric("log_evidence", MetricInput(told()))[""].tolist()[:2] == [-1.0, -3.0]
     assert compute_metric("rejected", MetricInput(gated))[""].tolist()[:2] == [2.0, 4.0]
+
+
+def test_a_floor_stands_beside_an_evidence_and_nowhere_else() -> None:
+    floored = told(evidence_floor=[-2.0, -2.5, -9.0])
+    values = compute_metric("log_evidence_floor", MetricInput(floored))[""]
+    assert values.tolist() == pytest.approx([-2.0, -2.5, NAN], nan_ok=True)
+    assert compute_metric("log_evidence_floor", MetricInput(told())) == {}
+    floored.meta["has_counts"] = True
+    assert compute_metric("log_evidence_floor", MetricInput(floored)) == {}
