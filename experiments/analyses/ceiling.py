@@ -74,6 +74,8 @@ LEFT_OUT = {
     "`recorded_car_constrained`": "the scenario `recorded_car_drive` with further components of the measurement.",
     "`recorded_canyon`, `gps_ins_inflated`": "the scenarios `recorded_berlin` and `gps_ins_generic` with another model.",
     "`home_002_bursts`, `home_004_outliers`": "the scenarios `anshun_short` and `gps_ins_inflated` with another noise.",
+    "`lorenz63_twin`, `lorenz96_twin`, `double_pendulum_twin`": "chaotic systems without process noise. Their limits are the printed "
+    "errors of [twins.md](twins.md).",
     "`user_log`, `user_log_aligned`, `user_raw_log`, `user_ins_log`": "the data are of the user.",
 }
 

@@ -23,6 +23,12 @@ from pfbench.model.base import (
     StateSpaceModel as StateSpaceModel,
     StaticModel as StaticModel,
 )
+from pfbench.model.chaotic import (
+    ChaoticSystem as ChaoticSystem,
+    DoublePendulum as DoublePendulum,
+    Lorenz63 as Lorenz63,
+    Lorenz96 as Lorenz96,
+)
 from pfbench.model.constraints import Constraints as Constraints
 from pfbench.model.earth_form import (
     EarthForm as EarthForm,
@@ -63,7 +69,6 @@ from pfbench.model.terrain import (
 )
 from pfbench.model.textbook import (
     Benes as Benes,
-    Lorenz63 as Lorenz63,
     Pendulum as Pendulum,
     StochasticVolatility as StochasticVolatility,
     UnivariateGrowth as UnivariateGrowth,

@@ -1,4 +1,4 @@
-"""Nonlinear models from the literature, for tests and tutorials: scalar ones, the pendulum, the Lorenz attractor."""
+"""Nonlinear models from the literature, for tests and tutorials: scalar ones and the pendulum."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing_extensions import override
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock
 from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.parameter_checks import as_float64, check_positive, require_range
-from pfbench.core.record import Record, name_channels
+from pfbench.core.record import Record
 from pfbench.model.base import StateSpaceModel
 
 # Posteriors of scalar models can be computed in closed form or on a grid.
@@ -246,7 +246,7 @@ class Benes(StateSpaceModel):
 
 
 # --------------------------------------------------------------------------------------------------
-# Pendulum and Lorenz attractor: dynamical systems with several states, for tests and tutorials.
+# Pendulum: a dynamical system with two states.
 
 
 class Pendulum(StateSpaceModel):
@@ -338,99 +338,3 @@ class Pendulum(StateSpaceModel):
     @override
     def observation(self, x: Tensor, u: Any) -> Distribution:
         return independent_normal(torch.sin(x[..., :1]), self.r)
-
-
-class Lorenz63(StateSpaceModel):
-    """Lorenz attractor (10, 28, 8/3) with noisy measurements [Lorenz 1963].
-
-    All three states are measured. Each step is one Runge-Kutta step of order 4.
-
-    Args:
-        step: Time step.
-        process_sd: Standard deviation of the process noise of each state.
-        measurement_sd: Standard deviation of the measurement noise of each state.
-        initial_sd: Standard deviation of each state about (1, 1, 25).
-
-    Raises:
-        ValueError: If an argument is not positive.
-    """
-
-    channel_names = name_channels("state of the Lorenz attractor", ("x", "y", "z"), "1")
-    q: Tensor
-    r: Tensor
-    p0: Tensor
-
-    def __init__(
-        self,
-        step: float = 0.02,
-        process_sd: float = 0.1,
-        measurement_sd: float = 1.0,
-        initial_sd: float = 5.0,
-    ) -> None:
-        super().__init__()
-        self.register_buffer("q", check_positive("model.process_sd", [process_sd] * 3))
-        self.register_buffer("r", check_positive("model.measurement_sd", [measurement_sd] * 3))
-        self.register_buffer("p0", check_positive("model.initial_sd", [initial_sd] * 3))
-        self.step, self.noise_dim = float(check_positive("model.step", step)), 3
-        self.names, self.units, self.groups = ("x", "y", "z"), ("",) * 3, {"state": (0, 1, 2)}
-
-    @override
-    def initial(self, runs: int) -> Distribution:
-        return normal_batch(runs, self.p0, self.p0.new_tensor([1.0, 1.0, 25.0]))
-
-    def drift(self, x: Tensor) -> Tensor:
-        """Compute the time derivative of states [..., 3]."""
-        a, b, c = x.unbind(-1)
-        return torch.stack([10.0 * (b - a), a * (28.0 - c) - b, a * b - 8.0 / 3.0 * c], -1)
-
-    @override
-    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
-        h = self.step
-        k1 = self.drift(x)
-        k2 = self.drift(x + 0.5 * h * k1)
-        k3 = self.drift(x + 0.5 * h * k2)
-        k4 = self.drift(x + h * k3)
-        return x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4) + self.q * w
-
-    def drift_jacobian(self, x: Tensor) -> Tensor:
-        """Compute the derivative of `drift`, [..., 3, 3]."""
-        a, b, c = x.unbind(-1)
-        unit, zero = torch.ones_like(a), torch.zeros_like(a)
-        rows = (-10.0 * unit, 10.0 * unit, zero, 28.0 - c, -unit, -a, b, a, -8.0 / 3.0 * unit)
-        return torch.stack(rows, -1).unflatten(-1, (3, 3))
-
-    def propagation_jacobian(self, x: Tensor, u: Any) -> Tensor:
-        """Return the derivative of the Runge-Kutta step, [R, N, 3, 3].
-
-        Args:
-            x: States, [R, N, D].
-            u: Inputs of the step.
-        """
-        eye, h = torch.eye(3, dtype=x.dtype, device=x.device), self.step
-        total, slope, rate = torch.zeros_like(eye), torch.zeros_like(eye), torch.zeros_like(x)
-        for weight, length in ((1.0, 0.0), (2.0, 0.5), (2.0, 0.5), (1.0, 1.0)):
-            at = x + length * h * rate
-            slope = self.drift_jacobian(at) @ (eye + length * h * slope)
-            rate, total = self.drift(at), total + weight * slope
-        return eye + h / 6.0 * total
-
-    def observation_jacobian(self, x: Tensor, u: Any) -> Tensor:
-        """Return the unit matrix, [1, 1, 3, 3].
-
-        Args:
-            x: States, [R, N, D].
-            u: Inputs of the step.
-        """
-        return torch.eye(3, dtype=x.dtype, device=x.device)[None, None]
-
-    @override
-    def noise_gain(self, u: Any) -> Tensor:
-        return torch.diag(self.q).unsqueeze(0)
-
-    @override
-    def observation(self, x: Tensor, u: Any) -> Distribution:
-        return independent_normal(x, self.r)
-
-    @override
-    def transition(self, x: Tensor, u: Any) -> Distribution:
-        return independent_normal(self.propagate(x, u, torch.zeros_like(x)), self.q)

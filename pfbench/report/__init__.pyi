@@ -41,6 +41,7 @@ from pfbench.results.plotting import (
     FigureSpec as FigureSpec,
     LineStyle as LineStyle,
     add_legend as add_legend,
+    draw_figure as draw_figure,
     format_axis_label as format_axis_label,
     line_styles as line_styles,
     render_palette_png as render_palette_png,

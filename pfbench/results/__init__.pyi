@@ -11,6 +11,7 @@ from pfbench.results.metrics import (
 from pfbench.results.status import is_diverged as is_diverged
 from pfbench.results.store import read_metadata as read_metadata
 from pfbench.stats.comparison import (
+    MIN_RUNS as MIN_RUNS,
     Effect as Effect,
     Verdict as Verdict,
     compare as compare,
@@ -24,10 +25,14 @@ from pfbench.stats.pair_states import (
     format_look as format_look,
 )
 from pfbench.stats.rank_tests import holm as holm, wilcoxon_signed_rank as wilcoxon_signed_rank
+from pfbench.stats.sentences import format_with_interval as format_with_interval
 from pfbench.stats.study_runs import (
     StudyRuns as StudyRuns,
     arrange_runs as arrange_runs,
     compare_filters as compare_filters,
     compute_losses as compute_losses,
 )
-from pfbench.stats.study_size import detectable_effects as detectable_effects
+from pfbench.stats.study_size import (
+    count_needed_runs as count_needed_runs,
+    detectable_effects as detectable_effects,
+)

@@ -289,7 +289,15 @@ class FigureSpec(NamedTuple):
 
 
 def draw_figure(drawing: FigureSpec, formats: Sequence[str]) -> dict[str, bytes]:
-    """Draw a figure in several formats. Equal figures give equal bytes."""
+    """Draw a figure in several formats. Equal figures give equal bytes.
+
+    Args:
+        drawing: Figure with its name and caption.
+        formats: Suffixes of files: svg, pdf or png.
+
+    Returns:
+        Content of the file of each format.
+    """
     with matplotlib.rc_context(RC):
         figure = drawing.make()
         engine = figure.get_layout_engine()

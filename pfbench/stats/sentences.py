@@ -29,6 +29,11 @@ def format_with_interval(ratio: float, low: float, high: float) -> str:
     """Format a ratio with its interval: three decimals where two would put a bound on one that is not one.
 
     An end that lost runs or few runs leave open is infinite. One that is exactly 1, where a test stops, is written 1.
+
+    Args:
+        ratio: Ratio of errors.
+        low: Lower end of its interval.
+        high: Upper end.
     """
     digits = 3 if any(end != 1.0 and f"{end:.2f}" == "1.00" for end in (low, high)) else 2
     ends = {1.0: "1", math.inf: "∞"}

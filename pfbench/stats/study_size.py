@@ -103,7 +103,14 @@ def count_needed_runs(d: Array, ratio: float, alpha: float) -> float:
 
     The differences keep their scatter and get the ratio as their centre. Exact for the sign test, the formula of Noether [1987] for the
     other one. Infinite beyond 10 000 runs.
-    Shapes: log ratios of losses [n], at least two.
+
+    Args:
+        d: Log ratios of losses, [n], at least two.
+        ratio: Ratio of errors that is to be shown.
+        alpha: Error rate of each test, on the side of the ratio.
+
+    Returns:
+        Number of runs.
     """
     means = np.add.outer(d, d) / 2
     centred = means - np.median(means[np.triu_indices(len(d))]) + math.log(ratio)

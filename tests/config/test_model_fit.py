@@ -41,6 +41,7 @@ MARKOV = {
 TIGHT = {"sins_gnss_tight", "sins_gnss_tight_nl"}
 SIMULATED = {
     "benes", "growth", "linear_walk", "local_level", "lorenz63", "pendulum", "stochastic_volatility",
+    "lorenz63_twin", "lorenz96_twin", "double_pendulum_twin",
 }  # fmt: skip
 # one scenario of each kind: models that fit
 KINDS = {

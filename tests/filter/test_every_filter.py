@@ -110,6 +110,7 @@ def some_steps(name: str, model: StateSpaceModel, record: Record) -> None:
 # one of each model, with and without feedback: test_configs runs the others with their default filter
 WORLDS = (
     *("linear_walk", "local_level", "benes", "growth", "lorenz63", "pendulum"),
+    *("lorenz63_twin", "lorenz96_twin", "double_pendulum_twin"),
     *("stochastic_volatility", "passive_1", "gps_ins", "flight_500s", "sar_flight", "anshun_fit"),
     *("anshun_nl", "azimuth", "azimuth_closed_loop", "azimuth_small", "flight_300s_closed_loop"),
     *(

@@ -26,6 +26,7 @@ from pfbench.testing import check_jacobians
 BOTH = {"propagation_jacobian", "observation_jacobian"}
 STATED = {
     "growth": BOTH, "stochastic_volatility": {"propagation_jacobian"}, "pendulum": BOTH, "lorenz63": BOTH,
+    "lorenz63_twin": BOTH, "lorenz96_twin": set(),
     "linear_walk": BOTH, "passive_1": {"propagation_jacobian"}, "flight_300s": BOTH,
     "anshun_short": {"propagation_jacobian"}, "azimuth": {"observation_jacobian"},
     "terrain": BOTH,

@@ -21,8 +21,11 @@ from pfbench.core.linear_algebra import (
 )
 from pfbench.model import (
     Benes,
+    ChaoticSystem,
+    DoublePendulum,
     LinearGaussian,
     Lorenz63,
+    Lorenz96,
     Pendulum,
     StateSpaceModel,
     StaticModel,
@@ -38,6 +41,7 @@ MODELS: dict[str, Callable[[], StateSpaceModel]] = {
     "benes": Benes,
     "pendulum": Pendulum,
     "lorenz": Lorenz63,
+    "without noise": lambda: Lorenz63(process_sd=0.0, substeps=2),
     "level": lambda: local_level(10.0, 20.0, 0.0, 30.0),
     "walk": lambda: linear_walk(0.5, 0.3, 1.0),
     "singular": lambda: LinearGaussian(
@@ -138,7 +142,7 @@ def test_transition_law_is_that_of_the_propagation(name: str) -> None:
     u = inputs(model)
     law = model.transition(initial_states(model, 3, 1).expand(-1, 4000, -1), u)
     if law is None:
-        assert name in ("benes", "pendulum", "singular")
+        assert name in ("benes", "pendulum", "singular", "without noise")
         return
     x = initial_states(model, 3, 1).expand(-1, 4000, -1)
     z = whitened(law, model.propagate(x, u, normal(3, 4000, model.noise_dim, "w")))
@@ -241,18 +245,51 @@ def test_benes_draws_its_exact_transition(start: float) -> None:
     assert stats.kstest(x, lambda v: np.interp(v, grid, cdf)).pvalue > 1e-3
 
 
-def test_lorenz_is_of_fourth_order() -> None:
-    start, end = np.array([1.0, -2.0, 20.0]), 0.32
-    flow = integrate.solve_ivp(
-        lambda t, x: [10 * (x[1] - x[0]), x[0] * (28 - x[2]) - x[1], x[0] * x[1] - 8 / 3 * x[2]],
-        (0, end), start, rtol=1e-12, atol=1e-12, method="DOP853",
-    ).y[:, -1]  # fmt: skip
+def lagrange(t: float, x: np.ndarray) -> np.ndarray:
+    """Equations of a double pendulum as two forces on the ends of the rods, whose tensions are unknown."""
+    a, v, b, w = x
+    radial = np.array([[np.sin(a), -np.cos(a)], [np.sin(b), -np.cos(b)]])
+    along = np.array([[np.cos(a), np.sin(a)], [np.cos(b), np.sin(b)]])
+    # unknown are both angular accelerations and both tensions: m r'' = gravity + tensions
+    upper = np.stack([along[0], 0 * along[0], radial[0], -radial[1]], 1)
+    lower = np.stack([along[0], along[1], 0 * radial[0], radial[1]], 1)
+    turn = np.array([0.0, -9.8]) + v**2 * radial[0]
+    right = np.concatenate([turn, turn + w**2 * radial[1]])
+    accelerations = np.linalg.solve(np.concatenate([upper, lower]), right)
+    return np.array([v, accelerations[0], w, accelerations[1]])
+
+
+def circle(t: float, x: np.ndarray) -> list[float]:
+    return [(x[(i + 1) % 40] - x[i - 2]) * x[i - 1] - x[i] + 8 for i in range(40)]
+
+
+def attractor(t: float, x: np.ndarray) -> list[float]:
+    return [10 * (x[1] - x[0]), x[0] * (28 - x[2]) - x[1], x[0] * x[1] - 8 / 3 * x[2]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "rate", "start"),
+    [
+        (Lorenz63, attractor, [1.0, -2.0, 20.0]),
+        (Lorenz96, circle, [8.0 + math.sin(3.0 * i) for i in range(40)]),
+        (DoublePendulum, lagrange, [2.0, 0.5, -0.3, -1.0]),
+    ],
+)
+def test_a_chaotic_system_is_integrated_to_fourth_order(
+    kind: type[ChaoticSystem], rate: Any, start: list[float]
+) -> None:
+    end = 0.32
+    flow = integrate.solve_ivp(rate, (0, end), start, rtol=1e-12, atol=1e-12, method="DOP853")
     errors = []
     for step in (0.02, 0.01, 0.005):
-        model, x = Lorenz63(step=step), torch.tensor(start).reshape(1, 1, 3)
-        for _ in range(round(end / step)):
-            x = model.propagate(x, (), torch.zeros(1, 1, 3, dtype=torch.float64))
-        errors.append(np.linalg.norm(x.numpy().ravel() - flow))
+        model = kind(
+            step=step, substeps=round(end / step), process_sd=0.0, measurement_sd=1.0,
+            initial_sd=1.0, initial_mean=start,
+        )  # fmt: skip
+        x = model.propagate(
+            model.m0.reshape(1, 1, -1), (), torch.zeros(1, 1, 1, dtype=torch.float64)
+        )
+        errors.append(np.linalg.norm(x.numpy().ravel() - flow.y[:, -1]))
     ratios = np.array(errors[:-1]) / errors[1:]
     # 2^4 with a term of the next order: third-order and fifth-order schemes give 8 and 32
     assert np.all((ratios > 12) & (ratios < 22)), ratios
@@ -439,6 +476,7 @@ BAD = [
     (lambda: UnivariateGrowth(measurement_sd=-1.0), "measurement_sd"),
     (lambda: UnivariateGrowth(initial_sd=math.nan), "initial_sd"),
     (lambda: Lorenz63(process_sd=math.inf), "process_sd"),
+    (lambda: Lorenz63(substeps=0), "substeps"),
     (lambda: StochasticVolatility(rho=1.0), "rho"),
     (lambda: Benes(step=0.0), "step"),
     (lambda: Pendulum(noise=0.0), "noise"),

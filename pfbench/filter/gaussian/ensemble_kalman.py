@@ -68,17 +68,25 @@ class EnsembleUpdate(Protocol):
 class PerturbedObservationUpdate(EnsembleUpdate):
     """Update each member with a different perturbed measurement.
 
-    x + K (y + e - h(x)), e ~ N(0, R), with the model's R. The errors e are neither centred nor
-    replaced by their sample covariance. [ours]
+    x + K (y + e - h(x)), e ~ N(0, R), with the model's R. The errors e are not replaced by their sample
+    covariance. [ours]
+
+    Attributes:
+        centred: Subtract the mean of the errors e, so that the mean of the ensemble moves without them. The factor
+            sqrt(N / (N - 1)) keeps the covariance R of each.
 
     References:
         Burgers, van Leeuwen and Evensen 1998, Analysis scheme in the ensemble Kalman filter.
     """
 
+    centred: bool = False
+
     @override
     def __call__(self, forecast: EnsembleForecast, draws: RandomStream) -> Tensor:
         n, k = forecast.s.shape[1:]
         e = draws.normal("perturbed", n, k).to(forecast.s)
+        if self.centred:
+            e = math.sqrt(n / (n - 1)) * (e - e.mean(1, keepdim=True))
         return (
             forecast.d
             + (forecast.r.unsqueeze(1) + e - math.sqrt(n - 1) * forecast.s)
@@ -90,22 +98,45 @@ class PerturbedObservationUpdate(EnsembleUpdate):
 class EnsembleTransformUpdate(EnsembleUpdate):
     """Update the mean by the gain and the differences by T = (I + S S')^-1/2.
 
-    Without random numbers. The result is the Kalman update of the ensemble's mean and covariance
+    Without random numbers, unless it rotates. The result is the Kalman update of the ensemble's mean and covariance
     [Bishop, Etherton and Majumdar 2001]. T is the symmetric root, since other roots shift the mean
     [Wang, Bishop and Julier 2004]. T follows from the k x k matrix S'S = V diag(l) V':
     T = I - S V diag(1 / (q^2 + q)) V' S' with q^2 = 1 + l. [ours]
 
+    Attributes:
+        rotates: Multiply the updated differences by a uniform random orthogonal matrix that keeps their mean and
+            covariance. Without it a nonlinear model drives one member far away from all others.
+
     References:
         Bishop, Etherton and Majumdar 2001, Adaptive sampling with the ensemble transform Kalman
-        filter.
+        filter. Sakov and Oke 2008, Implications of the form of the ensemble transformation in the ensemble square
+        root filters.
     """
+
+    rotates: bool = False
 
     @override
     def __call__(self, forecast: EnsembleForecast, draws: RandomStream) -> Tensor:
         d, s, r, values, vectors = forecast
         q2 = 1.0 + values
         shrink = vectors / (q2 + q2.sqrt()).unsqueeze(-2) @ vectors.mT
-        return d - s @ (shrink @ (s.mT @ d)) + r.unsqueeze(1) @ forecast.compute_gain()
+        d = d - s @ (shrink @ (s.mT @ d))
+        d = _rotate(d, draws) if self.rotates else d
+        return d + r.unsqueeze(1) @ forecast.compute_gain()
+
+
+def _rotate(d: Tensor, draws: RandomStream) -> Tensor:
+    """Multiply differences [R, N, d] by a random orthogonal matrix that keeps vectors of equal components.
+
+    It is uniform. Only its product with the left singular vectors is drawn, an orthonormal frame across equal components.
+    That is Q of a normal matrix with the signs of the diagonal of its R.
+    """
+    mean, k = d.mean(1, keepdim=True), min(d.shape[1] - 1, d.shape[2])
+    _, values, right = torch.linalg.svd(d - mean, full_matrices=False)
+    z = draws.normal("rotation", d.shape[1], k).to(d)
+    frame, upper = torch.linalg.qr(z - z.mean(1, keepdim=True))
+    signs = torch.where(upper.diagonal(dim1=-2, dim2=-1) < 0.0, -1.0, 1.0)
+    return mean + frame @ ((signs * values[:, :k]).unsqueeze(-1) * right[:, :k])
 
 
 @dataclass(frozen=True)
@@ -123,6 +154,8 @@ class EnsembleKalmanFilter:
         update: PerturbedObservationUpdate or EnsembleTransformUpdate.
         inflation: Factor on the predicted differences from the mean, against sampling error in
             the covariance [Anderson and Anderson 1999]. 1 means no inflation.
+        inflates_update: Apply the factor to the updated differences instead, before the next prediction. In a linear
+            model without process noise that is the same.
 
     Raises:
         ValueError: If there are fewer than two members or the inflation is not positive.
@@ -131,6 +164,7 @@ class EnsembleKalmanFilter:
     particles: int
     update: EnsembleUpdate = field(default_factory=PerturbedObservationUpdate)
     inflation: float = 1.0
+    inflates_update: bool = False
     is_exact = False  # exact in the limit on linear-Gaussian models only
 
     def __post_init__(self) -> None:
@@ -176,11 +210,15 @@ class EnsembleKalmanFilter:
             BootstrapProposal()(model, belief, record, draws).x, belief.log_w, belief.x
         )
         mean = chart.mean(x, torch.full_like(belief.log_w, 1.0 / n)).unsqueeze(1)
-        d = self.inflation * chart.subtract(x, mean)
-        x = chart.add(mean, d) if self.inflation != 1.0 else x
+        factors = (1.0, self.inflation) if self.inflates_update else (self.inflation, 1.0)
+        d = factors[0] * chart.subtract(x, mean)
+        x = chart.add(mean, d) if factors[0] != 1.0 else x
         forecast, log_like = _forecast(model, x, d, record)
         along = (forecast.r.unsqueeze(-2) @ forecast.vectors).squeeze(-2)
-        updated_x = chart.add(mean, self.update(forecast, draws))
+        d = self.update(forecast, draws)
+        if factors[1] != 1.0:
+            d = torch.lerp(d.mean(1, keepdim=True), d, factors[1])
+        updated_x = chart.add(mean, d)
         valid_mask = torch.isfinite(log_like) & torch.isfinite(updated_x).all(-1).all(-1)
         # a lost run has evidence -inf from here on; it continues from its prediction to stay finite
         log_z = belief.log_evidence + torch.where(valid_mask, log_like, -torch.inf)

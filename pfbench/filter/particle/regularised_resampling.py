@@ -8,12 +8,14 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 from typing_extensions import override
 
+from pfbench.core.chart import Chart
 from pfbench.core.linear_algebra import factor
 from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
-from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
+from pfbench.filter.belief import ParticleBelief, normalise_log_weights, weighted_mean_cov
 from pfbench.filter.particle.stages import EssResampler, Resampler
 from pfbench.filter.whitening import whiten
 from pfbench.model.base import StateSpaceModel
@@ -132,6 +134,9 @@ class RegularisedResampler(Resampler):
             1 + h^2 times the variance of the kernel. Copies by equal probabilities, as before the first
             measurement, stay as they are.
         kernel: Distribution of e.
+        is_unbiased: Divide the covariance by 1 - sum w^2, and take that of equal weights where one particle has all
+            the weight. Without it few particles of uneven weights are smoothed too little.
+        moves_unique: Also move particles that were copied once. If False, copies alone are moved.
 
     Raises:
         ValueError: If the scale is not positive.
@@ -145,6 +150,8 @@ class RegularisedResampler(Resampler):
     scale: float = 1.0
     shrink_to_mean: bool = False
     kernel: SmoothingKernel = field(default_factory=GaussianSmoothing)
+    is_unbiased: bool = False
+    moves_unique: bool = True
     is_exact = False
 
     def __post_init__(self) -> None:
@@ -161,12 +168,18 @@ class RegularisedResampler(Resampler):
         n: Tensor,
         draws: RandomStream,
     ) -> tuple[ParticleBelief, Tensor]:
-        mean, covariance = weighted_mean_cov(model.chart, belief)
+        if self.is_unbiased:
+            mean, covariance = _unbiased_mean_cov(model.chart, belief)
+        else:
+            mean, covariance = weighted_mean_cov(model.chart, belief)
         copies, resampled_mask = self.resampler(model, belief, log_a, n, draws)
         d = covariance.shape[-1]
         h = self.scale * self.kernel.bandwidth(d, n.to(covariance.dtype))  # [R, 1]
         e = self.kernel.draw(draws, "regularise", copies.x.shape[1], d)
         step = h.unsqueeze(-1) * (e @ factor(covariance)[0].mT)
+        if not self.moves_unique:  # copies are neighbours: resampling keeps the order
+            is_equal = (copies.x[:, 1:] == copies.x[:, :-1]).all(-1, keepdim=True)
+            step = step * (pad(is_equal, (0, 0, 1, 0)) | pad(is_equal, (0, 0, 0, 1)))
         centre = mean.unsqueeze(1)
         if self.shrink_to_mean:
             shrinkage = torch.sqrt(1.0 - (self.kernel.variance(d) * h * h).clamp(max=1.0))
@@ -175,6 +188,20 @@ class RegularisedResampler(Resampler):
         else:
             x = model.chart.add(copies.x, step)
         return _move_where_uneven(copies, x, log_a, resampled_mask), resampled_mask
+
+
+_LONE = 1e-10  # weight of all other particles below this: equal weights
+
+
+def _unbiased_mean_cov(chart: Chart, belief: ParticleBelief) -> tuple[Tensor, Tensor]:
+    """Return the weighted mean [R, D] and the unbiased covariance [R, d, d], of equal weights for a lone particle."""
+    w = normalise_log_weights(belief.log_w)
+    is_lone = w.amax(1, keepdim=True) > 1.0 - _LONE
+    is_flat = is_lone & (belief.log_w > -torch.inf)  # inactive slots stay so
+    spread = belief._replace(log_w=torch.where(is_flat, 0.0, belief.log_w))
+    mean, covariance = weighted_mean_cov(chart, spread)
+    w = normalise_log_weights(spread.log_w)
+    return mean, covariance / (1.0 - w.square().sum(1)).clamp(min=_LONE)[:, None, None]
 
 
 def _move_where_uneven(

@@ -138,10 +138,6 @@ def _scale_prior(innovation: Innovation, scale: Tensor) -> Innovation:
     return innovation._replace(m=innovation.m * columns, root=innovation.root * columns)
 
 
-# --------------------------------------------------------------------------------------------------
-# Student's t errors by a variational scale.
-
-
 @dataclass(frozen=True)
 class StudentUpdate(ResidualLoss):
     """Student's t errors by a variational scale [Piche, Sarkka and Hartikainen 2012].
@@ -178,10 +174,6 @@ class StudentUpdate(ResidualLoss):
     @override
     def log_density(self, squared: Tensor, size: Tensor) -> Tensor:
         return student_log_density(squared, size, self.dof)
-
-
-# --------------------------------------------------------------------------------------------------
-# Weighted observation likelihood: the power of the likelihood depends on the innovation.
 
 
 @dataclass(frozen=True)
@@ -254,9 +246,6 @@ class WeightedLikelihoodUpdate(InnovationWeight):
         return w, groups, count_downweighted(groups, w)
 
 
-# --------------------------------------------------------------------------------------------------
-# Chi-square gate of the innovation.
-
 _STREAK = "rejected_streak"
 
 
@@ -314,10 +303,6 @@ class InnovationGate(InnovationWeight):
             )
         counts["rejected"] = groups.count_groups(rejected_mask)
         return (~rejected_mask).to(innovation.r), groups, counts
-
-
-# --------------------------------------------------------------------------------------------------
-# Constant factors on the noise covariances: the control of every study of robustness.
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,11 @@ from pfbench.model import (
 ANALYSES: dict[str, EnsembleUpdate] = {
     "perturbed": PerturbedObservationUpdate(),
     "square root": EnsembleTransformUpdate(),
+    "centred": PerturbedObservationUpdate(centred=True),
+    "rotated": EnsembleTransformUpdate(rotates=True),
 }
 every_analysis = pytest.mark.parametrize("analysis", ANALYSES.values(), ids=ANALYSES.keys())
+without_rotation = pytest.mark.parametrize("analysis", list(ANALYSES.values())[:3])
 WALK = linear_walk(1.0, 0.5, 1.0)
 WALK_Y = torch.tensor([[0.8], [2.9], [1.2], [math.nan], [3.0], [6.5]], dtype=torch.float64)
 MODERATE = (0.5, 2.0, 0.4)
@@ -95,16 +98,16 @@ def updated(model: LinearGaussian, x: Tensor, y: Tensor, noise: np.ndarray) -> o
 
 @pytest.mark.parametrize("unseen", [(), (1,), (0, 2), (0, 1, 2)], ids=str)
 @pytest.mark.parametrize("kind", [LinearGaussian, Correlated])
-@pytest.mark.parametrize("n", [3, 40])
+@pytest.mark.parametrize(("n", "rotates"), [(3, False), (40, False), (3, True), (40, True)])
 def test_the_square_root_keeps_mean_and_covariance_exactly(
-    n: int, kind: type[LinearGaussian], unseen: tuple[int, ...]
+    n: int, rotates: bool, kind: type[LinearGaussian], unseen: tuple[int, ...]
 ) -> None:
     """Whatever the ensemble is, even with fewer members than states: no statistics here."""
     model, y = four_states(MODERATE, kind), Y.clone()
     y[list(unseen)] = torch.nan
     noise = NOISE.numpy() if kind is Correlated else np.diag(model.r.numpy() ** 2)
     method, draws = (
-        EnsembleKalmanFilter(n, EnsembleTransformUpdate()),
+        EnsembleKalmanFilter(n, EnsembleTransformUpdate(rotates)),
         PhiloxStream(3, torch.arange(2)),
     )
     before, seen = method.init(model, 2, draws), Record(y.expand(2, -1))
@@ -145,39 +148,47 @@ class Same:
         return self.inner.uniform(purpose, n, w)
 
 
+@pytest.mark.parametrize("centred", [False, True])
 @pytest.mark.parametrize("kind", [LinearGaussian, Correlated])
 def test_perturbed_members_have_the_kalman_update_as_their_expectation(
-    kind: type[LinearGaussian],
+    kind: type[LinearGaussian], centred: bool
 ) -> None:
     """Of one predicted ensemble, over the errors drawn: both moments are unbiased for any number of members."""
     model, runs, n = four_states(MODERATE, kind), 8000, 6
     noise = NOISE.numpy() if kind is Correlated else np.diag(model.r.numpy() ** 2)
     y = Y.clone()
     y[1] = torch.nan
-    method, draws = EnsembleKalmanFilter(n), Same(PhiloxStream(3, torch.arange(runs)))
+    method, draws = (
+        EnsembleKalmanFilter(n, PerturbedObservationUpdate(centred)),
+        Same(PhiloxStream(3, torch.arange(runs))),
+    )
     before, seen = method.init(model, runs, draws), Record(y.expand(runs, -1))
     truth = updated(
         model, BootstrapProposal()(model, before, seen, draws.at_step(1)).x[0], y, noise
     )
     cloud, info = method.step(model, before, seen, draws.at_step(1))
     mean, covariance = info.mean.numpy(), info.covariance().numpy()
-    assert np.all(np.abs(mean.mean(0) - truth.mean[0]) < 4.5 * mean.std(0) / math.sqrt(runs))
-    assert np.all(
-        np.abs(covariance.mean(0) - truth.covariance[0]) < 4.5 * covariance.std(0) / math.sqrt(runs)
-    )
-    assert np.all(mean.std(0) > 0)
-    # the mean scatters by K R K' / N for the errors, the mean of them not being taken off
     _, p = sample(BootstrapProposal()(model, before, seen, draws.at_step(1)).x[0])
     h, r = model.h.numpy()[[0, 2]], noise[np.ix_([0, 2], [0, 2])]
     gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + r)
-    spread = np.diag(gain @ r @ gain.T) / n
-    assert np.all(np.abs(mean.var(0) / spread - 1.0) < 4.5 * math.sqrt(2.0 / runs))
+    errors = gain @ r @ gain.T
+    slack = 4.5 * mean.std(0) / math.sqrt(runs) + 1e-10
+    assert np.all(np.abs(mean.mean(0) - truth.mean[0]) < slack)
+    # each centred error has the covariance R, so those about their mean have that by N / (N - 1)
+    expected = truth.covariance[0] + (errors / (n - 1) if centred else 0.0)
+    assert np.all(np.abs(covariance.mean(0) - expected) < 4.5 * covariance.std(0) / math.sqrt(runs))
+    # the mean scatters by K R K' / N for the errors, unless the mean of them is taken off
+    spread = np.diag(errors) / n
+    if centred:
+        assert np.all(mean.std(0) < 1e-12)
+    else:
+        assert np.all(np.abs(mean.var(0) / spread - 1.0) < 4.5 * math.sqrt(2.0 / runs))
     assert torch.allclose(
         cloud.log_evidence, torch.full_like(cloud.log_evidence, truth.log_evidence[0])
     )
 
 
-@every_analysis
+@without_rotation
 def test_what_is_not_seen_changes_nothing(analysis: EnsembleUpdate) -> None:
     method, draws = EnsembleKalmanFilter(20, analysis), PhiloxStream(1, torch.arange(3))
     before, seen = (
@@ -191,7 +202,7 @@ def test_what_is_not_seen_changes_nothing(analysis: EnsembleUpdate) -> None:
     assert torch.equal(cloud.log_evidence, before.log_evidence)
 
 
-@every_analysis
+@without_rotation
 def test_noise_that_tells_of_the_state_teaches_an_ensemble_nothing(
     analysis: EnsembleUpdate,
 ) -> None:
@@ -218,6 +229,7 @@ def test_inflation_widens_the_prediction_before_it_is_seen(analysis: EnsembleUpd
         torch.full((3, 1), torch.nan, dtype=torch.float64),
     )
     plain, wide = (EnsembleKalmanFilter(20, analysis, inflation=a) for a in (1.0, 1.5))
+    late = dataclasses.replace(wide, inflates_update=True)
     before = plain.init(WALK, 3, draws)
     (a, _), (b, _) = (
         m.step(WALK, before, Record(nothing), draws.at_step(1)) for m in (plain, wide)
@@ -231,6 +243,31 @@ def test_inflation_widens_the_prediction_before_it_is_seen(analysis: EnsembleUpd
     truth = updated(WALK, b.x[1], y, np.eye(1))
     assert np.allclose(sample(cloud.x[1])[1], truth.covariance[0], rtol=1e-10)
     assert float(cloud.log_evidence[1]) == pytest.approx(truth.log_evidence[0])
+    (a, _), (b, _) = (
+        m.step(WALK, before, Record(y.expand(3, -1)), draws.at_step(1)) for m in (plain, late)
+    )
+    spread = a.x - a.x.mean(1, keepdim=True)
+    assert torch.allclose(b.x, a.x.mean(1, keepdim=True) + 1.5 * spread, atol=1e-12)
+    assert torch.equal(a.log_evidence, b.log_evidence)  # the prediction is not inflated
+
+
+def test_rotations_are_uniform() -> None:
+    """The updated differences have mean zero and equal squares over many rotations, whatever the members were."""
+    n, runs = 5, 4000
+    draws = PhiloxStream(3, torch.arange(runs))
+    x = torch.tensor([4.0, -1.0, 0.5, -1.5, -2.0], dtype=torch.float64).view(1, n, 1)
+    before = ParticleBelief(
+        x.expand(runs, -1, 2), 0.0 * x[..., 0].expand(runs, -1), 0.0 * x[0, 0].expand(runs)
+    )
+    method = EnsembleKalmanFilter(n, EnsembleTransformUpdate(rotates=True))
+    nothing = Record(torch.full((runs, 1), torch.nan, dtype=torch.float64))
+    still = linear_walk(1.0, 1e-9, 1.0)
+    after, _ = method.step(still, before, nothing, draws.at_step(1))
+    moved = after.x[..., 1]
+    assert torch.all(moved.mean(0).abs() < 4.5 * moved.std(0) / math.sqrt(runs))
+    square = moved.square()
+    expected = float(x.square().mean())
+    assert torch.all((square.mean(0) - expected).abs() < 4.5 * square.std(0) / math.sqrt(runs))
 
 
 # Kalman

@@ -409,6 +409,32 @@ def test_regularisation_of_a_collapsed_cloud_moves_nothing_far() -> None:
     assert float((after.x - before.x).abs().max()) < 1e-12  # a component without spread gets none
 
 
+@pytest.mark.parametrize("is_lone", [False, True])
+def test_copies_alone_are_moved_by_the_unbiased_covariance(is_lone: bool) -> None:
+    runs, n, d = 2000, 12, 2
+    before = gaussian_cloud(1, n)
+    log_w = before.log_w.clone()
+    log_w[:, 3] += 60.0 if is_lone else 1.0
+    before = ParticleBelief(
+        before.x.expand(runs, -1, -1), log_w.log_softmax(-1).expand(runs, -1), torch.zeros(runs)
+    )
+    resampler = EssResampler(Systematic(), 1.0)
+    after, _ = refresh(
+        RegularisedResampler(resampler, is_unbiased=True, moves_unique=False), before
+    )
+    copies, _ = refresh(resampler, before)
+    counts = (copies.x.unsqueeze(1) == copies.x.unsqueeze(2)).all(-1).sum(2)
+    assert torch.equal(after.x[counts == 1], copies.x[counts == 1])
+    step = (after.x - copies.x)[counts > 1].numpy()
+    w = np.full(n, 1.0 / n) if is_lone else before.log_w[0].exp().numpy()
+    covariance = np.cov(before.x[0].T.numpy(), aweights=w)  # numpy divides by 1 - sum w^2
+    h = (4 / (d + 2)) ** (1 / (d + 4)) * n ** (-1 / (d + 4))
+    z = np.linalg.solve(h * np.linalg.cholesky(covariance), step.T)
+    deviation = z @ z.T / len(step) - np.eye(d)
+    assert np.all(np.abs(deviation) < 4.5 * math.sqrt(2.0 / len(step)))
+    assert np.all(np.abs(z.mean(1)) < 4.5 / math.sqrt(len(step)))
+
+
 def test_regularisation_respects_the_chart() -> None:
     model = Turning(np.eye(2), np.eye(2), np.eye(2), [1.0, 1.0], [0.0, 0.0], [1.0, 1.0])
     z = normal(1, 500, 2)
