@@ -267,7 +267,7 @@ def test_studies_run_cheapest_first_and_within_a_limit() -> None:
 
 
 # Studies with jobs of uncommitted code. They run again; no study is added.
-WAITING_FOR_A_RERUN = ["twins"]
+WAITING_FOR_A_RERUN: list[str] = []
 
 
 def test_published_jobs_are_of_committed_code() -> None:

@@ -89,12 +89,15 @@ def _name_by_number(label: str, counts: set[float], numbers: Mapping[str, set[fl
     return f"{name}[particles={int(*counts)}]"
 
 
-def merge_runs(published: pd.DataFrame, newer: pd.DataFrame) -> pd.DataFrame:
+def merge_runs(
+    published: pd.DataFrame, newer: pd.DataFrame, has_rounds: bool = False
+) -> pd.DataFrame:
     """Add the cells that a published study lacks, and check those that both have.
 
     Args:
         published: Runs of the published study, with the labels of `name_by_number`.
         newer: Runs of the newer report, with the same.
+        has_rounds: Whether the times of the published study are those of rounds. New cells have no time then.
 
     Raises:
         ValueError: If a condition of the newer report has no cell of the published study, or one whose errors differ.
@@ -120,7 +123,10 @@ def merge_runs(published: pd.DataFrame, newer: pd.DataFrame) -> pd.DataFrame:
             f"errors of {', '.join(sorted(set(pairs['filter'][differs].astype(str))))} must be those of the published "
             "study, got others. The data have changed: run the whole study again."
         )
-    return pd.concat([published, added[list(newer.columns)]], ignore_index=True)
+    new = added[list(newer.columns)]
+    if has_rounds:  # a time of a single job does not stand beside those of rounds
+        new = new.assign(ms=math.nan)
+    return pd.concat([published, new], ignore_index=True)
 
 
 def _list_conditions(table: pd.DataFrame) -> list[tuple[Any, ...]]:
@@ -250,11 +256,11 @@ def merge_packs(published: Pack, newer: Pack, runs: pd.DataFrame) -> Pack:
         runs: Runs of the merged study.
 
     Raises:
-        ValueError: If a page has times per step in rounds.
+        ValueError: If the newer page has times per step in rounds.
     """
-    if published["facts"]["times"] or newer["facts"]["times"]:
+    if newer["facts"]["times"]:
         raise ValueError(
-            "a page to merge must have one time per job, got rounds of `pfbench cost`. Run it after all jobs."
+            "a report to merge must have one time per job, got rounds of `pfbench cost`. Leave it out for this report."
         )
     looks = {look["key"]: look for look in (*newer["facts"]["looks"], *published["facts"]["looks"])}
     for look in newer["facts"]["looks"]:
@@ -358,7 +364,7 @@ def merge_study(study: str, folder: Path, reports: Path = REPORTS) -> list[str]:
         (rename_pack(pack, labels), table.assign(filter=table["filter"].astype(str).map(labels)))
         for (pack, table), labels in zip(stored, names, strict=True)
     )
-    runs = merge_runs(old, new)
+    runs = merge_runs(old, new, bool(published["facts"]["times"]))
     cells = [
         set(map(tuple, table[["scenario", "filter"]].drop_duplicates().to_numpy()))
         for table in (old, new)

@@ -332,7 +332,10 @@ def describe_price(overview: Overview) -> str:
         for world, tuning in tunings.items()
         if (hours := tuning.get("not_tuned_hours"))
     ]
-    return f"The tuning took {sum(t[n]['seconds'] for t in tunings.values() for n in names if n in t) / 60:.0f} CPU minutes. Not tuned in this world: {'; '.join(texts) or 'none'}. These are estimates."
+    return (
+        f"The tuning took {sum(t[n]['seconds'] for t in tunings.values() for n in names if n in t) / 60:.0f} CPU minutes."
+        + f" Not tuned in this world: {'; '.join(texts)}. These are estimates." * bool(texts)
+    )
 
 
 def word_headline(
