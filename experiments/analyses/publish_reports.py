@@ -128,7 +128,9 @@ def _without_empty_sections(text: str) -> str:
 
 def main() -> None:
     """Publish all reports that exist."""
-    write_manifest(PUBLISHED_FILES, hash_published())  # a page may show the published runs of another study
+    write_manifest(
+        PUBLISHED_FILES, hash_published()
+    )  # a page may show the published runs of another study
     for page in sorted(REPORTS.glob("*/report.md")):
         if page.parent.name in HEADLINES:
             publish_report(page.parent)
