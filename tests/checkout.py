@@ -8,7 +8,7 @@ from typing import Any
 TESTS = Path(__file__).resolve().parent
 ROOT = TESTS.parent
 PUBLISHED_FILE = re.compile(
-    r"reports/(README\.md|published\.json|\w+/((report|worlds)\.md|(heat_map|matrices)\.svg|verdicts\.json(\.gz)?|words\.json|values\.json\.gz|runs\.parquet|figures/paper_\w+\.svg|results\.json\.gz"
+    r"reports/(README\.md|published\.json|\w+/((report|worlds)\.md|(heat_map|heat_map_at_home|matrices)\.svg|verdicts\.json(\.gz)?|words\.json|values\.json\.gz|runs\.parquet|figures/paper_\w+\.svg|results\.json\.gz"
     r"|headline\.(png|svg)))"
 )
 _EVENTS = ("open", "os.listdir", "os.scandir")

@@ -367,11 +367,11 @@ def format_table(key: str, entry: Mapping[str, Any], source: Mapping[str, str]) 
 INTRODUCTION = """# Public claims and what their tables show
 
 Programs for navigation are compared in public, with words such as "outperforms" and with tables of errors by drive. This page asks of {count}
-such claims whether their own tables show them. They were chosen by the rule below, and none for its verdict. {dropped} entries were
+such claims whether their own tables show them. They were chosen by the rule below. {dropped} entries were
 read and left out, each with its reason.
 
 **{holds} hold, {part} hold in part, {open} are not decided by their tables, {few} have too few drives,
-and {contrary} contradicted.**
+and {contrary} shown to be the reverse.**
 
 ![Ratio of the errors and its interval for the weakest pair of each claim, coloured by what the table decides](audit.svg)
 
@@ -379,7 +379,7 @@ A row is a claim; after a colon, the rival with an interval that agrees least wi
 the 95 % interval, cut at the ends of the axis. The grey band is 5 %. `=` marks claims that two programs are on a par. A claim holds if it does
 against all rivals.
 
-"Not decided" does not mean wrong. The printed counts, such as 10 of 12, are right unless a note says otherwise. The question here is
+"Not decided" does not mean wrong. The printed counts, such as 10 of 12, are right unless a note says otherwise: the notes name words that the table itself does not have, such as "in all". The question here is
 another one: does the table show a smaller error in most other drives of this kind?
 
 ## How the claims were chosen

@@ -167,7 +167,7 @@ def nimble_vector() -> Iterator[Number]:
         yield Number(f"mean_{k + 1}", f"{setting}, last mean of state {k + 1}", printed, float(mean[2, k]), 5e-4, filters=("ckf",))  # fmt: skip
     yield Number(
         "first_mean_1", f"{setting}, first mean of state 1", 0.323, float(mean[0, 0]), 5e-4, filters=("ckf",),
-        note="The means of the later steps agree in all digits. A digit is probably misprinted: 0.333 would agree.",
+        note="The means of the later steps agree in all digits. A digit is probably misprinted: 0.333 would agree. The third mean of this step is printed as 1.03 and is 1.037 here, without a row of its own.",
     )  # fmt: skip
 
 

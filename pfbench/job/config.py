@@ -205,7 +205,9 @@ def _take_knobs(tree: Any, choices: Mapping[str, str], trusted: Sequence[str]) -
 
 def list_groups() -> dict[str, list[str]]:
     """List the names of each configuration group and of the group `experiment`."""
-    groups = sorted({path.parent.name for path in conf_dir().glob("*/*.yaml")} - {READING})
+    groups = sorted(
+        {p.parent.name for pattern in ("*/*.yaml", f"*/{FAMILY_FOLDER}") for p in conf_dir().glob(pattern)} - {READING}
+    )  # fmt: skip
     return {group: list_named_parts(group) for group in [*groups, "experiment"]}
 
 

@@ -75,10 +75,6 @@ def check_p_values(
     return LawCheck(statement, smallest, limit, details=dict(details))
 
 
-# --------------------------------------------------------------------------------------------------
-# Checks of what a test receives: an object of the right kind, whose results can be repeated.
-
-
 def find_kind(
     tester: str, stage: object, kinds: Mapping[str, tuple[str, ...]], example: str
 ) -> str:

@@ -215,9 +215,9 @@ class EnsembleKalmanFilter:
         x = chart.add(mean, d) if factors[0] != 1.0 else x
         forecast, log_like = _forecast(model, x, d, record)
         along = (forecast.r.unsqueeze(-2) @ forecast.vectors).squeeze(-2)
-        d = self.update(forecast, draws)
-        if factors[1] != 1.0:
-            d = torch.lerp(d.mean(1, keepdim=True), d, factors[1])
+        updated = self.update(forecast, draws)
+        updated = torch.lerp(updated.mean(1, keepdim=True), updated, factors[1])
+        d = torch.where(record.y.isnan().all(-1, keepdim=True).unsqueeze(-1), d, updated)
         updated_x = chart.add(mean, d)
         valid_mask = torch.isfinite(log_like) & torch.isfinite(updated_x).all(-1).all(-1)
         # a lost run has evidence -inf from here on; it continues from its prediction to stay finite

@@ -260,9 +260,9 @@ def test_rotations_are_uniform() -> None:
         x.expand(runs, -1, 2), 0.0 * x[..., 0].expand(runs, -1), 0.0 * x[0, 0].expand(runs)
     )
     method = EnsembleKalmanFilter(n, EnsembleTransformUpdate(rotates=True))
-    nothing = Record(torch.full((runs, 1), torch.nan, dtype=torch.float64))
-    still = linear_walk(1.0, 1e-9, 1.0)
-    after, _ = method.step(still, before, nothing, draws.at_step(1))
+    vague = Record(torch.zeros(runs, 1, dtype=torch.float64))
+    still = linear_walk(1.0, 1e-9, 1e9)
+    after, _ = method.step(still, before, vague, draws.at_step(1))
     moved = after.x[..., 1]
     assert torch.all(moved.mean(0).abs() < 4.5 * moved.std(0) / math.sqrt(runs))
     square = moved.square()

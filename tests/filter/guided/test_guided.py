@@ -52,8 +52,8 @@ from pfbench.filter import (
     run_filter,
 )
 from pfbench.filter.belief import ParticleBelief, ess, weighted_mean_cov
-from pfbench.model import LinearGaussian, StateSpaceModel
-from pfbench.model.textbook import Lorenz63, Pendulum, TimeIndexInputs, UnivariateGrowth
+from pfbench.model import LinearGaussian, Lorenz63, Pendulum, StateSpaceModel, UnivariateGrowth
+from pfbench.model.textbook import TimeIndexInputs
 from pfbench.testing import check_evidence, check_independence, filter_record, reference_moments
 
 EKF, UKF, CKF = (
