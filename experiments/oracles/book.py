@@ -92,6 +92,7 @@ class Recipe(NamedTuple):
     make: Callable[[], Iterable[Number]]
 
 
+REGISTRY = "registry_nile."  # rows of filters of the registry, by their start
 _RECIPES: dict[str, Recipe] = {}
 
 
@@ -173,6 +174,11 @@ def run_book(name: str, folder: Path) -> list[dict[str, Any]]:
         ValueError: If the name does not exist.
     """
     recipes, digest, rows = list_recipes(name), find_digest(), []
+    seconds = sum(entry.seconds for entry in recipes)
+    print(
+        f"Recipes: {len(recipes)}; about {seconds:.0f} s on one core; finished rows are kept in {folder}",
+        flush=True,
+    )
     for entry in recipes:
         results, is_kept = read_or_compute(entry, folder, digest)
         for row in results["rows"]:
@@ -182,5 +188,7 @@ def run_book(name: str, folder: Path) -> list[dict[str, Any]]:
     require(rows, "oracle", f"be a row of {recipes[0].name}", name, "Use: pfbench check oracles")
     misses = [row["id"] for row in rows if not row["hit"]]
     said = f"; misses: {', '.join(misses)}" if misses else ""
-    print(f"{len(rows) - len(misses)} of {len(rows)} rows are met{said}")
+    registry = sum(row["id"].startswith(REGISTRY) for row in rows)
+    of_these = f", {registry} of them filters of the registry on one number" if registry else ""
+    print(f"{len(rows) - len(misses)} of {len(rows)} rows are met{of_these}{said}")
     return rows
