@@ -437,7 +437,7 @@ def test_a_failed_job_leaves_a_note_and_its_success_takes_it_away(tmp_path: Path
 
 REFUSED = {
     "dtype=double": "dtype must be float64 (default) or float32, got 'double'. Set dtype=float64.",
-    "runs=ten": "runs must be a whole number of at least 1, got ten. Set runs=100.",
+    "runs=ten": "runs must be a whole number of at least 1, got 'ten'. Set runs=100.",
     "runs=0": "runs must be a whole number of at least 1, got 0. Set runs=100.",
     "runs=1e9": "runs must be a whole number of at least 1, got 1000000000.0. Write it without exponent and "
     "without a decimal point: runs=1000000000.",
@@ -445,7 +445,7 @@ REFUSED = {
     "seed=-1": "seed must be a whole number of at least 0, got -1. Set seed=1.",
     "filter.particles=0": "filter.particles must be a whole number of at least 2, got 0. Use 2 or more, without a point or exponent.",
     "particles=0": "particles must be a whole number of at least 2, got 0. Set particles=500.",
-    "particles=many": "particles must be a whole number of at least 2, got many. Set particles=500.",
+    "particles=many": "particles must be a whole number of at least 2, got 'many'. Set particles=500.",
     "scenario.steps=0": "scenario.steps must be a whole number of at least 1, got 0. Change",
 }
 
