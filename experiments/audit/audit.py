@@ -379,12 +379,12 @@ A row is a claim; after a colon, the rival with an interval that agrees least wi
 the 95 % interval, cut at the ends of the axis. The grey band is 5 %. `=` marks claims that two programs are on a par. A claim holds if it does
 against all rivals.
 
-"Not decided" does not mean wrong. The printed counts, such as 10 of 12, are right unless a note says otherwise: the notes name words that the table itself does not have, such as "in all". The question here is
-another one: does the table show a smaller error in most other drives of this kind?
+"Not decided" does not mean wrong. The printed counts, such as 10 of 12, are right unless a note says otherwise.
+The question here is another one: does the table show a smaller error in most other drives of this kind?
 
 ## How the claims were chosen
 
-The rule comes before the results. One claim, of FusionCore, came with the task of this page, with its verdict known. Rule, list and verdicts
+The rule was written before the verdicts. One claim, of FusionCore, came with the task of this page, with its verdict known. Rule, list and verdicts
 entered the history of the repository in one commit, so the history does not prove their order.
 
 - Searched: {searched}. Data sets: {data_sets}.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Iterator
 from typing import Any
 
@@ -55,11 +56,11 @@ class AdditiveModel(StateSpaceModel):
         self.names, self.units = tuple(f"x{k}" for k in range(size)), ("",) * size
         self.groups, self.noise_dim = {"state": tuple(range(size))}, size
 
-    def move(self, x: Tensor) -> Tensor:
-        raise NotImplementedError
+    @abstractmethod
+    def move(self, x: Tensor) -> Tensor: ...
 
-    def see(self, x: Tensor) -> Tensor:
-        raise NotImplementedError
+    @abstractmethod
+    def see(self, x: Tensor) -> Tensor: ...
 
     def initial(self, runs: int) -> Distribution:
         return normal_batch(runs, self.s0, self.m0)

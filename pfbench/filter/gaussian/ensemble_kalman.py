@@ -154,8 +154,9 @@ class EnsembleKalmanFilter:
         update: PerturbedObservationUpdate or EnsembleTransformUpdate.
         inflation: Factor on the predicted differences from the mean, against sampling error in
             the covariance [Anderson and Anderson 1999]. 1 means no inflation.
-        inflates_update: Apply the factor to the updated differences instead, before the next prediction. In a linear
-            model without process noise that is the same.
+        inflates_update: Apply the factor to the updated differences instead, before the next prediction, where
+            something is measured. In a linear model measured in each step, without process noise, that is
+            the same.
 
     Raises:
         ValueError: If there are fewer than two members or the inflation is not positive.
