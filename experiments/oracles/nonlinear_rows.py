@@ -120,8 +120,11 @@ class Ricker(AdditiveModel):
     def move(self, x: Tensor) -> Tensor:
         return 3.8 + x - torch.exp(x)
 
+    def see(self, x: Tensor) -> Tensor:
+        return 10.0 * torch.exp(x)
+
     def observation(self, x: Tensor, u: Any) -> Distribution:
-        return Independent(Poisson(10.0 * torch.exp(x), validate_args=False), 1)
+        return Independent(Poisson(self.see(x), validate_args=False), 1)
 
 
 def _gaussian(name: str, *words: str) -> GaussianFilter:
