@@ -106,7 +106,7 @@ def _draw_leaderboard(
     limits = ratio_limits(list(finite)) if is_ratio else (finite.min() / 1.08, finite.max() * 1.08)
     use_ratio_scale(axis, *limits)
     label_rows(axis, [str(looks[key]["name"]) for key in rows], setting)
-    texts = [f"{value:.2f}" if is_ratio else f"{value:.3g}" for value in ends[:, 0]]
+    texts = [f"{value:.2f}" if is_ratio else f"{float(f'{value:.3g}'):g}" for value in ends[:, 0]]
     for y, ((key, row), text) in enumerate(zip(rows.items(), texts, strict=True)):
         draw_interval(axis, y, tuple(ends[y]), looks[key], limits)
         axis.annotate(
@@ -119,8 +119,8 @@ def _draw_leaderboard(
                 setting.escape(DAGGER), (1.0, y), xycoords=("axes fraction", "data"), xytext=(3 + 0.52 * size * len(text), 1.5),
                 textcoords="offset points", va="center", fontsize=0.8 * size, annotation_clip=False,
             )  # fmt: skip
-    metric = pack["metrics"][0]
-    level = f"median {metric['name']} [{'k' * is_far}{metric['unit']}]"
+    metric, unit = pack["metrics"][0], next(iter(rows.values()))["unit"] or ""  # worlds differ in their units
+    level = f"median {format_axis_label(metric['name'], 'k' * is_far + unit)}"
     axis.set_xlabel(
         setting.escape(f"{metric['name']} relative to {name_baseline(pack)}" if is_ratio else level)
     )
