@@ -411,7 +411,7 @@ def position_table(scores: Scores) -> list[str]:
         np.array(scores["position"]["normal", source, stretch])
         for (_, source, stretch), _ in mixtures
     ]
-    raw = [wilcoxon_signed_rank(b - a).p for (_, a), b in zip(mixtures, usual, strict=True)]
+    raw = [wilcoxon_signed_rank(b - a)[1] for (_, a), b in zip(mixtures, usual, strict=True)]
     lines = markdown_head(*names)
     for ((name, _, stretch), a), b, p, corrected in zip(
         mixtures, usual, raw, holm(raw), strict=True

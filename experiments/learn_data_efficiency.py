@@ -261,7 +261,7 @@ def table(results: Mapping[str, Any], case: Case) -> list[str]:
         d = ess - np.array(hand[best]["ess"])
         spent = [scores["training"][0] for scores in parts if "training" in scores]
         p = (
-            f"{wilcoxon_signed_rank(d).p:.1g}, {'above' if d.mean() > 0.0 else 'below'}"
+            f"{wilcoxon_signed_rank(d)[1]:.1g}, {'above' if d.mean() > 0.0 else 'below'}"
             if spent
             else ""
         )
@@ -300,7 +300,7 @@ def verdicts(results: Mapping[str, Any]) -> list[str]:
         }
         mean, half = crossed_mean_interval(each["error"])
         ratio = f"{math.exp(mean):.3f} ({math.exp(mean - half):.3f} to {math.exp(mean + half):.3f})"
-        raw += [wilcoxon_signed_rank(values.mean(0)).p for values in each.values()]
+        raw += [wilcoxon_signed_rank(values.mean(0))[1] for values in each.values()]
         cells.append([name, other, ratio, f"{np.median(each['evidence'].mean(0)):.3f}"])
     adjusted = holm(raw)
     lines = [

@@ -168,7 +168,7 @@ def compare(parts: list[Any], others: list[Any]) -> tuple[float, float, float]:
         np.log(np.array(a["error"]) / np.array(others[i % len(others)]["error"]))
         for i, a in enumerate(parts)
     ])  # fmt: skip
-    return *crossed_mean_interval(each), wilcoxon_signed_rank(each.mean(0)).p
+    return *crossed_mean_interval(each), wilcoxon_signed_rank(each.mean(0))[1]
 
 
 def decide(mean: float, half: float, p: float) -> str:

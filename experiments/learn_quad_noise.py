@@ -152,7 +152,7 @@ def compare(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
     ).confidence_interval
     return {
         "a": float(np.median(a)), "b": float(np.median(b)), "difference": float(np.median(d)),
-        "low": float(interval.low), "high": float(interval.high), "p": wilcoxon_signed_rank(d).p,
+        "low": float(interval.low), "high": float(interval.high), "p": wilcoxon_signed_rank(d)[1],
     }  # fmt: skip
 
 

@@ -147,7 +147,7 @@ class Effect(NamedTuple):
     @property
     def p_lost(self) -> float:
         """p-value of McNemar's exact test: whether one filter loses more runs than the other."""
-        return _sign_p(self.lost.a, self.lost.b)
+        return float(_sign_p(self.lost.a, self.lost.b))
 
     @property
     def has_ratio(self) -> bool:
@@ -223,8 +223,8 @@ def compare_all(
     pairs: Sequence[tuple[tuple[str, Array], tuple[str, Array]]], unit: Unit = "run"
 ) -> list[Effect]:
     """Compare several pairs, those of equal length in one call of the test."""
-    differences = []
-    for (name, first), (name_b, second) in pairs:
+    places: dict[int, list[int]] = {}
+    for k, ((name, first), (name_b, second)) in enumerate(pairs):
         require(
             np.shape(first) == np.shape(second) and np.ndim(first) == 1,
             f"{name} and {name_b}",
@@ -232,28 +232,32 @@ def compare_all(
             f"{np.shape(first)} and {np.shape(second)}",
             f"Select common {unit}s.",
         )
-        differences.append(subtract_losses(first, second))
-    p = _signed_rank_p(differences)
-    effects = []
-    for (a, b), d, value in zip(pairs, differences, p, strict=True):
-        tests = (float(value), _trimmed_p(d), math.nan)
-        effect = Effect(a[0], b[0], unit, d, *tests, *_describe_losses(a[1], b[1]))
-        effects.append(effect._replace(p_sign=_side_p(d if d.any() and effect.is_smaller else -d)))
-    return effects
+        places.setdefault(len(first), []).append(k)
+    effects: dict[int, Effect] = {}
+    for index in places.values():
+        first, second = (np.stack([pairs[k][side][1] for k in index]) for side in (0, 1))
+        d = subtract_losses(first, second)
+        counts, means = _describe_losses(first, second)
+        columns = (d, _signed_rank_p(d), _trimmed_p(d), counts, means)
+        for k, row, signed, trimmed, lost, mean in zip(index, *columns, strict=True):
+            names = pairs[k][0][0], pairs[k][1][0]
+            effects[k] = Effect(*names, unit, row, float(signed), float(trimmed), math.nan, LostRuns(*lost.tolist()), float(mean))  # fmt: skip
+        sides = np.array([effects[k].differences.any() and effects[k].is_smaller for k in index])
+        p_sign = _side_p(np.where(sides[:, None], d, -d))
+        effects |= {k: effects[k]._replace(p_sign=float(p)) for k, p in zip(index, p_sign, strict=True)}  # fmt: skip
+    return [effects[k] for k in range(len(pairs))]
 
 
-def _describe_losses(first: Array, second: Array) -> tuple[LostRuns, float]:
-    """Count the lost runs of a pair, and compare the mean errors of its other runs."""
+def _describe_losses(first: Array, second: Array) -> tuple[Array, Array]:
+    """Count the lost runs of pairs, [K, 3], and compare the mean errors of their other runs, [K]. Shapes: losses [K, n]."""
     lost_a, lost_b = np.isposinf(first), np.isposinf(second)
-    counts = (lost_a & ~lost_b, lost_b & ~lost_a, lost_a & lost_b)
-    is_common = ~(lost_a | lost_b)
-    mean = math.nan
-    if is_common.any():
-        largest = max(first[is_common].max(), second[is_common].max())
-        sums = [np.exp(losses[is_common] - largest).sum() for losses in (first, second)]
-        mean = math.log(max(sums[0], _LEAST_SUM)) - math.log(max(sums[1], _LEAST_SUM))
-    of_a, of_b, of_both = (int(flags.sum()) for flags in counts)
-    return LostRuns(of_a, of_b, of_both), mean
+    counts = np.stack([lost_a & ~lost_b, lost_b & ~lost_a, lost_a & lost_b], 1).sum(axis=2)
+    kept = np.where(lost_a | lost_b, -np.inf, np.stack([first, second]))
+    largest = kept.max(axis=(0, 2), initial=-np.inf)
+    has_kept = np.isfinite(largest)
+    sums = np.exp(kept - np.where(has_kept, largest, 0.0)[:, None]).sum(axis=2)
+    a, b = np.log(np.maximum(sums, _LEAST_SUM))
+    return counts, np.where(has_kept, a - b, np.nan)
 
 
 def decide(
@@ -315,21 +319,17 @@ def find_largest_p(pairs: Sequence[tuple[Array, Array]]) -> float:
     hypotheses needs no correction for their number.
     Shapes: losses [n] of a pair.
     """
-    differences = [subtract_losses(first, second) for first, second in pairs]
-    if not differences or not all(map(_varies, differences)):
+    some = [subtract_losses(first, second) for first, second in pairs]
+    if not some or not all(map(_varies, some)):
         return 1.0
-    signed = map(float, _signed_rank_p(differences, "less"))
-    return max(*signed, *(max(_trimmed_p(d, "less"), _side_p(d)) for d in differences))
+    rows = [np.stack([d for d in some if len(d) == n]) for n in {len(d) for d in some}]
+    tests = (_signed_rank_p, _trimmed_p, lambda d, _: _side_p(d))
+    return max(float(test(d, "less").max()) for test in tests for d in rows)
 
 
-def _signed_rank_p(differences: Sequence[Array], alternative: Alternative = "two-sided") -> Array:
-    """Return a p-value for each array of differences [n], 1 for an empty one: those of equal length in one call."""
-    p = np.ones(len(differences))
-    sizes = np.array([len(d) for d in differences], dtype=int)
-    for size in np.unique(sizes[sizes > 0]):
-        d = np.stack([row for row in differences if len(row) == size])
-        p[sizes == size] = wilcoxon_signed_rank_rows(d, alternative)[1]
-    return p
+def _signed_rank_p(d: Array, alternative: Alternative = "two-sided") -> Array:
+    """Return a p-value for each row of differences, [K]; 1 for empty ones. Shapes: d [K, n]."""
+    return wilcoxon_signed_rank_rows(d, alternative)[1] if d.shape[1] else np.ones(len(d))
 
 
 def subtract_losses(first: Array, second: Array) -> Array:
@@ -339,16 +339,15 @@ def subtract_losses(first: Array, second: Array) -> Array:
     return np.where(np.abs(d) <= LOG_TOLERANCE, 0.0, d)
 
 
-def _sign_p(more: int, fewer: int) -> float:
-    """Return the p-value of the exact test that two counts have the same expectation, two-sided."""
-    least, total = min(more, fewer), more + fewer
-    return min(1.0, 2 * float(scipy.special.bdtr(least, total, 0.5))) if total else 1.0
+def _sign_p(more: Array | int, fewer: Array | int) -> Array:
+    """Return the p-value of the exact test that two counts have the same expectation, two-sided; 1 without any."""
+    least, total = np.minimum(more, fewer), np.add(more, fewer)
+    return np.asarray(np.minimum(1.0, 2 * scipy.special.bdtr(least, total, 0.5)))
 
 
-def _side_p(d: Array) -> float:
-    """Return the p-value of the sign test against a smaller error in most units: of one side; 1 without a difference."""
-    more, fewer = int((d > 0).sum()), int((d < 0).sum())
-    return float(scipy.special.bdtr(more, more + fewer, 0.5)) if more + fewer else 1.0
+def _side_p(d: Array) -> Array:
+    """Return the p-value of the sign test against a smaller error in most units, for each row: of one side; 1 without a difference."""
+    return np.asarray(scipy.special.bdtr((d > 0).sum(axis=1), (d != 0).sum(axis=1), 0.5))
 
 
 def _varies(d: Array) -> bool:
@@ -410,7 +409,7 @@ def _choose_word(
     if p >= alpha:
         return NO_DECISION, ""
     side = math.copysign(1.0, location)
-    if evidence.p_trimmed >= alpha or _trimmed_mean(effect.differences)[0] * side <= 0:
+    if evidence.p_trimmed >= alpha or _trimmed_mean(effect.differences[None])[0] * side <= 0:
         return NO_DECISION, "the trimmed mean does not agree"
     if evidence.p_sign >= alpha:
         return NO_DECISION, "the sign test does not agree"
@@ -488,46 +487,45 @@ def _count_outside(n: int, alpha: float) -> int:
     return max(int(centre + scipy.special.ndtri(alpha / 2) * sd), 0)
 
 
-def _trimmed_mean(d: Array) -> tuple[float, float, float]:
-    """Return the trimmed mean of differences, its standard error and its degrees of freedom.
+def _trimmed_mean(d: Array) -> tuple[Array, Array]:
+    """Return the trimmed mean of rows of differences and its standard error, [K].
 
     The error is that of Tukey and McLaughlin, from the winsorised differences. Where lost runs remain after trimming, the
-    sum of the signs replaces the mean, without an error.
+    sum of the signs replaces the mean, without an error. Shapes: d [K, n].
     """
-    n, cut = len(d), int(TRIM_SHARE * len(d) + 1e-9)
-    middle = n - 2 * cut
-    ordered = np.sort(d)
-    if not np.isfinite(
-        ordered[[cut, n - cut - 1]]
-    ).all():  # lost runs remain: only signs are numbers
-        return float(np.sign(d).sum()), math.nan, math.nan
-    location = float(ordered[cut : n - cut].mean())
-    if middle < 2:
-        return location, math.inf, 1.0
-    winsorised = np.clip(d, ordered[cut], ordered[n - cut - 1])
-    squares = float(((winsorised - winsorised.mean()) ** 2).sum())
-    if np.ptp(winsorised) <= _ROUNDING * np.abs(winsorised).max():
-        squares = 0.0
-    return location, math.sqrt(squares / (middle * (middle - 1))), middle - 1.0
-
-
-def _trimmed_p(d: Array, alternative: str = "two-sided") -> float:
-    """Return the p-value of the trimmed mean, 1 where the middle runs do not differ; of the signs where lost runs are among them."""
-    if len(d) < 2:
-        return 1.0
-    value, error, df = _trimmed_mean(d)
-    if math.isnan(error):
-        return (
-            _side_p(d) if alternative == "less" else _sign_p(int((d > 0).sum()), int((d < 0).sum()))
-        )
-    if value == 0:
-        return 1.0
-    t = value / error if error > 0 else math.copysign(math.inf, value)
-    return (
-        float(scipy.special.stdtr(df, t))
-        if alternative == "less"
-        else float(2 * scipy.special.stdtr(df, -abs(t)))
+    n = d.shape[1]
+    cut = int(TRIM_SHARE * n + 1e-9)
+    ordered, middle = np.sort(d, axis=1), n - 2 * cut
+    ends = ordered[:, [cut, n - cut - 1]]
+    has_mean = np.asarray(np.isfinite(ends).all(axis=1))  # else only signs are numbers
+    low, high = np.where(has_mean[:, None], ends, 0.0).T[..., None]
+    location = np.clip(ordered[:, cut : n - cut], low, high).mean(axis=1)
+    winsorised = np.clip(d, low, high)
+    squares = ((winsorised - winsorised.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
+    is_flat = np.ptp(winsorised, axis=1) <= _ROUNDING * np.abs(winsorised).max(axis=1)
+    squares = np.where(is_flat, 0.0, squares) / (middle * (middle - 1)) if middle > 1 else np.inf
+    return np.where(has_mean, location, np.sign(d).sum(axis=1)), np.where(
+        has_mean, np.sqrt(squares), np.nan
     )
+
+
+def _trimmed_p(d: Array, alternative: Alternative = "two-sided") -> Array:
+    """Return the p-value of the trimmed mean of each row of differences, 1 where the middle runs do not differ; of the signs where lost runs are among them.
+
+    Shapes: d [K, n].
+    """
+    if d.shape[1] < 2:
+        return np.ones(len(d))
+    value, error = _trimmed_mean(d)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = np.where(value == 0.0, 0.0, value / error)
+    df = max(d.shape[1] - 2 * int(TRIM_SHARE * d.shape[1] + 1e-9) - 1, 1)
+    if alternative == "less":
+        p, of_signs = scipy.special.stdtr(df, t), _side_p(d)
+    else:
+        p = 2 * scipy.special.stdtr(df, -np.abs(t))
+        of_signs = _sign_p((d > 0).sum(axis=1), (d < 0).sum(axis=1))
+    return np.where(np.isnan(error), of_signs, np.where(value == 0.0, 1.0, p))
 
 
 # --------------------------------------------------------------------------------------------------

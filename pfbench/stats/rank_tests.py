@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 from itertools import product
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import scipy  # scipy.stats is imported at its first use, which takes longer than a small report
@@ -16,18 +16,6 @@ _SIGNS_ENUMERATED = 13  # tied differences up to which all signs are enumerated,
 EXACT_DIFFERENCES = 50  # untied differences up to which the distribution is exact, as in scipy
 _POSTERIOR_DRAWS = 2000
 Alternative = Literal["two-sided", "greater", "less"]
-
-
-class SignedRankResult(NamedTuple):
-    """Result of Wilcoxon's signed-rank test.
-
-    Attributes:
-        statistic: Smaller rank sum, or the positive one of a one-sided test.
-        p: p-value.
-    """
-
-    statistic: float
-    p: float
 
 
 def holm(p: Sequence[float] | Array) -> Array:
@@ -43,15 +31,15 @@ def holm(p: Sequence[float] | Array) -> Array:
     return adjusted
 
 
-def wilcoxon_signed_rank(d: Array, alternative: Alternative = "two-sided") -> SignedRankResult:
-    """Test whether paired differences are centred at zero.
+def wilcoxon_signed_rank(d: Array, alternative: Alternative = "two-sided") -> tuple[float, float]:
+    """Test whether paired differences are centred at zero; return statistic and p-value.
 
     Args:
         d: Differences, [n].
         alternative: As in `wilcoxon_signed_rank_rows`.
     """
     statistic, p = wilcoxon_signed_rank_rows(np.asarray(d, dtype=np.float64)[None], alternative)
-    return SignedRankResult(float(statistic[0]), float(p[0]))
+    return float(statistic[0]), float(p[0])
 
 
 def wilcoxon_signed_rank_rows(

@@ -226,6 +226,8 @@ def _average_runs(keys: np.ndarray, first: Array, second: Array) -> tuple[Array,
     if not used.any():
         return np.zeros(0), np.zeros(0)
     everywhere = common[used].all(axis=0)
+    if used.sum() == 1:  # its losses are the averages
+        return first[used][0, everywhere], second[used][0, everywhere]
     weights = _weigh(tuple(keys[used]))
     both = np.stack([first, second])[:, used][:, :, everywhere]
     is_lost = np.isposinf(both)

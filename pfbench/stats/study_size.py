@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -63,11 +64,6 @@ def detectable_score(df: float, alpha: float) -> float:
     return high
 
 
-def middle_runs(runs: int) -> int:
-    """Return the number of runs that remain after trimming."""
-    return runs - 2 * math.floor(TRIM_SHARE * runs + 1e-9)
-
-
 def detectable_effects(runs: int, worlds: int, pairs: int) -> DetectableEffects:
     """Compute the least effects that a planned study shows, before it runs.
 
@@ -90,7 +86,8 @@ def detectable_effects(runs: int, worlds: int, pairs: int) -> DetectableEffects:
         "Use 1 or more.",
     )
     level = ALPHA / (2 * pairs)
-    same_worlds = detectable_score(middle_runs(runs) - 1 if runs >= MIN_RUNS else 0, level)
+    middle = runs - 2 * math.floor(TRIM_SHARE * runs + 1e-9)  # that remain after trimming
+    same_worlds = detectable_score(middle - 1 if runs >= MIN_RUNS else 0, level)
     over_runs = RUN_SD * math.sqrt((1 + (worlds - 1) * WORLD_CORRELATION) / (worlds * runs))
     of_worlds = math.hypot(over_runs, WORLD_SD / math.sqrt(worlds))
     return DetectableEffects(
@@ -116,8 +113,7 @@ def count_needed_runs(d: Array, ratio: float, alpha: float) -> float:
     centred = means - np.median(means[np.triu_indices(len(d))]) + math.log(ratio)
     share = float((centred.diagonal() < 0).mean())
     counts = np.arange(1, _MOST_RUNS + 1)
-    critical = scipy.stats.binom.isf(alpha, counts, 0.5) + 1  # signs with which the test rejects
-    enough = scipy.stats.binom.sf(critical - 1, counts, share) >= POWER
+    enough = scipy.stats.binom.sf(_count_signs(alpha), counts, share) >= POWER
     of_signs = counts[enough][0] if enough.any() else math.inf
     both = float((centred[np.triu_indices(len(d), 1)] < 0).mean())
     if both >= _SURE:  # one that rejects with few signs rejects with their ranks
@@ -126,6 +122,12 @@ def count_needed_runs(d: Array, ratio: float, alpha: float) -> float:
     of_ranks = math.ceil(score**2 / (3 * (both - 0.5) ** 2)) if both > 0.5 else math.inf
     needed = float(max(of_signs, of_ranks))
     return needed if needed <= _MOST_RUNS else math.inf
+
+
+@cache
+def _count_signs(alpha: float) -> Array:
+    """Count the signs, of 1 to 10 000 runs, with more of which the sign test rejects."""
+    return np.asarray(scipy.stats.binom.isf(alpha, np.arange(1, _MOST_RUNS + 1), 0.5))
 
 
 _LARGEST_RATIO = 1000.0
