@@ -8,14 +8,14 @@ import errno
 import re
 import tempfile
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from pfbench.core.parameter_checks import require
 from pfbench.files.escapes import ESCAPED
-from pfbench.job.trust import WRITTEN
+from pfbench.job.trust import WRITTEN, walk_nodes
 
 # extra of the package that installs a launcher
 _EXTRAS = {"ray": "ray", "submitit": "slurm", "joblib": "launch"}
@@ -196,18 +196,10 @@ def _composed_keys(words: Sequence[str], excluded: str) -> list[str]:
             [*first[:i], option, *first[i + 1 :]]
             for i, options in enumerate(alternatives) for option in options[1:]
         )]  # fmt: skip
-        return list(dict.fromkeys(key for job in jobs for key in _dotted_keys(compose(job).values)))
+        paths = [path for job in jobs for path, _ in walk_nodes(compose(job).values)]
+        return [path for path in dict.fromkeys(paths) if path and "[" not in path]
     except Exception:  # with a second mistake, a suggestion would only confuse
         return []
-
-
-def _dotted_keys(node: Any, path: str = "") -> Iterator[str]:
-    """Yield the dotted keys of a nested dictionary."""
-    if path:
-        yield path
-    if isinstance(node, dict):
-        for key, value in node.items():
-            yield from _dotted_keys(value, f"{path}.{key}" if path else str(key))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -17,9 +17,9 @@ from checkout import ROOT
 from command_line import environment, pfbench
 
 from pfbench.cli import progress
-from pfbench.cli.completion import make_script
+from pfbench.cli.list import make_script
 from pfbench.cli.new import SCRIPTS
-from pfbench.cli.open import COMMAND as OPEN
+from pfbench.cli.report import OPEN
 from pfbench.results import store
 
 WALK = ("scenario=linear_walk", "scenario.steps=5", "runs=3", "particles=30")

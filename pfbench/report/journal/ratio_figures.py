@@ -119,7 +119,10 @@ def _draw_leaderboard(
                 setting.escape(DAGGER), (1.0, y), xycoords=("axes fraction", "data"), xytext=(3 + 0.52 * size * len(text), 1.5),
                 textcoords="offset points", va="center", fontsize=0.8 * size, annotation_clip=False,
             )  # fmt: skip
-    metric, unit = pack["metrics"][0], next(iter(rows.values()))["unit"] or ""  # worlds differ in their units
+    metric, unit = (
+        pack["metrics"][0],
+        next(iter(rows.values()))["unit"] or "",
+    )  # worlds differ in their units
     level = f"median {format_axis_label(metric['name'], 'k' * is_far + unit)}"
     axis.set_xlabel(
         setting.escape(f"{metric['name']} relative to {name_baseline(pack)}" if is_ratio else level)
