@@ -153,7 +153,7 @@ def test_finished_chains_of_an_interrupted_inference_are_not_drawn_again(
         (("model=local_level", "method=pmmh", PARAMETERS, "infer.look_ahead=-1"), "infer.look_ahead must be"),
         (("model=local_level", "method=pmmh", PARAMETERS, "infer.draws=2.5"), "infer.draws must be a whole number of at least 1, got 2.5"),
         (("model=terrain", "method=pmmh", "parameters={terrain.seed:[1,3]}"), "parameters.terrain.seed must be a number that the model accepts near its value"),
-        (("model=local_level", "method=nuts", PARAMETERS, "cores=0"), "cores must be a number of processes from 1 on, got 0"),
+        (("model=local_level", "method=nuts", PARAMETERS, "cores=0"), "cores must be a whole number of at least 1, got 0. Default: cores=1."),
         (("method=nuts", PARAMETERS), "model must be set. Use: pfbench infer model=NAME"),
         (("model=local_level", PARAMETERS), "method must be set"),
         (("model=local_level", "method=nut", PARAMETERS), "method must be one of noise, nuts, pmmh, smc2, svi, got nut. Similar: nuts."),
