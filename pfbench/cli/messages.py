@@ -295,7 +295,7 @@ _STAGES |= dict.fromkeys(
     ),
     "composing the configuration",
 )
-_STAGES |= dict.fromkeys(("replay", "run_selection"), "computing the stored run again")
+_STAGES["replay"] = "computing the stored run again"
 _FILE_NAMES = ("path", "file")  # local variables of functions that read or write
 _RAISE = dis.opmap["RAISE_VARARGS"]
 

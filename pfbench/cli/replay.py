@@ -32,9 +32,8 @@ def replay_run(words: Sequence[str], run: int, filter: str, **choices: str | Non
     study, results = config["study"], Path(config["results_dir"])
     check_has_results(study, results)
     from pfbench.job import replay
-    from pfbench.job.run_selection import find_run
 
-    stored = find_run(study, results, run, filter, {k: v for k, v in choices.items() if v})
+    stored = replay.find_run(study, results, run, filter, {k: v for k, v in choices.items() if v})
     changes = choose_places(config, words)
     result = replay.recompute_run(stored, changes)
     comparable = replay.select_stored_scores(result, stored.result)

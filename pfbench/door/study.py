@@ -173,8 +173,7 @@ class Study:
             A row per step: time, error, standard deviation, NEES and traces such as the effective sample size.
         """
         from pfbench.door.running import check_trusted, preserved_process
-        from pfbench.job.replay import recompute_run, tabulate_traces
-        from pfbench.job.run_selection import find_run
+        from pfbench.job.replay import find_run, recompute_run, tabulate_traces
 
         with preserved_process(), trusting(self.trust):
             stored = find_run(self.name, self.results, run, label, choice)

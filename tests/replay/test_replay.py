@@ -11,13 +11,14 @@ from synthetic_results import list_results
 
 from pfbench import job
 from pfbench.job.replay import (
+    StoredRun,
     compare_runs,
     describe_agreement,
+    find_run,
     magnification,
     recompute_run,
     replay_config,
 )
-from pfbench.job.run_selection import StoredRun, find_run
 from pfbench.job.trust import UntrustedConfigError
 from pfbench.results import store
 

@@ -9,7 +9,7 @@ import synthetic_results as synthetic
 from refusals import check_refused
 from synthetic_results import list_results
 
-from pfbench.job.run_selection import find_run
+from pfbench.job.replay import find_run
 from pfbench.results import conditions, conditions as state_groups, frame, store
 from pfbench.results.looks import study_part_names
 
