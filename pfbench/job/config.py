@@ -19,6 +19,7 @@ from pfbench.job.trust import (
     check_configuration,
     check_places,
     check_study,
+    require_allowed,
     split_trust,
 )
 from pfbench.job.tuned_knobs import TUNED, check_tuned_seed, mark_foreign, select_knobs
@@ -337,9 +338,10 @@ def resolve_values(tree: DictConfig | Mapping[str, Any]) -> dict[str, Any]:
     from omegaconf import OmegaConf
     from omegaconf.errors import InterpolationResolutionError
 
+    _count_resolved_values()
+    token = _resolved.set([0, 0, 0])
     try:
-        with _bounded_resolution():
-            values = OmegaConf.to_container(tree, resolve=True)
+        values = OmegaConf.to_container(tree, resolve=True)
     except InterpolationResolutionError as error:
         cause: BaseException | None = error
         while cause is not None and not isinstance(cause, UntrustedConfigError):
@@ -355,24 +357,15 @@ def resolve_values(tree: DictConfig | Mapping[str, Any]) -> dict[str, Any]:
             f"{key} must not refer to itself, got {value}, which leads back to {key}. "
             f"Set {key} to a value."
         ) from error
+    finally:
+        _resolved.reset(token)
     assert isinstance(values, dict)
     return {str(key): value for key, value in values.items()}
 
 
-@contextmanager
-def _bounded_resolution() -> Iterator[None]:
-    """Limit what OmegaConf resolves: it resolves a value again each time that another one refers to it."""
-    _count_resolved_values()
-    token = _resolved.set([0, 0, 0])
-    try:
-        yield
-    finally:
-        _resolved.reset(token)
-
-
 @cache
 def _count_resolved_values() -> None:
-    """Let OmegaConf count the values and characters that it resolves."""
+    """Let OmegaConf count the values and characters that it resolves, which are limited: it resolves a value again for each reference."""
     from omegaconf.base import Container
 
     by_omegaconf = Container.resolve_parse_tree
@@ -394,11 +387,13 @@ def _add_size(value: Any, counts: list[int]) -> None:
     counts[1] += 1
     counts[2] += len(value) if isinstance(value, str) else 0
     most = (limits.RESOLVED_REFERENCES, limits.RESOLVED_VALUES, limits.RESOLVED_TEXT)
-    if any(count > limit for count, limit in zip(counts, most, strict=True)):
-        raise UntrustedConfigError(
-            "values that refer to others must have at most {} references, {} values and {} characters "
-            "in all, got more. Write fewer references.".format(*most)
-        )
+    require_allowed(
+        all(count <= limit for count, limit in zip(counts, most, strict=True)),
+        "values that refer to others",
+        "have at most {} references, {} values and {} characters in all".format(*most),
+        "more",
+        "Write fewer references.",
+    )
     children = (
         value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     )

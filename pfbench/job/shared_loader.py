@@ -38,7 +38,7 @@ from pfbench.job.file_rules import (
     check_place,
     launchers,
 )
-from pfbench.job.trust import UntrustedConfigError, check_study, trusted_packages
+from pfbench.job.trust import UntrustedConfigError, check_study, require_allowed, trusted_packages
 
 if TYPE_CHECKING:
     from pfbench.job.search_folders import ForeignFolder
@@ -249,11 +249,13 @@ class _SharedRepository(CachingConfigRepository):
         if config_path not in self.cache:
             self.cache[config_path] = self._load(config_path)
         self._loaded += 1
-        if self.has_search_path and self._loaded > limits.LOADED_FILES:
-            raise UntrustedConfigError(
-                f"defaults lists must name at most {limits.LOADED_FILES} files in all, repetitions counted, "
-                f"got more at {config_path}. Shorten the lists of your files, which may name each other."
-            )
+        require_allowed(
+            not self.has_search_path or self._loaded <= limits.LOADED_FILES,
+            "defaults lists",
+            f"name at most {limits.LOADED_FILES} files in all, repetitions counted",
+            f"more at {config_path}",
+            "Shorten the lists of your files, which may name each other.",
+        )
         return self.cache[config_path]
 
     def _load(self, config_path: str) -> ConfigResult | None:
@@ -369,16 +371,18 @@ def check_composed(
 ) -> None:
     """Check a composed configuration."""
     check_study(tree._get_node("study")._value() if "study" in tree else None)  # not resolved
-    if tree.hydra.job.chdir:
-        raise UntrustedConfigError(
-            "hydra.job.chdir must be left out, since the folders of results and data are given from the folder of the command, "
-            f"got {tree.hydra.job.chdir}. Set results_dir=... and reports_dir=... for other folders."
-        )
+    require_allowed(
+        not tree.hydra.job.chdir,
+        "hydra.job.chdir",
+        "be left out, since the folders of results and data are given from the folder of the command",
+        tree.hydra.job.chdir,
+        "Set results_dir=... and reports_dir=... for other folders.",
+    )
     for group, name in tree.hydra.runtime.choices.items():
-        if isinstance(name, str) and (name.startswith("/") or ".." in name.split("/")):
-            raise UntrustedConfigError(
-                f"{group} must be the name of a file in its group, got {name!r}. Use its name."
-            )
+        is_path = isinstance(name, str) and (name.startswith("/") or ".." in name.split("/"))
+        require_allowed(
+            not is_path, group, "be the name of a file in its group", repr(name), "Use its name."
+        )
     if compose_reference is None:
         return
     launcher = tree.hydra.runtime.choices.get("hydra/launcher")
@@ -391,11 +395,14 @@ def check_composed(
     for (key, value), (_, expected) in zip(
         _list_settings(tree, words), _list_settings(reference, words), strict=True
     ):
-        if value != expected and (is_shipped or key != "hydra.launcher"):
-            raise UntrustedConfigError(
-                f"{key} must be set on the command line, got {value!r:.200} from a file. "
-                f"Remove the key from the file, and add {key}=... to the command."
-            )
+        is_own_launcher = key == "hydra.launcher" and not is_shipped
+        require_allowed(
+            value == expected or is_own_launcher,
+            key,
+            "be set on the command line",
+            f"{value!r:.200} from a file",
+            f"Remove the key from the file, and add {key}=... to the command.",
+        )
 
 
 def _list_setting_words(words: Sequence[str]) -> list[str]:
