@@ -81,10 +81,9 @@ def _try_parts(plan: StudyPlan) -> None:
 
 def _run_until_decided(overrides: Sequence[str], plan: StudyPlan, *, is_sweep: bool) -> None:
     """Run a sweep that adds runs until its pairs are decided."""
-    from pfbench.cli.until_decided import GrowingSweep, check_has_sweep
+    from pfbench.cli.until_decided import GrowingSweep
 
-    check_has_sweep(is_sweep)
-    sweep = GrowingSweep.from_plan(plan)
+    sweep = GrowingSweep.from_plan(plan, is_sweep=is_sweep)
     others = [word for word in overrides if not re.match(r"(runs|first_run)=", word)]
     sweep.run(lambda more: run_sweep([*others, *more], plan, is_part=True))
 

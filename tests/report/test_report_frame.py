@@ -243,7 +243,7 @@ def test_a_run_is_found_by_the_settings_of_its_data(tmp_path):
     check_refused(
         [
             (
-                r"scenario must be one of the study, got flight\[gps_sd=3\]",
+                r"scenario must be one of the study demo, got flight\[gps_sd=3\]",
                 lambda: find_run("demo", tmp_path, 0, "ekf", {"scenario": "flight[gps_sd=3]"}),
             ),
             (
