@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
@@ -30,7 +30,13 @@ def check_installation(words: Sequence[str]) -> None:
     has_cuda = torch.cuda.is_available()
     root = compose([]).values["data"]["root"]
     hint = "recorded scenarios need PFBENCH_DATA or data.root=..."
-    errors = [f"{choice}: {error}" for choice, error in _compose_all() if error]
+    errors = []
+    for group, name in ((group, name) for group, names in list_groups().items() for name in names):
+        choice = f"{'+' if group in _ADDED else ''}{group}={name}"
+        try:
+            compose([choice, *_add_needs(group, name), "data.root=somewhere"])
+        except Exception as error:
+            errors.append(f"{choice}: {format_error(error, [choice])}")
     total = sum(map(len, list_groups().values()))
     rows = [
         ("item", "value", "status"),
@@ -58,19 +64,6 @@ def _check_oracles(words: Sequence[str]) -> None:
 
 
 _ADDED = ("experiment", "infer")  # groups that are not in the list of defaults
-
-
-def _compose_all() -> Iterator[tuple[str, str]]:
-    """Yield the choice of each configuration file, and its error or an empty text."""
-    for group, names in list_groups().items():
-        for name in names:
-            sign = "+" if group in _ADDED else ""
-            choice = f"{sign}{group}={name}"
-            try:
-                compose([choice, *_add_needs(group, name), "data.root=somewhere"])
-                yield choice, ""
-            except Exception as error:
-                yield choice, format_error(error, [choice])
 
 
 def _add_needs(group: str, name: str) -> list[str]:

@@ -50,7 +50,11 @@ def _choose_sentence(error: BaseException, words: Sequence[str]) -> str:
     if type(error).__name__ == "InstantiationException" and error.__cause__ is not None:
         return _format_refusal(f"{error}", error.__cause__, words)
     if isinstance(error, OSError) and error.errno is not None:
-        return _format_storage(error)
+        name, remedy = (
+            error.filename or "files of the command",
+            _STORAGE.get(error.errno, _OTHER_STORAGE),
+        )
+        return f"{name} must be accessible, got '{error.strerror}'. {remedy}, then repeat the command. Finished jobs are kept."
     if isinstance(error, MemoryError):
         return "memory must be enough for the command, got an array that is too large. Reduce runs, particles or steps."
     text = f"{error}".strip() or type(error).__name__
@@ -87,15 +91,6 @@ def _format_override(key: str, words: Sequence[str]) -> str:
         name = next((w.partition("=")[2] for w in words if w.startswith("experiment=")), "NAME")
         return f"experiment={name} must be added with a plus sign. Use +experiment={name}"
     return _format_unknown_key(key, words)
-
-
-def _format_storage(error: OSError) -> str:
-    """Format an error of the file system with its remedy."""
-    name = error.filename or "files of the command"
-    return (
-        f"{name} must be accessible, got '{error.strerror}'. {_STORAGE.get(error.errno or 0, _OTHER_STORAGE)}, then "
-        "repeat the command. Finished jobs are kept."
-    )
 
 
 def notes_of(error: BaseException) -> list[str]:

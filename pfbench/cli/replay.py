@@ -41,24 +41,20 @@ def replay_run(words: Sequence[str], run: int, filter: str, **choices: str | Non
     print(f"run {stored.run} of {stored.condition.name} / {stored.job.label}, seed {meta['seed']}")
     print(f"status: {replay.describe_status(comparable)}")
     print(replay.describe_agreement(replay.compare_runs(stored.result, comparable)))
-    _print_versions(meta["versions"], result.meta["versions"])
+    stored_versions, versions = meta["versions"], result.meta["versions"]
+    changes_of_versions = [
+        f"{name} {stored_versions.get(name) or 'unknown'} to {versions.get(name) or 'unknown'}"
+        for name in versions
+        if stored_versions.get(name) != versions.get(name)
+    ]
+    if changes_of_versions:
+        print(f"versions that changed since: {', '.join(changes_of_versions)}")
     if changed := replay.describe_changed_code(meta):
         print(changed)
     for name, old, new, unit in replay.tabulate_metrics(stored, comparable):
         print(f"  {name:28} {_format(new):>12} {unit:8} stored {_format(old)}")
     for path in replay.write_replay(stored, result, config["reports_dir"]):
         print(f"{path.suffix[1:]}: {path.resolve()}")
-
-
-def _print_versions(stored: dict[str, str], current: dict[str, str]) -> None:
-    """Print the versions that differ from those of the stored job."""
-    changes = [
-        f"{name} {stored.get(name) or 'unknown'} to {current.get(name) or 'unknown'}"
-        for name in current
-        if stored.get(name) != current.get(name)
-    ]
-    if changes:
-        print(f"versions that changed since: {', '.join(changes)}")
 
 
 def _format(value: float) -> str:

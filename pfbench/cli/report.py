@@ -230,23 +230,19 @@ def report_status(words: Sequence[str]) -> None:
     values = compose(words).values
     results = Path(values["results_dir"])
     if "study" in given_keys(words):
-        _print_study(results / str(values["study"]))
+        folder = results / str(values["study"])
+        state = read_state(folder)
+        if not (state.failures or state.running):
+            check_has_results(folder.name, results)
+        jobs = filter(None, map(read_undamaged, folder.glob("*.npz")))
+        mixed = describe_libraries([meta for _, meta in jobs])
+        print(state, *filter(None, [mixed]), *list_repeats(folder), sep="\n")
         return
     folders = [path for path in results.glob("*") if path.is_dir() and path.name not in NOT_STUDIES]
     for state in sorted(map(read_state, folders), key=lambda state: -state.changed):
         print(state)
     if not folders:
         print(f"No study has results in {results}. Next: pfbench run -m +experiment=quickstart")
-
-
-def _print_study(folder: Path) -> None:
-    """Print the state of a study, and its failed jobs."""
-    state = read_state(folder)
-    if not (state.failures or state.running):
-        check_has_results(folder.name, folder.parent)
-    jobs = filter(None, map(read_undamaged, folder.glob("*.npz")))
-    mixed = describe_libraries([meta for _, meta in jobs])
-    print(state, *filter(None, [mixed]), *list_repeats(folder), sep="\n")
 
 
 STATUS = Command(

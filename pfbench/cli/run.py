@@ -173,7 +173,12 @@ def run_task(
     end_with_parent()
 
     def run_job(counter: object) -> job.JobOutcome:
-        places = _list_place_words(application)
+        # of the words that Hydra does not count to the task of a job
+        path = [
+            w for w in map(str, application.overrides.hydra) if w.startswith("hydra.searchpath=")
+        ]
+        packages = os.environ.get(ENVIRONMENT)
+        places = [*path, *([f"trust=[{packages}]"] if packages else [])]
         config = checked or job.resolve_config(cfg, choices, words=[*words, *places])
         return job.run(config, choices, counter, announce)
 
@@ -189,14 +194,6 @@ def run_task(
         raise
     counter.note(outcome.status)
     return outcome.rmse
-
-
-def _list_place_words(application: Any) -> list[str]:
-    """List the words of a job that Hydra does not count to its task: search path and trust."""
-    packages = os.environ.get(ENVIRONMENT)
-    of_hydra = [str(word) for word in application.overrides.hydra]
-    path = [word for word in of_hydra if word.startswith("hydra.searchpath=")]
-    return [*path, *([f"trust=[{packages}]"] if packages else [])]
 
 
 def run_with_retries(sweep: Callable[[], Any]) -> None:

@@ -22,10 +22,16 @@ def train_network(words: Sequence[str]) -> None:
         "a sweep: it trains one network",
         "Set train.noise_regimes=[a,b] to train on several noise regimes.",
     )
+    from pfbench.filter.learned.checkpoint import read_checkpoint
+    from pfbench.report.scenario_figures import write_training_figure
+
     path = fit_network(words, print)
+    lines = read_checkpoint(path)["losses"]
+    names = ("epoch", "loss", "validation", "ess")
+    losses = {name: [line[name] for line in lines] for name in names}
+    figure = write_training_figure(path.with_suffix(".svg"), losses)
     shared = [word for word in words if not word.startswith(_NOT_OF_A_JOB)]
     command = shlex.join(["pfbench", "run", *shared, f"checkpoint={path}"])  # brackets for zsh
-    figure = _draw_losses(path)
     print(
         f"checkpoint: {path.resolve()}\nfigure of the losses: {figure.resolve()}\nNext: {command}"
     )
@@ -56,18 +62,6 @@ def fit_network(words: Sequence[str], tell: Callable[[str], object]) -> Path:
     }
     about = {"versions": job.read_versions(), "inputs": find_inputs(values, config.trusted)}
     return fit(values, choices, regimes, job.instantiate, about, tell)
-
-
-def _draw_losses(checkpoint: Path) -> Path:
-    """Draw the losses that a checkpoint contains, in its folder."""
-    from pfbench.filter.learned.checkpoint import read_checkpoint
-    from pfbench.report.scenario_figures import write_training_figure
-
-    lines = read_checkpoint(checkpoint)["losses"]
-    losses = {
-        name: [line[name] for line in lines] for name in ("epoch", "loss", "validation", "ess")
-    }
-    return write_training_figure(checkpoint.with_suffix(".svg"), losses)
 
 
 COMMAND = Command(

@@ -46,7 +46,13 @@ def tune_filters(
         print(f"note: the world of the defaults is tuned: {default}", file=sys.stderr)
     name = name or _name_file(study.choices, noise, words)
     runs = _RUNS.take("runs", str(study.values["runs"]))
-    _check_name(name)
+    require(
+        re.fullmatch("\\w+", name) and name not in _TAKEN,
+        "name",
+        f"consist of letters, digits and underscores and not be {' or '.join(_TAKEN)}",
+        f"{name!r}",
+        "It is a file of folder=.",
+    )
     check_seed(study, study.values["seed"] + SEED_SHIFT)
     settings = [word for word in words if word.partition("=")[0] not in _OWN]
     world = {
@@ -61,10 +67,20 @@ def tune_filters(
         "start_time_s": float(study.values["report"]["start_time_s"]),
         "regimes": noise,
     }
-    target = Path(folder or _own_folder(words))
-    _check_new_name(name, target)
+    paths = (re.match(r"[+]*hydra\.searchpath=\[?file://([^],]+)", word) for word in words)
+    # that of the search path, where the composition finds the file
+    target = Path(folder or next((path[1] for path in paths if path), "conf"))
+    require(  # a run refuses it
+        name not in read_families("tuned"),
+        "name",
+        f"differ from pfbench's own tuned={name}",
+        f"the same for a file of {target}",
+        f"Add name=my_{name}, and tuned=my_{name} to the words of the run.",
+    )
     path = _search(settings, grids, world, fit_runs or runs, fit_particles, target, name)
-    print(f"tuned={name}: {path.resolve()}{_describe_use(target, words)}")
+    print(f"tuned={name}: {path.resolve()}")
+    if target.resolve() != conf_dir() and not any("hydra.searchpath" in word for word in words):
+        print(f"Add to the words of a study: 'hydra.searchpath=[file://{target}]'")
 
 
 def _search(
@@ -139,42 +155,6 @@ def _name_file(choices: Mapping[str, str], regimes: Sequence[str], words: Sequen
     default = compose([f"scenario={scenario}", *places]).choices["model"]
     name = scenario if model == default else f"{scenario}_with_{model}"
     return f"{name}_{NOMINAL}" if list(regimes) == [NOMINAL] else name
-
-
-def _own_folder(words: Sequence[str]) -> str:
-    """Return the first folder of the search path, where the composition finds the file, else conf."""
-    paths = (re.match(r"[+]*hydra\.searchpath=\[?file://([^],]+)", word) for word in words)
-    return next((path[1] for path in paths if path), "conf")
-
-
-def _describe_use(folder: Path, words: Sequence[str]) -> str:
-    """Say how a study finds the file, if it does not by itself."""
-    is_found = folder.resolve() == conf_dir() or any("hydra.searchpath" in word for word in words)
-    return (
-        "" if is_found else f"\nAdd to the words of a study: 'hydra.searchpath=[file://{folder}]'"
-    )
-
-
-def _check_new_name(name: str, folder: Path) -> None:
-    """Check that the name of a file of a user's own folder differs from those of pfbench, since a run refuses it."""
-    require(
-        name not in read_families("tuned"),
-        "name",
-        f"differ from pfbench's own tuned={name}",
-        f"the same for a file of {folder}",
-        f"Add name=my_{name}, and tuned=my_{name} to the words of the run.",
-    )
-
-
-def _check_name(name: str) -> None:
-    """Check the name of the file."""
-    require(
-        re.fullmatch("\\w+", name) and name not in _TAKEN,
-        "name",
-        f"consist of letters, digits and underscores and not be {' or '.join(_TAKEN)}",
-        f"{name!r}",
-        "It is a file of folder=.",
-    )
 
 
 def _read_factors(key: str, text: str, remedy: str) -> tuple[float, ...]:

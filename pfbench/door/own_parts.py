@@ -195,10 +195,14 @@ class _NodeWriter:
 
     def write(self, value: Any, path: str) -> Any:
         """Describe a value: an object of dataclasses, a model, a part, numbers, texts and lists of them."""
-        if isinstance(value, Part):
-            return self._write_part(value)
-        if isinstance(value, pfbench.model.StateSpaceModel):
-            return self._write_model(value)
+        if isinstance(value, Part):  # by its composed node
+            node = compose([*value.words(), *place_words([value])]).values[value.group]
+            self.packages += value.packages
+            return {key: entry for key, entry in node.items() if key != "paper"}
+        if isinstance(value, pfbench.model.StateSpaceModel):  # by the arguments of its constructor
+            positional, options = value._arguments
+            bound = inspect.signature(type(value)).bind(*positional, **options)
+            return self.write_class(type(value), bound.arguments)
         if isinstance(value, type):
             return self.write_class(value, {})
         if dataclasses.is_dataclass(value):
@@ -275,18 +279,6 @@ class _NodeWriter:
         self.packages += self.model.packages
         return "${model}"
 
-    def _write_model(self, model: Any) -> dict[str, Any]:
-        """Describe a model by the arguments of its constructor."""
-        positional, options = model._arguments
-        bound = inspect.signature(type(model)).bind(*positional, **options)
-        return self.write_class(type(model), bound.arguments)
-
-    def _write_part(self, item: Part) -> Any:
-        """Describe a part by its composed node."""
-        config = compose([*item.words(), *place_words([item])])
-        self.packages += item.packages
-        return {key: value for key, value in config.values[item.group].items() if key != "paper"}
-
     def name_class(self, cls: type) -> str:
         """Name a class so that another process can import it."""
         if cls.__module__.startswith("pfbench."):
@@ -299,6 +291,14 @@ class _NodeWriter:
                 "Choose a name of pfbench.filter, pfbench.model, pfbench.noise or pfbench.scenario.",
             )
             return f"{home}.{cls.__name__}"
+        has_module = cls.__module__ != "builtins"  # that of code in a namespace without a name
+        require(
+            has_module,
+            cls.__name__,
+            "be in a file or a notebook",
+            "a class without a source",
+            "Save it in a module.",
+        )
         module = (
             write_module(cls)
             if cls.__module__ == "__main__" or "<locals>" in cls.__qualname__

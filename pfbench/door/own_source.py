@@ -242,15 +242,11 @@ def read_statements(values: Mapping[str, Any]) -> dict[str, list[_Statement]]:
 def _list_texts(values: Mapping[str, Any]) -> list[str]:
     """Return the text of the main script, or those of the cells that a notebook executed."""
     if isinstance(values.get("In"), list):
-        return ["\n".join(map(_blank_magic, cell.splitlines())) for cell in values["In"]]
+        # without the commands of the notebook
+        return [re.sub(r"^[ \t]*[%!].*", "", cell, flags=re.MULTILINE) for cell in values["In"]]
     file = values.get("__file__")
     is_file = isinstance(file, str) and Path(file).is_file()
     return [Path(file).read_text(encoding="utf-8")] if is_file and file else []
-
-
-def _blank_magic(line: str) -> str:
-    """Return a line of a cell, empty for a command of the notebook."""
-    return "" if line.lstrip().startswith(("%", "!")) else line
 
 
 def _list_defined(node: ast.stmt) -> Iterator[str]:

@@ -388,7 +388,13 @@ def check_composed(
     launcher = tree.hydra.runtime.choices.get("hydra/launcher")
     is_shipped = launcher in launchers()  # another one is of a folder of the user's own
     pattern = r"[+~]*hydra/launcher" if is_shipped else r"[+~]*hydra[/.]launcher"
-    others = [word for word in _list_setting_words(words) if not re.match(pattern, word)]
+    # the words that set what is compared, without the search path
+    keys = rf"[+~]*({'|'.join((*_SETTINGS, *_DATA, 'hydra'))})\b"
+    others = [
+        word
+        for word in words
+        if re.match(keys, word) and not re.match(rf"[+~]*hydra\.searchpath\b|{pattern}", word)
+    ]
     reference = compose_reference(
         [*others, f"hydra/launcher={launcher if is_shipped else 'basic'}"]
     )
@@ -403,16 +409,6 @@ def check_composed(
             f"{value!r:.200} from a file",
             f"Remove the key from the file, and add {key}=... to the command.",
         )
-
-
-def _list_setting_words(words: Sequence[str]) -> list[str]:
-    """Return the words that set what is compared, without the search path."""
-    keys = "|".join((*_SETTINGS, *_DATA, "hydra"))
-    return [
-        word
-        for word in words
-        if re.match(rf"[+~]*({keys})\b", word) and not re.match(r"[+~]*hydra\.searchpath\b", word)
-    ]
 
 
 def _list_settings(tree: Any, words: Sequence[str]) -> Iterator[tuple[str, Any]]:

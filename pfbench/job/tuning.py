@@ -133,7 +133,14 @@ class CandidateSearch:
         self.words, self.regimes, self.progress = tuple(words), tuple(regimes), progress
         self.start_time_s, self.seconds = start_time_s, 0.0
         self.batches = draw_batches({r: self.compose("ekf", r) for r in self.regimes})
-        _check_start(self.batches[0].episode.time, start_time_s)
+        end = float(self.batches[0].episode.time[-1])
+        require(
+            start_time_s <= end,
+            "report.start_time_s",
+            f"be at most {end:g} s, the end of the episode",
+            f"{start_time_s:g} s",
+            "Use a smaller value.",
+        )
         start_work()
         (self.reference,) = self._score([self.compose("ekf", self.regimes[0])])
 
@@ -201,17 +208,6 @@ class CandidateSearch:
                     places = slice(start + runs.start, start + runs.stop)
                     by_regime[regime] = score_runs(data, result.model, places, self.start_time_s)
         return scores
-
-
-def _check_start(time: Tensor, start_time_s: float) -> None:
-    """Check that a step remains after the start time."""
-    require(
-        bool((time >= start_time_s).any()),
-        "report.start_time_s",
-        f"be at most {float(time[-1]):g} s, the end of the episode",
-        f"{start_time_s:g} s",
-        "Use a smaller value.",
-    )
 
 
 def with_candidate(config: JobConfig, values: Mapping[str, float]) -> JobConfig:
@@ -445,26 +441,10 @@ R_FACTORS = (1.0, 2.0, 4.0, 8.0)
 _SCALED, _POWER = "pfbench.filter.ScaledNoise", "pfbench.filter.PowerLikelihoodUpdate"
 
 
-class Knob(NamedTuple):
-    """Knob of a method, as its file states it.
-
-    Attributes:
-        key: Key of the parameter in the settings of the filter.
-        values: Values to try.
-    """
-
-    key: str
-    values: tuple[float, ...]
-
-    @property
-    def name(self) -> str:
-        """Name of the parameter."""
-        return self.key.rpartition(".")[2]
-
-
+# Knob of a method, as its file states it: the name of the parameter, and the values to try.
 # Each method has the same number of values, so that each has the same number of candidates.
-KNOBS: Mapping[str, Knob] = {
-    method: Knob(block["knob"]["key"], tuple(block["knob"]["values"]))
+KNOBS: Mapping[str, tuple[str, tuple[float, ...]]] = {
+    method: (block["knob"]["key"].rpartition(".")[2], tuple(block["knob"]["values"]))
     for method in list_named_parts("filter")
     if "knob" in (block := read_paper_block("filter", method))
 }
@@ -482,8 +462,8 @@ def list_candidates(method: str, r_factors: Sequence[float] = R_FACTORS) -> list
         method,
         "Only these state a knob in their file.",
     )
-    knob = KNOBS[method]
-    return [{"r_factor": r, knob.name: v} for r, v in product(r_factors, knob.values)]
+    name, values = KNOBS[method]
+    return [{"r_factor": r, name: v} for r, v in product(r_factors, values)]
 
 
 def apply_candidate(node: Mapping[str, Any], values: Mapping[str, float]) -> dict[str, Any]:
