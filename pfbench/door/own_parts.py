@@ -72,6 +72,17 @@ def make_own(
             f"own must receive a class or an object, got the part {thing}. Pass it to run unchanged."
         )
     group, stage = find_group(thing)
+    cls = thing if isinstance(thing, type) else type(thing)
+    has_source = (
+        cls.__module__ != "builtins"
+    )  # that of code which exec runs in a namespace without a name
+    require(
+        has_source,
+        cls.__name__,
+        "be in a file or a notebook",
+        "a class without a source",
+        "Save it in a module.",
+    )
     title = name or _name_thing(thing, arguments)
     if name_file(title) in list_groups()[group]:
         title = f"Own {title}"
@@ -291,14 +302,6 @@ class _NodeWriter:
                 "Choose a name of pfbench.filter, pfbench.model, pfbench.noise or pfbench.scenario.",
             )
             return f"{home}.{cls.__name__}"
-        has_module = cls.__module__ != "builtins"  # that of code in a namespace without a name
-        require(
-            has_module,
-            cls.__name__,
-            "be in a file or a notebook",
-            "a class without a source",
-            "Save it in a module.",
-        )
         module = (
             write_module(cls)
             if cls.__module__ == "__main__" or "<locals>" in cls.__qualname__

@@ -441,10 +441,10 @@ R_FACTORS = (1.0, 2.0, 4.0, 8.0)
 _SCALED, _POWER = "pfbench.filter.ScaledNoise", "pfbench.filter.PowerLikelihoodUpdate"
 
 
-# Knob of a method, as its file states it: the name of the parameter, and the values to try.
+# Knob of a method, as its file states it: the key of the parameter in the settings of the filter, and the values to try.
 # Each method has the same number of values, so that each has the same number of candidates.
 KNOBS: Mapping[str, tuple[str, tuple[float, ...]]] = {
-    method: (block["knob"]["key"].rpartition(".")[2], tuple(block["knob"]["values"]))
+    method: (block["knob"]["key"], tuple(block["knob"]["values"]))
     for method in list_named_parts("filter")
     if "knob" in (block := read_paper_block("filter", method))
 }
@@ -462,7 +462,8 @@ def list_candidates(method: str, r_factors: Sequence[float] = R_FACTORS) -> list
         method,
         "Only these state a knob in their file.",
     )
-    name, values = KNOBS[method]
+    key, values = KNOBS[method]
+    name = key.rpartition(".")[2]
     return [{"r_factor": r, name: v} for r, v in product(r_factors, values)]
 
 
