@@ -274,7 +274,7 @@ def train_filter(
     Raises:
         ValueError: If a name or a value is not valid, or the filter has nothing to train. Nothing was trained.
     """
-    from pfbench.cli.train import fit_network
+    from pfbench.cli.tune import fit_network
 
     values = {"scenario": scenario, "noise": noise, "model": model, "filter": method}
     parts = [_find_part(group, value) for group, value in values.items() if value is not None]

@@ -50,7 +50,9 @@ class ForeignFolder(FileConfigSource):
         text = _read(file)
         _check_measures(file, text)
         header = ConfigSource._get_header_dict(text[:512])  # as many as Hydra reads
-        config = OmegaConf.load(_NamedText(text, file))
+        stream = io.StringIO(text)
+        setattr(stream, "name", f"{file}")  # noqa: B010 - for the messages of the reader
+        config = OmegaConf.load(stream)
         return ConfigResult(self.provider, self.full_path(), config, header)
 
 
@@ -63,14 +65,6 @@ class OwnFolder(ForeignFolder):
     def scheme() -> str:
         """Return the scheme of the path."""
         return "own"
-
-
-class _NamedText(io.StringIO):
-    """Text with the name of its file, for the messages of the reader."""
-
-    def __init__(self, text: str, file: Path) -> None:
-        super().__init__(text)
-        self.name = f"{file}"
 
 
 def open_folder(provider: str, path: str, trusted: Sequence[str]) -> ForeignFolder:

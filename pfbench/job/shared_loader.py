@@ -13,7 +13,7 @@ import pickle
 import re
 import traceback
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from hydra._internal import defaults_list as hydra_defaults
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
@@ -38,10 +38,8 @@ from pfbench.job.file_rules import (
     check_place,
     launchers,
 )
+from pfbench.job.search_folders import ForeignFolder, open_folder
 from pfbench.job.trust import UntrustedConfigError, check_study, require_allowed, trusted_packages
-
-if TYPE_CHECKING:
-    from pfbench.job.search_folders import ForeignFolder
 
 _Object = TypeVar("_Object")
 
@@ -235,8 +233,6 @@ class _SharedRepository(CachingConfigRepository):
         folders: list[ForeignFolder] = []
         for entry in config_search_path.get_path():
             if str(entry.provider).startswith(_SEARCH_PATH):
-                from pfbench.job.search_folders import open_folder
-
                 folders.append(open_folder(str(entry.provider), str(entry.path), self._trusted))
         *others, schema = self.delegate.sources
         self.delegate.sources = [*others, *folders, schema]
@@ -284,8 +280,6 @@ class _SharedRepository(CachingConfigRepository):
         """Return the source of a file, which must be the only one if it is in a search path."""
         if not self.has_search_path:
             return next((s for s in self.delegate.sources if s.is_config(config_path)), None)
-        from pfbench.job.search_folders import ForeignFolder
-
         holders = [source for source in self.delegate.sources if source.is_config(config_path)]
         folder = next((source for source in holders if isinstance(source, ForeignFolder)), None)
         if folder is not None:
@@ -314,8 +308,6 @@ class _StoredNode:
 
 def _name_file(source: ConfigSource, config_path: str) -> str:
     """Return the place of a file, for messages."""
-    from pfbench.job.search_folders import ForeignFolder
-
     group, _, name = config_path.rpartition("/")
     if isinstance(source, ForeignFolder):
         return f"{source.file_of(config_path)}"
@@ -434,8 +426,6 @@ def _has_key(values: Any, key: str) -> bool:
 
 def to_plain(tree: Any) -> dict[str, Any]:
     """Return an unresolved configuration as plain dictionaries and lists."""
-    from omegaconf import OmegaConf
-
     content = OmegaConf.to_container(tree, resolve=False)
     assert isinstance(content, dict)
     return {str(key): value for key, value in content.items()}
