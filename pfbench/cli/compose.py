@@ -262,9 +262,6 @@ def _check_values(alternatives: Sequence[Sequence[str]], config: JobConfig | Non
                     instantiate_parts(composed.values, (group,), composed.trusted)
 
 
-# --------------------------------------------------------------------------------------------------
-# Jobs, worlds and pairs of a sweep, before it runs.
-
 UNTIL_DECIDED = "until-decided"  # value of `runs`
 
 

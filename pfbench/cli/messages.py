@@ -197,9 +197,6 @@ def _composed_keys(words: Sequence[str], excluded: str) -> list[str]:
         return []
 
 
-# --------------------------------------------------------------------------------------------------
-# Messages for errors of Hydra, which name neither key nor remedy.
-
 # of the texts of Hydra and other libraries about a single value
 _SENTENCES = {
     r"Ambiguous value for argument '(?P<key>[^']+)'": "{key} must be one value, got several. Add -m to run all: pfbench run -m ...",

@@ -102,11 +102,17 @@ def compose(overrides: Sequence[str] = ()) -> JobConfig:
         ValueError: If a file sets a key that only the command line may set, or a value names what
             is not trusted.
     """
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import open_dict
+
     words, trusted = split_trust(overrides)
     with _preserved_hydra_state():
         composed = compose_tree(words, trusted)
         choices = {str(k): str(v) for k, v in composed.hydra.runtime.choices.items()}
-        _move_hydra_node(composed)
+        # where an experiment may look up the choices
+        HydraConfig.instance().set_config(composed)
+        with open_dict(composed):
+            del composed["hydra"]
         return resolve_config(composed, choices, trusted, overrides)
 
 
@@ -291,22 +297,6 @@ def _load_text(group: str, name: str, text: str) -> Any:
     return ConfigNode(name, node, group, package, f"pfbench.{group}")
 
 
-def _move_hydra_node(composed: DictConfig) -> None:
-    """Move the node `hydra` to where an experiment may look up the choices, as Hydra does by a copy."""
-    from hydra.core.hydra_config import HydraConfig
-    from omegaconf import OmegaConf, flag_override, open_dict
-
-    application: Any = HydraConfig.instance()
-    holder, node = OmegaConf.create(), composed._get_node("hydra")
-    with open_dict(composed):
-        del composed["hydra"]
-    with flag_override(holder, "no_deepcopy_set_nodes", True):
-        holder["hydra"] = node
-    holder.hydra._set_parent(composed)
-    OmegaConf.set_readonly(holder.hydra, True)
-    application.cfg = holder
-
-
 @contextmanager
 def _preserved_hydra_state() -> Iterator[None]:
     """Clear Hydra's global state for one composition and restore it afterwards, in one thread at a time."""
@@ -438,9 +428,6 @@ def is_simulated_from(scenario: Any, name: str) -> bool:
         and name in list_named_parts("scenario")
     )
 
-
-# --------------------------------------------------------------------------------------------------
-# Named sets of filters, which a sweep may name in place of a list.
 
 _TABLE = "_in"  # end of the names of tables from which an experiment takes `runs` or `seed`; no settings of a job
 SUFFIX = "tuned"  # end of the names of the tuned filters

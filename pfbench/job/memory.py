@@ -388,10 +388,6 @@ def _extrapolate(sizes: Sequence[int], values: Sequence[float], n: int) -> float
     return float(values[2] + max(0.0, later) * (n - 4 * a) + bend * (n - 4 * a) * (n - 2 * a))
 
 
-# --------------------------------------------------------------------------------------------------
-# Memory of the process: freed blocks of the C library, and the peak on Linux.
-
-
 @cache
 def keep_freed_memory() -> None:
     """Make glibc keep freed memory for the next step; without effect for other C libraries.

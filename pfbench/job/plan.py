@@ -151,9 +151,6 @@ def apply_global_settings(values: Mapping[str, Any]) -> None:
     keep_freed_memory()
 
 
-# --------------------------------------------------------------------------------------------------
-# Metadata of a job: all that a report states about how its results were computed.
-
 # parts of a checkout that decide results; analyses read them only
 _DECIDING = ("pfbench", "conf", "experiments", "pyproject.toml", "setup.py")
 _TIMEOUT = 10  # s, of git

@@ -267,9 +267,6 @@ def select_stored_scores(result: store.JobResult, stored: store.JobResult) -> st
     return store.JobResult(result.meta, data)
 
 
-# --------------------------------------------------------------------------------------------------
-# Agreement of a replayed run with the stored one: common digits, and the first step that differs.
-
 AGREEING_DIGITS = (
     4  # significant digits from which two runs are the same run with other rounding [ours]
 )
@@ -356,9 +353,6 @@ def _compare_array(
         first = float(times[np.argmax(rows)]) if rows.any() else math.nan
     return ArrayAgreement(name, float(digits), first)
 
-
-# --------------------------------------------------------------------------------------------------
-# Traces of one run: a table with a row per step, and a figure.
 
 _NOT_TRACES = (
     "time",

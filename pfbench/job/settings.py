@@ -55,10 +55,6 @@ def job_key(values: Mapping[str, Any], inputs: Inputs | None = None) -> str:
     return extend_key(compute_config_key(values, (*IGNORED_IN_KEY, *defaults)), inputs)
 
 
-# --------------------------------------------------------------------------------------------------
-# Settings of a job that do not belong to one of its objects: seed, threads, precision, device, engine.
-
-
 def check_settings(values: Mapping[str, Any]) -> None:
     """Check the settings of a job that do not belong to one of its objects."""
     memory = values["memory_limit_gib"]

@@ -42,9 +42,6 @@ from pfbench.results.status import is_diverged
 from pfbench.results.store import DamagedResultError, read_metadata
 from pfbench.stats.error_measures import Array, Flags, mean_per_run, rmse_per_run
 
-# --------------------------------------------------------------------------------------------------
-# Search of the knobs of a filter: all candidates, several noise regimes, seeds that no study scores.
-
 _RUNS_AT_ONCE = 400  # of all candidates and regimes in one pass, which bounds its memory
 TIE = 0.01  # relative difference of two scores that calibration decides
 OBJECTIVE = (
@@ -249,10 +246,6 @@ def select_errors(
     return error, np.asarray(data["lost"][runs], dtype=bool)
 
 
-# --------------------------------------------------------------------------------------------------
-# Episodes of several noise regimes as one batch: a filter passes over all of them in one call.
-
-
 class RegimeBatch(NamedTuple):
     """Runs of several noise regimes behind one another.
 
@@ -433,9 +426,6 @@ def _select(parts: Any, places: Tensor) -> Any:
 
     return type(parts)(*map(select, parts))
 
-
-# --------------------------------------------------------------------------------------------------
-# Knobs of the filters that are tuned alike: the factor on R, and one knob of the method.
 
 R_FACTORS = (1.0, 2.0, 4.0, 8.0)
 _SCALED, _POWER = "pfbench.filter.ScaledNoise", "pfbench.filter.PowerLikelihoodUpdate"

@@ -160,7 +160,7 @@ def test_finished_chains_of_an_interrupted_inference_are_not_drawn_again(
         (("model=local_level", "method=nuts"), "parameters must name at least one unknown key of the model, got none. Choose from level_sd"),
         (("model=local_level", "method=nuts", "parameters={levle_sd:[1,2]}"), "parameters must name numbers of the model, got levle_sd. Choose from level_sd"),
         (("model=local_level", "method=nuts", "parameters={level_sd:[5,2]}"), "parameters.level_sd must be two positive numbers"),
-        (("model=ins_gnss", "method=nuts", PARAMETERS), "scenario must be set for model=ins_gnss"),
+        (("model=ins_gnss", "method=nuts", PARAMETERS), "scenario must be set for model=ins_gnss, got none of its name. Add scenario=NAME, also for a scenario of your own"),
         (("model=local_level", "method=smc2", PARAMETERS, "calibrate=3"), "calibrate must be a whole number of at least 20, got 3. Use calibrate=100."),
         (("model=local_level", "method=smc2", PARAMETERS, "calibrate=x"), "calibrate must be a whole number of at least 20, got 'x'"),
         (("model=local_level", "method=smc2", PARAMETERS, "calibrate=40", "runs=2"), "runs must be 1 for calibrate"),
