@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 
 import torch
 
-from pfbench.cli.messages import require_choice
 from pfbench.core import require
 from pfbench.files import hash_content, hash_folder, write_atomically
 
@@ -115,10 +114,11 @@ def list_recipes(name: str = "") -> list[Recipe]:
     """
     for file in sorted(HERE.glob("*_rows.py")):
         importlib.import_module(f"{__package__}.{file.stem}")
-    if name:
-        require_choice("oracle", name.partition(".")[0], sorted(_RECIPES), "Use: pfbench check oracles NAME")
     every = sorted(_RECIPES.values(), key=lambda entry: entry.seconds)
-    return [entry for entry in every if not name or entry.name == name.partition(".")[0]]
+    chosen = [entry for entry in every if not name or entry.name == name.partition(".")[0]]
+    names = ", ".join(sorted(_RECIPES))
+    require(chosen, "oracle", f"be one of {names}", name, "Use: pfbench check oracles NAME")
+    return chosen
 
 
 def find_digest() -> str:

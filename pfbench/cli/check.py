@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pfbench import job
 from pfbench.cli.command import Command
-from pfbench.cli.messages import format_error
+from pfbench.cli.messages import format_error, require_choice
 from pfbench.core.parameter_checks import require
 from pfbench.files.command_start import collect_rarely, start_work
 from pfbench.job.config import SUFFIX, compose, list_groups
@@ -58,7 +58,9 @@ def _check_oracles(words: Sequence[str]) -> None:
     require(len(names) < 2, "oracles", "have at most one name", " ".join(names), "Use: pfbench check oracles NAME")  # fmt: skip
     config = compose([word for word in words if "=" in word])
     book = import_module("pfbench.experiments.oracles.book")
-    book.list_recipes(*names)  # refuses an unknown name before the work starts
+    recipes = sorted(recipe.name for recipe in book.list_recipes())
+    for name in names:  # before the work starts
+        require_choice("oracle", name.partition(".")[0], recipes, "Use: pfbench check oracles NAME")
     start_work()
     book.run_book("".join(names), Path(config.values["results_dir"]) / "oracles")
 

@@ -1,6 +1,6 @@
 """Commands: help, options with their checks, and the function that runs one.
 
-A file of the command line whose docstring has a line "Command `pfbench NAME`: what it does." has a command `NAME`. A file of one
+A file of the command line whose docstring has a line "Command `pfbench NAME`: what it does." has a command `NAME_COMMAND`. A file of one
 command may begin with this line and end in its `COMMAND`.
 """
 
@@ -150,7 +150,7 @@ class CommandFile(NamedTuple):
     def load(self) -> Command:
         """Import the command."""
         module: Any = import_module(self.module)
-        return getattr(module, self.name.upper(), None) or module.COMMAND
+        return getattr(module, f"{self.name.upper()}_COMMAND", None) or module.COMMAND
 
 
 @cache

@@ -105,7 +105,7 @@ def add_search_path(words: Sequence[str]) -> list[str]:
     return list(words)
 
 
-LIST = Command(
+LIST_COMMAND = Command(
     list_options,
     """\
 pfbench list [GROUP] [key=value ...]
@@ -161,7 +161,7 @@ def make_script(shell: str) -> str:
     )
 
 
-COMPLETION = Command(
+COMPLETION_COMMAND = Command(
     print_completion,
     """\
 pfbench completion bash|zsh

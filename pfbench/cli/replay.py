@@ -63,7 +63,7 @@ def _format(value: float) -> str:
 
 
 _NEEDED = "needed where the filter has results in several conditions"
-REPLAY = Command(
+REPLAY_COMMAND = Command(
     replay_run,
     """\
 pfbench replay study=NAME run=NUMBER filter=NAME [scenario=NAME] [noise=NAME] [model=NAME] [key=value ...]
@@ -148,7 +148,7 @@ def _name_engines(jobs: Mapping[str, Mapping[str, Any]]) -> str:
     return f"; engines: {text}" if len(set(engines.values())) > 1 else ""
 
 
-COST = Command(
+COST_COMMAND = Command(
     measure_cost,
     """\
 pfbench cost study=NAME [rounds=7] [overwrite=true] [key=value ...]

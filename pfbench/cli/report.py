@@ -182,7 +182,7 @@ def _renew_published(study: str, folder: Path, results: Path) -> str:
     )
 
 
-REPORT = Command(
+REPORT_COMMAND = Command(
     report_study,
     """\
 pfbench report study=NAME [key=value ...]
@@ -212,7 +212,7 @@ def open_report(words: Sequence[str]) -> None:
         print("No browser was found. Open the page by its path.")
 
 
-OPEN = Command(
+OPEN_COMMAND = Command(
     open_report,
     """\
 pfbench open study=NAME [results_dir=FOLDER] [reports_dir=FOLDER]
@@ -245,7 +245,7 @@ def report_status(words: Sequence[str]) -> None:
         print(f"No study has results in {results}. Next: pfbench run -m +experiment=quickstart")
 
 
-STATUS = Command(
+STATUS_COMMAND = Command(
     report_status,
     """\
 pfbench status [study=NAME] [results_dir=FOLDER]
@@ -284,7 +284,7 @@ def compare_study(words: Sequence[str], published: str) -> None:
         print(f"heat map: {picture.resolve()}")
 
 
-COMPARE = Command(
+COMPARE_COMMAND = Command(
     compare_study,
     """\
 pfbench compare study=NAME published=all_seven [key=value ...]
@@ -348,7 +348,7 @@ def _read_study(
     return pack, table, {name: (stored.parent / name).read_bytes() for name in names}
 
 
-PAPER = Command(
+PAPER_COMMAND = Command(
     write_study_paper,
     """\
 pfbench paper study=NAME journal=ieee|elsevier|springer [key=value ...]
@@ -385,7 +385,7 @@ def report_scenario(words: Sequence[str]) -> None:
     print(f"datasheet: {page.resolve()}")
 
 
-DATASHEET = Command(
+DATASHEET_COMMAND = Command(
     report_scenario,
     """\
 pfbench datasheet scenario=NAME [noise=NAME] [runs=20] [key=value ...]

@@ -173,7 +173,7 @@ def _read_factors(key: str, text: str, remedy: str) -> tuple[float, ...]:
     return values
 
 
-TUNE = Command(
+TUNE_COMMAND = Command(
     tune_filters,
     """\
 pfbench tune scenario=NAME [model=NAME] [filter=NAME,NAME] [key=value ...]
@@ -266,7 +266,7 @@ def fit_network(words: Sequence[str], tell: Callable[[str], object]) -> Path:
     return fit(values, choices, regimes, job.instantiate, about, tell)
 
 
-TRAIN = Command(
+TRAIN_COMMAND = Command(
     train_network,
     """\
 pfbench train key=value ...

@@ -73,9 +73,8 @@ def make_own(
         )
     group, stage = find_group(thing)
     cls = thing if isinstance(thing, type) else type(thing)
-    has_source = (
-        cls.__module__ != "builtins"
-    )  # that of code which exec runs in a namespace without a name
+    # exec in a namespace without a name gives classes of the module builtins
+    has_source = cls.__module__ != "builtins"
     require(
         has_source,
         cls.__name__,

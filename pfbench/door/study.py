@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pfbench.cli.compose import choose_places
 from pfbench.cli.messages import require_choice
 from pfbench.cli.progress import StudyState, format_repeat, read_state
-from pfbench.cli.report import PAPER, check_has_results
+from pfbench.cli.report import PAPER_COMMAND, check_has_results
 from pfbench.door.parts import format_words, plain_errors
 from pfbench.job.config import compose
 from pfbench.job.trust import trusted_packages, trusting
@@ -213,7 +213,7 @@ class Study:
         places = {"results_dir": self.results, "reports_dir": self.reports}
         words = format_words({"study": self.name, "journal": journal, **places, **settings})
         with plain_errors(words):
-            PAPER(words)
+            PAPER_COMMAND(words)
         return sorted(path for path in folder.rglob("*") if path.is_file())
 
     def status(self) -> StudyState:

@@ -251,7 +251,9 @@ def choose_engine(
     return "kernels" if obstacle else "tape"
 
 
-def describe_copies(plan: JobPlan, model: StateSpaceModel, record: Record) -> tuple[str, ...]:
+def describe_unmoved_copies(
+    plan: JobPlan, model: StateSpaceModel, record: Record
+) -> tuple[str, ...]:
     """Say once, and return as a note, that nothing moves the copies of resampling apart: neither the filter nor the process."""
     method, choices = plan.method, plan.config.choices
     if (
@@ -264,8 +266,8 @@ def describe_copies(plan: JobPlan, model: StateSpaceModel, record: Record) -> tu
     _, step_model, step = next(iter(iterate_steps(model, start)))
     x, w = model.origin.expand(1, 1, -1), model.origin.new_zeros(1, 1, model.noise_dim)
     with torch.no_grad():
-        moved, unmoved = (step_model.propagate(x, step.u, noise) for noise in (w + 1.0, w))
-    if not torch.equal(moved, unmoved):
+        pushed, still = (step_model.propagate(x, step.u, noise) for noise in (w + 1.0, w))
+    if not torch.equal(pushed, still):
         return ()
     _say_once(f"warning  {choices['scenario']} / {choices['filter']}   {_COPIES}")
     return (_COPIES,)

@@ -93,8 +93,14 @@ def run(
         _announce_change(path, job_choices, inputs)
     meta, outputs = _compute_or_note(config, name, path, announce, is_alone=not counter)
     check_unchanged(inputs, values, config.trusted)
-    head = {"key": path.stem, "study": values["study"], "choices": job_choices, "config": values}
-    head |= {"inputs": inputs, "trusted": list_used_packages(config)}
+    head = {
+        "key": path.stem,
+        "study": values["study"],
+        "choices": job_choices,
+        "config": values,
+        "inputs": inputs,
+        "trusted": list_used_packages(config),
+    }
     store.write_result(path, {**head, **meta}, outputs)
     outcome = JobOutcome(path, "finished", main_rmse(outputs, meta))
     seconds = meta["seconds"]

@@ -19,7 +19,7 @@ from command_line import environment, pfbench
 from pfbench.cli import progress
 from pfbench.cli.list import make_script
 from pfbench.cli.new import SCRIPTS
-from pfbench.cli.report import OPEN
+from pfbench.cli.report import OPEN_COMMAND as OPEN
 from pfbench.results import store
 
 WALK = ("scenario=linear_walk", "scenario.steps=5", "runs=3", "particles=30")

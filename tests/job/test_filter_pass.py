@@ -118,7 +118,9 @@ def test_copies_that_nothing_moves_apart_are_named(
 ) -> None:
     plan = build_plan(settings(tmp_path, f"scenario={world}", f"filter={method}"))
     episode = truncated(plan.draw_episode(plan.runs), 3)
-    notes = filter_pass.describe_copies(plan, plan.make_filter_model(episode), episode.record)
+    notes = filter_pass.describe_unmoved_copies(
+        plan, plan.make_filter_model(episode), episode.record
+    )
     assert ["filter=rpf_copies" in note for note in notes] == [True] * is_still
 
 
