@@ -130,8 +130,10 @@ def _make_part(group: str, item: Any) -> Part:
             f"{group} must be a name, a part or a class, got {describe_value(item)}. List the names: pfbench.names({group!r})."
         )
     kind = item.group if isinstance(item, Part) else find_group(item)[0]
-    if group == "scenario" and kind == "model":
-        return simulate_model(item)
+    if group == "scenario" and kind == "model":  # which is simulated for 100 steps
+        if isinstance(item, Part) and not item.folders:
+            return add_changes(get_part("scenario", item.name), item.changes)
+        return make_own(pfbench.scenario.ModelSimulation, model=item, steps=100)
     require(
         kind == group,
         group,
@@ -140,13 +142,6 @@ def _make_part(group: str, item: Any) -> Part:
         f"Pass it as {kind}=...",
     )
     return item if isinstance(item, Part) else make_own(item)
-
-
-def simulate_model(item: Any) -> Part:
-    """Make the scenario that simulates a model for 100 steps."""
-    if isinstance(item, Part) and not item.folders:
-        return add_changes(get_part("scenario", item.name), item.changes)
-    return make_own(pfbench.scenario.ModelSimulation, model=item, steps=100)
 
 
 def _compose_job(words: list[str]) -> JobConfig:

@@ -61,7 +61,7 @@ def check_settings(values: Mapping[str, Any]) -> None:
     valid = {
         **{
             key: type(values[key]) is int and least <= values[key] <= _MOST.get(key, math.inf)
-            for key, least in _INTEGERS.items()
+            for key, (least, _) in _INTEGERS.items()
         },
         "overwrite": type(values.get("overwrite", False)) is bool,
         "oracle_noise": type(values["oracle_noise"]) is bool,
@@ -96,15 +96,14 @@ def check_settings(values: Mapping[str, Any]) -> None:
 
 
 _LARGEST = 1_000_000_000  # a number that is advised
-# with minimum
-_INTEGERS = {"runs": 1, "particles": 2, "first_run": 0, "threads": 1, "seed": 0, "score_steps": 0}
-_EXAMPLES = {
-    "runs": 100,
-    "particles": 500,
-    "first_run": 0,
-    "threads": 1,
-    "seed": 1,
-    "score_steps": 10,
+# whole numbers with minimum and example
+_INTEGERS = {
+    "runs": (1, 100),
+    "particles": (2, 500),
+    "first_run": (0, 0),
+    "threads": (1, 1),
+    "seed": (0, 1),
+    "score_steps": (0, 10),
 }
 # threads beyond the cores only wait, and OpenMP ends the process with a fault if there are many
 _MOST = {"threads": max(256, os.cpu_count() or 1)}
@@ -112,9 +111,9 @@ _REQUIREMENTS = {  # requirement and valid value by key
     **{
         key: (
             f"a whole number of at least {least}" + f", at most {_MOST.get(key)}" * (key in _MOST),
-            str(_EXAMPLES[key]),
+            str(example),
         )
-        for key, least in _INTEGERS.items()
+        for key, (least, example) in _INTEGERS.items()
     },
     "oracle_noise": ("true (the filter receives the true noise regime) or false", "false"),
     "overwrite": ("true (repeat finished jobs) or false", "false"),

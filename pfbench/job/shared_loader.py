@@ -286,9 +286,12 @@ class _SharedRepository(CachingConfigRepository):
             self.folders[config_path] = folder
         if folder is not None and len(holders) > 1:
             second = next(source for source in holders if source is not folder)
+            group, _, name = config_path.rpartition("/")
+            other = f"pfbench's own {group or 'main file'} {name}"
+            if isinstance(second, ForeignFolder):
+                other = f"{second.file_of(config_path)}"
             raise UntrustedConfigError(
-                f"{folder.file_of(config_path)} must have another name than "
-                f"{_name_file(second, config_path)}, got the same. Rename your file."
+                f"{folder.file_of(config_path)} must have another name than {other}, got the same. Rename your file."
             )
         return holders[0] if holders else None
 
@@ -304,14 +307,6 @@ class _StoredNode:
 
     def __hash__(self) -> int:
         return id(self._node)
-
-
-def _name_file(source: ConfigSource, config_path: str) -> str:
-    """Return the place of a file, for messages."""
-    group, _, name = config_path.rpartition("/")
-    if isinstance(source, ForeignFolder):
-        return f"{source.file_of(config_path)}"
-    return f"pfbench's own {group or 'main file'} {name}"
 
 
 def _find_version(source: ConfigSource, config_path: str, schema: ConfigSource) -> Hashable | None:

@@ -268,15 +268,10 @@ class RegimeBatch(NamedTuple):
 
     def pass_candidates(self, configs: Sequence[JobConfig]) -> TimedFilterPass:
         """Run several candidates of a filter over all runs in one pass, one candidate behind another."""
-        methods = [build_plan(config).method for config in configs]
-        plan = replace(
-            self.plan, config=configs[0], method=join_candidates(methods, len(self.runs))
-        )
-        return pass_filter(plan, *self.repeat(len(configs)), "candidates")
-
-    def repeat(self, times: int) -> tuple[Episode, Tensor]:
-        """Return the episode and the numbers of the runs several times behind one another."""
-        return join_episodes([self.episode] * times), self.runs.repeat(times)
+        joined = join_candidates([build_plan(c).method for c in configs], len(self.runs))
+        plan, count = replace(self.plan, config=configs[0], method=joined), len(configs)
+        episode = join_episodes([self.episode] * count)
+        return pass_filter(plan, episode, self.runs.repeat(count), "candidates")
 
     def list_runs(self) -> Iterator[tuple[str, slice]]:
         """Yield each regime with the places of its runs."""
