@@ -143,7 +143,7 @@ def _time_study(
 
 def _name_engines(jobs: Mapping[str, Mapping[str, Any]]) -> str:
     """Name the engine of each filter if they differ: SIR by a tape is faster than a filter without one."""
-    engines = {label: job["engine"] for label, job in jobs.items()}
+    engines = {job["label"]: job["engine"] for job in jobs.values()}
     text = ", ".join(f"{label} by {engine}" for label, engine in engines.items())
     return f"; engines: {text}" if len(set(engines.values())) > 1 else ""
 
