@@ -163,11 +163,8 @@ def make_metadata(
 
     Returns values that JSON can represent.
     """
-    from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-
     values, method = plan.values, plan.method
     device = values["device"]
-    is_kalman_filter = model.linear and isinstance(method, GaussianFilter) and method.plain
     unnamed = describe_unnamed_files(values["scenario"], plan.config.trusted)
     return {
         "label": plan.config.choices["filter"],
@@ -179,7 +176,7 @@ def make_metadata(
         "dtype": values["dtype"],
         "device": device if device == "cpu" else torch.cuda.get_device_name(device),
         "threads": values["threads"],
-        "is_exact": method.is_exact or is_kalman_filter,
+        "is_exact": method.is_exact or _is_kalman_filter(model, method),
         "has_bounded_weights": has_bounded_weights(method),
         "has_evidence": has_evidence(method),
         "has_counts": model.has_counts,
@@ -198,6 +195,13 @@ def describe_state(model: StateSpaceModel) -> dict[str, Any]:
         "units": list(model.units),
         "groups": {name: list(components) for name, components in model.groups.items()},
     }
+
+
+def _is_kalman_filter(model: StateSpaceModel, method: Any) -> bool:
+    """Return whether a filter is the Kalman filter of a linear model."""
+    from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+
+    return model.linear and isinstance(method, GaussianFilter) and method.plain
 
 
 def make_provenance() -> dict[str, Any]:
