@@ -242,7 +242,7 @@ def list_alternatives(overrides: Sequence[str], *, is_sweep: bool = True) -> lis
 
 
 def _check_values(alternatives: Sequence[Sequence[str]], config: JobConfig | None) -> None:
-    """Check all settings of a sweep, and all values that can choose a file that is not pfbench's."""
+    """Check all settings of a sweep, the values of keys of a filter or noise regime, and all values that can choose a file that is not pfbench's."""
     first = [options[0] for options in alternatives]
     values: Mapping[str, object] = config.values if config else {}
     for index, options in enumerate(alternatives):
