@@ -21,7 +21,7 @@ from refusals import check_refused
 from pfbench import job
 from pfbench.cli.compose import read_sweep
 from pfbench.cli.messages import format_error
-from pfbench.cli.tune import COMMAND as TUNE
+from pfbench.cli.tune import TUNE_COMMAND as TUNE
 from pfbench.job import tuning
 from pfbench.job.config import FILTER_SETS, TUNED_METHODS, expand_filter_sets
 from pfbench.job.tuned_files import Ratio, compare_errors, decide_fit, find_best
