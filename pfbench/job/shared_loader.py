@@ -287,11 +287,11 @@ class _SharedRepository(CachingConfigRepository):
         if folder is not None and len(holders) > 1:
             second = next(source for source in holders if source is not folder)
             group, _, name = config_path.rpartition("/")
-            place = f"pfbench's own {group or 'main file'} {name}"
+            second_file = f"pfbench's own {group or 'main file'} {name}"
             if isinstance(second, ForeignFolder):
-                place = f"{second.file_of(config_path)}"
+                second_file = f"{second.file_of(config_path)}"
             raise UntrustedConfigError(
-                f"{folder.file_of(config_path)} must have another name than {place}, got the same. Rename your file."
+                f"{folder.file_of(config_path)} must have another name than {second_file}, got the same. Rename your file."
             )
         return holders[0] if holders else None
 
