@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
 
 from pfbench import job
 from pfbench.cli.command import Command
-from pfbench.cli.messages import format_error
+from pfbench.cli.messages import format_error, require_choice
 from pfbench.core.parameter_checks import require
 from pfbench.files.command_start import collect_rarely, start_work
 from pfbench.job.config import SUFFIX, compose, list_groups
@@ -30,7 +30,13 @@ def check_installation(words: Sequence[str]) -> None:
     has_cuda = torch.cuda.is_available()
     root = compose([]).values["data"]["root"]
     hint = "recorded scenarios need PFBENCH_DATA or data.root=..."
-    errors = [f"{choice}: {error}" for choice, error in _compose_all() if error]
+    errors = []
+    for group, name in ((group, name) for group, names in list_groups().items() for name in names):
+        choice = f"{'+' if group in _ADDED else ''}{group}={name}"
+        try:
+            compose([choice, *_add_needs(group, name), "data.root=somewhere"])
+        except Exception as error:
+            errors.append(f"{choice}: {format_error(error, [choice])}")
     total = sum(map(len, list_groups().values()))
     rows = [
         ("item", "value", "status"),
@@ -52,25 +58,14 @@ def _check_oracles(words: Sequence[str]) -> None:
     require(len(names) < 2, "oracles", "have at most one name", " ".join(names), "Use: pfbench check oracles NAME")  # fmt: skip
     config = compose([word for word in words if "=" in word])
     book = import_module("pfbench.experiments.oracles.book")
-    book.list_recipes(*names)  # refuses an unknown name before the work starts
+    recipes = sorted(recipe.name for recipe in book.list_recipes())
+    for name in names:  # before the work starts
+        require_choice("oracle", name.partition(".")[0], recipes, "Use: pfbench check oracles NAME")
     start_work()
     book.run_book("".join(names), Path(config.values["results_dir"]) / "oracles")
 
 
 _ADDED = ("experiment", "infer")  # groups that are not in the list of defaults
-
-
-def _compose_all() -> Iterator[tuple[str, str]]:
-    """Yield the choice of each configuration file, and its error or an empty text."""
-    for group, names in list_groups().items():
-        for name in names:
-            sign = "+" if group in _ADDED else ""
-            choice = f"{sign}{group}={name}"
-            try:
-                compose([choice, *_add_needs(group, name), "data.root=somewhere"])
-                yield choice, ""
-            except Exception as error:
-                yield choice, format_error(error, [choice])
 
 
 def _add_needs(group: str, name: str) -> list[str]:

@@ -60,6 +60,7 @@ def write_claims_page(words: Sequence[str]) -> Path:
 
     values = compose(words).values
     _take_published(Path(values["results_dir"]), Path(values["reports_dir"]))
+    print("claims: the stored runs decide all claims, which takes about a minute", flush=True)
     return write_claims(values["results_dir"], values["reports_dir"])
 
 

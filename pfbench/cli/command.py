@@ -1,6 +1,7 @@
 """Commands: help, options with their checks, and the function that runs one.
 
-A file of the command line whose first line is "Command `pfbench NAME`: what it does." is a command, and ends in its `COMMAND`.
+A file of the command line whose docstring has a line "Command `pfbench NAME`: what it does." has a command `NAME_COMMAND`. A file of one
+command may begin with this line and end in its `COMMAND`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from pfbench.core.parameter_checks import require, require_range
 Reader = Callable[[str, str, str], Any]  # of key, text and remedy
 _FOLDERS = ("cli", "logs/cli")  # of commands
 _FIRST = ("run", "report")  # in the list of commands
-_HEAD = re.compile(r'"""Command `pfbench (\w+)`: (.+?)\.?"""\n')
+_HEAD = re.compile(r'^(?:""")?Command `pfbench (\w+)`: (.+?)\.?(?:""")?$', re.MULTILINE)
 
 
 def read_word(key: str, text: str, remedy: str) -> str:
@@ -140,15 +141,16 @@ class Command:
 
 
 class CommandFile(NamedTuple):
-    """File of a command: its module, and what the command does."""
+    """File of a command: its module, the name of the command, and what it does."""
 
     module: str
+    name: str
     summary: str
 
     def load(self) -> Command:
         """Import the command."""
-        command: Command = import_module(self.module).COMMAND
-        return command
+        module: Any = import_module(self.module)
+        return getattr(module, f"{self.name.upper()}_COMMAND", None) or module.COMMAND
 
 
 @cache
@@ -157,7 +159,7 @@ def list_commands() -> dict[str, CommandFile]:
     package, commands = Path(pfbench.__file__).parent, {}
     for folder in _FOLDERS:
         for file in (package / folder).glob("*.py"):
-            if head := _HEAD.match(file.read_text(encoding="utf-8")):
-                module = f"pfbench.{folder.replace('/', '.')}.{file.stem}"
-                commands[head[1]] = CommandFile(module, head[2])
+            module = f"pfbench.{folder.replace('/', '.')}.{file.stem}"
+            for name, summary in _HEAD.findall(file.read_text(encoding="utf-8")):
+                commands[name] = CommandFile(module, name, summary)
     return {name: commands[name] for name in (*_FIRST, *sorted(commands.keys() - {*_FIRST}))}

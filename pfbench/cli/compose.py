@@ -17,7 +17,7 @@ from pfbench.core.parameter_checks import require
 from pfbench.job.config import CHOICES, JobConfig, compose, compose_tree, expand_filter_sets
 from pfbench.job.file_rules import FOLDER_KEYS
 from pfbench.job.settings import check_settings
-from pfbench.job.trust import UntrustedConfigError, check_study
+from pfbench.job.trust import UntrustedConfigError, check_study, require_allowed
 from pfbench.results.paper_block import (
     PAPER,
     experiments_dir,
@@ -186,11 +186,10 @@ def _parse_flags(words: list[str]) -> Any:
         refuse(message)
     if unknown:
         raise ValueError(format_flag(words, unknown[0], "run"))
-    if args.config_path or args.config_name or args.config_dir or args.experimental_rerun:
-        raise UntrustedConfigError(
-            "--config-path, --config-name and --experimental-rerun must not be used, since pfbench has its "
-            "own main file. Use --config-dir=FOLDER for more files."
-        )
+    of_hydra = args.config_path or args.config_name or args.config_dir or args.experimental_rerun
+    flags = "--config-path, --config-name and --experimental-rerun"
+    must = "not be used, since pfbench has its own main file"
+    require_allowed(not of_hydra, flags, must, of_hydra, "Use --config-dir=FOLDER for more files.")
     return args
 
 
@@ -211,11 +210,11 @@ def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
         key = override.get_key_element()
         if override.is_sweep_override():
             texts = list(islice(override.sweep_string_iterator(), _MOST_VALUES + 1))
-            if not 0 < len(texts) <= _MOST_VALUES:
-                raise UntrustedConfigError(
-                    f"{key} must have 1 to {_MOST_VALUES} values, got {'more' if texts else 'none'} of "
-                    f"{override.input_line}. Write them as {key}=A,B."
-                )
+            got = f"{'more' if texts else 'none'} of {override.input_line}"
+            is_few = 0 < len(texts) <= _MOST_VALUES
+            require_allowed(
+                is_few, key, f"have 1 to {_MOST_VALUES} values", got, f"Write them as {key}=A,B."
+            )
             values = [f"{key}={value}" for value in texts]
         else:
             values = [override.input_line or f"{key}={override.get_value_element_as_str()}"]
@@ -243,7 +242,7 @@ def list_alternatives(overrides: Sequence[str], *, is_sweep: bool = True) -> lis
 
 
 def _check_values(alternatives: Sequence[Sequence[str]], config: JobConfig | None) -> None:
-    """Check all settings of a sweep, and all values that can choose a file that is not pfbench's."""
+    """Check all settings of a sweep, the values of keys of a filter or noise regime, and all values that can choose a file that is not pfbench's."""
     first = [options[0] for options in alternatives]
     values: Mapping[str, object] = config.values if config else {}
     for index, options in enumerate(alternatives):
@@ -255,11 +254,13 @@ def _check_values(alternatives: Sequence[Sequence[str]], config: JobConfig | Non
             if is_plain and value != UNTIL_DECIDED:  # known before a job starts
                 check_settings({**values, "runs": 1, key: parse_words([option])[0].value()})
             elif not is_plain and value not in list_named_parts(key):
-                _check_composition([*first[:index], option, *first[index + 1 :]])
+                composed = _check_composition([*first[:index], option, *first[index + 1 :]])
+                group = key.partition(".")[0]
+                if composed and group in ("filter", "noise") and group != key:
+                    from pfbench.job.model_fit import instantiate_parts  # which imports torch
 
+                    instantiate_parts(composed.values, (group,), composed.trusted)
 
-# --------------------------------------------------------------------------------------------------
-# Jobs, worlds and pairs of a sweep, before it runs.
 
 UNTIL_DECIDED = "until-decided"  # value of `runs`
 
@@ -330,7 +331,12 @@ class StudyPlan:
         firsts = [options[0] for options in self.alternatives]
         others = [word for word in firsts if given_keys([word]) != {"scenario"}]
         worlds = [compose_words([*others, scenario]) for scenario in scenarios]
-        return dict(map(_family, worlds or [self.first]))
+        families = {}
+        for config in worlds or [self.first]:
+            name, node = config.choices["scenario"], config.values.get("scenario")
+            paper = node.get(PAPER) if isinstance(node, Mapping) else None
+            families[name] = str((paper or {}).get("family") or name)
+        return families
 
     def count_pairs(self) -> int:
         """Count the planned pairs of filters; at least 1, since one filter is compared later."""
@@ -383,11 +389,3 @@ def plan_study(overrides: Sequence[str]) -> StudyPlan:
 def compose_words(words: Sequence[str]) -> JobConfig:
     """Compose a configuration without the overrides of Hydra itself, except its search path."""
     return compose([word for word in words if not re.match(r"[+~]*hydra[/.](?!searchpath)", word)])
-
-
-def _family(config: JobConfig) -> tuple[str, str]:
-    """Return the scenario of a job and its family, itself if none is set."""
-    name = config.choices["scenario"]
-    scenario: Any = config.values.get("scenario")
-    paper = scenario.get(PAPER) if isinstance(scenario, dict) else None
-    return name, str((paper or {}).get("family") or name)

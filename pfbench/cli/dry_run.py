@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
@@ -25,8 +24,8 @@ from pfbench.job.inputs import find_inputs
 from pfbench.job.memory import first_steps
 from pfbench.job.plan import JobPlan, build_plan
 from pfbench.job.run_job import find_result_path, list_used_packages
+from pfbench.job.step_timing import TimingTask
 from pfbench.job.trust import list_user_packages, list_user_targets, trusted_packages
-from pfbench.kernels import dispatch
 from pfbench.results.conditions import select_main_group
 from pfbench.testing.models import check_regime_in
 from pfbench.testing.results import check_is_model
@@ -47,6 +46,11 @@ class JobEstimate(NamedTuple):
     seconds: float = 0.0
     bytes: float = 0.0
 
+    def __str__(self) -> str:
+        if self.state != "new":
+            return f"{self.state:9}"
+        return f"new       about {format_duration(self.seconds):>6}   {self.bytes / 2**30:.2g} GiB"
+
 
 def print_dry_run(plan: StudyPlan, *, is_sweep: bool) -> None:
     """Print a line for each job, and the sums."""
@@ -62,21 +66,12 @@ def print_dry_run(plan: StudyPlan, *, is_sweep: bool) -> None:
                 f"[{number + 1}/{len(configs)}] refused   {name}   {format_error(error, config.words)}"
             )
             continue
-        print(f"[{number + 1}/{len(configs)}] {_format(estimates[-1])}   {name}")
+        print(f"[{number + 1}/{len(configs)}] {estimates[-1]}   {name}")
     fresh = [estimate for estimate in estimates if estimate.state == "new"]
     print(
         f"dry run: {len(configs)} jobs, {len(fresh)} new, {len(estimates) - len(fresh)} skipped, "
         f"{len(configs) - len(estimates)} refused; about {format_duration(sum(e.seconds for e in fresh))} in one process, "
         f"{max((e.bytes for e in fresh), default=0.0) / 2**30:.2g} GiB at the peak. Nothing was run."
-    )
-
-
-def _format(estimate: JobEstimate) -> str:
-    """Format an estimate."""
-    return (
-        f"new       about {format_duration(estimate.seconds):>6}   {estimate.bytes / 2**30:.2g} GiB"
-        if estimate.state == "new"
-        else f"{estimate.state:9}"
     )
 
 
@@ -91,10 +86,6 @@ class DrawnWorlds:
 
         The time is that of what all runs share, such as a trajectory, and a part for each run.
         """
-        from dataclasses import replace
-
-        from pfbench.job.budget import EpisodeSource
-
         names = ("scenario", "noise", "model", "seed", "first_run", "runs", "oracle_noise", "dtype")
         key = json.dumps([plan.values[name] for name in names], sort_keys=True)
         if key in self._sources:
@@ -112,20 +103,15 @@ def estimate_job(config: JobConfig, worlds: DrawnWorlds) -> JobEstimate:
     file = find_result_path(values, find_inputs(values, config.trusted))
     if file.is_file() and not values["overwrite"]:
         return JobEstimate("skipped")
-    plan = build_plan(_without_cache(config))
+    scenario = values["scenario"]
+    changes = {"cache_dir": None} if "cache_dir" in scenario else {}  # it stores no episodes
+    plan = build_plan(replace(config, values={**values, "scenario": {**scenario, **changes}}))
     source, seconds = worlds.draw(plan)
     episode = source.sample()
     small, _ = apply_budget(replace(plan, runs=plan.runs[:2]), source)
     plan = replace(plan, method=small.method)
     seconds += _time_filter(plan, episode)
     return JobEstimate("new", seconds, estimate_job_memory(plan, episode).peak(len(plan.runs)))
-
-
-def _without_cache(config: JobConfig) -> JobConfig:
-    """Return a configuration that stores no episodes."""
-    scenario = config.values["scenario"]
-    changes = {"cache_dir": None} if "cache_dir" in scenario else {}
-    return replace(config, values={**config.values, "scenario": {**scenario, **changes}})
 
 
 def _time_filter(plan: JobPlan, episode: Episode) -> float:
@@ -143,20 +129,10 @@ def _time_filter(plan: JobPlan, episode: Episode) -> float:
         y=short.y[index], u=map_inputs(copy, short.u), start=start, spread=spread
     )
     engine = choose_engine(plan.values["engine"], plan.method, model, runs, steps)
-    times = []
-    for _ in range(2):  # the first one also loads what the filter needs
-        draws = PhiloxStream(plan.values["seed"], plan.runs, plan.dtype)
-        begin = time.perf_counter()
-        with torch.no_grad(), dispatch.use_kernels(engine != "eager"):
-            run_filter(
-                wrap_steps("tape" if engine == "tape" else "", plan.method) or plan.method,
-                model,
-                record,
-                draws,
-                run_batch=plan.choose_run_batch(plan.method, runs),
-            )
-        times.append(time.perf_counter() - begin)
-    return min(times) / record.y.shape[1] * steps
+    method = wrap_steps("tape" if engine == "tape" else "", plan.method) or plan.method
+    task = TimingTask(plan, model, record, engine, method)
+    # twice, since the first time also loads what the filter needs
+    return steps * min(wall for _, wall in (task.measure(), task.measure()))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -255,19 +231,15 @@ def _check_truth(plan: JobPlan, truth: Collection[str]) -> None:
         )
 
 
-def _check_numbers(scenario: str, episode: Episode) -> None:
-    """Check that the times of a scenario of the user increase, and that no measurement is infinite."""
-    assert (episode.time.diff() > 0).all(), f"{scenario}.draw must return times that increase"
-    assert not episode.record.y.isinf().any(), f"{scenario}.draw must return finite measurements, or NaN for a missing one"  # fmt: skip
-
-
 def _take_steps(
     config: JobConfig, plan: JobPlan, episode: Episode, own_groups: Collection[str]
 ) -> None:
     """Take three steps of a filter of the user, else of a bootstrap filter."""
     if "scenario" in own_groups:
         _check_truth(plan, episode.truth)
-        _check_numbers(type(plan.scenario).__name__, episode)
+        name = type(plan.scenario).__name__
+        assert (episode.time.diff() > 0).all(), f"{name}.draw must return times that increase"
+        assert not episode.record.y.isinf().any(), f"{name}.draw must return finite measurements, or NaN for a missing one"  # fmt: skip
     method = plan.method if "filter" in own_groups else ParticleFilter(20)
     draws = PhiloxStream(plan.values["seed"], plan.runs[:2])
     try:

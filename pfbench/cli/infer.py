@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pfbench.cli.command import Command
+from pfbench.cli.command import Command, Option, in_range
 from pfbench.cli.compose import given_keys
-from pfbench.cli.messages import suggest_similar
-from pfbench.cli.noise_scenario import (
-    check_scenario_name,
-    format_noise,
-    list_places,
-    write_scenario,
-)
+from pfbench.cli.list import list_own_files
+from pfbench.cli.messages import require_choice
 from pfbench.core.parameter_checks import require
+from pfbench.files.atomic_write import write_atomically
 from pfbench.job.config import compose, is_simulated_from, list_groups
+from pfbench.results.paper_block import list_named_parts
 
 HELP = """\
 pfbench infer model=NAME method=nuts|svi|pmmh|smc2 'parameters={KEY:[LOW,HIGH]}' [key=value ...]
@@ -39,10 +37,8 @@ from data sheets (method=noise). The numbers become a scenario that run, tune an
   runs=1 seed=1 noise=NAME   runs that share the parameters
   filter=NAME                filter of the likelihood: ekf, and sir for pmmh
   infer.draws=500            settings of the method: pfbench list infer
-  cores=2                    processes of the chains of nuts and pmmh
   overwrite=true             infer again
-  calibrate=100              ranks of true parameters in 100 simulated data sets, uniform if the method is right
-  name=SCENARIO_noise        of the scenario of method=noise, a file of folder=conf
+  OPTIONS
 
 Python: pfbench.ppl, docs/parameter_inference.md"""
 
@@ -50,32 +46,28 @@ NOISE = "noise"  # method without named parameters
 _USAGE = "Use: pfbench infer model=NAME method=nuts 'parameters={KEY:[LOW,HIGH]}'"
 
 
-def infer_parameters(words: Sequence[str]) -> None:
+def infer_parameters(
+    words: Sequence[str], method: str, cores: int, calibrate: int | None, name: str, folder: str
+) -> None:
     """Infer the parameters of a model, and print their posterior."""
     from pfbench import job
     from pfbench.job.inputs import find_inputs
-    from pfbench.ppl.inference_job import calibrate, infer
+    from pfbench.ppl import inference_job
 
-    options = {"name": "", "folder": "conf", "cores": "1", "calibrate": ""}
-    options |= {k: v for k, _, v in (word.partition("=") for word in words) if k in options}
-    method, composed = _read_words([w for w in words if w.partition("=")[0] not in options])
+    method, composed = _read_words(words, method)
     config = compose(composed)
     values, choices = config.values, config.choices
     job.apply_global_settings(values)
     has_truth = choices["noise"] == "nominal" and is_simulated_from(values["scenario"], choices["scenario"])  # fmt: skip
     about = {"versions": job.read_versions(), "inputs": find_inputs(values, config.trusted)}
-    if count := options["calibrate"]:
-        print(calibrate(method, values, choices, _build, int(count) if count.isdigit() else count))
+    if calibrate is not None:
+        print(inference_job.calibrate(method, values, choices, _build, calibrate))
         return
     scenario_file = None
     if method == NOISE:
-        name = options["name"] or f"{choices['scenario']}_noise"
-        scenario_file = check_scenario_name(name, options["folder"])
-    cores = int(options["cores"]) if options["cores"].isdigit() else 0
-    require(cores > 0, "cores", "be a number of processes from 1 on", options["cores"], "Use cores=2.")  # fmt: skip
-    path, content = infer(
-        method, values, choices, _build, about, values["model"] if has_truth else {}, cores
-    )
+        scenario_file = check_scenario_name(name or f"{choices['scenario']}_noise", folder)
+    truth = values["model"] if has_truth else {}
+    path, content = inference_job.infer(method, values, choices, _build, about, truth, cores)
     print(format_noise(content) if scenario_file else format_posterior(content))
     print(f"inference: {path.resolve()}")
     if scenario_file:
@@ -93,39 +85,26 @@ def _keep_scenario(
     print("\n".join(filter(None, (left_out, f"scenario={path.stem}: {path.resolve()}", use))))
 
 
-def _read_words(words: Sequence[str]) -> tuple[str, list[str]]:
+def _read_words(words: Sequence[str], method: str) -> tuple[str, list[str]]:
     """Return the method, and the words of the configuration: the method is a file of the group `infer`."""
     if {"-m", "--multirun"} & set(words):
         raise ValueError("pfbench infer must be run without -m, got a sweep. Repeat the command for each choice.")  # fmt: skip
     keys = given_keys(words)
-    if "scenario" in keys and not keys & {"method", "parameters"}:
-        words, keys = [*words, f"method={NOISE}"], keys | {"method"}
-    if not {"model", "scenario"} & keys or "method" not in keys:
+    if "scenario" in keys and "parameters" not in keys:
+        method = method or NOISE
+    if not {"model", "scenario"} & keys or not method:
         raise ValueError(f"{'method' if {'model', 'scenario'} & keys else 'model'} must be set. {_USAGE}")  # fmt: skip
-    methods = list_groups()["infer"]
+    require_choice("method", method, list_groups()["infer"], _USAGE)
     words_by_key = {word.partition("=")[0]: word.partition("=")[2] for word in words}
-    method = words_by_key["method"]
-    if method not in methods:
-        raise ValueError(
-            f"method must be one of {', '.join(methods)}, got {method}.{suggest_similar(method, methods)} {_USAGE}"
-        )
     by_kalman = method in (NOISE, "nuts", "svi")
     require(not by_kalman or "particles" not in keys, "particles", f"be left out for method={method}, a Kalman filter", words_by_key.get("particles"), "Leave it out, or use method=pmmh.")  # fmt: skip
-    others = [
-        f"++infer.{word}" if word.startswith("parameters") else word
-        for word in words
-        if not word.startswith("method=")
-    ]
-    if "scenario" not in keys:
-        others.insert(0, f"scenario={_find_scenario(words_by_key['model'])}")
+    others = [f"++infer.{word}" if word.startswith("parameters") else word for word in words]
+    if "scenario" not in keys:  # that of the name of the model
+        model = words_by_key["model"]
+        names = [*list_groups()["scenario"], *(path.stem for path in list_own_files("scenario"))]
+        require(model in names, "scenario", f"be set for model={model}", "none of its name", "Add scenario=NAME, also for a scenario of your own: pfbench list scenario.")  # fmt: skip
+        others.insert(0, f"scenario={model}")
     return method, [f"+infer={method}", *([] if "runs" in keys else ["runs=1"]), *others]
-
-
-def _find_scenario(model: str) -> str:
-    """Return the scenario of the name of a model."""
-    has_name = model in list_groups()["scenario"]
-    require(has_name, "scenario", f"be set for model={model}", "none of its name", "Choose one: pfbench list scenario.")  # fmt: skip
-    return model
 
 
 def _build(node: Any, **changed: Any) -> Any:
@@ -182,4 +161,97 @@ def format_evidence(content: Mapping[str, Any]) -> str:
     return f"\nlog evidence {evidence:.2f}, {verdict}; an autoregression or independent normals fitted to the measurements have {floor:.2f}"
 
 
-COMMAND = Command(infer_parameters, HELP)
+_FIRST = "# Noise numbers that `pfbench infer` found"
+_PLAIN = ("gyro_density", "accelerometer_density", "gyro_bias_walk", "accelerometer_bias_walk")
+
+
+def check_scenario_name(name: str, folder: str) -> Path:
+    """Return the file of a scenario, which must not be one that another command or a person wrote."""
+    require(re.fullmatch(r"\w+", name), "name", "consist of letters, digits and underscores", name)
+    path = Path(folder) / "scenario" / f"{name}.yaml"
+    is_new = not path.is_file() or path.read_text(encoding="utf-8").startswith(_FIRST)
+    require(is_new and name not in list_named_parts("scenario"), "name", "be that of a new file, or of one that this command wrote", name, "Add name=NAME.")  # fmt: skip
+    return path
+
+
+def list_places(words: Sequence[str]) -> list[str]:
+    """List the words that say where the log is, which a file may not: a command has them each time."""
+    return [word for word in words if re.match(r"\+*(data\.root|scenario\.(root|folder|files|cache_dir)\b)", word)]  # fmt: skip
+
+
+def write_scenario(
+    path: Path, base: str, words: Sequence[str], node: Mapping[str, Any], content: Mapping[str, Any]
+) -> str:
+    """Write a variant of a scenario with the inferred numbers; return a sentence on what it leaves out.
+
+    `words` are those of the command, whose settings of the scenario the variant keeps. `node` is the scenario as composed.
+    """
+    import yaml
+    from omegaconf import OmegaConf
+
+    values = {name: row["value"] for name, row in content["rows"].items()}
+    plain = [w.lstrip("+") for w in words if re.match(r"\+*scenario\.", w) and w not in list_places(words)]  # fmt: skip
+    settings: Any = OmegaConf.to_container(OmegaConf.from_dotlist(plain)).get("scenario", {})  # type: ignore[union-attr]
+    tuning = settings.setdefault("tuning", {})
+    tuning |= {name: values[name] for name in _PLAIN}
+    for kind in ("position", "velocity"):
+        if f"{kind}_vertical" in values:
+            level = values[f"{kind}_horizontal"]
+            tuning[f"{kind}_sd"] = [level, level, values[f"{kind}_vertical"]]
+    model, left_out = _add_geometry(settings, node, values)
+    defaults = [base, "_self_", *([{"override /model@_global_.model": model}] if model else [])]
+    text = yaml.safe_dump({"defaults": defaults, **settings}, sort_keys=False)
+    head = f"{_FIRST} from {content['fixes']} fixes (docs/parameter_inference.md).\n"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda file: file.write((head + text).encode()))
+    return left_out
+
+
+def _add_geometry(
+    settings: dict[str, Any], node: Mapping[str, Any], values: Mapping[str, float]
+) -> tuple[str, str]:
+    """Add lever arm and delay that are not zero; return the model that reads them, and a sentence on what is left out."""
+    lever = [values["lever_forward"], values["lever_right"], -values["lever_up"]]
+    delay, model, left_out = values.get("delay", 0.0), "", []
+    if any(lever) and "constraints" in node:
+        earlier = node["constraints"].get("lever_arm") or (0.0, 0.0, 0.0)
+        settings.setdefault("constraints", {})["lever_arm"] = [a + b for a, b in zip(earlier, lever, strict=True)]  # fmt: skip
+        model = "strapdown_blocks"
+    elif any(lever):
+        left_out.append("the lever arm")
+    if delay and "corrections" in node:
+        shifts = node["corrections"].get("shift_s") or {}
+        delay += shifts.get("gnss", 0.0)
+        settings.setdefault("corrections", {})["shift_s"] = {**shifts, "gnss": delay}
+    elif delay:
+        left_out.append("the delay")
+    return model, f"{' and '.join(left_out)} not written: scenario=user_log has the keys for them" if left_out else ""  # fmt: skip
+
+
+def format_noise(content: Mapping[str, Any]) -> str:
+    """Format the numbers with priors and verdicts, and the scores of held-out fixes."""
+    import pandas as pd
+
+    rows = pd.DataFrame.from_dict(content["rows"], orient="index")
+    scores = pd.DataFrame.from_dict(content["scores"], orient="index")
+    table = rows.rename(columns={"low": "5 %", "high": "95 %", "prior low": "prior 5 %", "prior high": "prior 95 %", "value": "for a filter"})  # fmt: skip
+    k = f"Pareto k {content['pareto_k']:.2f}, {content['ess']:.0f} effective draws, {content['cpu_seconds']:.0f} s of CPU"  # fmt: skip
+    head = f"noise of {content['choices']['scenario']} by the EKF in closed form, {content['fixes']} fixes: {k}"  # fmt: skip
+    split = "second half of the fixes, numbers inferred from the first half:"
+    texts = (frame.to_string(float_format=lambda value: f"{value:.4g}") for frame in (table, scores))  # fmt: skip
+    return f"\n{split}\n".join(texts).join((f"{head}\n", ""))
+
+
+COMMAND = Command(
+    infer_parameters,
+    HELP,
+    options={
+        "method": Option("nuts", "nuts, svi, pmmh or smc2; noise without parameters", default=""),
+        "cores": Option("1", "processes of the chains of nuts and pmmh", in_range("whole [1, inf)")),
+        "calibrate": Option(
+            "100", "ranks of true parameters in 100 simulated data sets, uniform if the method is right", in_range("whole [20, inf)"), None
+        ),
+        "name": Option("SCENARIO_noise", "of the scenario of method=noise", default=""),
+        "folder": Option("conf", "folder of its file"),
+    },
+)  # fmt: skip

@@ -1,4 +1,8 @@
-"""Command `pfbench list`: list what a configuration can choose."""
+"""Commands of names: what a configuration can choose.
+
+Command `pfbench list`: list what a configuration can choose.
+Command `pfbench completion`: print the completion of words for a shell.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from pfbench.cli.command import Command
+from pfbench.cli.command import Command, list_commands
 from pfbench.cli.compose import given_keys, read_description
 from pfbench.cli.messages import require_choice
 from pfbench.core.parameter_checks import require
@@ -101,7 +105,7 @@ def add_search_path(words: Sequence[str]) -> list[str]:
     return list(words)
 
 
-COMMAND = Command(
+LIST_COMMAND = Command(
     list_options,
     """\
 pfbench list [GROUP] [key=value ...]
@@ -112,4 +116,58 @@ List the configuration groups with their files, or the files of a group with the
   pfbench list filter
   pfbench list model scenario=sar_flight     the models that fit a scenario
   pfbench list scenario model=ins_gnss       the scenarios that fit a model""",
+)
+
+
+_SHELLS = ("bash", "zsh")
+_SCRIPT = """\
+{head}_pfbench() {{
+    local word="${{COMP_LINE:0:$COMP_POINT}}"
+    word="${{word##* }}"
+    local key="${{word%%=*}}" value="${{word##*[=,]}}" names=""
+    if [[ "$word" != *=* ]]; then
+        names="{words}"
+        [[ $COMP_CWORD -eq 1 ]] && names="{commands}"
+        COMPREPLY=($(compgen -W "$names" -- "$word"))
+        return
+    fi
+    case "${{key#+}}" in
+{cases}
+    esac
+    local own
+    own=$(ls "conf/${{key#+}}" 2>/dev/null | sed -n 's/\\.yaml$//p')
+    COMPREPLY=($(compgen -W "$names $own" -- "$value"))
+}}
+complete -o nospace -F _pfbench pfbench
+"""
+
+
+def print_completion(words: Sequence[str]) -> None:
+    """Print the script of a shell."""
+    shell = " ".join(words) or "none"
+    require_choice("shell", shell, _SHELLS, "Use: pfbench completion bash")
+    print(make_script(shell))
+
+
+def make_script(shell: str) -> str:
+    """Make the script of a shell."""
+    groups = describe_choices(None)
+    cases = [f'        {group}) names="{" ".join(describe_choices(group))}" ;;' for group in groups]
+    keys = [f"{group}=" for group in groups if group != "experiment"]
+    keys += ["+experiment=", "runs=", "seed=", "study=", "particles=", "-m", "--dry-run"]
+    head = "autoload -U +X bashcompinit && bashcompinit\n" if shell == "zsh" else ""
+    return _SCRIPT.format(
+        head=head, words=" ".join(keys), commands=" ".join(list_commands()), cases="\n".join(cases)
+    )
+
+
+COMPLETION_COMMAND = Command(
+    print_completion,
+    """\
+pfbench completion bash|zsh
+
+Print the completion of commands, keys and names. It also completes the files of conf/ in the current folder.
+
+  pfbench completion bash > ~/.local/share/bash-completion/completions/pfbench
+  eval "$(pfbench completion zsh)"        in ~/.zshrc""",
 )

@@ -8,14 +8,14 @@ import errno
 import re
 import tempfile
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from pfbench.core.parameter_checks import require
 from pfbench.files.escapes import ESCAPED
-from pfbench.job.trust import WRITTEN
+from pfbench.job.trust import WRITTEN, walk_nodes
 
 # extra of the package that installs a launcher
 _EXTRAS = {"ray": "ray", "submitit": "slurm", "joblib": "launch"}
@@ -50,7 +50,11 @@ def _choose_sentence(error: BaseException, words: Sequence[str]) -> str:
     if type(error).__name__ == "InstantiationException" and error.__cause__ is not None:
         return _format_refusal(f"{error}", error.__cause__, words)
     if isinstance(error, OSError) and error.errno is not None:
-        return _format_storage(error)
+        name, remedy = (
+            error.filename or "files of the command",
+            _STORAGE.get(error.errno, _OTHER_STORAGE),
+        )
+        return f"{name} must be accessible, got '{error.strerror}'. {remedy}, then repeat the command. Finished jobs are kept."
     if isinstance(error, MemoryError):
         return "memory must be enough for the command, got an array that is too large. Reduce runs, particles or steps."
     text = f"{error}".strip() or type(error).__name__
@@ -87,15 +91,6 @@ def _format_override(key: str, words: Sequence[str]) -> str:
         name = next((w.partition("=")[2] for w in words if w.startswith("experiment=")), "NAME")
         return f"experiment={name} must be added with a plus sign. Use +experiment={name}"
     return _format_unknown_key(key, words)
-
-
-def _format_storage(error: OSError) -> str:
-    """Format an error of the file system with its remedy."""
-    name = error.filename or "files of the command"
-    return (
-        f"{name} must be accessible, got '{error.strerror}'. {_STORAGE.get(error.errno or 0, _OTHER_STORAGE)}, then "
-        "repeat the command. Finished jobs are kept."
-    )
 
 
 def notes_of(error: BaseException) -> list[str]:
@@ -196,22 +191,11 @@ def _composed_keys(words: Sequence[str], excluded: str) -> list[str]:
             [*first[:i], option, *first[i + 1 :]]
             for i, options in enumerate(alternatives) for option in options[1:]
         )]  # fmt: skip
-        return list(dict.fromkeys(key for job in jobs for key in _dotted_keys(compose(job).values)))
+        paths = [path for job in jobs for path, _ in walk_nodes(compose(job).values)]
+        return [path for path in dict.fromkeys(paths) if path and "[" not in path]
     except Exception:  # with a second mistake, a suggestion would only confuse
         return []
 
-
-def _dotted_keys(node: Any, path: str = "") -> Iterator[str]:
-    """Yield the dotted keys of a nested dictionary."""
-    if path:
-        yield path
-    if isinstance(node, dict):
-        for key, value in node.items():
-            yield from _dotted_keys(value, f"{path}.{key}" if path else str(key))
-
-
-# --------------------------------------------------------------------------------------------------
-# Messages for errors of Hydra, which name neither key nor remedy.
 
 # of the texts of Hydra and other libraries about a single value
 _SENTENCES = {
@@ -303,7 +287,7 @@ _STAGES |= dict.fromkeys(
     ),
     "composing the configuration",
 )
-_STAGES |= dict.fromkeys(("replay", "run_selection"), "computing the stored run again")
+_STAGES["replay"] = "computing the stored run again"
 _FILE_NAMES = ("path", "file")  # local variables of functions that read or write
 _RAISE = dis.opmap["RAISE_VARARGS"]
 

@@ -43,8 +43,7 @@ def write_script(words: Sequence[str]) -> None:
     print(f"script: {path.resolve()}\nNext: python {path}")
 
 
-# --------------------------------------------------------------------------------------------------
-# Scripts of `pfbench new`. NAME and TITLE are replaced by the name of the file and of the class.
+# NAME and TITLE are replaced by the name of the file and of the class.
 
 _END = """
 

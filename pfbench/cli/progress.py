@@ -179,10 +179,6 @@ def reported_failure(
         raise SweepJobError(message) from error
 
 
-# --------------------------------------------------------------------------------------------------
-# State of a study: finished, failed and running jobs, of the command line and of Python.
-
-
 @dataclass(frozen=True, repr=False)
 class StudyState:
     """State of a study.

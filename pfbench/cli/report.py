@@ -1,23 +1,45 @@
-"""Command `pfbench report`: write the report of a study: figures, tables and tests."""
+"""Commands of pages: they read what is stored.
+
+Command `pfbench report`: write the report of a study: figures, tables and tests.
+Command `pfbench open`: show the report of a study in a browser, and write it if it is missing.
+Command `pfbench status`: print what is finished, failed and running, and the time left.
+Command `pfbench compare`: compare an own study with a published one in the same runs.
+Command `pfbench paper`: write figures, tables and text of a study for a journal.
+Command `pfbench datasheet`: write the datasheet of a scenario.
+"""
 
 from __future__ import annotations
 
 import sys
+import webbrowser
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from pfbench import report
-from pfbench.cli.command import Command
-from pfbench.cli.compose import compose_study, count_planned_jobs, given_keys
+from pfbench.cli.command import Command, Option
+from pfbench.cli.compose import compose_study, count_planned_jobs, given_keys, read_description
 from pfbench.cli.messages import format_error, suggest_similar
+from pfbench.cli.progress import list_repeats, read_state
 from pfbench.core.parameter_checks import require
+from pfbench.files.atomic_write import write_atomically
 from pfbench.files.command_start import start_work
-from pfbench.files.recorded_folder import copy_published, describe_missing_runs, find_published_file
+from pfbench.files.recorded_folder import (
+    RecordedFolder,
+    copy_published,
+    describe_missing_runs,
+    find_published_file,
+)
 from pfbench.job.config import JobConfig, compose
-from pfbench.results.conditions import DATASHEETS, list_stored_studies
-from pfbench.results.paper_block import experiments_dir, name_run_command
+from pfbench.results.conditions import (
+    DATASHEETS,
+    list_stored_studies,
+    load_conditions,
+    read_undamaged,
+)
+from pfbench.results.inputs import describe_libraries
+from pfbench.results.paper_block import experiments_dir, name_run_command, read_part
 from pfbench.results.store import list_failures
 
 CLAIMS = "claims_2"  # folder of the claims among results and reports
@@ -160,7 +182,7 @@ def _renew_published(study: str, folder: Path, results: Path) -> str:
     )
 
 
-COMMAND = Command(
+REPORT_COMMAND = Command(
     report_study,
     """\
 pfbench report study=NAME [key=value ...]
@@ -174,4 +196,204 @@ Write the report of a study: figures, tables and statistical tests, as index.htm
   pfbench list report        report configurations
 
 See also: pfbench claims, pfbench datasheet scenario=NAME""",
+)
+
+
+def open_report(words: Sequence[str]) -> None:
+    """Show the report of a study, and write it if results are newer."""
+    values = compose_study(words).values
+    page = Path(values["reports_dir"]) / values["study"] / "index.html"
+    files = (Path(values["results_dir"]) / values["study"]).glob("*.npz")
+    newest = max((file.stat().st_mtime for file in files), default=0.0)
+    if not page.is_file() or page.stat().st_mtime < newest:
+        report_study(words)
+    print(f"page: {page.resolve()}")
+    if not webbrowser.open(page.resolve().as_uri()):
+        print("No browser was found. Open the page by its path.")
+
+
+OPEN_COMMAND = Command(
+    open_report,
+    """\
+pfbench open study=NAME [results_dir=FOLDER] [reports_dir=FOLDER]
+
+Show the report of a study in a browser. It is written first if it is missing or older than the newest result.
+
+  pfbench open study=quickstart""",
+    keys=("study", "results_dir", "reports_dir"),
+    required=("study",),
+)
+
+
+def report_status(words: Sequence[str]) -> None:
+    """Print the state of all studies, or of one."""
+    values = compose(words).values
+    results = Path(values["results_dir"])
+    if "study" in given_keys(words):
+        folder = results / str(values["study"])
+        state = read_state(folder)
+        if not (state.failures or state.running):
+            check_has_results(folder.name, results)
+        jobs = filter(None, map(read_undamaged, folder.glob("*.npz")))
+        mixed = describe_libraries([meta for _, meta in jobs])
+        print(state, *filter(None, [mixed]), *list_repeats(folder), sep="\n")
+        return
+    folders = [path for path in results.glob("*") if path.is_dir() and path.name not in NOT_STUDIES]
+    for state in sorted(map(read_state, folders), key=lambda state: -state.changed):
+        print(state)
+    if not folders:
+        print(f"No study has results in {results}. Next: pfbench run -m +experiment=quickstart")
+
+
+STATUS_COMMAND = Command(
+    report_status,
+    """\
+pfbench status [study=NAME] [results_dir=FOLDER]
+
+Print the numbers of finished and failed jobs of each study, the sweeps that are at work with the time left, and
+for one study the failed jobs with the words that repeat them.
+
+  pfbench status
+  pfbench status study=mine""",
+    keys=("study", "results_dir"),
+)
+
+
+def compare_study(words: Sequence[str], published: str) -> None:
+    """Compare a study with a published one, print the verdicts and write them."""
+    from pfbench.report.overview.figures import to_svg
+    from pfbench.report.published_study import compare_with_published, find_published
+
+    config = compose_study(words)
+    study, results = config.values["study"], Path(config.values["results_dir"])
+    check_has_results(study, results)
+    folder = find_published(published, Path(config.values["reports_dir"]))
+    compared = compare_with_published(load_conditions(study, results), folder)
+    print(compared)
+    path = Path(config.values["reports_dir"]) / study / "published.csv"
+    write_atomically(path, lambda file: file.write(compared.table().to_csv(index=False).encode()))
+    print(f"verdicts: {path.resolve()}")
+    if compared.cells:
+        try:
+            svg = to_svg(compared.plot()).encode()
+        except ValueError as error:  # the verdicts above stand without it
+            print(f"no heat map: {error}")
+            return
+        picture = path.with_name("published_heat_map.svg")
+        write_atomically(picture, lambda file: file.write(svg))
+        print(f"heat map: {picture.resolve()}")
+
+
+COMPARE_COMMAND = Command(
+    compare_study,
+    """\
+pfbench compare study=NAME published=all_seven [key=value ...]
+
+Compare the filters of an own study with all filters of a published one, in the same worlds and runs. The
+published filters do not run again: random numbers follow from seed and run. At least one filter of the
+published study runs again in each world as a witness; its errors must agree, else the worlds differ.
+
+  pfbench run -m +experiment=all_seven scenario=growth particles=100 study=mine filter=ukf,my_filter
+  pfbench compare study=mine published=all_seven
+
+  OPTIONS
+
+The verdicts are written to REPORTS_DIR/NAME/published.csv, and published_heat_map.svg has the own filters
+next to the seven methods. In Python: study.against("all_seven"), and .plot().""",
+    options={"published": Option("NAME", "name of a report among reports_dir, or a folder with its runs.parquet")},
+    required=("published",),
+)  # fmt: skip
+
+
+def write_study_paper(words: Sequence[str], journal: str, width: str) -> None:
+    """Write the paper export of a study."""
+    from pfbench.report.journal.paper_folder import write_paper
+    from pfbench.report.study_report import format_verdicts
+
+    page = report.find_page_format(journal, width)
+    config = compose_study(words)
+    study, reports = config.values["study"], Path(config.values["reports_dir"])
+    RecordedFolder(reports / study, is_complete=False)  # refuses a link
+    stored = find_page_data(config, words)
+    if stored is None:
+        check_has_results(study, Path(config.values["results_dir"]))
+    pack, table, files = _read_study(config, stored)
+    drawings = {
+        Path(entry["file"]).name: (entry["caption"], files[entry["file"]])
+        for entry in pack["paper_figures"]
+    }
+    with RecordedFolder(reports / study / "paper") as folder:
+        remarks = write_paper(pack, page, folder, drawings)
+        folder.write("verdicts.csv", format_verdicts(pack))
+        folder.write(report.RUNS_FILE, report.format_runs(table, {**pack, "paper_figures": ()}))
+    if stored is not None:
+        print(f"note: without results, the paper is made of {stored}")
+    for remark in remarks:
+        print(f"note: {remark}")
+    print(f"paper: {(folder.path / 'paper.tex').resolve()}")
+
+
+def _read_study(
+    config: JobConfig, stored: Path | None
+) -> tuple[dict[str, Any], Any, dict[str, Any]]:
+    """Read a study from its results, or from its stored runs: data of its page, runs, and figures of its paper."""
+    from pfbench.report.study_report import read_results
+
+    if stored is None:
+        study, results = config.values["study"], config.values["results_dir"]
+        pack, data, files = read_results(study, results, make_report_options(config), ("pdf",))
+        return pack, data.table, files
+    pack, table = report.read_stored_study(stored.parent)
+    names = [entry["file"] for entry in pack["paper_figures"]]
+    return pack, table, {name: (stored.parent / name).read_bytes() for name in names}
+
+
+PAPER_COMMAND = Command(
+    write_study_paper,
+    """\
+pfbench paper study=NAME journal=ieee|elsevier|springer [key=value ...]
+pfbench paper study=NAME width=120mm [key=value ...]
+
+Write the paper export of a study to REPORTS/STUDY/paper/: figures as PDF (and PGF if pdflatex is installed),
+tables, methods paragraph, references, paper.tex, and the values of all runs. A table that does not fit the page
+is refused. Without results, the paper is made of the stored runs of the report (runs.parquet).
+
+  pfbench paper study=quickstart journal=ieee
+  pfbench paper study=mine width=345pt report.alpha=0.01
+
+  OPTIONS
+  results_dir, reports_dir   folders""",
+    options={
+        "journal": Option("NAME", "ieee, elsevier or springer, or else a width", default=""),
+        "width": Option("120mm", "width of the text in mm, or in pt of TeX", default=""),
+    },
+)
+
+
+def report_scenario(words: Sequence[str]) -> None:
+    """Write the datasheet of a scenario."""
+    from pfbench.job.datasheet_data import RUNS, build_datasheet
+    from pfbench.report.datasheet import write_datasheet
+
+    config = compose(words if "runs" in given_keys(words) else [*words, f"runs={RUNS}"])
+    data = build_datasheet(
+        config, read_description(read_part("scenario", config.choices["scenario"]))
+    )
+    page = write_datasheet(
+        data, config.values["reports_dir"], tuple(config.values["report"]["figure_formats"])
+    )
+    print(f"datasheet: {page.resolve()}")
+
+
+DATASHEET_COMMAND = Command(
+    report_scenario,
+    """\
+pfbench datasheet scenario=NAME [noise=NAME] [runs=20] [key=value ...]
+
+Write the datasheet of a scenario: trajectory, sensors, measurements and truth of its episodes.
+
+  pfbench datasheet scenario=flight_300s
+  pfbench datasheet scenario=flight_300s noise=outliers runs=50
+  pfbench list scenario      scenarios""",
+    required=("scenario",),
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import os
 import re
 import shlex
@@ -81,10 +80,9 @@ def _try_parts(plan: StudyPlan) -> None:
 
 def _run_until_decided(overrides: Sequence[str], plan: StudyPlan, *, is_sweep: bool) -> None:
     """Run a sweep that adds runs until its pairs are decided."""
-    from pfbench.cli.until_decided import GrowingSweep, check_has_sweep
+    from pfbench.cli.until_decided import GrowingSweep
 
-    check_has_sweep(is_sweep)
-    sweep = GrowingSweep.from_plan(plan)
+    sweep = GrowingSweep.from_plan(plan, is_sweep=is_sweep)
     others = [word for word in overrides if not re.match(r"(runs|first_run)=", word)]
     sweep.run(lambda more: run_sweep([*others, *more], plan, is_part=True))
 
@@ -94,12 +92,12 @@ def _run_alone(overrides: Sequence[str], plan: StudyPlan | None) -> None:
     # what was checked is what runs, unless a word may have another value in Hydra's application
     checked = plan.first if plan and not any("${" in word for word in overrides) else None
 
-    @functools.wraps(run_task)
-    def run_with_plan(cfg: Any) -> float:
-        return run_task(cfg, lambda: print_study_size(plan), checked)
-
     with hide_hydra_line():
-        run_application(run_with_plan, overrides, is_sweep=False)
+        run_application(
+            lambda cfg: run_task(cfg, lambda: print_study_size(plan), checked),
+            overrides,
+            is_sweep=False,
+        )
 
 
 def print_surprise(plan: StudyPlan, words: Sequence[str], *, is_sweep: bool) -> None:
@@ -174,7 +172,12 @@ def run_task(
     end_with_parent()
 
     def run_job(counter: object) -> job.JobOutcome:
-        places = _list_place_words(application)
+        # of the words that Hydra does not count to the task of a job
+        path = [
+            w for w in map(str, application.overrides.hydra) if w.startswith("hydra.searchpath=")
+        ]
+        packages = os.environ.get(ENVIRONMENT)
+        places = [*path, *([f"trust=[{packages}]"] if packages else [])]
         config = checked or job.resolve_config(cfg, choices, words=[*words, *places])
         return job.run(config, choices, counter, announce)
 
@@ -190,14 +193,6 @@ def run_task(
         raise
     counter.note(outcome.status)
     return outcome.rmse
-
-
-def _list_place_words(application: Any) -> list[str]:
-    """List the words of a job that Hydra does not count to its task: search path and trust."""
-    packages = os.environ.get(ENVIRONMENT)
-    of_hydra = [str(word) for word in application.overrides.hydra]
-    path = [word for word in of_hydra if word.startswith("hydra.searchpath=")]
-    return [*path, *([f"trust=[{packages}]"] if packages else [])]
 
 
 def run_with_retries(sweep: Callable[[], Any]) -> None:
@@ -228,9 +223,6 @@ def run_with_retries(sweep: Callable[[], Any]) -> None:
             if "ray" in sys.modules:
                 sys.modules["ray"].shutdown()  # the next attempt starts new processes of Ray
 
-
-# --------------------------------------------------------------------------------------------------
-# Report of a failed job: once, on its line in a sweep, else as the error of the command.
 
 _HYDRA_LINE = "Error executing job with overrides"
 
@@ -277,7 +269,7 @@ def summarise_failed_jobs(error: Exception, words: Sequence[str]) -> Exception:
 
 
 @contextmanager
-def _application(name: str) -> Iterator[Any]:
+def _application() -> Iterator[Any]:
     """Open Hydra's application, whose loader checks what it loads."""
     from hydra import version
     from hydra._internal import utils
@@ -287,7 +279,7 @@ def _application(name: str) -> Iterator[Any]:
     from pfbench.job.shared_loader import SharedLoader
 
     version.setbase("1.3")
-    application = Hydra(name, SharedLoader(utils.create_config_search_path(str(conf_dir()))))
+    application = Hydra("run", SharedLoader(utils.create_config_search_path(str(conf_dir()))))
     GlobalHydra.instance().initialize(application)
     try:
         yield application
@@ -301,8 +293,7 @@ def run_application(
     """Run a task for each job of overrides, as `hydra.main` does."""
     from hydra._internal import utils
 
-    name = utils.detect_task_name(*utils.detect_calling_file_or_module_from_task_function(task))
-    with _application(name) as application:
+    with _application() as application:
         words = list(overrides)
         utils._run_app(
             run=not is_sweep,
@@ -317,7 +308,7 @@ def run_application(
 
 def print_configuration(args: Any) -> None:
     """Print what the flags `--cfg` and `--info` ask for."""
-    with _application("run") as application:
+    with _application() as application:
         if args.cfg:
             more = args.cfg, args.package, args.resolve
             application.show_cfg("config", args.overrides, *more)

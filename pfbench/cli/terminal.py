@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from pfbench.files.command_start import has_work_started
@@ -46,20 +46,12 @@ class LastingOutput:
 
     def write(self, text: str) -> int:
         """Write a text."""
-        if self.error is None:
-            try:
-                self._stream.write(text.translate(ESCAPED))
-            except OSError as error:
-                self._leave(error)
+        self._try(self._stream.write, text.translate(ESCAPED))
         return len(text)
 
     def flush(self) -> None:
         """Write what is buffered."""
-        if self.error is None:
-            try:
-                self._stream.flush()
-            except OSError as error:
-                self._leave(error)
+        self._try(self._stream.flush)
 
     def tell(self) -> None:
         """Print once that the output is closed, if the command still works."""
@@ -71,9 +63,15 @@ class LastingOutput:
                 file=sys.stderr,
             )
 
-    def _leave(self, error: OSError) -> None:
-        """Send all that follows to nowhere, what Python flushes at its end included."""
-        self.error = error
+    def _try(self, action: Callable[..., object], *values: str) -> None:
+        """Use the stream while it works. Then all that follows goes to nowhere, what Python flushes at its end included."""
+        if self.error is not None:
+            return
+        try:
+            action(*values)
+            return
+        except OSError as error:
+            self.error = error
         with contextlib.suppress(OSError), open(os.devnull, "w") as nowhere:
             os.dup2(nowhere.fileno(), self._stream.fileno())
         self.tell()

@@ -1,11 +1,16 @@
-"""Command `pfbench tune`: tune the baselines of a study of robustness alike."""
+"""Commands that prepare filters for a world.
+
+Command `pfbench tune`: tune the baselines of a study of robustness alike.
+Command `pfbench train`: train the network of a neural_* filter or of kalman_net.
+"""
 
 from __future__ import annotations
 
 import math
 import re
+import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,7 +51,13 @@ def tune_filters(
         print(f"note: the world of the defaults is tuned: {default}", file=sys.stderr)
     name = name or _name_file(study.choices, noise, words)
     runs = _RUNS.take("runs", str(study.values["runs"]))
-    _check_name(name)
+    require(
+        re.fullmatch("\\w+", name) and name not in _TAKEN,
+        "name",
+        f"consist of letters, digits and underscores and not be {' or '.join(_TAKEN)}",
+        f"{name!r}",
+        "It is a file of folder=.",
+    )
     check_seed(study, study.values["seed"] + SEED_SHIFT)
     settings = [word for word in words if word.partition("=")[0] not in _OWN]
     world = {
@@ -61,10 +72,20 @@ def tune_filters(
         "start_time_s": float(study.values["report"]["start_time_s"]),
         "regimes": noise,
     }
-    target = Path(folder or _own_folder(words))
-    _check_new_name(name, target)
+    paths = (re.match(r"[+]*hydra\.searchpath=\[?file://([^],]+)", word) for word in words)
+    # that of the search path, where the composition finds the file
+    target = Path(folder or next((path[1] for path in paths if path), "conf"))
+    require(  # a run refuses it
+        name not in read_families("tuned"),
+        "name",
+        f"differ from pfbench's own tuned={name}",
+        f"the same for a file of {target}",
+        f"Add name=my_{name}, and tuned=my_{name} to the words of the run.",
+    )
     path = _search(settings, grids, world, fit_runs or runs, fit_particles, target, name)
-    print(f"tuned={name}: {path.resolve()}{_describe_use(target, words)}")
+    print(f"tuned={name}: {path.resolve()}")
+    if target.resolve() != conf_dir() and not any("hydra.searchpath" in word for word in words):
+        print(f"Add to the words of a study: 'hydra.searchpath=[file://{target}]'")
 
 
 def _search(
@@ -141,42 +162,6 @@ def _name_file(choices: Mapping[str, str], regimes: Sequence[str], words: Sequen
     return f"{name}_{NOMINAL}" if list(regimes) == [NOMINAL] else name
 
 
-def _own_folder(words: Sequence[str]) -> str:
-    """Return the first folder of the search path, where the composition finds the file, else conf."""
-    paths = (re.match(r"[+]*hydra\.searchpath=\[?file://([^],]+)", word) for word in words)
-    return next((path[1] for path in paths if path), "conf")
-
-
-def _describe_use(folder: Path, words: Sequence[str]) -> str:
-    """Say how a study finds the file, if it does not by itself."""
-    is_found = folder.resolve() == conf_dir() or any("hydra.searchpath" in word for word in words)
-    return (
-        "" if is_found else f"\nAdd to the words of a study: 'hydra.searchpath=[file://{folder}]'"
-    )
-
-
-def _check_new_name(name: str, folder: Path) -> None:
-    """Check that the name of a file of a user's own folder differs from those of pfbench, since a run refuses it."""
-    require(
-        name not in read_families("tuned"),
-        "name",
-        f"differ from pfbench's own tuned={name}",
-        f"the same for a file of {folder}",
-        f"Add name=my_{name}, and tuned=my_{name} to the words of the run.",
-    )
-
-
-def _check_name(name: str) -> None:
-    """Check the name of the file."""
-    require(
-        re.fullmatch("\\w+", name) and name not in _TAKEN,
-        "name",
-        f"consist of letters, digits and underscores and not be {' or '.join(_TAKEN)}",
-        f"{name!r}",
-        "It is a file of folder=.",
-    )
-
-
 def _read_factors(key: str, text: str, remedy: str) -> tuple[float, ...]:
     """Read factors on R, which must be positive numbers."""
     entries = read_list(key, text, remedy)
@@ -188,7 +173,7 @@ def _read_factors(key: str, text: str, remedy: str) -> tuple[float, ...]:
     return values
 
 
-COMMAND = Command(
+TUNE_COMMAND = Command(
     tune_filters,
     """\
 pfbench tune scenario=NAME [model=NAME] [filter=NAME,NAME] [key=value ...]
@@ -225,3 +210,70 @@ of these filters, ekf and ukf (`best`), and whether Kalman filters fit the world
         "folder": Option("conf", "folder of the file, default that of hydra.searchpath if there is one", default=""),
     },
 )  # fmt: skip
+
+
+_NOT_OF_A_JOB = ("train.", "train=", "overwrite=", "checkpoint=")
+
+
+def train_network(words: Sequence[str]) -> None:
+    """Train the network of a filter and print the command that uses it."""
+    require(
+        not {"-m", "--multirun"} & set(words),
+        "pfbench train",
+        "be run without -m",
+        "a sweep: it trains one network",
+        "Set train.noise_regimes=[a,b] to train on several noise regimes.",
+    )
+    from pfbench.filter.learned.checkpoint import read_checkpoint
+    from pfbench.report.scenario_figures import write_training_figure
+
+    path = fit_network(words, print)
+    lines = read_checkpoint(path)["losses"]
+    names = ("epoch", "loss", "validation", "ess")
+    losses = {name: [line[name] for line in lines] for name in names}
+    figure = write_training_figure(path.with_suffix(".svg"), losses)
+    shared = [word for word in words if not word.startswith(_NOT_OF_A_JOB)]
+    command = shlex.join(["pfbench", "run", *shared, f"checkpoint={path}"])  # brackets for zsh
+    print(
+        f"checkpoint: {path.resolve()}\nfigure of the losses: {figure.resolve()}\nNext: {command}"
+    )
+
+
+def fit_network(words: Sequence[str], tell: Callable[[str], object]) -> Path:
+    """Train the network of the configuration of words, unless its checkpoint exists.
+
+    Returns the path of the checkpoint.
+    """
+    from pfbench import job
+    from pfbench.job.inputs import find_inputs
+    from pfbench.learn.training_job import fit
+
+    config = compose(words)
+    values, choices = config.values, config.choices
+    job.apply_global_settings(values)
+    require(
+        not values["oracle_noise"],
+        "oracle_noise",
+        "be false for training",
+        "true",
+        "Set oracle_noise=true when the filter runs.",
+    )
+    names = list(values["train"]["noise_regimes"]) or [choices["noise"]]
+    regimes = {
+        name: job.instantiate(compose([*words, f"noise={name}"]).values["noise"]) for name in names
+    }
+    about = {"versions": job.read_versions(), "inputs": find_inputs(values, config.trusted)}
+    return fit(values, choices, regimes, job.instantiate, about, tell)
+
+
+TRAIN_COMMAND = Command(
+    train_network,
+    """\
+pfbench train key=value ...
+
+Train the network of a neural_* filter or of kalman_net. The resulting file is the value of `checkpoint` of a job.
+An interrupted training resumes when the command is repeated.
+
+  pfbench train filter=neural_sir scenario=passive_1 train=vsmc train.epochs=20
+  pfbench list train         training configurations""",
+)

@@ -76,8 +76,15 @@ class GrowingSweep:
     report: Mapping[str, Any]
 
     @classmethod
-    def from_plan(cls, plan: StudyPlan) -> GrowingSweep:
+    def from_plan(cls, plan: StudyPlan, *, is_sweep: bool) -> GrowingSweep:
         """Read the settings of a study."""
+        require(
+            is_sweep,
+            f"runs={UNTIL_DECIDED}",
+            "be a sweep over at least two filters",
+            "one job",
+            "Add -m and filter=NAME,NAME.",
+        )
         values = plan.first.values
         settings = values["until_decided"]
         require(
@@ -144,19 +151,23 @@ class GrowingSweep:
 
     def run(self, run_part: Callable[[Sequence[str]], None]) -> None:
         """Run look after look until all pairs are decided or a cap is reached."""
-        record = self._open_record()
-        numbers = range(1, len(self.schedule.runs) + 1)
+        request = {  # settings that must not change between looks
+            "until_decided.max_runs": self.schedule.max_runs,
+            **{f"report.{name}": self.report[name] for name in _DECIDING_SETTINGS},
+            "jobs": sorted(self.job_keys(1)),
+        }
+        record = LookRecord(self.results / self.study / RECORD, request)
+        next_command = f"Next: pfbench report study={self.study}"
         if record.state and self.has_results(len(record.looks)) and not self.repeats_jobs:
             print(*record.looks, sep="\n")
-            print(f"study {self.study} is finished: {record.state}\n{self._next_command()}")
+            print(f"study {self.study} is finished: {record.state}\n{next_command}")
             return
-        lines: list[str] = []
+        lines, seconds = list[str](), 0.0
         states: PairStates = []
-        seconds = 0.0
-        for number in numbers:
+        for number in range(1, len(self.schedule.runs) + 1):
             if number > 1 and (reason := self._exceeds_time(seconds, number)):
                 record.write(lines)
-                print(f"{reason}\n{self._next_command()}")
+                print(f"{reason}\n{next_command}")
                 return
             data = self._compute_look(number, run_part)
             seconds = data.seconds
@@ -166,17 +177,8 @@ class GrowingSweep:
             state = describe_end(number, self.schedule, states)
             record.write(lines, state)
             if state:
-                print(f"study {self.study} is finished: {state}\n{self._next_command()}")
+                print(f"study {self.study} is finished: {state}\n{next_command}")
                 return
-
-    def _open_record(self) -> LookRecord:
-        """Open the record of the study, with the settings that must not change between looks."""
-        request = {
-            "until_decided.max_runs": self.schedule.max_runs,
-            **{f"report.{name}": self.report[name] for name in _DECIDING_SETTINGS},
-            "jobs": sorted(self.job_keys(1)),
-        }
-        return LookRecord(self.results / self.study / RECORD, request)
 
     def _compute_look(self, number: int, run_part: Callable[[Sequence[str]], None]) -> LookResults:
         """Run the jobs of a look without a result, and read all runs so far."""
@@ -227,18 +229,3 @@ class GrowingSweep:
             f"time, the limit until_decided.max_hours is {self.max_hours:g} h. Raise it and repeat "
             "the command to go on."
         )
-
-    def _next_command(self) -> str:
-        """Format the next command."""
-        return f"Next: pfbench report study={self.study}"
-
-
-def check_has_sweep(is_sweep: bool) -> None:
-    """Check that `runs=until-decided` is used for a sweep."""
-    require(
-        is_sweep,
-        f"runs={UNTIL_DECIDED}",
-        "be a sweep over at least two filters",
-        "one job",
-        "Add -m and filter=NAME,NAME.",
-    )

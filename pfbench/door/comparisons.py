@@ -159,18 +159,14 @@ class Comparison:
         return f"{table}<p>{html.escape(self.reach)}</p>" if self.reach else table
 
     def _format(self, name: str) -> str:
-        """Format the verdict of a condition, and where it tends if nothing is decided."""
-        chances = self.chances.get(name)
-        return _format(self.verdicts[name]) + (f" Probabilities: {chances}." if chances else "")
-
-
-def _format(verdict: Verdict) -> str:
-    """Format a verdict as a sentence, in the words of the pages."""
-    words = word_verdict(verdict)
-    if not np.isfinite(verdict.ratio):
-        return f"{verdict.a} against {verdict.b}: {words}."
-    size = format_with_interval(verdict.ratio, verdict.low, verdict.high)
-    return f"the error of {verdict.a} is {size} times that of {verdict.b} ({verdict.n} paired runs): {words}."
+        """Format the verdict of a condition as a sentence, in the words of the pages, and where it tends if nothing is decided."""
+        verdict, chances = self.verdicts[name], self.chances.get(name)
+        compared = f"{verdict.a} against {verdict.b}"
+        if np.isfinite(verdict.ratio):
+            size = format_with_interval(verdict.ratio, verdict.low, verdict.high)
+            compared = f"the error of {verdict.a} is {size} times that of {verdict.b} ({verdict.n} paired runs)"
+        tendency = f" Probabilities: {chances}." if chances else ""
+        return f"{compared}: {word_verdict(verdict)}.{tendency}"
 
 
 def compare_in_conditions(conditions: Sequence[Condition], a: str, b: str) -> Comparison:

@@ -72,6 +72,16 @@ def make_own(
             f"own must receive a class or an object, got the part {thing}. Pass it to run unchanged."
         )
     group, stage = find_group(thing)
+    cls = thing if isinstance(thing, type) else type(thing)
+    # exec in a namespace without a name gives classes of the module builtins
+    has_source = cls.__module__ != "builtins"
+    require(
+        has_source,
+        cls.__name__,
+        "be in a file or a notebook",
+        "a class without a source",
+        "Save it in a module.",
+    )
     title = name or _name_thing(thing, arguments)
     if name_file(title) in list_groups()[group]:
         title = f"Own {title}"
@@ -195,10 +205,14 @@ class _NodeWriter:
 
     def write(self, value: Any, path: str) -> Any:
         """Describe a value: an object of dataclasses, a model, a part, numbers, texts and lists of them."""
-        if isinstance(value, Part):
-            return self._write_part(value)
-        if isinstance(value, pfbench.model.StateSpaceModel):
-            return self._write_model(value)
+        if isinstance(value, Part):  # by its composed node
+            node = compose([*value.words(), *place_words([value])]).values[value.group]
+            self.packages += value.packages
+            return {key: entry for key, entry in node.items() if key != "paper"}
+        if isinstance(value, pfbench.model.StateSpaceModel):  # by the arguments of its constructor
+            positional, options = value._arguments
+            bound = inspect.signature(type(value)).bind(*positional, **options)
+            return self.write_class(type(value), bound.arguments)
         if isinstance(value, type):
             return self.write_class(value, {})
         if dataclasses.is_dataclass(value):
@@ -274,18 +288,6 @@ class _NodeWriter:
         self.folders += self.model.folders
         self.packages += self.model.packages
         return "${model}"
-
-    def _write_model(self, model: Any) -> dict[str, Any]:
-        """Describe a model by the arguments of its constructor."""
-        positional, options = model._arguments
-        bound = inspect.signature(type(model)).bind(*positional, **options)
-        return self.write_class(type(model), bound.arguments)
-
-    def _write_part(self, item: Part) -> Any:
-        """Describe a part by its composed node."""
-        config = compose([*item.words(), *place_words([item])])
-        self.packages += item.packages
-        return {key: value for key, value in config.values[item.group].items() if key != "paper"}
 
     def name_class(self, cls: type) -> str:
         """Name a class so that another process can import it."""

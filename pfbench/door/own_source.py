@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import ast
 import builtins
-import dis
 import hashlib
 import importlib
 import re
@@ -37,6 +36,7 @@ _VERBS = (
 _HEAD = (
     '"""Written by pfbench from a script or a notebook. Do not change it: results name it."""\n\n'
 )
+_FUTURE = "from __future__ import annotations"
 
 
 class _Statement(NamedTuple):
@@ -169,7 +169,7 @@ class _Collector:
         self._add_statements(name)
         imports = "\n".join(sorted(self.lines.values()))
         body = "\n\n\n".join(text for _, text in sorted(self.selected.items()))
-        return f"{_HEAD}from __future__ import annotations\n\n{imports}\n\n\n{body}\n"
+        return f"{_HEAD}{_FUTURE}\n\n{imports}\n\n\n{body}\n"
 
     def _add_statements(self, name: str) -> None:
         """Add the statements that define a name, and the names that they use."""
@@ -209,8 +209,9 @@ class _Collector:
         """Check that a name is collected, a built-in one or only an annotation."""
         if name in self.lines or hasattr(builtins, name) or name in ("__name__", "__file__"):
             return
+        # a module does not evaluate annotations
         require(
-            name not in _evaluated_names(user),
+            name not in list_globals(f"{_FUTURE}\n{user}"),
             name,
             "be defined before the class is passed",
             "a name that does not exist",
@@ -242,15 +243,11 @@ def read_statements(values: Mapping[str, Any]) -> dict[str, list[_Statement]]:
 def _list_texts(values: Mapping[str, Any]) -> list[str]:
     """Return the text of the main script, or those of the cells that a notebook executed."""
     if isinstance(values.get("In"), list):
-        return ["\n".join(map(_blank_magic, cell.splitlines())) for cell in values["In"]]
+        # without the commands of the notebook
+        return [re.sub(r"^[ \t]*[%!].*", "", cell, flags=re.MULTILINE) for cell in values["In"]]
     file = values.get("__file__")
     is_file = isinstance(file, str) and Path(file).is_file()
     return [Path(file).read_text(encoding="utf-8")] if is_file and file else []
-
-
-def _blank_magic(line: str) -> str:
-    """Return a line of a cell, empty for a command of the notebook."""
-    return "" if line.lstrip().startswith(("%", "!")) else line
 
 
 def _list_defined(node: ast.stmt) -> Iterator[str]:
@@ -289,22 +286,6 @@ def list_globals(text: str) -> list[str]:
             if symbol.is_referenced() and (is_top or symbol.is_global()):
                 names[symbol.get_name()] = None
     return sorted(names)
-
-
-def _evaluated_names(text: str) -> set[str]:
-    """Return the global names that a statement reads, without those of annotations, which a module does not evaluate."""
-    names: set[str] = set()
-    pending: list[Any] = [compile(text, "own", "exec", annotations.compiler_flag)]
-    while pending:
-        code = pending.pop()
-        pending += [item for item in code.co_consts if isinstance(item, types.CodeType)]
-        reads = (
-            item
-            for item in dis.get_instructions(code)
-            if item.opname in ("LOAD_GLOBAL", "LOAD_NAME")
-        )
-        names.update(item.argval for item in reads)
-    return names
 
 
 def _is_of_module(value: object) -> bool:

@@ -157,7 +157,11 @@ def format_value(key: str, value: Any) -> str:
     if isinstance(value, int | float):
         return repr(value)
     if isinstance(value, str):
-        return _format_text(value)
+        if _PLAIN_TEXT.fullmatch(value) and value.lower() not in _READ_OTHERWISE:
+            return value
+        from hydra.core.override_parser.types import Quote, QuotedString
+
+        return QuotedString(text=value, quote=Quote.single).with_quotes()
     if isinstance(value, Mapping):
         pairs = ",".join(f"{name}:{format_value(key, entry)}" for name, entry in value.items())
         return f"{{{pairs}}}"
@@ -167,15 +171,6 @@ def format_value(key: str, value: Any) -> str:
         f"{key} must be a number, a text, a list or a dictionary, got {describe_value(value)}. "
         "Pass a class or an object by pfbench.own(...)."
     )
-
-
-def _format_text(text: str) -> str:
-    """Format a text, in quotes where the parser would read something else."""
-    if _PLAIN_TEXT.fullmatch(text) and text.lower() not in _READ_OTHERWISE:
-        return text
-    from hydra.core.override_parser.types import Quote, QuotedString
-
-    return QuotedString(text=text, quote=Quote.single).with_quotes()
 
 
 def describe_value(value: object) -> str:

@@ -1,4 +1,4 @@
-"""Run of filters from Python: the jobs of the command line, in this process or in several."""
+"""Run and training of filters from Python: the jobs of the command line, in this process or in several."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ from pfbench.door.worker import COUNTER, JobReply, WorkerPool, logging_to, run_r
 from pfbench.job.config import CHOICES, FILTER_SETS, JobConfig, compose
 from pfbench.job.run_job import list_used_packages
 from pfbench.job.settings import check_settings
+from pfbench.job.trust import trusting
 from pfbench.results.conditions import JobFile
 
 
@@ -86,7 +87,10 @@ def run_filters(  # noqa: PLR0913 - what `help` shows and an editor completes
     parts = [list_parts(group, value) for group, value in groups.items()]
     settings_of_all = {"runs": runs, "particles": particles, "seed": seed}
     words = format_words({**settings_of_all, **settings, "study": study})
-    jobs = [_list_words(choice, words) for choice in product(*parts)]
+    jobs = [
+        [*(word for item in choice for word in item.words()), *words, *place_words(choice)]
+        for choice in product(*parts)
+    ]
     configs = [_compose_job(list(job)) for job in dict.fromkeys(map(tuple, jobs))]
     if any(map(list_used_packages, configs)):
         from pfbench.cli.dry_run import try_own_parts
@@ -112,14 +116,9 @@ def list_parts(group: str, value: Any) -> list[Part]:
         "an empty list",
         f"List the names: pfbench.names({group!r}).",
     )
-    names = [name for item in items for name in _expand(group, item)]
-    return [_make_part(group, item) for item in names]
-
-
-def _expand(group: str, item: Any) -> Sequence[Any]:
-    """Return the members of a named set of filters, or the item itself."""
-    is_set = group == "filter" and isinstance(item, str) and item in FILTER_SETS
-    return FILTER_SETS[item] if is_set else (item,)
+    sets = FILTER_SETS if group == "filter" else {}
+    members = [sets.get(item, (item,)) if isinstance(item, str) else (item,) for item in items]
+    return [_make_part(group, item) for several in members for item in several]
 
 
 def _make_part(group: str, item: Any) -> Part:
@@ -131,8 +130,10 @@ def _make_part(group: str, item: Any) -> Part:
             f"{group} must be a name, a part or a class, got {describe_value(item)}. List the names: pfbench.names({group!r})."
         )
     kind = item.group if isinstance(item, Part) else find_group(item)[0]
-    if group == "scenario" and kind == "model":
-        return simulate_model(item)
+    if group == "scenario" and kind == "model":  # which is simulated for 100 steps
+        if isinstance(item, Part) and not item.folders:
+            return add_changes(get_part("scenario", item.name), item.changes)
+        return make_own(pfbench.scenario.ModelSimulation, model=item, steps=100)
     require(
         kind == group,
         group,
@@ -141,18 +142,6 @@ def _make_part(group: str, item: Any) -> Part:
         f"Pass it as {kind}=...",
     )
     return item if isinstance(item, Part) else make_own(item)
-
-
-def simulate_model(item: Any) -> Part:
-    """Make the scenario that simulates a model for 100 steps."""
-    if isinstance(item, Part) and not item.folders:
-        return add_changes(get_part("scenario", item.name), item.changes)
-    return make_own(pfbench.scenario.ModelSimulation, model=item, steps=100)
-
-
-def _list_words(parts: Sequence[Part], words: Sequence[str]) -> list[str]:
-    """Return the words of one job."""
-    return [*(word for item in parts for word in item.words()), *words, *place_words(parts)]
 
 
 def _compose_job(words: list[str]) -> JobConfig:
@@ -246,3 +235,61 @@ def preserved_process() -> Iterator[None]:
         for name in set(os.environ) - set(environment):
             del os.environ[name]
         os.environ.update(environment)
+
+
+def train_filter(
+    scenario: Any,
+    method: Any,
+    *,
+    objective: str = "vsmc",
+    noise: Any = "nominal",
+    model: Any = None,
+    study: str = "notebook",
+    progress: bool = True,
+    **settings: Any,
+) -> Part:
+    """Train the network of a filter, or load it if the same training is finished.
+
+    Training runs have other numbers than those that `run` compares.
+
+    Args:
+        scenario: Name, part or class of your own.
+        method: Filter with a network, such as `neural_sir`, or the class of a network of your own. It is a module of
+            torch, made of a number of features and a dimension of the noise. See `pfbench.filter.LearnedProposal`.
+        objective: What is trained for: a name of the group `train`.
+        noise: Noise regime.
+        model: Model of the filter. That of the scenario by default.
+        study: Folder of the checkpoint.
+        progress: Whether each epoch prints a line.
+        **settings: Settings of the training by key, such as `epochs=20` or `training_runs=64`.
+
+    Returns:
+        The filter with its trained weights, for `run`.
+
+    Raises:
+        ValueError: If a name or a value is not valid, or the filter has nothing to train. Nothing was trained.
+    """
+    from pfbench.cli.tune import fit_network
+
+    values = {"scenario": scenario, "noise": noise, "model": model, "filter": method}
+    parts = [_find_part(group, value) for group, value in values.items() if value is not None]
+    words = [word for item in parts for word in item.words()]
+    words += [f"train={objective}", *(f"train.{word}" for word in format_words(settings))]
+    words += [*format_words({"study": study}), *place_words(parts)]
+    packages = [name for item in parts for name in item.packages]
+    with plain_errors(words), preserved_process(), trusting(packages):
+        path = fit_network(words, print if progress else lambda line: None)
+    return add_changes(parts[-1], format_words({"checkpoint": str(path.resolve())}))
+
+
+def _find_part(group: str, value: Any) -> Part:
+    """Return the part of a group that is trained with; several are refused."""
+    parts = list_parts(group, value)
+    require(
+        not len(parts) > 1,
+        group,
+        f"be one {group}",
+        len(parts),
+        "Train with each in a call of its own.",
+    )
+    return parts[0]

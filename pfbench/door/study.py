@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from pfbench.cli.compose import choose_places
 from pfbench.cli.messages import require_choice
-from pfbench.cli.paper import COMMAND as WRITE_PAPER
 from pfbench.cli.progress import StudyState, format_repeat, read_state
-from pfbench.cli.report import check_has_results
+from pfbench.cli.report import PAPER_COMMAND, check_has_results
 from pfbench.door.parts import format_words, plain_errors
 from pfbench.job.config import compose
 from pfbench.job.trust import trusted_packages, trusting
@@ -174,8 +173,7 @@ class Study:
             A row per step: time, error, standard deviation, NEES and traces such as the effective sample size.
         """
         from pfbench.door.running import check_trusted, preserved_process
-        from pfbench.job.replay import recompute_run, tabulate_traces
-        from pfbench.job.run_selection import find_run
+        from pfbench.job.replay import find_run, recompute_run, tabulate_traces
 
         with preserved_process(), trusting(self.trust):
             stored = find_run(self.name, self.results, run, label, choice)
@@ -215,7 +213,7 @@ class Study:
         places = {"results_dir": self.results, "reports_dir": self.reports}
         words = format_words({"study": self.name, "journal": journal, **places, **settings})
         with plain_errors(words):
-            WRITE_PAPER(words)
+            PAPER_COMMAND(words)
         return sorted(path for path in folder.rglob("*") if path.is_file())
 
     def status(self) -> StudyState:

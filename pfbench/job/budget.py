@@ -2,6 +2,8 @@
 
 The cost is time or evaluations of the likelihood. The number is solved for by trials of the filter
 on the first steps of the job's own episode.
+
+Here are also the episodes of a job, and how many of its runs are in memory at a time.
 """
 
 from __future__ import annotations
@@ -165,9 +167,6 @@ def _next_trial(costs: dict[int, float], price: float) -> int:
     step = math.log(price / costs[near[0]]) / slope
     return max(MIN_PARTICLES, round(near[0] * math.exp(min(math.log(16.0), step))))
 
-
-# --------------------------------------------------------------------------------------------------
-# Episodes of a job, particles under a budget, runs under a memory limit.
 
 log = logging.getLogger("pfbench")
 

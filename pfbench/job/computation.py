@@ -12,7 +12,7 @@ from torch import Tensor
 from pfbench.core.record import Episode
 from pfbench.files.command_start import start_work
 from pfbench.job.budget import EpisodeSource, apply_budget, max_runs_in_memory
-from pfbench.job.filter_pass import TimedFilterPass, pass_filter
+from pfbench.job.filter_pass import TimedFilterPass, describe_unmoved_copies, pass_filter
 from pfbench.job.inputs import find_inputs, names_checkpoint
 from pfbench.job.pcrb import compute_pcrb
 from pfbench.job.plan import JobPlan, make_metadata
@@ -89,7 +89,8 @@ def _batch_metadata(
 ) -> dict[str, Any]:
     """Collect the metadata of a batch."""
     runs, steps = episode.record.y.shape[:2]
-    meta = make_metadata(plan, result.model, steps, episode.notes) | result.cost
+    notes = (*episode.notes, *describe_unmoved_copies(plan, result.model, episode.record))
+    meta = make_metadata(plan, result.model, steps, notes) | result.cost
     if episode.measured_truth is not None:
         meta["measured_truth"] = episode.measured_truth.name
     if (number := result.estimate.trace.get("particles")) is not None:

@@ -19,6 +19,7 @@ from pfbench.job.trust import (
     check_configuration,
     check_places,
     check_study,
+    require_allowed,
     split_trust,
 )
 from pfbench.job.tuned_knobs import TUNED, check_tuned_seed, mark_foreign, select_knobs
@@ -101,11 +102,17 @@ def compose(overrides: Sequence[str] = ()) -> JobConfig:
         ValueError: If a file sets a key that only the command line may set, or a value names what
             is not trusted.
     """
+    from hydra.core.hydra_config import HydraConfig
+    from omegaconf import open_dict
+
     words, trusted = split_trust(overrides)
     with _preserved_hydra_state():
         composed = compose_tree(words, trusted)
         choices = {str(k): str(v) for k, v in composed.hydra.runtime.choices.items()}
-        _move_hydra_node(composed)
+        # where an experiment may look up the choices
+        HydraConfig.instance().set_config(composed)
+        with open_dict(composed):
+            del composed["hydra"]
         return resolve_config(composed, choices, trusted, overrides)
 
 
@@ -290,22 +297,6 @@ def _load_text(group: str, name: str, text: str) -> Any:
     return ConfigNode(name, node, group, package, f"pfbench.{group}")
 
 
-def _move_hydra_node(composed: DictConfig) -> None:
-    """Move the node `hydra` to where an experiment may look up the choices, as Hydra does by a copy."""
-    from hydra.core.hydra_config import HydraConfig
-    from omegaconf import OmegaConf, flag_override, open_dict
-
-    application: Any = HydraConfig.instance()
-    holder, node = OmegaConf.create(), composed._get_node("hydra")
-    with open_dict(composed):
-        del composed["hydra"]
-    with flag_override(holder, "no_deepcopy_set_nodes", True):
-        holder["hydra"] = node
-    holder.hydra._set_parent(composed)
-    OmegaConf.set_readonly(holder.hydra, True)
-    application.cfg = holder
-
-
 @contextmanager
 def _preserved_hydra_state() -> Iterator[None]:
     """Clear Hydra's global state for one composition and restore it afterwards, in one thread at a time."""
@@ -337,9 +328,10 @@ def resolve_values(tree: DictConfig | Mapping[str, Any]) -> dict[str, Any]:
     from omegaconf import OmegaConf
     from omegaconf.errors import InterpolationResolutionError
 
+    _count_resolved_values()
+    token = _resolved.set([0, 0, 0])
     try:
-        with _bounded_resolution():
-            values = OmegaConf.to_container(tree, resolve=True)
+        values = OmegaConf.to_container(tree, resolve=True)
     except InterpolationResolutionError as error:
         cause: BaseException | None = error
         while cause is not None and not isinstance(cause, UntrustedConfigError):
@@ -355,24 +347,15 @@ def resolve_values(tree: DictConfig | Mapping[str, Any]) -> dict[str, Any]:
             f"{key} must not refer to itself, got {value}, which leads back to {key}. "
             f"Set {key} to a value."
         ) from error
+    finally:
+        _resolved.reset(token)
     assert isinstance(values, dict)
     return {str(key): value for key, value in values.items()}
 
 
-@contextmanager
-def _bounded_resolution() -> Iterator[None]:
-    """Limit what OmegaConf resolves: it resolves a value again each time that another one refers to it."""
-    _count_resolved_values()
-    token = _resolved.set([0, 0, 0])
-    try:
-        yield
-    finally:
-        _resolved.reset(token)
-
-
 @cache
 def _count_resolved_values() -> None:
-    """Let OmegaConf count the values and characters that it resolves."""
+    """Let OmegaConf count the values and characters that it resolves, which are limited: it resolves a value again for each reference."""
     from omegaconf.base import Container
 
     by_omegaconf = Container.resolve_parse_tree
@@ -394,11 +377,13 @@ def _add_size(value: Any, counts: list[int]) -> None:
     counts[1] += 1
     counts[2] += len(value) if isinstance(value, str) else 0
     most = (limits.RESOLVED_REFERENCES, limits.RESOLVED_VALUES, limits.RESOLVED_TEXT)
-    if any(count > limit for count, limit in zip(counts, most, strict=True)):
-        raise UntrustedConfigError(
-            "values that refer to others must have at most {} references, {} values and {} characters "
-            "in all, got more. Write fewer references.".format(*most)
-        )
+    require_allowed(
+        all(count <= limit for count, limit in zip(counts, most, strict=True)),
+        "values that refer to others",
+        "have at most {} references, {} values and {} characters in all".format(*most),
+        "more",
+        "Write fewer references.",
+    )
     children = (
         value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     )
@@ -443,9 +428,6 @@ def is_simulated_from(scenario: Any, name: str) -> bool:
         and name in list_named_parts("scenario")
     )
 
-
-# --------------------------------------------------------------------------------------------------
-# Named sets of filters, which a sweep may name in place of a list.
 
 _TABLE = "_in"  # end of the names of tables from which an experiment takes `runs` or `seed`; no settings of a job
 SUFFIX = "tuned"  # end of the names of the tuned filters

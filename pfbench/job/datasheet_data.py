@@ -87,10 +87,15 @@ def compute_datasheet(
         pcrb, pcrb_text = compute_pcrb(values, model, recording_regime, episode, runs, inputs)
         truth = model.assemble(episode.truth)
         group = main_component_group(describe_state(model))
+        deviation = compute_deviations(model, truth).float()
         raw = compute_raw_estimate(model, truth, episode.record, group.places)
         outputs = {
             "time": episode.time,
-            **_unfiltered_arrays(model, compute_deviations(model, truth)),
+            "error": deviation,
+            "sd": torch.full_like(deviation, torch.nan),
+            "nees": torch.full((*truth.shape[:2], len(model.groups)), torch.nan),
+            "log_evidence": torch.full((len(truth),), torch.nan),
+            "lost": torch.zeros(len(truth), dtype=torch.bool),
             "residual": compute_residuals(model, truth, episode).float(),
             "seen": (~torch.isnan(episode.record.y)).double().mean(0).float(),
             **{name: value.float() for name, value in episode.datasheet.items()},
@@ -144,18 +149,6 @@ def compute_residuals(model: StateSpaceModel, truth: Tensor, episode: Episode) -
         z = model.residual(step.y, expected) / distribution.variance[:, 0].sqrt()
         residuals.append(torch.where(is_dependent, torch.nan, z))
     return torch.stack(residuals, 1)
-
-
-def _unfiltered_arrays(model: StateSpaceModel, deviation: Tensor) -> dict[str, Tensor]:
-    """Return the required arrays of a result, without a filter."""
-    runs, steps = deviation.shape[:2]
-    return {
-        "error": deviation.float(),
-        "sd": torch.full_like(deviation, torch.nan, dtype=torch.float32),
-        "nees": torch.full((runs, steps, len(model.groups)), torch.nan),
-        "log_evidence": torch.full((runs,), torch.nan),
-        "lost": torch.zeros(runs, dtype=torch.bool),
-    }
 
 
 def _make_metadata(

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pfbench.files import limits
-from pfbench.job.trust import UntrustedConfigError
+from pfbench.job.trust import require_allowed
 from pfbench.results.paper_block import conf_dir
 
 FOLDER_KEYS = ("results_dir", "reports_dir", "episode_cache_dir")
@@ -46,6 +46,8 @@ _RESOLVERS = (
 
 _PATH = re.compile(r"^[/~\\]|^[A-Za-z]:[/\\]|(^|[/\\])\.\.([/\\]|$)")
 
+_SWEEP = ("hydra", "sweeper", "params")
+
 _PLAIN_KEY = re.compile(r"[\w.\[\]@-]+")
 
 
@@ -57,15 +59,14 @@ def check_content(file: Path, values: Mapping[str, Any], *, is_own: bool) -> Non
             _check_hydra_value(file, path, value, is_own)
         elif path[0] == "data" or key in _WRITTEN or key in _SETTINGS or key in _READ[1:]:
             _check_protected(file, path, value, is_own)
-        if isinstance(key, str) and "${" in key:
-            _refuse(file, path, "be a plain name", key, "Write the name itself.")
-        if isinstance(value, str) and not is_own and _PATH.search(value):
-            _refuse(file, path, "not be a path", value, _own_remedy(file))
+        is_plain = not isinstance(key, str) or "${" not in key
+        _require(is_plain, file, path, "be a plain name", key, "Write the name itself.")
+        is_inside = is_own or not isinstance(value, str) or not _PATH.search(value)
+        _require(is_inside, file, path, "not be a path", value, _own_remedy(file))
         if isinstance(value, str) and "${" in value and not _is_reference(path, value):
             _check_interpolation(file, path, value, is_own)
-    params = _find(values, "hydra", "sweeper", "params")
-    if params is not None:
-        _check_sweep(file, params, is_own)
+        if path == _SWEEP and isinstance(value, Mapping):  # Hydra reports another value
+            _check_sweep(file, value, is_own)
 
 
 def check_defaults(file: Path, defaults: Sequence[Any], *, is_own: bool) -> None:
@@ -84,33 +85,38 @@ def check_defaults(file: Path, defaults: Sequence[Any], *, is_own: bool) -> None
         )
         in_hydra = any(re.split(r"[/.]", text.lstrip("/"))[0] == "hydra" for text in texts)
         leaves = any(".." in text or "${" in text for text in texts)
-        if leaves or (in_hydra and not is_launcher):
-            choice = "@".join(filter(None, [group or texts[0], entry.package]))
-            raise UntrustedConfigError(
-                f"{file}: defaults must name files of a group directly and outside hydra, got {choice}: {value}. Choose it on "
-                "the command line. In a folder of your own (own://) they may choose a launcher: "
-                f"{', '.join(launchers())}."
-            )
+        choice = "@".join(filter(None, [group or "".join(texts[:1]), entry.package]))
+        require_allowed(
+            not leaves and (is_launcher or not in_hydra),
+            f"{file}: defaults",
+            "name files of a group directly and outside hydra",
+            f"{choice}: {value}",
+            f"Choose it on the command line. In a folder of your own (own://) they may choose a launcher: {', '.join(launchers())}.",
+        )
 
 
 def check_place(config_path: str, package: str | None) -> None:
     """Check that no file is placed in the node `hydra` but those of Hydra's own groups."""
     in_hydra = (package or "").partition(".")[0].partition("[")[0] == "hydra"
-    if in_hydra and not config_path.lstrip("/").startswith("hydra/"):
-        raise UntrustedConfigError(
-            f"{config_path} must not be placed in hydra, got the package {package}. Remove it from the "
-            "header or from the defaults list."
-        )
+    require_allowed(
+        not in_hydra or config_path.lstrip("/").startswith("hydra/"),
+        config_path,
+        "not be placed in hydra",
+        f"the package {package}",
+        "Remove it from the header or from the defaults list.",
+    )
 
 
 def check_group(file: Path, config_path: str, *, is_own: bool) -> None:
     """Check that a file of a search path is none of Hydra's settings."""
     is_launcher = is_own and config_path.startswith("hydra/launcher/")
-    if config_path.lstrip("./").startswith("hydra") and not is_launcher:
-        raise UntrustedConfigError(
-            f"{file} must not be a setting of hydra. Choose a launcher of pfbench on the command line "
-            f"({', '.join(launchers())}), or write own:// before a folder of your own launchers."
-        )
+    require_allowed(
+        is_launcher or not config_path.lstrip("./").startswith("hydra"),
+        file,
+        "not be a setting of hydra",
+        config_path,
+        f"Choose a launcher of pfbench on the command line ({', '.join(launchers())}), or write own:// before a folder of your own launchers.",
+    )
 
 
 @cache
@@ -134,43 +140,37 @@ def _walk(node: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ..
         yield from _walk(value, below)
 
 
-def _find(node: Any, *path: str) -> Any:
-    """Return the value of a path, None if there is none."""
-    for key in path:
-        node = node.get(key) if isinstance(node, Mapping) else None
-    return node
-
-
 def _check_hydra_value(file: Path, path: tuple[Any, ...], value: Any, is_own: bool) -> None:
     """Check that a value below `hydra` belongs to the values of a sweep."""
-    allowed = [("hydra", "sweeper", "params")]
+    allowed = [_SWEEP]
     if is_own:  # a launcher of the user, which the command line chooses
         allowed.append(("hydra", "launcher", *path[2:3]))
     is_between = isinstance(value, Mapping) and any(path == keys[: len(path)] for keys in allowed)
-    if not is_between and path[:3] not in allowed:
-        _refuse(
-            file, path[:2], "not be set: hydra must have sweeper.params only", value,
-            "Set the settings of hydra on the command line.",
-        )  # fmt: skip
+    _require(
+        is_between or path[:3] in allowed, file, path[:2], "not be set: hydra must have sweeper.params only", value,
+        "Set the settings of hydra on the command line.",
+    )  # fmt: skip
 
 
 def _check_protected(file: Path, path: tuple[Any, ...], value: Any, is_own: bool) -> None:
     """Check a value of a key that only the command line may set."""
     key = path[-1]
-    is_top = len(path) == 1
-    if key in _SETTINGS and not is_top:
+    if key in _SETTINGS and len(path) > 1:
         return  # the same name elsewhere is none of them
     is_nothing = value is None or value == "???" or (key == "overwrite" and value is False)
     is_whole = isinstance(value, Mapping) and key in _READ  # its own keys are checked
     is_data = key in _READ or path[0] == "data"
     if is_nothing or is_whole or _is_reference(path, value) or (is_own and is_data):
         return
-    remedy = _own_remedy(file) if is_data else ""
-    name = _join(path)
-    _refuse(
-        file, path, "be set on the command line", value,
-        f"Remove the key from the file, and add {name}=... to the command. {remedy}".rstrip(),
-    )  # fmt: skip
+    remedy = f"Remove the key from the file, and add {_join(path)}=... to the command."
+    _require(
+        False,
+        file,
+        path,
+        "be set on the command line",
+        value,
+        f"{remedy} {_own_remedy(file) if is_data else ''}".rstrip(),
+    )
 
 
 def _is_reference(path: tuple[Any, ...], value: Any) -> bool:
@@ -185,23 +185,22 @@ def _check_interpolation(file: Path, path: tuple[Any, ...], text: str, is_own: b
     from omegaconf import grammar_parser
     from omegaconf.errors import GrammarParseError
 
-    if len(text) > limits.CONFIG_INTERPOLATED:
-        _refuse(
-            file, path, f"have at most {limits.CONFIG_INTERPOLATED} characters with an interpolation",
-            len(text), "Give the value on the command line.",
-        )  # fmt: skip
+    _require(
+        len(text) <= limits.CONFIG_INTERPOLATED, file, path, f"have at most {limits.CONFIG_INTERPOLATED} characters with an interpolation",
+        len(text), "Give the value on the command line.",
+    )  # fmt: skip
     try:
         tree = grammar_parser.parse(text)
     except GrammarParseError as error:
-        _refuse(file, path, "be a valid interpolation", text, f"{error}".splitlines()[0])
+        _require(False, file, path, "be a valid interpolation", text, f"{error}".splitlines()[0])
     for resolver, key in _list_interpolations(tree):
         names_user = not is_own and {*_WRITTEN, *_READ, "hydra"} & set(re.findall(r"\w+", key))
-        if resolver not in _RESOLVERS or not _PLAIN_KEY.fullmatch(key) or names_user:
-            got = f"the resolver {resolver} in {text}" if resolver not in _RESOLVERS else text
-            _refuse(
-                file, path, "have interpolations of plain keys, and none of the user's folders",
-                got, "Give the value on the command line.",
-            )  # fmt: skip
+        is_known = resolver in _RESOLVERS
+        _require(
+            is_known and _PLAIN_KEY.fullmatch(key) and not names_user, file, path,
+            "have interpolations of plain keys, and none of the user's folders",
+            text if is_known else f"the resolver {resolver} in {text}", "Give the value on the command line.",
+        )  # fmt: skip
 
 
 def _list_interpolations(tree: Any) -> Iterator[tuple[str, str]]:
@@ -220,34 +219,33 @@ def _list_interpolations(tree: Any) -> Iterator[tuple[str, str]]:
         yield from _list_interpolations(child)
 
 
-def _check_sweep(file: Path, params: Any, is_own: bool) -> None:
+def _check_sweep(file: Path, params: Mapping[Any, Any], is_own: bool) -> None:
     """Check the sweep of an experiment as Hydra's parser of overrides reads it."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
 
-    if not isinstance(params, Mapping):
-        return  # Hydra reports it
     jobs = 1
     for name, value in params.items():
         is_plain = isinstance(value, str | int | float | bool) or value is None
-        if not is_plain or re.search(r"[@~]", str(name)) or "${" in f"{name}{value}":
-            _refuse(
-                file, ("hydra", "sweeper", "params"), "be plain keys and values",
-                f"{name}={value}", "Give it on the command line.",
-            )  # fmt: skip
+        is_plain = is_plain and not re.search(r"[@~]", str(name)) and "${" not in f"{name}{value}"
+        _require(
+            is_plain, file, _SWEEP, "be plain keys and values", f"{name}={value}", "Give it on the command line."
+        )  # fmt: skip
         word = OverridesParser.create().parse_override(f"{name}={value}")
         values = list(islice(_list_swept(word.value()), limits.SWEPT_JOBS + 1))
         jobs *= max(1, len(values))
-        if jobs > limits.SWEPT_JOBS:
-            _refuse(
-                file, ("hydra", "sweeper", "params"), f"have at most {limits.SWEPT_JOBS} jobs",
-                "more", "Give the sweep on the command line.",
-            )  # fmt: skip
+        most = f"have at most {limits.SWEPT_JOBS} jobs"
+        _require(
+            jobs <= limits.SWEPT_JOBS,
+            file,
+            _SWEEP,
+            most,
+            "more",
+            "Give the sweep on the command line.",
+        )
         key = re.split(r"[./]", word.key_or_group)
-        if key[0] == "hydra":
-            _refuse(
-                file, ("hydra", "sweeper", "params"), f"not set {word.key_or_group}", value,
-                f"Give {word.key_or_group} on the command line.",
-            )  # fmt: skip
+        _require(
+            key[0] != "hydra", file, _SWEEP, f"not set {word.key_or_group}", value, f"Give {word.key_or_group} on the command line."
+        )  # fmt: skip
         for single in values:
             nested: Any = _to_plain(single)
             for name_of_node in reversed(key):
@@ -285,8 +283,9 @@ def _join(path: Sequence[Any]) -> str:
     return ".".join(map(str, path))
 
 
-def _refuse(file: Path, path: Sequence[Any], requirement: str, value: Any, remedy: str) -> Any:
-    """Raise the error of a value of a file."""
-    raise UntrustedConfigError(
-        f"{file}: {_join(path)} must {requirement}, got {value!r:.80}. {remedy}"
-    )
+def _require(
+    ok: object, file: Path, path: Sequence[Any], must: str, value: Any, remedy: str
+) -> None:
+    """Raise UntrustedConfigError unless a requirement on a value of a file holds."""
+    if not ok:
+        require_allowed(False, f"{file}: {_join(path)}", must, f"{value!r:.80}", remedy)

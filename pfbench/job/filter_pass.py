@@ -15,10 +15,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from pfbench.core.random_stream import PhiloxStream
-from pfbench.core.record import Episode, Record
+from pfbench.core.record import Episode, Record, iterate_steps
 from pfbench.filter.belief import StepInfo
-from pfbench.filter.loop import FilterResult, run_filter
+from pfbench.filter.loop import FilterResult, prepare_record, run_filter
 from pfbench.filter.particle.particle_filter import ParticleFilter
+from pfbench.filter.particle.stages import EssResampler
 from pfbench.filter.particle.taped_filter import TapedParticleFilter, find_obstacle
 from pfbench.job.memory import MemoryTrimmer, first_steps, peak_above, start_peak_measurement
 from pfbench.job.plan import JobPlan
@@ -37,6 +38,10 @@ log = logging.getLogger("pfbench")
 
 # normal numbers of a job: on a CUDA device compiling costs seconds and saves 15 ms per million [measured]
 _CUDA_NUMBERS = 5e8
+_COPIES = (
+    "this world has no process noise: a resampled cloud collapses to copies of a few particles. Choose filter=rpf_copies, "
+    "or give the filter moves or a resampler that moves copies"
+)
 _WARM_UP_STEPS = 2  # the second of a compiled filter is recorded
 
 
@@ -244,6 +249,28 @@ def choose_engine(
     if obstacle and engine == "tape":  # what was asked for
         _say_once(f"engine=tape: C++ operators, step by step ({obstacle})")
     return "kernels" if obstacle else "tape"
+
+
+def describe_unmoved_copies(
+    plan: JobPlan, model: StateSpaceModel, record: Record
+) -> tuple[str, ...]:
+    """Say once, and return as a note, that nothing moves the copies of resampling apart: neither the filter nor the process."""
+    method, choices = plan.method, plan.config.choices
+    if (
+        not isinstance(method, ParticleFilter)
+        or type(method.resampler) is not EssResampler
+        or method.moves
+    ):
+        return ()
+    start = prepare_record(model, first_steps(model, record.select_runs(slice(0, 1)), 1))
+    _, step_model, step = next(iter(iterate_steps(model, start)))
+    x, w = model.origin.expand(1, 1, -1), model.origin.new_zeros(1, 1, model.noise_dim)
+    with torch.no_grad():
+        pushed, still = (step_model.propagate(x, step.u, noise) for noise in (w + 1.0, w))
+    if not torch.equal(pushed, still):
+        return ()
+    _say_once(f"warning  {choices['scenario']} / {choices['filter']}   {_COPIES}")
+    return (_COPIES,)
 
 
 @cache

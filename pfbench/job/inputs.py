@@ -23,6 +23,7 @@ from pfbench.job.trust import (
     hash_user_code,
     list_user_targets,
     trusted_packages,
+    walk_nodes,
 )
 from pfbench.results.inputs import list_changed
 from pfbench.results.paper_block import remove_all_blocks
@@ -51,20 +52,15 @@ def find_inputs(values: Mapping[str, Any], trusted: Sequence[str] = ()) -> Input
         entries = _hash_files(_list_files(node, trusted), values.get("data", {}).get("root"))
         code = hash_user_code(node).items()
         entries |= {f"{CODE_OF[0]}{remove_digests(name)}": value for name, value in code}
-        if code:
-            entries |= _hash_values(node, trusted)
+        if code:  # with the values that the classes reach; packages without trust are not loaded
+            entries |= {
+                f"{CODE_OF[1]}{remove_digests(target)}": hash_reached(target, thing)
+                for target in sorted(set(list_user_targets(node)))
+                if (thing := _find_class(target, trusted)) is not None
+            }
         if entries:
             digests[group] = entries
     return digests
-
-
-def _hash_values(node: Any, trusted: Sequence[str]) -> dict[str, str]:
-    """Compute digests of the values that the classes of a user reach, by class. Those of packages without trust are not loaded."""
-    return {
-        f"{CODE_OF[1]}{remove_digests(target)}": hash_reached(target, thing)
-        for target in sorted(set(list_user_targets(node)))
-        if (thing := _find_class(target, trusted)) is not None
-    }
 
 
 def check_unchanged(before: Inputs, values: Mapping[str, Any], trusted: Sequence[str] = ()) -> None:
@@ -85,9 +81,10 @@ def check_unchanged(before: Inputs, values: Mapping[str, Any], trusted: Sequence
 
 def names_checkpoint(node: Any) -> bool:
     """Return whether a filter names a checkpoint of trained weights."""
-    if isinstance(node, Mapping):
-        return isinstance(node.get("checkpoint"), str) or any(map(names_checkpoint, node.values()))
-    return isinstance(node, list) and any(map(names_checkpoint, node))
+    return any(
+        isinstance(value, Mapping) and isinstance(value.get("checkpoint"), str)
+        for _, value in walk_nodes(node)
+    )
 
 
 def describe_unnamed_files(scenario: Any, trusted: Sequence[str] = ()) -> tuple[str, ...]:
@@ -108,10 +105,10 @@ def _list_files(node: Any, trusted: Sequence[str]) -> Iterator[Path]:
             built = _build(json.dumps(reader, sort_keys=True, default=str), tuple(trusted))
         except Exception:  # the plan of the job builds it again, and raises with its full key
             continue
-        for entry in built.input_files():
-            path = Path(entry)
+        for path in map(Path, built.input_files()):
+            is_file = not path.exists() or path.is_file()
             require(
-                not path.exists() or path.is_file(),
+                is_file,
                 f"input_files of {reader['_target_']}",
                 "return files",
                 path,

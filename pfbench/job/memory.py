@@ -47,24 +47,26 @@ def available_memory() -> float | None:
     return min([*_machine_memory(), *_group_memory()], default=None)
 
 
-def resident_bytes() -> int | None:
-    """Return the resident bytes of this process, or None if unknown."""
-    file = Path("/proc/self/statm")
-    return int(file.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if file.exists() else None
-
-
 def start_peak_measurement(device: str) -> int | None:
     """Reset the peak of used memory and return the bytes in use, for `peak_above`."""
     if device != "cpu":
         torch.cuda.reset_peak_memory_stats(device)
-    return _reset_peak_memory()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:  # freed memory of earlier jobs would hide the memory of this one
+        trim(0)
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+    except OSError:  # not on Linux
+        return None
+    return read_memory("VmRSS")
 
 
 def peak_above(baseline: int | None, device: str) -> int | None:
     """Return the peak of used memory above a baseline."""
     if device != "cpu":
         return int(torch.cuda.max_memory_allocated(device))
-    return None if baseline is None else max(0, peak_memory() - baseline)
+    peak = read_memory("VmHWM")
+    return None if baseline is None or peak is None else max(0, peak - baseline)
 
 
 class AllocationCounter(TorchDispatchMode):
@@ -114,7 +116,7 @@ class MemoryTrimmer:
     def __call__(self) -> None:
         """Release memory if necessary. Call this function once per time step."""
         self._step += 1
-        now = resident_bytes() if self._step % _CHECK_STEPS == 1 else None
+        now = read_memory("VmRSS") if self._step % _CHECK_STEPS == 1 else None
         if self._release is None or now is None:
             return
         if self._baseline is None:
@@ -386,10 +388,6 @@ def _extrapolate(sizes: Sequence[int], values: Sequence[float], n: int) -> float
     return float(values[2] + max(0.0, later) * (n - 4 * a) + bend * (n - 4 * a) * (n - 2 * a))
 
 
-# --------------------------------------------------------------------------------------------------
-# Memory of the process: freed blocks of the C library, and the peak on Linux.
-
-
 @cache
 def keep_freed_memory() -> None:
     """Make glibc keep freed memory for the next step; without effect for other C libraries.
@@ -403,25 +401,8 @@ def keep_freed_memory() -> None:
             set_option(option, 1 << 30)
 
 
-def _reset_peak_memory() -> int | None:
-    """Reset the peak and return the present memory, bytes; None if not on Linux."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:  # freed memory of earlier jobs would hide the memory of this one
-        trim(0)
-    try:
-        Path("/proc/self/clear_refs").write_text("5")
-    except OSError:
-        return None
-    return _memory("VmRSS")
-
-
-def peak_memory() -> int:
-    """Return the peak memory of the process since `_reset_peak_memory`, bytes."""
-    return _memory("VmHWM")
-
-
-def _memory(name: str) -> int:
-    (line,) = (
-        line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(name)
-    )
-    return 1024 * int(line.split()[1])
+def read_memory(name: str) -> int | None:
+    """Return the present (VmRSS) or the largest (VmHWM) memory of the process, bytes; None if not on Linux."""
+    file = Path("/proc/self/status")
+    lines = file.read_text().splitlines() if file.exists() else []
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(name)), None)

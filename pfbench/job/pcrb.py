@@ -242,10 +242,6 @@ def _root_of(wide: Tensor) -> Tensor:
     return torch.linalg.qr(wide.mT, mode="r")[1].mT
 
 
-# --------------------------------------------------------------------------------------------------
-# PCRB of a job's episodes, stored with them and shared by all filters of a study.
-
-
 def compute_pcrb(
     values: Mapping[str, Any],
     model: StateSpaceModel,

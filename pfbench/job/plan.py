@@ -151,9 +151,6 @@ def apply_global_settings(values: Mapping[str, Any]) -> None:
     keep_freed_memory()
 
 
-# --------------------------------------------------------------------------------------------------
-# Metadata of a job: all that a report states about how its results were computed.
-
 # parts of a checkout that decide results; analyses read them only
 _DECIDING = ("pfbench", "conf", "experiments", "pyproject.toml", "setup.py")
 _TIMEOUT = 10  # s, of git
@@ -191,13 +188,6 @@ def make_metadata(
     }
 
 
-def _is_kalman_filter(model: StateSpaceModel, method: Any) -> bool:
-    """Return whether a filter is the Kalman filter of a linear model."""
-    from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
-
-    return model.linear and isinstance(method, GaussianFilter) and method.plain
-
-
 def describe_state(model: StateSpaceModel) -> dict[str, Any]:
     """Return names and units of the state's components, and its groups."""
     return {
@@ -205,6 +195,13 @@ def describe_state(model: StateSpaceModel) -> dict[str, Any]:
         "units": list(model.units),
         "groups": {name: list(components) for name, components in model.groups.items()},
     }
+
+
+def _is_kalman_filter(model: StateSpaceModel, method: Any) -> bool:
+    """Return whether a filter is the Kalman filter of a linear model."""
+    from pfbench.filter.gaussian.gaussian_filter import GaussianFilter
+
+    return model.linear and isinstance(method, GaussianFilter) and method.plain
 
 
 def make_provenance() -> dict[str, Any]:

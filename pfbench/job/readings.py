@@ -6,7 +6,7 @@ A row states its level of a factor: `text`, `class`, `why`, `use` (files of othe
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from copy import deepcopy
 from functools import cache
 from typing import Any
@@ -27,19 +27,15 @@ def read_reading_table(paper: str) -> Mapping[str, Mapping[str, Any]]:
     rows = {CENTRAL_READING: {"factor": "none", **table[CENTRAL_READING]}}
     for factor, levels in table["factors"].items():
         rows |= {name: {"factor": factor, **row} for name, row in levels.items()}
-    rows = {
-        name: {**row, "filters": dict(_split_names(row.get("filters")))}
-        for name, row in rows.items()
-    }
+    for name, row in rows.items():
+        filters = row.get("filters") or {}
+        split = {
+            n.strip(): settings or {} for key, settings in filters.items() for n in key.split(",")
+        }
+        rows[name] = {**row, "filters": split}
     for name, row in table.get("pairs", {}).items():
         rows[name] = _compose_pair(row, *(rows[level] for level in name.split("_and_")))
     return rows
-
-
-def _split_names(filters: Mapping[str, Any] | None) -> Iterator[tuple[str, Any]]:
-    """Yield name and settings of each filter of keys such as `sir, apf`."""
-    for names, settings in (filters or {}).items():
-        yield from ((name.strip(), settings or {}) for name in names.split(","))
 
 
 def _compose_pair(

@@ -1,11 +1,11 @@
-"""Replay of one stored run with all its traces: computation, agreement, figure and files."""
+"""Replay of one stored run with all its traces: selection, computation, agreement, figure and files."""
 
 from __future__ import annotations
 
 import copy
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,12 +22,18 @@ from pfbench.job.computation import compute_job
 from pfbench.job.config import CHOICES, JobConfig
 from pfbench.job.inputs import CODE_OF, find_inputs
 from pfbench.job.plan import build_plan
-from pfbench.job.run_selection import StoredRun
-from pfbench.job.trust import UntrustedConfigError, trusted_packages
+from pfbench.job.trust import require_allowed, trusted_packages
 from pfbench.results import store
-from pfbench.results.conditions import main_component_group
+from pfbench.results.conditions import (
+    Condition,
+    JobFile,
+    load_conditions,
+    main_component_group,
+    parse_label,
+)
 from pfbench.results.frame import to_long_rows
 from pfbench.results.inputs import list_changed
+from pfbench.results.joined_runs import select_run
 from pfbench.results.plotting import (
     FigureSpec,
     draw_figure,
@@ -38,8 +44,98 @@ from pfbench.results.plotting import (
 )
 from pfbench.results.status import count_statuses, divergence_threshold
 from pfbench.results.store import Inputs
+from pfbench.stats.study_runs import natural_sort_key
 
+_SCORES = ("crps", "pit", "energy_score", "nis", "nis_dof")
 _ENGINES = ("kernels", "tape", "compiled")  # engines that a job may have used; the others are eager
+
+
+class StoredRun(NamedTuple):
+    """A stored run.
+
+    Attributes:
+        condition: Condition of the job.
+        job: Job of the run.
+        run: Number of the run.
+        result: Metadata of the job, and its arrays with this run alone.
+    """
+
+    condition: Condition
+    job: JobFile
+    run: int
+    result: store.JobResult
+
+
+def find_run(
+    study: str, results: str | Path, run: int, label: str, choices: Mapping[str, str]
+) -> StoredRun:
+    """Find one run of a study by its number, its filter, and the names of scenario, noise and model, with or without their settings."""
+    conditions: Sequence[Condition] = load_conditions(study, results, allow_mixed_versions=True)
+    for group, value in choices.items():
+        names = {str(getattr(condition, group)): condition for condition in conditions}
+        conditions = [
+            c for c in conditions if value in (getattr(c, group), parse_label(getattr(c, group))[0])
+        ]
+        require(
+            conditions,
+            group,
+            f"be one of the study {study}",
+            value,
+            f"Choose from {_list_names(names)}.",
+        )
+    labels = {job.label for condition in conditions for job in condition.jobs}
+    matches = [
+        (condition, job)
+        for condition in conditions
+        for job in condition.jobs
+        if label in (job.label, job.meta["choices"]["filter"])
+    ]
+    require(
+        matches,
+        "filter",
+        f"be a filter of the study {study}",
+        label,
+        f"Choose from {_list_names(labels)}.",
+    )
+    _check_single(matches, label)
+    condition, job = matches[0]
+    result = job.load()
+    first = int(result.meta.get("first_run", 0))
+    numbers = np.asarray(result.data.get("run", first + np.arange(result.data["lost"].size)))
+    require(
+        run in numbers, "run", f"be a run of {job.label}, {numbers.min()} to {numbers.max()}", run, f"Set run={numbers.min()}."
+    )  # fmt: skip
+    return StoredRun(condition, job, run, select_run(result, int(np.argmax(numbers == run))))
+
+
+def _check_single(matches: Sequence[tuple[Condition, JobFile]], label: str) -> None:
+    """Raise ValueError if several jobs match."""
+    labels = {job.label for _, job in matches}
+    conditions = {condition.name: condition for condition, _ in matches}
+    is_single = len(matches) == 1 or len(conditions) > 1
+    require(
+        is_single,
+        "filter",
+        "name one job",
+        f"{label} with {len(labels)} settings",
+        f"Choose from {_list_names(labels)}.",
+    )
+    names = {
+        g: {str(getattr(c, g)) for c in conditions.values()} for g in ("scenario", "noise", "model")
+    }
+    several = {group: values for group, values in names.items() if len(values) > 1}
+    if several:
+        advice = ", ".join(
+            f"{group}=... ({_list_names(values)})" for group, values in several.items()
+        )
+        raise ValueError(
+            f"{' and '.join(several)} must be set, since {label} has results in {len(conditions)} conditions. Add {advice}."
+        )
+
+
+def _list_names(names: Iterable[str]) -> str:
+    """Format names in natural order."""
+    return ", ".join(sorted(names, key=natural_sort_key))
 
 
 def replay_config(stored: StoredRun, changes: Mapping[str, Any]) -> JobConfig:
@@ -74,17 +170,18 @@ def stored_config(meta: Mapping[str, Any], path: Path, changes: Mapping[str, Any
     if meta.get("budget_allocation"):
         values["filter"]["particles"] = meta["particles"]
     places = {"root": values["data"]["root"], "cache_dir": values["episode_cache_dir"]}
-    places |= {key: changes[key] for key in ("checkpoint",) if key in changes}
+    places |= {"checkpoint": changes["checkpoint"]} if "checkpoint" in changes else {}
     for name in parts:
         _replace_places(values[name], places, path.parents[1])
     trusted = trusted_packages()
     packages = meta.get("trusted", [])
-    if not set(packages) <= set(trusted):
-        text = f"trust=[{','.join(trusted)}]" if trusted else "none of them"
-        raise UntrustedConfigError(
-            f"trust must name the packages whose classes the run used, {', '.join(packages)}, got {text}. Nothing was "
-            f"run. If you still trust them, add trust=[{','.join(packages)}] to the command."
-        )
+    require_allowed(
+        set(packages) <= set(trusted),
+        "trust",
+        f"name the packages whose classes the run used, {', '.join(packages)}",
+        f"trust=[{','.join(trusted)}]" if trusted else "none of them",
+        f"Nothing was run. If you still trust them, add trust=[{','.join(packages)}] to the command.",
+    )
     return JobConfig(
         values, {group: str(meta["choices"][group]) for group in CHOICES}, trusted=trusted
     )
@@ -113,11 +210,14 @@ def _replace_places(node: Any, places: Mapping[str, str | None], results: Path) 
         if key in places and isinstance(value, str):
             node[key] = places[key]
         elif key == "checkpoint" and isinstance(value, str):
-            if not Path(value).resolve().is_relative_to(results.resolve()) and value != "untrained":
-                raise UntrustedConfigError(
-                    f"checkpoint must be a file below {results}, since a result names it, got {value}. Nothing was "
-                    f"opened. If it is yours, add checkpoint={value} to the command."
-                )
+            is_below = Path(value).resolve().is_relative_to(results.resolve())
+            require_allowed(
+                is_below or value == "untrained",
+                "checkpoint",
+                f"be a file below {results}, since a result names it",
+                value,
+                f"Nothing was opened. If it is yours, add checkpoint={value} to the command.",
+            )
         else:
             _replace_places(value, places, results)
 
@@ -125,7 +225,17 @@ def _replace_places(node: Any, places: Mapping[str, str | None], results: Path) 
 def recompute_run(stored: StoredRun, changes: Mapping[str, Any]) -> store.JobResult:
     """Compute one stored run again."""
     config = replay_config(stored, changes)
-    _check_inputs(stored.result.meta, find_inputs(config.values, config.trusted))
+    present = find_inputs(config.values, config.trusted)
+    changed = _list_changed_inputs(stored.result.meta, present)
+    # another code of a user's classes is printed, since it may be a mended message
+    files = [name for name in changed if not name.startswith(CODE_OF)]
+    require(
+        not files,
+        " and ".join(files),
+        "be as it was when the result was computed",
+        "other content",
+        "Run the job again, and replay the new result.",
+    )
     choices = {group: config.choices[group] for group in CHOICES}
     title = " / ".join(choices[group] for group in ("scenario", "noise", "filter"))
     plan, size = build_plan(config), len(stored.result.data["time"])
@@ -143,43 +253,23 @@ def recompute_run(stored: StoredRun, changes: Mapping[str, Any]) -> store.JobRes
     return store.JobResult(full, outputs)
 
 
-def _check_inputs(meta: Mapping[str, Any], present: Inputs) -> None:
-    """Raise ValueError if a job cannot be computed again, since a file that it read has changed.
-
-    Another code of a user's classes is printed, since it may be a mended message.
-    """
-    changed = [name for name in _list_changed_inputs(meta, present) if not name.startswith(CODE_OF)]
-    require(
-        not changed,
-        " and ".join(changed),
-        "be as it was when the result was computed",
-        "other content",
-        "Run the job again, and replay the new result.",
-    )
-
-
 def select_stored_scores(result: store.JobResult, stored: store.JobResult) -> store.JobResult:
     """Select the scores of a replay at the steps at which the stored run was scored.
 
     Returns the replay with the arrays of scores that the stored run has.
     """
     steps = stored.data.get("score_steps")
-    names = ("crps", "pit", "energy_score", "nis", "nis_dof")
-    data = {k: v for k, v in result.data.items() if k not in (*names, "score_steps")}
+    data = {k: v for k, v in result.data.items() if k not in (*_SCORES, "score_steps")}
     if steps is not None:
         index = np.searchsorted(result.data["score_steps"], steps)
-        data |= {k: result.data[k][:, index] for k in names if k in result.data}
+        data |= {k: result.data[k][:, index] for k in _SCORES if k in result.data}
         data["score_steps"] = np.asarray(steps)
     return store.JobResult(result.meta, data)
 
 
-# --------------------------------------------------------------------------------------------------
-# Agreement of a replayed run with the stored one: common digits, and the first step that differs.
-
 AGREEING_DIGITS = (
     4  # significant digits from which two runs are the same run with other rounding [ours]
 )
-_SCORES = ("crps", "pit", "energy_score", "nis", "nis_dof")
 _SHARED = ("time", "pcrb", "range", "score_steps")
 
 
@@ -214,8 +304,9 @@ def compare_runs(stored: store.JobResult, replayed: store.JobResult) -> list[Arr
             continue
         a = np.asarray(stored.data[name][0], dtype=np.float64)
         b = np.asarray(replayed.data[name][0], dtype=np.float64)
-        times = _times(name, a, stored)
-        rows.append(_compare_array(name, a, b, times))
+        time = stored.data["time"]
+        times = time[stored.data["score_steps"]] if name in _SCORES else time
+        rows.append(_compare_array(name, a, b, times if a.ndim else None))
     return sorted(rows, key=lambda row: row.digits)
 
 
@@ -237,14 +328,6 @@ def describe_agreement(rows: list[ArrayAgreement]) -> str:
         f"The stored numbers do not agree: {names} differ in the first {AGREEING_DIGITS} digits{since}. "
         "Another version of pfbench or of a library, another processor or another engine can be the reason."
     )
-
-
-def _times(name: str, values: np.ndarray, result: store.JobResult) -> np.ndarray | None:
-    """Return the time of each row of an array, or None if it is without an axis of time."""
-    if values.ndim == 0:
-        return None
-    time = result.data["time"]
-    return time[result.data["score_steps"]] if name in _SCORES else time
 
 
 def _compare_array(
@@ -270,9 +353,6 @@ def _compare_array(
         first = float(times[np.argmax(rows)]) if rows.any() else math.nan
     return ArrayAgreement(name, float(digits), first)
 
-
-# --------------------------------------------------------------------------------------------------
-# Traces of one run: a table with a row per step, and a figure.
 
 _NOT_TRACES = (
     "time",
@@ -336,8 +416,11 @@ def plot_traces(result: store.JobResult) -> Figure:
 def _plot_error(axis: Axes, result: store.JobResult) -> None:
     """Plot the norm of the error of the main group, and the norm of its standard deviations."""
     group, time = main_component_group(result.meta["state"]), result.data["time"]
-    error = _norm(result.data["error"][0][:, group.places]) * group.scale
-    sd = _norm(result.data["sd"][0][:, group.places]) * group.scale
+    error = (
+        np.linalg.norm(result.data["error"][0][:, group.places].astype(float), axis=-1)
+        * group.scale
+    )
+    sd = np.linalg.norm(result.data["sd"][0][:, group.places].astype(float), axis=-1) * group.scale
     axis.plot(time, error, color=_COLOUR, label="error")
     axis.plot(time, sd, color=_GREY, ls="--", label="standard deviation of the filter")
     limit = divergence_threshold(result.meta)
@@ -390,21 +473,10 @@ def magnification(track: np.ndarray, error: np.ndarray) -> int:
     Shapes: track [T, 2], error [T, 2].
     """
     extent = float(np.ptp(track, axis=0).max())
-    size = float(np.nanmedian(_norm(error))) if np.isfinite(error).any() else 0.0
+    size = float(np.nanmedian(np.linalg.norm(error, axis=-1))) if np.isfinite(error).any() else 0.0
     if not 0.0 < size < 0.005 * extent:
         return 1
     return int(10 ** np.floor(np.log10(0.05 * extent / size)))
-
-
-def _norm(values: np.ndarray) -> np.ndarray:
-    """Return the norm of each row, [T]."""
-    return np.sqrt(np.sum(np.asarray(values, np.float64) ** 2, axis=-1))
-
-
-# --------------------------------------------------------------------------------------------------
-# Files of a replay: traces as CSV and Parquet, and a figure.
-
-_FIGURE = "traces"
 
 
 def write_replay(stored: StoredRun, result: store.JobResult, reports: str | Path) -> list[Path]:
@@ -412,20 +484,19 @@ def write_replay(stored: StoredRun, result: store.JobResult, reports: str | Path
 
     Returns traces.csv, traces.parquet if pyarrow is installed, and traces.svg.
     """
-    condition, job = stored.condition, stored.job
-    names = (condition.scenario, condition.noise, condition.model, job.label)
+    condition = stored.condition
+    names = (condition.scenario, condition.noise, condition.model, stored.job.label)
     name = format_slug(f"{'_'.join(names)}_run_{stored.run}")
     folder = Path(reports) / str(result.meta["study"]) / "replay" / name
     table = tabulate_traces(result)
-    drawing = FigureSpec(_FIGURE, "", lambda: plot_traces(result))
+    drawing = FigureSpec("traces", "", lambda: plot_traces(result))
     with RecordedFolder(folder) as target:
         paths = [target.write("traces.csv", table.rename(columns=escape_csv).to_csv(index=False))]
         if find_spec("pyarrow"):
             buffer = io.BytesIO()
             table.to_parquet(buffer, index=False)
             paths.append(target.write("traces.parquet", buffer.getvalue()))
-        figure = draw_figure(drawing, ("svg",))["svg"]
-        paths.append(target.write(f"{_FIGURE}.svg", figure))
+        paths.append(target.write("traces.svg", draw_figure(drawing, ("svg",))["svg"]))
     return paths
 
 

@@ -6,7 +6,7 @@ This module imports torch only for a job that is not finished, since torch takes
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -85,15 +85,22 @@ def run(
     if result is not None:
         check_settings(values)
         outcome = JobOutcome(path, "skipped", main_rmse(result.data, result.meta))
-        of = _name_other(result.meta["choices"]["filter"], job_choices["filter"])
+        stored = result.meta["choices"]["filter"]
+        of = "" if stored == job_choices["filter"] else f" of {stored}, which has the same settings"
         log.info("%sskipped   %s   result exists%s: %s   (overwrite=true to repeat)", counter, name, of, path)  # fmt: skip
         return outcome
     if inputs and not path.exists():
         _announce_change(path, job_choices, inputs)
     meta, outputs = _compute_or_note(config, name, path, announce, is_alone=not counter)
     check_unchanged(inputs, values, config.trusted)
-    head = {"key": path.stem, "study": values["study"], "choices": job_choices, "config": values}
-    head |= {"inputs": inputs, "trusted": list_used_packages(config)}
+    head = {
+        "key": path.stem,
+        "study": values["study"],
+        "choices": job_choices,
+        "config": values,
+        "inputs": inputs,
+        "trusted": list_used_packages(config),
+    }
     store.write_result(path, {**head, **meta}, outputs)
     outcome = JobOutcome(path, "finished", main_rmse(outputs, meta))
     seconds = meta["seconds"]
@@ -158,17 +165,13 @@ def _read_finished(path: Path, values: Mapping[str, Any]) -> store.JobResult | N
         new_path = set_aside(path)
         log.warning("warning  %s   renamed to %s. Running the job", error, new_path.name)
         return None
-    if _lacks_bound(values, result.meta, result.data):
+    # a bound that is requested now and was not when the job ran
+    strictness = {False: 0, "auto": 1, True: 2}
+    before = strictness.get(result.meta["config"].get("pcrb"), 0)
+    if "pcrb" not in result.data and strictness.get(values["pcrb"], 0) > before:
         log.info("pcrb=%s   %s has no bound. Running the job", values["pcrb"], path.name)
         return None
     return result
-
-
-def _lacks_bound(values: Mapping[str, Any], meta: Mapping[str, Any], names: Container[str]) -> bool:
-    """Return whether a finished job lacks a bound that is requested now and was not when it ran."""
-    strictness = {False: 0, "auto": 1, True: 2}
-    before = strictness.get(meta["config"].get("pcrb"), 0)
-    return "pcrb" not in names and strictness.get(values["pcrb"], 0) > before
 
 
 def _announce_change(path: Path, choices: Mapping[str, str], inputs: Inputs) -> None:
@@ -193,11 +196,6 @@ def _read_meta(path: Path) -> dict[str, Any]:
         return store.read_metadata(path)
     except (ValueError, OSError):
         return {}
-
-
-def _name_other(stored: str, requested: str) -> str:
-    """Name the filter whose result is that of another name, with the same settings; empty for one name."""
-    return "" if stored == requested else f" of {stored}, which has the same settings"
 
 
 def find_result_path(values: Mapping[str, Any], inputs: Inputs) -> Path:

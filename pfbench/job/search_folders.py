@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 
 from pfbench.core.parameter_checks import require
 from pfbench.files import limits
-from pfbench.job.trust import UntrustedConfigError
+from pfbench.job.trust import UntrustedConfigError, require_allowed
 
 
 class ForeignFolder(FileConfigSource):
@@ -50,7 +50,9 @@ class ForeignFolder(FileConfigSource):
         text = _read(file)
         _check_measures(file, text)
         header = ConfigSource._get_header_dict(text[:512])  # as many as Hydra reads
-        config = OmegaConf.load(_NamedText(text, file))
+        stream = io.StringIO(text)
+        setattr(stream, "name", f"{file}")  # noqa: B010 - for the messages of the reader
+        config = OmegaConf.load(stream)
         return ConfigResult(self.provider, self.full_path(), config, header)
 
 
@@ -63,14 +65,6 @@ class OwnFolder(ForeignFolder):
     def scheme() -> str:
         """Return the scheme of the path."""
         return "own"
-
-
-class _NamedText(io.StringIO):
-    """Text with the name of its file, for the messages of the reader."""
-
-    def __init__(self, text: str, file: Path) -> None:
-        super().__init__(text)
-        self.name = f"{file}"
 
 
 def open_folder(provider: str, path: str, trusted: Sequence[str]) -> ForeignFolder:
@@ -98,11 +92,13 @@ def open_folder(provider: str, path: str, trusted: Sequence[str]) -> ForeignFold
 
 def _find_package(name: str, trusted: Sequence[str]) -> str:
     """Return the folder of a trusted package."""
-    if not any(name == package or name.startswith(f"{package}.") for package in trusted):
-        raise UntrustedConfigError(
-            f"hydra.searchpath must have packages that you trust, got pkg://{name}. If you trust it, add "
-            f"trust=[{name.partition('.')[0]}] on the command line."
-        )
+    require_allowed(
+        any(name == package or name.startswith(f"{package}.") for package in trusted),
+        "hydra.searchpath",
+        "have packages that you trust",
+        f"pkg://{name}",
+        f"If you trust it, add trust=[{name.partition('.')[0]}] on the command line.",
+    )
     try:
         spec = find_spec(name)
     except ModuleNotFoundError:
@@ -118,13 +114,12 @@ def _is_kind(root: Path, name: str, kind: int) -> bool:
         return False
     mode = path.lstat().st_mode
     inside = os.path.normpath(os.path.realpath(root) + os.sep + name)
-    if stat.S_ISLNK(mode) or os.path.realpath(path) != inside:
-        raise UntrustedConfigError(
-            f"{path} must be a file or a folder below {root}, got a link or a path out of it. "
-            "Copy the file into the folder."
-        )
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-        raise UntrustedConfigError(f"{path} must be a file, got a pipe or a device. Remove it.")
+    is_inside = not stat.S_ISLNK(mode) and os.path.realpath(path) == inside
+    require_allowed(
+        is_inside, path, f"be a file or a folder below {root}", "a link or a path out of it", "Copy the file into the folder."
+    )  # fmt: skip
+    is_kind = stat.S_ISREG(mode) or stat.S_ISDIR(mode)
+    require_allowed(is_kind, path, "be a file", "a pipe or a device", "Remove it.")
     return stat.S_IFMT(mode) == kind
 
 
@@ -133,8 +128,7 @@ def _read(file: Path) -> str:
     with open(os.open(file, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as stream:
         is_file = stat.S_ISREG(os.fstat(stream.fileno()).st_mode)
         content = stream.read(limits.CONFIG_BYTES + 1) if is_file else b""
-    if len(content) > limits.CONFIG_BYTES:
-        _refuse(file, f"{limits.CONFIG_BYTES} bytes")
+    _require_size(len(content) <= limits.CONFIG_BYTES, file, f"{limits.CONFIG_BYTES} bytes")
     try:
         text = content.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -150,21 +144,21 @@ def _check_measures(file: Path, text: str) -> None:
     try:
         for event, values, depth in _measure(text):
             root = root or (event if isinstance(event, yaml.NodeEvent) else None)
-            if values > limits.CONFIG_VALUES:
-                _refuse(file, f"{limits.CONFIG_VALUES} values with its aliases expanded")
-            if depth > limits.CONFIG_DEPTH:
-                _refuse(file, f"{limits.CONFIG_DEPTH} levels")
-            if len(getattr(event, "value", "")) > limits.CONFIG_TEXT:
-                _refuse(file, f"{limits.CONFIG_TEXT} characters in a text")
+            expanded = f"{limits.CONFIG_VALUES} values with its aliases expanded"
+            _require_size(values <= limits.CONFIG_VALUES, file, expanded)
+            _require_size(depth <= limits.CONFIG_DEPTH, file, f"{limits.CONFIG_DEPTH} levels")
+            is_short = len(getattr(event, "value", "")) <= limits.CONFIG_TEXT
+            _require_size(is_short, file, f"{limits.CONFIG_TEXT} characters in a text")
     except yaml.YAMLError:
         return
-    if not isinstance(root, yaml.MappingStartEvent):
-        kinds = {yaml.ScalarEvent: "a scalar", yaml.SequenceStartEvent: "a sequence"}
-        kind = kinds.get(type(root), "an empty file")
-        raise UntrustedConfigError(
-            f"{file} must be keys and values, got {kind}. Write key: value on each line, or choose "
-            f"another one: pfbench list {file.parent.name}"
-        )
+    kinds = {yaml.ScalarEvent: "a scalar", yaml.SequenceStartEvent: "a sequence"}
+    require_allowed(
+        isinstance(root, yaml.MappingStartEvent),
+        file,
+        "be keys and values",
+        kinds.get(type(root), "an empty file"),
+        f"Write key: value on each line, or choose another one: pfbench list {file.parent.name}",
+    )
 
 
 def _measure(text: str) -> Iterator[tuple[yaml.Event, int, int]]:
@@ -186,9 +180,7 @@ def _measure(text: str) -> Iterator[tuple[yaml.Event, int, int]]:
         yield event, values, len(starts)
 
 
-def _refuse(file: Path, limit: str) -> None:
-    """Raise the error of a file that is too large."""
-    raise UntrustedConfigError(
-        f"{file} must have at most {limit}, got more. Write a shorter file, or put the numbers into a "
-        "table that a class reads."
-    )
+def _require_size(ok: bool, file: Path, limit: str) -> None:
+    """Raise UntrustedConfigError unless a file is small enough."""
+    remedy = "Write a shorter file, or put the numbers into a table that a class reads."
+    require_allowed(ok, file, f"have at most {limit}", "more", remedy)

@@ -55,31 +55,29 @@ def job_key(values: Mapping[str, Any], inputs: Inputs | None = None) -> str:
     return extend_key(compute_config_key(values, (*IGNORED_IN_KEY, *defaults)), inputs)
 
 
-# --------------------------------------------------------------------------------------------------
-# Settings of a job that do not belong to one of its objects: seed, threads, precision, device, engine.
-
-
 def check_settings(values: Mapping[str, Any]) -> None:
     """Check the settings of a job that do not belong to one of its objects."""
+    memory = values["memory_limit_gib"]
     valid = {
         **{
             key: type(values[key]) is int and least <= values[key] <= _MOST.get(key, math.inf)
-            for key, least in _INTEGERS.items()
+            for key, (least, _) in _INTEGERS.items()
         },
         "overwrite": type(values.get("overwrite", False)) is bool,
         "oracle_noise": type(values["oracle_noise"]) is bool,
         "pcrb": values["pcrb"] in (True, False, "auto"),
-        "memory_limit_gib": _is_memory_limit(values["memory_limit_gib"]),
+        "memory_limit_gib": memory is None
+        or (type(memory) in (int, float) and 0 < memory < math.inf),
         "dtype": values["dtype"] in ("float32", "float64"),
         "budget": values["budget"] in store.BUDGETS,
         "engine": values["engine"] in ("auto", "eager", "kernels", "tape", "compiled"),
         "device": re.fullmatch(r"cpu|cuda(:\d{1,3})?", str(values["device"])) is not None,
     }
     for key, (requirement, example) in _REQUIREMENTS.items():
-        if not valid[key]:
-            remedy = _advise_integer(key, values[key]) or f"Set {key}={example}."
-            # a text in quotes: "10" is none of the numbers
-            raise ValueError(f"{key} must be {requirement}, got {values.get(key)!r}. {remedy}")
+        value = values.get(key)
+        remedy = _advise_integer(key, value) or f"Set {key}={example}."
+        # a text in quotes: "10" is none of the numbers
+        require(valid[key], key, f"be {requirement}", repr(value), remedy)
     require(
         not values["first_run"] + values["runs"] > RUN_NUMBERS,
         "first_run + runs",
@@ -87,34 +85,25 @@ def check_settings(values: Mapping[str, Any]) -> None:
         f"{values['first_run']} + {values['runs']}",
         "Larger run numbers would repeat random numbers: use another seed.",
     )
-    if values["device"] != "cpu":
-        _check_device(values["device"])
+    if (device := values["device"]) != "cpu":
+        import torch
 
-
-def _check_device(device: str) -> None:
-    """Check that a CUDA device is there."""
-    import torch
-
-    count = torch.cuda.device_count()
-    require(
-        not (torch.device(device).index or 0) >= count,
-        "device",
-        f"be cpu or one of {count} CUDA devices",
-        device,
-        "Use device=cpu.",
-    )
+        count = torch.cuda.device_count()
+        is_there = (torch.device(device).index or 0) < count
+        require(
+            is_there, "device", f"be cpu or one of {count} CUDA devices", device, "Use device=cpu."
+        )
 
 
 _LARGEST = 1_000_000_000  # a number that is advised
-# with minimum
-_INTEGERS = {"runs": 1, "particles": 2, "first_run": 0, "threads": 1, "seed": 0, "score_steps": 0}
-_EXAMPLES = {
-    "runs": 100,
-    "particles": 500,
-    "first_run": 0,
-    "threads": 1,
-    "seed": 1,
-    "score_steps": 10,
+# whole numbers with minimum and example
+_INTEGERS = {
+    "runs": (1, 100),
+    "particles": (2, 500),
+    "first_run": (0, 0),
+    "threads": (1, 1),
+    "seed": (0, 1),
+    "score_steps": (0, 10),
 }
 # threads beyond the cores only wait, and OpenMP ends the process with a fault if there are many
 _MOST = {"threads": max(256, os.cpu_count() or 1)}
@@ -122,9 +111,9 @@ _REQUIREMENTS = {  # requirement and valid value by key
     **{
         key: (
             f"a whole number of at least {least}" + f", at most {_MOST.get(key)}" * (key in _MOST),
-            str(_EXAMPLES[key]),
+            str(example),
         )
-        for key, least in _INTEGERS.items()
+        for key, (least, example) in _INTEGERS.items()
     },
     "oracle_noise": ("true (the filter receives the true noise regime) or false", "false"),
     "overwrite": ("true (repeat finished jobs) or false", "false"),
@@ -144,8 +133,3 @@ def _advise_integer(key: str, value: Any) -> str:
     if abs(value) > _LARGEST:
         return f"Choose at most {_LARGEST}."
     return f"Write it without exponent and without a decimal point: {key}={int(value)}."
-
-
-def _is_memory_limit(value: Any) -> bool:
-    """Return whether a value is a memory limit: a positive number, or None."""
-    return value is None or (type(value) in (int, float) and 0 < value < math.inf)

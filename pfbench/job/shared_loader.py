@@ -13,7 +13,7 @@ import pickle
 import re
 import traceback
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from hydra._internal import defaults_list as hydra_defaults
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
@@ -38,10 +38,8 @@ from pfbench.job.file_rules import (
     check_place,
     launchers,
 )
-from pfbench.job.trust import UntrustedConfigError, check_study, trusted_packages
-
-if TYPE_CHECKING:
-    from pfbench.job.search_folders import ForeignFolder
+from pfbench.job.search_folders import ForeignFolder, open_folder
+from pfbench.job.trust import UntrustedConfigError, check_study, require_allowed, trusted_packages
 
 _Object = TypeVar("_Object")
 
@@ -235,8 +233,6 @@ class _SharedRepository(CachingConfigRepository):
         folders: list[ForeignFolder] = []
         for entry in config_search_path.get_path():
             if str(entry.provider).startswith(_SEARCH_PATH):
-                from pfbench.job.search_folders import open_folder
-
                 folders.append(open_folder(str(entry.provider), str(entry.path), self._trusted))
         *others, schema = self.delegate.sources
         self.delegate.sources = [*others, *folders, schema]
@@ -249,11 +245,13 @@ class _SharedRepository(CachingConfigRepository):
         if config_path not in self.cache:
             self.cache[config_path] = self._load(config_path)
         self._loaded += 1
-        if self.has_search_path and self._loaded > limits.LOADED_FILES:
-            raise UntrustedConfigError(
-                f"defaults lists must name at most {limits.LOADED_FILES} files in all, repetitions counted, "
-                f"got more at {config_path}. Shorten the lists of your files, which may name each other."
-            )
+        require_allowed(
+            not self.has_search_path or self._loaded <= limits.LOADED_FILES,
+            "defaults lists",
+            f"name at most {limits.LOADED_FILES} files in all, repetitions counted",
+            f"more at {config_path}",
+            "Shorten the lists of your files, which may name each other.",
+        )
         return self.cache[config_path]
 
     def _load(self, config_path: str) -> ConfigResult | None:
@@ -282,17 +280,18 @@ class _SharedRepository(CachingConfigRepository):
         """Return the source of a file, which must be the only one if it is in a search path."""
         if not self.has_search_path:
             return next((s for s in self.delegate.sources if s.is_config(config_path)), None)
-        from pfbench.job.search_folders import ForeignFolder
-
         holders = [source for source in self.delegate.sources if source.is_config(config_path)]
         folder = next((source for source in holders if isinstance(source, ForeignFolder)), None)
         if folder is not None:
             self.folders[config_path] = folder
         if folder is not None and len(holders) > 1:
             second = next(source for source in holders if source is not folder)
+            group, _, name = config_path.rpartition("/")
+            second_file = f"pfbench's own {group or 'main file'} {name}"
+            if isinstance(second, ForeignFolder):
+                second_file = f"{second.file_of(config_path)}"
             raise UntrustedConfigError(
-                f"{folder.file_of(config_path)} must have another name than "
-                f"{_name_file(second, config_path)}, got the same. Rename your file."
+                f"{folder.file_of(config_path)} must have another name than {second_file}, got the same. Rename your file."
             )
         return holders[0] if holders else None
 
@@ -308,16 +307,6 @@ class _StoredNode:
 
     def __hash__(self) -> int:
         return id(self._node)
-
-
-def _name_file(source: ConfigSource, config_path: str) -> str:
-    """Return the place of a file, for messages."""
-    from pfbench.job.search_folders import ForeignFolder
-
-    group, _, name = config_path.rpartition("/")
-    if isinstance(source, ForeignFolder):
-        return f"{source.file_of(config_path)}"
-    return f"pfbench's own {group or 'main file'} {name}"
 
 
 def _find_version(source: ConfigSource, config_path: str, schema: ConfigSource) -> Hashable | None:
@@ -369,43 +358,44 @@ def check_composed(
 ) -> None:
     """Check a composed configuration."""
     check_study(tree._get_node("study")._value() if "study" in tree else None)  # not resolved
-    if tree.hydra.job.chdir:
-        raise UntrustedConfigError(
-            "hydra.job.chdir must be left out, since the folders of results and data are given from the folder of the command, "
-            f"got {tree.hydra.job.chdir}. Set results_dir=... and reports_dir=... for other folders."
-        )
+    require_allowed(
+        not tree.hydra.job.chdir,
+        "hydra.job.chdir",
+        "be left out, since the folders of results and data are given from the folder of the command",
+        tree.hydra.job.chdir,
+        "Set results_dir=... and reports_dir=... for other folders.",
+    )
     for group, name in tree.hydra.runtime.choices.items():
-        if isinstance(name, str) and (name.startswith("/") or ".." in name.split("/")):
-            raise UntrustedConfigError(
-                f"{group} must be the name of a file in its group, got {name!r}. Use its name."
-            )
+        is_path = isinstance(name, str) and (name.startswith("/") or ".." in name.split("/"))
+        require_allowed(
+            not is_path, group, "be the name of a file in its group", repr(name), "Use its name."
+        )
     if compose_reference is None:
         return
     launcher = tree.hydra.runtime.choices.get("hydra/launcher")
     is_shipped = launcher in launchers()  # another one is of a folder of the user's own
     pattern = r"[+~]*hydra/launcher" if is_shipped else r"[+~]*hydra[/.]launcher"
-    others = [word for word in _list_setting_words(words) if not re.match(pattern, word)]
+    # the words that set what is compared, without the search path
+    keys = rf"[+~]*({'|'.join((*_SETTINGS, *_DATA, 'hydra'))})\b"
+    others = [
+        word
+        for word in words
+        if re.match(keys, word) and not re.match(rf"[+~]*hydra\.searchpath\b|{pattern}", word)
+    ]
     reference = compose_reference(
         [*others, f"hydra/launcher={launcher if is_shipped else 'basic'}"]
     )
     for (key, value), (_, expected) in zip(
         _list_settings(tree, words), _list_settings(reference, words), strict=True
     ):
-        if value != expected and (is_shipped or key != "hydra.launcher"):
-            raise UntrustedConfigError(
-                f"{key} must be set on the command line, got {value!r:.200} from a file. "
-                f"Remove the key from the file, and add {key}=... to the command."
-            )
-
-
-def _list_setting_words(words: Sequence[str]) -> list[str]:
-    """Return the words that set what is compared, without the search path."""
-    keys = "|".join((*_SETTINGS, *_DATA, "hydra"))
-    return [
-        word
-        for word in words
-        if re.match(rf"[+~]*({keys})\b", word) and not re.match(r"[+~]*hydra\.searchpath\b", word)
-    ]
+        is_own_launcher = key == "hydra.launcher" and not is_shipped
+        require_allowed(
+            value == expected or is_own_launcher,
+            key,
+            "be set on the command line",
+            f"{value!r:.200} from a file",
+            f"Remove the key from the file, and add {key}=... to the command.",
+        )
 
 
 def _list_settings(tree: Any, words: Sequence[str]) -> Iterator[tuple[str, Any]]:
@@ -431,8 +421,6 @@ def _has_key(values: Any, key: str) -> bool:
 
 def to_plain(tree: Any) -> dict[str, Any]:
     """Return an unresolved configuration as plain dictionaries and lists."""
-    from omegaconf import OmegaConf
-
     content = OmegaConf.to_container(tree, resolve=False)
     assert isinstance(content, dict)
     return {str(key): value for key, value in content.items()}

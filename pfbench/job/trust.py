@@ -47,6 +47,12 @@ class UntrustedConfigError(ValueError):
     """A configuration names what it may not name, or sets what it may not set."""
 
 
+def require_allowed(ok: object, key: object, must: str, got: object, remedy: str) -> None:
+    """Raise UntrustedConfigError unless a requirement holds, in the form of `require`."""
+    if not ok:
+        raise UntrustedConfigError(f"{key} must {must}, got {got}. {remedy}")
+
+
 def split_trust(words: Sequence[str]) -> tuple[list[str], tuple[str, ...]]:
     """Take the key `trust` out of overrides.
 
@@ -95,16 +101,18 @@ def _parse_packages(texts: Sequence[str]) -> tuple[str, ...]:
     names = [name.strip(" '\"") for text in texts for name in text.strip(" []").split(",")]
     packages = tuple(dict.fromkeys(name for name in names if name))
     for name in packages:
-        if not re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", name):
-            raise UntrustedConfigError(
-                f"trust must be a list of package names, got {name!r}. Use trust=[mylab]."
-            )
+        is_name = re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", name)
+        require_allowed(
+            is_name, "trust", "be a list of package names", f"{name!r}", "Use trust=[mylab]."
+        )
         is_broad = name.split(".")[0] in (*BROAD, "pfbench", *sys.stdlib_module_names)
-        if is_broad and name not in HARMLESS:
-            raise UntrustedConfigError(
-                f"trust must not be a general library, got {name!r}. It can run or delete files. "
-                "Name the package that defines your classes."
-            )
+        require_allowed(
+            not is_broad or name in HARMLESS,
+            "trust",
+            "not be a general library",
+            f"{name!r}",
+            "It can run or delete files. Name the package that defines your classes.",
+        )
     _local.update(packages)
     if packages and _CurrentFolder not in sys.meta_path:
         sys.meta_path.append(_CurrentFolder)
@@ -113,12 +121,13 @@ def _parse_packages(texts: Sequence[str]) -> tuple[str, ...]:
 
 def check_configuration(values: Any, trusted: Sequence[str] = (), path: str = "") -> None:
     """Check all names that instantiation would import, and that nothing is left to resolve."""
-    for key, node in _walk(values, path):
-        if isinstance(node, str) and "${" in node:
-            raise UntrustedConfigError(
-                f"{key} must be resolved, got {node!r}. Remove the escaped interpolation."
+    for key, node in walk_nodes(values, path):
+        if isinstance(node, str):
+            is_resolved = "${" not in node
+            require_allowed(
+                is_resolved, key, "be resolved", repr(node), "Remove the escaped interpolation."
             )
-        if isinstance(node, Mapping):
+        elif isinstance(node, Mapping):
             _check_node(key, node, trusted)
 
 
@@ -128,42 +137,50 @@ def check_study(name: Any) -> str:
     Returns the name as a text.
     """
     name = str(name) if isinstance(name, int | float) else name
-    if not isinstance(name, str) or not STUDY.fullmatch(name) or set(name) == {"."}:
-        raise UntrustedConfigError(
-            f"study must be a name of letters, digits, '_', '-', '+' and '.', got {name!r}. "
-            "Use results_dir=... and reports_dir=... for other folders."
-        )
-    return name
+    require_allowed(
+        isinstance(name, str) and STUDY.fullmatch(name) and set(name) != {"."},
+        "study",
+        "be a name of letters, digits, '_', '-', '+' and '.'",
+        repr(name),
+        "Use results_dir=... and reports_dir=... for other folders.",
+    )
+    return str(name)
 
 
 def check_places(values: Mapping[str, Any]) -> None:
     """Check the folders of results and reports: Hydra makes them before a job begins."""
     for key in ("results_dir", "reports_dir"):
-        if not isinstance(values.get(key, key), str) or values.get(key) == "":
-            raise UntrustedConfigError(
-                f"{key} must be a folder, got {values[key]!r}. Set {key}={key.partition('_')[0]}, or {key}=./5 for a "
-                "name that YAML reads as a number."
-            )
-
-
-def _walk(node: Any, path: str, depth: int = 0) -> Iterator[tuple[str, Any]]:
-    """Yield all nodes of a configuration with their keys."""
-    if depth > limits.CONFIG_DEPTH:
-        raise UntrustedConfigError(
-            f"{path} must have at most {limits.CONFIG_DEPTH} levels, got more. Simplify the configuration."
+        value = values.get(key, key)
+        require_allowed(
+            isinstance(value, str) and value,
+            key,
+            "be a folder",
+            repr(value),
+            f"Set {key}={key.partition('_')[0]}, or {key}=./5 for a name that YAML reads as a number.",
         )
+
+
+def walk_nodes(node: Any, path: str = "", depth: int = 0) -> Iterator[tuple[str, Any]]:
+    """Yield all nodes of a configuration with their keys, each before those inside of it."""
+    require_allowed(
+        depth <= limits.CONFIG_DEPTH,
+        path,
+        f"have at most {limits.CONFIG_DEPTH} levels",
+        "more",
+        "Simplify the configuration.",
+    )
     yield path, node
     if isinstance(node, Mapping):
         for key, value in node.items():
-            yield from _walk(value, f"{path}.{key}" if path else str(key), depth + 1)
+            yield from walk_nodes(value, f"{path}.{key}" if path else str(key), depth + 1)
     elif isinstance(node, list | tuple):
         for index, value in enumerate(node):
-            yield from _walk(value, f"{path}[{index}]", depth + 1)
+            yield from walk_nodes(value, f"{path}[{index}]", depth + 1)
 
 
 def _check_node(key: str, node: Mapping[Any, Any], trusted: Sequence[str]) -> None:
     """Check one dictionary of a configuration."""
-    special = [name for name in node if isinstance(name, str) and re.fullmatch(r"_.*_", name)]
+    special = (name for name in node if isinstance(name, str) and re.fullmatch(r"_.*_", name))
     unknown = [name for name in special if name not in HYDRA_KEYS]
     if unknown:
         raise UntrustedConfigError(
@@ -173,31 +190,33 @@ def _check_node(key: str, node: Mapping[Any, Any], trusted: Sequence[str]) -> No
     if "_target_" not in node:
         return
     target = node["_target_"]
-    requirement = (
-        f"{key}{'.' if key else ''}_target_ must be a public class of pfbench or of a trusted "
-        f"package, got {target!r}. "
+    has_keys = "_args_" not in node or not str(target).startswith("pfbench.")
+    require_allowed(
+        has_keys, key, f"name the arguments of {target}", "_args_", "Write them as keys."
     )
+    remedy = _find_remedy(target, trusted)
+    require_allowed(
+        not remedy, f"{key}._target_".lstrip("."), "be a public class of pfbench or of a trusted package", repr(target), remedy
+    )  # fmt: skip
+
+
+def _find_remedy(target: Any, trusted: Sequence[str]) -> str:
+    """Return what to do about a name that instantiation must not import; empty for one that it may."""
     if not isinstance(target, str) or not NAME.fullmatch(target):
-        raise UntrustedConfigError(requirement + "Write it as pfbench.FOLDER.Class.")
+        return "Write it as pfbench.FOLDER.Class."
     if target.startswith("pfbench."):
-        if "_args_" in node:
-            raise UntrustedConfigError(
-                f"{key} must name the arguments of {target}, got _args_. Write them as keys."
-            )
-        if not _is_public(target):
-            remedy = _suggest_public(target) + "See pfbench.FOLDER.__all__ for the names."
-            raise UntrustedConfigError(requirement + remedy)
-    elif not any(target.startswith(f"{package}.") for package in trusted):
-        package = target.split(".")[0]
-        is_library = package in BROAD or package in sys.stdlib_module_names
-        remedy = (
-            "Remove this node."
-            if is_library
-            else f"If you trust this package, add trust=[{package}] on the command line."
+        public = "See pfbench.FOLDER.__all__ for the names."
+        return "" if _is_public(target) else _suggest_public(target) + public
+    if any(target.startswith(f"{package}.") for package in trusted):
+        return (
+            ""
+            if _is_defined_in(target, trusted)
+            else "The package imports this name from elsewhere."
         )
-        raise UntrustedConfigError(requirement + "Nothing was run. " + remedy)
-    elif not _is_defined_in(target, trusted):
-        raise UntrustedConfigError(requirement + "The package imports this name from elsewhere.")
+    package = target.split(".")[0]
+    if package in BROAD or package in sys.stdlib_module_names:
+        return "Nothing was run. Remove this node."
+    return f"Nothing was run. If you trust this package, add trust=[{package}] on the command line."
 
 
 @cache
@@ -229,11 +248,10 @@ def _is_defined_in(target: str, trusted: Sequence[str]) -> bool:
     """Return whether a name is defined by a trusted package, not imported there from another one."""
     parts = target.split(".")
     value: Any = None
-    if importlib.util.find_spec(parts[0]) is None:
-        raise UntrustedConfigError(
-            f"{target} must be importable, but the package {parts[0]} is not installed. Install it, or "
-            "set PYTHONPATH to the folder that contains it."
-        )
+    require_allowed(
+        importlib.util.find_spec(parts[0]) is not None, target, "be importable", f"the package {parts[0]}, which is not installed",
+        "Install it, or set PYTHONPATH to the folder that contains it.",
+    )  # fmt: skip
     for count in range(len(parts) - 1, 0, -1):
         name = ".".join(parts[:count])
         if not any(name == package or name.startswith(f"{package}.") for package in trusted):
@@ -285,12 +303,7 @@ def list_user_packages(values: Any, trusted: Sequence[str]) -> list[str]:
 
 def list_user_targets(node: Any) -> Iterator[str]:
     """Yield the names of classes that are defined by neither pfbench nor a general library."""
-    if isinstance(node, Mapping):
-        target = node.get("_target_")
+    for _, value in walk_nodes(node):
+        target = value.get("_target_") if isinstance(value, Mapping) else None
         if isinstance(target, str) and target.split(".")[0] not in ("pfbench", *BROAD):
             yield target
-        for value in node.values():
-            yield from list_user_targets(value)
-    elif isinstance(node, list | tuple):
-        for value in node:
-            yield from list_user_targets(value)

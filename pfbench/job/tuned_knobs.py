@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pfbench.core.parameter_checks import require
 from pfbench.results.paper_block import PAPER, add_world, conf_dir, name_world
 
 TUNED = "tuned"  # group of the knobs that `pfbench tune` chose, which no job stores
@@ -49,11 +50,9 @@ def _find_world(node: Any, choices: Mapping[str, str]) -> dict[str, Any]:
     content: Any = OmegaConf.to_container(node, resolve=False)
     if choice not in (AUTO, NOMINAL):
         return {"world": {"scenario": choice}, "data": choice, **content}
-    if loose := sorted({*content} - {*_PLACES}):
-        raise ValueError(
-            f"{TUNED}.{loose[0]} must be in a file, got a value with {TUNED}={choice}. Choose the file that it "
-            f"changes: {TUNED}=NAME (pfbench list {TUNED})."
-        )
+    loose = min({*content} - {*_PLACES}, default="")
+    remedy = f"Choose the file that it changes: {TUNED}=NAME (pfbench list {TUNED})."
+    require(not loose, f"{TUNED}.{loose}", "be in a file", f"a value with {TUNED}={choice}", remedy)
     worlds = [world for world in content.values() if _is_of(world.get("world", {}), choices)]
     if choice == NOMINAL:
         worlds = [world for world in worlds if world["world"].get("regimes") == [NOMINAL]]

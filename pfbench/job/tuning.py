@@ -42,9 +42,6 @@ from pfbench.results.status import is_diverged
 from pfbench.results.store import DamagedResultError, read_metadata
 from pfbench.stats.error_measures import Array, Flags, mean_per_run, rmse_per_run
 
-# --------------------------------------------------------------------------------------------------
-# Search of the knobs of a filter: all candidates, several noise regimes, seeds that no study scores.
-
 _RUNS_AT_ONCE = 400  # of all candidates and regimes in one pass, which bounds its memory
 TIE = 0.01  # relative difference of two scores that calibration decides
 OBJECTIVE = (
@@ -133,7 +130,14 @@ class CandidateSearch:
         self.words, self.regimes, self.progress = tuple(words), tuple(regimes), progress
         self.start_time_s, self.seconds = start_time_s, 0.0
         self.batches = draw_batches({r: self.compose("ekf", r) for r in self.regimes})
-        _check_start(self.batches[0].episode.time, start_time_s)
+        end = float(self.batches[0].episode.time[-1])
+        require(
+            start_time_s <= end,
+            "report.start_time_s",
+            f"be at most {end:g} s, the end of the episode",
+            f"{start_time_s:g} s",
+            "Use a smaller value.",
+        )
         start_work()
         (self.reference,) = self._score([self.compose("ekf", self.regimes[0])])
 
@@ -203,17 +207,6 @@ class CandidateSearch:
         return scores
 
 
-def _check_start(time: Tensor, start_time_s: float) -> None:
-    """Check that a step remains after the start time."""
-    require(
-        bool((time >= start_time_s).any()),
-        "report.start_time_s",
-        f"be at most {float(time[-1]):g} s, the end of the episode",
-        f"{start_time_s:g} s",
-        "Use a smaller value.",
-    )
-
-
 def with_candidate(config: JobConfig, values: Mapping[str, float]) -> JobConfig:
     """Return a configuration with the knobs of a candidate."""
     if not values:
@@ -253,10 +246,6 @@ def select_errors(
     return error, np.asarray(data["lost"][runs], dtype=bool)
 
 
-# --------------------------------------------------------------------------------------------------
-# Episodes of several noise regimes as one batch: a filter passes over all of them in one call.
-
-
 class RegimeBatch(NamedTuple):
     """Runs of several noise regimes behind one another.
 
@@ -279,15 +268,10 @@ class RegimeBatch(NamedTuple):
 
     def pass_candidates(self, configs: Sequence[JobConfig]) -> TimedFilterPass:
         """Run several candidates of a filter over all runs in one pass, one candidate behind another."""
-        methods = [build_plan(config).method for config in configs]
-        plan = replace(
-            self.plan, config=configs[0], method=join_candidates(methods, len(self.runs))
-        )
-        return pass_filter(plan, *self.repeat(len(configs)), "candidates")
-
-    def repeat(self, times: int) -> tuple[Episode, Tensor]:
-        """Return the episode and the numbers of the runs several times behind one another."""
-        return join_episodes([self.episode] * times), self.runs.repeat(times)
+        joined = join_candidates([build_plan(c).method for c in configs], len(self.runs))
+        plan, count = replace(self.plan, config=configs[0], method=joined), len(configs)
+        episode = join_episodes([self.episode] * count)
+        return pass_filter(plan, episode, self.runs.repeat(count), "candidates")
 
     def list_runs(self) -> Iterator[tuple[str, slice]]:
         """Yield each regime with the places of its runs."""
@@ -438,33 +422,14 @@ def _select(parts: Any, places: Tensor) -> Any:
     return type(parts)(*map(select, parts))
 
 
-# --------------------------------------------------------------------------------------------------
-# Knobs of the filters that are tuned alike: the factor on R, and one knob of the method.
-
 R_FACTORS = (1.0, 2.0, 4.0, 8.0)
 _SCALED, _POWER = "pfbench.filter.ScaledNoise", "pfbench.filter.PowerLikelihoodUpdate"
 
 
-class Knob(NamedTuple):
-    """Knob of a method, as its file states it.
-
-    Attributes:
-        key: Key of the parameter in the settings of the filter.
-        values: Values to try.
-    """
-
-    key: str
-    values: tuple[float, ...]
-
-    @property
-    def name(self) -> str:
-        """Name of the parameter."""
-        return self.key.rpartition(".")[2]
-
-
+# Knob of a method, as its file states it: the key of the parameter in the settings of the filter, and the values to try.
 # Each method has the same number of values, so that each has the same number of candidates.
-KNOBS: Mapping[str, Knob] = {
-    method: Knob(block["knob"]["key"], tuple(block["knob"]["values"]))
+KNOBS: Mapping[str, tuple[str, tuple[float, ...]]] = {
+    method: (block["knob"]["key"], tuple(block["knob"]["values"]))
     for method in list_named_parts("filter")
     if "knob" in (block := read_paper_block("filter", method))
 }
@@ -482,8 +447,9 @@ def list_candidates(method: str, r_factors: Sequence[float] = R_FACTORS) -> list
         method,
         "Only these state a knob in their file.",
     )
-    knob = KNOBS[method]
-    return [{"r_factor": r, knob.name: v} for r, v in product(r_factors, knob.values)]
+    key, values = KNOBS[method]
+    name = key.rpartition(".")[2]
+    return [{"r_factor": r, name: v} for r, v in product(r_factors, values)]
 
 
 def apply_candidate(node: Mapping[str, Any], values: Mapping[str, float]) -> dict[str, Any]:

@@ -82,9 +82,9 @@ def test_finished_rows_are_kept_until_a_source_changes(
 
 
 def test_an_unknown_name_is_refused_before_any_work(tmp_path: Path) -> None:
-    said = pfbench("check", "oracles", "moon", home=tmp_path)
+    said = pfbench("check", "oracles", "earth_radi.meridian_0", home=tmp_path)
     assert said.code == 2
-    assert "oracle must be one of " in said.err
+    assert "got earth_radi. Similar: earth_radii. Use: pfbench check oracles NAME" in said.err
     assert not list(tmp_path.iterdir())
 
 

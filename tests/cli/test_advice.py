@@ -260,10 +260,19 @@ def test_a_sweep_without_a_result_has_no_next_report(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "setting", ["particles=10,abc", "particles=abc,10", "seed=1,1e3", "threads=choice(1,0)"]
+    ("setting", "must"),
+    [
+        ("particles=10,abc", "be a whole number"),
+        ("particles=abc,10", "be a whole number"),
+        ("seed=1,1e3", "be a whole number"),
+        ("threads=choice(1,0)", "be a whole number"),
+        ("filter.resampler.ess_threshold=0.5,1.5", "be in [0, 1], got 1.5"),
+    ],
 )
-def test_a_bad_value_of_a_sweep_is_told_before_a_job_starts(tmp_path: Path, setting: str) -> None:
-    said = pfbench("run", "-m", *WALK, "filter=sir,ekf", setting, home=tmp_path)
+def test_a_bad_value_of_a_sweep_is_told_before_a_job_starts(
+    tmp_path: Path, setting: str, must: str
+) -> None:
+    said = pfbench("run", "-m", *WALK, "filter=sir,apf", setting, home=tmp_path)
     assert said.code == 2
-    assert f"error run: {setting.partition('=')[0]} must be a whole number" in said.err
+    assert f"error run: {setting.partition('=')[0]} must {must}" in said.err
     assert not (tmp_path / "results").exists()

@@ -17,9 +17,9 @@ from checkout import ROOT
 from command_line import environment, pfbench
 
 from pfbench.cli import progress
-from pfbench.cli.completion import make_script
+from pfbench.cli.list import make_script
 from pfbench.cli.new import SCRIPTS
-from pfbench.cli.open import COMMAND as OPEN
+from pfbench.cli.report import OPEN_COMMAND as OPEN
 from pfbench.results import store
 
 WALK = ("scenario=linear_walk", "scenario.steps=5", "runs=3", "particles=30")
@@ -120,10 +120,10 @@ def test_a_dry_run_counts_jobs_and_stores_nothing(
     again = pfbench("run", "--dry-run", "-m", *WALK, "study=s", "filter=ekf,sir", home=tmp_path)
     assert "2 jobs, 1 new, 1 skipped" in again.out
     refused = pfbench(
-        "run", "--dry-run", "-m", *WALK, "study=s", "filter=sir", "filter.particles=0,9", home=tmp_path
+        "run", "--dry-run", "-m", *WALK, "study=s", "filter=sir", "scenario.steps=0,9", home=tmp_path
     )  # fmt: skip
     assert "1 refused" in refused.out
-    assert "filter.particles must be a whole number of at least 2" in refused.out
+    assert "scenario.steps must be a whole number of at least 1" in refused.out
 
 
 def test_the_estimate_grows_with_the_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,16 +149,16 @@ def test_the_state_of_a_study_lists_failed_jobs_with_the_words_that_repeat_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    sweep = pfbench("run", "-m", *WALK, "study=s", "filter=sir", "filter.particles=0,9", home=tmp_path)  # fmt: skip
+    sweep = pfbench("run", "-m", *WALK, "study=s", "filter=sir", "scenario.steps=0,9", home=tmp_path)  # fmt: skip
     assert sweep.code == 1
     said = pfbench("status", "study=s", home=tmp_path)
     assert said.out.startswith("s: 1 finished, 1 failed\n")
     assert re.search(r"mended it: remove \S+results/s/\w+\.failed\.json\n", said.out)
     for text in (sweep.out, said.out):
         (repeat,) = re.findall(r"repeat: pfbench (run .*)", text)
-        assert {"filter.particles=0", "study=s", *WALK} <= set(repeat.split())
+        assert {"scenario.steps=0", "study=s"} <= set(repeat.split())
     assert (
-        "filter.particles must be a whole number of at least 2"
+        "scenario.steps must be a whole number of at least 1"
         in pfbench(*repeat.split(), home=tmp_path).err
     )
     assert pfbench("status", home=tmp_path).out == "s: 1 finished, 1 failed\n"

@@ -125,7 +125,7 @@ def test_several_processes_give_the_bits_of_one_and_a_bad_cell_fails_alone(tmp_p
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     words = (
         *("run", "-m", "scenario=linear_walk", "scenario.steps=30", "runs=4"),
-        *("filter=sir", "filter.particles=0,50,60"),
+        *("filter=sir", "scenario.steps=0,50,60"),
     )
     several, alone = tmp_path / "several", tmp_path / "alone"
     several.mkdir()
@@ -133,7 +133,7 @@ def test_several_processes_give_the_bits_of_one_and_a_bad_cell_fails_alone(tmp_p
     said = process(*words, *launcher, home=several, cwd=several)
     assert said.code == 1
     assert (
-        "failed    linear_walk / nominal / sir   filter.particles must be a whole number of at least 2"
+        "failed    linear_walk / nominal / sir   scenario.steps must be a whole number of at least 1"
         in said.out
     )
     assert len(list((several / "results" / "adhoc").glob("*.failed.json"))) == 1

@@ -197,6 +197,7 @@ def test_an_application_runs_as_that_of_hydra(
         own = cast(Any, HydraConfig.get())
         settings = OmegaConf.to_container(own, resolve=False)
         assert isinstance(settings, dict)
+        assert settings["job"].pop("name") in ("run", "test_shared_loader")  # of the module
         seen[-1].append((OmegaConf.to_container(cfg, resolve=True), settings))
 
     monkeypatch.chdir(tmp_path)

@@ -465,6 +465,10 @@ def test_an_object_of_an_earlier_definition_is_refused(notebook: Notebook) -> No
         (lambda: pfbench.study(3), "study must be the name of a study, got 3"),
         (lambda: pfbench.own(WALK), "own must receive a class or an object, got the part scenario=linear_walk"),
         (lambda: pfbench.own("sir"), "'sir' must have the methods of a part"),
+        (
+            lambda: pfbench.own(type("Sea", (), {"__module__": "builtins", "draw": lambda *_: None})),
+            "Sea must be in a file or a notebook, got a class without a source. Save it in a module.",
+        ),
     ],
 )  # fmt: skip
 def test_bad_input_is_a_sentence(home: Path, call, sentence: str) -> None:

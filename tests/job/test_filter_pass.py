@@ -103,6 +103,27 @@ def test_what_a_process_loads_once_is_not_in_the_time_of_a_step(
     assert result.seconds["filter"] < 0.4
 
 
+@pytest.mark.parametrize(
+    ("world", "method", "is_still"),
+    [
+        ("lorenz63_twin", "sir", True),
+        ("lorenz63_twin", "rpf_copies", False),  # which moves copies
+        ("lorenz63_twin", "ekf", False),
+        ("lorenz63", "sir", False),  # with process noise
+        ("flight_300s", "sir", False),
+    ],
+)
+def test_copies_that_nothing_moves_apart_are_named(
+    world: str, method: str, is_still: bool, tmp_path: Path
+) -> None:
+    plan = build_plan(settings(tmp_path, f"scenario={world}", f"filter={method}"))
+    episode = truncated(plan.draw_episode(plan.runs), 3)
+    notes = filter_pass.describe_unmoved_copies(
+        plan, plan.make_filter_model(episode), episode.record
+    )
+    assert ["filter=rpf_copies" in note for note in notes] == [True] * is_still
+
+
 def test_both_orders_of_two_jobs_have_equal_times(tmp_path: Path) -> None:
     """One filter in two jobs of a process, in several processes: the first is no dearer than the second."""
     code = (

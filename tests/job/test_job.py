@@ -489,27 +489,27 @@ def test_a_failure_does_not_touch_a_good_result(tmp_path: Path) -> None:
 
 def test_a_sweep_goes_on_after_a_bad_cell_and_says_so(tmp_path: Path) -> None:
     said = pfbench(
-        "run", "-m", *WALK, "filter=sir", "runs=2", "filter.particles=0,50,1,60", home=tmp_path
+        "run", "-m", *WALK, "filter=sir", "runs=2", "scenario.steps=0,50,-1,60", home=tmp_path
     )
     assert said.code == 1
-    for number, particles in ((1, 0), (3, 1)):  # on the line of the job, and at the end
-        message = f"filter.particles must be a whole number of at least 2, got {particles}. Use 2 or more, without a point or exponent."
+    for number, steps in ((1, 0), (3, -1)):  # on the line of the job, and at the end
+        message = f"scenario.steps must be a whole number of at least 1, got {steps}. Change scenario.steps."
         assert f"[{number}/4] failed    linear_walk / nominal / sir   {message}   trace" in said.out
         assert (said.out + said.err).count(message) == 2  # and with the words that repeat it
     assert "Error executing job" not in said.err
     assert "error run: all jobs of the sweep must finish, got failed jobs." in said.err
     assert "sweep: 2 finished, 0 skipped, 2 failed" in said.out
     folder = tmp_path / "results" / "adhoc"
-    assert sorted(stored(file)[0]["particles"] for file in folder.glob("*.npz")) == [50, 60]
+    assert sorted(stored(file)[0]["steps"] for file in folder.glob("*.npz")) == [50, 60]
     notes = list(folder.glob("*.failed.json"))
     messages = [json.loads(note.read_text())["message"] for note in notes]
     assert len(notes) == 2
     assert all(
         any(
-            f"filter.particles must be a whole number of at least 2, got {n}" in message
+            f"scenario.steps must be a whole number of at least 1, got {n}" in message
             for message in messages
         )
-        for n in (0, 1)
+        for n in (0, -1)
     )
     assert all(str(note) in said.out for note in notes)  # every one is named, not only the first
 

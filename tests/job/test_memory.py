@@ -339,7 +339,7 @@ import sys
 from pfbench.cli.main import main
 from pfbench.job import memory as process_memory
 main(sys.argv[1:])
-print("kibibytes", process_memory.peak_memory() // 1024)  # not getrusage's: that begins with what the process had that started this one
+print("kibibytes", process_memory.read_memory('VmHWM') // 1024)  # not getrusage's: that begins with what the process had that started this one
 """
 
 

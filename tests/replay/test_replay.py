@@ -11,13 +11,14 @@ from synthetic_results import list_results
 
 from pfbench import job
 from pfbench.job.replay import (
+    StoredRun,
     compare_runs,
     describe_agreement,
+    find_run,
     magnification,
     recompute_run,
     replay_config,
 )
-from pfbench.job.run_selection import StoredRun, find_run
 from pfbench.job.trust import UntrustedConfigError
 from pfbench.results import store
 
@@ -44,13 +45,14 @@ def replay(folder: Path, *words: str) -> Said:
     return pfbench("replay", "study=walks", f"reports_dir={folder}/reports", *words, home=folder)
 
 
-@pytest.mark.parametrize("name", ["ekf", "sir"])
-def test_a_run_alone_equals_the_run_of_the_batch(home: Path, name: str) -> None:
+@pytest.mark.parametrize(("name", "label"), [("ekf", "ekf"), ("sir", "sir[particles=30]")])
+def test_a_run_alone_equals_the_run_of_the_batch(home: Path, name: str, label: str) -> None:
+    """Its label is that of the report of the study."""
     said = replay(home, "run=12", f"filter={name}", "scenario=linear_walk", "noise=nominal")
     assert said.code == 0, said.err
-    assert f"run 12 of linear_walk / nominal / linear_walk / {name}, seed" in said.out
+    assert f"run 12 of linear_walk / nominal / linear_walk / {label}, seed" in said.out
     assert "equal in every digit" in said.out or "agree to" in said.out
-    file = next((home / "reports/walks/replay").glob(f"*nominal*_{name}_run_12/traces.csv"))
+    file = next((home / "reports/walks/replay").glob(f"*nominal*_{name}_*run_12/traces.csv"))
     table = pd.read_csv(file)
     (result,) = [
         r
@@ -99,7 +101,10 @@ def test_a_changed_number_is_found_with_its_time(home: Path, tmp_path: Path) -> 
     [
         (("study=wlaks", "run=12", "filter=ekf"), "got wlaks. Similar: walks."),
         (("study=walks", "run=14", "filter=ekf", "noise=nominal"), "10 to 13, got 14"),
-        (("study=walks", "run=x", "filter=ekf"), "run must be a whole number of at least 0, got x"),
+        (
+            ("study=walks", "run=x", "filter=ekf"),
+            "run must be a whole number of at least 0, got 'x'",
+        ),
         (("study=walks", "run=12", "filter=ukf"), "Choose from ekf, sir[particles=30], sir["),
         (
             ("study=walks", "run=12", "filter=ekf"),

@@ -8,7 +8,7 @@ import pytest
 import synthetic_results as synthetic
 from refusals import check_refused
 
-from pfbench.cli.paper import COMMAND as PAPER
+from pfbench.cli.report import PAPER_COMMAND as PAPER
 from pfbench.report.study_report import write_report
 
 

@@ -9,7 +9,7 @@ from checkout import ROOT
 from refusals import check_refused
 
 import pfbench
-from pfbench.cli.compare import COMMAND as COMPARE
+from pfbench.cli.report import COMPARE_COMMAND as COMPARE
 from pfbench.report.published_study import compare_tables, find_witness
 from pfbench.report.stored_study import RUNS_FILE, StoredStudy, read_stored_study
 from pfbench.report.study_report import find_overviews

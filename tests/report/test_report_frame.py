@@ -9,7 +9,7 @@ import synthetic_results as synthetic
 from refusals import check_refused
 from synthetic_results import list_results
 
-from pfbench.job.run_selection import find_run
+from pfbench.job.replay import find_run
 from pfbench.results import conditions, conditions as state_groups, frame, store
 from pfbench.results.looks import study_part_names
 
@@ -243,7 +243,7 @@ def test_a_run_is_found_by_the_settings_of_its_data(tmp_path):
     check_refused(
         [
             (
-                r"scenario must be one of the study, got flight\[gps_sd=3\]",
+                r"scenario must be one of the study demo, got flight\[gps_sd=3\]",
                 lambda: find_run("demo", tmp_path, 0, "ekf", {"scenario": "flight[gps_sd=3]"}),
             ),
             (

@@ -14,7 +14,7 @@ import synthetic_results as synthetic
 from refusals import check_refused
 
 from pfbench.files.atomic_write import hash_content
-from pfbench.job.run_selection import find_run
+from pfbench.job.replay import find_run
 from pfbench.results import store
 from pfbench.results.conditions import load_conditions
 

@@ -21,7 +21,7 @@ from refusals import check_refused
 from pfbench import job
 from pfbench.cli.compose import read_sweep
 from pfbench.cli.messages import format_error
-from pfbench.cli.tune import COMMAND as TUNE
+from pfbench.cli.tune import TUNE_COMMAND as TUNE
 from pfbench.job import tuning
 from pfbench.job.config import FILTER_SETS, TUNED_METHODS, expand_filter_sets
 from pfbench.job.tuned_files import Ratio, compare_errors, decide_fit, find_best
@@ -30,7 +30,6 @@ from pfbench.job.tuning import (
     KNOBS,
     Candidate,
     CandidateSearch,
-    Knob,
     apply_candidate,
     check_seed,
     choose_candidate,
@@ -108,7 +107,7 @@ def test_the_knobs_reach_the_filter(method: str) -> None:
     values = list_candidates(method)[-1]
     changed = apply_candidate(node, values)
     built = job.instantiate({k: v for k, v in changed.items() if k != "paper"})
-    assert stated_values(built, KNOBS[method].key) == values
+    assert stated_values(built, KNOBS[method][0]) == values
 
 
 def stated_values(built: Any, key: str) -> dict[str, float]:
@@ -278,9 +277,7 @@ def test_a_search_finds_that_errors_are_larger_than_the_model_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Outliers of 10 sd in 5 % of the epochs have six times the variance: R x 4 is better than R."""
-    monkeypatch.setattr(
-        tuning, "KNOBS", {"ekf_scaled": Knob("noise_adaptations.0.q_factor", (1.0,))}
-    )
+    monkeypatch.setattr(tuning, "KNOBS", {"ekf_scaled": ("noise_adaptations.0.q_factor", (1.0,))})
     monkeypatch.chdir(tmp_path)
     TUNE([
         "scenario=linear_walk", "scenario.steps=60", "runs=20", "filter=ekf_scaled",
@@ -331,8 +328,8 @@ def test_a_filter_is_added_to_the_file_of_its_world(
         tuning,
         "KNOBS",
         {
-            "ekf_scaled": Knob("noise_adaptations.0.q_factor", (1.0,)),
-            "rpf": Knob("resampler.scale", (0.5, 1.0)),
+            "ekf_scaled": ("noise_adaptations.0.q_factor", (1.0,)),
+            "rpf": ("resampler.scale", (0.5, 1.0)),
         },
     )
     monkeypatch.chdir(tmp_path)

@@ -17,8 +17,7 @@ from pfbench.files.atomic_write import hash_file
 from pfbench.files.limits import LimitError
 from pfbench.job.inputs import check_unchanged, describe_unnamed_files, find_inputs
 from pfbench.job.plan import build_plan
-from pfbench.job.replay import recompute_run
-from pfbench.job.run_selection import StoredRun
+from pfbench.job.replay import StoredRun, recompute_run
 from pfbench.report.study_report import write_report
 from pfbench.results.conditions import load_conditions
 from pfbench.results.paper_block import list_named_parts, read_part
