@@ -16,25 +16,32 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pfbench.claims.claim_lines import TIMING, ClaimPlan, list_dots, read_claim_data
+from pfbench.claims.claim_lines import (
+    TIMING,
+    ClaimPlan,
+    ClaimPoint,
+    list_main_parts,
+    list_points,
+    read_claim_data,
+)
 from pfbench.claims.claim_runs import (
-    CENTRE,
     CLAIMS_STUDY,
-    MOVER,
-    SCREEN,
+    FIRST,
+    MORE,
     Batch,
     Cell,
     ClaimRuns,
+    Decisions,
     StoredValues,
     estimate_seconds,
-    list_batches,
     list_claim_cells,
-    list_dot_cells,
+    list_point_cells,
+    make_batch,
     name_timing,
     write_values,
 )
 from pfbench.claims.measures import MOVED, Measure, measure_runs
-from pfbench.claims.words import DEPENDS, FALSE, OPEN, TRUE, UNDECIDED, ClaimDecision
+from pfbench.claims.words import LOOKS, OPEN, UNDECIDED
 from pfbench.job.config import compose
 from pfbench.results import store
 
@@ -73,15 +80,17 @@ class Task(NamedTuple):
 
 
 class ClaimPrice(NamedTuple):
-    """Price of the next stage of a claim.
+    """Price of the next look of a claim.
 
     Attributes:
         plan: Claim.
-        stage: Stage: screen, centre or mover.
+        draws: Joint draws of the look; 0 for a claim without draws.
+        stage: Runs of each draw: first, or more where it is open.
         tasks: Jobs that are missing.
     """
 
     plan: ClaimPlan
+    draws: int
     stage: str
     tasks: tuple[Task, ...]
 
@@ -91,72 +100,63 @@ class ClaimPrice(NamedTuple):
         return sum(task.seconds for task in self.tasks)
 
 
-Decisions = Mapping[tuple[str, str, str], ClaimDecision]
-
-
 def price_claims(
     plans: Sequence[ClaimPlan], runs: ClaimRuns, decisions: Decisions
 ) -> list[ClaimPrice]:
-    """Price the next stage of each claim that runs can still decide, the cheapest first.
+    """Price the next look of each claim whose word does not stand, the cheapest first.
 
-    Jobs that may refuse are the first of a claim: they take seconds, and one that refuses in all readings decides it.
+    Draws run in their order: those of the cheapest readings alone would be no sample of the grid. Jobs that may refuse
+    are the first of a claim: they take seconds, and one that refuses in all readings decides it.
     """
-    prices = []
-    for plan in plans:
-        mine = [decided for (claim, _, _), decided in decisions.items() if claim == plan.claim.id]
-        for stage in (SCREEN, CENTRE, MOVER):
-            missing = _list_missing(plan, stage, runs, mine)
-            tasks = tuple(sorted(missing, key=lambda task: not may_refuse(task)))
-            if tasks and (stage == SCREEN or any(d.word in (OPEN, DEPENDS) for d in mine)):
-                prices.append(ClaimPrice(plan, stage, tasks))
-                break
-    order = {SCREEN: 0, CENTRE: 1, MOVER: 2}
-    return sorted(prices, key=lambda p: (order[p.stage], p.seconds, p.plan.claim.id))
+    prices = (_price_look(plan, runs, decisions) for plan in plans)
+    found = [price for price in prices if price is not None]
+    return sorted(found, key=lambda price: (price.seconds, price.plan.claim.id))
 
 
-def _list_missing(
-    plan: ClaimPlan, stage: str, runs: ClaimRuns, decisions: Sequence[ClaimDecision]
-) -> Iterator[Task]:
-    """Yield the missing jobs of a claim at a stage."""
-    paper, cells = plan.claim.paper, list_claim_cells(plan)
-    selected = _select_readings(plan, stage, decisions)
-    places = [cell for name, measured in list_dot_cells(plan) if name in selected for cell, _ in measured]  # fmt: skip
-    for cell in dict.fromkeys(places):
-        price = estimate_seconds(paper, cell, runs)
-        for batch in list_batches(paper, stage):
-            if not runs.has(cell, batch, [n for n, m in cells[cell].items() if m.metric != TIMING]):
-                yield Task(paper, cell, batch, cells[cell], seconds=price * batch.runs)
-    if stage == SCREEN:
-        yield from _list_timings(plan, runs)
+def _price_look(plan: ClaimPlan, runs: ClaimRuns, decisions: Decisions) -> ClaimPrice | None:
+    """Price the next look of a claim; None if its word stands or all draws have run."""
+    mine = [decisions[plan.claim.id, column, part] for column, part in list_main_parts(plan)]
+    points = list_points(plan)
+    for look in LOOKS if plan.is_drawn else (0,):
+        chosen = [p for p in points if p.draw < look and (p.draw >= 0) == plan.is_drawn]
+        first = _list_missing(plan, FIRST, chosen, runs)
+        if first or not plan.is_drawn:
+            return ClaimPrice(plan, look, FIRST, first) if first else None
+        if all(d.word != OPEN and d.is_drawn for d in mine):
+            return None
+        undecided = [p for p in chosen if any(d.outcomes[p.name] == UNDECIDED for d in mine if d.word == OPEN)]  # fmt: skip
+        more = _list_missing(plan, MORE, undecided, runs)
+        if more:
+            return ClaimPrice(plan, look, MORE, more)
+    return None
 
 
-def _select_readings(
-    plan: ClaimPlan, stage: str, decisions: Sequence[ClaimDecision]
-) -> Sequence[str]:
-    """Select the readings of a stage: all, the central one, or those that turn the claim or are open."""
-    names = list(list_dots(plan))
-    if stage == SCREEN:
-        return names
-    if stage == CENTRE:
-        return names[:1]
-    outcomes = [(d.outcomes, next(iter(d.outcomes.values()))) for d in decisions]
-    return [
-        name for name in names[1:]
-        if any(outcome.get(name) in (UNDECIDED, TRUE, FALSE) and outcome.get(name) != first for outcome, first in outcomes)
-    ]  # fmt: skip
+def _list_missing(plan: ClaimPlan, stage: str, points: Sequence[ClaimPoint], runs: ClaimRuns) -> tuple[Task, ...]:  # fmt: skip
+    """List the missing jobs of a claim in some readings, those that may refuse first."""
+    paper, tasks = plan.claim.paper, list[Task]()
+    for point in points:
+        batch, cells = make_batch(paper, point, stage), dict[Cell, dict[str, Measure]]()
+        for cell, measure in list_point_cells(plan, point):
+            cells.setdefault(cell, {})[measure.name] = measure
+        for cell, measures in cells.items():
+            if not runs.has(cell, batch, [n for n, m in measures.items() if m.metric != TIMING]):
+                price = estimate_seconds(paper, cell, runs) * batch.runs
+                tasks.append(Task(paper, cell, batch, measures, seconds=price))
+    tasks += _list_timings(plan, points, runs)
+    return tuple(sorted(tasks, key=lambda task: not may_refuse(task)))
 
 
-def _list_timings(plan: ClaimPlan, runs: ClaimRuns) -> Iterator[Task]:
-    """Yield the timings of a claim that are missing: of the runs of the screen, or as many as take five minutes.
+def _list_timings(plan: ClaimPlan, points: Sequence[ClaimPoint], runs: ClaimRuns) -> Iterator[Task]:  # fmt: skip
+    """Yield the timings of a claim that are missing: of the runs of a reading, or as many as take five minutes.
 
     A filter that takes hours has thousands of updates in each step of three runs.
     """
     comparisons = [c for parts in plan.parts.values() for c in parts if c.a.measure.metric == TIMING]  # fmt: skip
     if not comparisons:
         return
-    batch = list_batches(plan.claim.paper, SCREEN)[0]
-    for _, measured in list_dot_cells(plan):
-        cells = [cell for cell, _ in measured]
+    for point in points:
+        batch = make_batch(plan.claim.paper, point, FIRST)
+        cells = [cell for cell, _ in list_point_cells(plan, point)]
         start = 0
         for c in [c for parts in plan.parts.values() for c in parts]:
             size = sum(bool(side.filter) for side in (c.a, c.b))
@@ -403,11 +403,11 @@ def find_measures(plans: Sequence[ClaimPlan]) -> dict[Cell, dict[str, Measure]]:
 
 
 def merge_tasks(tasks: Sequence[Task], plans: Sequence[ClaimPlan]) -> list[Task]:
-    """List each job once, with the quantities of all claims that use it; timings follow their jobs."""
+    """List each job once, with the quantities of all claims that use it, draw by draw; timings follow."""
     measures = find_measures(plans)
     once = {(task.cell, task.batch): task for task in tasks}
     merged = [t._replace(measures=measures.get(t.cell, {})) for t in once.values()]
-    return [t for t in merged if not t.timed] + [t for t in merged if t.timed]
+    return sorted(merged, key=lambda task: (bool(task.timed), task.batch))
 
 
 def describe_words(decisions: Decisions) -> dict[str, str]:

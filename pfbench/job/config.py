@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pfbench.core.parameter_checks import require
 from pfbench.files import limits
-from pfbench.job.readings import make_reading, read_reading_table
+from pfbench.job.readings import JOINER, make_reading, read_reading_table
 from pfbench.job.trust import (
     UntrustedConfigError,
     check_configuration,
@@ -220,9 +220,12 @@ class _LazyGroup(dict[str, Any]):
 
     list_names: Callable[[], list[str]]
     make: Callable[[str], Any]
+    joiner: str | None = None  # of names that stand for several at once
 
     def __contains__(self, name: object) -> bool:
-        return name != "None.yaml" and name in self.list_names()  # `null` of a defaults list
+        parts = str(name).removesuffix(".yaml").split(self.joiner)
+        is_listed = {f"{part}.yaml" for part in parts} <= {*self.list_names()}
+        return name != "None.yaml" and is_listed  # `null` of a defaults list
 
     def keys(self) -> Any:
         return self.list_names()
@@ -240,7 +243,7 @@ def register_experiments() -> None:
 
     repo = ConfigStore.instance().repo
     repo[READING] = {
-        path.stem: _LazyGroup(partial(_list_readings, path.stem), partial(_make_reading, path.stem))
+        path.stem: _LazyGroup(partial(_list_readings, path.stem), partial(_make_reading, path.stem), JOINER)
         for path in (conf_dir() / READING).glob("*.yaml")
     }
     for group in (
@@ -482,7 +485,7 @@ def expand_filter_sets(words: Sequence[str]) -> list[str]:
 
 READING = "reading"
 CLASSES = ("printed", "cited", "ours", "fitted")
-_STATED = {"factor", "class", "why", "filters", "cites", "completions", "claims"}
+_STATED = {"factor", "class", "why", "filters", "cites", "completions"}
 
 
 def name_readings(words: Sequence[str]) -> list[str]:
@@ -520,7 +523,7 @@ def check_reading(paper: str, stated: Any) -> None:
     require(
         isinstance(stated, Mapping) and {"factor", "class", "why"} <= set(stated) <= _STATED,
         key,
-        "state factor, class and why, perhaps filters, cites, completions and claims",
+        "state factor, class and why, perhaps filters, cites and completions",
         f"{stated!r:.120}",
         "Correct the file.",
     )
