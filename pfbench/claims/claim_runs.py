@@ -53,7 +53,6 @@ SEEDS = (2001, 2002, 2003)  # of listed readings
 VALUES_SUFFIX = ".values.json"
 PUBLISHED_VALUES = "values.json.gz"  # of all runs, in the folder of the page
 LISTED, FIRST, MORE = "listed", "first", "more"  # runs of a listed reading, of a joint draw, and those that follow if it is open
-_OF_DRAW = 1000  # numbers of runs that a joint draw has for itself
 Cell = tuple[str, ...]
 
 
@@ -103,11 +102,6 @@ class StoredValues:
     def batch(self) -> Batch:
         """Runs of the job."""
         return Batch(self.seed, self.first_run, self.runs)
-
-    @property
-    def draw(self) -> int:
-        """Joint draw that the runs are of; -1 for those of a listed reading."""
-        return self.first_run // _OF_DRAW if self.seed == JOINT_SEED else -1
 
 
 class Series(NamedTuple):
@@ -162,9 +156,9 @@ class ClaimRuns:
             for record in self.find(cell)
         )
 
-    def join(self, cell: Cell, name: str, draw: int = -1) -> Series | None:
-        """Join the values of a quantity in a joint draw, or in a listed reading; None without runs."""
-        records = [r for r in self.find(cell) if name in r.values and not r.failed and r.draw == draw]  # fmt: skip
+    def join(self, cell: Cell, name: str, of_draws: bool = False) -> Series | None:
+        """Join the values of a quantity over the runs of joint draws, or of listed readings; None without runs."""
+        records = [r for r in self.find(cell) if name in r.values and not r.failed and (r.seed == JOINT_SEED) == of_draws]  # fmt: skip
         if not records:
             return None
         runs = [r.seed * 2**32 + r.first_run + np.arange(len(r.lost)) for r in records]
@@ -176,12 +170,14 @@ class ClaimRuns:
 
 
 def make_batch(paper: str, point: ClaimPoint, stage: str) -> Batch:
-    """Make the runs of a reading at a stage: the first ones, or those that follow."""
+    """Make the runs of a reading at a stage: the first ones, or those that follow.
+
+    All joint draws have the same runs, so that they share worlds, and jobs of filters that a level does not concern.
+    """
     counts = read_claim_data()["papers"][paper]["runs"]
     if point.draw < 0:
         return Batch(SEEDS[0], 0, counts[LISTED])
-    first_run = _OF_DRAW * point.draw + (counts[FIRST] if stage == MORE else 0)
-    return Batch(JOINT_SEED, first_run, counts[stage])
+    return Batch(JOINT_SEED, counts[FIRST] if stage == MORE else 0, counts[stage])
 
 
 def find_file(folder: Path, cell: Cell, batch: Batch) -> Path:
@@ -262,7 +258,7 @@ def select_points(plan: ClaimPlan, runs: ClaimRuns) -> list[ClaimPoint]:
 def _has_runs(plan: ClaimPlan, point: ClaimPoint, runs: ClaimRuns) -> bool:
     """Return whether all cells of a joint draw have runs, or cannot run."""
     return all(
-        any(r.failed or (r.draw == point.draw and measure.name in r.values) for r in runs.find(cell))
+        any(r.failed or (r.seed == JOINT_SEED and measure.name in r.values) for r in runs.find(cell))
         for cell, measure in list_point_cells(plan, point)
     )  # fmt: skip
 
@@ -315,7 +311,7 @@ def _join_pair(plan: ClaimPlan, point: ClaimPoint, c: LineComparison, runs: Clai
         return CANNOT_RUN
     if c.a.measure.metric == TIMING:
         return _join_times([cell for cell, _ in measured], c, runs)
-    series = [runs.join(cell, measure.name, point.draw) for cell, measure in measured]
+    series = [runs.join(cell, measure.name, point.draw >= 0) for cell, measure in measured]
     present = [s for s in series if s is not None]
     if len(present) < len(series):
         return NOT_RUN

@@ -403,11 +403,11 @@ def find_measures(plans: Sequence[ClaimPlan]) -> dict[Cell, dict[str, Measure]]:
 
 
 def merge_tasks(tasks: Sequence[Task], plans: Sequence[ClaimPlan]) -> list[Task]:
-    """List each job once, with the quantities of all claims that use it, draw by draw; timings follow."""
+    """List each job once, with the quantities of all claims that use it, in their order; timings follow."""
     measures = find_measures(plans)
     once = {(task.cell, task.batch): task for task in tasks}
     merged = [t._replace(measures=measures.get(t.cell, {})) for t in once.values()]
-    return sorted(merged, key=lambda task: (bool(task.timed), task.batch))
+    return sorted(merged, key=lambda task: bool(task.timed))
 
 
 def describe_words(decisions: Decisions) -> dict[str, str]:
