@@ -16,31 +16,43 @@ import yaml
 from markupsafe import Markup
 
 from pfbench.claims.claim_lines import (
+    BESIDE_PART,
+    MUCH_BETTER,
     REPAIRED,
     ClaimPlan,
     read_claim_data,
     read_plans,
     read_proofs,
-    read_readings,
 )
 from pfbench.claims.claim_runs import (
     CLAIMS_STUDY,
     PUBLISHED_VALUES,
     Cell,
     ClaimRuns,
+    Decisions,
     decide_claims,
 )
+from pfbench.claims.curve import render_curve
 from pfbench.claims.ledger import (
     ClaimWord,
     conclude,
     count_by_paper,
     describe_kind,
-    describe_tip,
-    describe_turns,
+    describe_levels,
+    describe_share,
     list_choices,
+    name_reading,
 )
-from pfbench.claims.run_claims import Decisions, Task, describe_words, price_claims
-from pfbench.claims.words import NOT_RUN, OPEN, WORDS, ClaimDecision
+from pfbench.claims.run_claims import Task, describe_words, price_claims
+from pfbench.claims.words import (
+    LOOKS,
+    NOT_RUN,
+    OPEN,
+    REFUTED,
+    WORDS,
+    ClaimDecision,
+    ShownRatio,
+)
 from pfbench.files.recorded_folder import RecordedFolder, find_published_file
 from pfbench.report import RUNS_FILE, count_better_worlds, find_overviews, read_stored_study
 from pfbench.report.page_kit import (
@@ -51,20 +63,24 @@ from pfbench.report.page_kit import (
     render_template,
     with_heading,
 )
+from pfbench.report.writers import format_data_address
 
 _RATES = Path(__file__).with_name("error_rates.yaml")
 COMPARISON = "all_seven"  # study that compares the methods with the Kalman filters of each world
 RULES = (
-    "Confirmed or refuted: the same outcome in all readings that can run, at 2.5 % for all claims of a paper.",
+    "A reading is a level of each factor that the paper leaves open. Joint readings are drawn from the grid of all factors, with equal odds for each level, by a stored seed. All have the same runs.",
+    "A claim is true or false in a reading if that is shown at 2 % on its side, at the first runs or at all. Otherwise it is undecided there, and counts as either.",
+    f"Looks after {', '.join(map(str, LOOKS))} joint readings. Refuted: true in at most 2 %, and in at most 5 % by the interval of the share, 97.5 % on a side. Confirmed: false in as few. Depends: true and false in more than 5 % each, by the same interval.",
+    "A claim that depends names the factor that explains most of the variance of true and false.",
+    f"With fewer than {LOOKS[0]} joint readings, all readings with one level changed must agree, and the word says so. Such a word may turn where two levels change together.",
+    "Worlds of this project and times have no joint readings.",
     "Better is true below a ratio of 1, by however little. If that is not shown, it is false above 0.99.",
-    "Much better: a ratio below 0.8. The same: from 1/1.1 to 1.1. A level: within 20 %. At most twice: below 2.",
+    "Much is a factor: a fifth, a ratio below 0.8, or any amount. The same: from 1/1.1 to 1.1. A level: within 20 %. At most twice: below 2.",
     "A printed ratio has another line, its size: half to twice its logarithm.",
-    "Of several comparisons all must hold. The ratio shown is the one that decides, or else the closest to a border.",
-    "Depends: outcomes of both kinds, after correction over claims times readings.",
+    "A claim is split into atoms: what, against whom, and how much. All must hold. What the paper does not plot is shown beside, and does not count.",
     "Untestable: circular, vacuous, lost, or no reading can run. Open: none of these.",
     "As published is the printed form. What is lost or cannot run is completed, by name, in the central reading.",
-    "A fitted reading is shown and does not count. A repaired form must keep track in the paper's world.",
-    "Two looks, at a half and two per cent on each side: the first runs of seed 2001, and all runs.",
+    "A fitted level is not drawn. A repaired form must keep track in the paper's world.",
 )
 
 
@@ -140,6 +156,7 @@ def make_context(
         "rules": (*RULES, _say_error_rates()),
         "proofs": read_proofs(),
         "n": len(lines),
+        "drawn": sum(row["is_drawn"] for row in rows),
         "jobs": len(runs.records),
         "hours": sum(record.seconds for record in runs.records) / 3600,
         "missing": sum(task.seconds for task in tasks.values()) / 3600,
@@ -159,7 +176,7 @@ def list_claim_blocks(page: Mapping[str, Any]) -> list[Block]:
     )  # fmt: skip
     columns = ("name", "published", "repaired", "tuned", "is")
     return [
-        Block("title", f"{page['n']} claims of five papers, over every plausible reading"),
+        Block("title", f"{page['n']} claims of five papers, over joint readings of each paper"),
         Block("text", f"{counts}.{unrun}"),
         Block("list", [Markup(f"**{plain(paper['name'])}.** {plain(paper['sentence'])}") for paper in page["papers"]]),
         make_rows(heads, [[row[name] for name in columns] for row in page["seven"]], rule="---"),
@@ -175,7 +192,7 @@ def list_claim_blocks(page: Mapping[str, Any]) -> list[Block]:
         Block("list", [f"{', '.join(row['claims'])}: {row['what']} Before: {row['before']}." for row in page["amendments"]]),
         Block("heading", "Rules"),
         Block("list", page["rules"]),
-        Block("text", f"{page['jobs']} jobs, {page['hours']:.1f} hours of processor time spent, {page['missing']:.1f} hours of second looks missing."),
+        Block("text", f"{page['jobs']} jobs, {page['hours']:.1f} hours of processor time spent, {page['missing']:.1f} hours to the next looks missing."),
     ]  # fmt: skip
 
 
@@ -191,14 +208,14 @@ def _list_row(row: Mapping[str, Any]) -> str:
 
 
 def _say_error_rates() -> str:
-    """Say how often simulated papers, whose claims are at a border, have a false word."""
+    """Say how often simulated claims at a border have a false word."""
     stored = yaml.safe_load(_RATES.read_text(encoding="utf-8"))
-    confirmed, refuted = (
-        max(row[name] for row in stored["rates"]) for name in ("false_confirmed", "false_refuted")
-    )
+    confirmed, refuted, depends = (
+        max(row[f"false_{word}"] for row in stored["rates"]) for word in ("confirmed", "refuted", "depends")
+    )  # fmt: skip
     return (
-        f"In {stored['ledgers']} simulated papers with all claims at a border, at most {confirmed:.1%} have a false "
-        f"confirmed, and {refuted:.1%} a false refuted."
+        f"In {stored['claims']} simulated claims at each border, at most {confirmed:.1%} have a false confirmed, {refuted:.1%} a "
+        f"false refuted, and {depends:.1%} a false depends."
     )
 
 
@@ -252,9 +269,14 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
         "figure": f"{claim.figure}: {claim.a}" + (f" and {', '.join(claim.b)}" if claim.b else ""),
         "printed": claim.printed,
         "measured": measured,
-        "border": describe_tip(line),
+        "strongest": _format_strongest(line),
+        "atoms": _list_atoms(claim.id, decisions),
+        "curve": Markup(format_data_address("svg", render_curve(line.plan, decision))) if decision and decision.is_drawn else "",
         "dots": _make_dots(line),
-        "turns": describe_turns(line),
+        "levels": describe_levels(line),
+        "factor": decision.factor if decision else "",
+        "explained": f"{decision.explained:.0%}" if decision else "",
+        "is_drawn": bool(decision and decision.is_drawn),
         "proof": claim.proof,
         "mark": claim.mark,
         "objection": " ".join(row["what"] for row in read_claim_data()["disputed"] if claim.id in row["claims"]),
@@ -265,13 +287,39 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
 
 
 def _format_measured(line: ClaimWord, decision: ClaimDecision | None) -> str:
-    """Format the ratio of a decision with its interval, and name its reading if it is not the central one."""
-    if decision is None or not decision.runs:
+    """Format the ratio in the first reading that has one with its interval, and name that reading if others decide too."""
+    if decision is None or not decision.first[1].runs:
         return ""
-    numbers = _format_ratio(decision.ratio, decision.low, decision.high)
-    first = next(iter(decision.outcomes))
-    where = "" if decision.reading == first else f" ({_name_dot(line, decision.reading)})"
-    return f"{decision.sides} = {numbers}, {decision.runs} runs; smaller in {decision.order:.0%} of them{where}"
+    name, shown = decision.first
+    where = f" ({name_reading(line.plan, name, decision)})" if decision.is_drawn or name != next(iter(decision.outcomes)) else ""  # fmt: skip
+    return _format_shown(shown) + where
+
+
+def _format_shown(shown: ShownRatio) -> str:
+    """Format a ratio: what is divided by what, its interval and runs."""
+    numbers = _format_ratio(shown.ratio, shown.low, shown.high)
+    return f"{shown.sides} = {numbers}, {shown.runs} runs; smaller in {shown.order:.0%} of them"
+
+
+def _format_strongest(line: ClaimWord) -> str:
+    """Format the reading that is the best for a refuted claim."""
+    if line.decision is None or line.word != REFUTED or not line.decision.strongest[1].runs:
+        return ""
+    name, shown = line.decision.strongest
+    return f"{name_reading(line.plan, name, line.decision)}: {_format_shown(shown)}"
+
+
+def _list_atoms(claim: str, decisions: Decisions) -> list[dict[str, str]]:
+    """List the atoms of a claim: what is compared with whom and how much is asked, with the word on it."""
+    rows = []
+    for (name, column, part), decision in decisions.items():
+        portion, _, text = part.partition(", ")
+        is_alone = portion == BESIDE_PART and not any(key[2].startswith(f"{part}, ") for key in decisions if key[:2] == (name, column))  # fmt: skip
+        if name == claim and (text or is_alone):
+            asked = text.replace(MUCH_BETTER, "a fifth better") or decision.first[1].sides
+            beside = ", beside the claim" if portion == BESIDE_PART else ""
+            rows.append({"text": f"{asked} ({column}{beside})", "word": decision.word, "share": describe_share(decision)})  # fmt: skip
+    return rows
 
 
 def _format_ratio(value: float, low: float, high: float) -> str:
@@ -294,24 +342,14 @@ def _format_price(seconds: float) -> str:
 
 
 def _make_dots(line: ClaimWord) -> list[dict[str, str]]:
-    """Make the dots of a claim: a reading each, with outcome and text."""
-    if line.decision is None:
+    """Make the dots of a claim that listed readings decide: outcome and text of each."""
+    decision = line.decision
+    if decision is None or decision.is_drawn:
         return []
     return [
-        {
-            "outcome": outcome.replace(" ", "-"),
-            "text": f"{_name_dot(line, name)}: {outcome}",
-        }
-        for name, outcome in line.decision.outcomes.items()
-    ]
-
-
-def _name_dot(line: ClaimWord, name: str) -> str:
-    """Name a reading, a window of time or a world of this project."""
-    if line.plan.toy:
-        return f"World of this project, {' '.join(line.plan.toy)}"
-    readings = read_readings(line.plan.claim.paper)
-    return readings[name].text.rstrip(".") if name in readings else name
+        {"outcome": outcome.replace(" ", "-"), "text": f"{name_reading(line.plan, name, decision)}: {outcome}"}
+        for name, outcome in decision.outcomes.items()
+    ]  # fmt: skip
 
 
 def make_seven(

@@ -124,6 +124,8 @@ def _price_look(plan: ClaimPlan, runs: ClaimRuns, decisions: Decisions) -> Claim
             return ClaimPrice(plan, look, FIRST, first) if first else None
         if all(d.word != OPEN and d.is_drawn for d in mine):
             return None
+        if look == LOOKS[0]:  # so few cannot confirm or refute, and more readings serve better than more runs
+            continue
         undecided = [p for p in chosen if any(d.outcomes[p.name] == UNDECIDED for d in mine if d.word == OPEN)]  # fmt: skip
         more = _list_missing(plan, MORE, undecided, runs)
         if more:
