@@ -91,9 +91,9 @@ class SelectedClaims(NamedTuple):
         return cls(select_plans(names), Path(values["results_dir"]), Path(values["reports_dir"]))
 
     def decide(self) -> tuple[ClaimRuns, Decisions]:
-        """Read the stored runs, and decide all claims of the papers: those of a paper are one family."""
+        """Read the stored runs, and decide the claims."""
         runs = ClaimRuns.read(self.results, self.reports)
-        return runs, decide_claims(select_plans([plan.claim.paper for plan in self.plans]), runs)
+        return runs, decide_claims(self.plans, runs)
 
     def list_prices(self) -> list[ClaimPrice]:
         """List what the next looks of the claims lack."""

@@ -215,7 +215,7 @@ def test_a_claim_has_the_central_reading_single_levels_and_joint_draws() -> None
         assert len(points[-1].levels) == len(list_options(plan))
         assert len({tuple(p.levels) for p in points}) == 1
         drawn = [point.draw for point in points if point.draw >= 0]
-        assert drawn == list(range(DRAWS if plan.is_drawn and plan.parts and factors else 0))
+        assert drawn == list(range(DRAWS if plan.is_drawn and list_options(plan) else 0))
 
 
 def test_joint_draws_are_uniform_on_the_grid_and_the_same_for_all_claims_of_a_paper() -> None:
@@ -581,8 +581,7 @@ def test_a_dry_run_prints_prices_and_runs_nothing(tmp_path: Path, capsys: pytest
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_new_clone_runs_only_what_is_not_published(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    monkeypatch.setattr(command, "decide_claims", lambda plans, runs: {})
+def test_a_new_clone_runs_only_what_is_not_published(tmp_path: Path) -> None:
     places = {"": tmp_path, "published": Path(__file__).parents[2] / "reports"}
     prices = [
         command.SelectedClaims(command.select_plans(["C000-7"]), tmp_path, folder).list_prices()

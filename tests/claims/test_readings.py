@@ -127,7 +127,7 @@ def flatten(values: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     ("paper", "levels", "method"),
     [
         ("001", ("grid_4", "shift_centred", "speed_200"), "qmc_polymerised_printed"),
-        ("002", ("receiver_3", "weights_guide"), "cpf"),
+        ("002", ("guide_moments", "receiver_3"), "cpf"),
         ("004", ("chaos_020", "learning_2", "receiver_fine"), "cpso_pf"),
     ],
 )
