@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -64,26 +64,6 @@ class LineComparison(NamedTuple):
     printed: float = math.nan
 
 
-class Reading(NamedTuple):
-    """Level of a factor in which a paper can be read.
-
-    Attributes:
-        name: Name of the level.
-        factor: Factor; "none" for the central reading.
-        grade: Class: printed, cited, ours or fitted.
-        reason: Reason.
-        text: What it is, in words.
-        filters: Filters that it sets; None if it sets the world, so that it concerns all of them.
-    """
-
-    name: str
-    factor: str
-    grade: str
-    reason: str
-    text: str
-    filters: tuple[str, ...] | None
-
-
 class ClaimPoint(NamedTuple):
     """Reading of a claim: a level of each factor at once.
 
@@ -124,13 +104,6 @@ class ClaimPlan(NamedTuple):
     without: tuple[str, ...] = ()
 
     @property
-    def has_other_kind(self) -> bool:
-        """Return whether a comparison has another kind than the claim."""
-        expected = {self.claim.kind, "better"} if self.claim.kind == "number" else {self.claim.kind}
-        kinds = {c.kind for parts in self.parts.values() for c in parts}
-        return not kinds <= expected | {"level", "size"}
-
-    @property
     def is_drawn(self) -> bool:
         """Return whether joint readings are drawn: not in one world of this project, and not for times."""
         comparisons = [c for parts in self.parts.values() for c in parts]
@@ -141,18 +114,6 @@ class ClaimPlan(NamedTuple):
 def read_claim_data() -> Mapping[str, Any]:
     """Read the file of the claims: settings of papers, lines of claims, texts of settings, the seven methods, corrections."""
     return yaml.safe_load(_DATA.read_text(encoding="utf-8"))
-
-
-@cache
-def read_readings(paper: str) -> Mapping[str, Reading]:
-    """Read the readings of a paper by name, the central one first."""
-    entries_read = {}
-    for name, row in sorted(read_reading_table(paper).items()):
-        sets_world = name == CENTRAL_READING or row.get("use") or row.get("set")
-        filters = None if sets_world else tuple(row["filters"])
-        texts = (row["factor"], row["class"], row["why"], row["text"])
-        entries_read[name] = Reading(name, *texts, filters)
-    return {CENTRAL_READING: entries_read[CENTRAL_READING], **entries_read}
 
 
 def read_plans() -> list[ClaimPlan]:
@@ -188,12 +149,9 @@ def _expand(
     """Yield part and comparison of all values of an entry."""
     for more in row.get("rows", ({},)):
         merged = {**row, **more}
-        if "pairs" in merged:
-            alternatives = [{"a": a, "b": b} for a, b in merged["pairs"]]
-        else:
-            alternatives = [{}]
-        for choice in alternatives:
-            full = {**merged, **choice}
+        pairs = merged.get("pairs", ((merged.get("a"), merged.get("b")),))
+        for a, b in pairs:
+            full = {**merged, "a": a, "b": b}
             lists = {key: full[key] for key in _LISTS if isinstance(full.get(key), list)}
             for values in product(*lists.values()):
                 single = {**full, **dict(zip(lists, values, strict=True))}
@@ -255,9 +213,9 @@ def list_options(plan: ClaimPlan) -> dict[str, list[str]]:
     Factors without runs are the window, and how much better "much" is.
     """
     options: dict[str, list[str]] = {}
-    for reading in () if plan.toy else read_readings(plan.claim.paper).values():
-        if reading.factor in plan.claim.factors and reading.grade != "fitted" and reading.name not in plan.without:  # fmt: skip
-            options.setdefault(reading.factor, [CENTRAL_READING]).append(reading.name)
+    for name, row in () if plan.toy else read_reading_table(plan.claim.paper).items():
+        if row["factor"] in plan.claim.factors and row["class"] != "fitted" and name not in plan.without:  # fmt: skip
+            options.setdefault(row["factor"], [CENTRAL_READING]).append(name)
     if plan.windows:
         options[WINDOW] = list(plan.windows)
     if any(c.kind == MUCH_BETTER for parts in plan.parts.values() for c in parts):
@@ -317,23 +275,19 @@ def make_cell(plan: ClaimPlan, point: ClaimPoint, side: Side) -> tuple[str, ...]
     paper = plan.claim.paper
     if plan.toy:
         return (*plan.toy, f"filter={side.filter}", *side.words, *side.world)
-    settings, readings = read_claim_data()["papers"][paper], read_readings(paper)
-    limits: Mapping[str, Sequence[str]] = settings.get("only", {})
-    names = sorted(name for name in point.levels.values() if name in readings and name != CENTRAL_READING)  # fmt: skip
+    settings, rows = read_claim_data()["papers"][paper], read_reading_table(paper)
     concerned = [
-        name for name in names if side.filter in limits.get(name, readings[name].filters or (side.filter,))
-    ]  # fmt: skip
+        name
+        for name in sorted({*point.levels.values()} & rows.keys() - {CENTRAL_READING})
+        if side.filter in settings.get("only", {}).get(name, rows[name]["filters"])
+        or (name not in settings.get("only", {}) and rows[name].keys() & {"use", "set"})
+    ]
     text = side.filter
     for name in concerned:
         text = settings.get("instead", {}).get(name, {}).get(side.filter, text)
     name, words = _split_settings(text)
     reading = JOINER.join(concerned) or CENTRAL_READING
     return (f"reading/{paper}={reading}", f"filter={name}", *words, *side.words, *side.world)
-
-
-def apply_window(measure: Measure, window: tuple[float, float] | None) -> Measure:
-    """Replace the times of a measure by those of a window."""
-    return measure if window is None else replace(measure, start=window[0], end=window[1])
 
 
 # --------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache, reduce
 from itertools import takewhile
 from pathlib import Path
@@ -24,7 +24,6 @@ from pfbench.claims.claim_lines import (
     ClaimPoint,
     LineComparison,
     Side,
-    apply_window,
     list_kinds,
     list_points,
     make_cell,
@@ -33,6 +32,7 @@ from pfbench.claims.claim_lines import (
 from pfbench.claims.measures import METRIC_WORDS, OFF_TRACK, Measure
 from pfbench.claims.words import (
     CANNOT_RUN,
+    FALSE,
     LOOKS,
     NOT_RUN,
     VACUOUS,
@@ -53,6 +53,7 @@ SEEDS = (2001, 2002, 2003)  # of listed readings
 VALUES_SUFFIX = ".values.json"
 PUBLISHED_VALUES = "values.json.gz"  # of all runs, in the folder of the page
 LISTED, FIRST, MORE = "listed", "first", "more"  # runs of a listed reading, of a joint draw, and those that follow if it is open
+_PROVED = {FALSE: WeighedSample(1.0, 0.0)}
 Cell = tuple[str, ...]
 
 
@@ -104,18 +105,7 @@ class StoredValues:
         return Batch(self.seed, self.first_run, self.runs)
 
 
-class Series(NamedTuple):
-    """Values of a cell over all of its jobs.
-
-    Attributes:
-        runs: Seed and number of each run as one number, [n], ascending.
-        values: Values, [n].
-        lost: Lost runs, [n].
-    """
-
-    runs: np.ndarray
-    values: Array
-    lost: np.ndarray
+Series = tuple[np.ndarray, Array, np.ndarray]  # numbers of runs, ascending, their values, and which are lost, [n] each
 
 
 class ClaimRuns:
@@ -166,7 +156,7 @@ class ClaimRuns:
         values = np.concatenate([np.array(r.values[name], dtype=np.float64) for r in records])
         # Jobs of two stages overlap, and a run that counts twice would make its claim look surer than it is.
         numbers, places = np.unique(np.concatenate(runs), return_index=True)
-        return Series(numbers, values[places], lost[places])
+        return numbers, values[places], lost[places]
 
 
 def make_batch(paper: str, point: ClaimPoint, stage: str) -> Batch:
@@ -217,10 +207,10 @@ def name_timing(a: Cell, b: Cell) -> Cell:
     return ("time", *a, "against", *b)
 
 
-def list_claim_cells(plan: ClaimPlan) -> dict[Cell, dict[str, Measure]]:
-    """List the cells of a claim, with the quantities that it compares by name."""
+def list_claim_cells(plan: ClaimPlan, points: Sequence[ClaimPoint] = ()) -> dict[Cell, dict[str, Measure]]:  # fmt: skip
+    """List the cells of a claim in some readings, or in all, with the quantities that it compares by name."""
     cells: dict[Cell, dict[str, Measure]] = {}
-    for point in list_points(plan):
+    for point in points or list_points(plan):
         for cell, measure in list_point_cells(plan, point):
             cells.setdefault(cell, {})[measure.name] = measure
     return cells
@@ -228,16 +218,15 @@ def list_claim_cells(plan: ClaimPlan) -> dict[Cell, dict[str, Measure]]:
 
 def list_point_cells(plan: ClaimPlan, point: ClaimPoint) -> list[tuple[Cell, Measure]]:
     """List the cells and quantities of a reading; none if a proof decides it."""
-    if _find_state(plan, point):
-        return []
-    sides = [side for parts in plan.parts.values() for c in parts for side in (c.a, c.b)]
-    return [_measure_side(plan, point, side) for side in sides if side.filter]
+    comparisons = [] if _find_state(plan, point) else [c for parts in plan.parts.values() for c in parts]  # fmt: skip
+    return [pair for c in comparisons for pair in measure_sides(plan, point, c)]
 
 
-def _measure_side(plan: ClaimPlan, point: ClaimPoint, side: Side) -> tuple[Cell, Measure]:
-    """Return the cell and the quantity of a side in a reading."""
-    measure = apply_window(side.measure, plan.windows.get(point.levels.get(WINDOW, "")))
-    return make_cell(plan, point, side), measure
+def measure_sides(plan: ClaimPlan, point: ClaimPoint, c: LineComparison) -> list[tuple[Cell, Measure]]:  # fmt: skip
+    """Return cell and quantity of the sides that are no numbers, in the window of a reading."""
+    window = plan.windows.get(point.levels.get(WINDOW, ""), ())
+    times = dict(zip(("start", "end"), window, strict=False))
+    return [(make_cell(plan, point, side), replace(side.measure, **times)) for side in (c.a, c.b) if side.filter]  # fmt: skip
 
 
 def _find_state(plan: ClaimPlan, point: ClaimPoint) -> str:
@@ -263,41 +252,31 @@ def _has_runs(plan: ClaimPlan, point: ClaimPoint, runs: ClaimRuns) -> bool:
     )  # fmt: skip
 
 
-_Weighed = Mapping[str, Mapping[str, WeighedSample | str]]  # by kind and reading
+_Weighed = Mapping[str, Mapping[str, WeighedSample]]  # by kind and reading
 
 
 def weigh_comparison(plan: ClaimPlan, points: Sequence[ClaimPoint], c: LineComparison, runs: ClaimRuns) -> _Weighed:  # fmt: skip
-    """Weigh a comparison in some readings, as each of its kinds; a state where there is no sample."""
-    weighed: dict[str, dict[str, WeighedSample | str]] = {kind: {} for kind in list_kinds(c)}
-    for point in points:
-        state = _find_state(plan, point)
-        pair = state or _join_pair(plan, point, c, runs)
-        for kind, column in weighed.items():
-            column[point.name] = pair if isinstance(pair, str) else weigh(pair._replace(kind=kind))
-    return weighed
+    """Weigh a comparison in some readings, as each of its kinds."""
+    pairs = {p.name: _find_state(plan, p) or _join_pair(plan, p, c, runs) for p in points}
+    return {
+        kind: {
+            name: _PROVED.get(pair, WeighedSample(state=pair)) if isinstance(pair, str) else weigh(pair._replace(kind=kind))
+            for name, pair in pairs.items()
+        }
+        for kind in list_kinds(c)
+    }  # fmt: skip
 
 
 def make_dots(points: Sequence[ClaimPoint], weighed: Sequence[_Weighed], kind: str = "") -> dict[str, ReadingDot]:  # fmt: skip
     """Make the dots of a part of a claim, or of an atom with one kind, for which "much" is no factor."""
     dots = {}
     for point in points:
-        levels = {f: level for f, level in point.levels.items() if f != MUCH or not kind}
         if not (kind and point.name.startswith(MUCH)):
             much = kind or point.levels.get(MUCH, "")
-            parts = [column[much if much in column else next(iter(column))][point.name] for column in weighed]  # fmt: skip
-            dots[point.name] = _make_dot(levels, parts, point.draw)
+            parts = [column.get(much, next(iter(column.values())))[point.name] for column in weighed]  # fmt: skip
+            levels = {f: level for f, level in point.levels.items() if f != MUCH or not kind}
+            dots[point.name] = ReadingDot(levels, parts, point.draw)
     return dots
-
-
-def _make_dot(levels: Mapping[str, str], parts: Sequence[WeighedSample | str], draw: int) -> ReadingDot:  # fmt: skip
-    """Make the dot of a reading from its weighed comparisons."""
-    states = [part for part in parts if isinstance(part, str)]
-    for state in (CANNOT_RUN, VACUOUS):
-        if state in states:
-            return ReadingDot(levels, state=state, draw=draw)
-    if states:
-        return ReadingDot(levels, state=states[0], draw=draw)
-    return ReadingDot(levels, [part for part in parts if not isinstance(part, str)], draw=draw)
 
 
 def _join_pair(plan: ClaimPlan, point: ClaimPoint, c: LineComparison, runs: ClaimRuns) -> ClaimSample | str:  # fmt: skip
@@ -305,8 +284,7 @@ def _join_pair(plan: ClaimPlan, point: ClaimPoint, c: LineComparison, runs: Clai
 
     `NOT_RUN` without runs, `CANNOT_RUN` if a job fails, `VACUOUS` if losses of track are compared and no run of either side has one.
     """
-    sides = [side for side in (c.a, c.b) if side.filter]
-    measured = [_measure_side(plan, point, side) for side in sides]
+    measured = measure_sides(plan, point, c)
     if any(record.failed for cell, _ in measured for record in runs.find(cell)):
         return CANNOT_RUN
     if c.a.measure.metric == TIMING:
@@ -315,7 +293,7 @@ def _join_pair(plan: ClaimPlan, point: ClaimPoint, c: LineComparison, runs: Clai
     present = [s for s in series if s is not None]
     if len(present) < len(series):
         return NOT_RUN
-    common = reduce(np.intersect1d, (s.runs for s in present))
+    common = reduce(np.intersect1d, (s[0] for s in present))
     matches = iter([_select(s, common) for s in present])
     n = len(common)
     a, b = (next(matches) if side.filter else (np.full(n, side.number), np.zeros(n, bool)) for side in (c.a, c.b))  # fmt: skip
@@ -361,8 +339,8 @@ def describe_quantity(measure: Measure) -> str:
 
 def _select(series: Series, runs: np.ndarray) -> tuple[Array, np.ndarray]:
     """Select some runs of a series: values and lost runs, [n]."""
-    places = np.searchsorted(series.runs, runs)
-    return series.values[places], series.lost[places]
+    places = np.searchsorted(series[0], runs)
+    return series[1][places], series[2][places]
 
 
 def _join_times(cells: Sequence[Cell], c: LineComparison, runs: ClaimRuns) -> ClaimSample | str:
@@ -402,15 +380,14 @@ def decide_claims(plans: Sequence[ClaimPlan], runs: ClaimRuns) -> Decisions:
 def _list_atoms(comparisons: Sequence[LineComparison]) -> Iterator[tuple[str, str, list[int]]]:
     """Yield name, kind and comparisons of the atoms of a part: what is compared with whom, and how much is asked.
 
-    Worlds of one comparison are one atom. A part of one atom has none.
+    Worlds of one comparison are one atom.
     """
     atoms: dict[tuple[str, str], list[int]] = {}
     for k, c in enumerate(comparisons):
         text = describe_sides(c._replace(a=c.a._replace(world=()), b=c.b._replace(world=())))
         for kind in list_kinds(c):
             atoms.setdefault((text, kind), []).append(k)
-    if len(atoms) > 1:
-        yield from ((f"{text}: {kind}", kind, members) for (text, kind), members in atoms.items())
+    yield from ((f"{text}: {kind}", kind, members) for (text, kind), members in atoms.items())
 
 
 def estimate_seconds(paper: str, cell: Cell, runs: ClaimRuns) -> float:

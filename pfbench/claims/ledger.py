@@ -18,7 +18,6 @@ from pfbench.claims.claim_lines import (
     list_main_parts,
     list_options,
     read_claim_data,
-    read_readings,
 )
 from pfbench.claims.claim_list import KINDS
 from pfbench.claims.claim_runs import Decisions
@@ -36,15 +35,6 @@ from pfbench.claims.words import (
 )
 from pfbench.job.readings import CENTRAL_READING, read_reading_table
 from pfbench.stats.sentences import format_count
-
-_KIND_TEXTS = {
-    "better": "a smaller figure than the other one",
-    "much better": "a figure at least a fifth smaller",
-    "same": "figures within 10 %",
-    "number": "a printed number",
-    "within": "a figure of at most {printed:g} times the other one",
-}
-
 
 class ClaimWord(NamedTuple):
     """Word on a claim.
@@ -143,8 +133,8 @@ def name_level(plan: ClaimPlan, factor: str, level: str) -> str:
     """Name a level of a factor in words."""
     if factor in (MUCH, WINDOW):
         return f"{factor} as {level}"
-    readings = read_readings(plan.claim.paper)
-    return f"{factor} as in the central reading" if level == CENTRAL_READING else readings[level].text.rstrip(".")  # fmt: skip
+    rows = read_reading_table(plan.claim.paper)
+    return f"{factor} as in the central reading" if level == CENTRAL_READING else rows[level]["text"].rstrip(".")  # fmt: skip
 
 
 def name_reading(plan: ClaimPlan, name: str, decision: ClaimDecision) -> str:
@@ -156,27 +146,16 @@ def name_reading(plan: ClaimPlan, name: str, decision: ClaimDecision) -> str:
     return "; ".join(changed) or "Central reading"
 
 
-def describe_kind(plan: ClaimPlan) -> str:
-    """Describe what a claim must show."""
-    if not plan.has_other_kind:
-        return _KIND_TEXTS[plan.claim.kind]
-    comparisons = [c for parts in plan.parts.values() for c in parts]
-    texts = (_KIND_TEXTS[c.kind].format(printed=c.printed) for c in comparisons)
-    return "; ".join(dict.fromkeys(texts))
-
-
 def list_choices(plan: ClaimPlan) -> list[str]:
     """List the choices of this project that enter a claim: completions of the central reading, and own levels."""
     paper = plan.claim.paper
     if plan.toy:
         return ["a world of this project: " + ", ".join(plan.toy)]
-    completed = [
-        entry["why"] for entry in read_reading_table(paper)[CENTRAL_READING].get("completions", ())
-    ]
-    names = [level for levels in list_options(plan).values() for level in levels]
-    readings = read_readings(paper)
-    ours = [readings[name] for name in dict.fromkeys(names) if name in readings]
-    return [*completed, *(f"{r.text} {r.reason}" for r in ours if r.grade == "ours")]
+    rows = read_reading_table(paper)
+    completed = [entry["why"] for entry in rows[CENTRAL_READING].get("completions", ())]
+    names = [level for levels in list_options(plan).values() for level in levels[1:]]
+    ours = [rows[name] for name in names if rows.get(name, {}).get("class") == "ours"]
+    return [*completed, *(f"{row['text']} {row['why']}" for row in ours)]
 
 
 def count_by_paper(lines: Sequence[ClaimWord]) -> dict[str, dict[str, int]]:

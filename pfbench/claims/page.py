@@ -27,7 +27,6 @@ from pfbench.claims.claim_lines import (
 from pfbench.claims.claim_runs import (
     CLAIMS_STUDY,
     PUBLISHED_VALUES,
-    Cell,
     ClaimRuns,
     Decisions,
     decide_claims,
@@ -37,13 +36,12 @@ from pfbench.claims.ledger import (
     ClaimWord,
     conclude,
     count_by_paper,
-    describe_kind,
     describe_levels,
     describe_share,
     list_choices,
     name_reading,
 )
-from pfbench.claims.run_claims import Task, describe_words, price_claims
+from pfbench.claims.run_claims import describe_words, price_claims
 from pfbench.claims.words import (
     LOOKS,
     NOT_RUN,
@@ -51,7 +49,6 @@ from pfbench.claims.words import (
     REFUTED,
     WORDS,
     ClaimDecision,
-    ShownRatio,
 )
 from pfbench.files.recorded_folder import RecordedFolder, find_published_file
 from pfbench.report import RUNS_FILE, count_better_worlds, find_overviews, read_stored_study
@@ -66,6 +63,7 @@ from pfbench.report.page_kit import (
 from pfbench.report.writers import format_data_address
 
 _RATES = Path(__file__).with_name("error_rates.yaml")
+_SEVEN = ("name", "published", "repaired", "tuned", "is")  # columns of the table of the seven
 COMPARISON = "all_seven"  # study that compares the methods with the Kalman filters of each world
 RULES = (
     "A reading is a level of each factor that the paper leaves open. Joint readings are drawn from the grid of all factors, with equal odds for each level, by a stored seed. All have the same runs.",
@@ -160,7 +158,6 @@ def make_context(
         "jobs": len(runs.records),
         "hours": sum(record.seconds for record in runs.records) / 3600,
         "missing": sum(task.seconds for task in tasks.values()) / 3600,
-        "prices": _list_spent(runs, list(tasks.values())),
         "commits": commits,
         "dirty": sum(record.commit.endswith("-dirty") for record in runs.records),
     }
@@ -174,12 +171,11 @@ def list_claim_blocks(page: Mapping[str, Any]) -> list[Block]:
         "method", "beats its own baseline, as published", "our repair does",
         "our forms, in the study of all seven, beat every single Kalman filter", "as printed, it is",
     )  # fmt: skip
-    columns = ("name", "published", "repaired", "tuned", "is")
     return [
         Block("title", f"{page['n']} claims of five papers, over joint readings of each paper"),
         Block("text", f"{counts}.{unrun}"),
         Block("list", [Markup(f"**{plain(paper['name'])}.** {plain(paper['sentence'])}") for paper in page["papers"]]),
-        make_rows(heads, [[row[name] for name in columns] for row in page["seven"]], rule="---"),
+        make_rows(heads, [[row[name] for name in _SEVEN] for row in page["seven"]], rule="---"),
         *itertools.chain.from_iterable(
             with_heading(Block("heading", paper["name"]), Block("list", [_list_row(row) for row in paper["rows"]])) for paper in page["papers"]
         ),
@@ -219,25 +215,6 @@ def _say_error_rates() -> str:
     )
 
 
-def _list_spent(runs: ClaimRuns, tasks: Sequence[Task]) -> list[dict[str, Any]]:
-    """List jobs and hours spent and missing of each paper; worlds of this project are those of no paper."""
-
-    def find_paper(cell: Cell) -> str:
-        return next((word[8:11] for word in cell if word.startswith("reading/")), "others")
-
-    papers = sorted({find_paper(record.cell) for record in runs.records} | {task.paper for task in tasks})  # fmt: skip
-    return [
-        {
-            "paper": paper,
-            "jobs": sum(find_paper(record.cell) == paper for record in runs.records),
-            "spent": sum(r.seconds for r in runs.records if find_paper(r.cell) == paper) / 3600,
-            "missing_jobs": sum(find_paper(task.cell) == paper for task in tasks),
-            "missing": sum(t.seconds for t in tasks if find_paper(t.cell) == paper) / 3600,
-        }
-        for paper in papers
-    ]
-
-
 def _say_paper(sentence: str, counts: Mapping[str, int]) -> str:
     """Say what became of a paper: its proof, and the words of its claims."""
     numbers = ", ".join(f"{n} {word}" for word, n in counts.items() if n)
@@ -250,8 +227,7 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
     price = prices.get(claim.id, 0.0)
     reason = f"{line.reason}, price {_format_price(price)}" if price and line.state == NOT_RUN else line.reason  # fmt: skip
     statement = f"{line.label}: {reason}" if reason else line.label
-    measured = _format_measured(line, decision)
-    repaired = decisions.get((claim.id, REPAIRED, "direction"))
+    measured = _format_shown(line, decision)
     return {
         "id": claim.id,
         "paper": claim.paper,
@@ -263,13 +239,12 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
         "tip": f"{claim.id}: {statement}. “{claim.words}” {measured}".strip(),
         "repaired": line.repaired,
         "repaired_reason": line.repaired_reason,
-        "repaired_measured": _format_measured(line, repaired),
+        "repaired_measured": _format_shown(line, decisions.get((claim.id, REPAIRED, "direction"))),
         "size": line.size,
-        "kind": describe_kind(line.plan),
         "figure": f"{claim.figure}: {claim.a}" + (f" and {', '.join(claim.b)}" if claim.b else ""),
         "printed": claim.printed,
         "measured": measured,
-        "strongest": _format_strongest(line),
+        "strongest": _format_shown(line, decision, is_best=True) if line.word == REFUTED else "",
         "atoms": _list_atoms(claim.id, decisions),
         "curve": Markup(format_data_address("svg", render_curve(line.plan, decision))) if decision and decision.is_drawn else "",
         "dots": _make_dots(line),
@@ -286,40 +261,28 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
     }  # fmt: skip
 
 
-def _format_measured(line: ClaimWord, decision: ClaimDecision | None) -> str:
-    """Format the ratio in the first reading that has one with its interval, and name that reading if others decide too."""
-    if decision is None or not decision.first[1].runs:
+def _format_shown(line: ClaimWord, decision: ClaimDecision | None, is_best: bool = False) -> str:
+    """Format the ratio in the first reading that has one, or in the best one for the claim, and name it if others decide too."""
+    if decision is None or not decision.ratios:
         return ""
-    name, shown = decision.first
-    where = f" ({name_reading(line.plan, name, decision)})" if decision.is_drawn or name != next(iter(decision.outcomes)) else ""  # fmt: skip
-    return _format_shown(shown) + where
-
-
-def _format_shown(shown: ShownRatio) -> str:
-    """Format a ratio: what is divided by what, its interval and runs."""
+    name, shown = decision.strongest if is_best else decision.first
+    is_central = name == next(iter(decision.outcomes)) and not is_best
+    where = "" if is_central else f" ({name_reading(line.plan, name, decision)})"
     numbers = _format_ratio(shown.ratio, shown.low, shown.high)
-    return f"{shown.sides} = {numbers}, {shown.runs} runs; smaller in {shown.order:.0%} of them"
-
-
-def _format_strongest(line: ClaimWord) -> str:
-    """Format the reading that is the best for a refuted claim."""
-    if line.decision is None or line.word != REFUTED or not line.decision.strongest[1].runs:
-        return ""
-    name, shown = line.decision.strongest
-    return f"{name_reading(line.plan, name, line.decision)}: {_format_shown(shown)}"
+    return f"{shown.sides} = {numbers}, {shown.runs} runs; smaller in {shown.order:.0%} of them{where}"
 
 
 def _list_atoms(claim: str, decisions: Decisions) -> list[dict[str, str]]:
     """List the atoms of a claim: what is compared with whom and how much is asked, with the word on it."""
-    rows = []
-    for (name, column, part), decision in decisions.items():
-        portion, _, text = part.partition(", ")
-        is_alone = portion == BESIDE_PART and not any(key[2].startswith(f"{part}, ") for key in decisions if key[:2] == (name, column))  # fmt: skip
-        if name == claim and (text or is_alone):
-            asked = text.replace(MUCH_BETTER, "a fifth better") or decision.first[1].sides
-            beside = ", beside the claim" if portion == BESIDE_PART else ""
-            rows.append({"text": f"{asked} ({column}{beside})", "word": decision.word, "share": describe_share(decision)})  # fmt: skip
-    return rows
+    return [
+        {
+            "text": f"{part.partition(', ')[2].replace(MUCH_BETTER, 'a fifth better')} ({column}{', beside the claim' * part.startswith(BESIDE_PART)})",
+            "word": decision.word,
+            "share": describe_share(decision),
+        }
+        for (name, column, part), decision in decisions.items()
+        if name == claim and ", " in part
+    ]  # fmt: skip
 
 
 def _format_ratio(value: float, low: float, high: float) -> str:

@@ -10,7 +10,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import replace
-from itertools import repeat
+from itertools import product, repeat
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,8 +35,8 @@ from pfbench.claims.claim_runs import (
     StoredValues,
     estimate_seconds,
     list_claim_cells,
-    list_point_cells,
     make_batch,
+    measure_sides,
     name_timing,
     write_values,
 )
@@ -108,9 +108,8 @@ def price_claims(
     Draws run in their order: those of the cheapest readings alone would be no sample of the grid. Jobs that may refuse
     are the first of a claim: they take seconds, and one that refuses in all readings decides it.
     """
-    prices = (_price_look(plan, runs, decisions) for plan in plans)
-    found = [price for price in prices if price is not None]
-    return sorted(found, key=lambda price: (price.seconds, price.plan.claim.id))
+    prices = filter(None, (_price_look(plan, runs, decisions) for plan in plans))
+    return sorted(prices, key=lambda price: (price.seconds, price.plan.claim.id))
 
 
 def _price_look(plan: ClaimPlan, runs: ClaimRuns, decisions: Decisions) -> ClaimPrice | None:
@@ -124,10 +123,9 @@ def _price_look(plan: ClaimPlan, runs: ClaimRuns, decisions: Decisions) -> Claim
             return ClaimPrice(plan, look, FIRST, first) if first else None
         if all(d.word != OPEN and d.is_drawn for d in mine):
             return None
-        if look == LOOKS[0]:  # so few cannot confirm or refute, and more readings serve better than more runs
-            continue
         undecided = [p for p in chosen if any(d.outcomes[p.name] == UNDECIDED for d in mine if d.word == OPEN)]  # fmt: skip
-        more = _list_missing(plan, MORE, undecided, runs)
+        # so few readings as those of the first look cannot confirm or refute: more of them serve better than more runs
+        more = _list_missing(plan, MORE, undecided if look > LOOKS[0] else (), runs)
         if more:
             return ClaimPrice(plan, look, MORE, more)
     return None
@@ -137,10 +135,8 @@ def _list_missing(plan: ClaimPlan, stage: str, points: Sequence[ClaimPoint], run
     """List the missing jobs of a claim in some readings, those that may refuse first."""
     paper, tasks = plan.claim.paper, list[Task]()
     for point in points:
-        batch, cells = make_batch(paper, point, stage), dict[Cell, dict[str, Measure]]()
-        for cell, measure in list_point_cells(plan, point):
-            cells.setdefault(cell, {})[measure.name] = measure
-        for cell, measures in cells.items():
+        batch = make_batch(paper, point, stage)
+        for cell, measures in list_claim_cells(plan, [point]).items():
             if not runs.has(cell, batch, [n for n, m in measures.items() if m.metric != TIMING]):
                 price = estimate_seconds(paper, cell, runs) * batch.runs
                 tasks.append(Task(paper, cell, batch, measures, seconds=price))
@@ -154,38 +150,24 @@ def _list_timings(plan: ClaimPlan, points: Sequence[ClaimPoint], runs: ClaimRuns
     A filter that takes hours has thousands of updates in each step of three runs.
     """
     comparisons = [c for parts in plan.parts.values() for c in parts if c.a.measure.metric == TIMING]  # fmt: skip
-    if not comparisons:
-        return
-    for point in points:
-        batch = make_batch(plan.claim.paper, point, FIRST)
-        cells = [cell for cell, _ in list_point_cells(plan, point)]
-        start = 0
-        for c in [c for parts in plan.parts.values() for c in parts]:
-            size = sum(bool(side.filter) for side in (c.a, c.b))
-            pair = tuple(cells[start : start + size])
-            start += size
-            name = name_timing(pair[0], pair[-1])
-            if c.a.measure.metric == TIMING and not runs.find(name):
-                # 20 rounds of at least 20 steps take about as long as the job itself
-                rounds = _ROUNDS * _ROUND_S * size * 3
-                run_s = 2.0 * sum(
-                    estimate_seconds(plan.claim.paper, cell, runs) for cell in set(pair)
-                )
-                count = min(batch.runs, max(_FEWEST_TIMED, int((_TIMING_S - rounds) / run_s)))
-                yield Task(
-                    plan.claim.paper, name, batch._replace(runs=count), {}, pair, rounds + count * run_s
-                )  # fmt: skip
+    for point, c in product(points, comparisons):
+        cells = [cell for cell, _ in measure_sides(plan, point, c)]
+        name, batch = name_timing(cells[0], cells[-1]), make_batch(plan.claim.paper, point, FIRST)
+        if not runs.find(name):
+            # 20 rounds of at least 20 steps take about as long as the job itself
+            rounds = _ROUNDS * _ROUND_S * len(cells) * 3
+            run_s = 2.0 * sum(estimate_seconds(plan.claim.paper, cell, runs) for cell in {*cells})
+            count = min(batch.runs, max(_FEWEST_TIMED, int((_TIMING_S - rounds) / run_s)))
+            yield Task(
+                plan.claim.paper, name, batch._replace(runs=count), {}, tuple(cells), rounds + count * run_s
+            )  # fmt: skip
 
 
 def run_claim_task(task: Task, results: str) -> StoredValues:
     """Run a job, or read it if it exists, and write its values."""
-    folder = Path(results) / CLAIMS_STUDY
-    if task.timed:
-        record = _time_in_turn(task, results)
-    else:
-        record = _run_job(task, results)
+    record = (_time_in_turn if task.timed else _run_job)(task, results)
     if not record.failed or may_refuse(task):
-        write_values(folder, record)
+        write_values(Path(results) / CLAIMS_STUDY, record)
     return record
 
 
@@ -248,20 +230,15 @@ def _time_in_turn(task: Task, results: str) -> StoredValues:
     from pfbench.job.step_timing import time_condition
     from pfbench.results.conditions import Condition, JobFile
 
-    cells = list(dict.fromkeys(task.timed))
-    jobs = []
-    for cell in cells:
-        path = run(compose(list_words(cell, task.batch, results))).path
-        jobs.append(JobFile(path, " ".join(cell), store.read_metadata(path)))
-    choices = jobs[0].meta["choices"]
-    names = (choices["scenario"], choices["noise"], choices["model"])
+    paths = {cell: run(compose(list_words(cell, task.batch, results))).path for cell in task.timed}
+    jobs = [JobFile(path, " ".join(cell), store.read_metadata(path)) for cell, path in paths.items()]
+    names = (jobs[0].meta["choices"][group] for group in ("scenario", "noise", "model"))
     begin = time.process_time()
     measured = time_condition(Condition(*names, tuple(jobs)), {}, _ROUNDS, _ROUND_S)
     times = {str(k): measured["jobs"][job.path.stem]["cpu"] for k, job in enumerate(jobs)}
     commit, spent = read_versions()["commit"], time.process_time() - begin
-    zeros = (0,) * _ROUNDS
     return StoredValues(
-        task.cell, *task.batch, "", commit, spent, "", zeros, times if len(times) > 1 else {**times, "1": times["0"]},
+        task.cell, *task.batch, "", commit, spent, "", (0,) * _ROUNDS, times if len(times) > 1 else {**times, "1": times["0"]},
     )  # fmt: skip
 
 
@@ -269,26 +246,14 @@ def run_tasks(
     tasks: Sequence[Task], results: str, workers: int, seconds: float
 ) -> Iterator[tuple[Task, StoredValues]]:
     """Run jobs in at most two processes until the time is over, and yield each as it ends."""
-    if workers == 1:
-        begin = time.monotonic()
-        for task in tasks:
-            if time.monotonic() - begin > seconds:
-                return
-            yield task, run_claim_task(task, results)
-        return
+    end, waiting = time.monotonic() + seconds, list(reversed(tasks))
     context = multiprocessing.get_context("spawn")
-    begin = time.monotonic()
+    running: dict[Future[StoredValues], Task] = {}
     with ProcessPoolExecutor(min(workers, WORKERS), mp_context=context) as pool:
-        waiting = list(reversed(tasks))
-        running: dict[Future[StoredValues], Task] = {}
-        while waiting or running:
-            is_over = time.monotonic() - begin > seconds
-            while waiting and len(running) < workers and not is_over:
+        while running or (waiting and time.monotonic() < end):
+            while waiting and len(running) < workers and time.monotonic() < end:
                 task = waiting.pop()
-                future = pool.submit(run_claim_task, task, results)
-                running[future] = task
-            if not running:
-                return
+                running[pool.submit(run_claim_task, task, results)] = task
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
                 yield running.pop(future), future.result()

@@ -105,12 +105,12 @@ class WeighedSample(NamedTuple):
     Attributes:
         p_true: p-value against the claim being false.
         p_false: p-value against its being true.
-        state: `CANNOT_RUN` or `VACUOUS` of a comparison that says nothing; empty otherwise.
+        state: `NOT_RUN`, `CANNOT_RUN` or `VACUOUS` of a comparison that says nothing; empty otherwise.
         shown: Its ratio.
     """
 
-    p_true: float
-    p_false: float
+    p_true: float = 1.0
+    p_false: float = 1.0
     state: str = ""
     shown: ShownRatio = ShownRatio()
 
@@ -120,31 +120,26 @@ class ReadingDot(NamedTuple):
 
     Attributes:
         levels: Level of each factor.
-        comparisons: Comparisons that must all hold; empty if there is none to decide by.
-        state: Outcome without runs: `NOT_RUN`, `CANNOT_RUN`, `VACUOUS`, `TRUE` or `FALSE` by a proof, or empty.
+        comparisons: Comparisons that must all hold, of those that say something.
         draw: Number of the joint draw; -1 for a reading in a list.
     """
 
     levels: Mapping[str, str]
-    comparisons: Sequence[WeighedSample] = ()
-    state: str = ""
+    comparisons: Sequence[WeighedSample]
     draw: int = -1
 
     @property
     def p_values(self) -> tuple[float, float]:
         """p-values of true and of false."""
-        if self.state:
-            return float(self.state != TRUE), float(self.state != FALSE)
         used = [c for c in self.comparisons if not c.state]
         return max(c.p_true for c in used), min(1.0, len(used) * min(c.p_false for c in used))
 
     @property
     def outcome(self) -> str:
         """Outcome. Better by less than 1 % is true, and not false as well."""
-        if self.state:
-            return self.state
-        if all(c.state for c in self.comparisons):
-            return self.comparisons[0].state if self.comparisons else NOT_RUN
+        states = [c.state for c in self.comparisons]
+        if NOT_RUN in states or all(states):
+            return NOT_RUN if NOT_RUN in states else states[0]
         p_true, p_false = self.p_values
         return TRUE if p_true <= READING_SIDE else FALSE if p_false <= READING_SIDE else UNDECIDED
 
@@ -195,16 +190,19 @@ class ClaimDecision(NamedTuple):
     outcomes: Mapping[str, str]
 
     @property
+    def ratios(self) -> dict[str, ShownRatio]:
+        """Ratios of the readings that have one, by name."""
+        return {name: dot.shown for name, dot in self.readings.items() if dot.shown.runs}
+
+    @property
     def first(self) -> tuple[str, ShownRatio]:
         """Name and ratio of the first reading that has one: the central one, if it can run."""
-        ratios = ((name, dot.shown) for name, dot in self.readings.items())
-        return next(((name, shown) for name, shown in ratios if shown.runs), ("", ShownRatio()))
+        return next(iter(self.ratios.items()), ("", ShownRatio()))
 
     @property
     def strongest(self) -> tuple[str, ShownRatio]:
         """Name and ratio of the reading that is the best for the claim."""
-        ratios = [(name, dot.shown) for name, dot in self.readings.items() if dot.shown.runs]
-        return min(ratios, key=lambda row: row[1].beyond, default=("", ShownRatio()))
+        return min(self.ratios.items(), key=lambda row: row[1].beyond, default=("", ShownRatio()))
 
 
 _Region = tuple[float, float]

@@ -27,7 +27,6 @@ from pfbench.claims.claim_lines import (
     make_cell,
     read_claim_data,
     read_plans,
-    read_readings,
 )
 from pfbench.claims.claim_runs import (
     CLAIMS_STUDY,
@@ -39,13 +38,12 @@ from pfbench.claims.claim_runs import (
     decide_claims,
     describe_sides,
     list_claim_cells,
-    list_point_cells,
     make_batch,
     write_values,
 )
-from pfbench.claims.ledger import conclude, describe_kind, describe_levels, name_reading
+from pfbench.claims.ledger import conclude
 from pfbench.claims.measures import Measure
-from pfbench.claims.page import _format_measured, _format_ratio, _list_atoms, write_claims
+from pfbench.claims.page import _format_ratio, _format_shown, _list_atoms, write_claims
 from pfbench.claims.run_claims import (
     Task,
     _has_equal_mean,
@@ -62,6 +60,7 @@ from pfbench.claims.words import CONFIRMED, DEPENDS, LOOKS, OPEN, REFUTED, WORDS
 from pfbench.cli import claims as command
 from pfbench.job.inputs import find_inputs
 from pfbench.job.moved_clouds import measure_moved_clouds
+from pfbench.job.readings import read_reading_table
 
 PLANS = {plan.claim.id: plan for plan in read_plans()}
 PAPERS = ("000", "001", "002", "003", "004")
@@ -104,7 +103,7 @@ def test_a_claim_whose_central_reading_cannot_run_has_the_numbers_of_one_that_ca
     assert next(iter(decided.outcomes.values())) == "cannot run"
     name, shown = decided.first
     assert (name, shown.ratio, shown.runs) == ("noise_1", 1.0, 20)
-    assert "Process noise of 1 %" in _format_measured(conclude(plan, decisions), decided)
+    assert "Process noise of 1 %" in _format_shown(conclude(plan, decisions), decided)
 
 
 @pytest.mark.parametrize(
@@ -198,7 +197,7 @@ def test_each_claim_has_comparisons_or_a_word_with_a_reason() -> None:
         # no repair of the method of paper 003 is admitted
         assert set(settings["method"]) == set(COLUMNS[: 1 if paper == "003" else 2])
         assert set(settings.get("instead", {})) | set(settings.get("only", {})) <= set(
-            read_readings(paper)
+            read_reading_table(paper)
         )
 
 
@@ -206,10 +205,10 @@ def test_a_claim_has_the_central_reading_single_levels_and_joint_draws() -> None
     for plan in PLANS.values():
         points = list_points(plan)
         assert points[0].name == "central"
-        readings = read_readings(plan.claim.paper)
+        readings = read_reading_table(plan.claim.paper)
         levels = {level for point in points for level in point.levels.values()} & set(readings)
-        assert not any(readings[name].grade == "fitted" for name in levels)
-        factors = {readings[name].factor for name in levels} - {"none"}
+        assert not any(readings[name]["class"] == "fitted" for name in levels)
+        factors = {readings[name]["factor"] for name in levels} - {"none"}
         fitted = {"interval"}  # has no other level
         assert plan.toy or plan.word or factors == set(plan.claim.factors) - fitted
         assert len(points[-1].levels) == len(list_options(plan))
@@ -286,22 +285,13 @@ def draw_values(plan_id: str, ratio: float, runs: int = 0, true: str = "") -> It
     plan = PLANS[plan_id]
     points = [p for p in list_points(plan) if p.draw < 0 or (runs and p.draw < LOOKS[1])]
     is_a = {make_cell(plan, p, c.a) for part in plan.parts.values() for c in part for p in points}
-    for k, (cell, measures) in enumerate(collect_cells(plan, points).items()):
+    for k, (cell, measures) in enumerate(list_claim_cells(plan, points).items()):
         for batch in {make_batch(plan.claim.paper, p, "first") for p in points}:
             n = runs if batch.seed == JOINT_SEED else batch.runs
             g = np.random.default_rng([k, batch.seed])
             size = (0.6 if true and true in cell[0] else ratio) if cell in is_a else 1.0
             draws = {name: list(size * np.exp(0.2 * g.standard_normal(n))) for name in measures}
             yield store(cell, batch._replace(runs=n), draws)
-
-
-def collect_cells(plan: ClaimPlan, points: Sequence[Any]) -> dict[Cell, dict[str, Measure]]:
-    """Collect the cells of some readings."""
-    cells: dict[Cell, dict[str, Measure]] = {}
-    for point in points:
-        for cell, measure in list_point_cells(plan, point):
-            cells.setdefault(cell, {})[measure.name] = measure
-    return cells
 
 
 def test_values_are_stored_whole_and_found_by_their_words(tmp_path: Path) -> None:
@@ -316,8 +306,8 @@ def test_values_are_stored_whole_and_found_by_their_words(tmp_path: Path) -> Non
     assert not runs.has(record.cell, batch._replace(seed=2002))
     series = runs.join(record.cell, "x")
     assert series is not None
-    assert list(series.lost) == [False, False, True]
-    assert series.values[1] == math.inf
+    assert list(series[2]) == [False, False, True]
+    assert series[1][1] == math.inf
 
 
 def test_runs_of_joint_draws_are_those_of_a_fresh_seed_without_repetition() -> None:
@@ -619,19 +609,6 @@ def test_an_objection_stands_at_its_claims_and_in_the_list(tmp_path: Path) -> No
     for row in read_claim_data()["disputed"]:
         assert set(row["claims"]) <= set(PLANS)
         assert text.count(row["what"].replace("'", "&#39;")) == len(row["claims"]) + 1
-
-
-def test_what_a_claim_must_show_is_that_of_its_comparisons() -> None:
-    """Three satellites: at most twice the error with eight, and less than with none."""
-    assert describe_kind(PLANS["002-40"]) == (
-        "a figure of at most 2 times the other one; a smaller figure than the other one"
-    )
-    assert (
-        describe_kind(PLANS["002-38"]) == "figures within 10 %; a smaller figure than the other one"
-    )
-    assert describe_kind(PLANS["002-18"]) == "a printed number"
-    c = next(iter(PLANS["002-40"].parts.values()))[0]
-    assert (c.kind, c.printed, c.a.measure.end) == ("within", 2.0, 660.0)
 
 
 def test_corrections_after_the_first_runs_are_on_the_page(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from pfbench.claims.words import (
     ClaimDecision,
     ClaimSample,
     ReadingDot,
+    WeighedSample,
     bound_share,
     decide_claim,
     weigh,
@@ -121,7 +122,7 @@ def test_a_word_of_listed_readings_needs_all_of_them_and_depends_names_the_facto
     found = decide_claim(dots)
     assert (found.word, found.factor, found.is_drawn) == (DEPENDS, "noise", False)
     assert found.outcomes == {"central": TRUE, "speed_200": TRUE, "noise_5": FALSE}
-    missing = decide_claim({"central": dot(better, speed="20"), "speed": ReadingDot({"speed": "200"}, state=NOT_RUN)})  # fmt: skip
+    missing = decide_claim({"central": dot(better, speed="20"), "speed": ReadingDot({"speed": "200"}, [WeighedSample(state=NOT_RUN)])})  # fmt: skip
     assert missing.word == OPEN
     assert missing.outcomes == {"central": TRUE, "speed": NOT_RUN}
 
@@ -194,7 +195,7 @@ def test_readings_without_information_do_not_count() -> None:
     equal = same._replace(a=same.b)
     lost = better._replace(lost_a=np.ones(90, bool), lost_b=np.ones(90, bool))
     for empty, outcome in (
-        (ReadingDot({}, state=CANNOT_RUN), CANNOT_RUN),
+        (ReadingDot({}, [WeighedSample(state=CANNOT_RUN)]), CANNOT_RUN),
         (dot(equal), VACUOUS),
         (dot(lost), CANNOT_RUN),
     ):
@@ -203,7 +204,7 @@ def test_readings_without_information_do_not_count() -> None:
         assert decide_claim({"x": empty}).word == UNTESTABLE
     drawn = draw_readings(0.0, 100)
     for k in range(7):
-        drawn[f"draw {k}"] = ReadingDot({"x": "0", "y": "0"}, state=CANNOT_RUN, draw=k)
+        drawn[f"draw {k}"] = ReadingDot({"x": "0", "y": "0"}, [WeighedSample(state=CANNOT_RUN)], draw=k)
     found = decide_claim(drawn)
     assert (found.word, found.share.counted) == (OPEN, 93)  # too few for a bound of 5 %
 
@@ -212,7 +213,7 @@ def test_filters_that_are_equal_refute_a_direction_without_a_test() -> None:
     """As two cubature rules on a linear model: false by construction."""
     pair = draw(1.0, n=12)
     assert decide_single(pair._replace(a=pair.b)).word == REFUTED
-    assert decide_claim({"central": ReadingDot({}, state=FALSE)}).word == REFUTED
+    assert decide_claim({"central": ReadingDot({}, [WeighedSample(1.0, 0.0)])}).word == REFUTED
 
 
 def test_a_lost_run_is_worse_than_every_kept_one() -> None:
