@@ -134,6 +134,7 @@ def make_context(
         {
             "key": paper,
             "name": settings["name"],
+            "figures": settings["figures"],
             "sentence": _say_paper(settings["sentence"], counts[paper]),
             "rows": [row for row in rows if row["paper"] == paper],
             "proofs": re.findall(r"P\d+", settings["sentence"]),

@@ -9,6 +9,7 @@ from command_line import pfbench
 from config_cases import GROUPS
 
 from pfbench import job
+from pfbench.claims.claim_lines import read_claim_data
 from pfbench.job.config import CLASSES, check_reading, name_readings
 from pfbench.job.readings import make_reading, read_reading, read_reading_table
 from pfbench.job.trust import UntrustedConfigError
@@ -146,6 +147,27 @@ def test_a_joint_reading_is_all_of_its_levels_and_nothing_else(
         merged |= one
     assert joint == merged
     assert read_reading(paper, "_and_".join(levels))["factor"] == "joint"
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_the_world_of_the_figures_is_a_reading_of_the_paper(paper: str) -> None:
+    """One world a paper: a study, its figures and the ledger cannot differ but by levels that have a name."""
+    for study, reading in read_claim_data()["papers"][paper]["figures"].items():
+        own, named = (
+            {key: value for key, value in flatten(job.compose([*words, "filter=sir"]).values).items() if is_of_world(key)}
+            for words in ([f"+experiment={study}"], [f"reading/{paper}={reading}"])
+        )  # fmt: skip
+        keys = own.keys() | named.keys()
+        assert {key for key in keys if own.get(key, DEFAULT.get(key)) != named.get(key, DEFAULT.get(key))} == set()  # fmt: skip
+
+
+DEFAULT = {"scenario.initial_errors.randomise": True, "model.initial.randomise": True}
+
+
+def is_of_world(key: str) -> bool:
+    """Return whether a key is of the world, and no name of it."""
+    group, *rest = key.split(".")
+    return group in ("scenario", "model", "noise", "particles") and "paper" not in rest
 
 
 def test_a_joint_reading_has_one_level_of_a_factor() -> None:
