@@ -20,7 +20,11 @@ from pfbench.job.readings import CENTRAL_READING, JOINER, read_reading_table
 _DATA = Path(__file__).with_name("claim_lines.yaml")
 PUBLISHED, REPAIRED = "published", "repaired"
 COLUMNS = (PUBLISHED, REPAIRED)
-DIRECTION_PART, SIZE_PART, BESIDE_PART = "direction", "size", "beside"  # beside: shown, and not counted
+DIRECTION_PART, SIZE_PART, BESIDE_PART = (
+    "direction",
+    "size",
+    "beside",
+)  # beside: shown, and not counted
 MUCH, WINDOW = "much", "window"  # factors of a claim that take no runs of their own
 MUCH_BETTER, BETTER = "much better", "better"
 DRAWS, JOINT_SEED = 200, 3001  # joint readings of a claim, and the seed of their levels and runs

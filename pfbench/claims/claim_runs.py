@@ -23,7 +23,6 @@ from pfbench.claims.claim_lines import (
     ClaimPlan,
     ClaimPoint,
     LineComparison,
-    Side,
     list_kinds,
     list_points,
     make_cell,
@@ -52,7 +51,11 @@ CLAIMS_STUDY = "claims_2"  # folder of the jobs
 SEEDS = (2001, 2002, 2003)  # of listed readings
 VALUES_SUFFIX = ".values.json"
 PUBLISHED_VALUES = "values.json.gz"  # of all runs, in the folder of the page
-LISTED, FIRST, MORE = "listed", "first", "more"  # runs of a listed reading, of a joint draw, and those that follow if it is open
+LISTED, FIRST, MORE = (
+    "listed",
+    "first",
+    "more",
+)  # runs of a listed reading, of a joint draw, and those that follow if it is open
 _PROVED = {FALSE: WeighedSample(1.0, 0.0)}
 Cell = tuple[str, ...]
 
@@ -105,7 +108,9 @@ class StoredValues:
         return Batch(self.seed, self.first_run, self.runs)
 
 
-Series = tuple[np.ndarray, Array, np.ndarray]  # numbers of runs, ascending, their values, and which are lost, [n] each
+Series = tuple[
+    np.ndarray, Array, np.ndarray
+]  # numbers of runs, ascending, their values, and which are lost, [n] each
 
 
 class ClaimRuns:
@@ -225,7 +230,7 @@ def list_point_cells(plan: ClaimPlan, point: ClaimPoint) -> list[tuple[Cell, Mea
 def measure_sides(plan: ClaimPlan, point: ClaimPoint, c: LineComparison) -> list[tuple[Cell, Measure]]:  # fmt: skip
     """Return cell and quantity of the sides that are no numbers, in the window of a reading."""
     window = plan.windows.get(point.levels.get(WINDOW, ""), ())
-    times = dict(zip(("start", "end"), window, strict=False))
+    times: dict[str, Any] = dict(zip(("start", "end"), window, strict=False))
     return [(make_cell(plan, point, side), replace(side.measure, **times)) for side in (c.a, c.b) if side.filter]  # fmt: skip
 
 

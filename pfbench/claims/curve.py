@@ -17,7 +17,11 @@ from pfbench.report import RC, FigureSpec, draw_figure
 from pfbench.results.plotting import set_plain_ticks
 
 _COLOURS = {TRUE: "#1a7f55", FALSE: "#c4362b", UNDECIDED: "#8292a0"}
-_WIDTH, _CURVE, _ROW = 6.4, 1.7, 0.135  # inches: of the figure, and heights of the curve and of a level
+_WIDTH, _CURVE, _ROW = (
+    6.4,
+    1.7,
+    0.135,
+)  # inches: of the figure, and heights of the curve and of a level
 _FARTHEST = 1e4  # ratio that is drawn
 
 

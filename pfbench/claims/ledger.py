@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 from pfbench.claims.claim_lines import (
-    COLUMNS,
     DIRECTION_PART,
     MUCH,
     PUBLISHED,
@@ -23,9 +21,7 @@ from pfbench.claims.claim_list import KINDS
 from pfbench.claims.claim_runs import Decisions
 from pfbench.claims.words import (
     CONFIRMED,
-    DEPENDS,
     FALSE,
-    LOOKS,
     NOT_RUN,
     OPEN,
     REFUTED,
@@ -34,7 +30,7 @@ from pfbench.claims.words import (
     ClaimDecision,
 )
 from pfbench.job.readings import CENTRAL_READING, read_reading_table
-from pfbench.stats.sentences import format_count
+
 
 class ClaimWord(NamedTuple):
     """Word on a claim.

@@ -270,7 +270,9 @@ def _format_shown(line: ClaimWord, decision: ClaimDecision | None, is_best: bool
     is_central = name == next(iter(decision.outcomes)) and not is_best
     where = "" if is_central else f" ({name_reading(line.plan, name, decision)})"
     numbers = _format_ratio(shown.ratio, shown.low, shown.high)
-    return f"{shown.sides} = {numbers}, {shown.runs} runs; smaller in {shown.order:.0%} of them{where}"
+    return (
+        f"{shown.sides} = {numbers}, {shown.runs} runs; smaller in {shown.order:.0%} of them{where}"
+    )
 
 
 def _list_atoms(claim: str, decisions: Decisions) -> list[dict[str, str]]:

@@ -231,10 +231,17 @@ def _time_in_turn(task: Task, results: str) -> StoredValues:
     from pfbench.results.conditions import Condition, JobFile
 
     paths = {cell: run(compose(list_words(cell, task.batch, results))).path for cell in task.timed}
-    jobs = [JobFile(path, " ".join(cell), store.read_metadata(path)) for cell, path in paths.items()]
-    names = (jobs[0].meta["choices"][group] for group in ("scenario", "noise", "model"))
+    jobs = [
+        JobFile(path, " ".join(cell), store.read_metadata(path)) for cell, path in paths.items()
+    ]
+    choices = jobs[0].meta["choices"]
     begin = time.process_time()
-    measured = time_condition(Condition(*names, tuple(jobs)), {}, _ROUNDS, _ROUND_S)
+    measured = time_condition(
+        Condition(choices["scenario"], choices["noise"], choices["model"], tuple(jobs)),
+        {},
+        _ROUNDS,
+        _ROUND_S,
+    )
     times = {str(k): measured["jobs"][job.path.stem]["cpu"] for k, job in enumerate(jobs)}
     commit, spent = read_versions()["commit"], time.process_time() - begin
     return StoredValues(

@@ -40,7 +40,10 @@ NOT_RUN, CANNOT_RUN, VACUOUS = "not run", "cannot run", "vacuous"
 LOOKS = (50, 100, 200)  # draws after which the share is looked at
 SIDE = 0.025  # error rate of an end of the interval of the share, over all looks
 READING_SIDE = 0.02  # error rate of an outcome of one reading, over the first runs and all of them
-MOST_TRUE, MOST_BOUND = 0.02, 0.05  # share, and upper end, of a refuted claim; so for the false ones of a confirmed claim
+MOST_TRUE, MOST_BOUND = (
+    0.02,
+    0.05,
+)  # share, and upper end, of a refuted claim; so for the false ones of a confirmed claim
 LEVEL_BOUND = 1.2  # a printed level holds within 20 %
 SIZE_BOUND = 2.0  # a printed ratio holds within this factor of its logarithm
 _MOST_LOST = 0.5  # share of runs that both filters lose, above which a reading cannot run
@@ -275,8 +278,8 @@ def _describe(c: ClaimSample, a: Array, b: Array) -> ShownRatio:
     true_low, true_high = find_borders(c.kind, c.printed)[0]
     beyond = max(location - true_high, true_low - location)
     order = float((d < 0).mean())
-    ends = (math.exp(min(x, 700.0)) for x in (location, low, high))
-    return ShownRatio(*ends, len(a), order, c.sides, beyond)
+    ratio, low, high = (math.exp(min(x, 700.0)) for x in (location, low, high))
+    return ShownRatio(ratio, low, high, len(a), order, c.sides, beyond)
 
 
 def decide_claim(dots: Mapping[str, ReadingDot]) -> ClaimDecision:
@@ -313,7 +316,7 @@ def _judge_share(outcomes: Sequence[str]) -> tuple[str, TrueShare]:
         return REFUTED, share
     if n - true <= MOST_TRUE * n and low >= 1 - MOST_BOUND:
         return CONFIRMED, share
-    return DEPENDS if MOST_BOUND < low and high < 1 - MOST_BOUND else OPEN, share
+    return DEPENDS if low > MOST_BOUND and high < 1 - MOST_BOUND else OPEN, share
 
 
 def bound_share(count: int, n: int) -> float:

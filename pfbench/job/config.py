@@ -243,7 +243,9 @@ def register_experiments() -> None:
 
     repo = ConfigStore.instance().repo
     repo[READING] = {
-        path.stem: _LazyGroup(partial(_list_readings, path.stem), partial(_make_reading, path.stem), JOINER)
+        path.stem: _LazyGroup(
+            partial(_list_readings, path.stem), partial(_make_reading, path.stem), JOINER
+        )
         for path in (conf_dir() / READING).glob("*.yaml")
     }
     for group in (

@@ -19,7 +19,12 @@ from pfbench.results.paper_block import conf_dir
 
 CENTRAL_READING = "central"
 JOINER = "_and_"  # of the levels of a joint reading
-_CLASSES = ("fitted", "ours", "cited", "printed")  # the first one that occurs is that of a joint reading
+_CLASSES = (
+    "fitted",
+    "ours",
+    "cited",
+    "printed",
+)  # the first one that occurs is that of a joint reading
 _OF_ITSELF = ("factor", "class", "why", "filters", "cites", "completions")
 
 

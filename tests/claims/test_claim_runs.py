@@ -4,7 +4,7 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from pfbench.claims.claim_lines import (
     COLUMNS,
     DRAWS,
     JOINT_SEED,
-    ClaimPlan,
     list_options,
     list_points,
     make_cell,
@@ -193,6 +192,7 @@ def test_each_claim_has_comparisons_or_a_word_with_a_reason() -> None:
                 assert sides
                 assert all(side.filter in GROUPS["filter"] for side in sides), plan.claim.id
                 assert c.kind != "size" or 0 < c.printed < 1
+    assert [c.kind for c in PLANS["002-40"].parts["published", "direction"]] == ["within", "better"]
     for paper, settings in read_claim_data()["papers"].items():
         # no repair of the method of paper 003 is admitted
         assert set(settings["method"]) == set(COLUMNS[: 1 if paper == "003" else 2])
@@ -238,7 +238,11 @@ def test_a_level_that_does_not_concern_a_filter_is_left_out_of_its_job() -> None
     points = {point.name: point for point in list_points(plan)}
     assert make_cell(plan, points["each"], c.b) == ("reading/002=each", "filter=cpf_each")
     joint = points["central"]._replace(
-        levels={"adaptation": "adaptation_095", "weights": "weights_model", "receiver": "receiver_3"}
+        levels={
+            "adaptation": "adaptation_095",
+            "weights": "weights_model",
+            "receiver": "receiver_3",
+        }
     )
     assert make_cell(plan, joint, c.b)[0] == "reading/002=receiver_3_and_weights_model"
     assert make_cell(plan, joint, c.a)[0] == "reading/002=adaptation_095_and_receiver_3_and_weights_model"  # fmt: skip
@@ -277,7 +281,9 @@ def store(cell: Cell, batch: Batch, values: dict[str, Any], **changes: Any) -> S
     return replace(record, **changes)
 
 
-def draw_values(plan_id: str, ratio: float, runs: int = 0, true: str = "") -> Iterator[StoredValues]:
+def draw_values(
+    plan_id: str, ratio: float, runs: int = 0, true: str = ""
+) -> Iterator[StoredValues]:
     """Yield values of the cells of a claim, in which a is `ratio` times b; those of joint draws with the numbers of runs.
 
     In joint draws that have the level `true`, it is 0.6 times b.
@@ -336,7 +342,11 @@ def test_a_proof_decides_the_readings_that_it_covers() -> None:
     plan = PLANS["002-32"]
     decision = decide_claims([plan], ClaimRuns([]))["002-32", "published", "direction"]
     assert decision.word == OPEN
-    assert decision.outcomes == {"central": "false", "heading_45": "not run", "heading_80": "not run"}
+    assert decision.outcomes == {
+        "central": "false",
+        "heading_45": "not run",
+        "heading_80": "not run",
+    }
     worse, better = (decide_claims([plan], ClaimRuns(list(draw_values("002-32", ratio)))) for ratio in (1.2, 0.8))  # fmt: skip
     assert worse["002-32", "published", "direction"].word == REFUTED
     assert better["002-32", "published", "direction"].factor == "heading"

@@ -204,7 +204,9 @@ def test_readings_without_information_do_not_count() -> None:
         assert decide_claim({"x": empty}).word == UNTESTABLE
     drawn = draw_readings(0.0, 100)
     for k in range(7):
-        drawn[f"draw {k}"] = ReadingDot({"x": "0", "y": "0"}, [WeighedSample(state=CANNOT_RUN)], draw=k)
+        drawn[f"draw {k}"] = ReadingDot(
+            {"x": "0", "y": "0"}, [WeighedSample(state=CANNOT_RUN)], draw=k
+        )
     found = decide_claim(drawn)
     assert (found.word, found.share.counted) == (OPEN, 93)  # too few for a bound of 5 %
 
