@@ -224,8 +224,8 @@ class _LazyGroup(dict[str, Any]):
 
     def __contains__(self, name: object) -> bool:
         parts = str(name).removesuffix(".yaml").split(self.joiner)
-        is_listed = {f"{part}.yaml" for part in parts} <= {*self.list_names()}
-        return name != "None.yaml" and is_listed  # `null` of a defaults list
+        # None: `null` of a defaults list
+        return name != "None.yaml" and {f"{part}.yaml" for part in parts} <= {*self.list_names()}
 
     def keys(self) -> Any:
         return self.list_names()

@@ -33,11 +33,10 @@ def read_reading_table(paper: str) -> Mapping[str, Mapping[str, Any]]:
     """Read the rows of a paper by name, the central one first."""
     path = conf_dir() / "reading" / f"paper_{paper}.yaml"
     table = yaml.safe_load(path.read_text(encoding="utf-8"))
-    rows = {CENTRAL_READING: {"factor": "none", **table[CENTRAL_READING]}}
-    for factor, levels in table["factors"].items():
-        rows |= {name: {"factor": factor, **row} for name, row in levels.items()}
+    levels = {"none": {CENTRAL_READING: table[CENTRAL_READING]}, **table["factors"]}
     return {
-        name: {**row, "filters": dict(_split_names(row.get("filters")))}
+        name: {"factor": factor, **row, "filters": dict(_split_names(row.get("filters")))}
+        for factor, rows in levels.items()
         for name, row in rows.items()
     }
 
@@ -62,11 +61,13 @@ def read_reading(paper: str, name: str) -> Mapping[str, Any]:
         name,
         f"Their factors are {', '.join(factors)}. Leave out one level of a factor that is there twice, and the central one.",
     )
-    grade = next(grade for grade in _CLASSES if any(row["class"] == grade for row in rows))
-    joint = {"factor": "joint", "class": grade, "why": "levels of several factors at once"}
-    joint["text"] = " ".join(row["text"] for row in rows)
-    parts = {key: reduce(_merge, (row.get(key, {}) for row in rows)) for key in ("filters", "use", "set")}  # fmt: skip
-    return {**joint, **parts}
+    return {
+        "factor": "joint",
+        "class": next(grade for grade in _CLASSES if any(row["class"] == grade for row in rows)),
+        "why": "levels of several factors at once",
+        "text": " ".join(row["text"] for row in rows),
+        **{key: reduce(_merge, (row.get(key, {}) for row in rows)) for key in ("filters", "use", "set")},
+    }  # fmt: skip
 
 
 def _merge(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
@@ -82,7 +83,7 @@ def make_reading(paper: str, name: str) -> dict[str, Any]:
     """Make the content of the file of Hydra of a row."""
     row = read_reading(paper, name)
     overrides = [{f"override /{group}": choice} for group, choice in row.get("use", {}).items()]
-    is_central = name == CENTRAL_READING
-    defaults = [*overrides, "_self_"] if is_central else [CENTRAL_READING, "_self_", *overrides]
+    # a level changes the central reading, which comes first
+    defaults = [*overrides, "_self_"] if name == CENTRAL_READING else [CENTRAL_READING, "_self_", *overrides]  # fmt: skip
     stated = {key: row[key] for key in _OF_ITSELF if row.get(key)}
     return {"defaults": defaults, "reading": {paper: stated}, **row.get("set", {})}

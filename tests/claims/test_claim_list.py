@@ -3,7 +3,6 @@
 from collections import Counter
 from functools import cache
 
-import pytest
 from config_cases import GROUPS
 
 from pfbench.claims.claim_lines import read_proofs
@@ -53,8 +52,3 @@ def test_claims_have_a_kind_a_known_mark_and_a_name_of_their_own() -> None:
     assert len({claim.id for claim in CLAIMS}) == len(CLAIMS)
     assert {claim.kind for claim in CLAIMS} == set(KINDS)
     assert {claim.mark.split(":")[0] for claim in CLAIMS} <= {"circular", "vacuous", "lost", ""}
-
-
-def test_borders_of_true_and_false_do_not_overlap() -> None:
-    assert all(0 < false <= true for true, false in KINDS.values())
-    assert KINDS["much better"][0] == pytest.approx(0.8)

@@ -254,24 +254,12 @@ def test_no_word_has_the_opposite_sign_of_the_verdict_of_a_study_page() -> None:
     assert agreed >= 4
 
 
-def test_halves_of_the_runs_give_no_opposite_words() -> None:
-    """Beyond the level: of 40 claims at the border of true, both words at most once in all."""
-    opposite, decided = 0, 0
-    for seed in range(40):
-        pair = draw((0.75, 1.0)[seed % 2], n=120, seed=seed)
-        words = {decide_single(pair.select(np.arange(120) % 2 == half)).word for half in (0, 1)}
-        opposite += {CONFIRMED, REFUTED} <= words
-        decided += CONFIRMED in words
-    assert opposite <= 1
-    assert decided >= 15  # the planted effect is seen
-
-
-def test_error_rates_of_the_words() -> None:
+@pytest.mark.parametrize("lost", [0.0, pytest.param(0.1, marks=pytest.mark.slow)])
+def test_error_rates_of_the_words(lost: float) -> None:
     """False words at planted shares of 0, 1, 5, 50, 99 and 100 %; the script has 1000 claims for each."""
-    rows = RATES.measure_rates(40, 11)
+    rows = RATES.measure_rates(40, 11, lost)
     for row in rows:
-        for word in ("confirmed", "refuted", "depends"):
-            assert row[f"false_{word}"] <= RATES.allow(40), row
+        assert max(row["false_confirmed"], row["false_refuted"], row["false_depends"]) <= RATES.allow(40), row  # fmt: skip
     words = {(row["share"], row["effect"], row["readings"]): row for row in rows}
     assert words[0.0, "clear", "drawn"]["refuted"] == words[1.0, "clear", "drawn"]["confirmed"] == 1
     assert words[0.5, "clear", "drawn"]["depends"] == 1
@@ -286,13 +274,6 @@ def test_the_rates_of_the_page_keep_the_level() -> None:
             assert row[f"false_{word}"] <= RATES.allow(stored["claims"])
     worst = max(row["false_refuted"] for row in stored["rates"])
     assert f"{worst:.1%} a false refuted" in _say_error_rates()
-
-
-@pytest.mark.slow
-def test_error_rates_with_lost_runs() -> None:
-    for row in RATES.measure_rates(200, 12, lost=0.1):
-        assert row["false_confirmed"] <= RATES.allow(200)
-        assert row["false_refuted"] <= RATES.allow(200)
 
 
 def test_ratio_interval_and_order_of_the_central_reading() -> None:
