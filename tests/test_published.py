@@ -206,7 +206,8 @@ def test_publishing_removes_only_headlines_that_it_made(tmp_path: Path) -> None:
     figure.with_suffix(".svg").write_text("<svg/>")
     publish.publish_report(folder)
     names = {path.name for path in folder.iterdir() if path.is_file()} - {"manifest.json"}
-    assert names == {"report.md", "headline.mine", "headline.svg", "headline.svg.kept"}
+    made = {"report.md", "headline.mine", "headline.svg", "headline.svg.kept"}
+    assert names == made | {"ratios.png", "ratios.svg"}
     assert (folder / "headline.svg.kept").read_text() == "of the user\n"
     assert (folder / "headline.svg").read_text() == "<svg/>"
 
