@@ -55,6 +55,7 @@ def plot_curve(plan: ClaimPlan, decision: ClaimDecision) -> Figure:
         grid = np.array([[dot.levels[factor] == level for dot in dots] for factor, level in rows])
         names = [_name_row(plan, *row) for row in rows]
         seaborn.heatmap(grid, ax=marks, cmap=["white", "#4a5a6a"], vmin=0, vmax=1, cbar=False, xticklabels=False, yticklabels=names, rasterized=True)  # fmt: skip
+        marks.grid(visible=False)
         marks.tick_params(length=0, labelsize=6)
         marks.set_xlabel(f"{len(dots)} readings, sorted by their ratio")
         marks.hlines(np.cumsum([len(levels) for levels in options.values()])[:-1], 0, len(dots), color="#b0b8c0", lw=0.6)  # fmt: skip
