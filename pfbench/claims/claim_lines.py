@@ -211,7 +211,7 @@ def _split_settings(text: str) -> tuple[str, tuple[str, ...]]:
     )
 
 
-def list_options(plan: ClaimPlan) -> dict[str, list[str]]:
+def list_factor_levels(plan: ClaimPlan) -> dict[str, list[str]]:
     """List the levels of each factor of a claim, the central one first, without fitted ones.
 
     Factors without runs are the window, and how much better "much" is.
@@ -245,7 +245,7 @@ def list_points(plan: ClaimPlan) -> list[ClaimPoint]:
 
     The level of a factor in a draw is uniform, and the same for all claims of a paper that have the factor.
     """
-    options = list_options(plan)
+    options = list_factor_levels(plan)
     centre = {factor: levels[0] for factor, levels in options.items()}
     changed = [
         ClaimPoint(_name_level(factor, level), {**centre, factor: level})

@@ -245,8 +245,8 @@ def select_points(plan: ClaimPlan, runs: ClaimRuns) -> list[ClaimPoint]:
     points = list_points(plan)
     listed = [point for point in points if point.draw < 0]
     joint = points[len(listed) :]
-    drawn = list(takewhile(lambda point: _has_runs(plan, point, runs), joint))
-    return [*(listed[:1] if len(drawn) >= LOOKS[0] else listed), *drawn]
+    run = list(takewhile(lambda point: _has_runs(plan, point, runs), joint))
+    return [*(listed[:1] if len(run) >= LOOKS[0] else listed), *run]
 
 
 def _has_runs(plan: ClaimPlan, point: ClaimPoint, runs: ClaimRuns) -> bool:

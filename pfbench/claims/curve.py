@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from pfbench.claims.claim_lines import ClaimPlan, list_options
+from pfbench.claims.claim_lines import ClaimPlan, list_factor_levels
 from pfbench.claims.words import FALSE, TRUE, UNDECIDED, ClaimDecision
 from pfbench.job.readings import read_reading_table
 from pfbench.report import RC, FigureSpec, draw_figure
@@ -38,14 +38,16 @@ def plot_curve(plan: ClaimPlan, decision: ClaimDecision) -> Figure:
     """
     import seaborn
 
-    dots = [dot for dot in decision.readings.values() if dot.outcome in _COLOURS and dot.shown.runs]
-    dots.sort(key=lambda dot: dot.shown.ratio)
-    options, heights = list_options(plan), (_CURVE, _ROW * sum(map(len, list_options(plan).values())))  # fmt: skip
+    dots = [
+        dot for dot in decision.readings.values() if dot.outcome in _COLOURS and dot.effect.runs
+    ]
+    dots.sort(key=lambda dot: dot.effect.ratio)
+    options, heights = list_factor_levels(plan), (_CURVE, _ROW * sum(map(len, list_factor_levels(plan).values())))  # fmt: skip
     rows = [(factor, level) for factor, levels in options.items() for level in levels]
     with rc_context(RC):
         figure = Figure(figsize=(_WIDTH, sum(heights) + 0.5), layout="constrained")
         curve, marks = figure.subplots(2, 1, height_ratios=heights)
-        ratios = np.clip([dot.shown[:3] for dot in dots], 1 / _FARTHEST, _FARTHEST)
+        ratios = np.clip([dot.effect[:3] for dot in dots], 1 / _FARTHEST, _FARTHEST)
         places, colours = np.arange(len(dots)) + 0.5, [_COLOURS[dot.outcome] for dot in dots]
         curve.vlines(places, ratios[:, 1], ratios[:, 2], colors=colours, lw=0.9, alpha=0.5)
         seaborn.scatterplot(x=places, y=ratios[:, 0], c=colours, s=9, linewidth=0, ax=curve, zorder=3)  # fmt: skip

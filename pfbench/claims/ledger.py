@@ -13,8 +13,8 @@ from pfbench.claims.claim_lines import (
     SIZE_PART,
     WINDOW,
     ClaimPlan,
+    list_factor_levels,
     list_main_parts,
-    list_options,
     read_claim_data,
 )
 from pfbench.claims.claim_list import KINDS
@@ -69,7 +69,7 @@ def conclude(plan: ClaimPlan, decisions: Decisions) -> ClaimWord:
     """Conclude on a claim from its decisions, or from what decides it without runs."""
     if plan.word:
         return ClaimWord(plan, plan.word, plan.reason, "", "", "", None)
-    mine = {column: decisions[plan.claim.id, column, part] for column, part in list_main_parts(plan)}  # fmt: skip
+    mine = {column: decisions[plan.claim.id, column, portion] for column, portion in list_main_parts(plan)}  # fmt: skip
     published, repaired = mine[PUBLISHED], mine.get(REPAIRED)
     has_both = {(PUBLISHED, SIZE_PART), (PUBLISHED, DIRECTION_PART)} <= plan.parts.keys()
     return ClaimWord(
@@ -93,8 +93,8 @@ def _explain(plan: ClaimPlan, decision: ClaimDecision) -> str:
     texts = [describe_share(decision)]
     if plan.proved:
         texts += [f"proof {plan.claim.proof} in all readings but those of {', '.join(plan.but)}"]
-    shown = decision.first[1]
-    is_small = KINDS["better"][1] < shown.low < shown.high < 1
+    effect = decision.first[1]
+    is_small = KINDS["better"][1] < effect.low < effect.high < 1
     if decision.word == CONFIRMED and plan.claim.kind != "same" and is_small:
         texts += ["by less than 1 %"]
     return "; ".join(filter(None, texts))
@@ -120,8 +120,8 @@ def describe_levels(line: ClaimWord) -> list[str]:
     for dot in decision.readings.values():
         counts.setdefault(dot.levels[decision.factor], []).append(dot.outcome)
     return [
-        f"{name_level(line.plan, decision.factor, level)}: true in {found.count(TRUE)}, false in {found.count(FALSE)}"
-        for level, found in counts.items()
+        f"{name_level(line.plan, decision.factor, level)}: true in {outcomes.count(TRUE)}, false in {outcomes.count(FALSE)}"
+        for level, outcomes in counts.items()
     ]
 
 
@@ -137,7 +137,7 @@ def name_reading(plan: ClaimPlan, name: str, decision: ClaimDecision) -> str:
     """Name a reading by its levels that are not central."""
     if plan.toy:
         return f"World of this project, {' '.join(plan.toy)}"
-    options, levels = list_options(plan), decision.readings[name].levels
+    options, levels = list_factor_levels(plan), decision.readings[name].levels
     changed = [name_level(plan, f, level) for f, level in levels.items() if level != options[f][0]]
     return "; ".join(changed) or "Central reading"
 
@@ -149,7 +149,7 @@ def list_choices(plan: ClaimPlan) -> list[str]:
         return ["a world of this project: " + ", ".join(plan.toy)]
     rows = read_reading_table(paper)
     completed = [entry["why"] for entry in rows[CENTRAL_READING].get("completions", ())]
-    names = [level for levels in list_options(plan).values() for level in levels[1:]]
+    names = [level for levels in list_factor_levels(plan).values() for level in levels[1:]]
     ours = [rows[name] for name in names if rows.get(name, {}).get("class") == "ours"]
     return [*completed, *(f"{row['text']} {row['why']}" for row in ours)]
 

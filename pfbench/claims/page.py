@@ -266,25 +266,23 @@ def _format_shown(line: ClaimWord, decision: ClaimDecision | None, is_best: bool
     """Format the ratio in the first reading that has one, or in the best one for the claim, and name it if others decide too."""
     if decision is None or not decision.ratios:
         return ""
-    name, shown = decision.strongest if is_best else decision.first
+    name, effect = decision.strongest if is_best else decision.first
     is_central = name == next(iter(decision.outcomes)) and not is_best
     where = "" if is_central else f" ({name_reading(line.plan, name, decision)})"
-    numbers = _format_ratio(shown.ratio, shown.low, shown.high)
-    return (
-        f"{shown.sides} = {numbers}, {shown.runs} runs; smaller in {shown.order:.0%} of them{where}"
-    )
+    numbers = _format_ratio(effect.ratio, effect.low, effect.high)
+    return f"{effect.sides} = {numbers}, {effect.runs} runs; smaller in {effect.order:.0%} of them{where}"
 
 
 def _list_atoms(claim: str, decisions: Decisions) -> list[dict[str, str]]:
     """List the atoms of a claim: what is compared with whom and how much is asked, with the word on it."""
     return [
         {
-            "text": f"{part.partition(', ')[2].replace(MUCH_BETTER, 'a fifth better')} ({column}{', beside the claim' * part.startswith(BESIDE_PART)})",
+            "text": f"{portion.partition(', ')[2].replace(MUCH_BETTER, 'a fifth better')} ({column}{', beside the claim' * portion.startswith(BESIDE_PART)})",
             "word": decision.word,
             "share": describe_share(decision),
         }
-        for (name, column, part), decision in decisions.items()
-        if name == claim and ", " in part
+        for (name, column, portion), decision in decisions.items()
+        if name == claim and ", " in portion
     ]  # fmt: skip
 
 

@@ -114,16 +114,16 @@ def price_claims(
 
 def _price_look(plan: ClaimPlan, runs: ClaimRuns, decisions: Decisions) -> ClaimPrice | None:
     """Price the next look of a claim; None if its word stands or all draws have run."""
-    mine = [decisions[plan.claim.id, column, part] for column, part in list_main_parts(plan)]
+    mine = [decisions[plan.claim.id, column, portion] for column, portion in list_main_parts(plan)]
     points = list_points(plan)
     for look in LOOKS if plan.is_drawn else (0,):
-        chosen = [p for p in points if p.draw < look and (p.draw >= 0) == plan.is_drawn]
-        first = _list_missing(plan, FIRST, chosen, runs)
+        selected = [p for p in points if p.draw < look and (p.draw >= 0) == plan.is_drawn]
+        first = _list_missing(plan, FIRST, selected, runs)
         if first or not plan.is_drawn:
             return ClaimPrice(plan, look, FIRST, first) if first else None
         if all(d.word != OPEN and d.is_drawn for d in mine):
             return None
-        undecided = [p for p in chosen if any(d.outcomes[p.name] == UNDECIDED for d in mine if d.word == OPEN)]  # fmt: skip
+        undecided = [p for p in selected if any(d.outcomes[p.name] == UNDECIDED for d in mine if d.word == OPEN)]  # fmt: skip
         # so few readings as those of the first look cannot confirm or refute: more of them serve better than more runs
         more = _list_missing(plan, MORE, undecided if look > LOOKS[0] else (), runs)
         if more:

@@ -90,7 +90,7 @@ class ShownRatio(NamedTuple):
         runs: Number of runs.
         order: Share of the runs in which a is smaller.
         sides: What is divided by what.
-        beyond: How far the log ratio is beyond the border of true; negative on the side of true.
+        excess: How far the log ratio is beyond the border of true; negative on the side of true.
     """
 
     ratio: float = math.nan
@@ -99,7 +99,7 @@ class ShownRatio(NamedTuple):
     runs: int = 0
     order: float = math.nan
     sides: str = ""
-    beyond: float = math.nan
+    excess: float = math.nan
 
 
 class WeighedSample(NamedTuple):
@@ -109,13 +109,13 @@ class WeighedSample(NamedTuple):
         p_true: p-value against the claim being false.
         p_false: p-value against its being true.
         state: `NOT_RUN`, `CANNOT_RUN` or `VACUOUS` of a comparison that says nothing; empty otherwise.
-        shown: Its ratio.
+        effect: Its ratio.
     """
 
     p_true: float = 1.0
     p_false: float = 1.0
     state: str = ""
-    shown: ShownRatio = ShownRatio()
+    effect: ShownRatio = ShownRatio()
 
 
 class ReadingDot(NamedTuple):
@@ -147,10 +147,10 @@ class ReadingDot(NamedTuple):
         return TRUE if p_true <= READING_SIDE else FALSE if p_false <= READING_SIDE else UNDECIDED
 
     @property
-    def shown(self) -> ShownRatio:
+    def effect(self) -> ShownRatio:
         """Ratio of the comparison that is farthest beyond the border of true, or the closest to it."""
-        options = [c.shown for c in self.comparisons if c.shown.runs]
-        return max(options, key=lambda shown: shown.beyond, default=ShownRatio())
+        options = [c.effect for c in self.comparisons if c.effect.runs]
+        return max(options, key=lambda effect: effect.excess, default=ShownRatio())
 
 
 class TrueShare(NamedTuple):
@@ -195,7 +195,7 @@ class ClaimDecision(NamedTuple):
     @property
     def ratios(self) -> dict[str, ShownRatio]:
         """Ratios of the readings that have one, by name."""
-        return {name: dot.shown for name, dot in self.readings.items() if dot.shown.runs}
+        return {name: dot.effect for name, dot in self.readings.items() if dot.effect.runs}
 
     @property
     def first(self) -> tuple[str, ShownRatio]:
@@ -205,7 +205,7 @@ class ClaimDecision(NamedTuple):
     @property
     def strongest(self) -> tuple[str, ShownRatio]:
         """Name and ratio of the reading that is the best for the claim."""
-        return min(self.ratios.items(), key=lambda row: row[1].beyond, default=("", ShownRatio()))
+        return min(self.ratios.items(), key=lambda row: row[1].excess, default=("", ShownRatio()))
 
 
 _Region = tuple[float, float]
@@ -232,16 +232,16 @@ def weigh(c: ClaimSample) -> WeighedSample:
     """Weigh the evidence of a comparison, at the first runs and at all: the smaller p-value, twice."""
     c = c.select(~(np.isnan(c.a) & ~c.lost_a) & ~(np.isnan(c.b) & ~c.lost_b))
     losses = [_take_logarithms(c.a, c.lost_a), _take_logarithms(c.b, c.lost_b)]
-    shown = _describe(c, *losses)
+    effect = _describe(c, *losses)
     if len(c.a) and (c.lost_a & c.lost_b).mean() > _MOST_LOST:
-        return WeighedSample(1.0, 1.0, CANNOT_RUN, shown)
+        return WeighedSample(1.0, 1.0, CANNOT_RUN, effect)
     if c.kind == "same" and len(c.a) >= MIN_RUNS and not subtract_losses(*losses).any():
-        return WeighedSample(1.0, 1.0, VACUOUS, shown)  # as of two filters that are one
+        return WeighedSample(1.0, 1.0, VACUOUS, effect)  # as of two filters that are one
     true, not_false = find_borders(c.kind, c.printed)
     looks = [losses] if c.early.all() else [[loss[c.early] for loss in losses], losses]
     p_true = 2 * min(_find_p_inside(a, b, *true) for a, b in looks)
     p_false = 2 * min(_find_p_outside(a, b, *not_false) for a, b in looks)
-    return WeighedSample(min(1.0, p_true), min(1.0, p_false), "", shown)
+    return WeighedSample(min(1.0, p_true), min(1.0, p_false), "", effect)
 
 
 def _find_p_inside(a: Array, b: Array, low: float, high: float) -> float:
@@ -276,10 +276,10 @@ def _describe(c: ClaimSample, a: Array, b: Array) -> ShownRatio:
     d = subtract_losses(a, b)
     location, low, high = Effect("a", "b", "run", d, 1.0, 1.0, 1.0).estimate(ALPHA)
     true_low, true_high = find_borders(c.kind, c.printed)[0]
-    beyond = max(location - true_high, true_low - location)
+    excess = max(location - true_high, true_low - location)
     order = float((d < 0).mean())
     ratio, low, high = (math.exp(min(x, 700.0)) for x in (location, low, high))
-    return ShownRatio(ratio, low, high, len(a), order, c.sides, beyond)
+    return ShownRatio(ratio, low, high, len(a), order, c.sides, excess)
 
 
 def decide_claim(dots: Mapping[str, ReadingDot]) -> ClaimDecision:
@@ -292,15 +292,15 @@ def decide_claim(dots: Mapping[str, ReadingDot]) -> ClaimDecision:
         Decision.
     """
     outcomes = {name: dot.outcome for name, dot in dots.items()}
-    drawn = [name for name, dot in dots.items() if dot.draw >= 0]
-    looks = [look for look in LOOKS if look <= len(drawn)]
+    joint = [name for name, dot in dots.items() if dot.draw >= 0]
+    looks = [look for look in LOOKS if look <= len(joint)]
     for look in looks:
-        readings = {name: dots[name] for name in drawn[:look]}
+        readings = {name: dots[name] for name in joint[:look]}
         word, share = _judge_share([outcomes[name] for name in readings])
         if word != OPEN or look == looks[-1]:
             return _conclude(word, share, True, readings, outcomes)
     counts = list(outcomes.values())
-    share = TrueShare(counts.count(TRUE), counts.count(FALSE), sum(o in (TRUE, FALSE, UNDECIDED) for o in counts))  # fmt: skip
+    share = TrueShare(counts.count(TRUE), counts.count(FALSE), sum(map(counts.count, (TRUE, FALSE, UNDECIDED))))  # fmt: skip
     return _conclude(_agree(dots, share, NOT_RUN in counts), share, False, dots, outcomes)
 
 
@@ -337,8 +337,8 @@ def _agree(readings: Mapping[str, ReadingDot], share: TrueShare, is_missing: boo
     if not is_missing and share.counted in (share.true, share.false):
         return CONFIRMED if share.true else REFUTED
     level = READING_SIDE / share.counted
-    shown = [[p <= level for p in dot.p_values] for dot in readings.values() if dot.outcome in (TRUE, FALSE)]  # fmt: skip
-    is_both = any(is_true for is_true, _ in shown) and any(is_false and not is_true for is_true, is_false in shown)  # fmt: skip
+    evidence = [[p <= level for p in dot.p_values] for dot in readings.values() if dot.outcome in (TRUE, FALSE)]  # fmt: skip
+    is_both = any(is_true for is_true, _ in evidence) and any(is_false and not is_true for is_true, is_false in evidence)  # fmt: skip
     return DEPENDS if is_both else OPEN
 
 

@@ -223,9 +223,9 @@ class _LazyGroup(dict[str, Any]):
     joiner: str | None = None  # of names that stand for several at once
 
     def __contains__(self, name: object) -> bool:
-        parts = str(name).removesuffix(".yaml").split(self.joiner)
+        names = str(name).removesuffix(".yaml").split(self.joiner)
         # None: `null` of a defaults list
-        return name != "None.yaml" and {f"{part}.yaml" for part in parts} <= {*self.list_names()}
+        return name != "None.yaml" and {f"{level}.yaml" for level in names} <= {*self.list_names()}
 
     def keys(self) -> Any:
         return self.list_names()

@@ -19,7 +19,7 @@ from pfbench.claims.claim_lines import (
     COLUMNS,
     DRAWS,
     JOINT_SEED,
-    list_options,
+    list_factor_levels,
     list_points,
     make_cell,
     read_claim_data,
@@ -208,17 +208,17 @@ def test_a_claim_has_the_central_reading_single_levels_and_joint_draws() -> None
         factors = {readings[name]["factor"] for name in levels} - {"none"}
         fitted = {"interval"}  # has no other level
         assert plan.toy or plan.word or factors == set(plan.claim.factors) - fitted
-        assert len(points[-1].levels) == len(list_options(plan))
+        assert len(points[-1].levels) == len(list_factor_levels(plan))
         assert len({tuple(p.levels) for p in points}) == 1
         drawn = [point.draw for point in points if point.draw >= 0]
-        assert drawn == list(range(DRAWS if plan.is_drawn and list_options(plan) else 0))
+        assert drawn == list(range(DRAWS if plan.is_drawn and list_factor_levels(plan) else 0))
 
 
 def test_joint_draws_are_uniform_on_the_grid_and_the_same_for_all_claims_of_a_paper() -> None:
     """Each level of a factor as often as any other, within four standard errors, and without regard to other factors."""
     plan, other = PLANS["C001-7"], PLANS["C001-9"]
     drawn = [p.levels for p in list_points(plan) if p.draw >= 0]
-    for factor, levels in list_options(plan).items():
+    for factor, levels in list_factor_levels(plan).items():
         share = 1 / len(levels)
         error = math.sqrt(share * (1 - share) / DRAWS)
         for level in levels:
