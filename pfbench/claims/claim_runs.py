@@ -228,7 +228,7 @@ def list_point_cells(plan: ClaimPlan, point: ClaimPoint) -> list[tuple[Cell, Mea
 
 
 def measure_sides(plan: ClaimPlan, point: ClaimPoint, c: LineComparison) -> list[tuple[Cell, Measure]]:  # fmt: skip
-    """Return cell and quantity of the sides that are no numbers, in the window of a reading."""
+    """Return cell and quantity of the sides that are filters, in the window of a reading."""
     window = plan.windows.get(point.levels.get(WINDOW, ""), ())
     times: dict[str, Any] = dict(zip(("start", "end"), window, strict=False))
     return [(make_cell(plan, point, side), replace(side.measure, **times)) for side in (c.a, c.b) if side.filter]  # fmt: skip
@@ -273,7 +273,7 @@ def weigh_comparison(plan: ClaimPlan, points: Sequence[ClaimPoint], c: LineCompa
 
 
 def make_dots(points: Sequence[ClaimPoint], weighed: Sequence[_Weighed], kind: str = "") -> dict[str, ReadingDot]:  # fmt: skip
-    """Make the dots of a part of a claim, or of an atom with one kind, for which "much" is no factor."""
+    """Make the dots of a part of a claim, or of an atom with one kind, without "much" as a factor."""
     dots = {}
     for point in points:
         if not (kind and point.name.startswith(MUCH)):

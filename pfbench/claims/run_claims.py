@@ -113,7 +113,7 @@ def price_claims(
 
 
 def _price_look(plan: ClaimPlan, runs: ClaimRuns, decisions: Decisions) -> ClaimPrice | None:
-    """Price the next look of a claim; None if its word stands or all draws have run."""
+    """Price the next look of a claim; None if its word is decided or all draws are complete."""
     mine = [decisions[plan.claim.id, column, portion] for column, portion in list_main_parts(plan)]
     points = list_points(plan)
     for look in LOOKS if plan.is_drawn else (0,):

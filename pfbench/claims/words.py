@@ -160,7 +160,7 @@ class TrueShare(NamedTuple):
         true: Readings in which it is shown to be true.
         false: Readings in which it is shown to be false.
         counted: Readings that can run and say something.
-        low: Lower end of the interval of the share; NaN for listed readings, which are no sample.
+        low: Lower end of the interval of the share; NaN for listed readings, which are not a sample.
         high: Upper end.
     """
 
@@ -305,7 +305,7 @@ def decide_claim(dots: Mapping[str, ReadingDot]) -> ClaimDecision:
 
 
 def _judge_share(outcomes: Sequence[str]) -> tuple[str, TrueShare]:
-    """Judge a share by its interval, of which a look has its part of the error rate."""
+    """Judge a share by its interval. The looks divide the error rate."""
     true, false = outcomes.count(TRUE), outcomes.count(FALSE)
     n = true + false + outcomes.count(UNDECIDED)
     if not n:
