@@ -24,7 +24,7 @@ DIRECTION_PART, SIZE_PART, BESIDE_PART = (
     "direction",
     "size",
     "beside",
-)  # beside: on the page, without weight for the word
+)
 MUCH, WINDOW = "much", "window"  # factors of a claim that take no runs of their own
 MUCH_BETTER, BETTER = "much better", "better"
 DRAWS, JOINT_SEED = 200, 3001  # joint readings of a claim, and the seed of their levels and runs
