@@ -177,11 +177,11 @@ def test_stored_results_are_rounded_and_make_the_page(tmp_path: Path) -> None:
 
 def test_a_report_keeps_its_headline_figure_only(tmp_path: Path) -> None:
     publish = load("publish_reports")
-    folder = tmp_path / "claims"
-    (folder / "figures").mkdir(parents=True)
-    (folder / "figures" / "claims_printed_ratios.svg").write_text("<svg/>")
+    folder = tmp_path / "learn_gain"
+    folder.mkdir()
+    (folder / "ratios.svg").write_text("<svg/>")
     page = (
-        "# claims\n\n![a](figures/claims_printed_ratios.svg)\n\n*Kept.*\n\n"
+        "# claims\n\n![a](ratios.svg)\n\n*Kept.*\n\n"
         "## Levels\n\n![b](figures/claims_printed_levels.svg)\n\n*Removed.*\n\n"
         "## Claims\n\n- 0.2 [0.1, 0.3]; [figure of x](../paper_000/index.html#a)\n"
     )
@@ -196,8 +196,8 @@ def test_a_report_keeps_its_headline_figure_only(tmp_path: Path) -> None:
 
 def test_publishing_removes_only_headlines_that_it_made(tmp_path: Path) -> None:
     publish = load("publish_reports")
-    folder = tmp_path / "claims"
-    figure = folder / f"{publish.HEADLINES['claims']}.png"
+    folder = tmp_path / "learn_gain"
+    figure = folder / f"{publish.HEADLINES['learn_gain']}.png"
     figure.parent.mkdir(parents=True)
     figure.write_bytes(b"png")
     for name in ("report.md", "headline.mine", "headline.svg"):
@@ -206,7 +206,8 @@ def test_publishing_removes_only_headlines_that_it_made(tmp_path: Path) -> None:
     figure.with_suffix(".svg").write_text("<svg/>")
     publish.publish_report(folder)
     names = {path.name for path in folder.iterdir() if path.is_file()} - {"manifest.json"}
-    assert names == {"report.md", "headline.mine", "headline.svg", "headline.svg.kept"}
+    made = {"report.md", "headline.mine", "headline.svg", "headline.svg.kept"}
+    assert names == made | {"ratios.png", "ratios.svg"}
     assert (folder / "headline.svg.kept").read_text() == "of the user\n"
     assert (folder / "headline.svg").read_text() == "<svg/>"
 

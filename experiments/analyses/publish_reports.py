@@ -23,7 +23,6 @@ REPORTS = Path(__file__).parents[2] / "reports"
 
 # Figure of each report that is not of a study, relative to its folder and without suffix.
 HEADLINES = {
-    "claims": "figures/claims_printed_ratios",
     "learn_canyon_noise": "scores",
     "learn_data_efficiency": "data_efficiency",
     "learn_gain": "ratios",

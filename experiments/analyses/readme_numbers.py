@@ -10,7 +10,6 @@ from __future__ import annotations
 import gzip
 import json
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import cache
 from importlib import import_module
@@ -33,9 +32,7 @@ PAGES = (
 )
 
 _BLOCK = re.compile(r"<!-- numbers:(\w+) -->\n.*?<!-- numbers:end -->", re.DOTALL)
-_MARKS = "[vacuous or circular](glossary.md#results)"
 _STUDIES = "benchmarks/campaigns.md"
-_UNDECIDED = ("undecided", "cannot be decided")
 
 Row = dict[str, str]
 
@@ -151,51 +148,10 @@ def board_table(study: str) -> str:
     return f"{table}{describe_knobs(study)}"
 
 
-def read_old_claims() -> list[dict[str, Any]]:
-    """Read the claims of version 1 of the ledger."""
-    return json.loads((TOP / "reports/claims/verdicts.json").read_text())  # type: ignore[no-any-return]
-
-
 def claims_2() -> str:
     """Words on all claims, and what became of each paper: the first lines of their page."""
     _, total, papers, *_ = (TOP / "reports/claims_2/report.md").read_text().split("\n\n")
     return f"{total}\n\n{papers}"
-
-
-def claims() -> str:
-    """Verdicts by paper, counted in verdicts.json. Circular and vacuous claims are undecided."""
-    titles = [row["paper"] for row in read_table("reports/claims/report.md")][:-1]
-    records = read_old_claims()
-    marked = {record["id"] for record in records if record["reason"] in ("circular", "vacuous")}
-    papers = sorted({record["paper"] for record in records})
-    verdicts = (
-        "reproduced",
-        "reproduced only as printed",
-        "reproduced only as repaired",
-        "not reproduced",
-        "undecided",
-    )
-    counts = {
-        paper: Counter(
-            "undecided" if r["verdict"] in _UNDECIDED or r["id"] in marked else r["verdict"]
-            for r in records
-            if r["paper"] == paper
-        )
-        for paper in papers
-    }
-    rows = [
-        [
-            f"{paper}: {title}",
-            *(str(counts[paper][v]) for v in verdicts),
-            str(counts[paper].total()),
-        ]
-        for title, paper in zip(titles, papers, strict=True)
-    ]
-    total = sum(counts.values(), Counter())
-    rows.append(["all", *(str(total[verdict]) for verdict in verdicts), str(total.total())])
-    names = ", ".join(sorted(record["id"] for record in records if record["id"] in marked))
-    sentence = f"The claims {names} count as undecided: their tests are {_MARKS}."
-    return f"{format_table(('paper', *verdicts, 'claims'), rows)}\n\n{sentence}"
 
 
 @cache
@@ -444,7 +400,6 @@ BLOCKS: dict[str, Callable[[], str]] = {
         tie,
         contents,
         claims_2,
-        claims,
         all_seven,
         seven_at_home,
         equal_time,

@@ -7,5 +7,6 @@ from pfbench.claims.words import (
     ClaimDecision as ClaimDecision,
     ClaimSample as ClaimSample,
     ReadingDot as ReadingDot,
-    decide_paper as decide_paper,
+    decide_claim as decide_claim,
+    weigh as weigh,
 )

@@ -4,22 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import yaml
 
 from pfbench.claims.claim_list import PrintedClaim, read_printed_claims
 from pfbench.claims.measures import Measure
-from pfbench.job.readings import CENTRAL_READING, read_reading_table
+from pfbench.job.readings import CENTRAL_READING, JOINER, read_reading_table
 
 _DATA = Path(__file__).with_name("claim_lines.yaml")
 PUBLISHED, REPAIRED = "published", "repaired"
 COLUMNS = (PUBLISHED, REPAIRED)
-DIRECTION_PART, SIZE_PART = "direction", "size"
+DIRECTION_PART, SIZE_PART, BESIDE_PART = (
+    "direction",
+    "size",
+    "beside",
+)
+MUCH, WINDOW = "much", "window"  # factors of a claim that take no runs of their own
+MUCH_BETTER, BETTER = "much better", "better"
+DRAWS, JOINT_SEED = 200, 3001  # joint readings of a claim, and the seed of their levels and runs
 TIMING = "seconds_per_step"
 METHOD = "method"
 _SIDE_KEYS = {"metric": "metric", "group": "group", "component": "component", "from": "start", "to": "end", "settled": "settled"}  # fmt: skip
@@ -34,12 +42,14 @@ class Side(NamedTuple):
         filter: Name of the filter; empty for a number.
         words: Words of its jobs beyond those of the reading.
         number: Value of a number.
+        world: Words of one of several worlds in which the comparison must hold.
     """
 
     measure: Measure
     filter: str = ""
     words: tuple[str, ...] = ()
     number: float = math.nan
+    world: tuple[str, ...] = ()
 
 
 class LineComparison(NamedTuple):
@@ -58,26 +68,18 @@ class LineComparison(NamedTuple):
     printed: float = math.nan
 
 
-class Reading(NamedTuple):
-    """Reading of a paper.
+class ClaimPoint(NamedTuple):
+    """Reading of a claim: a level of each factor at once.
 
     Attributes:
-        name: Name of the file.
-        factor: Factor; "none" for the central reading.
-        grade: Class: printed, cited, ours or fitted.
-        why: Reason.
-        text: First line of the file.
-        filters: Filters that it sets; None if it sets the world, so that it concerns all of them.
-        claims: Claims that it is for, of a pair of levels that both turn them.
+        name: Name: that of the one level that is not central, or of a joint draw.
+        levels: Level of each factor of the claim.
+        draw: Number of the joint draw; -1 for a reading in a list, with one level changed.
     """
 
     name: str
-    factor: str
-    grade: str
-    reason: str
-    text: str
-    filters: tuple[str, ...] | None
-    claims: tuple[str, ...] = ()
+    levels: Mapping[str, str]
+    draw: int = -1
 
 
 class ClaimPlan(NamedTuple):
@@ -92,7 +94,7 @@ class ClaimPlan(NamedTuple):
         why: Reason of that word.
         proved: Outcome of a proof in all readings but those of `but`; empty without.
         but: Factors whose readings run although there is a proof.
-        without: Readings in which a is b, which say nothing.
+        without: Levels in which a is b, which say nothing.
     """
 
     claim: PrintedClaim
@@ -106,29 +108,16 @@ class ClaimPlan(NamedTuple):
     without: tuple[str, ...] = ()
 
     @property
-    def has_other_kind(self) -> bool:
-        """Return whether a comparison has another kind than the claim."""
-        expected = {self.claim.kind, "better"} if self.claim.kind == "number" else {self.claim.kind}
-        kinds = {c.kind for parts in self.parts.values() for c in parts}
-        return not kinds <= expected | {"level", "size"}
+    def is_drawn(self) -> bool:
+        """Return whether joint readings are drawn: not in one world of this project, and not for times."""
+        comparisons = [c for parts in self.parts.values() for c in parts]
+        return not self.toy and all(c.a.measure.metric != TIMING for c in comparisons)
 
 
 @cache
 def read_claim_data() -> Mapping[str, Any]:
     """Read the file of the claims: settings of papers, lines of claims, texts of settings, the seven methods, corrections."""
     return yaml.safe_load(_DATA.read_text(encoding="utf-8"))
-
-
-@cache
-def read_readings(paper: str) -> Mapping[str, Reading]:
-    """Read the readings of a paper by name, the central one first."""
-    entries_read = {}
-    for name, row in sorted(read_reading_table(paper).items()):
-        sets_world = name == CENTRAL_READING or row.get("use") or row.get("set")
-        filters = None if sets_world else tuple(row["filters"])
-        texts = (row["factor"], row["class"], row["why"], row["text"])
-        entries_read[name] = Reading(name, *texts, filters, tuple(row.get("claims", ())))
-    return {CENTRAL_READING: entries_read[CENTRAL_READING], **entries_read}
 
 
 def read_plans() -> list[ClaimPlan]:
@@ -148,7 +137,7 @@ def _parse_plan(claim: PrintedClaim, entry: Mapping[str, Any]) -> ClaimPlan:
             item for row in rows if row.get("form", column) == column
             for item in _expand(claim, row, forms[column])
         ]  # fmt: skip
-        for portion in (DIRECTION_PART, SIZE_PART):
+        for portion in (DIRECTION_PART, SIZE_PART, BESIDE_PART):
             members = tuple(item for name, item in entries_read if name == portion)
             parts |= {(column, portion): members} if members else {}
     windows = {name: (float(a), float(b)) for name, (a, b) in entry.get("windows", {}).items()}
@@ -164,12 +153,9 @@ def _expand(
     """Yield part and comparison of all values of an entry."""
     for more in row.get("rows", ({},)):
         merged = {**row, **more}
-        if "pairs" in merged:
-            alternatives = [{"a": a, "b": b} for a, b in merged["pairs"]]
-        else:
-            alternatives = [{}]
-        for choice in alternatives:
-            full = {**merged, **choice}
+        pairs = merged.get("pairs", ((merged.get("a"), merged.get("b")),))
+        for a, b in pairs:
+            full = {**merged, "a": a, "b": b}
             lists = {key: full[key] for key in _LISTS if isinstance(full.get(key), list)}
             for values in product(*lists.values()):
                 single = {**full, **dict(zip(lists, values, strict=True))}
@@ -185,6 +171,9 @@ def _parse_comparison(
     world = (row["worlds"],) if "worlds" in row else ()
     a = _parse_side(row["a"], _make_measure(keys), method, world)
     b = _parse_side(row["b"], _make_measure({**keys, **of_b}), method, world)
+    if row.get("beside"):
+        yield BESIDE_PART, LineComparison(row.get("kind", claim.kind), a, b)
+        return
     if row.get("level"):
         yield SIZE_PART, LineComparison("level", a, b)
         return
@@ -210,7 +199,7 @@ def _parse_side(text: Any, measure: Measure, method: str, world: tuple[str, ...]
     head, *words = text.split(" @")
     name, pairs = _split_settings(head)
     name = method if name == METHOD else name
-    return Side(measure, name, (*pairs, *words, *world))
+    return Side(measure, name, (*pairs, *words), world=world)
 
 
 def _split_settings(text: str) -> tuple[str, tuple[str, ...]]:
@@ -222,46 +211,87 @@ def _split_settings(text: str) -> tuple[str, tuple[str, ...]]:
     )
 
 
-def list_dots(plan: ClaimPlan) -> dict[str, tuple[str, str]]:
-    """List the readings of a claim: reading and window by name, the central one first.
+def list_factor_levels(plan: ClaimPlan) -> dict[str, list[str]]:
+    """List the levels of each factor of a claim, the central one first, without fitted ones.
 
-    A window is a factor of the central reading that takes no runs of its own.
+    Factors without runs are the window, and how much better "much" is.
     """
-    if plan.toy:
-        return {CENTRAL_READING: (CENTRAL_READING, "")}
-    first = next(iter(plan.windows), "")
-    readings = read_readings(plan.claim.paper).values()
-    names = [
-        CENTRAL_READING,
-        *(
-            r.name
-            for r in readings
-            if r.factor in plan.claim.factors and r.name not in plan.without
-        ),
-        *(r.name for r in readings if plan.claim.id in r.claims),
+    options: dict[str, list[str]] = {}
+    for name, row in () if plan.toy else read_reading_table(plan.claim.paper).items():
+        if row["factor"] in plan.claim.factors and row["class"] != "fitted" and name not in plan.without:  # fmt: skip
+            options.setdefault(row["factor"], [CENTRAL_READING]).append(name)
+    if plan.windows:
+        options[WINDOW] = list(plan.windows)
+    if any(c.kind == MUCH_BETTER for parts in plan.parts.values() for c in parts):
+        options[MUCH] = [MUCH_BETTER, BETTER]
+    return options
+
+
+def list_main_parts(plan: ClaimPlan) -> list[tuple[str, str]]:
+    """List column and part that give the words of a claim: its direction, or its size if it has none."""
+    return [
+        (column, DIRECTION_PART if (column, DIRECTION_PART) in plan.parts else SIZE_PART)
+        for column in dict.fromkeys(column for column, _ in plan.parts)
     ]
-    others = {f"window {name}": (CENTRAL_READING, name) for name in list(plan.windows)[1:]}
-    return {name: (name, first) for name in names} | others
 
 
-def make_cell(plan: ClaimPlan, reading: str, side: Side) -> tuple[str, ...]:
-    """Make the words of the jobs of a side in a reading, without seed, runs and folder."""
+def list_kinds(c: LineComparison) -> tuple[str, ...]:
+    """List the kinds that a comparison is read as: "much" is a fifth, or any amount."""
+    return (MUCH_BETTER, BETTER) if c.kind == MUCH_BETTER else (c.kind,)
+
+
+def list_points(plan: ClaimPlan) -> list[ClaimPoint]:
+    """List the readings of a claim: the central one, those with one level changed, and the joint draws in their order.
+
+    The level of a factor in a draw is uniform, and the same for all claims of a paper that have the factor.
+    """
+    options = list_factor_levels(plan)
+    centre = {factor: levels[0] for factor, levels in options.items()}
+    changed = [
+        ClaimPoint(_name_level(factor, level), {**centre, factor: level})
+        for factor, levels in options.items()
+        for level in levels[1:]
+    ]
+    draws = [
+        {f: levels[int(_draw_factor(plan.claim.paper, f)[k] * len(levels))] for f, levels in options.items()}
+        for k in range(DRAWS if plan.is_drawn and options else 0)
+    ]  # fmt: skip
+    joint = [ClaimPoint(f"draw {k + 1}", levels, k) for k, levels in enumerate(draws)]
+    return [ClaimPoint(CENTRAL_READING, centre), *changed, *joint]
+
+
+def _name_level(factor: str, level: str) -> str:
+    """Name a reading with one level changed."""
+    return f"{factor} {level}" if factor in (WINDOW, MUCH) else level
+
+
+@cache
+def _draw_factor(paper: str, factor: str) -> np.ndarray:
+    """Draw the numbers in [0, 1) that choose the levels of a factor, [DRAWS]."""
+    return np.random.default_rng([JOINT_SEED, int(paper), *factor.encode()]).random(DRAWS)
+
+
+def make_cell(plan: ClaimPlan, point: ClaimPoint, side: Side) -> tuple[str, ...]:
+    """Make the words of the jobs of a side in a reading, without seed, runs and folder.
+
+    Levels that do not concern the filter are left out, so that claims share jobs.
+    """
     paper = plan.claim.paper
     if plan.toy:
-        return (*plan.toy, f"filter={side.filter}", *side.words)
-    settings = read_claim_data()["papers"][paper]
-    limits: Mapping[str, Sequence[str]] = settings.get("only", {})
-    concerned = read_readings(paper)[reading].filters
-    if side.filter not in limits.get(reading, concerned or (side.filter,)):
-        reading = CENTRAL_READING  # the same job
-    text = settings.get("instead", {}).get(reading, {}).get(side.filter, side.filter)
+        return (*plan.toy, f"filter={side.filter}", *side.words, *side.world)
+    settings, rows = read_claim_data()["papers"][paper], read_reading_table(paper)
+    concerned = [
+        name
+        for name in sorted({*point.levels.values()} & rows.keys() - {CENTRAL_READING})
+        if side.filter in settings.get("only", {}).get(name, rows[name]["filters"])
+        or (name not in settings.get("only", {}) and rows[name].keys() & {"use", "set"})
+    ]
+    text = side.filter
+    for name in concerned:
+        text = settings.get("instead", {}).get(name, {}).get(side.filter, text)
     name, words = _split_settings(text)
-    return (f"reading/{paper}={reading}", f"filter={name}", *words, *side.words)
-
-
-def apply_window(measure: Measure, window: tuple[float, float] | None) -> Measure:
-    """Replace the times of a measure by those of a window."""
-    return measure if window is None else replace(measure, start=window[0], end=window[1])
+    reading = JOINER.join(concerned) or CENTRAL_READING
+    return (f"reading/{paper}={reading}", f"filter={name}", *words, *side.words, *side.world)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,16 +65,3 @@ def read_printed_claims() -> list[PrintedClaim]:
         The claims, in the order of the file.
     """
     return [PrintedClaim(**row) for row in yaml.safe_load(_DATA.read_text(encoding="utf-8"))]
-
-
-def find_tipping_bound(kind: str, low: float, high: float) -> float:
-    """Find the bound of a kind at which a decision by the interval of a ratio turns.
-
-    The claim is true with every larger bound. For "same" it is the smallest factor that holds the interval.
-
-    Args:
-        kind: One of `KINDS`.
-        low: Lower end of the interval of the ratio of a to b.
-        high: Upper end.
-    """
-    return math.exp(max(abs(math.log(low)), abs(math.log(high)))) if kind == "same" else high

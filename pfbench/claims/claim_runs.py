@@ -7,43 +7,56 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import cache
+from dataclasses import asdict, dataclass, replace
+from functools import cache, reduce
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pfbench.claims.claim_lines import (
+    JOINT_SEED,
+    MUCH,
     TIMING,
+    WINDOW,
     ClaimPlan,
+    ClaimPoint,
     LineComparison,
-    Side,
-    apply_window,
-    list_dots,
+    list_kinds,
+    list_points,
     make_cell,
     read_claim_data,
-    read_readings,
 )
 from pfbench.claims.measures import METRIC_WORDS, OFF_TRACK, Measure
 from pfbench.claims.words import (
     CANNOT_RUN,
-    NOT_COUNTED,
+    FALSE,
+    LOOKS,
+    NOT_RUN,
     VACUOUS,
     ClaimDecision,
     ClaimSample,
     ReadingDot,
-    decide_paper,
+    WeighedSample,
+    decide_claim,
+    weigh,
 )
 from pfbench.files.atomic_write import write_atomically
+from pfbench.job.readings import CENTRAL_READING
 from pfbench.results.paper_block import read_paper_block
 from pfbench.stats.error_measures import Array
 
 CLAIMS_STUDY = "claims_2"  # folder of the jobs
-SEEDS = (2001, 2002, 2003)
+SEEDS = (2001, 2002, 2003)  # of listed readings
 VALUES_SUFFIX = ".values.json"
 PUBLISHED_VALUES = "values.json.gz"  # of all runs, in the folder of the page
-SCREEN, CENTRE, MOVER = "screen", "centre", "mover"
+LISTED, FIRST, MORE = (
+    "listed",
+    "first",
+    "more",
+)  # runs of a listed reading, of a joint draw, and those that follow if it is open
+_PROVED = {FALSE: WeighedSample(1.0, 0.0)}
 Cell = tuple[str, ...]
 
 
@@ -95,18 +108,9 @@ class StoredValues:
         return Batch(self.seed, self.first_run, self.runs)
 
 
-class Series(NamedTuple):
-    """Values of a cell over all of its jobs.
-
-    Attributes:
-        runs: Seed and number of each run as one number, [n], ascending.
-        values: Values, [n].
-        lost: Lost runs, [n].
-    """
-
-    runs: np.ndarray
-    values: Array
-    lost: np.ndarray
+Series = tuple[
+    np.ndarray, Array, np.ndarray
+]  # numbers of runs, ascending, their values, and which are lost, [n] each
 
 
 class ClaimRuns:
@@ -147,9 +151,9 @@ class ClaimRuns:
             for record in self.find(cell)
         )
 
-    def join(self, cell: Cell, name: str) -> Series | None:
-        """Join the values of a quantity; None without runs."""
-        records = [r for r in self.find(cell) if name in r.values and not r.failed]
+    def join(self, cell: Cell, name: str, of_draws: bool = False) -> Series | None:
+        """Join the values of a quantity over the runs of joint draws, or of listed readings; None without runs."""
+        records = [r for r in self.find(cell) if name in r.values and not r.failed and (r.seed == JOINT_SEED) == of_draws]  # fmt: skip
         if not records:
             return None
         runs = [r.seed * 2**32 + r.first_run + np.arange(len(r.lost)) for r in records]
@@ -157,18 +161,18 @@ class ClaimRuns:
         values = np.concatenate([np.array(r.values[name], dtype=np.float64) for r in records])
         # Jobs of two stages overlap, and a run that counts twice would make its claim look surer than it is.
         numbers, places = np.unique(np.concatenate(runs), return_index=True)
-        return Series(numbers, values[places], lost[places])
+        return numbers, values[places], lost[places]
 
 
-def list_batches(paper: str, stage: str) -> list[Batch]:
-    """List the runs of a cell at a stage: the first look, all seeds of a central reading, or of one that turns."""
+def make_batch(paper: str, point: ClaimPoint, stage: str) -> Batch:
+    """Make the runs of a reading at a stage: the first ones, or those that follow.
+
+    All joint draws have the same runs, so that they share worlds, and jobs of filters that a level does not concern.
+    """
     counts = read_claim_data()["papers"][paper]["runs"]
-    first, number = counts[SCREEN], counts.get(stage, 0)
-    screen = [Batch(SEEDS[0], 0, first)]
-    if stage == SCREEN:
-        return screen
-    more = [Batch(SEEDS[0], first, number - first)] if stage == CENTRE else []
-    return [*screen, *more, *(Batch(seed, 0, number) for seed in SEEDS[1:])]
+    if point.draw < 0:
+        return Batch(SEEDS[0], 0, counts[LISTED])
+    return Batch(JOINT_SEED, counts[FIRST] if stage == MORE else 0, counts[stage])
 
 
 def find_file(folder: Path, cell: Cell, batch: Batch) -> Path:
@@ -208,102 +212,100 @@ def name_timing(a: Cell, b: Cell) -> Cell:
     return ("time", *a, "against", *b)
 
 
-def list_claim_cells(plan: ClaimPlan) -> dict[Cell, dict[str, Measure]]:
-    """List the cells of a claim, with the quantities that it compares by name."""
+def list_claim_cells(plan: ClaimPlan, points: Sequence[ClaimPoint] = ()) -> dict[Cell, dict[str, Measure]]:  # fmt: skip
+    """List the cells of a claim in some readings, or in all, with the quantities that it compares by name."""
     cells: dict[Cell, dict[str, Measure]] = {}
-    for _, measured in list_dot_cells(plan):
-        for cell, measure in measured:
+    for point in points or list_points(plan):
+        for cell, measure in list_point_cells(plan, point):
             cells.setdefault(cell, {})[measure.name] = measure
     return cells
 
 
-def list_dot_cells(plan: ClaimPlan) -> Iterator[tuple[str, list[tuple[Cell, Measure]]]]:
-    """Yield the name of each reading that takes runs, with its cells and quantities."""
-    for name, (reading, window) in list_dots(plan).items():
-        if not _find_state(plan, reading):
-            sides = [
-                _measure_side(plan, reading, window, side)
-                for comparisons in plan.parts.values()
-                for c in comparisons
-                for side in (c.a, c.b)
-                if side.filter
-            ]
-            yield name, sides
+def list_point_cells(plan: ClaimPlan, point: ClaimPoint) -> list[tuple[Cell, Measure]]:
+    """List the cells and quantities of a reading; none if a proof decides it."""
+    comparisons = [] if _find_state(plan, point) else [c for parts in plan.parts.values() for c in parts]  # fmt: skip
+    return [pair for c in comparisons for pair in measure_sides(plan, point, c)]
 
 
-def _measure_side(plan: ClaimPlan, reading: str, window: str, side: Side) -> tuple[Cell, Measure]:
-    """Return the cell and the quantity of a side in a reading and window."""
-    measure = apply_window(side.measure, plan.windows.get(window))
-    return make_cell(plan, reading, side), measure
+def measure_sides(plan: ClaimPlan, point: ClaimPoint, c: LineComparison) -> list[tuple[Cell, Measure]]:  # fmt: skip
+    """Return cell and quantity of the sides that are filters, in the window of a reading."""
+    window = plan.windows.get(point.levels.get(WINDOW, ""), ())
+    times: dict[str, Any] = dict(zip(("start", "end"), window, strict=False))
+    return [(make_cell(plan, point, side), replace(side.measure, **times)) for side in (c.a, c.b) if side.filter]  # fmt: skip
 
 
-def _find_state(plan: ClaimPlan, reading: str) -> str:
-    """Find the state of a reading that takes no runs: fitted, or decided by a proof; empty otherwise."""
-    if plan.toy or reading not in read_readings(plan.claim.paper):
-        return ""
-    stated = read_readings(plan.claim.paper)[reading]
-    if stated.grade == "fitted":
-        return NOT_COUNTED
-    return plan.proved if plan.proved and stated.factor not in plan.but else ""
+def _find_state(plan: ClaimPlan, point: ClaimPoint) -> str:
+    """Find the outcome that a proof gives in a reading; empty where runs decide."""
+    is_scope = all(point.levels[factor] == CENTRAL_READING for factor in plan.but)
+    return plan.proved if is_scope else ""
 
 
-def make_dots(
-    plan: ClaimPlan, comparisons: Sequence[LineComparison], runs: ClaimRuns
-) -> dict[str, ReadingDot]:
-    """Make the dots of a part of a claim from the stored values."""
+def select_points(plan: ClaimPlan, runs: ClaimRuns) -> list[ClaimPoint]:
+    """Select the readings that decide: joint draws up to the first without runs, and the listed ones if those are few."""
+    points = list_points(plan)
+    listed = [point for point in points if point.draw < 0]
+    joint = points[len(listed) :]
+    run = list(takewhile(lambda point: _has_runs(plan, point, runs), joint))
+    return [*(listed[:1] if len(run) >= LOOKS[0] else listed), *run]
+
+
+def _has_runs(plan: ClaimPlan, point: ClaimPoint, runs: ClaimRuns) -> bool:
+    """Return whether all cells of a joint draw have runs, or cannot run."""
+    return all(
+        any(r.failed or (r.seed == JOINT_SEED and measure.name in r.values) for r in runs.find(cell))
+        for cell, measure in list_point_cells(plan, point)
+    )  # fmt: skip
+
+
+_Weighed = Mapping[str, Mapping[str, WeighedSample]]  # by kind and reading
+
+
+def weigh_comparison(plan: ClaimPlan, points: Sequence[ClaimPoint], c: LineComparison, runs: ClaimRuns) -> _Weighed:  # fmt: skip
+    """Weigh a comparison in some readings, as each of its kinds."""
+    pairs = {p.name: _find_state(plan, p) or _join_pair(plan, p, c, runs) for p in points}
+    return {
+        kind: {
+            name: _PROVED.get(pair, WeighedSample(state=pair)) if isinstance(pair, str) else weigh(pair._replace(kind=kind))
+            for name, pair in pairs.items()
+        }
+        for kind in list_kinds(c)
+    }  # fmt: skip
+
+
+def make_dots(points: Sequence[ClaimPoint], weighed: Sequence[_Weighed], kind: str = "") -> dict[str, ReadingDot]:  # fmt: skip
+    """Make the dots of a part of a claim, or of an atom with one kind, without "much" as a factor."""
     dots = {}
-    for name, (reading, window) in list_dots(plan).items():
-        factor = _name_factor(plan, reading, window)
-        state = _find_state(plan, reading)
-        if state:
-            dots[name] = ReadingDot(factor, state=state)
-            continue
-        pairs = [_join_pair(plan, reading, window, c, runs) for c in comparisons]
-        if CANNOT_RUN in pairs:
-            dots[name] = ReadingDot(factor, state=CANNOT_RUN)
-        elif VACUOUS in pairs:
-            dots[name] = ReadingDot(factor, state=VACUOUS)
-        else:
-            matches = [pair for pair in pairs if isinstance(pair, ClaimSample)]
-            dots[name] = ReadingDot(factor, matches if len(matches) == len(pairs) else ())
+    for point in points:
+        if not (kind and point.name.startswith(MUCH)):
+            much = kind or point.levels.get(MUCH, "")
+            parts = [column.get(much, next(iter(column.values())))[point.name] for column in weighed]  # fmt: skip
+            levels = {f: level for f, level in point.levels.items() if f != MUCH or not kind}
+            dots[point.name] = ReadingDot(levels, parts, point.draw)
     return dots
 
 
-def _name_factor(plan: ClaimPlan, reading: str, window: str) -> str:
-    """Name the factor of a dot."""
-    if plan.toy:
-        return "none"
-    is_first = window == next(iter(plan.windows), "")
-    return read_readings(plan.claim.paper)[reading].factor if is_first else "window"
+def _join_pair(plan: ClaimPlan, point: ClaimPoint, c: LineComparison, runs: ClaimRuns) -> ClaimSample | str:  # fmt: skip
+    """Join the runs of both sides.
 
-
-def _join_pair(
-    plan: ClaimPlan, reading: str, window: str, c: LineComparison, runs: ClaimRuns
-) -> ClaimSample | str | None:
-    """Join the runs of both sides, None without runs.
-
-    `CANNOT_RUN` if a job fails, `VACUOUS` if losses of track are compared and no run of either side has one.
+    `NOT_RUN` without runs, `CANNOT_RUN` if a job fails, `VACUOUS` if losses of track are compared and no run of either side has one.
     """
-    sides = [side for side in (c.a, c.b) if side.filter]
-    measured = [_measure_side(plan, reading, window, side) for side in sides]
+    measured = measure_sides(plan, point, c)
     if any(record.failed for cell, _ in measured for record in runs.find(cell)):
         return CANNOT_RUN
     if c.a.measure.metric == TIMING:
         return _join_times([cell for cell, _ in measured], c, runs)
-    series = [runs.join(cell, measure.name) for cell, measure in measured]
+    series = [runs.join(cell, measure.name, point.draw >= 0) for cell, measure in measured]
     present = [s for s in series if s is not None]
     if len(present) < len(series):
-        return None
-    common = present[0].runs
-    for s in present[1:]:
-        common = np.intersect1d(common, s.runs)
+        return NOT_RUN
+    common = reduce(np.intersect1d, (s[0] for s in present))
     matches = iter([_select(s, common) for s in present])
     n = len(common)
     a, b = (next(matches) if side.filter else (np.full(n, side.number), np.zeros(n, bool)) for side in (c.a, c.b))  # fmt: skip
     if c.a.measure.metric == OFF_TRACK and n and max(a[0].max(), b[0].max()) <= 1.0:
         return VACUOUS
-    first = read_claim_data()["papers"][plan.claim.paper]["runs"][SCREEN]
-    early = common - SEEDS[0] * 2**32 < first
+    first = make_batch(plan.claim.paper, point, FIRST)
+    early = common - first.seed * 2**32 < first.first_run + first.runs
     return ClaimSample(c.kind, a[0], b[0], a[1], b[1], early, c.printed, describe_sides(c))
 
 
@@ -313,7 +315,7 @@ def describe_sides(c: LineComparison) -> str:
     quantities = [describe_quantity(side.measure) for side in filtered]
     is_common, texts = len(set(quantities)) == 1, read_claim_data()["settings"]
     names = [
-        " ".join([_name_filter(side.filter), *(texts[word] for word in side.words)])
+        " ".join([_name_filter(side.filter), *(texts[word] for word in (*side.words, *side.world))])
         if side.filter
         else f"{side.number:g}"
         for side in (c.a, c.b)
@@ -342,15 +344,15 @@ def describe_quantity(measure: Measure) -> str:
 
 def _select(series: Series, runs: np.ndarray) -> tuple[Array, np.ndarray]:
     """Select some runs of a series: values and lost runs, [n]."""
-    places = np.searchsorted(series.runs, runs)
-    return series.values[places], series.lost[places]
+    places = np.searchsorted(series[0], runs)
+    return series[1][places], series[2][places]
 
 
-def _join_times(cells: Sequence[Cell], c: LineComparison, runs: ClaimRuns) -> ClaimSample | None:
+def _join_times(cells: Sequence[Cell], c: LineComparison, runs: ClaimRuns) -> ClaimSample | str:
     """Join times per step that were measured in turn; the first look has a third of the rounds."""
     records = runs.find(name_timing(cells[0], cells[-1]))
     if not records:
-        return None
+        return NOT_RUN
     record = records[0]
     n = len(record.lost)
     a, b = (
@@ -362,28 +364,35 @@ def _join_times(cells: Sequence[Cell], c: LineComparison, runs: ClaimRuns) -> Cl
     return ClaimSample(c.kind, a, b, lost, lost, early, c.printed, describe_sides(c))
 
 
-def decide_claims(
-    plans: Sequence[ClaimPlan], runs: ClaimRuns
-) -> dict[tuple[str, str, str], ClaimDecision]:
-    """Decide all claims: decision by claim, column and part. A paper and column are one family."""
-    families: dict[tuple[str, str], dict[tuple[str, str], dict[str, ReadingDot]]] = {}
+Decisions = Mapping[tuple[str, str, str], ClaimDecision]
+
+
+def decide_claims(plans: Sequence[ClaimPlan], runs: ClaimRuns) -> Decisions:
+    """Decide all claims: decision by claim, column and part, and by the name of an atom."""
+    decisions: dict[tuple[str, str, str], ClaimDecision] = {}
     for plan in plans:
+        points = select_points(plan, runs)
         for (column, portion), comparisons in plan.parts.items():
-            family = families.setdefault((plan.claim.paper, column), {})
-            family[plan.claim.id, portion] = make_dots(plan, comparisons, runs)
-    return {
-        (claim, column, portion): decision
-        for (_, column), family in families.items()
-        for (claim, portion), decision in _decide_family(family).items()
-    }
+            weighed = [weigh_comparison(plan, points, c, runs) for c in comparisons]
+            dots = make_dots(points, weighed)
+            decisions[plan.claim.id, column, portion] = decide_claim(dots)
+            for name, kind, members in _list_atoms(comparisons):
+                parts = [weighed[k] for k in members]
+                decisions[plan.claim.id, column, f"{portion}, {name}"] = decide_claim(make_dots(points, parts, kind))  # fmt: skip
+    return decisions
 
 
-def _decide_family(
-    family: Mapping[tuple[str, str], Mapping[str, ReadingDot]],
-) -> dict[tuple[str, str], ClaimDecision]:
-    """Decide the parts of the claims of one paper and column."""
-    matches = decide_paper({" ".join(key): dots for key, dots in family.items()})
-    return {key: matches[" ".join(key)] for key in family}
+def _list_atoms(comparisons: Sequence[LineComparison]) -> Iterator[tuple[str, str, list[int]]]:
+    """Yield name, kind and comparisons of the atoms of a part: what is compared with whom, and how much is asked.
+
+    Worlds of one comparison are one atom.
+    """
+    atoms: dict[tuple[str, str], list[int]] = {}
+    for k, c in enumerate(comparisons):
+        text = describe_sides(c._replace(a=c.a._replace(world=()), b=c.b._replace(world=())))
+        for kind in list_kinds(c):
+            atoms.setdefault((text, kind), []).append(k)
+    yield from ((f"{text}: {kind}", kind, members) for (text, kind), members in atoms.items())
 
 
 def estimate_seconds(paper: str, cell: Cell, runs: ClaimRuns) -> float:

@@ -2,45 +2,34 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 from pfbench.claims.claim_lines import (
-    COLUMNS,
     DIRECTION_PART,
+    MUCH,
     PUBLISHED,
     REPAIRED,
     SIZE_PART,
+    WINDOW,
     ClaimPlan,
-    list_dots,
+    list_factor_levels,
+    list_main_parts,
     read_claim_data,
-    read_readings,
 )
-from pfbench.claims.claim_list import KINDS, find_tipping_bound
-from pfbench.claims.run_claims import Decisions
+from pfbench.claims.claim_list import KINDS
+from pfbench.claims.claim_runs import Decisions
 from pfbench.claims.words import (
     CONFIRMED,
-    DEPENDS,
     FALSE,
     NOT_RUN,
     OPEN,
     REFUTED,
     TRUE,
-    UNDECIDED,
     WORDS,
     ClaimDecision,
 )
 from pfbench.job.readings import CENTRAL_READING, read_reading_table
-from pfbench.stats.sentences import format_count
-
-_KIND_TEXTS = {
-    "better": "a smaller figure than the other one",
-    "much better": "a figure at least a fifth smaller",
-    "same": "figures within 10 %",
-    "number": "a printed number",
-    "within": "a figure of at most {printed:g} times the other one",
-}
 
 
 class ClaimWord(NamedTuple):
@@ -53,7 +42,6 @@ class ClaimWord(NamedTuple):
         repaired: Word for our repair; empty if the claim is about no repaired form.
         repaired_reason: Its reason.
         size: Word on the printed number; empty if the claim has a direction only, or a number only.
-        factors: Factors on which it depends.
         decision: Decision by runs; None for a word without.
     """
 
@@ -63,13 +51,13 @@ class ClaimWord(NamedTuple):
     repaired: str
     repaired_reason: str
     size: str
-    factors: tuple[str, ...]
     decision: ClaimDecision | None
 
     @property
     def label(self) -> str:
-        """Word with the factors on which it depends."""
-        return f"{DEPENDS} on {', '.join(self.factors)}" if self.word == DEPENDS else self.word
+        """Word with the factor on which it depends most."""
+        factor = self.decision.factor if self.decision else ""
+        return f"{self.word} on {factor}" if factor else self.word
 
     @property
     def state(self) -> str:
@@ -80,100 +68,78 @@ class ClaimWord(NamedTuple):
 def conclude(plan: ClaimPlan, decisions: Decisions) -> ClaimWord:
     """Conclude on a claim from its decisions, or from what decides it without runs."""
     if plan.word:
-        return ClaimWord(plan, plan.word, plan.reason, "", "", "", (), None)
-    by_part = {
-        (column, portion): decisions[plan.claim.id, column, portion]
-        for column, portion in plan.parts
-    }
-    main = {c: by_part.get((c, DIRECTION_PART)) or by_part.get((c, SIZE_PART)) for c in COLUMNS}
-    published, repaired = main[PUBLISHED], main[REPAIRED]
-    assert published is not None  # each claim has a published column
-    size = by_part.get((PUBLISHED, SIZE_PART))
-    has_both = size is not None and (PUBLISHED, DIRECTION_PART) in by_part
+        return ClaimWord(plan, plan.word, plan.reason, "", "", "", None)
+    mine = {column: decisions[plan.claim.id, column, portion] for column, portion in list_main_parts(plan)}  # fmt: skip
+    published, repaired = mine[PUBLISHED], mine.get(REPAIRED)
+    has_both = {(PUBLISHED, SIZE_PART), (PUBLISHED, DIRECTION_PART)} <= plan.parts.keys()
     return ClaimWord(
         plan,
         published.word,
         _explain(plan, published),
         repaired.word if repaired else "",
         _explain(plan, repaired) if repaired else "",
-        size.word if size is not None and has_both else "",
-        published.factors,
+        decisions[plan.claim.id, PUBLISHED, SIZE_PART].word if has_both else "",
         published,
     )
 
 
 def _explain(plan: ClaimPlan, decision: ClaimDecision) -> str:
-    """Explain a word that runs do not give, or not alone."""
+    """Explain on which readings a word rests, and what a proof or a small difference has to do with it."""
     outcomes = list(decision.outcomes.values())
     missing = outcomes.count(NOT_RUN)
     if decision.word == OPEN and missing:
-        has_runs = decision.runs or UNDECIDED in outcomes
-        return f"{missing} of {len(outcomes)} readings not run" if has_runs else NOT_RUN
+        is_begun = decision.share.counted > 0
+        return f"{missing} of {len(outcomes)} readings not run" if is_begun else NOT_RUN
+    texts = [describe_share(decision)]
     if plan.proved:
-        return f"proof {plan.claim.proof} in all readings but {', '.join(plan.but)}"
-    if decision.word == DEPENDS:
-        return f"true in {format_count(outcomes.count(TRUE), 'reading')}, false in {outcomes.count(FALSE)}"
-    if decision.word == OPEN and len(outcomes) > 1:
-        return f"in {outcomes.count(UNDECIDED)} of {len(outcomes)} readings"
-    is_same = plan.claim.kind == "same"
-    if (
-        decision.word == CONFIRMED
-        and not is_same
-        and KINDS["better"][1] < decision.low < decision.high < 1
-    ):
-        return "by less than 1 %"
-    if (
-        decision.word == REFUTED
-        and not plan.has_other_kind
-        and plan.claim.kind == "much better"
-        and decision.high < 1
-    ):
-        return f"smaller by {100 * (1 - decision.ratio):.0f} %, and much is {100 * (1 - KINDS['much better'][0]):.0f} % or more"
-    return ""
+        texts += [f"proof {plan.claim.proof} in all readings but those of {', '.join(plan.but)}"]
+    effect = decision.first[1]
+    is_small = KINDS["better"][1] < effect.low < effect.high < 1
+    if decision.word == CONFIRMED and plan.claim.kind != "same" and is_small:
+        texts += ["by less than 1 %"]
+    return "; ".join(filter(None, texts))
 
 
-def describe_tip(line: ClaimWord) -> str:
-    """Describe where the word would turn: the bound of the ratio of a to b."""
+def describe_share(decision: ClaimDecision) -> str:
+    """Describe the readings that a word rests on: the share of joint draws, or how many listed ones agree."""
+    true, false, n, low, high = decision.share
+    if decision.is_drawn:
+        interval = f"{100 * low:.0f} to {100 * high:.0f} %" if n else "none"
+        return f"true in {true} and false in {false} of {n} joint readings, a share of {interval}"
+    if decision.word in (CONFIRMED, REFUTED):
+        return f"in {n} readings, one level changed in each" if n > 1 else "in one reading"
+    return f"true in {true} and false in {false} of {n} readings, one level changed in each" if n else ""  # fmt: skip
+
+
+def describe_levels(line: ClaimWord) -> list[str]:
+    """Describe the outcomes at each level of the factor on which a claim depends."""
     decision = line.decision
-    if (
-        decision is None
-        or not decision.runs
-        or not math.isfinite(decision.high)
-        or decision.low <= 0
-    ):
-        return ""
-    kind = line.plan.claim.kind
-    if line.plan.has_other_kind:
-        return ""
-    bound = find_tipping_bound(kind, decision.low, decision.high)
-    if bound <= KINDS[kind][0]:  # true in the reading that is shown
-        return ""
-    return (
-        f"it would be true if ratios up to {bound:.3g} counted; they count up to {KINDS[kind][0]:g}"
-    )
-
-
-def describe_turns(line: ClaimWord) -> list[str]:
-    """Describe the readings that differ from the central one."""
-    if line.decision is None:
+    if decision is None or not decision.factor:
         return []
-    outcomes = dict(line.decision.outcomes)
-    first = next(iter(outcomes.values()))
-    readings = read_readings(line.plan.claim.paper)
+    counts: dict[str, list[str]] = {}
+    for dot in decision.readings.values():
+        counts.setdefault(dot.levels[decision.factor], []).append(dot.outcome)
     return [
-        f"{readings[name].text.rstrip('.') if name in readings else name}: {outcome}"
-        for name, outcome in outcomes.items()
-        if outcome != first and outcome not in (NOT_RUN, OPEN)
+        f"{name_level(line.plan, decision.factor, level)}: true in {outcomes.count(TRUE)}, false in {outcomes.count(FALSE)}"
+        for level, outcomes in counts.items()
     ]
 
 
-def describe_kind(plan: ClaimPlan) -> str:
-    """Describe what a claim must show."""
-    if not plan.has_other_kind:
-        return _KIND_TEXTS[plan.claim.kind]
-    comparisons = [c for parts in plan.parts.values() for c in parts]
-    texts = (_KIND_TEXTS[c.kind].format(printed=c.printed) for c in comparisons)
-    return "; ".join(dict.fromkeys(texts))
+def name_level(plan: ClaimPlan, factor: str, level: str) -> str:
+    """Name a level of a factor in words."""
+    if factor in (MUCH, WINDOW):
+        return f"{factor} as {level}"
+    rows = read_reading_table(plan.claim.paper)
+    return f"{factor} as in the central reading" if level == CENTRAL_READING else rows[level]["text"].rstrip(".")  # fmt: skip
+
+
+def name_reading(plan: ClaimPlan, name: str, decision: ClaimDecision) -> str:
+    """Name a reading by its levels that are not central."""
+    if plan.toy:
+        return f"World of this project, {' '.join(plan.toy)}"
+    options, levels = list_factor_levels(plan), decision.readings[name].levels
+    changed = [name_level(plan, f, level) for f, level in levels.items() if level != options[f][0]]
+    return "; ".join(changed) or "Central reading"
 
 
 def list_choices(plan: ClaimPlan) -> list[str]:
@@ -181,12 +147,11 @@ def list_choices(plan: ClaimPlan) -> list[str]:
     paper = plan.claim.paper
     if plan.toy:
         return ["a world of this project: " + ", ".join(plan.toy)]
-    completed = [
-        entry["why"] for entry in read_reading_table(paper)[CENTRAL_READING].get("completions", ())
-    ]
-    names = [name for name, _ in list_dots(plan).values() if name in read_readings(paper)]
-    ours = [read_readings(paper)[name] for name in dict.fromkeys(names)]
-    return [*completed, *(f"{r.text} {r.reason}" for r in ours if r.grade in ("ours", "fitted"))]
+    rows = read_reading_table(paper)
+    completed = [entry["why"] for entry in rows[CENTRAL_READING].get("completions", ())]
+    names = [level for levels in list_factor_levels(plan).values() for level in levels[1:]]
+    ours = [rows[name] for name in names if rows.get(name, {}).get("class") == "ours"]
+    return [*completed, *(f"{row['text']} {row['why']}" for row in ours)]
 
 
 def count_by_paper(lines: Sequence[ClaimWord]) -> dict[str, dict[str, int]]:

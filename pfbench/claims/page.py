@@ -16,31 +16,40 @@ import yaml
 from markupsafe import Markup
 
 from pfbench.claims.claim_lines import (
+    BESIDE_PART,
+    MUCH_BETTER,
     REPAIRED,
     ClaimPlan,
     read_claim_data,
     read_plans,
     read_proofs,
-    read_readings,
 )
 from pfbench.claims.claim_runs import (
     CLAIMS_STUDY,
     PUBLISHED_VALUES,
-    Cell,
     ClaimRuns,
+    Decisions,
     decide_claims,
 )
+from pfbench.claims.curve import render_curve
 from pfbench.claims.ledger import (
     ClaimWord,
     conclude,
     count_by_paper,
-    describe_kind,
-    describe_tip,
-    describe_turns,
+    describe_levels,
+    describe_share,
     list_choices,
+    name_reading,
 )
-from pfbench.claims.run_claims import Decisions, Task, describe_words, price_claims
-from pfbench.claims.words import NOT_RUN, OPEN, WORDS, ClaimDecision
+from pfbench.claims.run_claims import describe_words, price_claims
+from pfbench.claims.words import (
+    LOOKS,
+    NOT_RUN,
+    OPEN,
+    REFUTED,
+    WORDS,
+    ClaimDecision,
+)
 from pfbench.files.recorded_folder import RecordedFolder, find_published_file
 from pfbench.report import RUNS_FILE, count_better_worlds, find_overviews, read_stored_study
 from pfbench.report.page_kit import (
@@ -51,20 +60,25 @@ from pfbench.report.page_kit import (
     render_template,
     with_heading,
 )
+from pfbench.report.writers import format_data_address
 
 _RATES = Path(__file__).with_name("error_rates.yaml")
+_SEVEN = ("name", "published", "repaired", "tuned", "is")  # columns of the table of the seven
 COMPARISON = "all_seven"  # study that compares the methods with the Kalman filters of each world
 RULES = (
-    "Confirmed or refuted: the same outcome in all readings that can run, at 2.5 % for all claims of a paper.",
+    "A reading is a level of each factor that the paper leaves open. Joint readings are drawn from the grid of all factors, with equal odds for each level, by a stored seed. All have the same runs.",
+    "A claim is true or false in a reading if that is shown at 2 % on its side, at the first runs or at all. Otherwise it is undecided there, and counts as either.",
+    f"Looks after {', '.join(map(str, LOOKS))} joint readings. Refuted: true in at most 2 %, and in at most 5 % by the interval of the share, 97.5 % on a side. Confirmed: false in as few. Depends: true and false in more than 5 % each, by the same interval.",
+    "A claim that depends names the factor that explains most of the variance of true and false.",
+    f"With fewer than {LOOKS[0]} joint readings, all readings with one level changed must agree, and the word says so. Such a word may turn where two levels change together.",
+    "Worlds of this project and times have no joint readings.",
     "Better is true below a ratio of 1, by however little. If that is not shown, it is false above 0.99.",
-    "Much better: a ratio below 0.8. The same: from 1/1.1 to 1.1. A level: within 20 %. At most twice: below 2.",
+    "Much is a factor: a fifth, a ratio below 0.8, or any amount. The same: from 1/1.1 to 1.1. A level: within 20 %. At most twice: below 2.",
     "A printed ratio has another line, its size: half to twice its logarithm.",
-    "Of several comparisons all must hold. The ratio shown is the one that decides, or else the closest to a border.",
-    "Depends: outcomes of both kinds, after correction over claims times readings.",
+    "A claim is split into atoms: what, against whom, and how much. All must hold. What the paper does not plot is shown beside, and does not count.",
     "Untestable: circular, vacuous, lost, or no reading can run. Open: none of these.",
     "As published is the printed form. What is lost or cannot run is completed, by name, in the central reading.",
-    "A fitted reading is shown and does not count. A repaired form must keep track in the paper's world.",
-    "Two looks, at a half and two per cent on each side: the first runs of seed 2001, and all runs.",
+    "A fitted level is not drawn. A repaired form must keep track in the paper's world.",
 )
 
 
@@ -120,6 +134,7 @@ def make_context(
         {
             "key": paper,
             "name": settings["name"],
+            "figures": settings["figures"],
             "sentence": _say_paper(settings["sentence"], counts[paper]),
             "rows": [row for row in rows if row["paper"] == paper],
             "proofs": re.findall(r"P\d+", settings["sentence"]),
@@ -140,10 +155,10 @@ def make_context(
         "rules": (*RULES, _say_error_rates()),
         "proofs": read_proofs(),
         "n": len(lines),
+        "drawn": sum(row["is_drawn"] for row in rows),
         "jobs": len(runs.records),
         "hours": sum(record.seconds for record in runs.records) / 3600,
         "missing": sum(task.seconds for task in tasks.values()) / 3600,
-        "prices": _list_spent(runs, list(tasks.values())),
         "commits": commits,
         "dirty": sum(record.commit.endswith("-dirty") for record in runs.records),
     }
@@ -157,12 +172,11 @@ def list_claim_blocks(page: Mapping[str, Any]) -> list[Block]:
         "method", "beats its own baseline, as published", "our repair does",
         "our forms, in the study of all seven, beat every single Kalman filter", "as printed, it is",
     )  # fmt: skip
-    columns = ("name", "published", "repaired", "tuned", "is")
     return [
-        Block("title", f"{page['n']} claims of five papers, over every plausible reading"),
+        Block("title", f"{page['n']} claims of five papers, over joint readings of each paper"),
         Block("text", f"{counts}.{unrun}"),
         Block("list", [Markup(f"**{plain(paper['name'])}.** {plain(paper['sentence'])}") for paper in page["papers"]]),
-        make_rows(heads, [[row[name] for name in columns] for row in page["seven"]], rule="---"),
+        make_rows(heads, [[row[name] for name in _SEVEN] for row in page["seven"]], rule="---"),
         *itertools.chain.from_iterable(
             with_heading(Block("heading", paper["name"]), Block("list", [_list_row(row) for row in paper["rows"]])) for paper in page["papers"]
         ),
@@ -175,7 +189,7 @@ def list_claim_blocks(page: Mapping[str, Any]) -> list[Block]:
         Block("list", [f"{', '.join(row['claims'])}: {row['what']} Before: {row['before']}." for row in page["amendments"]]),
         Block("heading", "Rules"),
         Block("list", page["rules"]),
-        Block("text", f"{page['jobs']} jobs, {page['hours']:.1f} hours of processor time spent, {page['missing']:.1f} hours of second looks missing."),
+        Block("text", f"{page['jobs']} jobs, {page['hours']:.1f} hours of processor time spent, {page['missing']:.1f} hours to the next looks missing."),
     ]  # fmt: skip
 
 
@@ -191,34 +205,15 @@ def _list_row(row: Mapping[str, Any]) -> str:
 
 
 def _say_error_rates() -> str:
-    """Say how often simulated papers, whose claims are at a border, have a false word."""
+    """Say how often simulated claims at a border have a false word."""
     stored = yaml.safe_load(_RATES.read_text(encoding="utf-8"))
-    confirmed, refuted = (
-        max(row[name] for row in stored["rates"]) for name in ("false_confirmed", "false_refuted")
-    )
+    confirmed, refuted, depends = (
+        max(row[f"false_{word}"] for row in stored["rates"]) for word in ("confirmed", "refuted", "depends")
+    )  # fmt: skip
     return (
-        f"In {stored['ledgers']} simulated papers with all claims at a border, at most {confirmed:.1%} have a false "
-        f"confirmed, and {refuted:.1%} a false refuted."
+        f"In {stored['claims']} simulated claims at each border, at most {confirmed:.1%} have a false confirmed, {refuted:.1%} a "
+        f"false refuted, and {depends:.1%} a false depends."
     )
-
-
-def _list_spent(runs: ClaimRuns, tasks: Sequence[Task]) -> list[dict[str, Any]]:
-    """List jobs and hours spent and missing of each paper; worlds of this project are those of no paper."""
-
-    def find_paper(cell: Cell) -> str:
-        return next((word[8:11] for word in cell if word.startswith("reading/")), "others")
-
-    papers = sorted({find_paper(record.cell) for record in runs.records} | {task.paper for task in tasks})  # fmt: skip
-    return [
-        {
-            "paper": paper,
-            "jobs": sum(find_paper(record.cell) == paper for record in runs.records),
-            "spent": sum(r.seconds for r in runs.records if find_paper(r.cell) == paper) / 3600,
-            "missing_jobs": sum(find_paper(task.cell) == paper for task in tasks),
-            "missing": sum(t.seconds for t in tasks if find_paper(t.cell) == paper) / 3600,
-        }
-        for paper in papers
-    ]
 
 
 def _say_paper(sentence: str, counts: Mapping[str, int]) -> str:
@@ -233,8 +228,7 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
     price = prices.get(claim.id, 0.0)
     reason = f"{line.reason}, price {_format_price(price)}" if price and line.state == NOT_RUN else line.reason  # fmt: skip
     statement = f"{line.label}: {reason}" if reason else line.label
-    measured = _format_measured(line, decision)
-    repaired = decisions.get((claim.id, REPAIRED, "direction"))
+    measured = _format_shown(line, decision)
     return {
         "id": claim.id,
         "paper": claim.paper,
@@ -246,15 +240,19 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
         "tip": f"{claim.id}: {statement}. “{claim.words}” {measured}".strip(),
         "repaired": line.repaired,
         "repaired_reason": line.repaired_reason,
-        "repaired_measured": _format_measured(line, repaired),
+        "repaired_measured": _format_shown(line, decisions.get((claim.id, REPAIRED, "direction"))),
         "size": line.size,
-        "kind": describe_kind(line.plan),
         "figure": f"{claim.figure}: {claim.a}" + (f" and {', '.join(claim.b)}" if claim.b else ""),
         "printed": claim.printed,
         "measured": measured,
-        "border": describe_tip(line),
+        "strongest": _format_shown(line, decision, is_best=True) if line.word == REFUTED else "",
+        "atoms": _list_atoms(claim.id, decisions),
+        "curve": Markup(format_data_address("svg", render_curve(line.plan, decision))) if decision and decision.is_drawn else "",
         "dots": _make_dots(line),
-        "turns": describe_turns(line),
+        "levels": describe_levels(line),
+        "factor": decision.factor if decision else "",
+        "explained": f"{decision.explained:.0%}" if decision else "",
+        "is_drawn": bool(decision and decision.is_drawn),
         "proof": claim.proof,
         "mark": claim.mark,
         "objection": " ".join(row["what"] for row in read_claim_data()["disputed"] if claim.id in row["claims"]),
@@ -264,14 +262,28 @@ def make_row(line: ClaimWord, decisions: Decisions, prices: Mapping[str, float])
     }  # fmt: skip
 
 
-def _format_measured(line: ClaimWord, decision: ClaimDecision | None) -> str:
-    """Format the ratio of a decision with its interval, and name its reading if it is not the central one."""
-    if decision is None or not decision.runs:
+def _format_shown(line: ClaimWord, decision: ClaimDecision | None, is_best: bool = False) -> str:
+    """Format the ratio in the first reading that has one, or in the best one for the claim, and name it if others decide too."""
+    if decision is None or not decision.ratios:
         return ""
-    numbers = _format_ratio(decision.ratio, decision.low, decision.high)
-    first = next(iter(decision.outcomes))
-    where = "" if decision.reading == first else f" ({_name_dot(line, decision.reading)})"
-    return f"{decision.sides} = {numbers}, {decision.runs} runs; smaller in {decision.order:.0%} of them{where}"
+    name, effect = decision.strongest if is_best else decision.first
+    is_central = name == next(iter(decision.outcomes)) and not is_best
+    where = "" if is_central else f" ({name_reading(line.plan, name, decision)})"
+    numbers = _format_ratio(effect.ratio, effect.low, effect.high)
+    return f"{effect.sides} = {numbers}, {effect.runs} runs; smaller in {effect.order:.0%} of them{where}"
+
+
+def _list_atoms(claim: str, decisions: Decisions) -> list[dict[str, str]]:
+    """List the atoms of a claim: what is compared with whom and how much is asked, with the word on it."""
+    return [
+        {
+            "text": f"{portion.partition(', ')[2].replace(MUCH_BETTER, 'a fifth better')} ({column}{', beside the claim' * portion.startswith(BESIDE_PART)})",
+            "word": decision.word,
+            "share": describe_share(decision),
+        }
+        for (name, column, portion), decision in decisions.items()
+        if name == claim and ", " in portion
+    ]  # fmt: skip
 
 
 def _format_ratio(value: float, low: float, high: float) -> str:
@@ -294,24 +306,14 @@ def _format_price(seconds: float) -> str:
 
 
 def _make_dots(line: ClaimWord) -> list[dict[str, str]]:
-    """Make the dots of a claim: a reading each, with outcome and text."""
-    if line.decision is None:
+    """Make the dots of a claim that listed readings decide: outcome and text of each."""
+    decision = line.decision
+    if decision is None or decision.is_drawn:
         return []
     return [
-        {
-            "outcome": outcome.replace(" ", "-"),
-            "text": f"{_name_dot(line, name)}: {outcome}",
-        }
-        for name, outcome in line.decision.outcomes.items()
-    ]
-
-
-def _name_dot(line: ClaimWord, name: str) -> str:
-    """Name a reading, a window of time or a world of this project."""
-    if line.plan.toy:
-        return f"World of this project, {' '.join(line.plan.toy)}"
-    readings = read_readings(line.plan.claim.paper)
-    return readings[name].text.rstrip(".") if name in readings else name
+        {"outcome": outcome.replace(" ", "-"), "text": f"{name_reading(line.plan, name, decision)}: {outcome}"}
+        for name, outcome in decision.outcomes.items()
+    ]  # fmt: skip
 
 
 def make_seven(

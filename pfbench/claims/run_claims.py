@@ -10,31 +10,38 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import replace
-from itertools import repeat
+from itertools import product, repeat
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from pfbench.claims.claim_lines import TIMING, ClaimPlan, list_dots, read_claim_data
+from pfbench.claims.claim_lines import (
+    TIMING,
+    ClaimPlan,
+    ClaimPoint,
+    list_main_parts,
+    list_points,
+    read_claim_data,
+)
 from pfbench.claims.claim_runs import (
-    CENTRE,
     CLAIMS_STUDY,
-    MOVER,
-    SCREEN,
+    FIRST,
+    MORE,
     Batch,
     Cell,
     ClaimRuns,
+    Decisions,
     StoredValues,
     estimate_seconds,
-    list_batches,
     list_claim_cells,
-    list_dot_cells,
+    make_batch,
+    measure_sides,
     name_timing,
     write_values,
 )
 from pfbench.claims.measures import MOVED, Measure, measure_runs
-from pfbench.claims.words import DEPENDS, FALSE, OPEN, TRUE, UNDECIDED, ClaimDecision
+from pfbench.claims.words import LOOKS, OPEN, UNDECIDED
 from pfbench.job.config import compose
 from pfbench.results import store
 
@@ -73,15 +80,17 @@ class Task(NamedTuple):
 
 
 class ClaimPrice(NamedTuple):
-    """Price of the next stage of a claim.
+    """Price of the next look of a claim.
 
     Attributes:
         plan: Claim.
-        stage: Stage: screen, centre or mover.
+        draws: Joint draws of the look; 0 for a claim without draws.
+        stage: Runs of each draw: first, or more where it is open.
         tasks: Jobs that are missing.
     """
 
     plan: ClaimPlan
+    draws: int
     stage: str
     tasks: tuple[Task, ...]
 
@@ -91,99 +100,74 @@ class ClaimPrice(NamedTuple):
         return sum(task.seconds for task in self.tasks)
 
 
-Decisions = Mapping[tuple[str, str, str], ClaimDecision]
-
-
 def price_claims(
     plans: Sequence[ClaimPlan], runs: ClaimRuns, decisions: Decisions
 ) -> list[ClaimPrice]:
-    """Price the next stage of each claim that runs can still decide, the cheapest first.
+    """Price the next look of each claim whose word does not stand, the cheapest first.
 
-    Jobs that may refuse are the first of a claim: they take seconds, and one that refuses in all readings decides it.
+    Draws run in their order: those of the cheapest readings alone would be no sample of the grid. Jobs that may refuse
+    are the first of a claim: they take seconds, and one that refuses in all readings decides it.
     """
-    prices = []
-    for plan in plans:
-        mine = [decided for (claim, _, _), decided in decisions.items() if claim == plan.claim.id]
-        for stage in (SCREEN, CENTRE, MOVER):
-            missing = _list_missing(plan, stage, runs, mine)
-            tasks = tuple(sorted(missing, key=lambda task: not may_refuse(task)))
-            if tasks and (stage == SCREEN or any(d.word in (OPEN, DEPENDS) for d in mine)):
-                prices.append(ClaimPrice(plan, stage, tasks))
-                break
-    order = {SCREEN: 0, CENTRE: 1, MOVER: 2}
-    return sorted(prices, key=lambda p: (order[p.stage], p.seconds, p.plan.claim.id))
+    prices = filter(None, (_price_look(plan, runs, decisions) for plan in plans))
+    return sorted(prices, key=lambda price: (price.seconds, price.plan.claim.id))
 
 
-def _list_missing(
-    plan: ClaimPlan, stage: str, runs: ClaimRuns, decisions: Sequence[ClaimDecision]
-) -> Iterator[Task]:
-    """Yield the missing jobs of a claim at a stage."""
-    paper, cells = plan.claim.paper, list_claim_cells(plan)
-    selected = _select_readings(plan, stage, decisions)
-    places = [cell for name, measured in list_dot_cells(plan) if name in selected for cell, _ in measured]  # fmt: skip
-    for cell in dict.fromkeys(places):
-        price = estimate_seconds(paper, cell, runs)
-        for batch in list_batches(paper, stage):
-            if not runs.has(cell, batch, [n for n, m in cells[cell].items() if m.metric != TIMING]):
-                yield Task(paper, cell, batch, cells[cell], seconds=price * batch.runs)
-    if stage == SCREEN:
-        yield from _list_timings(plan, runs)
+def _price_look(plan: ClaimPlan, runs: ClaimRuns, decisions: Decisions) -> ClaimPrice | None:
+    """Price the next look of a claim; None if its word is decided or all draws are complete."""
+    mine = [decisions[plan.claim.id, column, portion] for column, portion in list_main_parts(plan)]
+    points = list_points(plan)
+    for look in LOOKS if plan.is_drawn else (0,):
+        selected = [p for p in points if p.draw < look and (p.draw >= 0) == plan.is_drawn]
+        first = _list_missing(plan, FIRST, selected, runs)
+        if first or not plan.is_drawn:
+            return ClaimPrice(plan, look, FIRST, first) if first else None
+        if all(d.word != OPEN and d.is_drawn for d in mine):
+            return None
+        undecided = [p for p in selected if any(d.outcomes[p.name] == UNDECIDED for d in mine if d.word == OPEN)]  # fmt: skip
+        # so few readings as those of the first look cannot confirm or refute: more of them serve better than more runs
+        more = _list_missing(plan, MORE, undecided if look > LOOKS[0] else (), runs)
+        if more:
+            return ClaimPrice(plan, look, MORE, more)
+    return None
 
 
-def _select_readings(
-    plan: ClaimPlan, stage: str, decisions: Sequence[ClaimDecision]
-) -> Sequence[str]:
-    """Select the readings of a stage: all, the central one, or those that turn the claim or are open."""
-    names = list(list_dots(plan))
-    if stage == SCREEN:
-        return names
-    if stage == CENTRE:
-        return names[:1]
-    outcomes = [(d.outcomes, next(iter(d.outcomes.values()))) for d in decisions]
-    return [
-        name for name in names[1:]
-        if any(outcome.get(name) in (UNDECIDED, TRUE, FALSE) and outcome.get(name) != first for outcome, first in outcomes)
-    ]  # fmt: skip
+def _list_missing(plan: ClaimPlan, stage: str, points: Sequence[ClaimPoint], runs: ClaimRuns) -> tuple[Task, ...]:  # fmt: skip
+    """List the missing jobs of a claim in some readings, those that may refuse first."""
+    paper, tasks = plan.claim.paper, list[Task]()
+    for point in points:
+        batch = make_batch(paper, point, stage)
+        for cell, measures in list_claim_cells(plan, [point]).items():
+            if not runs.has(cell, batch, [n for n, m in measures.items() if m.metric != TIMING]):
+                price = estimate_seconds(paper, cell, runs) * batch.runs
+                tasks.append(Task(paper, cell, batch, measures, seconds=price))
+    tasks += _list_timings(plan, points, runs)
+    return tuple(sorted(tasks, key=lambda task: not may_refuse(task)))
 
 
-def _list_timings(plan: ClaimPlan, runs: ClaimRuns) -> Iterator[Task]:
-    """Yield the timings of a claim that are missing: of the runs of the screen, or as many as take five minutes.
+def _list_timings(plan: ClaimPlan, points: Sequence[ClaimPoint], runs: ClaimRuns) -> Iterator[Task]:  # fmt: skip
+    """Yield the timings of a claim that are missing: of the runs of a reading, or as many as take five minutes.
 
     A filter that takes hours has thousands of updates in each step of three runs.
     """
     comparisons = [c for parts in plan.parts.values() for c in parts if c.a.measure.metric == TIMING]  # fmt: skip
-    if not comparisons:
-        return
-    batch = list_batches(plan.claim.paper, SCREEN)[0]
-    for _, measured in list_dot_cells(plan):
-        cells = [cell for cell, _ in measured]
-        start = 0
-        for c in [c for parts in plan.parts.values() for c in parts]:
-            size = sum(bool(side.filter) for side in (c.a, c.b))
-            pair = tuple(cells[start : start + size])
-            start += size
-            name = name_timing(pair[0], pair[-1])
-            if c.a.measure.metric == TIMING and not runs.find(name):
-                # 20 rounds of at least 20 steps take about as long as the job itself
-                rounds = _ROUNDS * _ROUND_S * size * 3
-                run_s = 2.0 * sum(
-                    estimate_seconds(plan.claim.paper, cell, runs) for cell in set(pair)
-                )
-                count = min(batch.runs, max(_FEWEST_TIMED, int((_TIMING_S - rounds) / run_s)))
-                yield Task(
-                    plan.claim.paper, name, batch._replace(runs=count), {}, pair, rounds + count * run_s
-                )  # fmt: skip
+    for point, c in product(points, comparisons):
+        cells = [cell for cell, _ in measure_sides(plan, point, c)]
+        name, batch = name_timing(cells[0], cells[-1]), make_batch(plan.claim.paper, point, FIRST)
+        if not runs.find(name):
+            # 20 rounds of at least 20 steps take about as long as the job itself
+            rounds = _ROUNDS * _ROUND_S * len(cells) * 3
+            run_s = 2.0 * sum(estimate_seconds(plan.claim.paper, cell, runs) for cell in {*cells})
+            count = min(batch.runs, max(_FEWEST_TIMED, int((_TIMING_S - rounds) / run_s)))
+            yield Task(
+                plan.claim.paper, name, batch._replace(runs=count), {}, tuple(cells), rounds + count * run_s
+            )  # fmt: skip
 
 
 def run_claim_task(task: Task, results: str) -> StoredValues:
     """Run a job, or read it if it exists, and write its values."""
-    folder = Path(results) / CLAIMS_STUDY
-    if task.timed:
-        record = _time_in_turn(task, results)
-    else:
-        record = _run_job(task, results)
+    record = (_time_in_turn if task.timed else _run_job)(task, results)
     if not record.failed or may_refuse(task):
-        write_values(folder, record)
+        write_values(Path(results) / CLAIMS_STUDY, record)
     return record
 
 
@@ -246,20 +230,22 @@ def _time_in_turn(task: Task, results: str) -> StoredValues:
     from pfbench.job.step_timing import time_condition
     from pfbench.results.conditions import Condition, JobFile
 
-    cells = list(dict.fromkeys(task.timed))
-    jobs = []
-    for cell in cells:
-        path = run(compose(list_words(cell, task.batch, results))).path
-        jobs.append(JobFile(path, " ".join(cell), store.read_metadata(path)))
+    paths = {cell: run(compose(list_words(cell, task.batch, results))).path for cell in task.timed}
+    jobs = [
+        JobFile(path, " ".join(cell), store.read_metadata(path)) for cell, path in paths.items()
+    ]
     choices = jobs[0].meta["choices"]
-    names = (choices["scenario"], choices["noise"], choices["model"])
     begin = time.process_time()
-    measured = time_condition(Condition(*names, tuple(jobs)), {}, _ROUNDS, _ROUND_S)
+    measured = time_condition(
+        Condition(choices["scenario"], choices["noise"], choices["model"], tuple(jobs)),
+        {},
+        _ROUNDS,
+        _ROUND_S,
+    )
     times = {str(k): measured["jobs"][job.path.stem]["cpu"] for k, job in enumerate(jobs)}
     commit, spent = read_versions()["commit"], time.process_time() - begin
-    zeros = (0,) * _ROUNDS
     return StoredValues(
-        task.cell, *task.batch, "", commit, spent, "", zeros, times if len(times) > 1 else {**times, "1": times["0"]},
+        task.cell, *task.batch, "", commit, spent, "", (0,) * _ROUNDS, times if len(times) > 1 else {**times, "1": times["0"]},
     )  # fmt: skip
 
 
@@ -267,26 +253,14 @@ def run_tasks(
     tasks: Sequence[Task], results: str, workers: int, seconds: float
 ) -> Iterator[tuple[Task, StoredValues]]:
     """Run jobs in at most two processes until the time is over, and yield each as it ends."""
-    if workers == 1:
-        begin = time.monotonic()
-        for task in tasks:
-            if time.monotonic() - begin > seconds:
-                return
-            yield task, run_claim_task(task, results)
-        return
+    end, waiting = time.monotonic() + seconds, list(reversed(tasks))
     context = multiprocessing.get_context("spawn")
-    begin = time.monotonic()
+    running: dict[Future[StoredValues], Task] = {}
     with ProcessPoolExecutor(min(workers, WORKERS), mp_context=context) as pool:
-        waiting = list(reversed(tasks))
-        running: dict[Future[StoredValues], Task] = {}
-        while waiting or running:
-            is_over = time.monotonic() - begin > seconds
-            while waiting and len(running) < workers and not is_over:
+        while running or (waiting and time.monotonic() < end):
+            while waiting and len(running) < workers and time.monotonic() < end:
                 task = waiting.pop()
-                future = pool.submit(run_claim_task, task, results)
-                running[future] = task
-            if not running:
-                return
+                running[pool.submit(run_claim_task, task, results)] = task
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
                 yield running.pop(future), future.result()
@@ -403,11 +377,11 @@ def find_measures(plans: Sequence[ClaimPlan]) -> dict[Cell, dict[str, Measure]]:
 
 
 def merge_tasks(tasks: Sequence[Task], plans: Sequence[ClaimPlan]) -> list[Task]:
-    """List each job once, with the quantities of all claims that use it; timings follow their jobs."""
+    """List each job once, with the quantities of all claims that use it, in their order; timings follow."""
     measures = find_measures(plans)
     once = {(task.cell, task.batch): task for task in tasks}
     merged = [t._replace(measures=measures.get(t.cell, {})) for t in once.values()]
-    return [t for t in merged if not t.timed] + [t for t in merged if t.timed]
+    return sorted(merged, key=lambda task: bool(task.timed))
 
 
 def describe_words(decisions: Decisions) -> dict[str, str]:

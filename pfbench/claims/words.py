@@ -1,32 +1,31 @@
-"""The five words on a claim over its readings, from `compare` and `decide` alone.
+"""The five words on a claim, by the share of its readings in which it is true.
 
 A kind of claim is a region of the log ratio of a to b. A test of a border is the comparison of a with b times the
-border. A claim is true in a reading if all of its comparisons are, with the largest of their p-values. It is false if
-some comparison is, with the smallest p-value times their number. It is confirmed if it is true in all readings, with
-the largest p-value over them, and Holm's correction over the claims of a paper. The rules for refuted are the same.
-"It depends" needs a reading of both outcomes after Holm's correction over claims times readings.
+border, by the three tests of `find_largest_p`. A claim is true in a reading if all of its comparisons are, with the largest
+of their p-values. It is false if some comparison is, with the smallest p-value times their number. A reading in which
+neither is shown is undecided: it counts for both.
+
+Readings are drawn from the grid of all factors. The share in which the claim is true has an interval of Clopper and Pearson,
+at looks after 50, 100 and 200 draws. Its ends allow for the error rate of single readings. A claim without draws, or with
+fewer than those of the first look, has the word that all listed readings agree on.
+
+References:
+    C. J. Clopper and E. S. Pearson (1934), The use of confidence or fiducial limits in the case of the binomial.
+    U. Simonsohn, J. P. Simmons and L. D. Nelson (2020), Specification curve analysis.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple
 
 import numpy as np
-import pandas as pd
+import scipy
 
 from pfbench.claims.claim_list import KINDS
-from pfbench.stats.comparison import (
-    ALPHA,
-    BETTER_THAN,
-    MIN_RUNS,
-    Effect,
-    decide,
-    is_testable,
-)
+from pfbench.stats.comparison import ALPHA, MIN_RUNS, Effect, find_largest_p, subtract_losses
 from pfbench.stats.error_measures import Array, Flags
-from pfbench.stats.study_runs import CONDITION, StudyRuns, compare_filters, compute_losses
 
 CONFIRMED: Final = "confirmed"
 REFUTED: Final = "refuted"
@@ -36,13 +35,19 @@ OPEN: Final = "open"
 WORDS = (CONFIRMED, REFUTED, DEPENDS, UNTESTABLE, OPEN)
 
 TRUE, FALSE, UNDECIDED = "true", "false", "open"
-NOT_RUN, CANNOT_RUN, VACUOUS, NOT_COUNTED = "not run", "cannot run", "vacuous", "not counted"
+NOT_RUN, CANNOT_RUN, VACUOUS = "not run", "cannot run", "vacuous"
 
-PAIR = "pair"  # factor of two levels together that turn a claim alone
-LOOKS = (0.01, 0.04)  # error rates of both sides at the first look and at all runs; half on a side
+LOOKS = (50, 100, 200)  # draws after which the share is looked at
+SIDE = 0.025  # error rate of an end of the interval of the share, over all looks
+READING_SIDE = 0.02  # error rate of an outcome of one reading, over the first runs and all of them
+MOST_TRUE, MOST_BOUND = (
+    0.02,
+    0.05,
+)  # share, and upper end, of a refuted claim; so for the false ones of a confirmed claim
 LEVEL_BOUND = 1.2  # a printed level holds within 20 %
 SIZE_BOUND = 2.0  # a printed ratio holds within this factor of its logarithm
 _MOST_LOST = 0.5  # share of runs that both filters lose, above which a reading cannot run
+_LEAST_ERROR = 1e-300  # an error of exactly 0 has a finite logarithm
 
 
 class ClaimSample(NamedTuple):
@@ -75,19 +80,95 @@ class ClaimSample(NamedTuple):
         })  # fmt: skip
 
 
+class ShownRatio(NamedTuple):
+    """Ratio of a comparison with its interval.
+
+    Attributes:
+        ratio: Ratio of a to b.
+        low: Lower end of its interval.
+        high: Upper end.
+        runs: Number of runs.
+        order: Share of the runs in which a is smaller.
+        sides: What is divided by what.
+        excess: How far the log ratio is beyond the border of true; negative on the side of true.
+    """
+
+    ratio: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    runs: int = 0
+    order: float = math.nan
+    sides: str = ""
+    excess: float = math.nan
+
+
+class WeighedSample(NamedTuple):
+    """Evidence of a comparison in a reading.
+
+    Attributes:
+        p_true: p-value against the claim being false.
+        p_false: p-value against its being true.
+        state: `NOT_RUN`, `CANNOT_RUN` or `VACUOUS` of a comparison that says nothing; empty otherwise.
+        effect: Its ratio.
+    """
+
+    p_true: float = 1.0
+    p_false: float = 1.0
+    state: str = ""
+    effect: ShownRatio = ShownRatio()
+
+
 class ReadingDot(NamedTuple):
     """A claim in a reading.
 
     Attributes:
-        factor: Factor of the reading; "none" for the central one.
-        comparisons: Comparisons that must all hold; empty if there is none to decide by.
-        state: Outcome without runs: `NOT_RUN`, `CANNOT_RUN`, `VACUOUS`, `NOT_COUNTED`, `FALSE` by a proof, or
-            empty.
+        levels: Level of each factor.
+        comparisons: Comparisons that must all hold, of those that say something.
+        draw: Number of the joint draw; -1 for a reading in a list.
     """
 
-    factor: str
-    comparisons: Sequence[ClaimSample] = ()
-    state: str = ""
+    levels: Mapping[str, str]
+    comparisons: Sequence[WeighedSample]
+    draw: int = -1
+
+    @property
+    def p_values(self) -> tuple[float, float]:
+        """p-values of true and of false."""
+        used = [c for c in self.comparisons if not c.state]
+        return max(c.p_true for c in used), min(1.0, len(used) * min(c.p_false for c in used))
+
+    @property
+    def outcome(self) -> str:
+        """Outcome. Better by less than 1 % is true, and not false as well."""
+        states = [c.state for c in self.comparisons]
+        if NOT_RUN in states or all(states):
+            return NOT_RUN if NOT_RUN in states else states[0]
+        p_true, p_false = self.p_values
+        return TRUE if p_true <= READING_SIDE else FALSE if p_false <= READING_SIDE else UNDECIDED
+
+    @property
+    def effect(self) -> ShownRatio:
+        """Ratio of the comparison that is farthest beyond the border of true, or the closest to it."""
+        options = [c.effect for c in self.comparisons if c.effect.runs]
+        return max(options, key=lambda effect: effect.excess, default=ShownRatio())
+
+
+class TrueShare(NamedTuple):
+    """Share of the readings in which a claim is true.
+
+    Attributes:
+        true: Readings in which it is shown to be true.
+        false: Readings in which it is shown to be false.
+        counted: Readings that can run and say something.
+        low: Lower end of the interval of the share; NaN for listed readings, which are not a sample.
+        high: Upper end.
+    """
+
+    true: int = 0
+    false: int = 0
+    counted: int = 0
+    low: float = math.nan
+    high: float = math.nan
 
 
 class ClaimDecision(NamedTuple):
@@ -95,43 +176,39 @@ class ClaimDecision(NamedTuple):
 
     Attributes:
         word: One of `WORDS`.
-        factors: Factors on which it depends.
-        outcomes: Outcome by reading.
-        ratio: Ratio of a to b in the central reading, of the comparison that is closest to turn the claim. If that
-            reading cannot run, in the first one that can.
-        low: Lower end of its interval.
-        high: Upper end.
-        runs: Runs of that comparison.
-        order: Share of its runs in which a is smaller.
-        sides: What is divided by what in that comparison.
-        reading: Reading of the ratio.
+        factor: Factor that explains most of the outcomes of a claim that depends; empty otherwise.
+        explained: Share of the variance of the outcomes that it explains.
+        share: Share of the readings in which the claim is true.
+        is_drawn: Whether joint draws decide, and not a list of readings.
+        readings: Readings that decide, by name.
+        outcomes: Outcome by reading, of all readings.
     """
 
     word: str
-    factors: tuple[str, ...]
+    factor: str
+    explained: float
+    share: TrueShare
+    is_drawn: bool
+    readings: Mapping[str, ReadingDot]
     outcomes: Mapping[str, str]
-    ratio: float = math.nan
-    low: float = math.nan
-    high: float = math.nan
-    runs: int = 0
-    order: float = math.nan
-    sides: str = ""
-    reading: str = ""
 
+    @property
+    def ratios(self) -> dict[str, ShownRatio]:
+        """Ratios of the readings that have one, by name."""
+        return {name: dot.effect for name, dot in self.readings.items() if dot.effect.runs}
 
-class _Evidence(NamedTuple):
-    """Evidence for one outcome: an effect whose "better" is the outcome, or certainty without a test."""
+    @property
+    def first(self) -> tuple[str, ShownRatio]:
+        """Name and ratio of the first reading that has one: the central one, if it can run."""
+        return next(iter(self.ratios.items()), ("", ShownRatio()))
 
-    effect: Effect
-    is_certain: bool = False
-    is_excluded: bool = False  # certain that it is not the outcome
+    @property
+    def strongest(self) -> tuple[str, ShownRatio]:
+        """Name and ratio of the reading that is the best for the claim."""
+        return min(self.ratios.items(), key=lambda row: row[1].excess, default=("", ShownRatio()))
 
 
 _Region = tuple[float, float]
-_Key = TypeVar("_Key", str, tuple[str, str])
-_TABLE = pd.DataFrame([["claim", "claim", "claim"]], columns=CONDITION)
-_NOTHING = Effect("claim", "border", "run", np.zeros(0), 1.0, 1.0, 1.0)
-_TESTS = ("p", "p_trimmed", "p_sign")  # of an effect
 
 
 def find_borders(kind: str, printed: float = math.nan) -> tuple[_Region, _Region]:
@@ -151,229 +228,137 @@ def find_borders(kind: str, printed: float = math.nan) -> tuple[_Region, _Region
     return (-math.inf, math.log(true)), (-math.inf, math.log(false))
 
 
-def decide_paper(claims: Mapping[str, Mapping[str, ReadingDot]]) -> dict[str, ClaimDecision]:
-    """Decide the claims of a paper, in one column.
+def weigh(c: ClaimSample) -> WeighedSample:
+    """Weigh the evidence of a comparison, at the first runs and at all: the smaller p-value, twice."""
+    c = c.select(~(np.isnan(c.a) & ~c.lost_a) & ~(np.isnan(c.b) & ~c.lost_b))
+    losses = [_take_logarithms(c.a, c.lost_a), _take_logarithms(c.b, c.lost_b)]
+    effect = _describe(c, *losses)
+    if len(c.a) and (c.lost_a & c.lost_b).mean() > _MOST_LOST:
+        return WeighedSample(1.0, 1.0, CANNOT_RUN, effect)
+    if c.kind == "same" and len(c.a) >= MIN_RUNS and not subtract_losses(*losses).any():
+        return WeighedSample(1.0, 1.0, VACUOUS, effect)  # as of two filters that are one
+    true, not_false = find_borders(c.kind, c.printed)
+    looks = [losses] if c.early.all() else [[loss[c.early] for loss in losses], losses]
+    p_true = 2 * min(_find_p_inside(a, b, *true) for a, b in looks)
+    p_false = 2 * min(_find_p_outside(a, b, *not_false) for a, b in looks)
+    return WeighedSample(min(1.0, p_true), min(1.0, p_false), "", effect)
+
+
+def _find_p_inside(a: Array, b: Array, low: float, high: float) -> float:
+    """Find the p-value of a ratio inside of both borders: the larger one."""
+    below = _find_p(a, b + high)
+    return max(below, _find_p(b + low, a)) if math.isfinite(low) else below
+
+
+def _find_p_outside(a: Array, b: Array, low: float, high: float) -> float:
+    """Find the p-value of a ratio beyond one of the borders: the smaller one, twice if there are two."""
+    above = _find_p(b + high, a)
+    return 2 * min(above, _find_p(a, b + low)) if math.isfinite(low) else above
+
+
+def _take_logarithms(values: Array, lost: Flags) -> Array:
+    """Take the logarithms of errors, infinite for a lost run."""
+    return np.where(lost, math.inf, np.log(np.maximum(np.where(lost, 1.0, values), _LEAST_ERROR)))
+
+
+def _find_p(first: Array, second: Array) -> float:
+    """Find the p-value of a smaller first loss: certain if all runs differ by the same, as of a filter and itself."""
+    d = subtract_losses(first, second)
+    if len(d) >= MIN_RUNS and not subtract_losses(d, np.full_like(d, d[0])).any():
+        return float(d[0] >= 0)
+    return find_largest_p([(first, second)])
+
+
+def _describe(c: ClaimSample, a: Array, b: Array) -> ShownRatio:
+    """Describe a comparison: ratio, interval, runs, share of runs with a smaller, sides, and distance to its border."""
+    if not len(a):
+        return ShownRatio(sides=c.sides)
+    d = subtract_losses(a, b)
+    location, low, high = Effect("a", "b", "run", d, 1.0, 1.0, 1.0).estimate(ALPHA)
+    true_low, true_high = find_borders(c.kind, c.printed)[0]
+    excess = max(location - true_high, true_low - location)
+    order = float((d < 0).mean())
+    ratio, low, high = (math.exp(min(x, 700.0)) for x in (location, low, high))
+    return ShownRatio(ratio, low, high, len(a), order, c.sides, excess)
+
+
+def decide_claim(dots: Mapping[str, ReadingDot]) -> ClaimDecision:
+    """Decide a claim by its joint draws, or by all readings if the draws of the first look have not all run.
 
     Args:
-        claims: Readings of each claim by name. The first is the central one.
+        dots: Readings of the claim by name. The first is the central one; joint draws are in their order, from the first.
 
     Returns:
-        Decision by claim.
+        Decision.
     """
-    weighed: dict[tuple[str, str, str], _Evidence] = {}
-    looks = [_decide_look(claims, is_early, alpha, weighed) for is_early, alpha in ((True, LOOKS[0]), (False, LOOKS[1]))]  # fmt: skip
-    return {
-        name: _conclude(dots, [(look[0][name], look[1][name]) for look in looks])
-        for name, dots in claims.items()
-    }
+    outcomes = {name: dot.outcome for name, dot in dots.items()}
+    joint = [name for name, dot in dots.items() if dot.draw >= 0]
+    looks = [look for look in LOOKS if look <= len(joint)]
+    for look in looks:
+        readings = {name: dots[name] for name in joint[:look]}
+        word, share = _judge_share([outcomes[name] for name in readings])
+        if word != OPEN or look == looks[-1]:
+            return _conclude(word, share, True, readings, outcomes)
+    counts = list(outcomes.values())
+    share = TrueShare(counts.count(TRUE), counts.count(FALSE), sum(map(counts.count, (TRUE, FALSE, UNDECIDED))))  # fmt: skip
+    return _conclude(_agree(dots, share, NOT_RUN in counts), share, False, dots, outcomes)
 
 
-_Look = tuple[dict[str, set[str]], dict[str, dict[str, set[str]]]]
+def _judge_share(outcomes: Sequence[str]) -> tuple[str, TrueShare]:
+    """Judge a share by its interval. The looks divide the error rate."""
+    true, false = outcomes.count(TRUE), outcomes.count(FALSE)
+    n = true + false + outcomes.count(UNDECIDED)
+    if not n:
+        return UNTESTABLE, TrueShare()
+    low, high = bound_share(true, n), 1 - bound_share(false, n)
+    share = TrueShare(true, false, n, low, high)
+    if n - false <= MOST_TRUE * n and high <= MOST_BOUND:
+        return REFUTED, share
+    if n - true <= MOST_TRUE * n and low >= 1 - MOST_BOUND:
+        return CONFIRMED, share
+    return DEPENDS if low > MOST_BOUND and high < 1 - MOST_BOUND else OPEN, share
 
 
-def _decide_look(
-    claims: Mapping[str, Mapping[str, ReadingDot]],
-    is_early: bool,
-    alpha: float,
-    weighed: dict[tuple[str, str, str], _Evidence],
-) -> _Look:
-    """Decide all claims and all readings at a look; returns the outcomes shown by claim, and by claim and reading.
+def bound_share(count: int, n: int) -> float:
+    """Bound a share of readings from below, given those in which it is shown.
 
-    Evidence of readings whose runs are all of the first look is stored in `weighed`, and not computed twice.
+    Among readings without it, at most `READING_SIDE` show it falsely.
     """
-    decided: dict[str, set[str]] = {name: set() for name in claims}
-    dots_shown: dict[str, dict[str, set[str]]] = {
-        name: {reading: set() for reading in dots} for name, dots in claims.items()
-    }
-    for outcome in (TRUE, FALSE):
-        dots = {
-            (name, reading): weighed.get((outcome, name, reading)) or _weigh(dot, outcome, is_early)
-            for name, readings in claims.items()
-            for reading, dot in readings.items()
-            if is_counted(dot)
-        }
-        weighed |= {
-            (outcome, *key): item
-            for key, item in dots.items()
-            if all(c.early.all() for c in claims[key[0]][key[1]].comparisons)
-        }
-        everywhere = {name: _hold_everywhere([e for (n, _), e in dots.items() if n == name]) for name in claims}  # fmt: skip
-        for name in _select_decided(everywhere, alpha):
-            _add_outcome(decided[name], outcome)
-        for name, reading in _select_decided(dots, alpha):
-            _add_outcome(dots_shown[name][reading], outcome)
-    return decided, dots_shown
+    if not count:
+        return 0.0
+    low = float(scipy.special.betaincinv(count, n - count + 1, SIDE / len(LOOKS)))
+    return max(0.0, (low - READING_SIDE) / (1 - READING_SIDE))
 
 
-def _add_outcome(decided: set[str], outcome: str) -> None:
-    """Add an outcome of a look. Better by less than 1 % is true, and not false as well."""
-    if TRUE not in decided:
-        decided.add(outcome)
+def _agree(readings: Mapping[str, ReadingDot], share: TrueShare, is_missing: bool) -> str:
+    """Find the word of listed readings: all must agree, or two differ after correction for their number."""
+    if not share.counted:
+        return OPEN if is_missing else UNTESTABLE
+    if not is_missing and share.counted in (share.true, share.false):
+        return CONFIRMED if share.true else REFUTED
+    level = READING_SIDE / share.counted
+    evidence = [[p <= level for p in dot.p_values] for dot in readings.values() if dot.outcome in (TRUE, FALSE)]  # fmt: skip
+    is_both = any(is_true for is_true, _ in evidence) and any(is_false and not is_true for is_true, is_false in evidence)  # fmt: skip
+    return DEPENDS if is_both else OPEN
 
 
-def is_counted(dot: ReadingDot) -> bool:
-    """Return whether a reading counts for the word: it can run, says something, and is not fitted to the claim."""
-    if dot.state in (CANNOT_RUN, VACUOUS, NOT_COUNTED):
-        return False
-    return not dot.comparisons or bool(_select_informative(dot))
+def _conclude(word: str, share: TrueShare, is_drawn: bool, readings: Mapping[str, ReadingDot], outcomes: Mapping[str, str]) -> ClaimDecision:  # fmt: skip
+    """Conclude on a claim, and name the factor on which it depends."""
+    shares = explain_outcomes(readings) if word == DEPENDS else {}
+    factor = max(shares, key=lambda name: shares[name], default="")
+    return ClaimDecision(word, factor, shares.get(factor, math.nan), share, is_drawn, readings, outcomes)  # fmt: skip
 
 
-def _select_informative(dot: ReadingDot) -> list[ClaimSample]:
-    """Select the comparisons that say something: not lost on both sides, and not equal by construction."""
-    return [
-        c for c in dot.comparisons
-        if (c.lost_a & c.lost_b).mean() <= _MOST_LOST and not (c.kind == "same" and _is_equal(c))
-    ]  # fmt: skip
-
-
-def _is_equal(c: ClaimSample) -> bool:
-    """Return whether a and b are equal in all runs, as of two filters that are one algebraically."""
-    d = compare_to_border(c, 0.0).differences
-    return len(d) >= MIN_RUNS and not d.any() and not (c.lost_a | c.lost_b).any()
-
-
-def compare_to_border(c: ClaimSample, border: float) -> Effect:
-    """Compare the losses of a with those of b times a border of the ratio, by the comparison of all pages."""
-    values = np.stack([c.a, c.b])[:, None]
-    is_lost = np.stack([c.lost_a, c.lost_b])[:, None]
-    present = ~np.isnan(values) | is_lost
-    runs = StudyRuns(("a", "b"), _TABLE, {"value": values}, ~is_lost, present)
-    losses = compute_losses(runs, "value")
-    losses[1] += border
-    return compare_filters(runs, losses, [("a", "b")])[0]
-
-
-def _weigh(dot: ReadingDot, outcome: str, is_early: bool) -> _Evidence:
-    """Weigh the evidence of a reading for an outcome."""
-    if dot.state or not dot.comparisons:
-        return _Evidence(_NOTHING, is_certain=dot.state == outcome, is_excluded=dot.state == (FALSE if outcome == TRUE else TRUE))  # fmt: skip
-    tests = []
-    for c in _select_informative(dot):
-        used = c.select(c.early) if is_early else c
-        borders = find_borders(c.kind, c.printed)[0 if outcome == TRUE else 1]
-        # below the high end and above the low end, or beyond one of them
-        turn = 1.0 if outcome == TRUE else -1.0
-        signs = ((borders[1], -turn), (borders[0], turn))
-        tests += [_orient(used, b, sign) for b, sign in signs if math.isfinite(b)]
-    return _hold_everywhere(tests) if outcome == TRUE else _hold_somewhere(tests)
-
-
-def _orient(c: ClaimSample, border: float, sign: float) -> _Evidence:
-    """Compare with a border such that "better" is the side of the sign; p is 1 on the other side."""
-    effect = compare_to_border(c, border)
-    d = -sign * effect.differences if sign > 0 else effect.differences
-    effect = effect._replace(differences=d)
-    if len(d) >= MIN_RUNS and not is_testable(effect):
-        is_certain = bool(d.max() < 0)
-        return _Evidence(
-            effect._replace(p=1.0, p_trimmed=1.0, p_sign=1.0), is_certain, not is_certain
-        )
-    if len(d) < MIN_RUNS or not effect.is_smaller:
-        effect = effect._replace(p=1.0, p_trimmed=1.0, p_sign=1.0)
-    return _Evidence(effect)
-
-
-def _hold_everywhere(parts: Sequence[_Evidence]) -> _Evidence:
-    """Combine evidence for an outcome that all parts must have: the largest p-values."""
-    if not parts or any(item.is_excluded for item in parts):
-        return _Evidence(_NOTHING, is_excluded=bool(parts))
-    tested = [item.effect for item in parts if not item.is_certain]
-    if not tested:
-        return parts[0]
-    weakest = max(tested, key=lambda e: max(e.p, e.p_trimmed))
-    largest = {name: max(getattr(e, name) for e in tested) for name in _TESTS}
-    return _Evidence(weakest._replace(**largest))
-
-
-def _hold_somewhere(parts: Sequence[_Evidence]) -> _Evidence:
-    """Combine evidence for an outcome that one part may have: the smallest p-values times the number of parts."""
-    if any(item.is_certain for item in parts):
-        return next(item for item in parts if item.is_certain)
-    if not parts or all(item.is_excluded for item in parts):
-        return _Evidence(_NOTHING, is_excluded=bool(parts))
-    strongest = min((item.effect for item in parts), key=lambda e: max(e.p, e.p_trimmed))
-    smallest = {name: min(1.0, len(parts) * getattr(strongest, name)) for name in _TESTS}
-    return _Evidence(strongest._replace(**smallest))
-
-
-def _select_decided(evidence: Mapping[_Key, _Evidence], alpha: float) -> list[_Key]:
-    """Select what is shown: certain, or decided by the verdicts of one family."""
-    tested = {key: item for key, item in evidence.items() if not item.is_certain}
-    verdicts = decide([item.effect for item in tested.values()], margin=0.0, alpha=alpha)
-    better = {
-        key for key, verdict in zip(tested, verdicts, strict=True) if verdict.word == BETTER_THAN
-    }
-    return [key for key in evidence if key not in tested or key in better]
-
-
-def _conclude(
-    dots: Mapping[str, ReadingDot], looks: Sequence[tuple[set[str], Mapping[str, set[str]]]]
-) -> ClaimDecision:
-    """Conclude on a claim from both looks."""
-    decided = set().union(*(look[0] for look in looks))
-    outcomes = {
-        reading: _name_outcome(dot, set().union(*(look[1][reading] for look in looks)))
-        for reading, dot in dots.items()
-    }
-    counted = [reading for reading, dot in dots.items() if is_counted(dot)]
-    if len(decided) == 1:  # what holds in all readings holds in each of them
-        outcomes |= dict.fromkeys(counted, next(iter(decided)))
-    central = _describe_first(dots)
-    if not counted:
-        return ClaimDecision(UNTESTABLE, (), outcomes, *central)
-    if len(decided) == 1:
-        return ClaimDecision(CONFIRMED if decided == {TRUE} else REFUTED, (), outcomes, *central)
-    if {TRUE, FALSE} <= set(outcomes.values()):
-        return ClaimDecision(DEPENDS, _find_factors(dots, outcomes), outcomes, *central)
-    return ClaimDecision(OPEN, (), outcomes, *central)
-
-
-def _name_outcome(dot: ReadingDot, decided: set[str]) -> str:
-    """Name the outcome of a reading; open if both looks differ."""
-    is_lost = any(
-        (c.lost_a & c.lost_b).mean() > _MOST_LOST for c in dot.comparisons
-    )  # in most runs, both
-    if not is_counted(dot):
-        return dot.state or (CANNOT_RUN if is_lost else VACUOUS)
-    if len(decided) == 1:
-        return next(iter(decided))
-    return UNDECIDED if dot.comparisons else NOT_RUN
-
-
-def _find_factors(dots: Mapping[str, ReadingDot], outcomes: Mapping[str, str]) -> tuple[str, ...]:
-    """Find the factors whose levels turn the outcome of the central reading; of all decided levels if it is open."""
-    central = next(iter(outcomes.values()))
-    turned = {TRUE: (FALSE,), FALSE: (TRUE,)}.get(central, (TRUE, FALSE))
-    names = (dot.factor for reading, dot in dots.items() if outcomes[reading] in turned)
-    return tuple(dict.fromkeys(name for name in names if name not in ("none", PAIR)))
-
-
-_Description = tuple[float, float, float, int, float, str]
-
-
-def _describe_first(dots: Mapping[str, ReadingDot]) -> tuple[*_Description, str]:
-    """Describe the comparison that decides, in the central reading or the first that runs.
-
-    It is the one that is shown to be beyond a border of true by most, else the one that is closest to turn the claim.
-
-    Returns ratio, interval, runs, order, sides and reading.
-    """
-    for reading, dot in dots.items():
-        options = [_describe(c) for c in dot.comparisons if len(c.a)]
-        if options:
-            return *max(options, key=lambda row: row[0])[1], reading
-        if not dot.state:
-            break
-    return math.nan, math.nan, math.nan, 0, math.nan, "", ""
-
-
-def _describe(c: ClaimSample) -> tuple[tuple[bool, float], _Description]:
-    """Return how far a comparison is beyond its border, and ratio, interval, runs, share of runs with a smaller, and sides."""
-    effect = compare_to_border(c, 0.0)
-    location, low, high = effect.estimate(ALPHA)
-    true_low, true_high = find_borders(c.kind, c.printed)[0]
-    excess = max(low - true_high, true_low - high)
-    nearness = (excess > 0, excess if excess > 0 else max(high - true_high, true_low - low))
-    order = float((effect.differences < 0).mean())
-    count = len(effect.differences)
-    return nearness, (math.exp(location), math.exp(low), math.exp(high), count, order, c.sides)
+def explain_outcomes(readings: Mapping[str, ReadingDot]) -> dict[str, float]:
+    """Find the share of the variance of true and false that each factor explains, corrected for its number of levels."""
+    dots = [dot for dot in readings.values() if dot.outcome in (TRUE, FALSE)]
+    y = np.array([dot.outcome == TRUE for dot in dots], float)
+    total = ((y - y.mean()) ** 2).sum()
+    shares = {}
+    for factor in dots[0].levels:
+        levels = np.array([dot.levels[factor] for dot in dots])
+        names = np.unique(levels)
+        within = sum(((y[levels == name] - y[levels == name].mean()) ** 2).sum() for name in names)
+        rest = max(len(y) - len(names), 1)
+        shares[factor] = float(1 - within / rest / (total / (len(y) - 1)))
+    return shares

@@ -16,6 +16,7 @@ from pfbench.claims.claim_runs import (
     PUBLISHED_VALUES,
     VALUES_SUFFIX,
     ClaimRuns,
+    Decisions,
     StoredValues,
     decide_claims,
 )
@@ -23,7 +24,6 @@ from pfbench.claims.ledger import conclude
 from pfbench.claims.run_claims import (
     WORKERS,
     ClaimPrice,
-    Decisions,
     Task,
     describe_words,
     draw_records,
@@ -92,21 +92,13 @@ class SelectedClaims(NamedTuple):
         return cls(select_plans(names), Path(values["results_dir"]), Path(values["reports_dir"]))
 
     def decide(self) -> tuple[ClaimRuns, Decisions]:
-        """Read the stored runs, and decide all claims of the papers: those of a paper are one family."""
+        """Read the stored runs, and decide the claims."""
         runs = ClaimRuns.read(self.results, self.reports)
-        return runs, decide_claims(select_plans([plan.claim.paper for plan in self.plans]), runs)
+        return runs, decide_claims(self.plans, runs)
 
-    def list_prices(self, readings: str) -> list[ClaimPrice]:
-        """List what the claims lack: all, or the jobs of some readings."""
-        prices = price_claims(self.plans, *self.decide())
-        if not readings:
-            return prices
-        endings = tuple(f"={name}" for name in readings.split(","))
-        restricted = [
-            price._replace(tasks=tuple(t for t in price.tasks if t.cell[0].endswith(endings)))
-            for price in prices
-        ]
-        return sorted((p for p in restricted if p.tasks), key=lambda price: price.seconds)
+    def list_prices(self) -> list[ClaimPrice]:
+        """List what the next looks of the claims lack."""
+        return price_claims(self.plans, *self.decide())
 
     def print_words(self) -> None:
         """Print the word of each claim."""
@@ -126,18 +118,18 @@ def select_plans(ids: Sequence[str]) -> list[ClaimPlan]:
 
 
 def run_claims(
-    words: Sequence[str], hours: float, workers: int, readings: str, dry: bool, uncommitted: bool
+    words: Sequence[str], hours: float, workers: int, dry: bool, uncommitted: bool
 ) -> None:
-    """Run the cheapest undecided claims first, stage by stage."""
+    """Run the cheapest undecided claims first, look by look."""
     claims = SelectedClaims.from_words(words)
     end, faults = time.monotonic() + 3600 * hours, 0
-    while prices := claims.list_prices(readings):
+    while prices := claims.list_prices():
         print_plan(prices)
         remaining = end - time.monotonic()
         if dry or remaining <= 0 or faults:
             break
         check_committed(uncommitted)
-        stage = [price for price in prices if price.stage == prices[0].stage]
+        stage = [p for p in prices if (p.draws, p.stage) == (prices[0].draws, prices[0].stage)]
         faults += run_stage(stage, claims.results, workers, remaining)
     if not dry:
         claims.print_words()
@@ -166,7 +158,7 @@ def print_plan(prices: Sequence[ClaimPrice]) -> None:
         once |= {(task.cell, task.batch): task for task in mine}
         extra = sum(task.seconds for task in mine)
         print(
-            f"{price.plan.claim.id:8} {price.stage:7} {len(price.tasks):4} jobs, {len(mine):4} of its own, "
+            f"{price.plan.claim.id:8} {price.draws:3} draws, {price.stage:5} runs {len(price.tasks):4} jobs, {len(mine):4} of its own, "
             f"{format_duration(extra)} more"
         )
     total = sum(task.seconds for task in once.values())
@@ -225,11 +217,10 @@ def verify_claims(words: Sequence[str], seed: int | None) -> None:
 _PLACES = ("results_dir", "reports_dir")
 _RUN = Command(
     run_claims,
-    "pfbench claims run [ID ...] [hours=H] [readings=NAME,...] [dry=true]\n\n  OPTIONS",
+    "pfbench claims run [ID ...] [hours=H] [dry=true]\n\n  OPTIONS",
     options={
         "hours": Option("2", "starts no job after this time; repeat the command to resume", in_range("(0, inf]"), math.inf),
         "workers": Option("2", "processes, at most two", in_range(f"whole [1, {WORKERS}]")),
-        "readings": Option("NAME,...", "readings to run, as in pfbench list reading", default=""),
         "dry": Option("true", "prints the plan only", read_flag, default=False),
         "uncommitted": Option("true", "runs from code that is not committed, and says so in each result", read_flag, default=False),
     },
@@ -255,7 +246,7 @@ readings of its paper, from the published runs. A claim without runs is open, wi
   pfbench claims
   pfbench claims run                     a plan with prices, then the cheapest undecided claims first
   pfbench claims run C001-7              one claim; 001 is all claims of a paper
-  pfbench claims run 002 readings=each hours=2
+  pfbench claims run 003 hours=2
   pfbench claims run dry=true            the plan only
   pfbench claims verify                  computes 20 stored cells again, and all words, in about five minutes.
                                          Runs must be equal; those of particles, which may amplify rounding,

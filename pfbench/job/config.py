@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pfbench.core.parameter_checks import require
 from pfbench.files import limits
-from pfbench.job.readings import make_reading, read_reading_table
+from pfbench.job.readings import JOINER, make_reading, read_reading_table
 from pfbench.job.trust import (
     UntrustedConfigError,
     check_configuration,
@@ -227,9 +227,12 @@ class _LazyGroup(dict[str, Any]):
 
     list_names: Callable[[], list[str]]
     make: Callable[[str], Any]
+    joiner: str | None = None  # of names that stand for several at once
 
     def __contains__(self, name: object) -> bool:
-        return name != "None.yaml" and name in self.list_names()  # `null` of a defaults list
+        names = str(name).removesuffix(".yaml").split(self.joiner)
+        # None: `null` of a defaults list
+        return name != "None.yaml" and {f"{level}.yaml" for level in names} <= {*self.list_names()}
 
     def keys(self) -> Any:
         return self.list_names()
@@ -247,7 +250,9 @@ def register_experiments() -> None:
 
     repo = ConfigStore.instance().repo
     repo[READING] = {
-        path.stem: _LazyGroup(partial(_list_readings, path.stem), partial(_make_reading, path.stem))
+        path.stem: _LazyGroup(
+            partial(_list_readings, path.stem), partial(_make_reading, path.stem), JOINER
+        )
         for path in (conf_dir() / READING).glob("*.yaml")
     }
     for group in (
@@ -464,7 +469,7 @@ def expand_filter_sets(words: Sequence[str]) -> list[str]:
 
 READING = "reading"
 CLASSES = ("printed", "cited", "ours", "fitted")
-_STATED = {"factor", "class", "why", "filters", "cites", "completions", "claims"}
+_STATED = {"factor", "class", "why", "filters", "cites", "completions"}
 
 
 def name_readings(words: Sequence[str]) -> list[str]:
@@ -502,7 +507,7 @@ def check_reading(paper: str, stated: Any) -> None:
     require(
         isinstance(stated, Mapping) and {"factor", "class", "why"} <= set(stated) <= _STATED,
         key,
-        "state factor, class and why, perhaps filters, cites, completions and claims",
+        "state factor, class and why, perhaps filters, cites and completions",
         f"{stated!r:.120}",
         "Correct the file.",
     )

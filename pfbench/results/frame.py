@@ -24,7 +24,7 @@ from pfbench.stats.run_dependence import select_independent_runs
 
 log = logging.getLogger("pfbench")
 
-_WHOLE_RUN_ARRAYS = ("log_evidence", "lost", "health", "pareto_k", "run")
+_WHOLE_RUN_ARRAYS = ("log_evidence", "evidence_floor", "lost", "health", "pareto_k", "run")
 _SHARED_ARRAYS = ("time", "pcrb", "range")  # without an axis of runs
 
 

@@ -9,8 +9,9 @@ from command_line import pfbench
 from config_cases import GROUPS
 
 from pfbench import job
+from pfbench.claims.claim_lines import read_claim_data
 from pfbench.job.config import CLASSES, check_reading, name_readings
-from pfbench.job.readings import make_reading, read_reading_table
+from pfbench.job.readings import make_reading, read_reading, read_reading_table
 from pfbench.job.trust import UntrustedConfigError
 
 PAPERS = ("000", "001", "002", "003", "004")
@@ -123,20 +124,58 @@ def flatten(values: Mapping[str, Any], path: str = "") -> dict[str, Any]:
     return {key: value for key, value in flat.items() if value is not None}
 
 
-@pytest.mark.parametrize(("paper", "name"), [key for key in ROWS if "_and_" in key[1]])
-def test_a_pair_of_levels_is_both_and_nothing_else(paper: str, name: str) -> None:
-    method = {"003": "dmc_reconstructed_printed", "004": "cpso_pf"}[paper]
-    method = "cpso_escape_printed" if "004-C1" in STATED[paper, name]["claims"] else method
-    central, first, second, pair = (
+@pytest.mark.parametrize(
+    ("paper", "levels", "method"),
+    [
+        ("001", ("grid_4", "shift_centred", "speed_200"), "qmc_polymerised_printed"),
+        ("002", ("guide_moments", "receiver_3"), "cpf"),
+        ("004", ("chaos_020", "learning_2", "receiver_fine"), "cpso_pf"),
+    ],
+)
+def test_a_joint_reading_is_all_of_its_levels_and_nothing_else(
+    paper: str, levels: tuple[str, ...], method: str
+) -> None:
+    central, *single, joint = (
         flatten(compose(paper, one, f"filter={method}"))
-        for one in ("central", *name.split("_and_"), name)
+        for one in ("central", *levels, "_and_".join(levels))
     )
-    changed = [
-        {key: one[key] for key in one if one[key] != central.get(key)} for one in (first, second)
-    ]
+    changed = [{key: one[key] for key in one if one[key] != central.get(key)} for one in single]
     assert all(changed)
-    assert not changed[0].keys() & changed[1].keys()
-    assert pair == central | changed[0] | changed[1]
+    assert sum(map(len, changed)) == len({key for one in changed for key in one})
+    merged = dict(central)
+    for one in changed:
+        merged |= one
+    assert joint == merged
+    assert read_reading(paper, "_and_".join(levels))["factor"] == "joint"
+
+
+@pytest.mark.parametrize("paper", PAPERS)
+def test_the_world_of_the_figures_is_a_reading_of_the_paper(paper: str) -> None:
+    """One world a paper: a study, its figures and the ledger cannot differ but by levels that have a name."""
+    for study, reading in read_claim_data()["papers"][paper]["figures"].items():
+        own, named = (
+            {key: value for key, value in flatten(job.compose([*words, "filter=sir"]).values).items() if is_of_world(key)}
+            for words in ([f"+experiment={study}"], [f"reading/{paper}={reading}"])
+        )  # fmt: skip
+        keys = own.keys() | named.keys()
+        assert {key for key in keys if own.get(key, DEFAULT.get(key)) != named.get(key, DEFAULT.get(key))} == set()  # fmt: skip
+
+
+DEFAULT = {"scenario.initial_errors.randomise": True, "model.initial.randomise": True}
+
+
+def is_of_world(key: str) -> bool:
+    """Return whether a key is of the world, and no name of it."""
+    group, *rest = key.split(".")
+    return group in ("scenario", "model", "noise", "particles") and "paper" not in rest
+
+
+def test_a_joint_reading_has_one_level_of_a_factor() -> None:
+    for name in ("grid_4_and_grid_16", "central_and_grid_4"):
+        with pytest.raises(ValueError, match=r"reading/001 must join levels of different factors"):
+            read_reading("001", name)
+    fitted = make_reading("003", "interval_tenth_and_noise_5")["reading"]["003"]
+    assert fitted["class"] == "fitted"
 
 
 def test_a_number_of_a_paper_is_a_group() -> None:

@@ -71,6 +71,9 @@ def test_scores_are_cut_with_the_instants(loaded):
     np.testing.assert_array_equal(late.data["time"][late.data["score_steps"]], [20.0, 30.0, 40.0])
     np.testing.assert_array_equal(late.data["pit"], whole.data["pit"][:, 1:])
     assert frame.drop_before(whole, 40.0).data["score_steps"].tolist() == [0]
+    of_runs = {name: whole.data["lost"] for name, axes in store._OPTIONAL.items() if axes == "R"}
+    cut = frame.drop_before(store.JobResult(whole.meta, whole.data | of_runs), 15.0)
+    assert all(cut.data[name] is column for name, column in of_runs.items())
     early = frame.select_steps(whole, whole.data["time"] < 10.0)
     assert not {"score_steps", "crps", "pit", "energy_score"} & early.data.keys()
 
