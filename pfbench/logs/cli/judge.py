@@ -26,7 +26,7 @@ _PAIR = re.compile(
 
 def judge_trajectories(words: Sequence[str]) -> None:
     """Compare programs and write the report."""
-    values = _split(words)
+    values = split_values(words, "judge")
     options, sources, programs = _sort_words(values)
     from pfbench.logs.judge.judgement import judge_programs
     from pfbench.logs.judge.page import describe_material, describe_notes, write_judgement
@@ -59,7 +59,7 @@ def judge_trajectories(words: Sequence[str]) -> None:
     print(f"report: {page.resolve()}")
 
 
-def _split(words: Sequence[str]) -> dict[str, str]:
+def split_values(words: Sequence[str], command: str) -> dict[str, str]:
     """Return the values by key; a key occurs once."""
     values: dict[str, str] = {}
     for word in words:
@@ -69,7 +69,7 @@ def _split(words: Sequence[str]) -> dict[str, str]:
             "words",
             "be key=value, each key once",
             word,
-            "See pfbench judge --help.",
+            f"See pfbench {command} --help.",
         )
         values[key] = value
     return values
