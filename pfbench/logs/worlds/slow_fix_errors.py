@@ -22,9 +22,9 @@ from pfbench.nav.strapdown import PreintegratedImu
 
 _WHITE = (0.7, 0.4, 0.15, 0.05)  # shares of the standard deviation that are tried, beside 1
 _TIMES = (3.0, 6.0, 12.0, 24.0, 48.0, 96.0, 192.0)  # s, with each of them
+_MOST_STEPS = 3000  # of the log, from its start on, that the fit takes: ten minutes of usual steps
 _LEAST = 1e-3  # share of a slow error that is none, so that covariances have roots
 _CLEAR = 100.0  # odds that white errors reach in one log of a hundred at most (Markov's inequality)
-_POSITION = slice(6, 9)  # of a difference of states
 
 
 class LastingErrors(NamedTuple):
@@ -85,6 +85,7 @@ class SlowFixErrors(StrapdownModel):
     @override
     def noise_gain(self, u: PreintegratedImu) -> Tensor:
         slow, motion = torch.diag_embed(self._relax(u)[1][:, 0]), self.motion.noise_gain(u)
+        assert motion is not None
         return block_diagonal(motion.expand(len(slow), -1, -1), slow)
 
     def _relax(self, u: PreintegratedImu) -> tuple[Tensor, Tensor]:
@@ -101,7 +102,7 @@ class SlowFixErrors(StrapdownModel):
         """Add slow errors to starts, whose position is that of fixes and has these errors with the other sign.
 
         Args:
-            record: Record with start [R, D] and spread [R, d, d] of the motion.
+            record: Record with start [R, D] and spread [R, d, d] of the motion. R is 1 for all members of a grid.
 
         Returns:
             The record for this model.
@@ -109,13 +110,17 @@ class SlowFixErrors(StrapdownModel):
         start, root = record.start, record.spread
         assert start is not None
         assert root is not None
-        root = torch.cat([root[:, :6], self.white * root[:, _POSITION], root[:, 9:]], 1)
-        covariance = pad(root @ root.mT, (0, 3, 0, 3))
-        slow = torch.diag_embed(self.slow_sd[:, 0].expand(len(root), 3))
-        effect = torch.zeros_like(covariance[..., :3])
-        effect[:, _POSITION], effect[:, -3:] = -slow, slow
-        covariance += effect @ effect.mT
-        return record._replace(start=pad(start, (0, 3)), spread=torch.linalg.cholesky(covariance))
+        runs, d = max(len(root), len(self.white)), root.shape[-1]
+        # of the position, which are rows 6 to 8, only the white part is independent of the slow errors
+        white = pad(self.white.expand(-1, 3, 1) - 1.0, (0, 0, 6, d - 9)) + 1.0
+        slow = torch.diag_embed(self.slow_sd[:, 0].expand(runs, 3))
+        effect = pad(slow, (0, 0, d, 0)) - pad(slow, (0, 0, 6, d - 6))
+        covariance = pad((white * root) @ (white * root).mT, (0, 3, 0, 3)) + effect @ effect.mT
+        return record._replace(
+            y=record.y.expand(runs, -1, -1),
+            start=pad(start, (0, 3)).expand(runs, -1),
+            spread=torch.linalg.cholesky(covariance),
+        )
 
 
 def fit_lasting_errors(motion: StrapdownModel, record: Record) -> LastingErrors:
@@ -132,11 +137,12 @@ def fit_lasting_errors(motion: StrapdownModel, record: Record) -> LastingErrors:
     """
     tried = torch.tensor([(1.0, 1.0), *product(_WHITE, _TIMES)], dtype=torch.float64)
     model, runs = SlowFixErrors(motion, *tried.T), len(tried)
-    same = Record(*(a if a is record.u else a[[0] * runs] for a in record[:4]))
     draws, method = PhiloxStream(0, torch.arange(runs)), GaussianFilter(TaylorLinearisation())
-    evidence = run_filter(method, model, model.start(same), draws).log_evidence
+    started = model.start(record.select_steps(slice(_MOST_STEPS)))
+    evidence = run_filter(method, model, started, draws).log_evidence
     evidence[1:] -= torch.tensor(runs - 1.0).log()
     weight, odds = torch.softmax(evidence, 0), evidence[1:].logsumexp(0) - evidence[0]
-    white, slow = (weight * tried[:, 0] ** 2).sum(), weight * (1.0 - tried[:, 0] ** 2)
+    # in a long log of white errors no weight but theirs is a number
+    white, slow = (weight * tried[:, 0] ** 2).sum(), (weight + 1e-300) * (1.0 - tried[:, 0] ** 2)
     time_s = torch.exp((slow * tried[:, 1].log()).sum() / slow.sum())
     return LastingErrors(float(white.sqrt()), float(time_s), float(odds.exp()))
