@@ -496,7 +496,7 @@ def _describe_lever(log: RawLog, fit: JointFit, error: Array, at: Array) -> Find
         "lever arm", TELL, float(np.abs(lever[:2]).max()), limit_of("lever arm"), "m",
         f"{log.names[1]}: the antenna is {lever.round(2).tolist()} m forward, right, down of the position of "
         f"{log.names[2]}, within {(2.0 * lever_error).round(2).tolist()}",
-        f"Set scenario.corrections.lever_arm={arm}", {"corrections": {"lever_arm": arm}},
+        f"Set scenario.corrections.lever_arm={arm}{'' if arm[2] else '. The motion does not show it downwards: measure it'}", {"corrections": {"lever_arm": arm}},
         ("a lever arm of the antenna", "an offset of the point to which the reference refers"),
         Picture("t [s]", "fix minus reference in body axes [m]", (
             thin_curve("forward", log.fixes.time, body[:, 0]), thin_curve("right", log.fixes.time, body[:, 1]),

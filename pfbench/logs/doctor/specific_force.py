@@ -71,9 +71,8 @@ _DELAYS, _DELAY_S = (
 )  # s of the force, and of the log that is compared
 
 
-Cause = tuple[
-    str, dict[str, Any], float
-]  # what is wrong, the corrections that mend it, and what the force leaves then
+# what is wrong, the corrections that mend it, and what the force leaves then, (m/s^2)^2
+Cause = tuple[str, dict[str, Any], float]
 _LEVEL = ["e", "n", "-d"]
 _ROS: dict[str, Any] = {
     "mounting": {"imu": ["x", "-y", "-z"]}, "level_axes": {"reference": _LEVEL, "gnss": _LEVEL},
