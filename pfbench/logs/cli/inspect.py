@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from pfbench.cli.command import Command
-from pfbench.cli.messages import require_choice
 from pfbench.core.parameter_checks import require
 from pfbench.logs.cli.judge import convert_numbers, split_values
 
@@ -23,9 +22,7 @@ _WARNED, _REFUSED = 3, 2
 def inspect_folder(words: Sequence[str]) -> None:
     """Inspect a log, print its findings and write the page."""
     folder, others = split_folder([w.removeprefix("scenario.") for w in words], "inspect")
-    values = split_values(others, "inspect")
-    for key in values:
-        require_choice("key", key, _KEYS, "See pfbench inspect --help.")
+    values = split_values(others, "inspect", _KEYS)
     require(folder.is_dir(), folder, "be a folder with imu, gnss and, if there is one, reference", "none", "Check the path.")  # fmt: skip
     from pfbench.logs.doctor.thresholds import THRESHOLDS
     from pfbench.logs.judge.log_page import describe_run, write_log_page

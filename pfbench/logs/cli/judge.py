@@ -9,7 +9,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from pfbench.cli.command import Command
-from pfbench.cli.messages import suggest_similar
+from pfbench.cli.messages import require_choice, suggest_similar
 from pfbench.core.parameter_checks import require
 
 if TYPE_CHECKING:
@@ -59,8 +59,10 @@ def judge_trajectories(words: Sequence[str]) -> None:
     print(f"report: {page.resolve()}")
 
 
-def split_values(words: Sequence[str], command: str) -> dict[str, str]:
-    """Return the values by key; a key occurs once."""
+def split_values(
+    words: Sequence[str], command: str, keys: Sequence[str] | None = None
+) -> dict[str, str]:
+    """Return the values by key; a key occurs once, and is one of some keys."""
     values: dict[str, str] = {}
     for word in words:
         key, _, value = word.partition("=")
@@ -71,6 +73,8 @@ def split_values(words: Sequence[str], command: str) -> dict[str, str]:
             word,
             f"See pfbench {command} --help.",
         )
+        if keys is not None:
+            require_choice("key", key, keys, f"See pfbench {command} --help.")
         values[key] = value
     return values
 

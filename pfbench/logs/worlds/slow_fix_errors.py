@@ -1,4 +1,4 @@
-"""Errors of fixes that last: a Gauss-Markov process beside the motion, its share and its time from the innovations."""
+"""Errors of fixes that last: a Gauss-Markov process next to the motion, its share and its time from the innovations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pfbench.filter.loop import run_filter
 from pfbench.model.strapdown import StrapdownModel, block_diagonal
 from pfbench.nav.strapdown import PreintegratedImu
 
-_WHITE = (0.7, 0.4, 0.15, 0.05)  # shares of the standard deviation that are tried, beside 1
+_WHITE = (0.7, 0.4, 0.15, 0.05)  # shares of the standard deviation that are tried, and 1
 _TIMES = (3.0, 6.0, 12.0, 24.0, 48.0, 96.0, 192.0)  # s, with each of them
 _MOST_STEPS = 3000  # of the log, from its start on, that the fit takes: ten minutes of usual steps
 _LEAST = 1e-3  # share of a slow error that is none, so that covariances have roots
@@ -28,7 +28,7 @@ _CLEAR = 100.0  # odds that white errors reach in one log of a hundred at most (
 
 
 class LastingErrors(NamedTuple):
-    """Errors of fixes of which a part lasts, by the innovations of the EKF.
+    """Errors of fixes with a part that lasts, by the innovations of the EKF.
 
     Attributes:
         white: White part of the stated standard deviation, 0 to 1.
