@@ -17,8 +17,7 @@ from scipy.signal import lfilter
 from scipy.special import bdtr, stdtr
 
 from pfbench.logs.judge.judge_options import JudgeOptions
-from pfbench.logs.judge.nuisance import remove_nuisance
-from pfbench.logs.judge.pair_verdicts import PairVerdict, judge_pairs
+from pfbench.logs.judge.pair_verdicts import PairVerdict, judge_pairs, remove_nuisance
 from pfbench.results.store import JobResult
 from pfbench.stats.comparison import EQUALITY_MARGIN, LOG_TOLERANCE, MIN_RUNS
 from pfbench.stats.rank_tests import rank_sum_cdf, wilcoxon_signed_rank_rows

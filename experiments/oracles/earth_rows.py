@@ -10,8 +10,8 @@ import torch
 from pfbench.experiments.oracles.book import Number, Source, recipe
 from torch import Tensor
 
-from pfbench.logs.doctor.sensor_grade import allan_deviation
 from pfbench.logs.sky.ephemeris import broadcast_elements
+from pfbench.logs.worlds.standing import allan_deviation
 from pfbench.nav import earth
 from pfbench.nav.atmosphere import Sight, delay_in_ionosphere, delay_in_troposphere
 

@@ -25,7 +25,9 @@ from pfbench.job.config import compose
 from pfbench.job.plan import JobPlan, build_plan
 from pfbench.logs.worlds.log_frames import place_of
 from pfbench.logs.worlds.log_tables import Array, find_dataset, swap_frd_rfu
+from pfbench.logs.worlds.slow_fix_errors import LastingErrors, SlowFixErrors, fit_lasting_errors
 from pfbench.logs.worlds.user_log import AlignedLog
+from pfbench.model.strapdown import StrapdownModel
 from pfbench.nav import earth
 from pfbench.nav.attitude import dcm_from_quaternion, euler_from_dcm
 
@@ -38,8 +40,8 @@ class MotionEstimate(NamedTuple):
     Attributes:
         state: Attitude quaternion, velocity, m/s, and position, m, [T, 10].
         sd: Standard deviations about right, forward, up, rad, of velocity and of position, [T, 9].
-        held_out: Estimate minus fix at each held-out fix, by a pass that did not get it, m, [m, 3].
-        held_out_sd: Standard deviations of these differences: filter and fix together, m, [m, 3].
+        held_out: Estimate of the fix minus fix at each held-out fix, by a pass that did not get it, m, [m, 3].
+        held_out_sd: Standard deviations of these differences: filter, slow error and white error of the fix together, m, [m, 3].
     """
 
     state: Array
@@ -81,9 +83,9 @@ class TrackEstimate:
         answers: Answer of each filter.
         fixes: Time, s, and position, m, East, North, Up, of the usable fixes, [m, 4].
         held_out_time: Times of the held-out fixes, s, [m].
-        neighbours: Line between the neighbours of each held-out fix minus the fix, m, [m, 3].
         rule: Sentence on how fixes are held out.
         centre: lat_deg, lon_deg, h_m of the origin, None if the log does not contain it.
+        fix_errors: Errors of the fixes that last, which all filters have as states.
         notes: Notes of the reader and of the start.
     """
 
@@ -92,9 +94,9 @@ class TrackEstimate:
     answers: tuple[FilterAnswer, ...]
     fixes: Array
     held_out_time: Array
-    neighbours: Array
     rule: str
     centre: tuple[float, ...] | None
+    fix_errors: LastingErrors
     notes: tuple[str, ...]
 
     def tracks(self) -> dict[str, MotionEstimate]:
@@ -205,15 +207,15 @@ class _Passes(NamedTuple):
     """Passes over a log: parts of the fixes withheld, and last none.
 
     Attributes:
+        model: Model of the motion and of the errors of fixes that last.
         record: Measurements of all passes, [R, T, Dy].
         truth: Withheld fixes relative to the start, m, [R - 1, T, 3]. NaN elsewhere.
-        truth_sd: Standard deviations of a fix, m, [3].
         start: Position of the start in the frame of the log, m, [3].
     """
 
+    model: SlowFixErrors
     record: Record
     truth: Tensor
-    truth_sd: Tensor
     start: Array
 
 
@@ -236,9 +238,12 @@ def _estimate(name: str, plans: dict[str, JobPlan]) -> TrackEstimate:
     complete = replace(plan, scenario=replace(scenario, holdout=None)).draw_episode(torch.arange(1))
     log = scenario.read_checked(find_dataset(scenario.root, scenario.folder))
     start = scenario.alignment.find(log, scenario.tuning, scenario.start_s).state[7:]
-    measured = withheld.measured_truth
-    assert measured is not None
-    passes = _Passes(_join(withheld.record, complete.record), withheld.truth["position"], measured.sd["position"], start)  # fmt: skip
+    motion = plan.model
+    assert isinstance(motion, StrapdownModel)
+    errors = fit_lasting_errors(motion, complete.record)
+    model = SlowFixErrors(motion, *torch.tensor(errors[:2], dtype=torch.float64)[:, None])
+    record = model.start(_join(withheld.record, complete.record))
+    passes = _Passes(model, record, withheld.truth["position"], start)
     usable = np.isfinite(log.fixes.position).all(1)
     truth = passes.truth.numpy()
     _, steps = np.nonzero(np.isfinite(truth[..., 0]))
@@ -249,8 +254,8 @@ def _estimate(name: str, plans: dict[str, JobPlan]) -> TrackEstimate:
     )
     return TrackEstimate(
         name, time, tuple(_answer(label, item, passes) for label, item in plans.items()),
-        np.column_stack([log.fixes.time, log.fixes.position])[usable], time[steps], _join_neighbours(passes, time),
-        rule, log.centre, withheld.notes,
+        np.column_stack([log.fixes.time, log.fixes.position])[usable], time[steps],
+        rule, log.centre, errors, withheld.notes,
     )  # fmt: skip
 
 
@@ -263,15 +268,20 @@ def _join(withheld: Record, complete: Record) -> Record:
 
 def _answer(name: str, plan: JobPlan, passes: _Passes) -> FilterAnswer:
     """Run a filter over all passes."""
-    runs, model = len(passes.record.y), plan.model
+    runs, model = len(passes.record.y), passes.model
+    first = len(model.names) - 3
+    fixed = torch.tensor(
+        [[6 + k, first + k] for k in range(3)]
+    )  # position and slow error of each axis
     has_nis: list[bool] = []
 
     def watch(t: int, info: StepInfo) -> dict[str, Tensor]:
         has_nis.append(info.nis is not None)
+        fix = {"fix": info.covariance_of(fixed).sum((-1, -2))}
         if info.nis is None:
-            return {}
+            return fix
         nis, dof = info.nis()
-        return {"nis": nis, "nis_dof": dof.to(nis)}
+        return {"nis": nis, "nis_dof": dof.to(nis), **fix}
 
     with torch.no_grad():
         smoothed = None
@@ -279,7 +289,8 @@ def _answer(name: str, plan: JobPlan, passes: _Passes) -> FilterAnswer:
             states = smooth(plan.method, model, passes.record, watch)
             result = states.filtered
             variance = states.covariance.diagonal(dim1=-2, dim2=-1)
-            smoothed = _describe(states.mean, variance, passes)
+            of_fix = states.covariance[..., fixed[:, :, None], fixed[:, None]].sum((-1, -2))
+            smoothed = _describe(states.mean, variance, of_fix, passes)
         else:
             draws = PhiloxStream(plan.values["seed"], torch.arange(runs))
             result = run_filter(plan.method, model, passes.record, draws, watch)
@@ -291,29 +302,18 @@ def _answer(name: str, plan: JobPlan, passes: _Passes) -> FilterAnswer:
             "See its fixes with pfbench inspect, or choose another filter.",
         )
     nis, dof = (result.trace[key][-1].numpy() for key in ("nis", "nis_dof")) if all(has_nis) else (np.zeros(0),) * 2  # fmt: skip
-    return FilterAnswer(name, _describe(result.mean, result.variance, passes), smoothed, nis[dof > 0], dof[dof > 0])  # fmt: skip
+    filtered = _describe(result.mean, result.variance, result.trace["fix"], passes)
+    return FilterAnswer(name, filtered, smoothed, nis[dof > 0], dof[dof > 0])
 
 
-def _describe(mean: Tensor, variance: Tensor, passes: _Passes) -> MotionEstimate:
+def _describe(mean: Tensor, variance: Tensor, of_fix: Tensor, passes: _Passes) -> MotionEstimate:
     """Return the motion of the pass with all fixes, and the distances of the others to their held-out fixes.
 
-    Shapes: mean [R, T, D], variance [R, T, d].
+    Shapes: mean [R, T, D], variance [R, T, d], that of position and slow error together of_fix [R, T, 3].
     """
     state, sd = mean[-1, :, :10].numpy().copy(), variance[-1, :, :9].clamp(min=0.0).sqrt().numpy()
     state[:, 7:] += passes.start
     is_held = ~torch.isnan(passes.truth[..., 0])
-    error = (mean[:-1, :, 7:10] - passes.truth)[is_held]
-    total = (variance[:-1, :, 6:9] + passes.truth_sd**2)[is_held].sqrt()
+    error = (mean[:-1, :, 7:10] + mean[:-1, :, -3:] - passes.truth)[is_held]
+    total = (of_fix[:-1] + passes.model.r[..., :3] ** 2)[is_held].sqrt()
     return MotionEstimate(state, sd, error.numpy(), total.numpy())
-
-
-def _join_neighbours(passes: _Passes, time: Array) -> Array:
-    """Return the line between the given fixes around each held-out fix minus the fix, m, [m, 3]."""
-    rows = []
-    for y, truth in zip(passes.record.y[:-1, :, :3].numpy(), passes.truth.numpy(), strict=True):
-        used_mask, withheld_mask = np.isfinite(y[:, 0]), np.isfinite(truth[:, 0])
-        line = np.stack(
-            [np.interp(time[withheld_mask], time[used_mask], c) for c in y[used_mask].T], -1
-        )
-        rows.append(line - truth[withheld_mask])
-    return np.concatenate(rows)

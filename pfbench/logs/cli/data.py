@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 
@@ -16,34 +16,29 @@ from pfbench.files.atomic_write import hash_file
 _LIST = Path(__file__).parents[1] / "worlds" / "data_sets.yaml"
 
 
-class SetState(NamedTuple):
-    """State of a data set in a folder: its name, its state in a word, and its files that are missing or differ."""
-
-    name: str
-    word: str
-    missing: tuple[str, ...] = ()
-    changed: tuple[str, ...] = ()
-
-
 def read_data_sets() -> dict[str, dict[str, Any]]:
     """Read the list of data sets by name: about, source, commit, folder, licence, and files with bytes and SHA-256."""
     content: dict[str, dict[str, Any]] = yaml.safe_load(_LIST.read_text(encoding="utf-8"))
     return content
 
 
-def check_data_set(name: str, files: Mapping[str, Mapping[str, Any]], root: Path) -> SetState:
-    """Check the files of a data set in a folder of data sets."""
+def check_data_set(
+    name: str, files: Mapping[str, Mapping[str, Any]], root: Path
+) -> tuple[str, list[str]]:
+    """Return the state of a data set in a folder of them, in a word, and what is wrong with its files."""
     folder = root / name
     if not folder.is_dir():
-        return SetState(name, "missing")
-    missing = tuple(file for file in files if not (folder / file).is_file())
-    changed = tuple(
+        return "missing", []
+    missing = [file for file in files if not (folder / file).is_file()]
+    changed = [
         file
         for file, facts in files.items()
         if file not in missing and not facts["sha256"].startswith(hash_file(folder / file))
-    )
+    ]
     word = "incomplete" if missing else "differs" if changed else "complete"
-    return SetState(name, word, missing, changed)
+    return word, [
+        f"{name}/{f} {'is missing' if f in missing else 'differs'}" for f in missing + changed
+    ]
 
 
 def list_data(words: Sequence[str]) -> None:
@@ -68,14 +63,13 @@ def list_data(words: Sequence[str]) -> None:
     states = {name: check_data_set(name, facts["files"], root) for name, facts in sets.items()} if folder else {}  # fmt: skip
     for name, facts in sets.items():
         size = sum(file["bytes"] for file in facts["files"].values()) / 1e6
-        word = states[name].word if folder else ""
+        word = states[name][0] if folder else ""
         print(f"{name:16} {word:11}{size:5.1f} MB  {facts['licence']:18} {facts['about']}")
         print(f"{'':16} {'':11}{facts['source']} {facts['commit'][:10]}, {facts['folder']}")
     if not folder:
         print("\nCheck a folder: pfbench data FOLDER. Use it: export PFBENCH_DATA=FOLDER")
         return
-    faults = [f"{s.name}/{file} is missing" for s in states.values() for file in s.missing]
-    faults += [f"{s.name}/{file} differs" for s in states.values() for file in s.changed]
+    faults = [fault for _, of_set in states.values() for fault in of_set]
     require(
         not faults,
         "data sets",
@@ -83,7 +77,7 @@ def list_data(words: Sequence[str]) -> None:
         f"{folder} where {'; '.join(faults)}",
         "Copy these files again, or remove the folder of the data set.",
     )
-    count = sum(state.word == "complete" for state in states.values())
+    count = sum(word == "complete" for word, _ in states.values())
     print(f"\n{count} of {len(states)} data sets are complete in {folder}. Use them: export PFBENCH_DATA={folder}")  # fmt: skip
 
 

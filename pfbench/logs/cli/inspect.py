@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from pfbench.cli.command import Command
-from pfbench.cli.messages import require_choice
 from pfbench.core.parameter_checks import require
-from pfbench.logs.cli.judge import convert_numbers
+from pfbench.logs.cli.judge import convert_numbers, split_values
 
 _KEYS = ("imu", "gnss", "reference", "path", "sensor", "fix_codes", "origin", "reports_dir")
 _SCENARIO = (
@@ -17,14 +16,13 @@ _SCENARIO = (
     "origin",
     "fix_codes",
 )  # keys of the scenario that read the log in the same way
-_ADVICE = "See pfbench inspect --help."
 _WARNED, _REFUSED = 3, 2
 
 
 def inspect_folder(words: Sequence[str]) -> None:
     """Inspect a log, print its findings and write the page."""
     folder, others = split_folder([w.removeprefix("scenario.") for w in words], "inspect")
-    values = _read_values(others)
+    values = split_values(others, "inspect", _KEYS)
     require(folder.is_dir(), folder, "be a folder with imu, gnss and, if there is one, reference", "none", "Check the path.")  # fmt: skip
     from pfbench.logs.doctor.thresholds import THRESHOLDS
     from pfbench.logs.judge.log_page import describe_run, write_log_page
@@ -55,16 +53,6 @@ def inspect_folder(words: Sequence[str]) -> None:
         print(f"Mended: {describe_run(page.parent, folder.parent)}")
     if counts["refuse"] or counts["warn"]:
         raise SystemExit(_REFUSED if counts["refuse"] else _WARNED)
-
-
-def _read_values(words: Sequence[str]) -> dict[str, str]:
-    """Return the values by key."""
-    values: dict[str, str] = {}
-    for key, _, value in (word.partition("=") for word in words):
-        require_choice("key", key, _KEYS, _ADVICE)
-        require(value and key not in values, "words", "be FOLDER and key=value, each key once", key, _ADVICE)  # fmt: skip
-        values[key] = value
-    return values
 
 
 def split_folder(words: Sequence[str], command: str) -> tuple[Path, list[str]]:

@@ -9,7 +9,7 @@ from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from pfbench.cli.command import Command
-from pfbench.cli.messages import suggest_similar
+from pfbench.cli.messages import require_choice, suggest_similar
 from pfbench.core.parameter_checks import require
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ _PAIR = re.compile(
 
 def judge_trajectories(words: Sequence[str]) -> None:
     """Compare programs and write the report."""
-    values = _split(words)
+    values = split_values(words, "judge")
     options, sources, programs = _sort_words(values)
     from pfbench.logs.judge.judgement import judge_programs
     from pfbench.logs.judge.page import describe_material, describe_notes, write_judgement
@@ -59,8 +59,10 @@ def judge_trajectories(words: Sequence[str]) -> None:
     print(f"report: {page.resolve()}")
 
 
-def _split(words: Sequence[str]) -> dict[str, str]:
-    """Return the values by key; a key occurs once."""
+def split_values(
+    words: Sequence[str], command: str, keys: Sequence[str] | None = None
+) -> dict[str, str]:
+    """Return the values by key; a key occurs once, and is one of some keys."""
     values: dict[str, str] = {}
     for word in words:
         key, _, value = word.partition("=")
@@ -69,8 +71,10 @@ def _split(words: Sequence[str]) -> dict[str, str]:
             "words",
             "be key=value, each key once",
             word,
-            "See pfbench judge --help.",
+            f"See pfbench {command} --help.",
         )
+        if keys is not None:
+            require_choice("key", key, keys, f"See pfbench {command} --help.")
         values[key] = value
     return values
 

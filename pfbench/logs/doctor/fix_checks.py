@@ -153,27 +153,31 @@ def compare_at(log: RawLog, offset: float) -> FixErrors:
 
 
 def _fit_frame(log: RawLog, plain: FixErrors) -> tuple[complex, Array, Array, bool]:
-    """Fit turn and scale of the fixes about their means.
+    """Fit turn and scale of the fixes jointly with lever arm, offset and shift.
 
     Returns the factor, fixes and reference without means as complex numbers, and whether the factor explains the fixes, and
     no order of axes does.
     """
-    used = np.flatnonzero(plain.inside)
+    used, error = plain.inside & ~find_jumps(plain.error, plain.inside)[2], plain.error[:, :2]
+    true = log.fixes.position - plain.error
+    path = true - true[used].mean(0)
+    forms = np.stack([path * [1.0, 1.0, 0.0], path[:, [1, 0, 2]] * [-1.0, 1.0, 0.0]], -1)
+    design = np.concatenate([_make_design(log, log.fixes.time), forms], -1)
     for _ in range(3):
-        fixes, error = (a[used, :2] @ [1.0, 1j] for a in (log.fixes.position, plain.error))
-        measured, expected = (z - z.mean() for z in (fixes, fixes - error))
-        factor = np.vdot(expected, measured) / max(np.vdot(expected, expected).real, 1e-9)
-        rest = np.abs(measured - factor * expected)
-        keep = rest <= 4.0 * np.median(rest) + 1e-9
-        before = float(np.sqrt(np.square(np.abs(measured - expected)[keep]).mean()))
-        after, used = float(np.sqrt(np.square(rest[keep]).mean())), used[keep]
-    recorded, true = (a - a.mean(0) for a in (log.fixes.position[used], (log.fixes.position - plain.error)[used]))  # fmt: skip
-    ordered = min(float(np.sqrt(np.square((recorded - true @ m.T)[:, :2]).sum(1).mean())) for m in BODY_ORDERS)  # fmt: skip
-    drifted = float(np.linalg.norm(remove_line(plain.error[used, :2]).std(0)))
+        solution = _fit_jointly(plain.error[used], design[used]).solution
+        rest = np.linalg.norm(error - (design @ solution)[:, :2], axis=1)
+        used &= rest <= 4.0 * np.median(rest[used]) + 1e-9
+    before, after, drifted = (
+        float(np.sqrt(np.square(a).sum(-1).mean()))
+        for a in (error[used] - error[used].mean(0), rest[used, None], remove_line(error[used]))
+    )
+    measured, expected = (a[used] - a[used].mean(0) for a in (log.fixes.position, true))
+    ordered = min(float(np.sqrt(np.square((measured - expected @ m.T)[:, :2]).sum(1).mean())) for m in BODY_ORDERS)  # fmt: skip
     is_explained = after <= min(_FRAME * before, 2.0 * ordered, drifted) and before > _LEAST_FRAME
     if is_explained and (late := _find_coarse_offset(log)).offset:  # a clock can look like a frame
         is_explained = after <= extent_of(late.error[late.inside, :2])
-    return factor, measured, expected, is_explained and bool(factor)
+    level = np.array([1.0, 1j])
+    return complex(1.0 + solution[7], solution[8]), measured[:, :2] @ level, expected[:, :2] @ level, is_explained  # fmt: skip
 
 
 def check_frame(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
@@ -185,7 +189,6 @@ def check_frame(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
     if plain.inside.sum() < _FEWEST:
         return
     factor, measured, expected, is_explained = _fit_frame(log, plain)
-    factor *= _refine_frame(log, factor) if is_explained else 1.0
     scale, turn = float(np.abs(factor)), float(np.rad2deg(np.angle(factor)))
     facts["turn and scale of fixes"] = [round(turn, 3), round(scale, 4)]
     quarter = abs((turn + 45.0) % 90.0 - 45.0)  # orders of axes have their own check
@@ -212,19 +215,6 @@ def check_frame(log: RawLog, facts: dict[str, Any]) -> Iterator[Finding]:
             {"corrections": {"level_axes": {"gnss": [round(turn, 3)]}}},
             ("grid North in place of true or magnetic North",), picture,
         )  # fmt: skip
-
-
-def _refine_frame(log: RawLog, factor: complex) -> complex:
-    """Return turn and scale that lever arm, offset and shift leave, if the fixes had those of a factor."""
-    level = (log.fixes.position[:, :2] @ [1.0, 1j]) / factor
-    position = np.stack([level.real, level.imag, log.fixes.position[:, 2]], -1)
-    errors = compare_at(log._replace(fixes=log.fixes._replace(position=position)), 0.0)
-    used, at = errors.inside & ~find_jumps(errors.error, errors.inside)[2], log.fixes.time
-    forms = position[:, [1, 0]] * [-1.0, 1.0], position[:, :2]
-    columns = np.stack([np.pad(form - form[used].mean(0), ((0, 0), (0, 1))) for form in forms], -1)
-    design = np.concatenate([_make_design(log, at), columns], -1)
-    turn, stretch = _fit_jointly(errors.error[used], design[used]).solution[7:]
-    return 1.0 + stretch + 1j * turn
 
 
 def _check_slow(log: RawLog, at: Array, rest: Array, facts: dict[str, Any]) -> Iterator[Finding]:
@@ -506,7 +496,7 @@ def _describe_lever(log: RawLog, fit: JointFit, error: Array, at: Array) -> Find
         "lever arm", TELL, float(np.abs(lever[:2]).max()), limit_of("lever arm"), "m",
         f"{log.names[1]}: the antenna is {lever.round(2).tolist()} m forward, right, down of the position of "
         f"{log.names[2]}, within {(2.0 * lever_error).round(2).tolist()}",
-        f"Set scenario.corrections.lever_arm={arm}", {"corrections": {"lever_arm": arm}},
+        f"Set scenario.corrections.lever_arm={arm}{'' if arm[2] else '. The motion does not show it downwards: measure it'}", {"corrections": {"lever_arm": arm}},
         ("a lever arm of the antenna", "an offset of the point to which the reference refers"),
         Picture("t [s]", "fix minus reference in body axes [m]", (
             thin_curve("forward", log.fixes.time, body[:, 0]), thin_curve("right", log.fixes.time, body[:, 1]),

@@ -9,12 +9,12 @@ from typing import Any
 from pfbench.files.reader_notes import announce_notes
 from pfbench.logs.doctor.checks import WITHOUT_REFERENCE, run_checks
 from pfbench.logs.doctor.finding import REFUSE, TELL, Finding, LogDiagnosis, merge_settings
-from pfbench.logs.doctor.sensor_grade import measure_noise
 from pfbench.logs.doctor.thresholds import limit_of
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
 from pfbench.logs.worlds.corrections import LogTables
 from pfbench.logs.worlds.log_reader import LogSource
 from pfbench.logs.worlds.log_tables import LogFiles, list_tables
+from pfbench.logs.worlds.standing import measure_noise
 
 _ROUNDS = 3  # of checks with the settings found so far
 _SPOILS = {"slow errors", "heading", "repeated column", "dead axis", "saturated axis", "gyro bias drift", "accelerometer bias drift", "attitude jump"}  # fmt: skip  # what no setting mends, and what others are measured with

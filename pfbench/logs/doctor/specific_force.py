@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -72,42 +71,13 @@ _DELAYS, _DELAY_S = (
 )  # s of the force, and of the log that is compared
 
 
-Cause = tuple[str, dict[str, Any]]  # what is wrong, and the corrections that mend it
+# what is wrong, the corrections that mend it, and what the force leaves then, (m/s^2)^2
+Cause = tuple[str, dict[str, Any], float]
 _LEVEL = ["e", "n", "-d"]
 _ROS: dict[str, Any] = {
     "mounting": {"imu": ["x", "-y", "-z"]}, "level_axes": {"reference": _LEVEL, "gnss": _LEVEL},
     "attitude": "forward_left_up",
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class ForceState:
-    """Residuals of the recorded axes and of the best ones.
-
-    Attributes:
-        aligned: Alignment by turns.
-        windows: Windows of the force.
-        fit: Fit of the recorded axes.
-        body: Cost and matrix of the best body axes of the force.
-        level: Cost and matrix of the best level axes.
-        ros: Cost of axes of ROS in all tables.
-        conventions: Rate residual, force cost and name of each convention of the attitude.
-    """
-
-    aligned: Alignment
-    windows: ForceWindows
-    fit: ForceFit
-    body: tuple[float, Array]
-    level: tuple[float, Array]
-    ros: float
-    conventions: tuple[tuple[float, float, str], ...] = ()
-
-    @property
-    def least(self) -> float:
-        """Least cost of any explanation."""
-        return min(
-            self.body[0], self.level[0], self.ros, *(cost for _, cost, _ in self.conventions)
-        )
 
 
 def check_force_and_rate(aligned: Alignment, facts: dict[str, Any]) -> tuple[RawLog, list[Finding]]:
@@ -118,9 +88,10 @@ def check_force_and_rate(aligned: Alignment, facts: dict[str, Any]) -> tuple[Raw
     windows = integrate_force(aligned.log, aligned.dcm, aligned.offset)
     if windows is None:
         return aligned.log, []
-    state = _try_axes(aligned, windows)
+    fit, is_rate = fit_force(windows), aligned.rate_ratio > limit_of("axes")
+    causes, least = _list_causes(aligned, windows, fit, is_rate)
     horizontal = float(np.sqrt(np.square(windows.change[:, :2]).mean()))
-    ratio = state.fit.cost / max(state.least, 1e-12)
+    ratio = fit.cost / max(least, 1e-12)
     facts.update(
         {
             "rate axes": aligned.rate_ratio,
@@ -128,18 +99,17 @@ def check_force_and_rate(aligned: Alignment, facts: dict[str, Any]) -> tuple[Raw
             "horizontal acceleration [m/s^2]": horizontal,
         }
     )
-    is_rate = aligned.rate_ratio > limit_of("axes")
     is_force = ratio > CLEAR_AXES and horizontal > LEAST_ACCELERATION
     # a part of exchanged axes is a turn about the vertical, and a motion along a line allows exchanged axes for a heading
-    if turned := _find_rotation(aligned, windows, facts) or _find_heading(state, facts):
+    if turned := _find_rotation(aligned, windows, facts) or _find_heading(aligned, windows, fit, least, facts):  # fmt: skip
         finding, log = turned
         return log, [finding]
     if is_rate or is_force:
-        finding, log = _describe_axes(state, is_rate, max(ratio, aligned.rate_ratio))
-        return log, [finding]
+        finding = _describe_axes(aligned, windows, ratio, causes)
+        return _mend(aligned.log, finding.settings.get("corrections", {})), [finding]
     return aligned.log, [
         *_check_force_delay(aligned, facts),
-        *_check_force_errors(state, facts),
+        *_check_force_errors(aligned, windows, fit, facts),
         *_check_rate_errors(aligned, facts),
     ]
 
@@ -193,12 +163,14 @@ def _find_rotation(aligned: Alignment, windows: ForceWindows, facts: dict[str, A
     return finding, _mend(log, finding.settings["corrections"])
 
 
-def _find_heading(state: ForceState, facts: dict[str, Any]) -> tuple[Finding, RawLog] | None:
+def _find_heading(
+    aligned: Alignment, windows: ForceWindows, plain: ForceFit, least: float, facts: dict[str, Any]
+) -> tuple[Finding, RawLog] | None:
     """Find a yaw of the reference that is off by a constant: turns agree, and the force moves in another direction.
 
     Returns the finding, and the log with the yaw corrected.
     """
-    plain, windows, log = state.fit, state.windows, state.aligned.log
+    log = aligned.log
     predicted, expected = (a[plain.keep, :2] @ [1.0, 1j] for a in (windows.change - plain.residual, windows.change))  # fmt: skip
     angle = float(np.angle(np.vdot(predicted, expected)))
     turn = Rotation.from_euler("z", angle).as_matrix()
@@ -207,8 +179,8 @@ def _find_heading(state: ForceState, facts: dict[str, Any]) -> tuple[Finding, Ra
     degrees = np.rad2deg(angle)
     facts["turn of the heading [deg]"] = round(degrees, 2)
     if (
-        fit.cost >= min(plain.cost / CLEAR_AXES, state.least, limit_of("rest of the force") ** 2)
-        or state.aligned.rate_ratio > limit_of("axes")
+        fit.cost >= min(plain.cost / CLEAR_AXES, least, limit_of("rest of the force") ** 2)
+        or aligned.rate_ratio > limit_of("axes")
         or abs((degrees + 45.0) % 90.0 - 45.0)
         < limit_of("mounting")  # orders of axes have their own check
     ):
@@ -247,73 +219,69 @@ def _drives_forward(log: RawLog) -> bool:
     return bool(moves.any() and np.cos(off).mean() > _AHEAD)
 
 
-def _try_axes(aligned: Alignment, windows: ForceWindows) -> ForceState:
-    """Fit the force with all orders of axes, and with other conventions if the recorded axes do not fit."""
-    fit = fit_force(windows)
-    body = min(((fit_force(windows, m).cost, m) for m in BODY_ORDERS), key=lambda pair: pair[0])
-    level = min(
-        ((fit_force(windows, level=m).cost, m) for m in LEVEL_ORDERS), key=lambda pair: pair[0]
-    )
-    # with these, turns agree, and only gravity points the other way: a bias can hide it
-    ros = fit.cost if fit.cost < limit_of("rest of the force") ** 2 else _find_ros_cost(aligned)
-    state = ForceState(aligned, windows, fit, body, level, ros)
-    if max(fit.cost / max(state.least, 1e-12), aligned.rate_ratio) <= limit_of("axes"):
-        return state
-    conventions = []
-    true, measured = aligned.pair
+def _list_causes(
+    aligned: Alignment, windows: ForceWindows, fit: ForceFit, is_rate: bool
+) -> tuple[list[Cause], float]:
+    """List the explanations of axes that fit as well as the best, simple ones first.
+
+    Other conventions are tried if the recorded axes do not fit. If the rate does not fit either, no explanation of force or
+    reference alone is one.
+
+    Returns them, and what the force leaves with the best.
+    """
+    log, gyro, limit = aligned.log, aligned.rate_axes.T, limit_of("axes")
+    imu, _, reference = log.names
+    body = min(BODY_ORDERS, key=lambda m: fit_force(windows, m).cost)
+    level = min(LEVEL_ORDERS, key=lambda m: fit_force(windows, level=m).cost)
+    names, others = name_axes(level, is_level=True), list[Cause]()
+    enu = " (East, North, Up under the names of North, East, Down)" if names == _LEVEL else ""
+    orders: list[Cause] = [
+        (f"{reference}: North, East, Down are the axes {', '.join(names)}{enu}", {"level_axes": {"reference": names}}, fit_force(windows, level=level).cost),
+        (f"{imu}: fx, fy, fz alone have other axes, {_join(body)}", {"mounting": {"accelerometer": name_axes(body)}}, fit_force(windows, body).cost),
+    ]  # fmt: skip
+    if not is_rate and fit.cost >= limit_of("rest of the force") ** 2:
+        # with these, turns agree, and only gravity points the other way: a bias can hide it
+        ros = _mend(log, _ROS)
+        turned = integrate_force(ros, dcm_of(ros.reference.angles), aligned.offset)
+        others = [("all tables: East, North, Up and forward, left, up, as in ROS", _ROS, fit_force(turned).cost)] if turned else []  # fmt: skip
+    least = min(cost for *_, cost in (*others, *orders))
+    if max(fit.cost / max(least, 1e-12), aligned.rate_ratio) > limit:
+        others += sorted(_try_conventions(aligned), key=lambda cause: cause[2])
+        least = min(cost for *_, cost in (*others, *orders))
+    if is_rate:
+        axes = _find_mounting(aligned, windows)
+        orders = [
+            (f"{imu}: forward, right, down are the axes {_join(axes)}", {"mounting": {"imu": name_axes(axes)}}, fit_force(windows, axes).cost),
+            (f"{imu}: wx, wy, wz alone have other axes, {_join(gyro)}", {"mounting": {"gyroscope": name_axes(gyro)}}, fit.cost),
+        ]  # fmt: skip
+    return [cause for cause in (*others, *orders) if cause[2] < _EQUAL * least], least
+
+
+def _try_conventions(aligned: Alignment) -> Iterator[Cause]:
+    """Yield the conventions of the attitude with which turns are those of the rate."""
+    (true, measured), log = aligned.pair, aligned.log
     least = max(float(((measured - true @ aligned.rate_axes.T) ** 2).sum()), 1e-300)
-    for name in CONVENTIONS:
-        dcm = dcm_of(convert_angles(name, aligned.log.reference.angles))
-        turns = turns_between(dcm, aligned.nodes)[aligned.used]
-        rest = float(((measured - remove_line(turns)) ** 2).sum()) / least
-        fitted = integrate_force(aligned.log, dcm, aligned.offset)
-        if fitted is not None:
-            conventions.append((rest, fit_force(fitted).cost, name))
-    return replace(state, conventions=tuple(sorted(conventions, key=lambda c: c[1])))
+    is_course = _drives_forward(log)  # a recorded yaw that is the course is right
+    for name, (text, _) in CONVENTIONS.items():
+        dcm = dcm_of(convert_angles(name, log.reference.angles))
+        turns = remove_line(turns_between(dcm, aligned.nodes)[aligned.used])
+        windows = integrate_force(log, dcm, aligned.offset)
+        is_like = float(np.square(measured - turns).sum()) < _EQUAL * least
+        if windows and is_like and not ("yaw" in name and is_course):
+            yield f"{log.names[2]}: {text}", {"attitude": name}, fit_force(windows).cost
 
 
-def _describe_axes(state: ForceState, is_rate: bool, ratio: float) -> tuple[Finding, RawLog]:
+def _describe_axes(aligned: Alignment, windows: ForceWindows, ratio: float, causes: list[Cause]) -> Finding:  # fmt: skip
     """Describe axes that disagree, with all explanations that fit as well as the best."""
-    aligned = state.aligned
-    causes = list(_list_causes(state, is_rate))
-    best = f"the best axes of the rate are {_join(aligned.rate_axes.T)}, of the force {_join(state.body[1])}"
-    remedy = (
-        f"Set scenario.corrections: {causes[0][1]}"
-        if causes
-        else f"No single change explains both: {best}. Check the axes of both tables"
-    )
-    finding = Finding(
-        "axes", REFUSE, ratio, limit_of("axes"), "times the least residual",
-        f"{aligned.log.names[0]} and {aligned.log.names[2]}: axes disagree, residuals of the rate are "
-        f"{aligned.rate_ratio:.1f} and of the force {state.fit.cost / max(state.least, 1e-12):.1f} times those of the best axes",
-        remedy, {"corrections": causes[0][1]} if causes else {},
-        tuple(text for text, _ in causes), _force_picture(state.windows),
+    imu, _, reference = aligned.log.names
+    corrections = causes[0][1] if causes else {}
+    unknown = f"No single change explains both: the best axes of the rate are {_join(aligned.rate_axes.T)}. Check the axes of both tables"  # fmt: skip
+    return Finding(
+        "axes", REFUSE, max(ratio, aligned.rate_ratio), limit_of("axes"), "times the least residual",
+        f"{imu} and {reference}: axes disagree, residuals of the rate are {aligned.rate_ratio:.1f} and of the force {ratio:.1f} times "
+        "those of the best axes",
+        f"Set scenario.corrections: {corrections}" if causes else unknown, {"corrections": corrections} if causes else {}, tuple(text for text, *_ in causes), _force_picture(windows),
     )  # fmt: skip
-    return finding, _mend(aligned.log, causes[0][1] if causes else {})
-
-
-def _list_causes(state: ForceState, is_rate: bool) -> Iterator[Cause]:
-    """Yield the explanations, simple ones first."""
-    log, limit = state.aligned.log, _EQUAL * state.least
-    (imu, _, reference), identity = log.names, np.eye(3)
-    if not is_rate and state.ros < limit:
-        yield "all tables: East, North, Up and forward, left, up, as in ROS", _ROS
-    for rest, cost, name in state.conventions:
-        if rest < _EQUAL and cost < limit and not ("yaw" in name and _drives_forward(log)):
-            yield f"{reference}: {CONVENTIONS[name][0]}", {"attitude": name}
-    axes = _find_mounting(state)
-    if is_rate and fit_force(state.windows, axes).cost < limit:
-        yield f"{imu}: forward, right, down are the axes {_join(axes)}", {"mounting": {"imu": name_axes(axes)}}  # fmt: skip
-    if is_rate and state.fit.cost < limit:
-        axes = state.aligned.rate_axes.T
-        yield f"{imu}: wx, wy, wz alone have other axes, {_join(axes)}", {"mounting": {"gyroscope": name_axes(axes)}}  # fmt: skip
-    if not is_rate and state.level[0] < limit and not np.array_equal(state.level[1], identity):
-        names = name_axes(state.level[1], is_level=True)
-        enu = " (East, North, Up under the names of North, East, Down)" if names == _ROS["level_axes"]["gnss"] else ""  # fmt: skip
-        yield f"{reference}: North, East, Down are the axes {', '.join(names)}{enu}", {"level_axes": {"reference": names}}  # fmt: skip
-    if not is_rate and state.body[0] < limit and not np.array_equal(state.body[1], identity):
-        axes = state.body[1]
-        yield f"{imu}: fx, fy, fz alone have other axes, {_join(axes)}", {"mounting": {"accelerometer": name_axes(axes)}}  # fmt: skip
 
 
 def _mend(log: RawLog, corrections: Mapping[str, Any]) -> RawLog:
@@ -336,20 +304,13 @@ def _mend(log: RawLog, corrections: Mapping[str, Any]) -> RawLog:
     return log._replace(imu=imu, reference=reference, fixes=fixes)
 
 
-def _find_ros_cost(aligned: Alignment) -> float:
-    """Return what the force leaves if all tables have axes of ROS."""
-    mended = _mend(aligned.log, _ROS)
-    windows = integrate_force(mended, dcm_of(mended.reference.angles), aligned.offset)
-    return fit_force(windows).cost if windows else np.inf
-
-
-def _find_mounting(state: ForceState) -> Array:
+def _find_mounting(aligned: Alignment, windows: ForceWindows) -> Array:
     """Return the body axes, to the true ones, that fit the force best among those that fit the rate."""
-    true, measured = state.aligned.pair
+    true, measured = aligned.pair
     residuals = np.array([float(((measured - true @ m.T) ** 2).sum()) for m in BODY_ORDERS])
     accepted = np.flatnonzero(residuals < _EQUAL * residuals.min())
     axes = (BODY_ORDERS[i].T for i in accepted)
-    return min(axes, key=lambda matrix: fit_force(state.windows, matrix).cost)
+    return min(axes, key=lambda matrix: fit_force(windows, matrix).cost)
 
 
 def _join(axes: Array) -> str:
@@ -389,9 +350,11 @@ def _check_force_delay(aligned: Alignment, facts: dict[str, Any]) -> Iterator[Fi
         )  # fmt: skip
 
 
-def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Finding]:
+def _check_force_errors(
+    aligned: Alignment, windows: ForceWindows, fit: ForceFit, facts: dict[str, Any]
+) -> Iterator[Finding]:
     """Check scale and bias of the force, which are not judged where the bias changes."""
-    windows, fit, name = state.windows, state.fit, state.aligned.log.names[0]
+    name, _, truth = aligned.log.names
     facts["rest of the force"] = float(np.sqrt(np.square(fit.residual[fit.keep]).sum(1).mean()))
     is_slow = facts.get("imu rate", np.inf) < limit_of("imu rate")  # motion between samples is lost
     change = None if is_slow else _find_force_change(windows, fit)
@@ -415,7 +378,7 @@ def _check_force_errors(state: ForceState, facts: dict[str, Any]) -> Iterator[Fi
     if abs(scale - 1.0) > limit_of("force scale") and windows.gravity:
         yield Finding(
             "force scale", WARN, scale - 1.0, limit_of("force scale"), "1",
-            f"{name}: fx, fy, fz are {scale:.3f} times the force that {state.aligned.log.names[2]} and gravity need",
+            f"{name}: fx, fy, fz are {scale:.3f} times the force that {truth} and gravity need",
             "Set scenario.corrections.scale, or correct the scale factor",
             {"corrections": {"scale": {"imu": dict.fromkeys(("fx", "fy", "fz"), round(1.0 / scale, 5))}}},
             ("a scale factor", "another gravity", f"an accelerometer bias of {bias.round(2).tolist()} m/s^2"),

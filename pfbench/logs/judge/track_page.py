@@ -16,6 +16,7 @@ from pfbench.results.plotting import FigureSpec, format_slug
 
 if TYPE_CHECKING:
     from pfbench.job import FilterAnswer, MotionEstimate, TrackEstimate
+    from pfbench.logs.worlds.slow_fix_errors import LastingErrors
 
 _NORMAL = 1.96  # standard deviations of a 95 % interval
 
@@ -56,7 +57,10 @@ def describe_track(estimate: TrackEstimate) -> list[str]:
     Returns:
         Lines for the console and the page.
     """
-    lines = [f"{estimate.name}: {len(estimate.time)} steps from t = {estimate.time[0]:.1f} to {estimate.time[-1]:.1f} s; {estimate.rule}"]  # fmt: skip
+    lines = [
+        f"{estimate.name}: {len(estimate.time)} steps from t = {estimate.time[0]:.1f} to {estimate.time[-1]:.1f} s; {estimate.rule}",
+        _describe_fix_errors(estimate.fix_errors),
+    ]  # fmt: skip
     for name, motion in estimate.tracks().items():
         distances, half = measure_held_out(motion), _NORMAL * np.median(motion.sd[:, 6:9], axis=0)
         lines.append(
@@ -64,9 +68,7 @@ def describe_track(estimate: TrackEstimate) -> list[str]:
             f"mean square over the expected one {distances.ratio:.2f}; 95 % interval of the track in the median +-{half[0]:.2f}, "
             f"{half[1]:.2f}, {half[2]:.2f} m East, North, Up"
         )
-    line = _rms(np.linalg.norm(estimate.neighbours[:, :2], axis=1))
-    lines.append(f"for comparison, a line between the neighbouring fixes: {line:.2f} m RMS")
-    lines += [_describe_innovations(answer) for answer in estimate.answers]
+    lines += [_describe_innovations(a, estimate.fix_errors.is_clear) for a in estimate.answers]
     first, *others = estimate.answers
     for answer in others:
         distance = _distances(first, answer)
@@ -74,8 +76,19 @@ def describe_track(estimate: TrackEstimate) -> list[str]:
     return lines
 
 
-def _describe_innovations(answer: FilterAnswer) -> str:
-    """Describe the innovations of a filter."""
+def _describe_fix_errors(errors: LastingErrors) -> str:
+    """Describe whether the errors of the fixes are white, by the odds of errors that last."""
+    if not errors.is_clear:
+        return f"fixes: white errors of the stated size explain the innovations; odds of errors that last {errors.odds:.2g}, which white ones take above 100 in one log of a hundred at most"  # fmt: skip
+    return (
+        f"fixes: their errors last (odds above 100). {errors.white:.0%} of the stated standard deviation is white, and the rest "
+        f"has a correlation time of about {errors.time_s:.0f} s. All filters have it as a state, so that intervals include it. An error that lasts "
+        "looks like a smaller one: if the receiver is better than tuning.position_sd says, set it"
+    )
+
+
+def _describe_innovations(answer: FilterAnswer, errors_last: bool) -> str:
+    """Describe the innovations of a filter; they say that the tuning is too large only if fixes have white errors."""
     if not len(answer.nis):
         return f"{answer.name}: the filter states no innovations"
     mean, band = (
@@ -85,8 +98,7 @@ def _describe_innovations(answer: FilterAnswer) -> str:
     where = "within" if abs(mean - 1.0) <= band else "above" if mean > 1.0 else "below"
     cause = {
         "within": "", "above": ": the noise that the tuning states is too small, or the log has a fault, see pfbench inspect",
-        "below": ": the noise that the tuning states is too large, or errors of the fixes last for seconds, which innovations do not "
-        "tell apart; the intervals do not hold for errors that last",
+        "below": "" if errors_last else ": the noise that the tuning states is too large",
     }[where]  # fmt: skip
     return (
         f"{answer.name}: mean NIS per component {mean:.2f}, {where} {1.0 - band:.2f} to {1.0 + band:.2f}, the 95 % band of "
@@ -153,7 +165,7 @@ def _list_figures(estimate: TrackEstimate) -> list[FigureSpec]:
     panels: list[tuple[Any, ...]] = [
         ("map", "Tracks and fixes.", "East [m]", "North [m]",
          [*fixes, *((name, m.state[:, 7], m.state[:, 8]) for name, m in tracks)]),
-        ("intervals", f"Half-width of the 95 % intervals of {first.name}. They hold if the stated noise is right, and not for errors of fixes that last for seconds.", "t [s]", "half-width [m]",
+        ("intervals", f"Half-width of the 95 % intervals of {first.name}. They hold if the stated size of the errors of fixes is right, whether these last or not.", "t [s]", "half-width [m]",
          [(axis + ending, time, _NORMAL * m.sd[:, 6 + k], line) for k, axis in enumerate(("East", "North", "Up")) for ending, m, line in kinds]),
         ("held_out", "Horizontal distance to held-out fixes, each by a pass that did not get the fix.", "t [s]", "distance [m]",
          [(name, estimate.held_out_time[order], np.linalg.norm(m.held_out[order, :2], axis=1), ".") for name, m in tracks]),

@@ -28,7 +28,7 @@ from pfbench.logs.sky.ephemeris import (
     parse_epochs,
     read_ephemeris,
 )
-from pfbench.logs.sky.ephemeris_checks import EphemerisSelection, check_ephemerides
+from pfbench.logs.sky.ephemeris_checks import check_ephemerides
 from pfbench.nav.orbits import LIGHT, TYPICAL_FLIGHT, Constellation, eccentric_anomaly, free_fall
 
 
@@ -191,12 +191,12 @@ class BroadcastConstellation(Constellation):
     def notes(self) -> tuple[str, ...]:
         """Messages about ignored, changed and unconfirmed ephemerides, for a report."""
         unhealthy = describe_unhealthy(self._file.rows, self.path)
-        return (*self._file.notes, *self._selection.notes, *unhealthy)
+        return (*self._file.notes, *self._selection[1], *unhealthy)
 
     @cached_property
     def _table(self) -> pd.DataFrame:
         """The ephemerides in use, one row each. Of each `toe` the last transmission is used."""
-        table = self._healthy[self._selection.mask]
+        table = self._selection[0]
         require(
             not table.empty,
             self.path,
@@ -216,7 +216,8 @@ class BroadcastConstellation(Constellation):
         return table.drop_duplicates(["name", "toe"], keep="last").reset_index(drop=True)
 
     @cached_property
-    def _selection(self) -> EphemerisSelection:
+    def _selection(self) -> tuple[pd.DataFrame, tuple[str, ...]]:
+        """Plausible ephemerides, and notes."""
         return check_ephemerides(self._healthy, self.path)
 
     @cached_property

@@ -19,7 +19,6 @@ from torch import Tensor
 from pfbench.core.parameter_checks import require
 from pfbench.files.limits import find_input, read_text
 from pfbench.files.table_file import read_table_file
-from pfbench.logs.sky.rinex_blocks import find_ionosphere, unfold_blocks
 from pfbench.logs.units import WEEK
 from pfbench.nav import earth
 from pfbench.nav.orbits import GPS_OMEGA, OrbitalElements, eccentric_anomaly
@@ -179,6 +178,7 @@ LINES = (
 _REQUIRED = {*CLOCK, *ORBIT, "week", "health", "ttx"}
 _BY_SYSTEM = {"G": {"tgd"}, "E": {"codes", "iodc"}}  # other fields that are used
 _RECORD_LINES = 8
+_READ = ("LNAV", "INAV", "FNAV")  # messages of RINEX 4 with the records of RINEX 3
 _SYSTEMS = {
     "G": "GPS", "R": "GLONASS", "E": "Galileo", "C": "BeiDou", "J": "QZSS", "I": "NavIC", "S": "SBAS",
 }  # fmt: skip
@@ -356,3 +356,50 @@ def parse_date(fields: Sequence[str]) -> float:
     second = float(fields[5])
     require(0.0 <= second < 60.0, "the second", "be at least 0 and less than 60", f"{second:g}")
     return (datetime(year, month, day, hour, minute) - EPOCH).total_seconds() + second
+
+
+def unfold_blocks(lines: Sequence[str], body: int) -> tuple[list[str], tuple[str, ...]]:
+    """Return a RINEX 4 file with the records of RINEX 3 alone, other lines blank, and a note on messages left out."""
+    records, skipped = [*lines[:body], *[""] * (len(lines) - body)], set()
+    for begin, block in _blocks(lines, body):
+        kind, satellite, message = (*lines[begin][1:].split(), "", "", "")[:3]
+        if kind == "EPH" and (satellite[:1] not in ("G", "E") or message in _READ):
+            records[begin + 1 : begin + 1 + len(block)] = block
+        elif kind == "EPH":
+            skipped.add(message)
+    note = f"messages {', '.join(sorted(skipped))} of GPS and Galileo: LNAV, INAV and FNAV are read"
+    return records, (note,) if skipped else ()
+
+
+def find_ionosphere(lines: Sequence[str], body: int) -> tuple[float, ...]:
+    """Return the eight coefficients of the broadcast ionosphere of GPS, none without them."""
+    for begin, block in _blocks(lines, body):
+        if lines[begin][2:7] == "ION G" and "LNAV" in lines[begin]:
+            numbers = [
+                *_fields(block[0], 23, 19)[:3],
+                *_fields(block[1], 4, 19)[:4],
+                *_fields(block[2], 4, 19)[:1],
+            ]
+            return tuple(numbers) if len(numbers) == 8 else ()
+    fields = {}
+    for line in lines[:body]:
+        label = line[60:].strip()
+        if label in ("ION ALPHA", "ION BETA"):
+            fields[label[4]] = _fields(line[:60], 2, 12)[:4]
+        elif label == "IONOSPHERIC CORR" and line[:4] in ("GPSA", "GPSB"):
+            fields[line[3]] = _fields(line[:60], 5, 12)[:4]
+    numbers = [*fields.get("A", ()), *fields.get("B", ())]
+    return tuple(numbers) if len(numbers) == 8 else ()
+
+
+def _blocks(lines: Sequence[str], body: int) -> Iterator[tuple[int, Sequence[str]]]:
+    """Yield the first line of each block of RINEX 4 and the lines after it."""
+    heads = [i for i in range(body, len(lines)) if lines[i][:1] == ">"]
+    for begin, end in pairwise([*heads, len(lines)]):
+        yield begin, lines[begin + 1 : end]
+
+
+def _fields(line: str, first: int, width: int) -> list[float]:
+    """Return the numbers of fields of a width up to the first blank one."""
+    texts = [line[k : k + width].strip() for k in range(first, len(line), width)]
+    return [float(text.upper().replace("D", "E")) for text in texts if text]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -56,22 +56,10 @@ _CLOCK_AGE = 7200.0  # s; longest time between toc and toe
 _LARGEST_SHARE = 0.2  # of records out of range in a merged file
 
 
-class EphemerisSelection(NamedTuple):
-    """Result of the checks.
-
-    Attributes:
-        mask: Mask of plausible ephemerides.
-        notes: Ignored ephemerides and changes of orbit.
-    """
-
-    mask: NDArray[np.bool_]
-    notes: tuple[str, ...]
-
-
-def check_ephemerides(table: pd.DataFrame, name: str) -> EphemerisSelection:
+def check_ephemerides(table: pd.DataFrame, name: str) -> tuple[pd.DataFrame, tuple[str, ...]]:
     """Select ephemerides with plausible parameters that agree with their neighbours.
 
-    Returns the selection.
+    Returns plausible ephemerides, and notes on ignored ones and on changes of orbit.
     """
     reasons = [_reason(row) for row in table.to_dict("records")]
     share = sum(map(bool, reasons)) / max(len(reasons), 1)
@@ -98,7 +86,7 @@ def check_ephemerides(table: pd.DataFrame, name: str) -> EphemerisSelection:
         notes.append(f"{name}: ephemerides without a neighbour to compare with: {', '.join(alone)}")
     clean = table[mask]
     notes += [*describe_unexplained(clean, name), *describe_clock_scale(clean, name)]
-    return EphemerisSelection(mask, tuple(notes))
+    return clean, tuple(notes)
 
 
 def _reason(row: Mapping[Any, Any]) -> str:

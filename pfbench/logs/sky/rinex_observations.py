@@ -47,27 +47,19 @@ class RawEpochs(NamedTuple):
         return np.unique(self.rows["t"].to_numpy())
 
 
-class _Header(NamedTuple):
-    """Header: types by system, position, and the line after it."""
-
-    types: dict[str, list[str]]
-    position: tuple[float, float, float] | None
-    end: int
-
-
 def read_observations(file: Path, signals: Mapping[str, Sequence[str]]) -> RawEpochs:
     """Read a RINEX 3 observation file; of each system the first signal that the file has."""
     lines = read_text(file).removeprefix(b"\xef\xbb\xbf").decode("latin-1").splitlines()
     check_version(file.name, lines[0] if lines else "")
-    header = _read_header(file.name, lines)
+    types_of, position, end = _read_header(file.name, lines)
     codes_in_use = {
-        s: next((code for code in codes if f"C{code}" in header.types[s]), "")
+        s: next((code for code in codes if f"C{code}" in types_of[s]), "")
         for s, codes in signals.items()
-        if s in header.types
+        if s in types_of
     }
     codes_in_use = {system: code for system, code in codes_in_use.items() if code}
     readable = ", ".join(f"C{code} of {s}" for s, codes in signals.items() for code in codes)
-    have = "; ".join(f"{s} {' '.join(types)}" for s, types in header.types.items())
+    have = "; ".join(f"{s} {' '.join(types)}" for s, types in types_of.items())
     require(
         codes_in_use,
         f"{file.name}: the types of observations",
@@ -77,18 +69,18 @@ def read_observations(file: Path, signals: Mapping[str, Sequence[str]]) -> RawEp
     )
     columns = {
         s: [
-            _FIRST + _WIDTH * header.types[s].index(kind + code) if kind + code in header.types[s] else None
+            _FIRST + _WIDTH * types_of[s].index(kind + code) if kind + code in types_of[s] else None
             for kind in "CDS"
         ]
         for s, code in codes_in_use.items()
     }  # fmt: skip
-    others = ", ".join(sorted(set(header.types) - set(codes_in_use)))
+    others = ", ".join(sorted(set(types_of) - set(codes_in_use)))
     notes = [f"{file.name}: systems {others} are not read"] if others else []
     notes += [
         f"{file.name}: {'C' + code} of {system} is read" for system, code in codes_in_use.items()
     ]
     rows: list[tuple[object, ...]] = []
-    for time, satellites in _epochs(file.name, lines, header.end, notes):
+    for time, satellites in _epochs(file.name, lines, end, notes):
         rows += [
             (time, text[0], text[1:3], *_values(text, columns[text[0]]))
             for text in satellites
@@ -104,7 +96,7 @@ def read_observations(file: Path, signals: Mapping[str, Sequence[str]]) -> RawEp
     require(
         len(table), f"{file.name}", f"contain ranges of {readable}", "none", "Choose another file."
     )
-    return RawEpochs(table, file.name, header.position, tuple(notes))
+    return RawEpochs(table, file.name, position, tuple(notes))
 
 
 def check_version(name: str, first: str) -> None:
@@ -140,14 +132,16 @@ def check_version(name: str, first: str) -> None:
     )
 
 
-def _read_header(name: str, lines: Sequence[str]) -> _Header:
-    """Read the header."""
+def _read_header(
+    name: str, lines: Sequence[str]
+) -> tuple[dict[str, list[str]], tuple[float, float, float] | None, int]:
+    """Return the types by system, the position, and the line after the header."""
     types: dict[str, list[str]] = {}
     position, system = None, ""
     for i, line in enumerate(lines):
         label = line[60:].strip()
         if label == "END OF HEADER":
-            return _Header(types, position, i + 1)
+            return types, position, i + 1
         if label == "SYS / # / OBS TYPES":
             system = line[0].strip() or system
             types.setdefault(system, []).extend(line[6:60].split())

@@ -23,7 +23,8 @@ def bridge_gaps(imu: ImuLog) -> tuple[ImuLog, tuple[float, float, int]]:
     """
     step = np.diff(imu.time)
     typical = float(np.median(step))
-    gaps = np.flatnonzero(step > GAP_SAMPLES * typical)
+    # longer ones stay, which the diagnosis refuses
+    gaps = np.flatnonzero((step > GAP_SAMPLES * typical) & (step <= longest_bridge(imu.time)))
     if not gaps.size:
         return imu, (0.0, 0.0, 0)
     times, values = [imu.time], [np.hstack([imu.force, imu.rate])]

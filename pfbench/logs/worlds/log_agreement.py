@@ -12,26 +12,20 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pfbench.core.parameter_checks import require
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
-from pfbench.logs.units import DEGREE
-from pfbench.logs.worlds.log_frames import GEODETIC_COLUMNS
 from pfbench.logs.worlds.log_tables import (
     Array,
     GnssLog,
     LogTable,
     ReferenceLog,
-    parse_numbers,
 )
 from pfbench.logs.worlds.time_grid import interpolate
-from pfbench.nav import earth
 
 _FIX_LIMITS = (2e3, 5e3, 1e4, 2e4, 5e4, 1e5)  # m; offered limits of the error of a fix
 _STEADY = 2.0  # m/s; least speed at which the track turns as the car
-_GEOCENTRIC = ("x", "y", "z")
 _BRAKING, _SLOW = 10.0, 1.0  # m/s^2, hard braking on a road; m/s, noise of the wheels about zero
 _LONGEST = 5.0  # s between compared epochs of satellites
 _STRAIGHT = 1.5  # s; longest interval over which the velocity is taken as linear
@@ -60,13 +54,6 @@ FIX_VELOCITY = Agreement("velocity of a fix and of the reference", "m/s", 5.0, m
 WHEELS = Agreement("wheel speed and speed of the reference", "m/s", 3.0, 50.0)
 YAW_RATE = Agreement("yaw rate and turn of the track", "rad/s", 1.0, 10.0)
 _ROW = "Correct or remove this row."
-PLACE = Agreement(
-    "x, y, z and lat_deg, lon_deg, h_m as the same position",
-    "m",
-    1.0,
-    1.0,
-    "Correct the wrong columns, or remove x, y, z.",
-)
 LEAST_RADIUS, LARGEST_RADIUS = 2.2e7, 4.6e7  # m; perigee of E14 23.3e6, geostationary 42.2e6
 _HALF = 0.5 * (LARGEST_RADIUS - LEAST_RADIUS)
 ORBIT_RADIUS = Agreement(
@@ -210,16 +197,6 @@ def describe_missing_times(name: str, time: Array, steps: Array) -> tuple[str, .
             f"from t = {time[i]:.3f} to {time[i + 1]:.3f} s. Check the clock of t"
         )
     return tuple(notes)
-
-
-def check_geocentric(table: LogTable) -> None:
-    """Check that Earth-fixed and geodetic positions are the same, if a table has both."""
-    if not table.has(_GEOCENTRIC):
-        return
-    geodetic = parse_numbers(table, GEODETIC_COLUMNS) * [DEGREE, DEGREE, 1.0]
-    expected = earth.ecef(torch.from_numpy(geodetic)).numpy()
-    difference = np.linalg.norm(parse_numbers(table, _GEOCENTRIC) - expected, axis=1)
-    _judge_rows(PLACE, difference, table, np.arange(len(difference)))
 
 
 def check_wheel_direction(table: LogTable, time: Array, speed: Array) -> tuple[str, ...]:

@@ -39,7 +39,7 @@ from pfbench.logs.doctor.raw_log import (
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
 from pfbench.logs.worlds.corrections import LogCorrections, LogTables
 from pfbench.logs.worlds.fix_codes import FixCodes, select_usable
-from pfbench.logs.worlds.imu_gaps import GAP_SAMPLES, bridge_gaps, find_longest
+from pfbench.logs.worlds.imu_gaps import GAP_SAMPLES, bridge_gaps
 from pfbench.logs.worlds.log_agreement import (
     compare_fixes,
     compare_velocities,
@@ -278,17 +278,6 @@ def _imu_time(table: LogTable) -> tuple[Array, tuple[str, ...]]:
         )
     check_time_order(table.name, time, table.row)
     check_seconds(table, time, longest=0.5)
-    (first, last, parts), i = find_longest(time), int(np.diff(time).argmax())
-    require(
-        parts == 1,
-        table.name,
-        "not have gaps",
-        f"a gap of {time[i + 1] - time[i]:.3f} s after {table.row(i)} (t = {time[i]}), with samples every {typical:.4f} s",
-        (
-            f"Keep the longest part without a gap, {table.row(first)} to {table.row(last)} "
-            f"(t = {time[first]:.3f} to {time[last]:.3f})."
-        ),
-    )
     return time, notes
 
 

@@ -21,7 +21,6 @@ from pfbench.core.record import Episode, MeasurementChannels, Record
 from pfbench.files.reader_notes import announce_notes
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
 from pfbench.logs.worlds.log_agreement import (
-    check_geocentric,
     check_orbits,
     check_wheel_direction,
     compare_ranges,
@@ -259,7 +258,6 @@ def read_drive(folder: Path, limits: PlausibleLimits | None = None) -> UrbanLog:
 def _check_drive(drive: UrbanLog, tables: tuple[LogTable, LogTable, LogTable]) -> tuple[str, ...]:
     """Check satellites, ranges, wheels and reference against each other; return notes."""
     pseudoranges, wheels, truth = tables
-    check_geocentric(truth)
     receiver = earth.ecef(torch.from_numpy(drive.position)).numpy()
     check_orbits(pseudoranges.name, drive.satellites, drive.time, drive.satellite_position)
     distance = np.linalg.norm(

@@ -16,13 +16,13 @@ FILES = {"imu.csv": {"bytes": len(CONTENT), "sha256": hashlib.sha256(CONTENT).he
 
 
 def test_the_states_of_a_data_set(tmp_path: Path) -> None:
-    assert check_data_set("walk", FILES, tmp_path).word == "missing"
+    assert check_data_set("walk", FILES, tmp_path)[0] == "missing"
     (tmp_path / "walk").mkdir()
-    assert check_data_set("walk", FILES, tmp_path).missing == ("imu.csv",)
+    assert check_data_set("walk", FILES, tmp_path)[1] == ["walk/imu.csv is missing"]
     (tmp_path / "walk" / "imu.csv").write_bytes(CONTENT)
-    assert check_data_set("walk", FILES, tmp_path).word == "complete"
+    assert check_data_set("walk", FILES, tmp_path)[0] == "complete"
     (tmp_path / "walk" / "imu.csv").write_bytes(CONTENT.replace(b"1", b"2"))
-    assert check_data_set("walk", FILES, tmp_path).changed == ("imu.csv",)
+    assert check_data_set("walk", FILES, tmp_path)[1] == ["walk/imu.csv differs"]
 
 
 def test_a_damaged_folder_is_refused_with_its_files(

@@ -9,7 +9,7 @@ import pytest
 from judge_rates import ROWS, Row, draw_studies, judge_studies, judge_study
 from scipy.signal import lfilter
 
-from pfbench.logs.judge.nuisance import remove_nuisance
+from pfbench.logs.judge.pair_verdicts import remove_nuisance
 from pfbench.stats.comparison import compare
 from pfbench.stats.time_blocks import (
     block_losses,

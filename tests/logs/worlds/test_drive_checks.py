@@ -1,4 +1,4 @@
-"""Tables of a drive: signs of wheels, positions given twice, and the scale of slow axes."""
+"""Tables of a drive: signs of wheels, and the scale of slow axes."""
 
 import math
 from contextlib import nullcontext
@@ -6,13 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pymap3d
 import pytest
 from refusals import check_refused
 from synthetic_log import tables, write
 
 from pfbench.logs.worlds.log_agreement import (
-    check_geocentric,
     check_wheel_direction,
     describe_missing_times,
 )
@@ -48,25 +46,6 @@ def test_a_drive_that_is_backwards_throughout_is_noted() -> None:
     (note,) = wheels(np.full(len(TIME), -5.0))
     assert "the wheels turn backwards in 40 of 40 moving rows" in note
     assert wheels(np.zeros(len(TIME))) == ()
-
-
-@pytest.mark.parametrize(("column", "change"), [("h_m", -50.0), ("x", 1e3), ("lat_deg", 1e-4)])
-def test_two_forms_of_a_position_must_be_the_same(column: str, change: float) -> None:
-    lat, lon, h = np.full(3, 52.5), np.array([13.4, 13.41, 13.42]), np.array([76.0, 77.0, 78.0])
-    x, y, z = pymap3d.geodetic2ecef(lat, lon, h)
-    rows = pd.DataFrame({"lat_deg": lat, "lon_deg": lon, "h_m": h, "x": x, "y": y, "z": z})
-    check_geocentric(LogTable(rows, "truth.csv", True, {}))
-    rows.loc[1, column] += change
-    check_refused(
-        [
-            (
-                r"truth\.csv: x, y, z .* same position .* at line 3",
-                lambda: check_geocentric(LogTable(rows, "truth.csv", True, {})),
-            )
-        ],
-        remedy=False,
-    )
-    check_geocentric(LogTable(rows.drop(columns="z"), "truth.csv", True, {}))
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.3048, 3.6, -1.0, math.pi / 180])

@@ -267,7 +267,7 @@ BAD: dict[str, tuple[Callable[[Log], None], str]] = {
     ),
     "gap": (
         cut_out,
-        r"imu\.csv .*got a gap of 0\.410 s after line 401 \(t = 3\.99\).*Keep the longest part",
+        r"imu\.csv: no sample for 0\.410 s after t = 3\.990.*Keep the longest part",
     ),
     "one row": (no_rows, r"gnss\.csv must have at least 2 rows, got 1"),
     "no origin": (

@@ -10,6 +10,7 @@ import pytest
 from synthetic_log import tables, write
 
 from pfbench.logs.sky.plausible_limits import PlausibleLimits
+from pfbench.logs.worlds.corrections import LogCorrections
 from pfbench.logs.worlds.log_reader import read_log
 
 Log = dict[str, pd.DataFrame]
@@ -127,9 +128,8 @@ def test_tables_of_shifted_clocks_are_brought_together(tmp_path: Path, shift: fl
 def test_the_longest_part_between_gaps_is_kept(tmp_path: Path) -> None:
     log = tables()
     log["imu"] = log["imu"].drop(index=[*range(300, 340), *range(1500, 1540)])
-    said = message(tmp_path, log)
-    first, last = rows_of(said)[-2:]
-    read = read_log(write(tmp_path, {**log, "imu": log["imu"].iloc[first : last + 1]}))
+    assert "set scenario.corrections.gaps=longest" in message(tmp_path, log)
+    read = read_log(write(tmp_path, log), corrections=LogCorrections(gaps="longest"))
     assert (read.imu.time[0], read.imu.time[-1]) == (3.4, 14.99)
 
 
