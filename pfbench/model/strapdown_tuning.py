@@ -9,7 +9,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pfbench.core.parameter_checks import check_positive, check_three_positive, require
+from pfbench.core.parameter_checks import (
+    as_float64,
+    check_positive,
+    check_three_positive,
+    require,
+)
 from pfbench.nav.ranging import ReceiverClock
 
 
@@ -89,8 +94,8 @@ class StrapdownTuning(StrapdownStart):
     def bias(self) -> Tensor:
         """Nominal gyro and accelerometer bias in model axes (right, forward, up) [6], SI."""
         (gf, gr, gd), (af, ar, ad) = self.gyro_bias_deg_s, self.accelerometer_bias
-        gyro = torch.tensor([gr, gf, -gd], dtype=torch.float64) * (math.pi / 180.0)
-        return torch.cat([gyro, torch.tensor([ar, af, -ad], dtype=torch.float64)])
+        gyro = as_float64([gr, gf, -gd]) * (math.pi / 180.0)
+        return torch.cat([gyro, as_float64([ar, af, -ad])])
 
 
 @dataclass(frozen=True)
