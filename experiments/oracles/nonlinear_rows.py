@@ -16,13 +16,25 @@ from torch.distributions import Distribution, Independent, Poisson
 
 from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
+    EssResampler,
     Filter,
     GaussianFilter,
+    ParticleFilter,
+    SoftResampler,
+    Systematic,
     TwistedParticleFilter,
     sample_trajectories,
     smooth,
 )
-from pfbench.model import StateSpaceModel, independent_normal, local_level, normal_batch
+from pfbench.filter.loop import FilterPass
+from pfbench.model import (
+    StateSpaceModel,
+    StochasticVolatility,
+    independent_normal,
+    local_level,
+    normal_batch,
+)
+from pfbench.ppl import simulate
 
 BSSM = Source(
     "bssm, R package", "tests/testthat/test_ekpf.R", "GPL-2 or later (facts alone); data remade",
@@ -285,3 +297,53 @@ def gym_lorenz() -> Iterator[Number]:
         for step, k in ((0, 0), (14, 1), (29, 2)):
             at = (step, k)
             yield Number(f"{name}_{'xyz'[k]}_{step + 1}", f"Lorenz bridge, ten of 30 measurements of x missing, smoothed {name} of {'xyz'[k]} at step {step + 1}", float(printed[at]), float(ours[at]), 1e-9, float(errors[at]), float(ours_error[at]), ("sir",), note)  # fmt: skip
+
+
+# --------------------------------------------------------------------------------------------------
+# PyDPF
+
+_PYDPF = Source(
+    "PyDPF, Python package", "jss_examples/Stochastic Volatility/results/fully_specified_results.csv; settings in the notebook beside it",
+    "GPL-3 (facts alone); data drawn by pfbench",
+    "read in the table: means over 500 records that its script draws at random; ours are over other records",
+)  # fmt: skip
+_PYDPF_RECORDS = 500  # of the printed averages
+
+
+def _mean_row(name: str, setting: str, printed: float, values: Tensor, filters: tuple[str, ...]) -> Number:  # fmt: skip
+    """Return the row of a mean over records, whose printed mean has the spread of ours."""
+    ours, error = average(values)
+    theirs = error * (len(values) / _PYDPF_RECORDS) ** 0.5
+    return Number(name, setting, printed, ours, 5e-7, theirs, error, filters)
+
+
+@recipe(30, _PYDPF)
+def pydpf_volatility() -> Iterator[Number]:
+    """Errors of 100 particles in stochastic volatility: to a filter with 10000 particles that are drawn independently."""
+    records, steps = 16, 1001
+    model = StochasticVolatility(2.0 * math.log(0.5), 0.91, 1.0)
+    record, _ = simulate(model, Record(torch.zeros(records, steps, 1, dtype=torch.float64)), 5)
+    many = build_filter("sir", 10000, "filter.resampler.ess_threshold=1.0", "filter.resampler.scheme._target_=pfbench.filter.Multinomial")  # fmt: skip
+    soft = SoftResampler(0.7, EssResampler(Systematic(), 1.0))
+    methods = {"sir_printed": build_filter("sir_printed", 100), "soft": ParticleFilter(100, resampler=soft)}  # fmt: skip
+    printed = {"sir_printed": (0.0268989484, 0.0636953045), "soft": (0.0262295765, 0.0654205315)}
+    reference = _step_estimates(many, model, record, 1)
+    for label, method in methods.items():
+        mean, factor = _step_estimates(method, model, record, 2)
+        squares = (mean - reference[0]).square().mean(1)
+        ratios = (1.0 - torch.exp(factor - reference[1])).abs().mean(1)
+        filters = (label,) if label == "sir_printed" else ()
+        setting = f"stochastic volatility, 1001 returns, 100 particles, {'soft resampling by 0.7' if label == 'soft' else 'systematic resampling'} in each step"
+        yield _mean_row(f"{label}_state", f"{setting}: squared error of the mean of a step", printed[label][0], squares, filters)  # fmt: skip
+        yield _mean_row(f"{label}_likelihood", f"{setting}: relative error of the likelihood of a step", printed[label][1], ratios, filters)  # fmt: skip
+
+
+def _step_estimates(method: Filter, model: StateSpaceModel, record: Record, seed: int) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Return the mean [R, T] and the log likelihood [R, T] of each step."""
+    means, totals = [], [torch.zeros(len(record.y), dtype=torch.float64)]
+    with torch.no_grad():
+        filter_pass = FilterPass(method, model, record, PhiloxStream(seed, torch.arange(len(record.y))))  # fmt: skip
+        for step in filter_pass:
+            means.append(step.info.mean[:, 0])
+            totals.append(filter_pass.belief.log_evidence)
+    return torch.stack(means, 1), torch.stack(totals, 1).diff(dim=1)

@@ -163,7 +163,7 @@ class TightTuning:
             ValueError: If a standard deviation is not positive.
         """
         inter_system = check_positive("tuning.inter_system_sd", [self.inter_system_sd])
-        clock = inter_system.new_tensor([self.clock.bias_sd, self.clock.drift_sd])
+        clock = as_float64([self.clock.bias_sd, self.clock.drift_sd])
         return torch.cat([clock, inter_system])
 
 

@@ -1,6 +1,5 @@
 """Inferred noise levels against a dense grid of Kalman likelihoods; calibration by ranks, which the wrong ones fail."""
 
-import csv
 import json
 import math
 import runpy
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from checkout import ROOT, TESTS
+from checkout import ROOT
 from oracles import kalman
 from pfbench.experiments.learn_noise_calibration import (
     LEVELS,
@@ -38,7 +37,7 @@ from pfbench.filter import (
     run_filter,
 )
 from pfbench.job import compose
-from pfbench.model import ModelWrapper, StateSpaceModel, StochasticVolatility, local_level
+from pfbench.model import ModelWrapper, StochasticVolatility, local_level
 from pfbench.ppl import (
     FilterLikelihood,
     GaussianHmmLikelihood,
@@ -75,9 +74,8 @@ LEVEL = ParameterisedModel(
 
 @cache
 def nile(years: int) -> Record:
-    with (TESTS / "nile.csv").open() as file:
-        volumes = [float(row["volume"]) for row in csv.DictReader(file)]
-    return Record(torch.tensor(volumes, dtype=torch.float64)[None, :years, None])
+    volumes = np.loadtxt(ROOT / "experiments" / "oracles" / "nile.csv")
+    return Record(torch.tensor(volumes)[None, :years, None])
 
 
 @cache
@@ -424,40 +422,81 @@ WORLDS = {  # of models whose name no scenario has
     "strapdown_total": "recorded_car_drive", "urban_gnss": "recorded_berlin", "urban_gnss_mixture": "recorded_berlin",
 }  # fmt: skip
 MODELS = sorted(path.stem for path in (ROOT / "conf" / "model").glob("*.yaml"))
+SIMULATED = [n for n in MODELS if "recorded" not in WORLDS.get(n, "") and n != "raw_gnss"]
 OF_THE_SCENARIO = ("gyro_bias_deg_s[", "accelerometer_bias[", "receiver.mask_deg")  # its inputs
 NO_REAL_NUMBERS = ("terrain.waves", "terrain.seed")
 STEPS = 4
 
 
-def vary(name: str) -> tuple[dict, dict[str, StateSpaceModel]]:
-    """Return the configuration of a model, and the model itself and with each number changed by 5 %."""
+def read_numbers(name: str) -> tuple[dict, dict[str, torch.Tensor]]:
+    """Return the configuration of a model, and each number of it changed by 5 %."""
     values = compose([f"model={name}", f"scenario={WORLDS.get(name, name)}"]).values
-    models = {"": build(values["model"])}
-    for key, value in list_numbers(values["model"]).items():
-        number = torch.tensor(0.95 * value if value else 1e-3, dtype=torch.float64)
-        if key not in NO_REAL_NUMBERS:
-            models[key] = build(values["model"], **{key: number})
-    return values, models
+    numbers = {
+        key: torch.tensor(0.95 * value if value else 1e-3, dtype=torch.float64)
+        for key, value in list_numbers(values["model"]).items()
+        if key not in NO_REAL_NUMBERS
+    }
+    return values, numbers
+
+
+def draw_steps(values: dict) -> Record:
+    """Draw the first steps of a run of a simulated world."""
+    episode = build(values["scenario"]).draw(build(values["noise"]), torch.arange(1), 1)
+    return episode.record._replace(
+        y=episode.record.y[:, :STEPS].double(), u=map_inputs(lambda a: a[:, :STEPS], episode.record.u)
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_the_likelihood_moves_with_each_number(name: str) -> None:
     """Of a few steps by a particle filter, where the world is simulated; of recorded ones the model, for which data are needed."""
-    values, models = vary(name)
+    values, numbers = read_numbers(name)
+    models = {"": build(values["model"])}
+    models |= {key: build(values["model"], **{key: number}) for key, number in numbers.items()}
     first = models[""]
     fixed = [key for key, model in models.items() if not list_differences(first, model)]
     assert [key for key in fixed[1:] if not any(part in key for part in OF_THE_SCENARIO)] == []
     kept = {key: model for key, model in models.items() if key not in fixed[1:]}
     assert len(kept) > 2
-    if "recorded" in WORLDS.get(name, "") or name == "raw_gnss":
+    if name not in SIMULATED:
         return
-    episode = build(values["scenario"]).draw(build(values["noise"]), torch.arange(1), 1)
-    record = episode.record._replace(
-        y=episode.record.y[:, :STEPS].double(), u=map_inputs(lambda a: a[:, :STEPS], episode.record.u)
-    )  # fmt: skip
+    record = draw_steps(values)
     stream = PhiloxStream(1, torch.zeros(len(kept), dtype=torch.long))
     batch, runs = ModelBatch(list(kept.values())), repeat_runs(record, len(kept))
     log_likelihood = run_filter(ParticleFilter(20), batch, runs, stream).log_evidence
     assert bool(torch.isfinite(log_likelihood).all())
     still = zip(kept, log_likelihood == log_likelihood[0], strict=True)
     assert [key for key, is_still in still if is_still] == [""]
+
+
+PLAIN = {
+    "lorenz63": ("step",),
+    "pendulum": ("step",),
+}  # of the design: compiled loops take them as plain numbers
+FINE = (
+    "terrain.shortest_m",
+    "terrain.longest_m",
+)  # larger steps of them turn far waves by many radians
+
+
+@pytest.mark.parametrize("name", SIMULATED)
+def test_the_gradient_of_the_likelihood_is_its_central_difference(name: str) -> None:
+    """By the EKF, for each number of a model: to 1e-6, or to rounding. Attitude errors start at zero, and noise gains are singular."""
+    values, numbers = read_numbers(name)
+    record = draw_steps(values)
+
+    def evidence(changed: dict[str, torch.Tensor]) -> torch.Tensor:
+        return FilterLikelihood(EKF)(build(values["model"], **(numbers | changed)), record).sum()
+
+    free = {
+        key: number.clone().requires_grad_()
+        for key, number in numbers.items()
+        if key not in PLAIN.get(name, ())
+    }
+    found = torch.autograd.grad(evidence(free), list(free.values()), allow_unused=True)
+    for key, gradient in zip(free, found, strict=True):
+        h = (1e-6 if key in FINE else 1e-4) * numbers[key].abs()
+        a, b, c, d = (float(evidence({key: numbers[key] + k * h})) for k in (1, -1, 2, -2))
+        slope, rounding = (8.0 * (a - b) - (c - d)) / (12.0 * float(h)), 2e-14 * abs(a) / float(h)
+        value = 0.0 if gradient is None else float(gradient)
+        assert value == pytest.approx(slope, rel=1e-6, abs=rounding), key
