@@ -34,7 +34,8 @@ from pfbench.model import (
     local_level,
     normal_batch,
 )
-from pfbench.ppl import simulate
+from pfbench.ppl import ParameterisedModel, simulate, smc2
+from pfbench.ppl.priors import prior_by_name
 
 BSSM = Source(
     "bssm, R package", "tests/testthat/test_ekpf.R", "GPL-2 or later (facts alone); data remade",
@@ -297,6 +298,43 @@ def gym_lorenz() -> Iterator[Number]:
         for step, k in ((0, 0), (14, 1), (29, 2)):
             at = (step, k)
             yield Number(f"{name}_{'xyz'[k]}_{step + 1}", f"Lorenz bridge, ten of 30 measurements of x missing, smoothed {name} of {'xyz'[k]} at step {step + 1}", float(printed[at]), float(ours[at]), 1e-9, float(errors[at]), float(ours_error[at]), ("sir",), note)  # fmt: skip
+
+
+# Volatility of an index: data, prior and posterior (50000 draws of another program) of `stochastic_volatility_sp500_small`
+# of Inference Gym 0.0.5. Closing prices of the S&P 500 to 24 June 2020; (rho + 1) / 2 has the law Beta(20, 1.5).
+PRICES = """
+3225.52 3248.92 3297.59 3334.69 3345.78 3327.71 3352.09 3357.75 3379.45 3373.94 3380.16 3370.29 3386.15
+3373.23 3337.75 3225.89 3128.21 3116.39 2978.76 2954.22 3090.23 3003.37 3130.12 3023.94 2972.37 2746.56
+2882.23 2741.38 2480.64 2711.02 2386.13 2529.19 2398.10 2409.39 2304.92 2237.40 2447.33 2475.56 2630.07
+2541.47 2626.65 2584.59 2470.50 2526.90 2488.65 2663.68 2659.41 2749.98 2789.82 2761.63 2846.06 2783.36
+2799.55 2874.56 2823.16 2736.56 2799.31 2797.80 2836.74 2878.48 2863.39 2939.51 2912.43 2830.71 2842.74
+2868.44 2848.42 2881.19 2929.80 2930.19 2870.12 2820.00 2852.50 2863.70 2953.91 2922.94 2971.61 2948.51
+2955.45 2991.77 3036.13 3029.73 3044.31 3055.73 3080.82 3122.87 3112.35 3193.93 3232.39 3207.18 3190.14
+3002.10 3041.31 3066.59 3124.74 3113.49 3115.34 3097.74 3117.86 3131.29 3050.33
+"""
+PUBLISHED = {"rho": (0.92498, 0.04760), "mu": (7.91517, 1.04789), "sigma": (0.50045, 0.13948)}
+_RETURNS = torch.tensor([float(v) for v in PRICES.split()], dtype=torch.float64).diff()
+INDEX = Record((_RETURNS - _RETURNS.mean())[None, :, None])
+VOLATILITY = ParameterisedModel(
+    StochasticVolatility,
+    {
+        "rho": prior_by_name("rho", {"beta": [20, 1.5], "on": [-1, 1]}),
+        "mu": prior_by_name("mu", {"cauchy": [0, 5]}),
+        "sigma": torch.distributions.HalfCauchy(torch.tensor(2.0, dtype=torch.float64)),
+    },
+)
+
+
+@recipe(13, _at("stochastic_volatility_sp500_small"))
+def gym_volatility() -> Iterator[Number]:
+    """Posterior means of three numbers of a volatility model by SMC2."""
+    repeats, values = 6, 200
+    method = build_filter("sir", 100)
+    fits = [smc2(VOLATILITY, method, INDEX, values, seed=seed) for seed in range(1, repeats + 1)]
+    setting = f"volatility of an index, 99 returns, {repeats} sets of {values} values with 100 particles each"
+    for name, (mean, sd) in PUBLISHED.items():
+        ours, error = average(torch.stack([fit.mean[name][-1] for fit in fits]))
+        yield Number(f"{name}_mean", f"{setting}: posterior mean of {name}", mean, ours, 5e-6, sd / 50000**0.5, error, ("sir",))  # fmt: skip
 
 
 # --------------------------------------------------------------------------------------------------
