@@ -341,7 +341,7 @@ def gym_volatility() -> Iterator[Number]:
 # PyDPF
 
 _PYDPF = Source(
-    "PyDPF, Python package", "jss_examples/Stochastic Volatility/results/fully_specified_results.csv; settings in the notebook beside it",
+    "PyDPF, Python package", "jss_examples/Stochastic Volatility/results/fully_specified_results.csv; settings in its notebook",
     "GPL-3 (facts alone); data drawn by pfbench",
     "read in the table: means over 500 records that its script draws at random; ours are over other records",
 )  # fmt: skip
