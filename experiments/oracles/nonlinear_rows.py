@@ -12,7 +12,7 @@ from pfbench.experiments.oracles.book import Number, Source, recipe
 from pfbench.experiments.oracles.r_numbers import RNumbers
 from pfbench.experiments.oracles.runs import average, build_filter, read_data, run_many, spread
 from torch import Tensor
-from torch.distributions import Distribution, Independent, Poisson
+from torch.distributions import Beta, Cauchy, Distribution, HalfCauchy, Independent, Poisson
 
 from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
@@ -26,7 +26,6 @@ from pfbench.filter import (
     sample_trajectories,
     smooth,
 )
-from pfbench.filter.loop import FilterPass
 from pfbench.model import (
     StateSpaceModel,
     StochasticVolatility,
@@ -35,7 +34,6 @@ from pfbench.model import (
     normal_batch,
 )
 from pfbench.ppl import ParameterisedModel, simulate, smc2
-from pfbench.ppl.priors import prior_by_name
 
 BSSM = Source(
     "bssm, R package", "tests/testthat/test_ekpf.R", "GPL-2 or later (facts alone); data remade",
@@ -315,13 +313,10 @@ PRICES = """
 PUBLISHED = {"rho": (0.92498, 0.04760), "mu": (7.91517, 1.04789), "sigma": (0.50045, 0.13948)}
 _RETURNS = torch.tensor([float(v) for v in PRICES.split()], dtype=torch.float64).diff()
 INDEX = Record((_RETURNS - _RETURNS.mean())[None, :, None])
-VOLATILITY = ParameterisedModel(
-    StochasticVolatility,
-    {
-        "rho": prior_by_name("rho", {"beta": [20, 1.5], "on": [-1, 1]}),
-        "mu": prior_by_name("mu", {"cauchy": [0, 5]}),
-        "sigma": torch.distributions.HalfCauchy(torch.tensor(2.0, dtype=torch.float64)),
-    },
+# a prior on (-1, 1) as one on (0, 1)
+_VOLATILITY = ParameterisedModel(
+    lambda half, mu, sigma: StochasticVolatility(mu, 2.0 * half - 1.0, sigma),
+    {"half": Beta(20.0, 1.5), "mu": Cauchy(0.0, 5.0), "sigma": HalfCauchy(2.0)},
 )
 
 
@@ -330,10 +325,11 @@ def gym_volatility() -> Iterator[Number]:
     """Posterior means of three numbers of a volatility model by SMC2."""
     repeats, values = 6, 200
     method = build_filter("sir", 100)
-    fits = [smc2(VOLATILITY, method, INDEX, values, seed=seed) for seed in range(1, repeats + 1)]
+    fits = [smc2(_VOLATILITY, method, INDEX, values, seed=seed) for seed in range(1, repeats + 1)]
     setting = f"volatility of an index, 99 returns, {repeats} sets of {values} values with 100 particles each"
     for name, (mean, sd) in PUBLISHED.items():
-        ours, error = average(torch.stack([fit.mean[name][-1] for fit in fits]))
+        means = [2.0 * fit.mean["half"] - 1.0 if name == "rho" else fit.mean[name] for fit in fits]
+        ours, error = average(torch.stack(means)[:, -1])
         yield Number(f"{name}_mean", f"{setting}: posterior mean of {name}", mean, ours, 5e-6, sd / 50000**0.5, error, ("sir",))  # fmt: skip
 
 
@@ -378,10 +374,13 @@ def pydpf_volatility() -> Iterator[Number]:
 
 def _step_estimates(method: Filter, model: StateSpaceModel, record: Record, seed: int) -> tuple[Tensor, Tensor]:  # fmt: skip
     """Return the mean [R, T] and the log likelihood [R, T] of each step."""
-    means, totals = [], [torch.zeros(len(record.y), dtype=torch.float64)]
+    runs = torch.arange(len(record.y))
+    draws = PhiloxStream(seed, runs)
+    belief = method.init(model, len(runs), draws.at_step(0), record.start, record.spread)
+    means, totals = [], [belief.log_evidence]
     with torch.no_grad():
-        filter_pass = FilterPass(method, model, record, PhiloxStream(seed, torch.arange(len(record.y))))  # fmt: skip
-        for step in filter_pass:
-            means.append(step.info.mean[:, 0])
-            totals.append(filter_pass.belief.log_evidence)
+        for t in range(record.y.shape[1]):
+            belief, info = method.step(model, belief, record.at_step(t), draws.at_step(t + 1))
+            means.append(info.mean)
+            totals.append(belief.log_evidence)
     return torch.stack(means, 1), torch.stack(totals, 1).diff(dim=1)

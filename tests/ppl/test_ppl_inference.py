@@ -22,7 +22,7 @@ from pfbench.experiments.learn_noise_calibration import (
     level,
     location,
 )
-from pfbench.experiments.oracles.nonlinear_rows import INDEX, PUBLISHED, VOLATILITY
+from pfbench.experiments.oracles.nonlinear_rows import INDEX, PUBLISHED
 from pyro.distributions import Beta, LogNormal, Normal
 from pyro.infer.autoguide import AutoMultivariateNormal
 from scipy.stats import chisquare
@@ -38,7 +38,7 @@ from pfbench.filter import (
     run_filter,
 )
 from pfbench.job import compose
-from pfbench.model import ModelWrapper, local_level
+from pfbench.model import ModelWrapper, StochasticVolatility, local_level
 from pfbench.ppl import (
     FilterLikelihood,
     GaussianHmmLikelihood,
@@ -61,6 +61,7 @@ from pfbench.ppl import (
 from pfbench.ppl.ibis_smc2 import Smc2Result, smc2
 from pfbench.ppl.inference_job import draw_equally, list_numbers
 from pfbench.ppl.model_batch import ModelBatch, list_differences
+from pfbench.ppl.priors import prior_by_name
 
 EKF, YEARS = GaussianFilter(TaylorLinearisation()), 12
 NILE = ParameterisedModel(
@@ -348,6 +349,16 @@ def test_the_page_has_the_table_of_the_stored_calibration() -> None:
         for case in ("local level, exact grid", f"local level, {script['PLANTED']}")
     )
     assert min(exact) > 0.05 > 0.01 > max(planted)
+
+
+VOLATILITY = ParameterisedModel(
+    StochasticVolatility,
+    {
+        "rho": prior_by_name("rho", {"beta": [20, 1.5], "on": [-1, 1]}),
+        "mu": prior_by_name("mu", {"cauchy": [0, 5]}),
+        "sigma": torch.distributions.HalfCauchy(torch.tensor(2.0, dtype=torch.float64)),
+    },
+)
 
 
 def on_grid(model: Any, record: Record) -> torch.Tensor:
