@@ -12,17 +12,28 @@ from pfbench.experiments.oracles.book import Number, Source, recipe
 from pfbench.experiments.oracles.r_numbers import RNumbers
 from pfbench.experiments.oracles.runs import average, build_filter, read_data, run_many, spread
 from torch import Tensor
-from torch.distributions import Distribution, Independent, Poisson
+from torch.distributions import Beta, Cauchy, Distribution, HalfCauchy, Independent, Poisson
 
 from pfbench.core import PhiloxStream, Record
 from pfbench.filter import (
+    EssResampler,
     Filter,
     GaussianFilter,
+    ParticleFilter,
+    SoftResampler,
+    Systematic,
     TwistedParticleFilter,
     sample_trajectories,
     smooth,
 )
-from pfbench.model import StateSpaceModel, independent_normal, local_level, normal_batch
+from pfbench.model import (
+    StateSpaceModel,
+    StochasticVolatility,
+    independent_normal,
+    local_level,
+    normal_batch,
+)
+from pfbench.ppl import ParameterisedModel, simulate, smc2
 
 BSSM = Source(
     "bssm, R package", "tests/testthat/test_ekpf.R", "GPL-2 or later (facts alone); data remade",
@@ -285,3 +296,91 @@ def gym_lorenz() -> Iterator[Number]:
         for step, k in ((0, 0), (14, 1), (29, 2)):
             at = (step, k)
             yield Number(f"{name}_{'xyz'[k]}_{step + 1}", f"Lorenz bridge, ten of 30 measurements of x missing, smoothed {name} of {'xyz'[k]} at step {step + 1}", float(printed[at]), float(ours[at]), 1e-9, float(errors[at]), float(ours_error[at]), ("sir",), note)  # fmt: skip
+
+
+# Volatility of an index: data, prior and posterior (50000 draws of another program) of `stochastic_volatility_sp500_small`
+# of Inference Gym 0.0.5. Closing prices of the S&P 500 to 24 June 2020; (rho + 1) / 2 has the law Beta(20, 1.5).
+PRICES = """
+3225.52 3248.92 3297.59 3334.69 3345.78 3327.71 3352.09 3357.75 3379.45 3373.94 3380.16 3370.29 3386.15
+3373.23 3337.75 3225.89 3128.21 3116.39 2978.76 2954.22 3090.23 3003.37 3130.12 3023.94 2972.37 2746.56
+2882.23 2741.38 2480.64 2711.02 2386.13 2529.19 2398.10 2409.39 2304.92 2237.40 2447.33 2475.56 2630.07
+2541.47 2626.65 2584.59 2470.50 2526.90 2488.65 2663.68 2659.41 2749.98 2789.82 2761.63 2846.06 2783.36
+2799.55 2874.56 2823.16 2736.56 2799.31 2797.80 2836.74 2878.48 2863.39 2939.51 2912.43 2830.71 2842.74
+2868.44 2848.42 2881.19 2929.80 2930.19 2870.12 2820.00 2852.50 2863.70 2953.91 2922.94 2971.61 2948.51
+2955.45 2991.77 3036.13 3029.73 3044.31 3055.73 3080.82 3122.87 3112.35 3193.93 3232.39 3207.18 3190.14
+3002.10 3041.31 3066.59 3124.74 3113.49 3115.34 3097.74 3117.86 3131.29 3050.33
+"""
+PUBLISHED = {"rho": (0.92498, 0.04760), "mu": (7.91517, 1.04789), "sigma": (0.50045, 0.13948)}
+_RETURNS = torch.tensor([float(v) for v in PRICES.split()], dtype=torch.float64).diff()
+INDEX = Record((_RETURNS - _RETURNS.mean())[None, :, None])
+# a prior on (-1, 1) as one on (0, 1)
+_VOLATILITY = ParameterisedModel(
+    lambda half, mu, sigma: StochasticVolatility(mu, 2.0 * half - 1.0, sigma),
+    {"half": Beta(20.0, 1.5), "mu": Cauchy(0.0, 5.0), "sigma": HalfCauchy(2.0)},
+)
+
+
+@recipe(13, _at("stochastic_volatility_sp500_small"))
+def gym_volatility() -> Iterator[Number]:
+    """Posterior means of three numbers of a volatility model by SMC2."""
+    repeats, values = 6, 200
+    method = build_filter("sir", 100)
+    fits = [smc2(_VOLATILITY, method, INDEX, values, seed=seed) for seed in range(1, repeats + 1)]
+    setting = f"volatility of an index, 99 returns, {repeats} sets of {values} values with 100 particles each"
+    for name, (mean, sd) in PUBLISHED.items():
+        means = [2.0 * fit.mean["half"] - 1.0 if name == "rho" else fit.mean[name] for fit in fits]
+        ours, error = average(torch.stack(means)[:, -1])
+        yield Number(f"{name}_mean", f"{setting}: posterior mean of {name}", mean, ours, 5e-6, sd / 50000**0.5, error, ("sir",))  # fmt: skip
+
+
+# --------------------------------------------------------------------------------------------------
+# PyDPF
+
+_PYDPF = Source(
+    "PyDPF, Python package", "jss_examples/Stochastic Volatility/results/fully_specified_results.csv; settings in its notebook",
+    "GPL-3 (facts alone); data drawn by pfbench",
+    "read in the table: means over 500 records that its script draws at random; ours are over other records",
+)  # fmt: skip
+_PYDPF_RECORDS = 500  # of the printed averages
+
+
+def _mean_row(name: str, setting: str, printed: float, values: Tensor, filters: tuple[str, ...]) -> Number:  # fmt: skip
+    """Return the row of a mean over records, whose printed mean has the spread of ours."""
+    ours, error = average(values)
+    theirs = error * (len(values) / _PYDPF_RECORDS) ** 0.5
+    return Number(name, setting, printed, ours, 5e-7, theirs, error, filters)
+
+
+@recipe(30, _PYDPF)
+def pydpf_volatility() -> Iterator[Number]:
+    """Errors of 100 particles in stochastic volatility: to a filter with 10000 particles that are drawn independently."""
+    records, steps = 16, 1001
+    model = StochasticVolatility(2.0 * math.log(0.5), 0.91, 1.0)
+    record, _ = simulate(model, Record(torch.zeros(records, steps, 1, dtype=torch.float64)), 5)
+    many = build_filter("sir", 10000, "filter.resampler.ess_threshold=1.0", "filter.resampler.scheme._target_=pfbench.filter.Multinomial")  # fmt: skip
+    soft = SoftResampler(0.7, EssResampler(Systematic(), 1.0))
+    methods = {"sir_printed": build_filter("sir_printed", 100), "soft": ParticleFilter(100, resampler=soft)}  # fmt: skip
+    printed = {"sir_printed": (0.0268989484, 0.0636953045), "soft": (0.0262295765, 0.0654205315)}
+    reference = _step_estimates(many, model, record, 1)
+    for label, method in methods.items():
+        mean, factor = _step_estimates(method, model, record, 2)
+        squares = (mean - reference[0]).square().mean(1)
+        ratios = (1.0 - torch.exp(factor - reference[1])).abs().mean(1)
+        filters = (label,) if label == "sir_printed" else ()
+        setting = f"stochastic volatility, 1001 returns, 100 particles, {'soft resampling by 0.7' if label == 'soft' else 'systematic resampling'} in each step"
+        yield _mean_row(f"{label}_state", f"{setting}: squared error of the mean of a step", printed[label][0], squares, filters)  # fmt: skip
+        yield _mean_row(f"{label}_likelihood", f"{setting}: relative error of the likelihood of a step", printed[label][1], ratios, filters)  # fmt: skip
+
+
+def _step_estimates(method: Filter, model: StateSpaceModel, record: Record, seed: int) -> tuple[Tensor, Tensor]:  # fmt: skip
+    """Return the mean [R, T] and the log likelihood [R, T] of each step."""
+    runs = torch.arange(len(record.y))
+    draws = PhiloxStream(seed, runs)
+    belief = method.init(model, len(runs), draws.at_step(0), record.start, record.spread)
+    means, totals = [], [belief.log_evidence]
+    with torch.no_grad():
+        for t in range(record.y.shape[1]):
+            belief, info = method.step(model, belief, record.at_step(t), draws.at_step(t + 1))
+            means.append(info.mean)
+            totals.append(belief.log_evidence)
+    return torch.stack(means, 1), torch.stack(totals, 1).diff(dim=1)

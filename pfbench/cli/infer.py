@@ -147,7 +147,7 @@ def format_posterior(content: dict[str, Any]) -> str:
         table["true value"] = pd.Series(content["truth"])
     choices = content["choices"]
     head = f"{content['method']}: {choices['model']} by {choices['filter']}, data of {choices['scenario']}, {content['seconds']:.0f} s"
-    note = "" if content["converged"] else "\nr_hat is above 1.05: the chains have not mixed. Use more draws: infer.warmup=... infer.draws=..."  # fmt: skip
+    note = "" if content["converged"] else "\nr_hat is not below 1.05, or unknown from so few draws: the chains may not have mixed. Use more draws: infer.warmup=... infer.draws=..."  # fmt: skip
     renamed = table.rename(columns={"low": "low 90 %", "high": "high 90 %"})
     return f"{head}\n{renamed.to_string(float_format=lambda value: f'{value:.4g}')}{format_evidence(content)}{note}"
 

@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, wrap_angle
 from pfbench.core.density import independent_normal
-from pfbench.core.parameter_checks import require_range
+from pfbench.core.parameter_checks import as_float64, require_range
 from pfbench.core.record import Record
 from pfbench.model.ins_gnss import BIASES, NAVIGATION, InsErrorModel, name_ins_components
 from pfbench.nav import attitude, earth, error_dynamics
@@ -152,10 +152,8 @@ class SinsGpsAzimuth(InsErrorModel):
         # and would reduce the noise.
         imu, span = self.imu, u.duration.unsqueeze(-1)
         constant = _bias_sizes(imu).to(span) * (0.0 if self.biases else 1.0)
-        random_walk = span.new_tensor(
-            [imu.gyro_random_walk] * 3 + [imu.accelerometer_random_walk] * 3
-        )
-        sd = torch.hypot(constant * span, random_walk * span.sqrt())
+        random_walk = as_float64([imu.gyro_random_walk] * 3 + [imu.accelerometer_random_walk] * 3)
+        sd = torch.hypot(constant * span, random_walk.to(span) * span.sqrt())
         impulse = self.process_noise_factor * sd.unsqueeze(-2)  # [..., 1, 6]
         zero = torch.zeros_like(dcm)
         scale = self.discretisation.mean_weight * (u.metres_end * span).unsqueeze(-1)
@@ -166,7 +164,7 @@ class SinsGpsAzimuth(InsErrorModel):
             return gain
         driver = [_driver_root(imu.gyro_markov, imu.gyro_markov_time_s)] * 3
         driver += [_driver_root(imu.accelerometer_markov, imu.accelerometer_markov_time_s)] * 3
-        walk = torch.diag_embed(span.new_tensor(driver) * span.sqrt()).expand(
+        walk = torch.diag_embed(as_float64(driver).to(span) * span.sqrt()).expand(
             *gain.shape[:-2], 6, 6
         )
         return torch.cat([pad(gain, (0, 6)), pad(walk, (6, 0))], -2)
@@ -217,7 +215,7 @@ def _bias_sizes(imu: ImuErrors) -> Tensor:
     """Return standard deviations of all gyro and accelerometer biases [6]."""
     gyro = (imu.gyro_bias**2 + imu.gyro_markov**2) ** 0.5
     accelerometer = (imu.accelerometer_bias**2 + imu.accelerometer_markov**2) ** 0.5
-    return torch.tensor([gyro] * 3 + [accelerometer] * 3, dtype=torch.float64)
+    return as_float64([gyro] * 3 + [accelerometer] * 3)
 
 
 def _driver_root(sigma: float, time: float) -> float:

@@ -8,7 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pfbench.core.parameter_checks import check_three_positive, require, require_range
+from pfbench.core.parameter_checks import (
+    as_float64,
+    check_three_positive,
+    require,
+    require_range,
+)
 from pfbench.core.record import name_channels
 
 _ANTENNA, _LATE = "position of the antenna", "late position"
@@ -90,7 +95,7 @@ class Constraints:
     def measurement_sd(self) -> Tensor:
         """Standard deviations of these components, [k], m/s or rad/s."""
         values = [sd for names, sd in self._list_components() for _ in names]
-        return torch.tensor(values, dtype=torch.float64)
+        return as_float64(values)
 
     def name_fixes(self, names: Sequence[str]) -> tuple[str, ...]:
         """Return the names of the components of a fix, which say that it is of an antenna or late.
@@ -114,7 +119,7 @@ class Constraints:
         for name, unit in (("odometer_scale", ""), ("delay", "s")):
             sd = getattr(self, f"{name}_sd")
             if sd is not None:
-                value = torch.tensor([sd], dtype=torch.float64)
+                value = as_float64([sd])
                 states[name] = (unit, torch.zeros_like(value), value)
         return states
 
@@ -127,4 +132,4 @@ class Constraints:
 def swap_axes(values: Sequence[float]) -> Tensor:
     """Convert forward, right, down to right, forward, up, [3]."""
     forward, right, down = values
-    return torch.tensor([right, forward, -down], dtype=torch.float64)
+    return as_float64([right, forward, -down])

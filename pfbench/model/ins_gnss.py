@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from pfbench.core.density import ChartNormal, dense_normal, independent_normal, normal_batch
 from pfbench.core.linear_algebra import affine_map, factor
-from pfbench.core.parameter_checks import require
+from pfbench.core.parameter_checks import as_float64, require
 from pfbench.core.record import Record, describe_misfit
 from pfbench.model.base import StateSpaceModel
 from pfbench.nav import attitude, error_dynamics
@@ -204,9 +204,7 @@ class InsGnss(InsErrorModel):
                 "Give positive gyro and accelerometer biases"
                 + (" and Markov parts (or markov=false)." if markov else ".")
             )
-        self.register_buffer(
-            "p0", torch.cat([initial.sd, torch.tensor(biases, dtype=torch.float64)])
-        )
+        self.register_buffer("p0", torch.cat([initial.sd, as_float64(biases)]))
         self.register_buffer("r", receiver.sd)
         self.register_buffer(
             "observed_indices", torch.tensor([6, 7, 8, 3, 4, 5][: len(receiver.sd)])
@@ -274,7 +272,7 @@ class InsGnss(InsErrorModel):
             gyro_driver,
             accelerometer_driver,
         ]
-        return f, g, f.new_tensor([value for value in q for _ in range(3)])
+        return f, g, as_float64([value for value in q for _ in range(3)]).to(f)
 
     @override
     def propagate(self, x: Tensor, u: LooseStep, w: Tensor) -> Tensor:

@@ -181,9 +181,7 @@ def linear_walk(
     """
     check_positive("noise", noise)
     check_positive("step", step)
-    q = noise**2 * torch.tensor(
-        [[step**3 / 3, step**2 / 2], [step**2 / 2, step]], dtype=torch.float64
-    )
+    q = noise**2 * as_float64([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
     model = LinearGaussian(
         [[1.0, step], [0.0, 1.0]], torch.linalg.cholesky(q), [[1.0, 0.0]], [measurement_sd],
         [0.0, 0.0], list(initial_sd), names=("position", "velocity"), units=("m", "m/s"),

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from pfbench.core.chart import wrap_angle
 from pfbench.core.density import independent_normal, normal_batch
-from pfbench.core.parameter_checks import check_positive, require, require_range
+from pfbench.core.parameter_checks import as_float64, check_positive, require, require_range
 from pfbench.model.base import StateSpaceModel
 
 SPEED_OF_LIGHT = 299792458.0  # m/s
@@ -92,15 +92,13 @@ class PassiveLocation(StateSpaceModel):
         for name, (values, length) in lengths.items():
             require(len(values) == length, f"model.{name}", f"be {length} numbers", list(values))
         require_range("model.acceleration_sd", acceleration_sd, "[0, inf) Give m/s^2.")
-        t = float(check_positive("model.interval", interval))
+        t = check_positive("model.interval", interval)
         eye = torch.eye(2, dtype=torch.float64)
-        self.register_buffer(
-            "phi", torch.kron(torch.tensor([[1.0, t], [0.0, 1.0]], dtype=torch.float64), eye)
-        )
-        step = torch.tensor([[0.5 * t * t], [t]], dtype=torch.float64)
+        self.register_buffer("phi", torch.kron(as_float64([[1.0, t], [0.0, 1.0]]), eye))
+        step = as_float64([[0.5 * t * t], [t]])
         self.register_buffer("gain", acceleration_sd * torch.kron(step, eye))
         self.register_buffer("r", check_positive("model.measurement_sd", list(measurement_sd)))
-        self.register_buffer("m0", torch.tensor(list(initial_mean), dtype=torch.float64))
+        self.register_buffer("m0", as_float64(list(initial_mean)))
         self.register_buffer("p0", check_positive("model.initial_sd", list(initial_sd)))
         self.names, self.units = ("x", "y", "vx", "vy"), ("m", "m", "m/s", "m/s")
         self.groups, self.noise_dim = {"position": (0, 1), "velocity": (2, 3)}, 2

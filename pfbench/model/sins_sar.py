@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock, wrap_angle
 from pfbench.core.density import independent_normal
-from pfbench.core.parameter_checks import require
+from pfbench.core.parameter_checks import as_float64, require
 from pfbench.core.record import Record
 from pfbench.model.ins_gnss import (
     BIASES,
@@ -150,11 +150,9 @@ class SinsSar(InsErrorModel):
         self.names, self.units, self.groups = name_ins_components(NAVIGATION + BIASES)
         self.rotate_noise_by_error, self.inflation = rotate_noise_by_error, inflation
         density = [imu.gyro_random_walk] * 3 + [imu.accelerometer_random_walk] * 3
-        self.register_buffer(
-            "p0", torch.cat([initial.sd, torch.tensor(biases, dtype=torch.float64)])
-        )
+        self.register_buffer("p0", torch.cat([initial.sd, as_float64(biases)]))
         self.register_buffer("r", receiver.sd)
-        self.register_buffer("density", torch.tensor(density, dtype=torch.float64))
+        self.register_buffer("density", as_float64(density))
         self.noise_dim = len(self.names) if inflation else 6
         self.choices = (
             "the attitude error quaternion rotates the INS level frame to the true one "

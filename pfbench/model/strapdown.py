@@ -14,7 +14,7 @@ from typing_extensions import override
 from pfbench.core import chart as quaternion
 from pfbench.core.chart import Chart, EuclideanBlock, LieGroupBlock, QuaternionBlock
 from pfbench.core.density import independent_normal, normal_batch
-from pfbench.core.parameter_checks import check_positive, check_tuning, require
+from pfbench.core.parameter_checks import as_float64, check_positive, check_tuning, require
 from pfbench.core.record import Record, name_channels
 from pfbench.model.base import StateSpaceModel, check_truth_sizes
 from pfbench.model.ins_gnss import name_components
@@ -261,7 +261,7 @@ class StrapdownAided(StrapdownModel):
         self.channel_names = (*self.motion.channel_names, *INSTRUMENT_CHANNELS)
         self.register_buffer("p0", torch.cat([tuning.motion.initial_sd, tuning.bias_sd]))
         self.register_buffer("r", tuning.measurement_sd)
-        self.register_buffer("magnetic_field_gauss", self.p0.new_tensor([east, north, -down]))
+        self.register_buffer("magnetic_field_gauss", as_float64([east, north, -down]))
         height = check_positive("tuning.height_bias_walk", [tuning.height_bias_walk])
         magnetic = check_positive("tuning.magnetic_bias_walk", [tuning.magnetic_bias_walk] * 3)
         self.register_buffer("walk", torch.cat([height, magnetic]))

@@ -9,7 +9,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pfbench.core.parameter_checks import check_positive, check_three_positive, require
+from pfbench.core.parameter_checks import (
+    as_float64,
+    check_positive,
+    check_three_positive,
+    require,
+)
 from pfbench.nav.ranging import ReceiverClock
 
 
@@ -89,8 +94,8 @@ class StrapdownTuning(StrapdownStart):
     def bias(self) -> Tensor:
         """Nominal gyro and accelerometer bias in model axes (right, forward, up) [6], SI."""
         (gf, gr, gd), (af, ar, ad) = self.gyro_bias_deg_s, self.accelerometer_bias
-        gyro = torch.tensor([gr, gf, -gd], dtype=torch.float64) * (math.pi / 180.0)
-        return torch.cat([gyro, torch.tensor([ar, af, -ad], dtype=torch.float64)])
+        gyro = as_float64([gr, gf, -gd]) * (math.pi / 180.0)
+        return torch.cat([gyro, as_float64([ar, af, -ad])])
 
 
 @dataclass(frozen=True)
@@ -158,7 +163,7 @@ class TightTuning:
             ValueError: If a standard deviation is not positive.
         """
         inter_system = check_positive("tuning.inter_system_sd", [self.inter_system_sd])
-        clock = inter_system.new_tensor([self.clock.bias_sd, self.clock.drift_sd])
+        clock = as_float64([self.clock.bias_sd, self.clock.drift_sd])
         return torch.cat([clock, inter_system])
 
 

@@ -14,7 +14,7 @@ from pfbench.core import chart as quaternion
 from pfbench.core.chart import Chart, EuclideanBlock, QuaternionBlock
 from pfbench.core.density import independent_normal
 from pfbench.core.linear_algebra import affine_map, factor
-from pfbench.core.parameter_checks import require
+from pfbench.core.parameter_checks import as_float64, require
 from pfbench.core.record import Record, map_inputs
 from pfbench.model.ins_gnss import (
     BIASES,
@@ -64,7 +64,7 @@ def compute_initial_sd(imu: ImuErrors, clock: ReceiverClock, initial: AlignmentE
         f"{imu.gyro_bias_deg_h} deg/h and {imu.accelerometer_bias_ug} ug",
         "Change them.",
     )
-    return torch.cat([initial.sd, torch.tensor(sizes, dtype=torch.float64)])
+    return torch.cat([initial.sd, as_float64(sizes)])
 
 
 class _TightModel(InsErrorModel):
@@ -219,7 +219,7 @@ class SinsGnssTight(_TightModel):
         f = error_dynamics.small_angle_matrix(u.pos, u.vel, u.f)
         gyro, accelerometer = self.imu.gyro_random_walk**2, self.imu.accelerometer_random_walk**2
         # isotropic, so it is the same in body and in level axes
-        density = torch.diag(f.new_tensor([gyro] * 3 + [accelerometer] * 3 + [0.0] * 3))
+        density = torch.diag(as_float64([gyro] * 3 + [accelerometer] * 3 + [0.0] * 3).to(f))
         return f, self._bias_columns(dcm), density
 
     @override

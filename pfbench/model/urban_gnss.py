@@ -22,6 +22,7 @@ from typing_extensions import override
 from pfbench.core.chart import AngleBlock, Chart, EuclideanBlock, wrap_angle
 from pfbench.core.density import independent_normal, normal_batch
 from pfbench.core.parameter_checks import (
+    as_float64,
     check_positive,
     check_three_positive,
     check_tuning,
@@ -136,11 +137,9 @@ class LosNlosRangeError(PseudorangeError):
 
     @override
     def __call__(self, mean: Tensor, u: UrbanInputs) -> Distribution:
-        odds = math.log(self.share / (1.0 - self.share)) + self.slope * (u.cn0 - self.cn0_reference)
-        distribution = NormalExponentialMixture(
-            mean, odds.unsqueeze(1), mean.new_tensor(self.sd), mean.new_tensor(self.tail)
-        )
-        return Independent(distribution, 1)
+        share, sd, tail = (as_float64(v).to(mean) for v in (self.share, self.sd, self.tail))
+        odds = torch.logit(share) + self.slope * (u.cn0 - self.cn0_reference)
+        return Independent(NormalExponentialMixture(mean, odds.unsqueeze(1), sd, tail), 1)
 
 
 class NormalExponentialMixture(TorchDistribution):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import require
+from pfbench.core.parameter_checks import as_float64, require
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import MeasurementChannels, fix_channels, name_channels
 from pfbench.nav import earth
@@ -81,7 +81,7 @@ class AidingSensor(Protocol):
 
 def _check_three(key: str, values: Sequence[float], allow_zero: bool = False) -> Tensor:
     """Return three standard deviations as a float64 tensor."""
-    sd = torch.tensor(list(values), dtype=torch.float64)
+    sd = as_float64(list(values))
     if sd.shape != (3,) or not bool(((sd >= 0) if allow_zero else (sd > 0)).all()):
         sign = "non-negative" if allow_zero else "positive"
         raise ValueError(
@@ -290,9 +290,7 @@ class SarSensor(AidingSensor):
     @property
     def sd(self) -> Tensor:
         """Standard deviation of heading rad, position North, East, Up m, [4]."""
-        return torch.tensor(
-            [self.heading_sd_deg * _DEG, *self.position_sd, self.height_sd], dtype=torch.float64
-        )
+        return as_float64([self.heading_sd_deg * _DEG, *self.position_sd, self.height_sd])
 
     @property
     @override

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import as_float64, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import EACH_SATELLITE, MeasurementChannels
 from pfbench.nav.aiding import AidingData, AidingSensor, FlightSolution
@@ -178,9 +178,7 @@ class RangingReceiver(AidingSensor):
     def sd(self) -> Tensor:
         """Standard deviation of S ranges, then S rates, [2 S]."""
         count = len(self.names)
-        return torch.tensor(
-            [self.pseudorange_sd] * count + [self.rate_sd] * count, dtype=torch.float64
-        )
+        return as_float64([self.pseudorange_sd] * count + [self.rate_sd] * count)
 
     @property
     @override

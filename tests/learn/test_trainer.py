@@ -1,26 +1,32 @@
 """Training: what each objective is worth where the answer is known, the loop's promises, and the command line."""
 
 import csv
+import json
 import math
 import re
+import runpy
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 import torch
+from checkout import ROOT
 from command_line import pfbench
 from network_cases import NETWORKS, shaken
+from particle_cases import CASES
 from refusals import check_refused
 from synthetic_results import list_results
 from torch import Tensor, nn
 from torch.distributions import Distribution, Independent, Normal
 
 from pfbench.core import PhiloxStream, Record
+from pfbench.core.density import independent_normal, normal_batch
+from pfbench.files import has_valid_digest
 from pfbench.filter import (
     BootstrapProposal,
     DiagonalNormalHead,
@@ -28,8 +34,11 @@ from pfbench.filter import (
     GaussianFilter,
     GuidedNoiseProposal,
     LearnedProposal,
+    Multinomial,
+    ParticleBelief,
     ParticleFilter,
     Proposal,
+    Resampler,
     SoftResampler,
     StopGradientResampler,
     Systematic,
@@ -46,9 +55,11 @@ from pfbench.filter.learned.objectives import (
 from pfbench.learn.trainer import Progress, Training, TrainingState
 from pfbench.learn.training_data import TrainingData, draw_training_data
 from pfbench.learn.training_job import train, write_losses
+from pfbench.model.base import StateSpaceModel
 from pfbench.model.linear_gaussian import local_level
 from pfbench.noise.base import NoiseRegime, NominalNoise
 from pfbench.scenario.simulated import ModelSimulation
+from pfbench.testing import check_evidence, filter_record
 
 LEVEL = local_level(1.0, 0.3, 0.0, 1.0)  # what is seen is three times as sure as what is predicted
 SMALL = partial(DiagonalNormalHead, hidden=(8,))
@@ -570,3 +581,182 @@ def test_a_table_of_the_user_is_kept_and_an_old_log_is_replaced(tmp_path: Path) 
     assert (tmp_path / "data.csv.kept").read_text() == "mine\n"
     assert path.read_bytes() == b"epoch,loss\r\n1,1.0\r\n"
     assert sorted(file.name for file in tmp_path.iterdir()) == ["data.csv", "data.csv.kept"]
+
+
+# gradients of the evidence through each kind of resampling, against Kalman's by automatic differentiation
+
+Y = torch.tensor([[0.8], [1.9], [-0.4], [2.5], [1.0], [-1.5]], dtype=torch.float64)
+THETA = torch.tensor([0.8, math.log(0.9)], dtype=torch.float64)  # a, log q
+
+
+class Walker(StateSpaceModel):
+    """x' = a x + q w, y = x + v, with a and log q of each run its own, so that one backward pass gives each run's gradient."""
+
+    linear = True
+
+    def __init__(self, theta: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("one", torch.ones(1, dtype=torch.float64))
+        self.theta = theta  # [R, 2]
+        self.names, self.units, self.groups, self.noise_dim = ("x",), ("",), {"state": (0,)}, 1
+
+    def initial(self, runs: int) -> Distribution:
+        return normal_batch(runs, self.one)
+
+    def propagate(self, x: Tensor, u: Any, w: Tensor) -> Tensor:
+        return self.theta[:, :1, None] * x + self.theta[:, 1:, None].exp() * w
+
+    def observation(self, x: Tensor, u: Any) -> Distribution:
+        return independent_normal(x, 0.7 * self.one)
+
+
+def kalman(theta: Tensor) -> Tensor:
+    """log p(y) of this model, by the textbook."""
+    a, q2 = theta[0], (2.0 * theta[1]).exp()
+    m, p, total = torch.zeros(()).double(), torch.ones(()).double(), torch.zeros(()).double()
+    for y in Y[:, 0]:
+        m, p = a * m, a * a * p + q2
+        s = p + 0.49
+        total = total - 0.5 * ((y - m) ** 2 / s + torch.log(2.0 * math.pi * s))
+        m, p = m + p / s * (y - m), p - p * p / s
+    return total
+
+
+def exact() -> Tensor:
+    theta = THETA.clone().requires_grad_()
+    return torch.autograd.grad(kalman(theta), theta)[0]
+
+
+class Found(NamedTuple):
+    """Mean of weight times gradient of log Z_hat over runs, less Kalman's, and standard errors, by parameter [2]."""
+
+    bias: Tensor
+    error: Tensor
+
+
+def bias(resampler: Resampler, particles: int, runs: int, of_z: bool) -> Found:
+    """Of grad Z_hat / Z (`of_z`), or of grad log Z_hat."""
+    theta = THETA.expand(runs, -1).clone().requires_grad_()
+    method = ParticleFilter(particles, resampler)
+    estimate = run_filter(
+        method, Walker(theta), Record(Y.expand(runs, -1, -1)), PhiloxStream(4, torch.arange(runs))
+    )
+    gradient = torch.autograd.grad(estimate.log_evidence.sum(), theta)[0]
+    if of_z:
+        gradient = gradient * (estimate.log_evidence.detach() - kalman(THETA)).exp()[:, None]
+    return Found(gradient.mean(0) - exact(), gradient.std(0) / math.sqrt(runs))
+
+
+DROPPED = EssResampler(Systematic(), 1.0)
+UNBIASED: dict[str, Resampler] = {
+    "score": StopGradientResampler(),
+    "score, multinomial": StopGradientResampler(EssResampler(Multinomial(), 1.0)),
+    "score, adaptive": StopGradientResampler(EssResampler(Systematic(), 0.6)),
+    "score, soft": SoftResampler(0.5, StopGradientResampler()),
+}
+
+
+@pytest.mark.parametrize("name", UNBIASED)
+def test_with_the_score_the_gradient_of_the_evidence_is_unbiased(name: str) -> None:
+    """E[grad Z_hat] = grad Z with six particles, as exactly as E[Z_hat] = Z."""
+    found = bias(UNBIASED[name], 6, 6000, of_z=True)
+    assert (found.bias.abs() < 4.5 * found.error).all(), found
+    assert (found.error < 0.2 * exact().abs()).all(), "too few runs to tell anything"
+
+
+@dataclass(frozen=True)
+class Slotted:
+    """Soft or score weights with the mistake that is often made: of the slot, not of the ancestor."""
+
+    soft: bool
+    is_exact = True
+
+    def __call__(
+        self, model: StateSpaceModel, belief: ParticleBelief, log_a: Tensor, n: Tensor, draws: Any
+    ) -> tuple[ParticleBelief, Tensor]:
+        wanted = torch.logaddexp(
+            log_a + math.log(0.5), torch.full_like(log_a, math.log(0.5 / log_a.shape[1]))
+        )
+        used = wanted if self.soft else log_a
+        fresh, hit = DROPPED(model, belief._replace(log_w=used), used, n, draws)
+        correction = log_a - wanted if self.soft else log_a - log_a.detach()
+        return fresh._replace(log_w=fresh.log_w + correction), hit
+
+
+@pytest.mark.parametrize(
+    "resampler",
+    [DROPPED, SoftResampler(0.5), Slotted(False)],
+    ids=["dropped", "soft", "wrong score"],
+)
+def test_without_it_there_is_a_bias_and_the_test_sees_it(resampler: Resampler) -> None:
+    found = bias(resampler, 6, 6000, of_z=True)
+    assert (found.bias.abs() > 6.0 * found.error).any(), found
+
+
+@pytest.mark.slow
+def test_the_bias_that_many_particles_leave() -> None:
+    """Of grad log Z_hat: the score's goes, the dropped one stays, and soft weights mend part of it."""
+    cases: dict[str, tuple[Resampler, int]] = {
+        "dropped": (DROPPED, 400), "soft": (SoftResampler(0.3), 400), "score": (StopGradientResampler(), 2000)
+    }  # fmt: skip
+    found = {
+        name: bias(resampler, 100, runs, of_z=False) for name, (resampler, runs) in cases.items()
+    }
+    share = {
+        name: (value.bias / exact()).norm().item() for name, value in found.items()
+    }  # of the gradient itself
+    noise = {name: (value.error / exact()).norm().item() for name, value in found.items()}
+    assert max(noise.values()) < 0.07
+    assert share["dropped"] > 0.5
+    assert 0.2 < share["soft"] < 0.9 * share["dropped"]
+    assert share["score"] < 0.1
+
+
+def test_the_score_changes_no_number() -> None:
+    model, y, _ = CASES["growth"]()
+    one, other = (
+        filter_record(ParticleFilter(30, resampler), model, y, runs=3)
+        for resampler in (DROPPED, StopGradientResampler())
+    )
+    assert torch.equal(one.mean, other.mean)
+    assert torch.equal(one.log_evidence, other.log_evidence)
+
+
+@pytest.mark.parametrize("alpha", [0.2, 0.7, 1.0])
+def test_soft_resampling_targets_what_it_should(alpha: float) -> None:
+    model, y, answer = CASES["growth"]()
+    method = ParticleFilter(60, SoftResampler(alpha))
+    assert method.is_exact
+    check_evidence(method, model, y, answer, runs=700)
+
+
+def test_soft_weights_of_the_slot_are_seen() -> None:
+    model, y, answer = CASES["growth"]()
+    with pytest.raises(AssertionError):
+        check_evidence(ParticleFilter(60, Slotted(True)), model, y, answer, runs=700)
+
+
+# transport
+
+
+def cloud_of(n: int, d: int, runs: int = 3) -> ParticleBelief:
+    draws = PhiloxStream(7, torch.arange(runs))
+    log_w = torch.log_softmax(1.5 * draws.normal("w", n, 1)[..., 0], 1)
+    return ParticleBelief(draws.normal("x", n, d), log_w, torch.zeros(runs, dtype=torch.float64))
+
+
+def test_resampling_with_gradients_refuses_what_it_cannot_do() -> None:
+    for alpha in (0.0, 1.5):
+        with pytest.raises(ValueError, match=r"resampler\.\w+ must be"):
+            SoftResampler(alpha)
+
+
+def test_the_page_has_the_stored_table_of_two_worlds() -> None:
+    """Its first sentence holds: no network pays in equal time, and one pays where a value of the likelihood is dear."""
+    path = ROOT / "experiments" / "analyses" / "learned_worlds.json"
+    stored, script = json.loads(path.read_text()), runpy.run_path(str(path.with_suffix(".py")))
+    assert has_valid_digest(stored)
+    page = (ROOT / "docs" / "train_a_proposal.md").read_text()
+    assert script["write_table"](stored["done"]) in page
+    rows = [script["list_rows"](stored["done"], price) for price in (None, 0.0, 10.0)]
+    assert [sum(row["word"] == "smaller" for row in some) for some in rows] == [1, 0, 1]

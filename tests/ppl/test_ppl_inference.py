@@ -1,6 +1,5 @@
 """Inferred noise levels against a dense grid of Kalman likelihoods; calibration by ranks, which the wrong ones fail."""
 
-import csv
 import json
 import math
 import runpy
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from checkout import ROOT, TESTS
+from checkout import ROOT
 from oracles import kalman
 from pfbench.experiments.learn_noise_calibration import (
     LEVELS,
@@ -23,6 +22,7 @@ from pfbench.experiments.learn_noise_calibration import (
     level,
     location,
 )
+from pfbench.experiments.oracles.nonlinear_rows import INDEX, PUBLISHED
 from pyro.distributions import Beta, LogNormal, Normal
 from pyro.infer.autoguide import AutoMultivariateNormal
 from scipy.stats import chisquare
@@ -38,7 +38,7 @@ from pfbench.filter import (
     run_filter,
 )
 from pfbench.job import compose
-from pfbench.model import ModelWrapper, StateSpaceModel, StochasticVolatility, local_level
+from pfbench.model import ModelWrapper, StochasticVolatility, local_level
 from pfbench.ppl import (
     FilterLikelihood,
     GaussianHmmLikelihood,
@@ -75,9 +75,9 @@ LEVEL = ParameterisedModel(
 
 @cache
 def nile(years: int) -> Record:
-    with (TESTS / "nile.csv").open() as file:
-        volumes = [float(row["volume"]) for row in csv.DictReader(file)]
-    return Record(torch.tensor(volumes, dtype=torch.float64)[None, :years, None])
+    return Record(
+        torch.tensor(np.loadtxt(ROOT / "experiments/oracles/nile.csv"))[None, :years, None]
+    )
 
 
 @cache
@@ -351,21 +351,6 @@ def test_the_page_has_the_table_of_the_stored_calibration() -> None:
     assert min(exact) > 0.05 > 0.01 > max(planted)
 
 
-# Volatility of an index: data, prior and posterior (50000 draws of another program) of `stochastic_volatility_sp500_small`
-# of Inference Gym 0.0.5. Closing prices of the S&P 500 to 24 June 2020; (rho + 1) / 2 has the law Beta(20, 1.5).
-PRICES = """
-3225.52 3248.92 3297.59 3334.69 3345.78 3327.71 3352.09 3357.75 3379.45 3373.94 3380.16 3370.29 3386.15
-3373.23 3337.75 3225.89 3128.21 3116.39 2978.76 2954.22 3090.23 3003.37 3130.12 3023.94 2972.37 2746.56
-2882.23 2741.38 2480.64 2711.02 2386.13 2529.19 2398.10 2409.39 2304.92 2237.40 2447.33 2475.56 2630.07
-2541.47 2626.65 2584.59 2470.50 2526.90 2488.65 2663.68 2659.41 2749.98 2789.82 2761.63 2846.06 2783.36
-2799.55 2874.56 2823.16 2736.56 2799.31 2797.80 2836.74 2878.48 2863.39 2939.51 2912.43 2830.71 2842.74
-2868.44 2848.42 2881.19 2929.80 2930.19 2870.12 2820.00 2852.50 2863.70 2953.91 2922.94 2971.61 2948.51
-2955.45 2991.77 3036.13 3029.73 3044.31 3055.73 3080.82 3122.87 3112.35 3193.93 3232.39 3207.18 3190.14
-3002.10 3041.31 3066.59 3124.74 3113.49 3115.34 3097.74 3117.86 3131.29 3050.33
-"""
-PUBLISHED = {"rho": (0.92498, 0.04760), "mu": (7.91517, 1.04789), "sigma": (0.50045, 0.13948)}
-RETURNS = torch.tensor([float(v) for v in PRICES.split()], dtype=torch.float64).diff()
-INDEX = Record((RETURNS - RETURNS.mean())[None, :, None])
 VOLATILITY = ParameterisedModel(
     StochasticVolatility,
     {
@@ -424,40 +409,80 @@ WORLDS = {  # of models whose name no scenario has
     "strapdown_total": "recorded_car_drive", "urban_gnss": "recorded_berlin", "urban_gnss_mixture": "recorded_berlin",
 }  # fmt: skip
 MODELS = sorted(path.stem for path in (ROOT / "conf" / "model").glob("*.yaml"))
+SIMULATED = [n for n in MODELS if "recorded" not in WORLDS.get(n, "") and n != "raw_gnss"]
 OF_THE_SCENARIO = ("gyro_bias_deg_s[", "accelerometer_bias[", "receiver.mask_deg")  # its inputs
 NO_REAL_NUMBERS = ("terrain.waves", "terrain.seed")
 STEPS = 4
 
 
-def vary(name: str) -> tuple[dict, dict[str, StateSpaceModel]]:
-    """Return the configuration of a model, and the model itself and with each number changed by 5 %."""
+def read_numbers(name: str) -> tuple[dict, dict[str, torch.Tensor]]:
+    """Return the configuration of a model, and each number of it changed by 5 %."""
     values = compose([f"model={name}", f"scenario={WORLDS.get(name, name)}"]).values
-    models = {"": build(values["model"])}
-    for key, value in list_numbers(values["model"]).items():
-        number = torch.tensor(0.95 * value if value else 1e-3, dtype=torch.float64)
-        if key not in NO_REAL_NUMBERS:
-            models[key] = build(values["model"], **{key: number})
-    return values, models
+    numbers = {
+        key: torch.tensor(0.95 * value if value else 1e-3, dtype=torch.float64)
+        for key, value in list_numbers(values["model"]).items()
+        if key not in NO_REAL_NUMBERS
+    }
+    return values, numbers
+
+
+def draw_steps(values: dict) -> Record:
+    """Draw the first steps of a run of a simulated world."""
+    episode = build(values["scenario"]).draw(build(values["noise"]), torch.arange(1), 1)
+    return episode.record._replace(
+        y=episode.record.y[:, :STEPS].double(), u=map_inputs(lambda a: a[:, :STEPS], episode.record.u)
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_the_likelihood_moves_with_each_number(name: str) -> None:
     """Of a few steps by a particle filter, where the world is simulated; of recorded ones the model, for which data are needed."""
-    values, models = vary(name)
+    values, numbers = read_numbers(name)
+    models = {"": build(values["model"])}
+    models |= {key: build(values["model"], **{key: number}) for key, number in numbers.items()}
     first = models[""]
     fixed = [key for key, model in models.items() if not list_differences(first, model)]
     assert [key for key in fixed[1:] if not any(part in key for part in OF_THE_SCENARIO)] == []
     kept = {key: model for key, model in models.items() if key not in fixed[1:]}
     assert len(kept) > 2
-    if "recorded" in WORLDS.get(name, "") or name == "raw_gnss":
+    if name not in SIMULATED:
         return
-    episode = build(values["scenario"]).draw(build(values["noise"]), torch.arange(1), 1)
-    record = episode.record._replace(
-        y=episode.record.y[:, :STEPS].double(), u=map_inputs(lambda a: a[:, :STEPS], episode.record.u)
-    )  # fmt: skip
+    record = draw_steps(values)
     stream = PhiloxStream(1, torch.zeros(len(kept), dtype=torch.long))
     batch, runs = ModelBatch(list(kept.values())), repeat_runs(record, len(kept))
     log_likelihood = run_filter(ParticleFilter(20), batch, runs, stream).log_evidence
     assert bool(torch.isfinite(log_likelihood).all())
     still = zip(kept, log_likelihood == log_likelihood[0], strict=True)
     assert [key for key, is_still in still if is_still] == [""]
+
+
+PLAIN = {
+    "lorenz63": ("step",),
+    "pendulum": ("step",),
+}  # of the design: compiled loops take them as plain numbers
+FINE = (
+    "terrain.shortest_m",
+    "terrain.longest_m",
+)  # larger steps of them turn far waves by many radians
+
+
+@pytest.mark.parametrize("name", SIMULATED)
+def test_the_gradient_of_the_likelihood_is_its_central_difference(name: str) -> None:
+    """By the EKF, for each number of a model: to 1e-6, or to rounding. Attitude errors start at zero, and noise gains are singular."""
+    values, numbers = read_numbers(name)
+    record = draw_steps(values)
+
+    def evidence(changed: dict[str, torch.Tensor]) -> torch.Tensor:
+        return FilterLikelihood(EKF)(build(values["model"], **(numbers | changed)), record).sum()
+
+    free = {
+        key: number.clone().requires_grad_()
+        for key, number in numbers.items()
+        if key not in PLAIN.get(name, ())
+    }
+    found = torch.autograd.grad(evidence(free), list(free.values()), materialize_grads=True)
+    for key, gradient in zip(free, found, strict=True):
+        h = (1e-6 if key in FINE else 1e-4) * numbers[key].abs()
+        a, b, c, d = (float(evidence({key: numbers[key] + k * h})) for k in (1, -1, 2, -2))
+        slope = (8.0 * (a - b) - (c - d)) / (12.0 * float(h))
+        assert float(gradient) == pytest.approx(slope, rel=1e-6, abs=2e-14 * abs(a) / float(h)), key

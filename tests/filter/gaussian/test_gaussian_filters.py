@@ -8,7 +8,7 @@ import numpy as np
 import oracles
 import pytest
 import torch
-from checkout import TESTS
+from checkout import ROOT
 from filter_laws import check_own, check_wrapped
 from model_cases import Bearing, Hidden, four_states, measurements
 from pyro.distributions import GaussianHMM, MultivariateNormal
@@ -55,9 +55,7 @@ RULES: dict[str, LinearisationRule] = {
     "cubature": SigmaPointLinearisation(CubaturePoints()),
 }
 every_rule = pytest.mark.parametrize("rule", RULES.values(), ids=RULES.keys())
-NILE = torch.tensor(np.loadtxt(TESTS / "nile.csv", delimiter=",", skiprows=1)[:, 1]).reshape(
-    1, 100, 1
-)
+NILE = torch.tensor(np.loadtxt(ROOT / "experiments" / "oracles" / "nile.csv"))[None, :, None]
 
 
 def run(

@@ -9,7 +9,7 @@ import numpy as np
 import oracles
 import pytest
 import torch
-from checkout import TESTS
+from checkout import ROOT
 from filter_laws import check_lost_alone, check_own, check_wrapped
 from model_cases import Fragile, measurements
 from particle_cases import CASES, WALK, WALK_Y, Drifting, Spiky, belief, benes_case, singular_case
@@ -189,7 +189,7 @@ def test_noise_follows_the_model_s_law(kind: type[LinearGaussian], law: Any) -> 
 
 
 def test_nile_evidence() -> None:
-    y = torch.tensor(np.loadtxt(TESTS / "nile.csv", delimiter=",", skiprows=1)[:, 1:])
+    y = torch.tensor(np.loadtxt(ROOT / "experiments" / "oracles" / "nile.csv", ndmin=2))
     model = local_level(math.sqrt(1470.0), math.sqrt(15100.0), 1000.0, math.sqrt(1000.0))
     estimate = filter_record(ParticleFilter(400), model, y, runs=200)
     ratio = torch.exp(estimate.log_evidence + 638.8133628).numpy()
