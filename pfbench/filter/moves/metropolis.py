@@ -470,13 +470,12 @@ def _replace_runs(
 
 def _choose(accept: Tensor, new: ParticleBelief, old: ParticleBelief) -> ParticleBelief:
     """Return `new` for accepted particles [R, N] and `old` for others."""
-    window = {
-        name: a if new.window[name] is a else _where(accept, new.window[name], a)
-        for name, a in old.window.items()
-    }
+    window = {name: _where(accept, new.window[name], a) for name, a in old.window.items()}
     return old._replace(x=_where(accept, new.x, old.x), window=window)
 
 
 def _where(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """Select among [R, N, ...] by a mask [R, N or 1]."""
+    """Select among [R, N, ...] by a mask [R, N or 1]; what is the same object remains it."""
+    if new is old:
+        return old
     return torch.where(mask.reshape(*mask.shape, *[1] * (old.dim() - 2)), new, old)

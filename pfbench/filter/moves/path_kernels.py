@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,6 +23,7 @@ from pfbench.filter.linearisation import (
     transition_jacobian,
     unwrap_independent,
 )
+from pfbench.filter.loop import MEMORY_OF_PASS
 from pfbench.filter.moves.metropolis import (
     McmcKernel,
     PathHistory,
@@ -40,7 +41,7 @@ from pfbench.filter.moves.path_proposals import (
 )
 from pfbench.filter.moves.taped_paths import find_taped_paths
 from pfbench.filter.particle.regularised_resampling import GaussianSmoothing, SmoothingKernel
-from pfbench.filter.whitening import compute_half_square, whiten
+from pfbench.filter.whitening import compute_half_square, fill_missing, whiten
 from pfbench.model.base import StateSpaceModel
 
 
@@ -239,16 +240,19 @@ class NoiseFlowKernel(McmcKernel):
         self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
     ) -> tuple[ParticleBelief, Tensor]:
         window, chart = belief.window, model.chart
-        start, centre = window["states"][:, :, 0], window["mean"][:, :, 0]
-        step, xi = self.random_walk(model, belief, start, draws), chart.subtract(start, centre)
+        start = window["states"][:, :, 0]
+        step = self.random_walk(model, belief, start, draws)
+        if "score" in window:
+            change, white_step = step @ window["information"][:, 0], step @ window["whitening"][:, 0].mT
+            white = window["white"] + white_step
+            log_beta = step * (window["score"] - 0.5 * change) - white_step * (white - 0.5 * white_step)
+            moved = {"states": (start + step).unsqueeze(2), "score": window["score"] - change, "white": white}
+            return belief._replace(window=window | moved), log_beta.sum(-1)
+        centre = window["mean"][:, :, 0]
+        xi = chart.subtract(start, centre)
         proposed_start = start + step if chart.flat else chart.add(centre, xi + step)
         root = factor(window["covariance"][:, 0, 0])[0]
         before, after = (compute_half_square(whiten(a, root)) for a in (xi, xi + step))
-        if "score" in window:
-            change = step @ window["information"][:, 0]
-            log_alpha = before - after + (step * (window["score"] - 0.5 * change)).sum(-1)
-            new_window = {"states": proposed_start.unsqueeze(2), "score": window["score"] - change}
-            return belief._replace(window=window | new_window), log_alpha
         noise = self._refresh_noise(model, window["noise"], draws)
         states, log_like = propagate_path(model, proposed_start, noise, belief.past)
         log_alpha = before - after + (log_like - window["log_like"]).sum(-1)
@@ -260,21 +264,25 @@ class NoiseFlowKernel(McmcKernel):
         """Return the particles of a linear model with the start and what its likelihood requires.
 
         Under fixed noises the log likelihood of the path is then quadratic in the start, with the gradient
-        `score` [R, N, d] and the curvature `information` [R, 1, d, d]. A step of a sweep costs no model step.
+        `score` [R, N, d] and the curvature `information` [R, 1, d, d]. The start has N(0, I) as its distribution
+        after `whitening` [R, 1, d, d], which gives `white` [R, N, d]. A step of a sweep costs no model step.
         """
         is_quadratic = model.linear and model.chart.flat and self.noise_refresh == 0.0
         if not (is_quadratic and belief.past):
             return belief
-        window, states = belief.window, belief.window["states"]
-        score, information = _measure_start(model, states, belief.past)
-        window = {
-            "states": states[:, :, :1],
-            "mean": window["mean"],
-            "covariance": window["covariance"],
+        window, start = belief.window, belief.window["states"][:, :, :1]
+        score, information = _measure_start(model, window["states"], belief.past)
+        root = fill_missing(factor(window["covariance"][:, 0, 0])[0])
+        eye = torch.eye(root.shape[-1], dtype=root.dtype, device=root.device)
+        whitening = torch.linalg.solve_triangular(root, eye, upper=False)
+        short = {
+            "states": start,
             "score": score,
+            "white": (start - window["mean"][:, :, :1]).squeeze(2) @ whitening.mT,
             "information": information.unsqueeze(1),
+            "whitening": whitening.unsqueeze(1),
         }
-        return belief._replace(window=window)
+        return belief._replace(window=short, past=())
 
     @override
     def complete(
@@ -293,7 +301,8 @@ class NoiseFlowKernel(McmcKernel):
             "states": torch.where(accepted[..., None, None], states, window["states"]),
             "log_like": torch.where(accepted.unsqueeze(2), values, window["log_like"]),
         }
-        return short._replace(x=additions["states"][:, :, -1], window=window | additions)
+        x = additions["states"][:, :, -1]
+        return before._replace(x=x, window=window | additions, ancestors=short.ancestors)
 
     def _refresh_noise(self, model: StateSpaceModel, w: Tensor, draws: RandomStream) -> Tensor:
         """Mix the noises [R, N, K, W] with new ones."""
@@ -341,6 +350,57 @@ def propagate_path(
     return results
 
 
+class _LinearStep(NamedTuple):
+    """A step of a linear model at a record: what no state changes.
+
+    Attributes:
+        model: The model, and the record: both live as long.
+        record: The record.
+        transition: Transition Jacobian, [R or 1, d, d].
+        slope: Measurement Jacobian, [R, k, d].
+        offset: Measurement at state 0 minus its mean there, [R, k, 1].
+        weighted: Slope divided by the measurement covariance, [R, k, d].
+    """
+
+    model: StateSpaceModel
+    record: Record
+    transition: Tensor
+    slope: Tensor
+    offset: Tensor
+    weighted: Tensor
+
+
+def _linearise_once(
+    model: StateSpaceModel, states: Tensor, past: tuple[Record, ...]
+) -> list[_LinearStep]:
+    """Return the steps of a linear model at past records, each computed once in a pass.
+
+    Shapes: states [R, N, K+1, D].
+    """
+    memory = MEMORY_OF_PASS.get()
+    known = {} if memory is None else memory.get(_LinearStep, {})
+    steps = {}
+    for j, record in enumerate(past):
+        step = known.get(id(record))
+        if step is None or step.model is not model:
+            x = states[:, :1, j]
+            slope = measurement_jacobian(model, x, record)[:, 0]
+            noise = distribution_covariance(model.observation(x, record.u))[:, 0]
+            observed = mask_covariance(noise, ~torch.isnan(record.y))
+            step = _LinearStep(
+                model,
+                record,
+                transition_jacobian(model, x, record.u)[:, 0],
+                slope,
+                linearised_innovation(model, x, record).mT + slope @ x.mT,
+                torch.linalg.solve_ex(observed, slope)[0],
+            )
+        steps[id(record)] = step
+    if memory is not None:
+        memory[_LinearStep] = steps
+    return list(steps.values())
+
+
 def _measure_start(
     model: StateSpaceModel, states: Tensor, past: tuple[Record, ...]
 ) -> tuple[Tensor, Tensor]:
@@ -348,20 +408,19 @@ def _measure_start(
 
     Returns gradient [R, N, d] and curvature [R, d, d]. Shapes: states [R, N, K+1, D].
     """
-    d = model.chart.dimension
-    gradient = torch.zeros_like(states[:, :, 0])
-    curvature = states.new_zeros(states.shape[0], d, d)
-    jacobian = torch.eye(d, dtype=states.dtype, device=states.device).expand_as(curvature)
-    for j, record in enumerate(past):
-        x = states[:, :, j]
-        if j > 0:
-            jacobian = transition_jacobian(model, x[:, :1], record.u)[:, 0] @ jacobian
-        h = measurement_jacobian(model, x[:, :1], record)[:, 0] @ jacobian
-        noise = distribution_covariance(model.observation(x[:, :1], record.u))[:, 0]
-        weight = torch.linalg.solve_ex(mask_covariance(noise, ~torch.isnan(record.y)), h)[0]
-        gradient = gradient + linearised_innovation(model, x, record) @ weight
-        curvature = curvature + h.mT @ weight
-    return gradient, curvature
+    _, *later = steps = _linearise_once(model, states, past)
+    products = [torch.eye(states.shape[-1]).to(states).expand(len(states), -1, -1)]
+    for step in later:
+        products.append(step.transition @ products[-1])
+    slopes, weighted = (
+        (torch.stack([step[k] for step in steps], 1) @ torch.stack(products, 1)).flatten(1, 2)
+        for k in (3, 5)
+    )
+    residuals = [
+        torch.baddbmm(step.offset, step.slope, states[:, :, j].mT, alpha=-1.0)
+        for j, step in enumerate(steps)
+    ]
+    return (weighted.mT @ torch.cat(residuals, 1)).mT, slopes.mT @ weighted
 
 
 @dataclass(frozen=True)
