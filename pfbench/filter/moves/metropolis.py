@@ -367,7 +367,8 @@ class MetropolisHastings(Move):
             proposed, log_alpha = self.kernel.propose(model, belief, step_draws)
             log_u = torch.log(step_draws.uniform("accept", active_mask.shape[1], 1).squeeze(2))
             accept = log_u < log_alpha  # never where it is NaN
-            belief = _choose(accept, proposed, belief)
+            window = {k: _where(accept, proposed.window[k], a) for k, a in belief.window.items()}
+            belief = belief._replace(x=_where(accept, proposed.x, belief.x), window=window)
             accepted = accepted + (accept & active_mask)
         if belief.ancestors is not None:
             n = active_mask.shape[1]
@@ -378,42 +379,6 @@ class MetropolisHastings(Move):
 
     def _rate(self, accepted: Tensor, log_w: Tensor) -> Tensor:
         return accepted.sum(1) / (self.mcmc_steps * torch.isfinite(log_w).sum(1))
-
-
-@dataclass(frozen=True)
-class KernelCycle(Move):
-    """Moves in turn, repeated. A cycle of invariant kernels is invariant.
-
-    Attributes:
-        moves: Moves in order.
-        mcmc_steps: Number of repetitions.
-    """
-
-    moves: Sequence[Move]
-    mcmc_steps: int = 1
-
-    @property
-    @override
-    def is_exact(self) -> bool:
-        return is_every_part_exact(
-            **{f"move.moves[{i}]": move for i, move in enumerate(self.moves)}
-        )
-
-    @property
-    @override
-    def required_history(self) -> PathHistory | None:
-        return combine_histories([move.required_history for move in self.moves])
-
-    @override
-    def __call__(
-        self, model: StateSpaceModel, belief: ParticleBelief, resampled: Tensor, draws: RandomStream
-    ) -> tuple[ParticleBelief, Tensor]:
-        total = torch.zeros_like(belief.log_w[:, 0])
-        for turn in range(self.mcmc_steps):
-            for i, move in enumerate(self.moves):
-                belief, rate = move(model, belief, resampled, relabel(draws, f"turn_{turn}.{i}."))
-                total = total + rate
-        return belief, total / max(1, self.mcmc_steps * len(self.moves))
 
 
 def _select_runs(belief: ParticleBelief, rows: Tensor) -> ParticleBelief:
@@ -466,12 +431,6 @@ def _replace_runs(
     if belief.ancestors is not None and moved_belief.ancestors is not None:
         ancestors = replace(belief.ancestors, moved_belief.ancestors)
     return belief._replace(x=replace(belief.x, moved_belief.x), window=window, ancestors=ancestors)
-
-
-def _choose(accept: Tensor, new: ParticleBelief, old: ParticleBelief) -> ParticleBelief:
-    """Return `new` for accepted particles [R, N] and `old` for others."""
-    window = {name: _where(accept, new.window[name], a) for name, a in old.window.items()}
-    return old._replace(x=_where(accept, new.x, old.x), window=window)
 
 
 def _where(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:

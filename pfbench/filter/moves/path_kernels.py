@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -64,8 +64,8 @@ class PathStatistics(PathHistory):
         if isinstance(history, PathStatistics):
             return self
         raise ValueError(
-            "filter.moves must not combine NoiseFlowStatKernel or NoiseFlowGibbsKernel with other "
-            "kernels, got both. Remove the other kernels, because these two do not store paths."
+            "filter.moves must not combine NoiseFlowStatKernel with other "
+            "kernels, got both. Remove the other kernels, because this one does not store paths."
         )
 
     @override
@@ -243,10 +243,19 @@ class NoiseFlowKernel(McmcKernel):
         start = window["states"][:, :, 0]
         step = self.random_walk(model, belief, start, draws)
         if "score" in window:
-            change, white_step = step @ window["information"][:, 0], step @ window["whitening"][:, 0].mT
+            change, white_step = (
+                step @ window["information"][:, 0],
+                step @ window["whitening"][:, 0].mT,
+            )
             white = window["white"] + white_step
-            log_beta = step * (window["score"] - 0.5 * change) - white_step * (white - 0.5 * white_step)
-            moved = {"states": (start + step).unsqueeze(2), "score": window["score"] - change, "white": white}
+            log_beta = step * (window["score"] - 0.5 * change) - white_step * (
+                white - 0.5 * white_step
+            )
+            moved = {
+                "states": (start + step).unsqueeze(2),
+                "score": window["score"] - change,
+                "white": white,
+            }
             return belief._replace(window=window | moved), log_beta.sum(-1)
         centre = window["mean"][:, :, 0]
         xi = chart.subtract(start, centre)
@@ -350,55 +359,20 @@ def propagate_path(
     return results
 
 
-class _LinearStep(NamedTuple):
-    """A step of a linear model at a record: what no state changes.
+def _linearise(
+    model: StateSpaceModel, x: Tensor, record: Record
+) -> tuple[Record, Tensor, Tensor, Tensor]:
+    """Compute what no state changes in a step of a linear model, at any state of each run.
 
-    Attributes:
-        model: The model, and the record: both live as long.
-        record: The record.
-        transition: Transition Jacobian, [R or 1, d, d].
-        slope: Measurement Jacobian, [R, k, d].
-        offset: Measurement at state 0 minus its mean there, [R, k, 1].
-        weighted: Slope divided by the measurement covariance, [R, k, d].
+    Returns the record; the transition Jacobian [R or 1, d, d]; the measurement Jacobian H, and H divided by the
+    covariance, [R, 2, k, d]; the measurement at state 0 minus its mean there, [R, k, 1]. Shapes: x [R, 1, D].
     """
-
-    model: StateSpaceModel
-    record: Record
-    transition: Tensor
-    slope: Tensor
-    offset: Tensor
-    weighted: Tensor
-
-
-def _linearise_once(
-    model: StateSpaceModel, states: Tensor, past: tuple[Record, ...]
-) -> list[_LinearStep]:
-    """Return the steps of a linear model at past records, each computed once in a pass.
-
-    Shapes: states [R, N, K+1, D].
-    """
-    memory = MEMORY_OF_PASS.get()
-    known = {} if memory is None else memory.get(_LinearStep, {})
-    steps = {}
-    for j, record in enumerate(past):
-        step = known.get(id(record))
-        if step is None or step.model is not model:
-            x = states[:, :1, j]
-            slope = measurement_jacobian(model, x, record)[:, 0]
-            noise = distribution_covariance(model.observation(x, record.u))[:, 0]
-            observed = mask_covariance(noise, ~torch.isnan(record.y))
-            step = _LinearStep(
-                model,
-                record,
-                transition_jacobian(model, x, record.u)[:, 0],
-                slope,
-                linearised_innovation(model, x, record).mT + slope @ x.mT,
-                torch.linalg.solve_ex(observed, slope)[0],
-            )
-        steps[id(record)] = step
-    if memory is not None:
-        memory[_LinearStep] = steps
-    return list(steps.values())
+    slope = measurement_jacobian(model, x, record)[:, 0]
+    noise = distribution_covariance(model.observation(x, record.u))[:, 0]
+    observed = mask_covariance(noise, ~torch.isnan(record.y))
+    slopes = torch.stack([slope, torch.linalg.solve_ex(observed, slope)[0]], 1)
+    offset = linearised_innovation(model, x, record).mT + slope @ x.mT
+    return record, transition_jacobian(model, x, record.u)[:, 0], slopes, offset
 
 
 def _measure_start(
@@ -408,19 +382,26 @@ def _measure_start(
 
     Returns gradient [R, N, d] and curvature [R, d, d]. Shapes: states [R, N, K+1, D].
     """
-    _, *later = steps = _linearise_once(model, states, past)
+    memory = MEMORY_OF_PASS.get()
+    owner, known = (memory or {}).get(_linearise, (model, {}))
+    known = known if owner is model else {}  # by the identity of a record, which lives as long
+    known = {
+        id(record): known.get(id(record)) or _linearise(model, states[:, :1, j], record)
+        for j, record in enumerate(past)
+    }
+    if memory is not None:
+        memory[_linearise] = model, known
+    _, transitions, slopes, offsets = zip(*known.values(), strict=True)
     products = [torch.eye(states.shape[-1]).to(states).expand(len(states), -1, -1)]
-    for step in later:
-        products.append(step.transition @ products[-1])
-    slopes, weighted = (
-        (torch.stack([step[k] for step in steps], 1) @ torch.stack(products, 1)).flatten(1, 2)
-        for k in (3, 5)
-    )
+    for transition in transitions[1:]:
+        products.append(transition @ products[-1])
+    moved = torch.stack(slopes, 2) @ torch.stack(products, 1).unsqueeze(1)
+    plain, weighted = moved.flatten(2, 3).unbind(1)
     residuals = [
-        torch.baddbmm(step.offset, step.slope, states[:, :, j].mT, alpha=-1.0)
-        for j, step in enumerate(steps)
+        torch.baddbmm(offset, slope[:, 0], states[:, :, j].mT, alpha=-1.0)
+        for j, (slope, offset) in enumerate(zip(slopes, offsets, strict=True))
     ]
-    return (weighted.mT @ torch.cat(residuals, 1)).mT, slopes.mT @ weighted
+    return (weighted.mT @ torch.cat(residuals, 1)).mT, plain.mT @ weighted
 
 
 @dataclass(frozen=True)
@@ -447,30 +428,6 @@ class NoiseFlowStatKernel(McmcKernel):
         information_shift = delta @ belief.window["information"][:, 0]
         log_alpha = (delta * (b - 0.5 * information_shift)).sum(-1)
         window = belief.window | {"score": b - information_shift}
-        return belief._replace(x=model.chart.add(belief.x, delta), window=window), log_alpha
-
-
-@dataclass(frozen=True)
-class NoiseFlowGibbsKernel(McmcKernel):
-    """`NoiseFlowStatKernel` with delta from its conditional distribution.
-
-    The distribution is N(Lambda^-1 b, Lambda^-1). Always accepted if Lambda has a Cholesky factor.
-    """
-
-    is_exact = False
-    required_history = PathStatistics()
-
-    @override
-    def propose(
-        self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
-    ) -> tuple[ParticleBelief, Tensor]:
-        b, information = belief.window["score"], belief.window["information"][:, 0]
-        root, ok = factor(information)
-        white = torch.linalg.solve_triangular(root, b.mT, upper=False).mT
-        e = draws.normal("gibbs", b.shape[1], b.shape[2])
-        delta = torch.linalg.solve_triangular(root.mT, (white + e).mT, upper=True).mT
-        log_alpha = torch.where(ok[:, None] & torch.isfinite(delta).all(-1), 0.0, -torch.inf)
-        window = belief.window | {"score": b - delta @ information}
         return belief._replace(x=model.chart.add(belief.x, delta), window=window), log_alpha
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -36,7 +36,7 @@ class TapedPaths:
     tape: Tape | None = None
     refused: bool = False
     _evaluations: int = 0  # of the measurement distribution, per particle and step
-    _inputs: dict[int, tuple[Record, Tensor]] = field(default_factory=dict)  # of the latest records
+    _inputs: tuple[Past, Tensor] | None = None  # of the records that were asked for last
 
     def record(
         self, start: Tensor, noise: Tensor, past: Past, states: Tensor, values: Tensor
@@ -72,23 +72,19 @@ class TapedPaths:
         """
         assert self.tape is not None
         runs, n, steps, width = noise.shape
-        known, self._inputs = self._inputs, {}
-        for record in past[1:]:
-            row = known.get(id(record)) or (record, _join_inputs(record, runs))
-            self._inputs[id(record)] = row
-        inputs = torch.stack([row[1] for row in self._inputs.values()])
+        if self._inputs is None or self._inputs[0] is not past:
+            rows = [[*tensors_in(record.u), record.y] for record in past[1:]]
+            flat = [
+                torch.cat([a.reshape(len(a), -1).expand(runs, -1).double() for a in row], 1)
+                for row in rows
+            ]
+            self._inputs = past, torch.stack(flat)
         draws = noise.permute(2, 3, 0, 1).reshape(steps * width, runs, n)
-        arguments = [inputs, to_storage(start), value, draws, torch.tensor(self.tape[3:])]
+        arguments = [self._inputs[1], to_storage(start), value, draws, torch.tensor(self.tape[3:])]
         states, values = dispatch.run_paths([*self.tape[:3], *arguments])
         if counter := getattr(self.model, "likelihood_counter", None):
             counter.count += steps * runs * n * self._evaluations
         return states.permute(2, 3, 0, 1), values.permute(1, 2, 0)
-
-
-def _join_inputs(record: Record, runs: int) -> Tensor:
-    """Return the inputs of a step as one row of each run, float64 [R, U]."""
-    tensors = [*tensors_in(record.u), record.y]
-    return torch.cat([a.reshape(len(a), -1).expand(runs, -1).double() for a in tensors], 1)
 
 
 def find_taped_paths(model: StateSpaceModel, x: Tensor) -> TapedPaths | None:
