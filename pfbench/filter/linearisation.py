@@ -33,18 +33,11 @@ def derivative(
 ) -> Tensor:
     """Compute the derivative of a map of states and increments at increment zero.
 
-    All directions are evaluated in one forward pass, as additional particles. At one state of each run
-    backward mode is used where it can be: `jacobian` says why.
+    All directions are evaluated in one forward pass, as additional particles.
 
     Returns derivative, [R, N, k, d]. Shapes: f [R, P, D], at [R, N, D].
     """
     runs, n = at.shape[:2]
-    if n == 1:
-
-        def shift(xi: Tensor) -> Tensor:
-            return f(at.expand(-1, xi.shape[1], -1), xi)
-
-        return jacobian(shift, shift(at.new_zeros(runs, 1, d)), d, subtract).unsqueeze(1)
     parts = []
     eye = torch.eye(d, dtype=at.dtype, device=at.device)
     for directions in eye.split(max(1, _POINTS // (runs * n))):

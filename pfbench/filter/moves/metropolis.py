@@ -144,15 +144,20 @@ class StateHistory(PathHistory):
         old = max(0, len(past) - 1 - self.lag)
         additions = {"states": after.x, "log_like": log_like}
         if self.store_noise:
-            additions |= _noise_history(model, after, w)
+            if w is None:
+                raise ValueError(
+                    "filter.proposal must return its noise if moves use it again, got None. "
+                    "Choose BootstrapProposal."
+                )
+            mean, covariance = weighted_mean_cov(model.chart, after)
+            additions |= {"noise": w, "mean": mean[:, None], "covariance": covariance[:, None]}
         window = {
             name: concatenate_histories([before.window[name][:, :, old:], new.unsqueeze(2)])
             for name, new in additions.items()
         }
         if old:
             past = (_unobserved(past[old]), *past[old + 1 :])
-            zeros = torch.zeros_like(window["log_like"][:, :, :1])
-            window["log_like"] = concatenate_histories([zeros, window["log_like"][:, :, 1:]])
+            window["log_like"][:, :, 0] = 0.0
         return after._replace(window=window, past=past)
 
 
@@ -166,19 +171,6 @@ def combine_histories(histories: Sequence[PathHistory | None]) -> PathHistory | 
         if history is not None:
             joint = history if joint is None else joint.merge(history)
     return joint
-
-
-def _noise_history(
-    model: StateSpaceModel, belief: ParticleBelief, w: Tensor | None
-) -> dict[str, Tensor]:
-    """Return the noise of a step and the filtered distribution after it."""
-    if w is None:
-        raise ValueError(
-            "filter.proposal must return its noise if moves use it again, got None. "
-            "Choose BootstrapProposal."
-        )
-    mean, covariance = weighted_mean_cov(model.chart, belief)
-    return {"noise": w, "mean": mean.unsqueeze(1), "covariance": covariance.unsqueeze(1)}
 
 
 def get_transition(

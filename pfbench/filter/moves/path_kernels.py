@@ -74,13 +74,13 @@ class PathStatistics(PathHistory):
     ) -> ParticleBelief:
         """Start with the information and score of the initial distribution."""
         root, ok = factor(covariance)
-        if not bool((ok & (root.diagonal(dim1=-2, dim2=-1) > 0.0).all(-1)).all()):
-            variance = covariance[0].diagonal().tolist()
-            raise ValueError(
-                "filter.moves: the initial covariance must be positive definite for kernels that use "
-                f"statistics of the path, got variances {variance} of the particles. Use "
-                "NoiseFlowKernel, or a larger initial standard deviation or number of particles."
-            )
+        require(
+            (ok & (root.diagonal(dim1=-2, dim2=-1) > 0.0).all(-1)).all(),
+            "filter.moves: the initial covariance",
+            "be positive definite for kernels that use statistics of the path",
+            f"variances {covariance[0].diagonal().tolist()} of the particles",
+            "Use NoiseFlowKernel, or a larger initial standard deviation or number of particles.",
+        )
         information = torch.cholesky_inverse(root)
         score = -model.chart.subtract(belief.x, mean.unsqueeze(1)) @ information
         return belief._replace(window={"score": score, "information": information.unsqueeze(1)})
@@ -282,8 +282,9 @@ class NoiseFlowKernel(McmcKernel):
         window, start = belief.window, belief.window["states"][:, :, :1]
         score, information = _measure_start(model, window["states"], belief.past)
         root = fill_missing(factor(window["covariance"][:, 0, 0])[0])
-        eye = torch.eye(root.shape[-1], dtype=root.dtype, device=root.device)
-        whitening = torch.linalg.solve_triangular(root, eye, upper=False)
+        whitening = torch.linalg.solve_triangular(
+            root, torch.eye(root.shape[-1]).to(root), upper=False
+        )
         short = {
             "states": start,
             "score": score,
@@ -310,8 +311,9 @@ class NoiseFlowKernel(McmcKernel):
             "states": torch.where(accepted[..., None, None], states, window["states"]),
             "log_like": torch.where(accepted.unsqueeze(2), values, window["log_like"]),
         }
-        x = additions["states"][:, :, -1]
-        return before._replace(x=x, window=window | additions, ancestors=short.ancestors)
+        return before._replace(
+            x=additions["states"][:, :, -1], window=window | additions, ancestors=short.ancestors
+        )
 
     def _refresh_noise(self, model: StateSpaceModel, w: Tensor, draws: RandomStream) -> Tensor:
         """Mix the noises [R, N, K, W] with new ones."""
@@ -395,8 +397,8 @@ def _measure_start(
     products = [torch.eye(states.shape[-1]).to(states).expand(len(states), -1, -1)]
     for transition in transitions[1:]:
         products.append(transition @ products[-1])
-    moved = torch.stack(slopes, 2) @ torch.stack(products, 1).unsqueeze(1)
-    plain, weighted = moved.flatten(2, 3).unbind(1)
+    along = torch.stack(products, 1).unsqueeze(1)
+    plain, weighted = (torch.stack(slopes, 2) @ along).flatten(2, 3).unbind(1)
     residuals = [
         torch.baddbmm(offset, slope[:, 0], states[:, :, j].mT, alpha=-1.0)
         for j, (slope, offset) in enumerate(zip(slopes, offsets, strict=True))

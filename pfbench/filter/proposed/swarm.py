@@ -370,8 +370,9 @@ class SwarmProposal(Proposal):
             Final swarm, and the number of iterations of each run [R].
         """
         spread = frame.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt().unsqueeze(1)
-        by_prior = self.limits.scale_by_prior
-        scale = memory["swarm.scale"][..., frame.components] if by_prior else spread
+        scale = (
+            memory["swarm.scale"][..., frame.components] if self.limits.scale_by_prior else spread
+        )
         q, spare, chaos = frame.q, frame.q[..., :0], frame.q[..., :0]
         if self.perturbation:
             spare = safe_seeds(draws.uniform("swarm.spare", *q.shape[1:]))

@@ -10,10 +10,9 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.chart import Chart
-from pfbench.core.linear_algebra import factor
+from pfbench.core.linear_algebra import factor, jacobian
 from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.record import Record
-from pfbench.filter.linearisation import derivative
 from pfbench.filter.whitening import fill_missing, whiten
 from pfbench.model.base import StateSpaceModel
 
@@ -202,12 +201,14 @@ def observed_components(model: StateSpaceModel, mean: Tensor, u: Any) -> Tensor:
     Shapes: mean [R, 1, D].
     """
 
-    def moments_of_y(at: Tensor, xi: Tensor) -> Tensor:
-        distribution: Any = model.observation(model.chart.add(at, xi), u)
+    def moments_of_y(xi: Tensor) -> Tensor:
+        x = model.chart.add(mean.expand(-1, xi.shape[1], -1), xi)
+        distribution: Any = model.observation(x, u)
         return torch.cat([distribution.mean, distribution.variance], -1)
 
-    slope = derivative(moments_of_y, mean, model.chart.dimension).nan_to_num()  # [R, 1, 2 Dy, d]
-    return (slope != 0.0).flatten(0, 2).any(0).nonzero().squeeze(-1)
+    zero = mean.new_zeros(len(mean), 1, model.chart.dimension)
+    slope = jacobian(moments_of_y, moments_of_y(zero), zero.shape[-1]).nan_to_num()  # [R, 2 Dy, d]
+    return (slope != 0.0).flatten(0, 1).any(0).nonzero().squeeze(-1)
 
 
 def bounded_root(covariance: Tensor) -> Tensor:
