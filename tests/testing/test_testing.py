@@ -195,7 +195,7 @@ def test_moves_pass_as_kernels_and_as_moves() -> None:
     for move in (
         PathBlockKernel(3, SmoothedSegment()),
         NoiseFlowStatKernel(),
-        MetropolisHastings(NoiseFlowKernel(10), 2),
+        MetropolisHastings(NoiseFlowKernel(10), 6),
     ):
         assert check_move(move, paths=500).details["moved"] > 0.5
 

@@ -181,7 +181,7 @@ def find_group_chart(model: StateSpaceModel, side: str) -> Chart:
     inner = model
     while isinstance(inner, ModelWrapper):
         inner = inner.model
-    group_chart = getattr(inner, "group_chart", None)
+    group_chart: Any = getattr(inner, "group_chart", None)
     require(
         group_chart is not None,
         "filter.chart",

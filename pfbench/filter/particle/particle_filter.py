@@ -124,7 +124,7 @@ class ParticleFilter(Filter):
             "Remove the moves.",
         )
         require(
-            isinstance(self.resampler, EssResampler) or not (self.history or self.stores_path),
+            not (self.history or self.stores_path) or isinstance(self.resampler, EssResampler),
             "filter.resampler",
             "copy particles with their past for moves or an interval",
             type(self.resampler).__name__,

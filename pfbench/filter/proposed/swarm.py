@@ -204,7 +204,7 @@ class SwarmMove(ModelWrapper):
         *columns, chaos = x.split(self.widths[0], -1)
         columns = [a.to(self.frame.q) for a in columns]
         columns[2::2] = [a.squeeze(-1) for a in columns[2::2]]
-        return SwarmState(*columns, chaos)
+        return SwarmState._make([*columns, chaos])
 
     def fit(self, frame: SwarmFrame, q: Tensor, active: Tensor, u: MoveInputs) -> Tensor:
         """Return the fitness of positions, -inf at inactive slots and where it is not defined, [R, N]."""

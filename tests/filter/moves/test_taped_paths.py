@@ -17,8 +17,10 @@ from pfbench.filter import (
     NoiseFlowKernel,
     ParticleFilter,
     PowerLikelihoodUpdate,
+    SwarmProposal,
     run_filter,
 )
+from pfbench.filter.loop import MEMORY_OF_PASS
 from pfbench.filter.moves import path_kernels, taped_paths
 from pfbench.job.scoring import LikelihoodCounter
 from pfbench.kernels import dispatch
@@ -27,7 +29,7 @@ from pfbench.noise.base import NominalNoise
 from pfbench.scenario.simulated import ModelSimulation
 
 pytestmark = compiler
-RUNS = torch.tensor([7, 0, 12])
+RUNS, ONE = torch.tensor([7, 0, 12]), torch.ones(1)
 MODELS: dict[str, Callable[[], StateSpaceModel]] = {
     "growth": UnivariateGrowth,  # with an input that runs share
     "lorenz": Lorenz63,
@@ -74,7 +76,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 def assert_close(one: FilterResult, other: FilterResult) -> None:
     for name in ("mean", "variance", "log_evidence"):
         torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-9, atol=1e-9)
-    assert torch.equal(one.trace["accepted_0"], other.trace["accepted_0"])
+    assert torch.equal(one.trace.get("accepted_0", ONE), other.trace.get("accepted_0", ONE))
 
 
 @pytest.mark.parametrize("refresh", [0.0, 0.1])
@@ -96,6 +98,40 @@ def test_paths_by_a_tape_are_those_of_the_model(
     moves = results[0].trace["accepted_0"]
     assert 0.0 < float(moves.mean()) < 1.0
     assert bool((moves == 0.0).any())  # not all runs move in each step
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_swarm_by_a_tape_is_that_of_the_model(name: str, taken: list[Any]) -> None:
+    """Both evaluations of an iteration, with the frame and the measurement of each step, and its count of evaluations."""
+    counts, results, record = [], [], simulate(MODELS[name]())
+    method = ParticleFilter(60, proposal=SwarmProposal(iterations=3))
+    for call in (run, run_by_torch):
+        model = MODELS[name]()
+        counter = LikelihoodCounter(model)
+        results.append(call(method, model, record))
+        counts.append(counter.count)
+    assert_close(*results)
+    assert counts[0] == counts[1] > 0
+    assert len(taken) == 1 + 12 * 3 - 1  # one checks the tape, and the first iteration records it
+
+
+def test_a_linear_flow_has_the_slopes_of_its_own_model() -> None:
+    """Two models of one pass at the same records: the second has what it has outside of a pass."""
+    models = [
+        LinearGaussian(
+            [[1.0, slope], [0.0, 0.9]], [[0.1], [0.3]], [[1.0, 0.0]], [sd], [0.0] * 2, [1.0] * 2
+        )
+        for slope, sd in ((0.1, 0.4), (0.3, 0.7))
+    ]
+    record = simulate(models[0])
+    past = tuple(record.at_step(t) for t in range(12))
+    states = PhiloxStream(3, RUNS).normal("states", 5, 24).unflatten(2, (12, 2))
+    alone = path_kernels._measure_start(models[1], states, past)
+    token = MEMORY_OF_PASS.set({})
+    within = [path_kernels._measure_start(model, states, past) for model in models]
+    MEMORY_OF_PASS.reset(token)
+    assert all(torch.equal(*pair) for pair in zip(within[1], alone, strict=True))
+    assert not torch.allclose(within[0][0], alone[0])
 
 
 def test_tempered_likelihoods_have_a_tape_of_their_own(taken: list[Any]) -> None:
