@@ -243,20 +243,16 @@ class NoiseFlowKernel(McmcKernel):
         start = window["states"][:, :, 0]
         step = self.random_walk(model, belief, start, draws)
         if "score" in window:
-            change, white_step = (
-                step @ window["information"][:, 0],
-                step @ window["whitening"][:, 0].mT,
-            )
+            change = step @ window["information"][:, 0]
+            white_step = step @ window["whitening"][:, 0].mT
             white = window["white"] + white_step
-            log_beta = step * (window["score"] - 0.5 * change) - white_step * (
-                white - 0.5 * white_step
-            )
-            moved = {
+            gain, loss = window["score"] - 0.5 * change, white - 0.5 * white_step
+            ends = {
                 "states": (start + step).unsqueeze(2),
                 "score": window["score"] - change,
                 "white": white,
             }
-            return belief._replace(window=window | moved), log_beta.sum(-1)
+            return belief._replace(window=window | ends), (step * gain - white_step * loss).sum(-1)
         centre = window["mean"][:, :, 0]
         xi = chart.subtract(start, centre)
         proposed_start = start + step if chart.flat else chart.add(centre, xi + step)
@@ -385,15 +381,15 @@ def _measure_start(
     Returns gradient [R, N, d] and curvature [R, d, d]. Shapes: states [R, N, K+1, D].
     """
     memory = MEMORY_OF_PASS.get()
-    owner, known = (memory or {}).get(_linearise, (model, {}))
-    known = known if owner is model else {}  # by the identity of a record, which lives as long
-    known = {
-        id(record): known.get(id(record)) or _linearise(model, states[:, :1, j], record)
+    owner, stored = (memory or {}).get(_linearise, (model, {}))
+    stored = stored if owner is model else {}  # by the identity of a record, which lives as long
+    stored = {
+        id(record): stored.get(id(record)) or _linearise(model, states[:, :1, j], record)
         for j, record in enumerate(past)
     }
     if memory is not None:
-        memory[_linearise] = model, known
-    _, transitions, slopes, offsets = zip(*known.values(), strict=True)
+        memory[_linearise] = model, stored
+    _, transitions, slopes, offsets = zip(*stored.values(), strict=True)
     products = [torch.eye(states.shape[-1]).to(states).expand(len(states), -1, -1)]
     for transition in transitions[1:]:
         products.append(transition @ products[-1])

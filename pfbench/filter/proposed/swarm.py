@@ -251,8 +251,9 @@ class SwarmMove(ModelWrapper):
 
 def join_columns(columns: Sequence[Tensor]) -> Tensor:
     """Join numbers [R, N] and [R, N, k] to [R, N, S], fastest component-major in memory."""
-    rows = [(a if a.dim() == 3 else a.unsqueeze(-1)).permute(2, 0, 1) for a in columns]
-    return torch.cat(rows).permute(1, 2, 0)
+    return torch.cat(
+        [(a if a.dim() == 3 else a.unsqueeze(-1)).permute(2, 0, 1) for a in columns]
+    ).permute(1, 2, 0)
 
 
 @dataclass(frozen=True)
@@ -369,20 +370,14 @@ class SwarmProposal(Proposal):
         Returns:
             Final swarm, and the number of iterations of each run [R].
         """
-        spread = frame.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt().unsqueeze(1)
-        scale = (
-            memory["swarm.scale"][..., frame.components] if self.limits.scale_by_prior else spread
-        )
         q, spare, chaos = frame.q, frame.q[..., :0], frame.q[..., :0]
         if self.perturbation:
             spare = safe_seeds(draws.uniform("swarm.spare", *q.shape[1:]))
             chaos = memory["swarm.chaos"][:, 0, :, frame.components]
-        shared = MoveInputs(
-            record.u, record.y, self.fitness(frame), frame.origin, frame.direction, scale, spread
-        )
+        shared = self._collect_inputs(frame, memory, record)
         move, step = SwarmMove(self, model, frame), Record(record.y, shared)
-        kept = q, frame.deviation, active_mask.to(spread), spare
-        fitness = move.fit(frame, q, kept[2].unsqueeze(-1), shared)
+        constant = q, frame.deviation, active_mask.to(q), spare
+        fitness = move.fit(frame, q, constant[2].unsqueeze(-1), shared)
         initial = join_columns((q, torch.zeros_like(q), fitness, q, fitness, q, fitness, chaos))
         active = observed_runs = is_measured(record)
         x, iterations = initial, torch.zeros_like(active, dtype=torch.long)
@@ -392,16 +387,26 @@ class SwarmProposal(Proposal):
             swarm = move.split_swarm(x)
             v = self.velocity(swarm, active_mask, i / self.iterations, draws, f"swarm.velocity.{i}")
             iterations = iterations + active
-            w = join_columns((*kept, v)).unsqueeze(2)
-            moved = propagate_path(move, x, w, (step, step))[0][:, :, 1]
-            x = torch.where(active[:, None, None], moved, x) if self.stopping else moved
+            w = join_columns((*constant, v)).unsqueeze(2)
+            after = propagate_path(move, x, w, (step, step))[0][:, :, 1]
+            x = torch.where(active[:, None, None], after, x) if self.stopping else after
             if self.stopping:
                 swarm = move.split_swarm(x)
-                best = swarm.best_fitness.argmax(1)
-                best_state = select_particle(frame.to_states(swarm.best), best)
-                active = active & ~self.stopping(model, best_state, record)
-        final = torch.where(observed_runs[:, None, None], x, initial)
-        return move.split_swarm(final), iterations
+                best = select_particle(frame.to_states(swarm.best), swarm.best_fitness.argmax(1))
+                active = active & ~self.stopping(model, best, record)
+        return move.split_swarm(torch.where(observed_runs[:, None, None], x, initial)), iterations
+
+    def _collect_inputs(
+        self, frame: SwarmFrame, memory: dict[str, Tensor], record: Record
+    ) -> MoveInputs:
+        """Return what the particles of a run share in all iterations of a step."""
+        spread = frame.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt().unsqueeze(1)
+        scale = (
+            memory["swarm.scale"][..., frame.components] if self.limits.scale_by_prior else spread
+        )
+        return MoveInputs(
+            record.u, record.y, self.fitness(frame), frame.origin, frame.direction, scale, spread
+        )
 
     def _start_step(
         self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream

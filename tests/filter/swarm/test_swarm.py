@@ -452,10 +452,9 @@ def test_the_posterior_fitness_is_highest_at_the_kalman_mean() -> None:
     mode = (gain @ (y[0] - h @ x.mean(1)[0]))[None, None]
     w = PosteriorFitness(covariance_shrinkage=0.0)(frame)
 
-    def value(q: Tensor) -> Tensor:
-        penalty = 0.5 * (q @ w.mT).square().sum(-1)
-        return model.log_likelihood(y, frame.origin + q, ()) - penalty
-
+    value = lambda q: (  # noqa: E731
+        model.log_likelihood(y, frame.origin + q, ()) - 0.5 * (q @ w.mT).square().sum(-1)
+    )
     steps = 0.1 * torch.eye(4, dtype=torch.float64)
     up, down = (value(mode + sign * steps) for sign in (1, -1))
     assert torch.allclose(up, down, rtol=0, atol=1e-9)
