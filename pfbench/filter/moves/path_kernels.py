@@ -362,8 +362,8 @@ def _linearise(
 ) -> tuple[Record, Tensor, Tensor, Tensor]:
     """Compute what no state changes in a step of a linear model, at any state of each run.
 
-    Returns the record; the transition Jacobian [R or 1, d, d]; the measurement Jacobian H, and H divided by the
-    covariance, [R, 2, k, d]; the measurement at state 0 minus its mean there, [R, k, 1]. Shapes: x [R, 1, D].
+    Returns the record and the transition Jacobian [R or 1, d, d]. Then the measurement Jacobian H, and H divided by the
+    covariance, [R, 2, k, d]. Last the measurement at state 0 minus its mean there, [R, k, 1]. Shapes: x [R, 1, D].
     """
     slope = measurement_jacobian(model, x, record)[:, 0]
     noise = distribution_covariance(model.observation(x, record.u))[:, 0]

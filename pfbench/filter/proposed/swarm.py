@@ -163,7 +163,7 @@ class ChiSquareStopping:
 
 
 class MoveInputs(NamedTuple):
-    """What the particles of a run share in an iteration.
+    """Inputs of an iteration, common to the particles of a run.
 
     Attributes:
         u: Inputs of the model.
