@@ -100,6 +100,8 @@ def main() -> None:
                 cwd=ROOT,
                 check=True,
             )
+            for name in ("conf", "experiments"):  # those of an installed checkout otherwise
+                (tree / "pfbench" / name).symlink_to(tree / name)
         try:
             rows = []
             for world in WORLDS:

@@ -93,7 +93,6 @@ from pfbench.filter.marginal.rao_blackwellised import (
     RaoBlackwellisedFilter as RaoBlackwellisedFilter,
 )
 from pfbench.filter.moves.metropolis import (
-    KernelCycle as KernelCycle,
     McmcKernel as McmcKernel,
     MetropolisHastings as MetropolisHastings,
     Move as Move,
@@ -102,7 +101,6 @@ from pfbench.filter.moves.metropolis import (
 from pfbench.filter.moves.path_kernels import (
     LastStateKernel as LastStateKernel,
     LikelihoodRatioKernel as LikelihoodRatioKernel,
-    NoiseFlowGibbsKernel as NoiseFlowGibbsKernel,
     NoiseFlowKernel as NoiseFlowKernel,
     NoiseFlowStatKernel as NoiseFlowStatKernel,
     PathBlockKernel as PathBlockKernel,

@@ -169,7 +169,9 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
             "numbers that are not finite for the first step",
             "Check the inputs and the parameters of the model.",
         )
-        _check_propagation(model, record, x, w, next_x)
+        _check_independence(step_model, x, first.u, w, next_x)
+        moving = 1 if model.observes_initial and record.y.shape[1] > 1 else 0
+        check_noise_gain(model.at_step(moving), x, record.at_step(moving).u)
         observed = _observe(step_model, next_x, first.u)
         check_event_dimension(observed, f"{name}.observation", width)
     shape = (*observed.batch_shape, *observed.event_shape)
@@ -194,22 +196,17 @@ def check_model(model: StateSpaceModel, record: Record) -> None:
 def _check_measurements(model: StateSpaceModel, record: Record, first: Any, x: Tensor) -> None:
     """Check the measurements against their distribution in the first step, at states after it."""
     check_measurement_resolution(first, record.y, type(model).__name__)
-    _check_counts(model.at_step(0), first)
-    _check_likelihood(model.at_step(0), record.at_step(0), x)
-    _check_support(model, record, first, x)
-
-
-def _check_counts(model: StateSpaceModel, observed: Any) -> None:
-    """Check that a model states whether its measurements are discrete."""
-    base = observed.base_dist if isinstance(observed, Independent) else observed
+    base = first.base_dist if isinstance(first, Independent) else first
     support = getattr(base, "support", None)
     require(
-        model.has_counts or not getattr(support, "is_discrete", False),
-        f"{type(model).__name__}.has_counts",
+        model.at_step(0).has_counts or not getattr(support, "is_discrete", False),
+        f"{type(model.at_step(0)).__name__}.has_counts",
         "be True for discrete measurements",
         f"False with a support of {support}",
         "Set `has_counts = True` in the class: its evidence is a probability, which is not compared with densities.",
     )
+    _check_likelihood(model.at_step(0), record.at_step(0), x)
+    _check_support(model, record, first, x)
 
 
 def _check_likelihood(model: StateSpaceModel, record: Record, x: Tensor) -> None:
@@ -255,15 +252,6 @@ def _fixed_support(distribution: Any) -> Constraint | None:
     if not isinstance(support, Constraint) or is_dependent(support) or support.event_dim:
         return None
     return support
-
-
-def _check_propagation(
-    model: StateSpaceModel, record: Record, x: Tensor, w: Tensor, next_x: Tensor
-) -> None:
-    """Check that particles move by themselves, and that noise has the gain that the model states."""
-    _check_independence(model.at_step(0), x, record.at_step(0).u, w, next_x)
-    moving = 1 if model.observes_initial and record.y.shape[1] > 1 else 0
-    check_noise_gain(model.at_step(moving), x, record.at_step(moving).u)
 
 
 def _check_independence(

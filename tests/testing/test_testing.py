@@ -25,7 +25,6 @@ from pfbench.filter import (
     GaussianFilter,
     GuidedNoiseProposal,
     HilbertSortedResampler,
-    KernelCycle,
     LastStateKernel,
     LookAheadWeights,
     MetropolisHastings,
@@ -196,9 +195,7 @@ def test_moves_pass_as_kernels_and_as_moves() -> None:
     for move in (
         PathBlockKernel(3, SmoothedSegment()),
         NoiseFlowStatKernel(),
-        KernelCycle(
-            (MetropolisHastings(LastStateKernel()), MetropolisHastings(NoiseFlowKernel(10))), 2
-        ),
+        MetropolisHastings(NoiseFlowKernel(10), 6),
     ):
         assert check_move(move, paths=500).details["moved"] > 0.5
 
@@ -388,7 +385,6 @@ SILENT = {
     "preference": lambda s: ParticleFilter(10, auxiliary_weights=s),
     "form": lambda s: ParticleFilter(10, auxiliary_weights=TemperedWeights(s)),
     "move": lambda s: ParticleFilter(10, moves=(s,)),
-    "move in a cycle": lambda s: ParticleFilter(10, moves=(KernelCycle((s,)),)),
     "proposal": lambda s: ParticleFilter(10, proposal=s),
     "points": lambda s: ParticleFilter(10, points=s),
     "points of a proposal": lambda s: ParticleFilter(10, proposal=SqmcProposal(s)),

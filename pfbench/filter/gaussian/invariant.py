@@ -181,13 +181,15 @@ def find_group_chart(model: StateSpaceModel, side: str) -> Chart:
     inner = model
     while isinstance(inner, ModelWrapper):
         inner = inner.model
-    group_chart = getattr(inner, "group_chart", None)
-    if group_chart is None:
-        raise ValueError(
-            f"filter.chart must be an invariant chart of the model, got {side} with "
-            f"{type(inner).__name__}, which has none. Choose filter=ekf, or a scenario whose truth "
-            "has an attitude, as scenario=recorded_quad_flights with model=strapdown_total."
-        )
+    group_chart: Any = getattr(inner, "group_chart", None)
+    require(
+        group_chart is not None,
+        "filter.chart",
+        "be an invariant chart of the model",
+        f"{side} with {type(inner).__name__}, which has none",
+        "Choose filter=ekf, or a scenario whose truth has an attitude, as scenario=recorded_quad_flights "
+        "with model=strapdown_total.",
+    )
     chart: Chart = group_chart(side)
     return chart
 

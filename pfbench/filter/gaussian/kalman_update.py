@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pfbench.core.chart import Chart
 from pfbench.core.linear_algebra import factor, jacobian
+from pfbench.core.parameter_checks import require
 from pfbench.filter.gaussian.innovation import Innovation, ObservationReader
 from pfbench.filter.gaussian.linearisation_rules import AffineApproximation
 from pfbench.filter.whitening import LOG_2PI
@@ -198,20 +199,21 @@ def check_measurement_update(update: object, adaptations: Sequence[object]) -> N
     """Check that an update has the calls of one, and that no adaptation comes with it."""
     if update is None:
         return
-    if isinstance(update, type) or not all(
-        hasattr(update, a) for a in ("observe", "read_parameters")
-    ):
-        kind = update.__name__ if isinstance(update, type) else type(update).__name__
-        raise ValueError(
-            "filter.measurement_update must be an update for an observation distribution, got "
-            f"{kind}. Use StudentObservationUpdate() or MixtureObservationUpdate()."
-        )
-    if adaptations:
-        names = " and ".join(type(adaptation).__name__ for adaptation in adaptations)
-        raise ValueError(
-            "filter.noise_adaptations and filter.gain_adaptations must be empty with "
-            f"measurement_update, got {names}. Remove them: the measurement would count twice."
-        )
+    is_update = all(hasattr(update, a) for a in ("observe", "read_parameters"))
+    require(
+        is_update and not isinstance(update, type),
+        "filter.measurement_update",
+        "be an update for an observation distribution",
+        update.__name__ if isinstance(update, type) else type(update).__name__,
+        "Use StudentObservationUpdate() or MixtureObservationUpdate().",
+    )
+    require(
+        not adaptations,
+        "filter.noise_adaptations and filter.gain_adaptations",
+        "be empty with measurement_update",
+        " and ".join(type(adaptation).__name__ for adaptation in adaptations),
+        "Remove them: the measurement would count twice.",
+    )
 
 
 def measurement_posterior(

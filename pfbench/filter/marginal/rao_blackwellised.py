@@ -382,9 +382,10 @@ def embed_components(values: Tensor, indices: list[int], d: int) -> Tensor:
 
 def check_normal(model: StateSpaceModel, label: str, distribution: Distribution) -> None:
     """Check that a noise distribution is normal."""
-    if not is_normal(distribution):
-        raise ValueError(
-            f"filter RaoBlackwellisedFilter must have a model where {label} is normal, got "
-            f"{type(unwrap_independent(distribution)).__name__} in {type(model).__name__}. "
-            "Sample all states (filter=sir), or choose normal noise."
-        )
+    require(
+        is_normal(distribution),
+        "filter RaoBlackwellisedFilter",
+        f"have a model where {label} is normal",
+        f"{type(unwrap_independent(distribution)).__name__} in {type(model).__name__}",
+        "Sample all states (filter=sir), or choose normal noise.",
+    )

@@ -144,15 +144,20 @@ class StateHistory(PathHistory):
         old = max(0, len(past) - 1 - self.lag)
         additions = {"states": after.x, "log_like": log_like}
         if self.store_noise:
-            additions |= _noise_history(model, after, w)
+            if w is None:
+                raise ValueError(
+                    "filter.proposal must return its noise if moves use it again, got None. "
+                    "Choose BootstrapProposal."
+                )
+            mean, covariance = weighted_mean_cov(model.chart, after)
+            additions |= {"noise": w, "mean": mean[:, None], "covariance": covariance[:, None]}
         window = {
             name: concatenate_histories([before.window[name][:, :, old:], new.unsqueeze(2)])
             for name, new in additions.items()
         }
         if old:
             past = (_unobserved(past[old]), *past[old + 1 :])
-            zeros = torch.zeros_like(window["log_like"][:, :, :1])
-            window["log_like"] = concatenate_histories([zeros, window["log_like"][:, :, 1:]])
+            window["log_like"][:, :, 0] = 0.0
         return after._replace(window=window, past=past)
 
 
@@ -166,19 +171,6 @@ def combine_histories(histories: Sequence[PathHistory | None]) -> PathHistory | 
         if history is not None:
             joint = history if joint is None else joint.merge(history)
     return joint
-
-
-def _noise_history(
-    model: StateSpaceModel, belief: ParticleBelief, w: Tensor | None
-) -> dict[str, Tensor]:
-    """Return the noise of a step and the filtered distribution after it."""
-    if w is None:
-        raise ValueError(
-            "filter.proposal must return its noise if moves use it again, got None. "
-            "Choose BootstrapProposal."
-        )
-    mean, covariance = weighted_mean_cov(model.chart, belief)
-    return {"noise": w, "mean": mean.unsqueeze(1), "covariance": covariance.unsqueeze(1)}
 
 
 def get_transition(
@@ -367,7 +359,8 @@ class MetropolisHastings(Move):
             proposed, log_alpha = self.kernel.propose(model, belief, step_draws)
             log_u = torch.log(step_draws.uniform("accept", active_mask.shape[1], 1).squeeze(2))
             accept = log_u < log_alpha  # never where it is NaN
-            belief = _choose(accept, proposed, belief)
+            window = {k: _where(accept, proposed.window[k], a) for k, a in belief.window.items()}
+            belief = belief._replace(x=_where(accept, proposed.x, belief.x), window=window)
             accepted = accepted + (accept & active_mask)
         if belief.ancestors is not None:
             n = active_mask.shape[1]
@@ -378,42 +371,6 @@ class MetropolisHastings(Move):
 
     def _rate(self, accepted: Tensor, log_w: Tensor) -> Tensor:
         return accepted.sum(1) / (self.mcmc_steps * torch.isfinite(log_w).sum(1))
-
-
-@dataclass(frozen=True)
-class KernelCycle(Move):
-    """Moves in turn, repeated. A cycle of invariant kernels is invariant.
-
-    Attributes:
-        moves: Moves in order.
-        mcmc_steps: Number of repetitions.
-    """
-
-    moves: Sequence[Move]
-    mcmc_steps: int = 1
-
-    @property
-    @override
-    def is_exact(self) -> bool:
-        return is_every_part_exact(
-            **{f"move.moves[{i}]": move for i, move in enumerate(self.moves)}
-        )
-
-    @property
-    @override
-    def required_history(self) -> PathHistory | None:
-        return combine_histories([move.required_history for move in self.moves])
-
-    @override
-    def __call__(
-        self, model: StateSpaceModel, belief: ParticleBelief, resampled: Tensor, draws: RandomStream
-    ) -> tuple[ParticleBelief, Tensor]:
-        total = torch.zeros_like(belief.log_w[:, 0])
-        for turn in range(self.mcmc_steps):
-            for i, move in enumerate(self.moves):
-                belief, rate = move(model, belief, resampled, relabel(draws, f"turn_{turn}.{i}."))
-                total = total + rate
-        return belief, total / max(1, self.mcmc_steps * len(self.moves))
 
 
 def _select_runs(belief: ParticleBelief, rows: Tensor) -> ParticleBelief:
@@ -468,15 +425,8 @@ def _replace_runs(
     return belief._replace(x=replace(belief.x, moved_belief.x), window=window, ancestors=ancestors)
 
 
-def _choose(accept: Tensor, new: ParticleBelief, old: ParticleBelief) -> ParticleBelief:
-    """Return `new` for accepted particles [R, N] and `old` for others."""
-    window = {
-        name: a if new.window[name] is a else _where(accept, new.window[name], a)
-        for name, a in old.window.items()
-    }
-    return old._replace(x=_where(accept, new.x, old.x), window=window)
-
-
 def _where(mask: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """Select among [R, N, ...] by a mask [R, N or 1]."""
+    """Select among [R, N, ...] by a mask [R, N or 1]; what is the same object remains it."""
+    if new is old:
+        return old
     return torch.where(mask.reshape(*mask.shape, *[1] * (old.dim() - 2)), new, old)

@@ -23,6 +23,7 @@ from pfbench.filter.linearisation import (
     transition_jacobian,
     unwrap_independent,
 )
+from pfbench.filter.loop import MEMORY_OF_PASS
 from pfbench.filter.moves.metropolis import (
     McmcKernel,
     PathHistory,
@@ -40,7 +41,7 @@ from pfbench.filter.moves.path_proposals import (
 )
 from pfbench.filter.moves.taped_paths import find_taped_paths
 from pfbench.filter.particle.regularised_resampling import GaussianSmoothing, SmoothingKernel
-from pfbench.filter.whitening import compute_half_square, whiten
+from pfbench.filter.whitening import compute_half_square, fill_missing, whiten
 from pfbench.model.base import StateSpaceModel
 
 
@@ -63,8 +64,8 @@ class PathStatistics(PathHistory):
         if isinstance(history, PathStatistics):
             return self
         raise ValueError(
-            "filter.moves must not combine NoiseFlowStatKernel or NoiseFlowGibbsKernel with other "
-            "kernels, got both. Remove the other kernels, because these two do not store paths."
+            "filter.moves must not combine NoiseFlowStatKernel with other "
+            "kernels, got both. Remove the other kernels, because this one does not store paths."
         )
 
     @override
@@ -73,13 +74,13 @@ class PathStatistics(PathHistory):
     ) -> ParticleBelief:
         """Start with the information and score of the initial distribution."""
         root, ok = factor(covariance)
-        if not bool((ok & (root.diagonal(dim1=-2, dim2=-1) > 0.0).all(-1)).all()):
-            variance = covariance[0].diagonal().tolist()
-            raise ValueError(
-                "filter.moves: the initial covariance must be positive definite for kernels that use "
-                f"statistics of the path, got variances {variance} of the particles. Use "
-                "NoiseFlowKernel, or a larger initial standard deviation or number of particles."
-            )
+        require(
+            (ok & (root.diagonal(dim1=-2, dim2=-1) > 0.0).all(-1)).all(),
+            "filter.moves: the initial covariance",
+            "be positive definite for kernels that use statistics of the path",
+            f"variances {covariance[0].diagonal().tolist()} of the particles",
+            "Use NoiseFlowKernel, or a larger initial standard deviation or number of particles.",
+        )
         information = torch.cholesky_inverse(root)
         score = -model.chart.subtract(belief.x, mean.unsqueeze(1)) @ information
         return belief._replace(window={"score": score, "information": information.unsqueeze(1)})
@@ -239,16 +240,24 @@ class NoiseFlowKernel(McmcKernel):
         self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
     ) -> tuple[ParticleBelief, Tensor]:
         window, chart = belief.window, model.chart
-        start, centre = window["states"][:, :, 0], window["mean"][:, :, 0]
-        step, xi = self.random_walk(model, belief, start, draws), chart.subtract(start, centre)
+        start = window["states"][:, :, 0]
+        step = self.random_walk(model, belief, start, draws)
+        if "score" in window:
+            change = step @ window["information"][:, 0]
+            white_step = step @ window["whitening"][:, 0].mT
+            white = window["white"] + white_step
+            gain, loss = window["score"] - 0.5 * change, white - 0.5 * white_step
+            ends = {
+                "states": (start + step).unsqueeze(2),
+                "score": window["score"] - change,
+                "white": white,
+            }
+            return belief._replace(window=window | ends), (step * gain - white_step * loss).sum(-1)
+        centre = window["mean"][:, :, 0]
+        xi = chart.subtract(start, centre)
         proposed_start = start + step if chart.flat else chart.add(centre, xi + step)
         root = factor(window["covariance"][:, 0, 0])[0]
         before, after = (compute_half_square(whiten(a, root)) for a in (xi, xi + step))
-        if "score" in window:
-            change = step @ window["information"][:, 0]
-            log_alpha = before - after + (step * (window["score"] - 0.5 * change)).sum(-1)
-            new_window = {"states": proposed_start.unsqueeze(2), "score": window["score"] - change}
-            return belief._replace(window=window | new_window), log_alpha
         noise = self._refresh_noise(model, window["noise"], draws)
         states, log_like = propagate_path(model, proposed_start, noise, belief.past)
         log_alpha = before - after + (log_like - window["log_like"]).sum(-1)
@@ -260,21 +269,26 @@ class NoiseFlowKernel(McmcKernel):
         """Return the particles of a linear model with the start and what its likelihood requires.
 
         Under fixed noises the log likelihood of the path is then quadratic in the start, with the gradient
-        `score` [R, N, d] and the curvature `information` [R, 1, d, d]. A step of a sweep costs no model step.
+        `score` [R, N, d] and the curvature `information` [R, 1, d, d]. The start has N(0, I) as its distribution
+        after `whitening` [R, 1, d, d], which gives `white` [R, N, d]. A step of a sweep costs no model step.
         """
         is_quadratic = model.linear and model.chart.flat and self.noise_refresh == 0.0
         if not (is_quadratic and belief.past):
             return belief
-        window, states = belief.window, belief.window["states"]
-        score, information = _measure_start(model, states, belief.past)
-        window = {
-            "states": states[:, :, :1],
-            "mean": window["mean"],
-            "covariance": window["covariance"],
+        window, start = belief.window, belief.window["states"][:, :, :1]
+        score, information = _measure_start(model, window["states"], belief.past)
+        root = fill_missing(factor(window["covariance"][:, 0, 0])[0])
+        whitening = torch.linalg.solve_triangular(
+            root, torch.eye(root.shape[-1]).to(root), upper=False
+        )
+        short = {
+            "states": start,
             "score": score,
+            "white": (start - window["mean"][:, :, :1]).squeeze(2) @ whitening.mT,
             "information": information.unsqueeze(1),
+            "whitening": whitening.unsqueeze(1),
         }
-        return belief._replace(window=window)
+        return belief._replace(window=short, past=())
 
     @override
     def complete(
@@ -293,7 +307,9 @@ class NoiseFlowKernel(McmcKernel):
             "states": torch.where(accepted[..., None, None], states, window["states"]),
             "log_like": torch.where(accepted.unsqueeze(2), values, window["log_like"]),
         }
-        return short._replace(x=additions["states"][:, :, -1], window=window | additions)
+        return before._replace(
+            x=additions["states"][:, :, -1], window=window | additions, ancestors=short.ancestors
+        )
 
     def _refresh_noise(self, model: StateSpaceModel, w: Tensor, draws: RandomStream) -> Tensor:
         """Mix the noises [R, N, K, W] with new ones."""
@@ -341,6 +357,22 @@ def propagate_path(
     return results
 
 
+def _linearise(
+    model: StateSpaceModel, x: Tensor, record: Record
+) -> tuple[Record, Tensor, Tensor, Tensor]:
+    """Compute what no state changes in a step of a linear model, at any state of each run.
+
+    Returns the record and the transition Jacobian [R or 1, d, d]. Then the measurement Jacobian H, and H divided by the
+    covariance, [R, 2, k, d]. Last the measurement at state 0 minus its mean there, [R, k, 1]. Shapes: x [R, 1, D].
+    """
+    slope = measurement_jacobian(model, x, record)[:, 0]
+    noise = distribution_covariance(model.observation(x, record.u))[:, 0]
+    observed = mask_covariance(noise, ~torch.isnan(record.y))
+    slopes = torch.stack([slope, torch.linalg.solve_ex(observed, slope)[0]], 1)
+    offset = linearised_innovation(model, x, record).mT + slope @ x.mT
+    return record, transition_jacobian(model, x, record.u)[:, 0], slopes, offset
+
+
 def _measure_start(
     model: StateSpaceModel, states: Tensor, past: tuple[Record, ...]
 ) -> tuple[Tensor, Tensor]:
@@ -348,20 +380,26 @@ def _measure_start(
 
     Returns gradient [R, N, d] and curvature [R, d, d]. Shapes: states [R, N, K+1, D].
     """
-    d = model.chart.dimension
-    gradient = torch.zeros_like(states[:, :, 0])
-    curvature = states.new_zeros(states.shape[0], d, d)
-    jacobian = torch.eye(d, dtype=states.dtype, device=states.device).expand_as(curvature)
-    for j, record in enumerate(past):
-        x = states[:, :, j]
-        if j > 0:
-            jacobian = transition_jacobian(model, x[:, :1], record.u)[:, 0] @ jacobian
-        h = measurement_jacobian(model, x[:, :1], record)[:, 0] @ jacobian
-        noise = distribution_covariance(model.observation(x[:, :1], record.u))[:, 0]
-        weight = torch.linalg.solve_ex(mask_covariance(noise, ~torch.isnan(record.y)), h)[0]
-        gradient = gradient + linearised_innovation(model, x, record) @ weight
-        curvature = curvature + h.mT @ weight
-    return gradient, curvature
+    memory = MEMORY_OF_PASS.get()
+    owner, stored = (memory or {}).get(_linearise, (model, {}))
+    stored = stored if owner is model else {}  # by the identity of a record, which lives as long
+    stored = {
+        id(record): stored.get(id(record)) or _linearise(model, states[:, :1, j], record)
+        for j, record in enumerate(past)
+    }
+    if memory is not None:
+        memory[_linearise] = model, stored
+    _, transitions, slopes, offsets = zip(*stored.values(), strict=True)
+    products = [torch.eye(states.shape[-1]).to(states).expand(len(states), -1, -1)]
+    for transition in transitions[1:]:
+        products.append(transition @ products[-1])
+    along = torch.stack(products, 1).unsqueeze(1)
+    plain, weighted = (torch.stack(slopes, 2) @ along).flatten(2, 3).unbind(1)
+    residuals = [
+        torch.baddbmm(offset, slope[:, 0], states[:, :, j].mT, alpha=-1.0)
+        for j, (slope, offset) in enumerate(zip(slopes, offsets, strict=True))
+    ]
+    return (weighted.mT @ torch.cat(residuals, 1)).mT, plain.mT @ weighted
 
 
 @dataclass(frozen=True)
@@ -388,30 +426,6 @@ class NoiseFlowStatKernel(McmcKernel):
         information_shift = delta @ belief.window["information"][:, 0]
         log_alpha = (delta * (b - 0.5 * information_shift)).sum(-1)
         window = belief.window | {"score": b - information_shift}
-        return belief._replace(x=model.chart.add(belief.x, delta), window=window), log_alpha
-
-
-@dataclass(frozen=True)
-class NoiseFlowGibbsKernel(McmcKernel):
-    """`NoiseFlowStatKernel` with delta from its conditional distribution.
-
-    The distribution is N(Lambda^-1 b, Lambda^-1). Always accepted if Lambda has a Cholesky factor.
-    """
-
-    is_exact = False
-    required_history = PathStatistics()
-
-    @override
-    def propose(
-        self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream
-    ) -> tuple[ParticleBelief, Tensor]:
-        b, information = belief.window["score"], belief.window["information"][:, 0]
-        root, ok = factor(information)
-        white = torch.linalg.solve_triangular(root, b.mT, upper=False).mT
-        e = draws.normal("gibbs", b.shape[1], b.shape[2])
-        delta = torch.linalg.solve_triangular(root.mT, (white + e).mT, upper=True).mT
-        log_alpha = torch.where(ok[:, None] & torch.isfinite(delta).all(-1), 0.0, -torch.inf)
-        window = belief.window | {"score": b - delta @ information}
         return belief._replace(x=model.chart.add(belief.x, delta), window=window), log_alpha
 
 

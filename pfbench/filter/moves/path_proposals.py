@@ -215,7 +215,8 @@ def _linearise_path(
     x, steps = old.states[:, :, 0], []
     jacobians = 1 if model.linear else x.shape[1]  # a linear model has one for all particles
     has_mean = shares_slopes and not model.linear
-    before = _find_mean(model, x) if has_mean else x[:, :jacobians]
+    equal = torch.full_like(x[..., 0], 1.0 / x.shape[1])
+    before = model.chart.mean(x, equal).unsqueeze(1) if has_mean else x[:, :jacobians]
     for record in old.records:
         transition = transition_jacobian(model, before, record.u)
         process_covariance = distribution_covariance(get_transition(model, before, record))
@@ -235,12 +236,6 @@ def _linearise_path(
             )
         )
     return steps
-
-
-def _find_mean(model: StateSpaceModel, x: Tensor) -> Tensor:
-    """Return the mean state of each run, [R, 1, D]."""
-    equal = torch.full_like(x[..., 0], 1.0 / x.shape[1])
-    return model.chart.mean(x, equal).unsqueeze(1)
 
 
 def _filter_path(steps: list[LinearisedStep], shape: torch.Size) -> list[tuple[Tensor, Tensor]]:

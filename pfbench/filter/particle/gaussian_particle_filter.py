@@ -16,6 +16,7 @@ from typing_extensions import override
 
 from pfbench.core.chart import Chart
 from pfbench.core.linear_algebra import factor
+from pfbench.core.parameter_checks import require
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, weighted_mean_cov
@@ -129,9 +130,10 @@ def refuse_history(belief: ParticleBelief, method_name: str) -> None:
         *belief.window,
         *(name for name, value in belief.memory.items() if value.shape[1] != 1),
     ]
-    if stored:
-        raise ValueError(
-            f"filter.resampler must copy particles that store {', '.join(stored)}, got "
-            f"{method_name}, which draws new ones without a past. Choose a proposal without memory "
-            "and no moves, or another resampler."
-        )
+    require(
+        not stored,
+        "filter.resampler",
+        f"copy particles that store {', '.join(stored)}",
+        f"{method_name}, which draws new ones without a past",
+        "Choose a proposal without memory and no moves, or another resampler.",
+    )

@@ -101,7 +101,14 @@ class ParticleFilter(Filter):
         require_ranges("filter", self, particles=rule)
         _ = self.is_exact  # warns of each stage that does not state it
         if self.initial_proposal is not None:
-            _check_initial_proposal(self.moves, self.particle_count)
+            count = self.particle_count
+            require(
+                not self.moves and isinstance(count, FixedCount),
+                "filter.initial_proposal",
+                "be used without moves and with a fixed number of particles",
+                f"{len(self.moves)} moves and {type(count).__name__}",
+                "Remove one of them.",
+            )
         require(
             not self.moves or not isinstance(self.weight_update, MemoryWeightUpdate),
             "filter.moves",
@@ -116,14 +123,13 @@ class ParticleFilter(Filter):
             f"{len(self.moves)} with {type(self.proposal).__name__}",
             "Remove the moves.",
         )
-        if (self.history is not None or self.stores_path) and not isinstance(
-            self.resampler, EssResampler
-        ):
-            name = type(self.resampler).__name__
-            raise ValueError(
-                "filter.resampler must copy particles with their past for moves or an interval, got "
-                f"{name}. Choose EssResampler."
-            )
+        require(
+            not (self.history or self.stores_path) or isinstance(self.resampler, EssResampler),
+            "filter.resampler",
+            "copy particles with their past for moves or an interval",
+            type(self.resampler).__name__,
+            "Choose EssResampler.",
+        )
 
     @property
     @override
@@ -339,17 +345,6 @@ class ParticleFilter(Filter):
             return compute_nis(model, belief.x, summary.predicted_log_w, get_record())
 
         return make_step_info(model, belief, summary.mean, summary.variance, summary.trace, nis)
-
-
-def _check_initial_proposal(moves: tuple[Move, ...], count: ParticleCount) -> None:
-    """Raise an error for stages that need equal weights of the initial distribution."""
-    require(
-        not moves and isinstance(count, FixedCount),
-        "filter.initial_proposal",
-        "be used without moves and with a fixed number of particles",
-        f"{len(moves)} moves and {type(count).__name__}",
-        "Remove one of them.",
-    )
 
 
 def _hold_resampling(log_a: Tensor, belief: ParticleBelief) -> tuple[Tensor, ParticleBelief]:

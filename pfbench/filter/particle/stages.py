@@ -13,7 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from pfbench.core.density import StandardNormal
-from pfbench.core.parameter_checks import require_ranges
+from pfbench.core.parameter_checks import require, require_ranges
 from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.core.simulate import draw_values
@@ -92,13 +92,13 @@ def count_particles(stage: ParticleCount, belief: ParticleBelief) -> Tensor:
     n, (runs, slots) = stage(belief), belief.log_w.shape
     if type(stage).__module__.startswith("pfbench.") or is_capturing():
         return n  # within its limits; a check would make the device wait
-    is_valid = n.shape in ((runs, 1), (1, 1)) and bool(((n >= 1) & (n <= slots)).all())
-    if not is_valid:
-        values = f"{list(n.shape)} with values from {float(n.min()):g} to {float(n.max()):g}"
-        raise ValueError(
-            f"particle_count {type(stage).__name__} must return [{runs} or 1, 1] numbers from 1 to "
-            f"{slots} slots, got {values}. Start with more particles, or clamp the number."
-        )
+    require(
+        n.shape in ((runs, 1), (1, 1)) and ((n >= 1) & (n <= slots)).all(),
+        f"particle_count {type(stage).__name__}",
+        f"return [{runs} or 1, 1] numbers from 1 to {slots} slots",
+        f"{list(n.shape)} with values from {float(n.min()):g} to {float(n.max()):g}",
+        "Start with more particles, or clamp the number.",
+    )
     return n
 
 

@@ -78,11 +78,8 @@ class OneStepResponse(DmcResponse):
         self, model: StateSpaceModel, belief: ParticleBelief, record: Record, h: Tensor
     ) -> tuple[Tensor, Tensor]:
         chart, d = model.chart, model.chart.dimension
-        if self.units is not None and len(self.units) != d:
-            raise ValueError(
-                f"response.units must have {d} numbers, got {len(self.units)}. "
-                "Set one for each state."
-            )
+        count = d if self.units is None else len(self.units)
+        require(count == d, "response.units", f"have {d} numbers", count, "Set one for each state.")
         b = h.new_ones(d) if self.units is None else h.new_tensor(list(self.units))
         b[state_indices(model, "response.uncontrolled_states", self.uncontrolled_states)] = 0.0
         centre = chart.mean(belief.x, normalise_log_weights(belief.log_w)).unsqueeze(1)

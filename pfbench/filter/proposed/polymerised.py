@@ -349,13 +349,14 @@ class PolymerisedResampler(Resampler):
     def __post_init__(self) -> None:
         rule = "[0, 1] Use 0 to resample never, 1 at every step."
         require_ranges("resampler", self, ess_threshold=rule)
-        if self.axes is not None and (
-            not self.axes or len(set(self.axes)) < len(self.axes) or min(self.axes) < 0
-        ):
-            raise ValueError(
-                f"resampler.axes must be distinct indices from 0, got {list(self.axes)}. "
-                "Use null for the default."
-            )
+        axes = [0] if self.axes is None else list(self.axes)
+        require(
+            axes and len(set(axes)) == len(axes) and min(axes) >= 0,
+            "resampler.axes",
+            "be distinct indices from 0",
+            axes,
+            "Use null for the default.",
+        )
 
     @override
     def __call__(
@@ -396,11 +397,13 @@ class PolymerisedResampler(Resampler):
         d = model.chart.dimension
         if self.axes is None:
             return model.groups.get("position", tuple(range(d)))[:2]
-        if max(self.axes) >= d:
-            raise ValueError(
-                f"resampler.axes must be at most {d - 1} for {type(model).__name__}, "
-                f"got {list(self.axes)}. Remove larger indices."
-            )
+        require(
+            max(self.axes) < d,
+            "resampler.axes",
+            f"be at most {d - 1} for {type(model).__name__}",
+            list(self.axes),
+            "Remove larger indices.",
+        )
         return self.axes
 
 

@@ -8,8 +8,9 @@ particle filter for integrated navigation system"].
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,6 +22,7 @@ from pfbench.core.random_stream import RandomStream
 from pfbench.core.record import Record
 from pfbench.filter.belief import ParticleBelief, normalise_log_weights
 from pfbench.filter.exactness import has_bounded_weights, is_every_part_exact
+from pfbench.filter.moves.path_kernels import propagate_path
 from pfbench.filter.particle.stages import (
     Proposal,
     ProposalSample,
@@ -45,14 +47,13 @@ from pfbench.filter.proposed.swarm_motion import (
     follow_logistic,
     iterate_logistic,
     logistic_map,
-    match_memory_layout,
     safe_seeds,
     select_particle,
-    select_swarm_by_run,
 )
 from pfbench.filter.proposed.swarm_weighting import MixtureWeighting, SwarmWeighting
+from pfbench.filter.whitening import compute_half_square
 from pfbench.kernels.dispatch import is_capturing
-from pfbench.model.base import StateSpaceModel
+from pfbench.model.base import ModelWrapper, StateSpaceModel
 
 
 @dataclass(frozen=True)
@@ -161,6 +162,100 @@ class ChiSquareStopping:
         return distance <= limits[observed_mask.sum(-1)]
 
 
+class MoveInputs(NamedTuple):
+    """Inputs of an iteration, common to the particles of a run.
+
+    Attributes:
+        u: Inputs of the model.
+        y: Measurements, [R, Dy].
+        penalty: W of the fitness, [R, k, k].
+        origin: As in `SwarmFrame`.
+        direction: As in `SwarmFrame`.
+        scale: Scale of the velocity, [R, 1, k].
+        spread: Standard deviation of the predicted particles, [R, 1, k].
+    """
+
+    u: Any
+    y: Tensor
+    penalty: Tensor
+    origin: Tensor
+    direction: Tensor
+    scale: Tensor
+    spread: Tensor
+
+
+class SwarmMove(ModelWrapper):
+    """Move of a swarm by given velocities, as a model: its states are the particles of the swarm.
+
+    So a tape can take it. The states are those of `SwarmState`. The noise is what stays in a step and the velocity:
+    predicted positions and their deviations, 1 for active slots, seeds of chaotic sequences that restart.
+    """
+
+    def __init__(self, proposal: SwarmProposal, model: StateSpaceModel, frame: SwarmFrame) -> None:
+        super().__init__(model)
+        self.proposal, self.frame, (k, d) = proposal, frame, frame.direction.shape[1:]
+        chaos = k * (proposal.perturbation is not None)
+        self.widths = (k, k, 1, k, 1, k, 1, chaos), (k, d, 1, chaos, k)
+        self.tape_key = id(proposal), getattr(model, "tape_key", id(model)), k
+        self.likelihood_counter = getattr(model, "likelihood_counter", None)
+
+    def split_swarm(self, x: Tensor) -> SwarmState:
+        """Return the swarm of joined columns, [R, N, S]."""
+        *columns, chaos = x.split(self.widths[0], -1)
+        columns = [a.to(self.frame.q) for a in columns]
+        columns[2::2] = [a.squeeze(-1) for a in columns[2::2]]
+        return SwarmState._make([*columns, chaos])
+
+    def fit(self, frame: SwarmFrame, q: Tensor, active: Tensor, u: MoveInputs) -> Tensor:
+        """Return the fitness of positions, -inf at inactive slots and where it is not defined, [R, N]."""
+        x, record = frame.to_states(q), Record(u.y, u.u)
+        value = self.proposal.fitness.fit_measurement(self.model, x, record)
+        value = value - compute_half_square(q @ u.penalty.mT)
+        return torch.where((active.squeeze(-1) > 0.0) & ~torch.isnan(value), value, -torch.inf)
+
+    @override
+    def propagate(self, x: Tensor, u: MoveInputs, w: Tensor) -> Tensor:
+        """Move to x + v or, if its fitness is higher, x + v + Dx, and update the records."""
+        swarm, limits, perturbation = (
+            self.split_swarm(x),
+            self.proposal.limits,
+            self.proposal.perturbation,
+        )
+        start, deviation, active, spare, v = w.split(self.widths[1], -1)
+        start, deviation, v = (a.to(swarm.q) for a in (start, deviation, v))
+        frame = self.frame._replace(
+            q=start, deviation=deviation, origin=u.origin, direction=u.direction
+        )
+        v = limits.clamp_velocity(v, u.scale)
+        move = swarm.v if self.proposal.lags_velocity else v
+        q, chaos = limits.clamp_position(swarm.q + move, u.spread), swarm.chaos
+        value = self.fit(frame, q, active, u)
+        if perturbation:
+            chaos = logistic_map(chaos, spare)
+            step = perturbation(chaos, u.scale)
+            perturbed = limits.clamp_position(swarm.q + move + step, u.spread)
+            perturbed_value = self.fit(frame, perturbed, active, u)
+            q = torch.where((perturbed_value > value).unsqueeze(-1), perturbed, q)
+            value = torch.maximum(perturbed_value, value)
+        better, worse = value > swarm.best_fitness, value < swarm.worst_fitness
+        best = torch.where(better.unsqueeze(-1), q, swarm.best)
+        worst = torch.where(worse.unsqueeze(-1), q, swarm.worst)
+        best_fitness = torch.maximum(value, swarm.best_fitness)
+        worst_fitness = torch.minimum(value, swarm.worst_fitness)
+        return join_columns((q, v, value, best, best_fitness, worst, worst_fitness, chaos))
+
+    @override
+    def log_likelihood(self, y: Tensor, x: Tensor, u: Any) -> Tensor:
+        return x.new_zeros(x.shape[:2])
+
+
+def join_columns(columns: Sequence[Tensor]) -> Tensor:
+    """Join numbers [R, N] and [R, N, k] to [R, N, S], fastest component-major in memory."""
+    return torch.cat(
+        [(a if a.dim() == 3 else a.unsqueeze(-1)).permute(2, 0, 1) for a in columns]
+    ).permute(1, 2, 0)
+
+
 @dataclass(frozen=True)
 class SwarmProposal(Proposal):
     """Bootstrap prediction followed by particle swarm optimisation [Tian et al.].
@@ -242,8 +337,7 @@ class SwarmProposal(Proposal):
         swarm, iterations = self.optimise(
             model, frame, torch.isfinite(log_w), memory, record, draws
         )
-        log_likelihood = model.log_likelihood(record.y, frame.to_states(swarm.q), record.u)
-        q, log_ratio = self.weighting(frame, swarm.q, log_likelihood, log_w, draws)
+        q, log_ratio = self.weighting(frame, swarm.q, log_w, draws)
         measured = is_measured(record).unsqueeze(1)
         if self.perturbation:
             chaos = memory["swarm.chaos"].index_copy(-1, frame.components, swarm.chaos.unsqueeze(1))
@@ -276,77 +370,43 @@ class SwarmProposal(Proposal):
         Returns:
             Final swarm, and the number of iterations of each run [R].
         """
-        penalty = self.fitness(frame)
-
-        def fitness(q: Tensor) -> Tensor:
-            value = self.fitness.fit_measurement(model, frame.to_states(q), record) + penalty(q)
-            return torch.where(active_mask & ~torch.isnan(value), value, -torch.inf)
-
-        swarm = initial = self._initialise_swarm(frame, fitness(frame.q), memory)
-        spread = frame.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt().unsqueeze(1)
-        by_prior = self.limits.scale_by_prior
-        scale = memory["swarm.scale"][..., frame.components] if by_prior else spread
-        spare = self._draw_spare_seeds(frame.q, draws)
+        q, spare, chaos = frame.q, frame.q[..., :0], frame.q[..., :0]
+        if self.perturbation:
+            spare = safe_seeds(draws.uniform("swarm.spare", *q.shape[1:]))
+            chaos = memory["swarm.chaos"][:, 0, :, frame.components]
+        shared = self._collect_inputs(frame, memory, record)
+        move, step = SwarmMove(self, model, frame), Record(record.y, shared)
+        constant = q, frame.deviation, active_mask.to(q), spare
+        fitness = move.fit(frame, q, constant[2].unsqueeze(-1), shared)
+        initial = join_columns((q, torch.zeros_like(q), fitness, q, fitness, q, fitness, chaos))
         active = observed_runs = is_measured(record)
-        iterations = torch.zeros_like(active, dtype=torch.long)
+        x, iterations = initial, torch.zeros_like(active, dtype=torch.long)
         for i in range(1, self.iterations + 1):
             if not (active.is_cuda or is_capturing()) and not bool(active.any()):
                 break
+            swarm = move.split_swarm(x)
             v = self.velocity(swarm, active_mask, i / self.iterations, draws, f"swarm.velocity.{i}")
             iterations = iterations + active
-            updated = self._move_swarm(swarm, v, fitness, scale, spread, spare)
-            swarm = select_swarm_by_run(active, updated, swarm) if self.stopping else updated
+            w = join_columns((*constant, v)).unsqueeze(2)
+            after = propagate_path(move, x, w, (step, step))[0][:, :, 1]
+            x = torch.where(active[:, None, None], after, x) if self.stopping else after
             if self.stopping:
-                best = swarm.best_fitness.argmax(1)
-                best_state = select_particle(frame.to_states(swarm.best), best)
-                active = active & ~self.stopping(model, best_state, record)
-        return select_swarm_by_run(observed_runs, swarm, initial), iterations
+                swarm = move.split_swarm(x)
+                best = select_particle(frame.to_states(swarm.best), swarm.best_fitness.argmax(1))
+                active = active & ~self.stopping(model, best, record)
+        return move.split_swarm(torch.where(observed_runs[:, None, None], x, initial)), iterations
 
-    def _draw_spare_seeds(self, q: Tensor, draws: RandomStream) -> Tensor | None:
-        """Draw seeds for chaotic sequences that restart, [R, N, k]."""
-        if not self.perturbation:
-            return None
-        return match_memory_layout(safe_seeds(draws.uniform("swarm.spare", *q.shape[1:])), q)
-
-    def _move_swarm(
-        self,
-        swarm: SwarmState,
-        v: Tensor,
-        fitness: Callable[[Tensor], Tensor],
-        scale: Tensor,
-        spread: Tensor,
-        spare: Tensor | None,
-    ) -> SwarmState:
-        """Move to x + v or, if its fitness is higher, x + v + Dx, and update the records."""
-        v = self.limits.clamp_velocity(v, scale)
-        move = swarm.v if self.lags_velocity else v
-        q = self.limits.clamp_position(swarm.q + move, spread)
-        value, chaos = fitness(q), swarm.chaos
-        if self.perturbation and spare is not None:
-            chaos = logistic_map(chaos, spare)
-            step = self.perturbation(chaos, scale)
-            perturbed = self.limits.clamp_position(swarm.q + move + step, spread)
-            perturbed_value = fitness(perturbed)
-            q = torch.where((perturbed_value > value).unsqueeze(-1), perturbed, q)
-            value = torch.maximum(perturbed_value, value)
-        better, worse = value > swarm.best_fitness, value < swarm.worst_fitness
-        best = torch.where(better.unsqueeze(-1), q, swarm.best)
-        worst = torch.where(worse.unsqueeze(-1), q, swarm.worst)
-        best_fitness = torch.maximum(value, swarm.best_fitness)
-        worst_fitness = torch.minimum(value, swarm.worst_fitness)
-        return SwarmState(q, v, value, best, best_fitness, worst, worst_fitness, chaos)
-
-    def _initialise_swarm(
-        self, frame: SwarmFrame, fitness: Tensor, memory: dict[str, Tensor]
-    ) -> SwarmState:
-        """Return the swarm before its first iteration, with stored chaotic values only."""
-        q = frame.q
-        chaos = (
-            match_memory_layout(memory["swarm.chaos"][:, 0, :, frame.components], q)
-            if self.perturbation
-            else q.new_zeros(len(q), 1, 1)
+    def _collect_inputs(
+        self, frame: SwarmFrame, memory: dict[str, Tensor], record: Record
+    ) -> MoveInputs:
+        """Return what the particles of a run share in all iterations of a step."""
+        spread = frame.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt().unsqueeze(1)
+        scale = (
+            memory["swarm.scale"][..., frame.components] if self.limits.scale_by_prior else spread
         )
-        return SwarmState(q, torch.zeros_like(q), fitness, q, fitness, q, fitness, chaos)
+        return MoveInputs(
+            record.u, record.y, self.fitness(frame), frame.origin, frame.direction, scale, spread
+        )
 
     def _start_step(
         self, model: StateSpaceModel, belief: ParticleBelief, draws: RandomStream

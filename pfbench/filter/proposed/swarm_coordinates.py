@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -10,11 +9,11 @@ import torch
 from torch import Tensor
 from typing_extensions import override
 
-from pfbench.core.linear_algebra import factor
+from pfbench.core.chart import Chart
+from pfbench.core.linear_algebra import factor, jacobian
 from pfbench.core.parameter_checks import require_ranges
 from pfbench.core.record import Record
-from pfbench.filter.linearisation import derivative
-from pfbench.filter.whitening import compute_half_square, fill_missing, whiten
+from pfbench.filter.whitening import fill_missing, whiten
 from pfbench.model.base import StateSpaceModel
 
 
@@ -25,13 +24,24 @@ class SwarmFrame(NamedTuple):
         q: Predicted particles, [R, N, k].
         covariance: Covariance of the predicted particles, [R, k, k].
         components: Indices of the chart components, [k].
-        to_states: Map of coordinates q [R, N, k] to states [R, N, D].
+        chart: Chart of the states.
+        origin: Mean of the predicted particles, [R, 1, D].
+        deviation: Chart components of the predicted particles about it, [R, N, d].
+        direction: Chart components that a coordinate moves, [R, k, d].
     """
 
     q: Tensor
     covariance: Tensor
     components: Tensor
-    to_states: Callable[[Tensor], Tensor]
+    chart: Chart
+    origin: Tensor
+    deviation: Tensor
+    direction: Tensor
+
+    def to_states(self, q: Tensor) -> Tensor:
+        """Return the states [R, N, D] of coordinates q [R, N, k] of each particle."""
+        difference = torch.baddbmm(self.deviation, q - self.q, self.direction)
+        return self.chart.add(self.origin, difference)
 
 
 class SwarmCoordinates(Protocol):
@@ -67,7 +77,9 @@ class AllComponents(SwarmCoordinates):
         mean = chart.mean(x, w).unsqueeze(1)
         c = chart.subtract(x, mean)
         index = torch.arange(c.shape[-1], device=c.device)
-        return SwarmFrame(c, (w.unsqueeze(-1) * c).mT @ c, index, lambda q: chart.add(mean, q))
+        covariance = (w.unsqueeze(-1) * c).mT @ c
+        eye = torch.eye(len(index), dtype=c.dtype, device=c.device).expand_as(covariance)
+        return SwarmFrame(c, covariance, index, chart, mean, c, eye)
 
 
 @dataclass(frozen=True)
@@ -107,19 +119,14 @@ class ObservedComponents(SwarmCoordinates):
             direction = torch.linalg.solve_triangular(root.mT, direction, upper=True).index_copy(
                 -1, index, eye.expand_as(covariance)
             )
-        return SwarmFrame(
-            q,
-            covariance,
-            index,
-            lambda new_q: chart.add(mean, torch.baddbmm(c, new_q - q, direction)),
-        )
+        return SwarmFrame(q, covariance, index, chart, mean, c, direction)
 
 
 class Fitness(Protocol):
-    """Fitness of swarm positions: that of the measurement, plus a term."""
+    """Fitness of swarm positions: that of the measurement, less |W q|^2 / 2."""
 
-    def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
-        """Return the fitness term [R, N] as a function of coordinates q [R, N, k]."""
+    def __call__(self, frame: SwarmFrame) -> Tensor:
+        """Return W, [R, k, k]."""
 
     def fit_measurement(self, model: StateSpaceModel, x: Tensor, record: Record) -> Tensor:
         """Return the fitness of the measurement, its log likelihood [R, N].
@@ -140,8 +147,8 @@ class LikelihoodFitness(Fitness):
     """
 
     @override
-    def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
-        return lambda q: q.new_zeros(q.shape[:-1])
+    def __call__(self, frame: SwarmFrame) -> Tensor:
+        return torch.zeros_like(frame.covariance)
 
 
 @dataclass(frozen=True)
@@ -180,11 +187,12 @@ class PosteriorFitness(Fitness):
         )
 
     @override
-    def __call__(self, frame: SwarmFrame) -> Callable[[Tensor], Tensor]:
+    def __call__(self, frame: SwarmFrame) -> Tensor:
         s = frame.covariance
         diagonal = torch.diag_embed(s.diagonal(dim1=-2, dim2=-1))
         root = bounded_root(s + self.covariance_shrinkage * (diagonal - s))
-        return lambda q: -compute_half_square(whiten(q, root))
+        eye = torch.eye(s.shape[-1], dtype=s.dtype, device=s.device)
+        return torch.linalg.solve_triangular(root, eye, upper=False)
 
 
 def observed_components(model: StateSpaceModel, mean: Tensor, u: Any) -> Tensor:
@@ -193,12 +201,14 @@ def observed_components(model: StateSpaceModel, mean: Tensor, u: Any) -> Tensor:
     Shapes: mean [R, 1, D].
     """
 
-    def moments_of_y(at: Tensor, xi: Tensor) -> Tensor:
-        distribution: Any = model.observation(model.chart.add(at, xi), u)
+    def moments_of_y(xi: Tensor) -> Tensor:
+        x = model.chart.add(mean.expand(-1, xi.shape[1], -1), xi)
+        distribution: Any = model.observation(x, u)
         return torch.cat([distribution.mean, distribution.variance], -1)
 
-    slope = derivative(moments_of_y, mean, model.chart.dimension).nan_to_num()  # [R, 1, 2 Dy, d]
-    return (slope != 0.0).flatten(0, 2).any(0).nonzero().squeeze(-1)
+    zero = mean.new_zeros(len(mean), 1, model.chart.dimension)
+    slope = jacobian(moments_of_y, moments_of_y(zero), zero.shape[-1]).nan_to_num()  # [R, 2 Dy, d]
+    return (slope != 0.0).flatten(0, 1).any(0).nonzero().squeeze(-1)
 
 
 def bounded_root(covariance: Tensor) -> Tensor:

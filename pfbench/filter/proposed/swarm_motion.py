@@ -172,33 +172,12 @@ class InertiaVelocity(VelocityUpdate):
         return v
 
 
-def match_memory_layout(a: Tensor, template: Tensor) -> Tensor:
-    """Copy a tensor into the memory layout of another one, for faster loops.
-
-    Returns copy of the tensor.
-    """
-    return torch.empty_like(template, dtype=a.dtype).copy_(a)
-
-
 def select_particle(q: Tensor, i: Tensor) -> Tensor:
     """Select one particle per run.
 
     Returns positions, [R, 1, k]. Shapes: q [R, N, k], i [R].
     """
     return q.gather(1, i[:, None, None].expand(-1, 1, q.shape[-1]))
-
-
-def select_swarm_by_run(active: Tensor, new: SwarmState, old: SwarmState) -> SwarmState:
-    """Select the swarm of each run.
-
-    Returns swarm. Shapes: active [R].
-    """
-    return SwarmState(
-        *(
-            torch.where(active.reshape(-1, *[1] * (a.dim() - 1)), a, b)
-            for a, b in zip(new, old, strict=True)
-        )
-    )
 
 
 # --------------------------------------------------------------------------------------------------

@@ -38,7 +38,6 @@ class SwarmWeighting(Protocol):
         self,
         frame: SwarmFrame,
         q: Tensor,
-        log_likelihood: Tensor,
         log_w: Tensor,
         draws: RandomStream,
     ) -> tuple[Tensor, Tensor]:
@@ -47,7 +46,6 @@ class SwarmWeighting(Protocol):
         Args:
             frame: Coordinates of the swarm.
             q: Final positions, [R, N, k].
-            log_likelihood: Log likelihood of the final positions, [R, N].
             log_w: Log weights before the measurement, [R, N].
             draws: Random stream of the step.
 
@@ -71,7 +69,6 @@ class PrintedWeighting(SwarmWeighting):
         self,
         frame: SwarmFrame,
         q: Tensor,
-        log_likelihood: Tensor,
         log_w: Tensor,
         draws: RandomStream,
     ) -> tuple[Tensor, Tensor]:
@@ -124,7 +121,6 @@ class MixtureWeighting(SwarmWeighting):
         self,
         frame: SwarmFrame,
         q: Tensor,
-        log_likelihood: Tensor,
         log_w: Tensor,
         draws: RandomStream,
     ) -> tuple[Tensor, Tensor]:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.distributions import Distribution
 from typing_extensions import override
 
-from pfbench.core.parameter_checks import require_range, require_ranges
+from pfbench.core.parameter_checks import require, require_range, require_ranges
 from pfbench.core.random_stream import BatchRandomStream, RandomStream, relabel
 from pfbench.core.record import Record
 from pfbench.filter.belief import Filter, ParticleBelief, StepInfo, weighted_mean_cov
@@ -194,12 +194,13 @@ def _check_dense(model: StateSpaceModel, inputs: Record, record: Record) -> None
         if inputs.start is None
         else inputs.start.unsqueeze(1)
     )
-    if model.transition(start.to(model.anchor), inputs.at_step(0).u) is None:
-        raise ValueError(
-            "trajectories: model must have a transition density, got "
-            f"{type(model).__name__} without one (fewer noise than state components). "
-            "Use smooth() with a Gaussian filter."
-        )
+    require(
+        model.transition(start.to(model.anchor), inputs.at_step(0).u) is not None,
+        "trajectories: model",
+        "have a transition density",
+        f"{type(model).__name__} without one (fewer noise than state components)",
+        "Use smooth() with a Gaussian filter.",
+    )
 
 
 # --------------------------------------------------------------------------------------------------

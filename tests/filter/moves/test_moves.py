@@ -19,6 +19,7 @@ from torch.distributions import Distribution, Independent, Laplace
 from pfbench import job
 from pfbench.core import Chart, PhiloxStream, QuaternionBlock, Record
 from pfbench.core.density import ChartNormal, independent_normal, normal_batch
+from pfbench.core.random_stream import relabel
 from pfbench.filter import (
     BootstrapProposal,
     EpanechnikovSmoothing,
@@ -33,18 +34,15 @@ from pfbench.filter import (
 )
 from pfbench.filter.linearisation import derivative
 from pfbench.filter.moves.metropolis import (
-    KernelCycle,
     McmcKernel,
     MetropolisHastings,
     StateHistory,
 )
 from pfbench.filter.moves.path_kernels import (
     LastStateKernel,
-    NoiseFlowGibbsKernel,
     NoiseFlowKernel,
     NoiseFlowStatKernel,
     PathBlockKernel,
-    PathStatistics,
     RandomWalk,
     fisher_information,
     propagate_path,
@@ -196,14 +194,13 @@ def test_flow_that_renews_its_noises_leaves_it_too(q: float) -> None:
 def test_a_cycle_of_kernels_leaves_it_too(walk: RandomWalk) -> None:
     """The bridge must tell the flow the noises of the states that it has moved."""
     case = simulate_path_posterior(0.1, 1000)
-    cycle = KernelCycle(
-        (
-            MetropolisHastings(NoiseFlowKernel(STEPS, walk)),
-            MetropolisHastings(PathBlockKernel(3, SmoothedSegment(), walk)),
-        ),
-        5,
+    moves = (
+        MetropolisHastings(NoiseFlowKernel(STEPS, walk)),
+        MetropolisHastings(PathBlockKernel(3, SmoothedSegment(), walk)),
     )
-    after, _ = cycle(case.model, case.belief(FULL), ALL, one())
+    after = case.belief(FULL)
+    for i, move in enumerate(5 * moves):
+        after, _ = move(case.model, after, ALL, relabel(one(), f"{i}."))
     assert case.moments_p_value(case.paths_after(after)) > 1e-4
     states, log_like = propagate_path(
         case.model, after.window["states"][:, :, 0], after.window["noise"], after.past
@@ -212,21 +209,15 @@ def test_a_cycle_of_kernels_leaves_it_too(walk: RandomWalk) -> None:
     assert torch.allclose(log_like, after.window["log_like"], atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "make", [NoiseFlowStatKernel, lambda walk: NoiseFlowGibbsKernel()], ids=["walk", "Gibbs"]
-)
 @pytest.mark.parametrize("q", [1.0, 0.1, 0.01])
-def test_flow_by_statistics_leaves_it_too(
-    q: float, make: Callable[[RandomWalk], McmcKernel]
-) -> None:
-    case = simulate_path_posterior(q, 4000)
-    statistics = make(as_of_500(4000)).required_history
-    cloud = case.belief(statistics)
-    after, rate = MetropolisHastings(make(as_of_500(4000)), 20)(case.model, cloud, ALL, one())
+def test_flow_by_statistics_leaves_it_too(q: float) -> None:
+    case, kernel = simulate_path_posterior(q, 4000), NoiseFlowStatKernel(as_of_500(4000))
+    cloud = case.belief(kernel.required_history)
+    after, rate = MetropolisHastings(kernel, 20)(case.model, cloud, ALL, one())
     paths = flown(case, after.x[0].numpy())
     assert float(rate) > 0.04
     assert case.moments_p_value(paths) > 1e-4
-    again = case._replace(paths=paths).belief(statistics).window["score"]
+    again = case._replace(paths=paths).belief(kernel.required_history).window["score"]
     assert torch.allclose(
         after.window["score"], again, atol=1e-9
     )  # what is carried is true of the moved path
@@ -717,16 +708,9 @@ def test_every_stage_says_whether_it_is_exact() -> None:
         "sim": PathBlockKernel(3, PriorSegment()),
     }
     assert all(moving(MetropolisHastings(kernel)).is_exact for kernel in kernels.values())
-    for kernel in (
-        NoiseFlowKernel(),
-        NoiseFlowStatKernel(),
-        NoiseFlowGibbsKernel(),
-    ):
+    for kernel in (NoiseFlowKernel(), NoiseFlowStatKernel()):
         assert not moving(MetropolisHastings(kernel)).is_exact
         assert moving(MetropolisHastings(kernel, 0)).is_exact
-    assert not KernelCycle(
-        (MetropolisHastings(LastStateKernel()), MetropolisHastings(NoiseFlowKernel()))
-    ).is_exact
 
 
 def spread_ratio(
@@ -752,7 +736,6 @@ def test_moves_do_not_widen_the_cloud_and_regularisation_does(q: float) -> None:
         LastStateKernel(),
         PathBlockKernel(3, SmoothedSegment()),
         NoiseFlowKernel(30),
-        NoiseFlowGibbsKernel(),
     ):
         ratio, error = spread_ratio(moving(MetropolisHastings(kernel), n=200), q, 20)
         assert 0.96 - 3 * error < ratio < 1.01 + 3 * error, kernel
@@ -874,13 +857,10 @@ def measurements(model: StateSpaceModel, runs: int, steps: int) -> Tensor:
 
 MODELS = [WALK, UnivariateGrowth(), StochasticVolatility(), Benes(), Pendulum(), Lorenz63()]
 every_model = pytest.mark.parametrize("model", MODELS, ids=lambda m: type(m).__name__)
-MIXED = KernelCycle(
-    (
-        MetropolisHastings(NoiseFlowKernel(4)),
-        MetropolisHastings(PathBlockKernel(2, SmoothedSegment())),
-        MetropolisHastings(LastStateKernel()),
-    ),
-    2,
+MIXED = 2 * (
+    MetropolisHastings(NoiseFlowKernel(4)),
+    MetropolisHastings(PathBlockKernel(2, SmoothedSegment())),
+    MetropolisHastings(LastStateKernel()),
 )
 
 
@@ -897,7 +877,9 @@ def history(method: ParticleFilter, model: StateSpaceModel, y: Tensor) -> list[P
 def test_what_is_carried_agrees_with_itself(model: StateSpaceModel) -> None:
     """The noises lead from the first state to all others, and the likelihoods are theirs: after moves, copies and sliding."""
     dense = isinstance(model, LinearGaussian | UnivariateGrowth | StochasticVolatility | Lorenz63)
-    method = moving(MIXED if dense else MetropolisHastings(NoiseFlowKernel(4), 3), threshold=0.9)
+    method = moving(
+        *(MIXED if dense else [MetropolisHastings(NoiseFlowKernel(4), 3)]), threshold=0.9
+    )
     for t, cloud in enumerate(history(method, model, measurements(model, 3, 9))):
         window, k = cloud.window, min(t + 1, 4)
         assert len(cloud.past) == k + 1
@@ -1015,7 +997,6 @@ def test_runs_that_are_not_hit_stay_as_they_are() -> None:
     [
         NoiseFlowKernel(3),
         NoiseFlowStatKernel(),
-        NoiseFlowGibbsKernel(),
         LastStateKernel(),
         PathBlockKernel(2, SmoothedSegment()),
     ],
@@ -1211,8 +1192,7 @@ def test_what_moves_cannot_do_without() -> None:
             (
                 "Remove the other kernels",
                 lambda: moving(
-                    MetropolisHastings(LastStateKernel()),
-                    MetropolisHastings(NoiseFlowGibbsKernel()),
+                    MetropolisHastings(LastStateKernel()), MetropolisHastings(NoiseFlowStatKernel())
                 ),
             ),
         ],
@@ -1235,7 +1215,7 @@ def test_what_moves_cannot_do_without() -> None:
     ).lost.any()
     wide = LinearGaussian(WALK.f, torch.cat([WALK.g, WALK.g], 1), WALK.h, WALK.r, WALK.m0, WALK.l0)
     check_refused(
-        [("do not determine its noise", lambda: filter_record(moving(MIXED), wide, WALK_Y))],
+        [("do not determine its noise", lambda: filter_record(moving(*MIXED), wide, WALK_Y))],
         remedy=False,
     )
 
@@ -1243,18 +1223,8 @@ def test_what_moves_cannot_do_without() -> None:
 def test_keepers_join() -> None:
     deep = moving(
         MetropolisHastings(LastStateKernel()),
-        KernelCycle(
-            (
-                MetropolisHastings(NoiseFlowKernel(7)),
-                MetropolisHastings(PathBlockKernel(3, SmoothedSegment())),
-            )
-        ),
+        MetropolisHastings(NoiseFlowKernel(7)),
+        MetropolisHastings(PathBlockKernel(3, SmoothedSegment())),
     )
     assert deep.history == StateHistory(7, store_noise=True, store_density=True)
-    assert (
-        moving(
-            MetropolisHastings(NoiseFlowStatKernel()), MetropolisHastings(NoiseFlowGibbsKernel())
-        ).history
-        == PathStatistics()
-    )
     assert moving().history is None

@@ -17,6 +17,8 @@ from pfbench.filter import (
     NoiseFlowKernel,
     ParticleFilter,
     PowerLikelihoodUpdate,
+    SwarmProposal,
+    loop,
     run_filter,
 )
 from pfbench.filter.moves import path_kernels, taped_paths
@@ -27,7 +29,7 @@ from pfbench.noise.base import NominalNoise
 from pfbench.scenario.simulated import ModelSimulation
 
 pytestmark = compiler
-RUNS = torch.tensor([7, 0, 12])
+RUNS, ONE = torch.tensor([7, 0, 12]), torch.ones(1)
 MODELS: dict[str, Callable[[], StateSpaceModel]] = {
     "growth": UnivariateGrowth,  # with an input that runs share
     "lorenz": Lorenz63,
@@ -74,17 +76,21 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 def assert_close(one: FilterResult, other: FilterResult) -> None:
     for name in ("mean", "variance", "log_evidence"):
         torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-9, atol=1e-9)
-    assert torch.equal(one.trace["accepted_0"], other.trace["accepted_0"])
+    assert torch.equal(one.trace.get("accepted_0", ONE), other.trace.get("accepted_0", ONE))
 
 
-@pytest.mark.parametrize("refresh", [0.0, 0.1])
+@pytest.mark.parametrize(
+    "method",
+    [make_filter(0.0), make_filter(), ParticleFilter(60, proposal=SwarmProposal(iterations=3))],
+    ids=["flow", "refreshed", "swarm"],
+)
 @pytest.mark.parametrize("name", MODELS)
-def test_paths_by_a_tape_are_those_of_the_model(
-    name: str, refresh: float, taken: list[Any]
+def test_a_tape_computes_what_the_model_does(
+    name: str, method: ParticleFilter, taken: list[Any]
 ) -> None:
     """Moments, evidence, accepted moves and counts of evaluations, also where few runs move."""
     counts, results = [], []
-    record, method = simulate(MODELS[name]()), make_filter(refresh)
+    record = simulate(MODELS[name]())
     for call in (run, run_by_torch):
         model = MODELS[name]()
         counter = LikelihoodCounter(model)
@@ -93,9 +99,25 @@ def test_paths_by_a_tape_are_those_of_the_model(
     assert_close(*results)
     assert counts[0] == counts[1]
     assert len(taken) >= 10  # once to check the tape, and then each time
-    moves = results[0].trace["accepted_0"]
+    moves = results[0].trace.get("accepted_0", torch.linspace(0, 0.9, 2))
     assert 0.0 < float(moves.mean()) < 1.0
     assert bool((moves == 0.0).any())  # not all runs move in each step
+
+
+def test_a_linear_flow_has_the_slopes_of_its_own_model() -> None:
+    """Two models of one pass at the same records: the second has what it has outside of a pass."""
+    models = [
+        LinearGaussian(
+            [[1.0, slope], [0.0, 0.9]], [[0.1], [0.3]], [[1.0, 0.0]], [sd], [0.0] * 2, [1.0] * 2
+        )
+        for slope, sd in ((0.1, 0.4), (0.3, 0.7))
+    ]
+    past = tuple(map(simulate(models[0]).at_step, range(12)))
+    states = PhiloxStream(3, RUNS).normal("states", 5, 24).unflatten(2, (12, 2))
+    alone = path_kernels._measure_start(models[1], states, past)
+    with loop._remember():
+        within = [path_kernels._measure_start(model, states, past) for model in models]
+    assert all(torch.equal(*pair) for pair in zip(within[1], alone, strict=True))
 
 
 def test_tempered_likelihoods_have_a_tape_of_their_own(taken: list[Any]) -> None:

@@ -18,7 +18,15 @@ from torch import Tensor
 from torch.distributions import Distribution
 
 from pfbench import job
-from pfbench.core import Episode, PhiloxStream, RandomStream, Record, map_inputs
+from pfbench.core import (
+    Chart,
+    Episode,
+    EuclideanBlock,
+    PhiloxStream,
+    RandomStream,
+    Record,
+    map_inputs,
+)
 from pfbench.filter import (
     ChiSquareStopping,
     EssResampler,
@@ -442,8 +450,11 @@ def test_the_posterior_fitness_is_highest_at_the_kalman_mean() -> None:
     s, h, r = frame.covariance[0], model.h, torch.diag(model.r**2)
     gain = s @ h.mT @ torch.linalg.inv(h @ s @ h.mT + r)
     mode = (gain @ (y[0] - h @ x.mean(1)[0]))[None, None]
-    penalty = PosteriorFitness(covariance_shrinkage=0.0)(frame)
-    value = lambda q: model.log_likelihood(y, frame.to_states(q), ()) + penalty(q)  # noqa: E731
+    w = PosteriorFitness(covariance_shrinkage=0.0)(frame)
+
+    value = lambda q: (  # noqa: E731
+        model.log_likelihood(y, frame.origin + q, ()) - 0.5 * (q @ w.mT).square().sum(-1)
+    )
     steps = 0.1 * torch.eye(4, dtype=torch.float64)
     up, down = (value(mode + sign * steps) for sign in (1, -1))
     assert torch.allclose(up, down, rtol=0, atol=1e-9)
@@ -461,10 +472,9 @@ def mixed(
     a = source.normal("a", n, 2) - torch.tensor([shift, 0.0], dtype=torch.float64)
     u = 2.0 * a[..., :1] + source.normal("u", n, 1)
     log_w = torch.where(live, shift * a[..., 0], -torch.inf).log_softmax(1)
-    frame = SwarmFrame(
-        a, torch.eye(2, dtype=torch.float64).expand(runs, -1, -1), torch.arange(2), lambda q: q
-    )
-    q, log_ratio = MixtureWeighting(0.4)(frame, centres(a), torch.zeros_like(log_w), log_w, source)
+    eye = torch.eye(2, dtype=torch.float64).expand(runs, -1, -1)
+    frame = SwarmFrame(a, eye, torch.arange(2), Chart((EuclideanBlock(2),)), 0.0 * a[:, :1], a, eye)
+    q, log_ratio = MixtureWeighting(0.4)(frame, centres(a), log_w, source)
     u = u + 2.0 * (q - a)[..., :1]
     assert (log_ratio[:, live] <= -math.log(round(0.4 * (n - 3)) / (n - 3)) + 1e-12).all()
     w = torch.exp(torch.where(live, log_w + log_ratio, -torch.inf))
@@ -500,13 +510,14 @@ def test_who_is_kept_is_drawn_afresh() -> None:
     """A fixed subset of a resampled cloud is a sorted one: neighbours are siblings."""
     n, runs = 10, 2000
     zero = torch.zeros(runs, n, 1, dtype=torch.float64)
+    one = torch.ones(runs, 1, 1, dtype=torch.float64)
     frame = SwarmFrame(
-        zero, torch.ones(runs, 1, 1, dtype=torch.float64), torch.zeros(1).long(), lambda q: q
+        zero, one, torch.zeros(1).long(), Chart((EuclideanBlock(1),)), 0.0 * one, zero, one
     )
     flat = torch.full((runs, n), -math.log(n), dtype=torch.float64)
     kept = []
     for step in (1, 2):
-        q, _ = MixtureWeighting(0.3)(frame, frame.q + 50.0, flat, flat, draws(runs, step=step))
+        q, _ = MixtureWeighting(0.3)(frame, frame.q + 50.0, flat, draws(runs, step=step))
         kept.append(q[..., 0].abs() < 1e-9)
         assert (kept[-1].sum(1) == 3).all()
         shares = kept[-1].double().mean(0)
