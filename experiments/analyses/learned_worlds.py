@@ -236,7 +236,7 @@ def compare(done: Mapping[str, Any], a: str, b: str) -> tuple[float, float, floa
     """Return the geometric mean ratio of errors of two parts, half of its log's 95 % interval, and Wilcoxon's p over runs."""
     logs = [0.5 * np.log(np.array(done[key]["squares"])) for key in (a, b)]
     mean, half = crossed_mean_interval((logs[0] - logs[1])[None])
-    return mean, half, wilcoxon_signed_rank(logs[0] - logs[1]).p
+    return mean, half, wilcoxon_signed_rank(logs[0] - logs[1])[1]
 
 
 def list_rows(done: Mapping[str, Any], price: float | None) -> list[dict[str, Any]]:

@@ -65,7 +65,7 @@ def compare_with_all(errors: pd.DataFrame, label: str, kalman: Sequence[str]) ->
     differences = {name: (logs[label] - logs[name]).to_numpy() for name in kalman}
     centres = {name: signed_rank_interval(d) for name, d in differences.items()}
     p = max(
-        wilcoxon_signed_rank(d).p if centres[n][0] < 0.0 else 1.0 for n, d in differences.items()
+        wilcoxon_signed_rank(d)[1] if centres[n][0] < 0.0 else 1.0 for n, d in differences.items()
     )
     closest = max(kalman, key=lambda name: centres[name][0])
     ratio, low, high = (float(np.exp(value)) for value in centres[closest])

@@ -109,7 +109,7 @@ def compare_pairs(
     keys = [(dose, label) for dose in errors for label in kalman]
     filled = {dose: np.log(table.fillna(LOST)) for dose, table in errors.items()}
     logs = [(filled[dose][PARTICLES] - filled[dose][label]).to_numpy() for dose, label in keys]
-    adjusted = holm([wilcoxon_signed_rank(log).p for log in logs])
+    adjusted = holm([wilcoxon_signed_rank(log)[1] for log in logs])
     pairs: dict[Key, dict[str, Pair]] = {dose: {} for dose in errors}
     for (dose, label), log, p in zip(keys, logs, adjusted, strict=True):
         centre, low, high = (float(np.exp(value)) for value in signed_rank_interval(log))

@@ -252,10 +252,10 @@ def _describe_losses(first: Array, second: Array) -> tuple[Array, Array]:
     """Count the lost runs of pairs, [K, 3], and compare the mean errors of their other runs, [K]. Shapes: losses [K, n]."""
     lost_a, lost_b = np.isposinf(first), np.isposinf(second)
     counts = np.stack([lost_a & ~lost_b, lost_b & ~lost_a, lost_a & lost_b], 1).sum(axis=2)
-    kept = np.where(lost_a | lost_b, -np.inf, np.stack([first, second]))
-    largest = kept.max(axis=(0, 2), initial=-np.inf)
+    errors_left = np.where(lost_a | lost_b, -np.inf, np.stack([first, second]))
+    largest = errors_left.max(axis=(0, 2), initial=-np.inf)
     has_kept = np.isfinite(largest)
-    sums = np.exp(kept - np.where(has_kept, largest, 0.0)[:, None]).sum(axis=2)
+    sums = np.exp(errors_left - np.where(has_kept, largest, 0.0)[:, None]).sum(axis=2)
     a, b = np.log(np.maximum(sums, _LEAST_SUM))
     return counts, np.where(has_kept, a - b, np.nan)
 
