@@ -9,9 +9,40 @@ import torch
 from torch import Tensor
 from torch.distributions import Distribution, Independent
 
-from pfbench.core import AngleBlock, Chart, EuclideanBlock, PhiloxStream, wrap_angle
+from pfbench.core import (
+    AngleBlock,
+    Chart,
+    Episode,
+    EuclideanBlock,
+    PhiloxStream,
+    Record,
+    wrap_angle,
+)
 from pfbench.core.density import independent_normal, normal_batch
+from pfbench.filter import FilterResult, run_filter
+from pfbench.job.scoring import ScoreRecorder
 from pfbench.model import LinearGaussian, Pendulum, StateSpaceModel
+from pfbench.noise import NominalNoise
+from pfbench.scenario import ModelSimulation
+
+RUNS = torch.tensor([7, 0, 12])  # of records with gaps
+
+
+def simulate_with_gaps(model: StateSpaceModel, steps: int = 20) -> Record:
+    """A record of `RUNS` with a component missing at times, in some runs."""
+    record = ModelSimulation(model, steps).draw(NominalNoise(), RUNS, 1).record
+    record.y[1, 4] = record.y[2, 7:9, 0] = torch.nan
+    return record
+
+
+def filter_with_scores(
+    method: Any, model: StateSpaceModel, episode: Episode, seed: int = 1
+) -> FilterResult:
+    """Filter the runs of an episode, and record their scores."""
+    runs = torch.arange(episode.record.y.shape[0])
+    watch = ScoreRecorder(model, model.assemble(episode.truth))
+    with torch.no_grad():
+        return run_filter(method, model, episode.record, PhiloxStream(seed, runs), watch)
 
 
 def tracker() -> LinearGaussian:

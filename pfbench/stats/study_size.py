@@ -126,7 +126,7 @@ def count_needed_runs(d: Array, ratio: float, alpha: float) -> float:
 
 @cache
 def _count_signs(alpha: float) -> Array:
-    """Count the signs, of 1 to 10 000 runs, with more of which the sign test rejects."""
+    """Return the largest count of signs that the sign test does not reject, for 1 to 10 000 runs."""
     return np.asarray(scipy.stats.binom.isf(alpha, np.arange(1, _MOST_RUNS + 1), 0.5))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from model_cases import filter_with_scores
 from recorded_data import believed
 from refusals import check_refused
 from scipy import stats
@@ -20,15 +21,12 @@ from pfbench.core.random_stream import PhiloxStream
 from pfbench.core.record import Episode, Record, iterate_steps
 from pfbench.filter import (
     CubaturePoints,
-    FilterResult,
     GaussianFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
     UnscentedPoints,
-    run_filter,
 )
 from pfbench.job.config import compose_tree
-from pfbench.job.scoring import ScoreRecorder
 from pfbench.model import Constraints, FlatEarth, RotatingEarth, StrapdownBlocks
 from pfbench.model.ins_gnss import InsGnss, LooseStep
 from pfbench.nav import (
@@ -267,13 +265,6 @@ def test_error_is_corrected_minus_true(flight: Episode) -> None:
     assert torch.allclose(error[..., 9:], guess[..., 9:] - truth[..., 9:])
 
 
-def filtered(rule: Any, model: InsGnss, episode: Episode) -> FilterResult:
-    runs = torch.arange(episode.record.y.shape[0])
-    watch = ScoreRecorder(model, model.assemble(episode.truth))
-    with torch.no_grad():
-        return run_filter(GaussianFilter(rule), model, episode.record, PhiloxStream(1, runs), watch)
-
-
 RULES = {
     "ukf": SigmaPointLinearisation(UnscentedPoints()),
     "ckf": SigmaPointLinearisation(CubaturePoints()),
@@ -287,8 +278,8 @@ def test_on_a_linear_model_all_gaussian_filters_are_one(
 ) -> None:
     model = MODELS[name]()
     kalman, other = (
-        filtered(TaylorLinearisation(), model, flight),
-        filtered(RULES[rule], model, flight),
+        filter_with_scores(GaussianFilter(TaylorLinearisation()), model, flight),
+        filter_with_scores(GaussianFilter(RULES[rule]), model, flight),
     )
     sd = kalman.variance.sqrt()
     assert ((kalman.mean - other.mean) / sd).abs().max() < 1e-9
@@ -301,17 +292,21 @@ def test_a_receiver_without_velocity_is_one_whose_velocity_is_never_seen(flight:
     y = flight.record.y.clone()
     y[..., 3:] = torch.nan
     position_only = flight.record._replace(y=y[..., :3])
-    a = filtered(
-        SigmaPointLinearisation(CubaturePoints()), blind, replace(flight, record=position_only)
+    a = filter_with_scores(
+        GaussianFilter(SigmaPointLinearisation(CubaturePoints())),
+        blind,
+        replace(flight, record=position_only),
     )
-    b = filtered(
-        SigmaPointLinearisation(CubaturePoints()),
+    b = filter_with_scores(
+        GaussianFilter(SigmaPointLinearisation(CubaturePoints())),
         MODELS["15 states"](),
         replace(flight, record=flight.record._replace(y=y)),
     )
     assert torch.allclose(a.mean, b.mean, rtol=1e-9, atol=1e-12)
     assert torch.allclose(a.log_evidence, b.log_evidence, rtol=1e-9)
-    both = filtered(SigmaPointLinearisation(CubaturePoints()), MODELS["15 states"](), flight)
+    both = filter_with_scores(
+        GaussianFilter(SigmaPointLinearisation(CubaturePoints())), MODELS["15 states"](), flight
+    )
     assert (both.variance[..., 3:6] < a.variance[..., 3:6]).all()  # seeing it would have helped
 
 
@@ -370,7 +365,9 @@ def test_the_kalman_filter_is_consistent_on_flights_that_its_model_did_not_draw(
     cfg = composed("scenario=flight_500s", "scenario.imu_rate_hz=10", "episode_cache_dir=null")
     model = job.instantiate(cfg.model)
     episode = job.instantiate(cfg.scenario).draw(NominalNoise(), torch.arange(runs), 12)
-    estimate = filtered(SigmaPointLinearisation(CubaturePoints()), model, episode)
+    estimate = filter_with_scores(
+        GaussianFilter(SigmaPointLinearisation(CubaturePoints())), model, episode
+    )
     assert not estimate.lost.any()
 
     # 18 states: the accelerometer bias is one Markov process of 112 ug; its constant 100 ug should not decay but does in the

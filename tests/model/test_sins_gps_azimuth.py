@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from config_cases import composed
+from model_cases import filter_with_scores
 from scipy import stats
 from torch import Tensor
 
@@ -15,7 +16,6 @@ from pfbench import job
 from pfbench.core import Episode, PhiloxStream, Record
 from pfbench.filter import (
     CubaturePoints,
-    FilterResult,
     GaussianFilter,
     ParticleFilter,
     SigmaPointLinearisation,
@@ -23,7 +23,6 @@ from pfbench.filter import (
     UnscentedPoints,
     run_filter,
 )
-from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.azimuth import (
     ErrorEquations,
     EulerDiscretisation,
@@ -496,13 +495,6 @@ def test_what_cannot_be(build: Any, message: str) -> None:
 # filters
 
 
-def filtered(method: Any, model: SinsGpsAzimuth, episode: Episode, seed: int = 1) -> FilterResult:
-    runs = torch.arange(episode.record.y.shape[0])
-    watch = ScoreRecorder(model, model.assemble(episode.truth))
-    with torch.no_grad():
-        return run_filter(method, model, episode.record, PhiloxStream(seed, runs), watch)
-
-
 CELLS = [
     (rule, form)
     for rule in (
@@ -520,7 +512,7 @@ def test_every_kind_of_filter_runs_and_learns(
     worlds: Episode, form: ErrorEquations, method: Any
 ) -> None:
     """After twenty seconds of acceleration it knows more than the receiver, and more of the attitude than it was told."""
-    estimate = filtered(method, model_of(form, process_noise_factor=30.0), worlds)
+    estimate = filter_with_scores(method, model_of(form, process_noise_factor=30.0), worlds)
     assert not estimate.lost.any()
     late = estimate.trace["error"][:, 20:].square().mean((0, 1)).sqrt()
     told = torch.cat(
@@ -531,7 +523,9 @@ def test_every_kind_of_filter_runs_and_learns(
 
 def test_single_precision_is_enough_for_a_filter(worlds: Episode) -> None:
     model = model_of(ExactErrorEquations(), process_noise_factor=5.0)
-    double = filtered(GaussianFilter(SigmaPointLinearisation(CubaturePoints())), model, worlds)
+    double = filter_with_scores(
+        GaussianFilter(SigmaPointLinearisation(CubaturePoints())), model, worlds
+    )
     single = run_filter(
         GaussianFilter(SigmaPointLinearisation(CubaturePoints())),
         model.float(),
@@ -625,7 +619,9 @@ def test_the_unscented_filter_gives_the_prototype_s_numbers(fixed: Episode, row:
         else [f"model.process_noise_factor={row.split()[1]}"]
     )
     model = job.instantiate(composed("scenario=azimuth_constant_errors", *words).model)
-    estimate = filtered(GaussianFilter(SigmaPointLinearisation(UnscentedPoints())), model, fixed)
+    estimate = filter_with_scores(
+        GaussianFilter(SigmaPointLinearisation(UnscentedPoints())), model, fixed
+    )
     square = (
         estimate.trace["error"][:, 60:].square().mean(1)[:, [0, 1, 2, 3, 4, 5, 7, 6, 8]]
     )  # position E, N, U
@@ -648,7 +644,7 @@ def test_the_filter_that_models_the_biases_is_consistent_and_the_others_are_not(
     episode = replace(flight, imu_rate_hz=20.0).draw(NominalNoise(), torch.arange(runs), 21)
 
     def nees(rule: Any, *words: str) -> np.ndarray:
-        estimate = filtered(
+        estimate = filter_with_scores(
             GaussianFilter(rule),
             job.instantiate(composed("scenario=azimuth", *words).model),
             episode,

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 from config_cases import composed
+from model_cases import filter_with_scores
 from refusals import check_refused
 from scipy import stats
 from torch import Tensor
@@ -16,15 +17,12 @@ from pfbench.core import Episode, PhiloxStream, map_inputs, wrap_angle
 from pfbench.core.density import ChartNormal
 from pfbench.filter import (
     CubaturePoints,
-    FilterResult,
     GaussianFilter,
-    LinearisationRule,
     ParticleFilter,
     SigmaPointLinearisation,
     TaylorLinearisation,
     run_filter,
 )
-from pfbench.job.scoring import ScoreRecorder
 from pfbench.model.sins_sar import SarStep, SinsSar
 from pfbench.nav import (
     CosineRamp,
@@ -509,13 +507,6 @@ def beginning(episode: Episode, steps: int) -> Episode:
     )
 
 
-def filtered(rule: LinearisationRule, model: SinsSar, episode: Episode) -> FilterResult:
-    runs = torch.arange(episode.record.y.shape[0])
-    watch = ScoreRecorder(model, model.assemble(episode.truth))
-    with torch.no_grad():
-        return run_filter(GaussianFilter(rule), model, episode.record, PhiloxStream(1, runs), watch)
-
-
 def test_at_arc_minutes_all_gaussian_filters_are_nearly_one_wherever_the_noise_is_turned(
     flight: Episode,
 ) -> None:
@@ -525,7 +516,7 @@ def test_at_arc_minutes_all_gaussian_filters_are_nearly_one_wherever_the_noise_i
         (TaylorLinearisation(), "G at the identity"),
         (SigmaPointLinearisation(CubaturePoints()), "G at q"),
     ]
-    made = [filtered(rule, VARIANTS[name], first) for rule, name in cells]
+    made = [filter_with_scores(GaussianFilter(rule), VARIANTS[name], first) for rule, name in cells]
     sd = made[0].variance.sqrt()
     assert not made[0].lost.any()
     for other, allowed in zip(
@@ -558,7 +549,7 @@ def test_the_extended_kalman_filter_is_consistent_on_the_flight() -> None:
         job.instantiate(cfg.model),
         job.instantiate(cfg.scenario).draw(NominalNoise(), runs, 21),
     )
-    estimate = filtered(TaylorLinearisation(), model, episode)
+    estimate = filter_with_scores(GaussianFilter(TaylorLinearisation()), model, episode)
     assert not estimate.lost.any()
     low, high = stats.chi2.ppf([level, 1 - level], 3 * len(runs))
     nees = estimate.trace["nees"][:, 99::100].sum(0)  # [4, groups]

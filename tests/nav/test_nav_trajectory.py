@@ -1,5 +1,8 @@
 """Trajectories: kinematics that differentiate into each other, sensors that feel what they should."""
 
+from collections.abc import Callable
+from functools import partial
+
 import hydra
 import numpy as np
 import pyproj
@@ -99,16 +102,6 @@ def test_a_vehicle_at_rest_feels_the_earth_turn_and_gravity(heading):
     assert (made.dtheta * 50 - level @ earth.earth_rate(made.pos[0, 0])).abs().max() < 1e-18
     assert (made.dv * 50 - level @ g).abs().max() < 1e-14
     assert (made.pos == made.pos[0]).all()
-
-
-def test_the_rate_changes_nothing_but_the_sampling():
-    coarse, fine = generate_manoeuvres(*SHORT, rate=20), generate_manoeuvres(*SHORT, rate=100)
-    metres = (coarse.pos - fine.pos[::5]) * earth.metre_scale(coarse.pos)
-    # three nodes of Gauss integrate to d^6; a quintic of 5 s in 0.05 s leaves 1e-9 of 100 m at the most
-    assert metres.abs().max() < 1e-6
-    assert (coarse.dcm - fine.dcm[::5]).abs().max() < 1e-12
-    assert (coarse.dv - fine.dv.unflatten(0, (-1, 5)).sum(1)).abs().max() < 1e-9
-    assert (coarse.dtheta - fine.dtheta.unflatten(0, (-1, 5)).sum(1)).abs().max() < 1e-9
 
 
 def test_single_segments_and_manoeuvres_mix():
@@ -299,16 +292,23 @@ def test_velocity_along_ramps_is_the_derivative_of_position(path: RampTrajectory
     assert apart.abs().max() < 30.0 / 6 * 1e-4  # jerks, with their jumps, are below 30 m/s^3
 
 
-@every_path
-def test_the_rate_changes_nothing_but_the_sampling_of_ramps(path: RampTrajectory) -> None:
-    coarse, fine = path.generate(20.0), path.generate(100.0)
+@pytest.mark.parametrize(
+    ("generate", "bound"),
+    [
+        (partial(generate_manoeuvres, *SHORT), 1e-9),
+        *((path.generate, 1e-8) for path in PATHS.values()),
+    ],
+)
+def test_the_rate_changes_nothing_but_the_sampling(
+    generate: Callable[[float], TrajectoryData], bound: float
+) -> None:
+    # three nodes of Gauss integrate to d^6: a quintic of 5 s, and a ramp of 6 s, leave 1e-9 of 100 m in 0.05 s at the most
+    coarse, fine = generate(20.0), generate(100.0)
     metres = (coarse.pos - fine.pos[::5]) * earth.metre_scale(coarse.pos)
-    assert (
-        metres.abs().max() < 1e-6
-    )  # Gauss with three nodes: the sixth derivative of a ramp of 6 s times 0.05^6
+    assert metres.abs().max() < 1e-6
     assert (coarse.dcm - fine.dcm[::5]).abs().max() < 1e-12
-    assert (coarse.dv - fine.dv.unflatten(0, (-1, 5)).sum(1)).abs().max() < 1e-8
-    assert (coarse.dtheta - fine.dtheta.unflatten(0, (-1, 5)).sum(1)).abs().max() < 1e-8
+    assert (coarse.dv - fine.dv.unflatten(0, (-1, 5)).sum(1)).abs().max() < bound
+    assert (coarse.dtheta - fine.dtheta.unflatten(0, (-1, 5)).sum(1)).abs().max() < bound
 
 
 @every_path

@@ -701,16 +701,6 @@ def test_the_printed_factor_depends_on_the_units() -> None:
     assert not torch.allclose(one.mean, other.mean, rtol=1e-3, atol=1e-4)
 
 
-@every_method
-def test_a_component_that_is_never_seen_is_as_if_it_did_not_exist(method: GaussianFilter) -> None:
-    keep = [0, 1, 3, 4, 6, 7, 8, 10]
-    y = simulate(Tight(), 3, 30, range(10, 20), r=9.0, q=50.0)
-    y[..., [2, 5, 9]] = torch.nan
-    whole, part = run(method, Tight(), y), run(method, Tight(keep), y[..., keep])
-    assert torch.allclose(whole.mean, part.mean, rtol=1e-7, atol=1e-9)
-    assert torch.allclose(whole.log_evidence, part.log_evidence, rtol=1e-8)
-
-
 class Correlated(Tight):
     """The same, sensors of a kind sharing a part of their noise."""
 
@@ -724,12 +714,19 @@ class Correlated(Tight):
         )
 
 
+@pytest.mark.parametrize(
+    ("model", "missing"),
+    [(Tight, [2, 5, 9]), (Correlated, [0, 3, 5, 8])],
+    ids=["alone", "with noise that others share"],
+)
 @every_method
-def test_nor_is_one_whose_noise_the_others_share(method: GaussianFilter) -> None:
-    keep = [1, 2, 4, 6, 7, 9, 10]
+def test_a_component_that_is_never_seen_is_as_if_it_did_not_exist(
+    method: GaussianFilter, model: type[Tight], missing: list[int]
+) -> None:
+    seen = [k for k in range(11) if k not in missing]
     y = simulate(Tight(), 3, 30, range(10, 20), r=9.0, q=50.0)
-    y[..., [0, 3, 5, 8]] = torch.nan
-    whole, part = run(method, Correlated(), y), run(method, Correlated(keep), y[..., keep])
+    y[..., missing] = torch.nan
+    whole, part = run(method, model(), y), run(method, model(seen), y[..., seen])
     assert torch.allclose(whole.mean, part.mean, rtol=1e-7, atol=1e-9)
     assert torch.allclose(whole.log_evidence, part.log_evidence, rtol=1e-8)
 

@@ -121,31 +121,23 @@ def same(a: FilterResult, b: FilterResult) -> bool:
 # noise given parent and measurement
 
 
-@pytest.mark.parametrize("guide", [EKF, UKF], ids=["ekf", "ukf"])
-@pytest.mark.parametrize("case", CASES)
-def test_guided_noise_is_unbiased(case: str, guide: GaussianFilter) -> None:
-    model, y, exact = CASES[case]()
-    method = ParticleFilter(
-        40, EssResampler(Systematic(), 0.7), proposal=GuidedNoiseProposal(guide)
-    )
-    assert method.is_exact
-    check_evidence(method, model, y, exact, runs=1000)
-
-
 @pytest.mark.parametrize(
-    "options",
+    ("case", "guide", "options"),
     [
-        {"shared_by_particles": True},
-        {"covariance_factor": 1.6},
-        {"shared_by_particles": True, "covariance_factor": 2.0},
-        {"points": SobolPoints()},
+        *((case, guide, {}) for case in CASES for guide in (EKF, UKF)),
+        ("growth", CKF, {"shared_by_particles": True}),
+        ("growth", CKF, {"covariance_factor": 1.6}),
+        ("growth", CKF, {"shared_by_particles": True, "covariance_factor": 2.0}),
+        ("growth", CKF, {"points": SobolPoints()}),
     ],
 )
-def test_guided_noise_is_unbiased_whatever_its_options(options: dict[str, Any]) -> None:
-    model, y, exact = CASES["growth"]()
-    method = ParticleFilter(
-        60, EssResampler(Systematic(), 0.7), proposal=GuidedNoiseProposal(CKF, **options)
-    )
+def test_guided_noise_is_unbiased(
+    case: str, guide: GaussianFilter, options: dict[str, Any]
+) -> None:
+    model, y, exact = CASES[case]()
+    proposal = GuidedNoiseProposal(guide, **options)
+    method = ParticleFilter(40, EssResampler(Systematic(), 0.7), proposal=proposal)
+    assert method.is_exact
     check_evidence(method, model, y, exact, runs=1000)
 
 

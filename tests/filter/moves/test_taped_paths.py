@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 from compiled_cases import compiler
-from model_cases import tracker
+from model_cases import RUNS, simulate_with_gaps, tracker
 from move_cases import moving
 
 from pfbench.core import PhiloxStream, Record
@@ -25,11 +25,9 @@ from pfbench.filter.moves import path_kernels, taped_paths
 from pfbench.job.scoring import LikelihoodCounter
 from pfbench.kernels import dispatch
 from pfbench.model import LinearGaussian, Lorenz63, Pendulum, StateSpaceModel, UnivariateGrowth
-from pfbench.noise.base import NominalNoise
-from pfbench.scenario.simulated import ModelSimulation
 
 pytestmark = compiler
-RUNS, ONE = torch.tensor([7, 0, 12]), torch.ones(1)
+ONE = torch.ones(1)
 MODELS: dict[str, Callable[[], StateSpaceModel]] = {
     "growth": UnivariateGrowth,  # with an input that runs share
     "lorenz": Lorenz63,
@@ -44,13 +42,6 @@ def make_filter(refresh: float = 0.1, threshold: float = 0.7, **stages: Any) -> 
     flow = MetropolisHastings(NoiseFlowKernel(lag=4, noise_refresh=refresh), 2)
     filter_ = moving(flow, n=300, threshold=threshold)
     return copy.replace(filter_, **stages) if hasattr(copy, "replace") else type(filter_)(**{**vars(filter_), **stages})  # fmt: skip
-
-
-def simulate(model: StateSpaceModel) -> Record:
-    """A record with a component missing at times, in some runs."""
-    record = ModelSimulation(model, 12).draw(NominalNoise(), RUNS, 1).record
-    record.y[1, 4] = record.y[2, 7:9, 0] = torch.nan
-    return record
 
 
 def run(method: ParticleFilter, model: StateSpaceModel, record: Record) -> FilterResult:
@@ -90,7 +81,7 @@ def test_a_tape_computes_what_the_model_does(
 ) -> None:
     """Moments, evidence, accepted moves and counts of evaluations, also where few runs move."""
     counts, results = [], []
-    record = simulate(MODELS[name]())
+    record = simulate_with_gaps(MODELS[name]())
     for call in (run, run_by_torch):
         model = MODELS[name]()
         counter = LikelihoodCounter(model)
@@ -112,7 +103,7 @@ def test_a_linear_flow_has_the_slopes_of_its_own_model() -> None:
         )
         for slope, sd in ((0.1, 0.4), (0.3, 0.7))
     ]
-    past = tuple(map(simulate(models[0]).at_step, range(12)))
+    past = tuple(map(simulate_with_gaps(models[0]).at_step, range(12)))
     states = PhiloxStream(3, RUNS).normal("states", 5, 24).unflatten(2, (12, 2))
     alone = path_kernels._measure_start(models[1], states, past)
     with loop._remember():
@@ -122,7 +113,7 @@ def test_a_linear_flow_has_the_slopes_of_its_own_model() -> None:
 
 def test_tempered_likelihoods_have_a_tape_of_their_own(taken: list[Any]) -> None:
     model = UnivariateGrowth()
-    record = simulate(model)
+    record = simulate_with_gaps(model)
     results = []
     for factor in (1.0, 4.0):
         method = make_filter(weight_update=PowerLikelihoodUpdate(factor))
@@ -135,7 +126,7 @@ def test_tempered_likelihoods_have_a_tape_of_their_own(taken: list[Any]) -> None
 def test_a_tape_has_the_constants_of_its_pass() -> None:
     """A buffer that changes in place, or a number of Python: the next pass of the same objects has the new one."""
     model, method = Lorenz63(), make_filter()
-    record, found = simulate(model), []
+    record, found = simulate_with_gaps(model), []
     for change in (lambda: None, lambda: model.q.mul_(3.0), lambda: setattr(model, "step", 0.03)):
         change()
         found.append(run(method, model, record))
@@ -153,7 +144,7 @@ class Branching(UnivariateGrowth):
 
 def test_without_a_tape_and_outside_of_a_pass_the_model_is_asked(taken: list[Any]) -> None:
     model = Branching()
-    record, method = simulate(model), make_filter()
+    record, method = simulate_with_gaps(model), make_filter()
     assert_close(run(method, model, record), run(method, UnivariateGrowth(), record))
     calls = len(taken)
     assert calls > 10  # of the second model
@@ -175,7 +166,7 @@ def test_a_tape_of_other_numbers_is_not_used(
 
     monkeypatch.setattr(taped_paths, "record_tape", record_wrong)
     model, method = UnivariateGrowth(), make_filter()
-    record = simulate(model)
+    record = simulate_with_gaps(model)
     assert_close(run(method, model, record), run_by_torch(method, model, record))
     assert len(taken) == 1
 
@@ -183,7 +174,7 @@ def test_a_tape_of_other_numbers_is_not_used(
 def test_wrong_instructions_are_refused(taken: list[Any]) -> None:
     """Nothing is read or written outside of the tape's own numbers."""
     model, call = UnivariateGrowth(), dispatch.run_paths
-    run(make_filter(), model, simulate(model))
+    run(make_filter(), model, simulate_with_gaps(model))
     given = taken[-1]
     wrong = [(1, given[1] + 1000), (3, given[3][:, 1:]), (4, given[4][0]), (5, given[5][:, :1])]
     wrong += [(6, given[6][1:]), (6, given[6].float()), (7, given[7] * 0), (7, given[7][:2])]

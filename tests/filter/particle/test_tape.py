@@ -10,7 +10,7 @@ import pytest
 import torch
 from compiled_cases import agree, compiler
 from config_cases import composed, world
-from model_cases import tracker
+from model_cases import RUNS, simulate_with_gaps, tracker
 from torch import Tensor
 
 from pfbench import job
@@ -42,11 +42,8 @@ from pfbench.model import (
     linear_walk,
 )
 from pfbench.model.ins_gnss import LooseStep
-from pfbench.noise.base import NominalNoise
-from pfbench.scenario.simulated import ModelSimulation
 
 pytestmark = compiler
-RUNS = torch.tensor([7, 0, 12])
 PARTICLES = 700  # blocks of 256 and a rest
 CLOSE = 2e-12
 ROTATION = torch.linalg.qr(torch.arange(25.0).reshape(5, 5).double().sin())[0]
@@ -56,13 +53,6 @@ MATRICES = 0.95 * ROTATION, ROTATION[:, :3], ROTATION[:2] + 0.1, [0.5, 0.7], [1.
 
 def make_filter(threshold: float = 0.5, particles: int = PARTICLES) -> ParticleFilter:
     return ParticleFilter(particles, EssResampler(Systematic(), threshold))
-
-
-def simulate(model: StateSpaceModel, steps: int = 20) -> Record:
-    """A record with a component missing at times, in some runs."""
-    record = ModelSimulation(model, steps).draw(NominalNoise(), RUNS, 1).record
-    record.y[1, 4] = record.y[2, 7:9, 0] = torch.nan
-    return record
 
 
 def run(
@@ -111,7 +101,7 @@ MODELS: dict[str, Callable[[], StateSpaceModel]] = {
 def test_a_tape_computes_what_the_operators_compute(name: str, threshold: float) -> None:
     """Also with measurements missing, in runs of any numbers, with a rest of a block, whether or not a step resamples."""
     model = MODELS[name]()
-    result = compare(model, simulate(model), threshold)
+    result = compare(model, simulate_with_gaps(model), threshold)
     resampled = result.trace["resampled"]
     assert bool(resampled.all()) == (threshold == 1.0)
     assert bool(resampled.any()) == (threshold > 0.0)
@@ -163,14 +153,14 @@ def test_matrices_may_be_those_of_a_run_and_a_step(threshold: float) -> None:
     model, change = Turning(*MATRICES), PhiloxStream(4, RUNS).normal("matrices", 20, 40)
     change = torch.where(change.abs() < 0.4, 0.0, 0.3 * change).unflatten(2, (5, 8))
     inputs = LooseStep(change[..., :5], change[:1, :, :, 5:])
-    record = simulate(LinearGaussian(*MATRICES))._replace(u=inputs)
+    record = simulate_with_gaps(LinearGaussian(*MATRICES))._replace(u=inputs)
     result, taped = compare(model, record, threshold), TapedParticleFilter(make_filter(threshold))
     assert torch.equal(run(taped, model, record, run_batch=1, threads=3).mean, result.mean)
 
 
 def break_record() -> Record:
     """Run 0 measures what no particle fits at step 10, all particles of run 2 are no number at step 7."""
-    record = simulate(UnivariateGrowth())
+    record = simulate_with_gaps(UnivariateGrowth())
     steps = record.y.shape[1]
     shift = 8.0 * torch.cos(1.2 * torch.arange(steps, dtype=torch.float64)).expand(3, -1).clone()
     shift += 0.3 * torch.arange(3)[:, None]  # a run with the inputs of another would be seen
@@ -221,7 +211,7 @@ def filter_in_numpy(model: UnivariateGrowth, record: Record, particles: int) -> 
 def test_a_tape_computes_what_a_filter_in_numpy_computes() -> None:
     """It shares the random numbers, as torch draws them, and no other code."""
     model = UnivariateGrowth()
-    record = simulate(model).select_runs(slice(0, 1))
+    record = simulate_with_gaps(model).select_runs(slice(0, 1))
     record.y[0, 5] = torch.nan
     taped = TapedParticleFilter(make_filter(0.5, 500))
     result = run(taped, model, record)
@@ -236,7 +226,7 @@ def test_a_tape_computes_what_a_filter_in_numpy_computes() -> None:
 def test_a_tape_has_the_constants_of_its_pass() -> None:
     """A buffer that changes, also in place, or a number of Python: the next pass of the same objects has the new one."""
     model, method = Lorenz63(), make_filter()
-    record, taped = simulate(model), TapedParticleFilter(make_filter())
+    record, taped = simulate_with_gaps(model), TapedParticleFilter(make_filter())
     found = []
     for change in (lambda: None, lambda: model.q.mul_(3.0), lambda: setattr(model, "step", 0.03)):
         change()
@@ -256,7 +246,11 @@ def test_steps_are_read_wherever_a_block_ends(
 ) -> None:
     """Moments, particles, covariances and innovations of each step, batches of runs, threads, and counts of evaluations."""
     monkeypatch.setattr(taped_filter, "MAX_NUMBERS", numbers)
-    record, results, counts = simulate(UnivariateGrowth()).select_runs(slice(0, runs)), [], []
+    record, results, counts = (
+        simulate_with_gaps(UnivariateGrowth()).select_runs(slice(0, runs)),
+        [],
+        [],
+    )
 
     def watch(t: int, info: StepInfo) -> dict[str, Tensor]:
         assert info.cloud is not None
@@ -281,7 +275,7 @@ def test_steps_are_read_wherever_a_block_ends(
 def test_the_first_measurement_may_be_of_the_initial_state() -> None:
     model = linear_walk(1.0, 0.3, 1.0)
     model.observes_initial = True
-    compare(model, simulate(model))
+    compare(model, simulate_with_gaps(model))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -354,7 +348,10 @@ def test_without_a_tape_the_operators_take_the_steps_and_one_line_says_so(
 ) -> None:
     caplog.set_level("INFO", "pfbench")
     method, model, dtype = OTHERS[reason]
-    record, taped = simulate(UnivariateGrowth()).to(model.anchor), TapedParticleFilter(method)
+    record, taped = (
+        simulate_with_gaps(UnivariateGrowth()).to(model.anchor),
+        TapedParticleFilter(method),
+    )
     draws = PhiloxStream(3, RUNS, dtype)
     with dispatch.use_kernels(), torch.no_grad():
         results = [run_filter(a, model, record, draws) for a in (taped, taped, method)]
@@ -378,7 +375,10 @@ def test_a_tape_of_other_numbers_is_not_used(
     monkeypatch.setattr(taped_filter, "record_tape", record_wrongly)
     taped = TapedParticleFilter(make_filter())
     model = UnivariateGrowth()
-    assert_close(run(taped, model, simulate(model)), run(make_filter(), model, simulate(model)))
+    assert_close(
+        run(taped, model, simulate_with_gaps(model)),
+        run(make_filter(), model, simulate_with_gaps(model)),
+    )
     assert not taped.is_active
     assert "the tape does not compute the numbers of torch" in caplog.text
 
@@ -437,7 +437,7 @@ def test_wrong_instructions_are_refused(monkeypatch: pytest.MonkeyPatch) -> None
     """Nothing is read or written outside of the tape's own numbers."""
     model, run_tape, calls = UnivariateGrowth(), dispatch.run_tape, []
     monkeypatch.setattr(dispatch, "run_tape", lambda given: calls.append(given) or run_tape(given))
-    run(TapedParticleFilter(make_filter()), model, simulate(model))
+    run(TapedParticleFilter(make_filter()), model, simulate_with_gaps(model))
     given = calls[-1]
     wrong = [(1, given[1] + 1000), (5, given[5][0]), (6, given[6][:, :1]), (8, given[8].double())]
     wrong += [(9, torch.tensor([0])), (9, given[9] + 1), (9, given[9] - 100), (3, given[3][1:])]
