@@ -231,7 +231,7 @@ def gather_ancestors(
         Particles, [R, M, D].
     """
     return belief._replace(
-        x=_gather_rows(belief.x, ancestors) if x is None else x,
+        x=_gather_states(belief.x, ancestors) if x is None else x,
         log_w=belief.log_w.gather(1, ancestors) if log_w is None else log_w,
         window={k: _gather_rows(v, ancestors) for k, v in belief.window.items()},
         memory={k: _gather_rows(v, ancestors) for k, v in belief.memory.items()},
@@ -284,6 +284,15 @@ def weighted_mean_cov(chart: Chart, belief: ParticleBelief) -> tuple[Tensor, Ten
     mean = chart.mean(belief.x, w)
     d = chart.subtract(belief.x, mean.unsqueeze(1))
     return mean, (w.unsqueeze(-1) * d).mT @ d
+
+
+def _gather_states(x: Tensor, ancestors: Tensor) -> Tensor:
+    """Gather [R, N, D] by ancestors [R, M], in the memory order of x."""
+    return (
+        _gather_components(x.permute(2, 0, 1), ancestors).permute(1, 2, 0)
+        if x.permute(2, 0, 1).is_contiguous()
+        else x.mT.gather(2, ancestors.unsqueeze(1).expand(-1, x.shape[2], -1)).mT
+    )
 
 
 def _select_components(first: Tensor, ancestors: Tensor) -> Tensor:

@@ -183,11 +183,10 @@ def _sample_mixture(distribution: MixtureSameFamily, z: Tensor, u: Tensor) -> Te
         )
     logits = categorical.logits.expand(*z.shape[:2], -1)
     mean, sd = (a.expand(*logits.shape, z.shape[-1]) for a in (normal.loc, normal.scale))
-    last = logits.shape[-1] - 1
     component = (
         (u > torch.softmax(logits.detach(), -1).cumsum(-1))
         .sum(-1, keepdim=True)
-        .clamp(max=last)
+        .clamp(max=logits.shape[-1] - 1)
         .unsqueeze(-1)
     )
     index = component.expand(*component.shape[:-1], z.shape[-1])

@@ -61,12 +61,14 @@ class PathStatistics(PathHistory):
 
     @override
     def merge(self, history: PathHistory) -> PathHistory:
-        if isinstance(history, PathStatistics):
-            return self
-        raise ValueError(
-            "filter.moves must not combine NoiseFlowStatKernel with other "
-            "kernels, got both. Remove the other kernels, because this one does not store paths."
+        require(
+            isinstance(history, PathStatistics),
+            "filter.moves",
+            "be without other kernels beside NoiseFlowStatKernel",
+            "both",
+            "Remove the other kernels, because this one does not store paths.",
         )
+        return self
 
     @override
     def start(
@@ -101,8 +103,8 @@ class PathStatistics(PathHistory):
             for belief in (before, after)
         )
         inverse_step = torch.linalg.inv_ex(transition_jacobian(model, start, record.u)[:, 0])[0]
-        information = inverse_step.mT @ before.window["information"][:, 0] @ inverse_step
-        information = information + fisher_information(model, end, record)
+        past = inverse_step.mT @ before.window["information"][:, 0] @ inverse_step
+        information = past + fisher_information(model, end, record)
         information = 0.5 * (information + information.mT)
         score = before.window["score"] @ inverse_step + _likelihood_gradient(model, after.x, record)
         return after._replace(window={"score": score, "information": information.unsqueeze(1)})

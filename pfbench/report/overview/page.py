@@ -284,7 +284,7 @@ def describe_tuned(overview: Overview, tuned: Overview) -> str:
     )
     counts = Counter(name_word(b) for _, b in pairs)
     return (
-        f"Each has 16 candidates, and the runs and the seed of the baselines. Tuned, they are {', '.join(f'{word} in {n}' for word, n in counts.items())} "
+        f"Each has 16 candidates, and the runs and the seed of the baselines. Tuned, they are {', '.join(f'{word} in {n}' for word, n in sorted(counts.items()))} "
         f"of {len(pairs)} cells. {f'Blue turns orange or back: {turned}' if turned else 'None turns from blue to orange or back'}; "
         f"{len(changed)} have another word (‡)."
     )

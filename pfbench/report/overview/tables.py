@@ -663,7 +663,7 @@ def format_times(overview: Overview, method: str) -> str:
         return "–"
     middle, low, high = (format_factor(f(finite)) for f in (np.median, min, max))
     text = middle if low == high else f"{middle} ({low} to {high})"
-    sir = list(overview.compare_times(method, SIR).values())
+    sir = [ratio for ratio in overview.compare_times(method, SIR).values() if np.isfinite(ratio)]
     return f"{text}; {format_factor(float(np.median(sir)))} of SIR" if sir else text
 
 
