@@ -28,7 +28,7 @@ and an interrupted one goes on: from the chains of nuts that are finished, and f
 Without a method and parameters: all noise numbers of an inertial log (IMU, bias walks, fixes), lever arm and delay, with priors
 from data sheets (method=noise). The numbers become a scenario that run, tune and estimate know by its name.
 
-  pfbench infer scenario=user_log scenario.folder=drive infer.sheet.gyro_deg_s=0.0038 infer.sheet.accelerometer_ug=70
+  pfbench infer data.root=. scenario=user_log scenario.folder=drive infer.sheet.gyro_deg_s=0.0038 infer.sheet.accelerometer_ug=70
   pfbench infer model=local_level method=nuts 'parameters={level_sd:[10,100],measurement_sd:[50,300]}'
   pfbench infer model=stochastic_volatility method=pmmh 'parameters={sigma:[0.1,1]}' particles=200 infer.chains=16
   pfbench infer model=stochastic_volatility method=smc2 filter=sir 'parameters={rho:{beta:[20,1.5],on:[-1,1]}}'
