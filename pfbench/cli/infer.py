@@ -228,6 +228,9 @@ def _add_geometry(
     return model, f"{' and '.join(left_out)} not written: scenario=user_log has the keys for them" if left_out else ""  # fmt: skip
 
 
+_FEW = 0.8  # of the true positions inside 90 % intervals, below which a note says so
+
+
 def format_noise(content: Mapping[str, Any]) -> str:
     """Format the numbers with priors and verdicts, and the scores of held-out fixes."""
     import pandas as pd
@@ -239,7 +242,12 @@ def format_noise(content: Mapping[str, Any]) -> str:
     head = f"noise of {content['choices']['scenario']} by the EKF in closed form, {content['fixes']} fixes: {k}"  # fmt: skip
     split = "second half of the fixes, numbers inferred from the first half:"
     texts = (frame.to_string(float_format=lambda value: f"{value:.4g}") for frame in (table, scores))  # fmt: skip
-    return f"\n{split}\n".join(texts).join((f"{head}\n", ""))
+    share = content["scores"]["inferred"].get("position in 90 %", 1.0)
+    note = "" if share > _FEW else (
+        f"\nThe reference is inside the 90 % intervals of position at {share:.0%} of the fixes: these numbers fit the next fix, not the position, as "
+        "where errors of fixes last. `pfbench estimate FOLDER` has such errors as states."
+    )  # fmt: skip
+    return f"\n{split}\n".join(texts).join((f"{head}\n", note))
 
 
 COMMAND = Command(
