@@ -246,7 +246,9 @@ def _check_values(alternatives: Sequence[Sequence[str]], config: JobConfig | Non
     first = [options[0] for options in alternatives]
     values: Mapping[str, object] = config.values if config else {}
     for index, options in enumerate(alternatives):
-        for option in options if values and len(options) > 1 else options[1:]:
+        # the first job is checked already, without building its filter and noise regime
+        is_built = len(options) == 1 and not options[0].startswith(("filter.", "noise."))
+        for option in options[1:] if is_built or not values else options:
             key, _, value = option.lstrip("+").partition("=")
             if key == "study":
                 check_study(value.strip("'\""))

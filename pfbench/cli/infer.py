@@ -238,8 +238,10 @@ def format_noise(content: Mapping[str, Any]) -> str:
     rows = pd.DataFrame.from_dict(content["rows"], orient="index")
     scores = pd.DataFrame.from_dict(content["scores"], orient="index")
     table = rows.rename(columns={"low": "5 %", "high": "95 %", "prior low": "prior 5 %", "prior high": "prior 95 %", "value": "for a filter"})  # fmt: skip
-    k = f"Pareto k {content['pareto_k']:.2f}, {content['ess']:.0f} effective draws, {content['cpu_seconds']:.0f} s of CPU"  # fmt: skip
-    head = f"noise of {content['choices']['scenario']} by the EKF in closed form, {content['fixes']} fixes: {k}"  # fmt: skip
+    head = (
+        f"noise of {content['choices']['scenario']} by the EKF in closed form, {content['fixes']} fixes: "
+        f"Pareto k {content['pareto_k']:.2f}, {content['ess']:.0f} effective draws, {content['cpu_seconds']:.0f} s of CPU"
+    )  # fmt: skip
     split = "second half of the fixes, numbers inferred from the first half:"
     texts = (frame.to_string(float_format=lambda value: f"{value:.4g}") for frame in (table, scores))  # fmt: skip
     share = content["scores"]["inferred"].get("position in 90 %", 1.0)

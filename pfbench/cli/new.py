@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,12 +23,13 @@ def write_script(words: Sequence[str]) -> None:
     )
     kind, name = words
     require_choice("kind", kind, list(SCRIPTS))
+    plain = re.sub(r"\W", "_", name.lower())
     require(
         name.isidentifier() and name.islower(),
         "name",
         "be of lower-case letters, digits and underscores",
         name,
-        f"Use my_{kind}.",
+        f"Use {plain if plain.isidentifier() else f'my_{kind}'}.",
     )
     path = Path(f"{name}.py")
     require(not path.exists(), path, "not exist", "a file", "Choose another name.")
