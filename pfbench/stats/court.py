@@ -123,12 +123,14 @@ class Court:
         if key not in self._families:
             selected, losses = self.runs.select(mask), self.losses(metric, mask)
             scenarios = selected.conditions["scenario"].unique()
-            more = self.fixed_in.get(str(scenarios[0]), set()) if len(scenarios) == 1 else set()
+            fixed = self._fixed | (
+                self.fixed_in.get(str(scenarios[0]), set()) if len(scenarios) == 1 else set()
+            )
             pairs = [p for p in self._pairs if share_conditions(selected, *p)]
             effects = dict(zip(pairs, compare_filters(selected, losses, pairs), strict=True))
             families: list[_Family] = []
             for is_fixed in (True, False):
-                some = [p for p in pairs if (frozenset(p) in self._fixed | more) == is_fixed]
+                some = [p for p in pairs if (frozenset(p) in fixed) == is_fixed]
                 opened = open_family([effects[p] for p in some], self.margin, self.alpha)
                 families.append(dict(zip(some, map(cache, opened), strict=True)))
             self._families[key] = families[0], families[1]
