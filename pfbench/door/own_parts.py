@@ -14,7 +14,7 @@ import yaml
 import pfbench
 from pfbench.core.parameter_checks import require
 from pfbench.door.own_source import find_home, name_file, write_module
-from pfbench.door.parts import Part, describe_value, place_words, plain_errors
+from pfbench.door.parts import READ_OTHERWISE, Part, describe_value, place_words, plain_errors
 from pfbench.files.atomic_write import write_atomically
 from pfbench.job.config import compose, list_groups
 from pfbench.job.trust import FOLDERS, WRITTEN, split_trust
@@ -83,7 +83,7 @@ def make_own(
         "Save it in a module.",
     )
     title = name or _name_thing(thing, arguments)
-    if name_file(title) in list_groups()[group]:
+    if name_file(title) in (*list_groups()[group], *READ_OTHERWISE):
         title = f"Own {title}"
     limit = arguments.pop("divergence_threshold", None) if group == "scenario" else None
     writer = _NodeWriter()

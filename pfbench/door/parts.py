@@ -20,7 +20,7 @@ from pfbench.cli.messages import (
 
 PART_GROUPS = ("scenario", "noise", "filter", "model")
 _PLAIN_TEXT = re.compile(r"[A-Za-z_][\w./-]*")
-_READ_OTHERWISE = ("null", "true", "false", "nan", "inf")  # by the parser of words
+READ_OTHERWISE = ("null", "true", "false", "nan", "inf")  # by the parser of words
 
 
 @contextmanager
@@ -157,7 +157,7 @@ def format_value(key: str, value: Any) -> str:
     if isinstance(value, int | float):
         return repr(value)
     if isinstance(value, str):
-        if _PLAIN_TEXT.fullmatch(value) and value.lower() not in _READ_OTHERWISE:
+        if _PLAIN_TEXT.fullmatch(value) and value.lower() not in READ_OTHERWISE:
             return value
         from hydra.core.override_parser.types import Quote, QuotedString
 
