@@ -40,10 +40,8 @@ NOT_RUN, CANNOT_RUN, VACUOUS = "not run", "cannot run", "vacuous"
 LOOKS = (50, 100, 200)  # draws after which the share is looked at
 SIDE = 0.025  # error rate of an end of the interval of the share, over all looks
 READING_SIDE = 0.02  # error rate of an outcome of one reading, over the first runs and all of them
-MOST_TRUE, MOST_BOUND = (
-    0.02,
-    0.05,
-)  # share, and upper end, of a refuted claim; so for the false ones of a confirmed claim
+# share, and upper end, of a refuted claim; so for the false ones of a confirmed claim
+MOST_TRUE, MOST_BOUND = 0.02, 0.05
 LEVEL_BOUND = 1.2  # a printed level holds within 20 %
 SIZE_BOUND = 2.0  # a printed ratio holds within this factor of its logarithm
 _MOST_LOST = 0.5  # share of runs that both filters lose, above which a reading cannot run

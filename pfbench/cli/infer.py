@@ -28,7 +28,7 @@ and an interrupted one goes on: from the chains of nuts that are finished, and f
 Without a method and parameters: all noise numbers of an inertial log (IMU, bias walks, fixes), lever arm and delay, with priors
 from data sheets (method=noise). The numbers become a scenario that run, tune and estimate know by its name.
 
-  pfbench infer scenario=user_log scenario.folder=drive infer.sheet.gyro_deg_s=0.0038 infer.sheet.accelerometer_ug=70
+  pfbench infer data.root=. scenario=user_log scenario.folder=drive infer.sheet.gyro_deg_s=0.0038 infer.sheet.accelerometer_ug=70
   pfbench infer model=local_level method=nuts 'parameters={level_sd:[10,100],measurement_sd:[50,300]}'
   pfbench infer model=stochastic_volatility method=pmmh 'parameters={sigma:[0.1,1]}' particles=200 infer.chains=16
   pfbench infer model=stochastic_volatility method=smc2 filter=sir 'parameters={rho:{beta:[20,1.5],on:[-1,1]}}'
@@ -228,6 +228,9 @@ def _add_geometry(
     return model, f"{' and '.join(left_out)} not written: scenario=user_log has the keys for them" if left_out else ""  # fmt: skip
 
 
+_FEW = 0.8  # of the true positions inside 90 % intervals, below which a note says so
+
+
 def format_noise(content: Mapping[str, Any]) -> str:
     """Format the numbers with priors and verdicts, and the scores of held-out fixes."""
     import pandas as pd
@@ -239,7 +242,12 @@ def format_noise(content: Mapping[str, Any]) -> str:
     head = f"noise of {content['choices']['scenario']} by the EKF in closed form, {content['fixes']} fixes: {k}"  # fmt: skip
     split = "second half of the fixes, numbers inferred from the first half:"
     texts = (frame.to_string(float_format=lambda value: f"{value:.4g}") for frame in (table, scores))  # fmt: skip
-    return f"\n{split}\n".join(texts).join((f"{head}\n", ""))
+    share = content["scores"]["inferred"].get("position in 90 %", 1.0)
+    note = "" if share > _FEW else (
+        f"\nThe reference is inside the 90 % intervals of position at {share:.0%} of the fixes: these numbers fit the next fix, not the position, as "
+        "where errors of fixes last. `pfbench estimate FOLDER` has such errors as states."
+    )  # fmt: skip
+    return f"\n{split}\n".join(texts).join((f"{head}\n", note))
 
 
 COMMAND = Command(

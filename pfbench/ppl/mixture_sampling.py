@@ -112,7 +112,7 @@ class Mixture(NamedTuple):
         A component with few effective points keeps much of its wider shape.
         """
         share = torch.softmax(self.log_parts(z), 0) * weights  # [K, n]
-        mass = share.sum(1).clamp(min=1e-12)
+        mass = share.sum(1).clamp(min=1e-300)  # 1e-40 far from all points, which are as few for it as for others
         effective = mass**2 / share.square().sum(1).clamp(min=1e-300)
         trust = effective / (effective + 5.0 * z.shape[1])
         loc = torch.lerp(self.loc, share @ z / mass[:, None], trust[:, None])

@@ -192,20 +192,24 @@ def test_numbers_that_a_log_does_not_show_keep_their_prior() -> None:
 
 
 def test_weights_of_all_rounds_are_those_of_the_mixture_of_their_proposals() -> None:
-    """A target of two normals, whose evidence and mean are known, from a proposal at one of them: four standard errors."""
+    """A target of two normals, whose evidence and mean are known, from a proposal at one of them and one far away: four standard errors."""
     mass, place, sd = torch.tensor([0.7, 0.3]).double(), torch.tensor([0.0, 4.0]).double(), 0.6
 
     def target(z: Tensor) -> Tensor:
         parts = mass.log() - 0.5 * ((z[:, None] - place[:, None]) / sd).square().sum(-1)
         return parts.logsumexp(-1) - 2 * np.log(sd * (2 * np.pi) ** 0.5) + np.log(5.0)
 
-    wide = torch.diag_embed(torch.tensor([[1.5, 1.5]]).double())
-    start = Mixture(torch.ones(1).double(), torch.full((1, 2), 1.0).double(), wide)
+    start = Mixture(
+        torch.tensor([0.95, 0.05]).double(),
+        torch.tensor([[1.0, 1.0], [60.0, 60.0]]).double(),
+        torch.diag_embed(torch.tensor([[1.5, 1.5], [1e-4, 1e-4]]).double()),
+    )
     found = [sample_mixture(target, start, PhiloxStream(s, torch.arange(1)), 400, 4) for s in range(20)]  # fmt: skip
     for values, exact in (([np.exp(f.log_evidence) / 5.0 for f in found], 1.0), ([float(f.weights @ f.z[:, 0]) for f in found], 1.2)):  # fmt: skip
         assert np.mean(values) == pytest.approx(exact, abs=4 * float(np.std(values, ddof=1)) / 20**0.5)  # fmt: skip
         assert np.std(values) < 0.1
     assert min(f.rounds for f in found) > 1
+    assert float(start.adapt(found[0].z, found[0].weights).root.diagonal(dim1=1, dim2=2).min()) > 0.1  # fmt: skip
 
 
 def test_a_filter_gets_the_root_of_the_mean_variance() -> None:

@@ -47,7 +47,7 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         "checkpoint",
         "be an existing file",
         path,
-        "Use the path that `pfbench train` prints, or checkpoint=untrained.",
+        "Use the path that `pfbench train` prints (give it none), or checkpoint=untrained.",
     )
     check_is_file(Path(path), TABLE_BYTES)
     check_zip(Path(path))

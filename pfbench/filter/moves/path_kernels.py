@@ -64,7 +64,7 @@ class PathStatistics(PathHistory):
         require(
             isinstance(history, PathStatistics),
             "filter.moves",
-            "be without other kernels beside NoiseFlowStatKernel",
+            "not combine NoiseFlowStatKernel with other kernels",
             "both",
             "Remove the other kernels, because this one does not store paths.",
         )

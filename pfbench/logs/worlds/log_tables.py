@@ -40,7 +40,7 @@ def find_dataset(root: str | None, folder: str) -> Path:
     Raises:
         ValueError: If data.root is not set, or does not contain the folder.
     """
-    remedy = f"Set the environment variable PFBENCH_DATA or data.root to the folder with {folder}/."
+    remedy = f"Set the environment variable PFBENCH_DATA or data.root to the folder with {folder}/; data.root=. is the current one."
     if root is None:
         raise ValueError(
             f"data.root is not set. Recorded data are not part of the package. {remedy}"

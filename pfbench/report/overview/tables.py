@@ -38,7 +38,8 @@ from pfbench.stats.study_size import count_needed_runs
 FEWEST_METHODS, FEWEST_WORLDS = 3, 2  # from which a study has this page
 CENTRAL = "nominal"  # regime of the page, if a world has several
 SIR = "sir"
-CONVENTIONAL = (SIR, "rpf", "rpf_tuned", "ekf_bank")  # that stand next to the methods
+# that stand next to the methods
+CONVENTIONAL = (SIR, "rpf", "rpf_tuned", "ekf_bank", "neural_mixture")
 PLANNED_RATIO = 0.8  # for which the runs of a cell are counted
 METRIC = "rmse"  # of all words of the page
 DEAD_RECKONING, PLAIN = "dead_reckoning", "ukf"
