@@ -779,7 +779,7 @@ def test_the_first_sentence_says_what_holds_at_equal_time(tabs: dict[TabKey, Ove
     assert choose_level({**tabs, 1000: fewer}) == 100  # the number that most methods ran with
     assert all(len(text.split()) <= 55 for text in said)
     alike = [word_headline(first, None, page) for page in stars[0]]
-    assert f"worlds. Tuned, so is: {name} (azimuth). Against" in alike[0]
+    assert f"worlds. Tuned, these are: {name} (azimuth). Against" in alike[0]
     assert re.search(r"worlds\. Nor is a tuned form, in \d+ cells\. Against", alike[1])
     star = tell_story(stars[0][0]._replace(cells=[
         c._replace(wins=True, verdict=c.verdict._replace(word="better")) for c in first.cells
@@ -823,7 +823,7 @@ def test_the_page_shows_what_tuned_methods_do_at_home(overview: Overview) -> Non
         "facts": {"options": {"home": "seven_at_home"}},
     }  # fmt: skip
     files = render_overview({0: overview, **home}, pack)
-    assert f"Nor is one at home, in {len(at_home.of_methods)} cells." in files["report.md"]
+    assert f"At home none is, in {len(at_home.of_methods)} cells." in files["report.md"]
     cells = pd.read_csv(io.StringIO(files["cells.csv"]))
     assert len(cells[cells["table"] == AT_HOME]) == len(at_home.cells)
     for name, text in describe_home(at_home):

@@ -361,8 +361,8 @@ def word_headline(
         first += " At equal time none is."
     words, single = Counter(map(name_word, overview.of_methods)), sum(c.beats_kalman for c in overview.of_methods)  # fmt: skip
     return (
-        f"{first}{f' Tuned, so is: {alike}.' if alike else f' Nor is a tuned form, in {len(tuned.of_methods)} cells.' if tuned else ''}"
-        f"{f' At home: {at_home}.' if at_home else f' Nor is one at home, in {len(home.of_methods)} cells.' if home else ''} "
+        f"{first}{f' Tuned, these are: {alike}.' if alike else f' Nor is a tuned form, in {len(tuned.of_methods)} cells.' if tuned else ''}"
+        f"{f' At home: {at_home}.' if at_home else f' At home none is, in {len(home.of_methods)} cells.' if home else ''} "
         f"Against each world's best Kalman filter: better in {words['better']} of {words.total()} cells"
         f"{f' (in {single} than all single ones)' if single else ''}, "
         f"equal in {words['equal']}, not decided in {words['not decided']}, worse in {words['worse']}."
