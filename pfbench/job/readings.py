@@ -71,10 +71,14 @@ def read_reading(paper: str, name: str) -> Mapping[str, Any]:
 
 
 def _merge(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge nested keys, those of the second last."""
+    """Merge nested keys, those of the second last. Another class takes the place of the first with its settings."""
     merged = dict(deepcopy(first))
     for key, value in second.items():
-        nested = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
+        nested = (
+            isinstance(value, Mapping)
+            and isinstance(merged.get(key), Mapping)
+            and value.get("_target_") in (None, merged[key].get("_target_"))
+        )
         merged[key] = _merge(merged[key], value) if nested else value
     return merged
 
