@@ -360,10 +360,13 @@ def verify_record(record: StoredValues, measures: Mapping[str, Measure], results
 
 
 def _has_equal_mean(again: np.ndarray, stored: np.ndarray) -> bool:
-    """Return whether the mean difference of runs is zero within its standard error."""
+    """Return whether the mean difference of runs, relative to the sum of both, is zero within its standard error."""
     if not np.array_equal(np.isfinite(again), np.isfinite(stored)):
         return False
-    off = (again - stored)[np.isfinite(stored)]
+    size = np.maximum(
+        np.abs(again) + np.abs(stored), 1e-300
+    )  # few large errors would hide all others
+    off = ((again - stored) / size)[np.isfinite(stored)]
     return bool(abs(off.mean()) <= _LARGEST_ERROR * off.std(ddof=1) / math.sqrt(len(off)))
 
 
